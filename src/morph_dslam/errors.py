@@ -1,0 +1,42 @@
+"""Errors that a user can mend: each message says what is wrong, where, and how to mend it.
+
+The command line prints the message alone and exits with status 2. Everything else that escapes is a defect.
+"""
+
+from __future__ import annotations
+
+
+class MorphError(Exception):
+    """A mistake in the input that the user can mend; the base of all errors raised on purpose."""
+
+
+class StudyError(MorphError):
+    """The study file, its mesh or its parameter box is wrong."""
+
+
+class SolverError(MorphError):
+    """A mechanical problem could not be solved where the study asked for it."""
+
+
+class ModelFileError(MorphError):
+    """A model file is missing, damaged, or of a version that this release cannot read."""
+
+
+class CameraError(MorphError):
+    """The calibration is missing, malformed, or belongs to other images."""
+
+
+class SourceError(MorphError):
+    """Frames are missing, unreadable or cut short."""
+
+
+class RegistrationError(MorphError):
+    """The object could not be placed in the reference frame."""
+
+
+class SceneError(MorphError):
+    """The scene file of a simulation is wrong."""
+
+
+class EvaluationError(MorphError):
+    """Results and ground truth do not fit together."""

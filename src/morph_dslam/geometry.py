@@ -1,0 +1,79 @@
+"""Rotations and rigid transforms, named target_from_source: ``a_from_b @ p_b`` is in frame a."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@njit(cache=True, nogil=True)
+def rotation_exp(rotation_vector):
+    """Rotation matrix (3, 3) of a rotation vector (3,) in radians (Rodrigues' formula)."""
+    x, y, z = rotation_vector[0], rotation_vector[1], rotation_vector[2]
+    squared = x * x + y * y + z * z
+    angle = np.sqrt(squared)
+    if angle < 1e-7:
+        # Taylor series: the closed form divides by zero here.
+        a, b = 1.0 - squared / 6.0, 0.5 - squared / 24.0
+    else:
+        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / squared
+    result = np.empty((3, 3))
+    result[0, 0] = 1.0 - b * (y * y + z * z)
+    result[1, 1] = 1.0 - b * (x * x + z * z)
+    result[2, 2] = 1.0 - b * (x * x + y * y)
+    result[0, 1] = -a * z + b * x * y
+    result[1, 0] = a * z + b * x * y
+    result[0, 2] = a * y + b * x * z
+    result[2, 0] = -a * y + b * x * z
+    result[1, 2] = -a * x + b * y * z
+    result[2, 1] = a * x + b * y * z
+    return result
+
+
+def rotation_log(rotation: Array) -> Array:
+    """Rotation vector (3,) in radians of a rotation matrix (3, 3); the inverse of `rotation_exp` up to pi."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(rotation).as_rotvec()
+
+
+@dataclass(frozen=True)
+class RigidTransform:
+    """A rotation (3, 3) followed by a translation (3,) in metres."""
+
+    rotation: Array
+    translation: Array
+
+    @classmethod
+    def identity(cls) -> RigidTransform:
+        return cls(np.eye(3), np.zeros(3))
+
+    @classmethod
+    def from_matrix(cls, matrix: Array) -> RigidTransform:
+        """From a homogeneous matrix (4, 4) or (3, 4)."""
+        return cls(np.array(matrix[:3, :3], dtype=float), np.array(matrix[:3, 3], dtype=float))
+
+    @property
+    def matrix(self) -> Array:
+        """The homogeneous matrix (4, 4)."""
+        result = np.eye(4)
+        result[:3, :3], result[:3, 3] = self.rotation, self.translation
+        return result
+
+    @property
+    def inverse(self) -> RigidTransform:
+        return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
+
+    def __matmul__(self, other: RigidTransform) -> RigidTransform:
+        return RigidTransform(
+            self.rotation @ other.rotation, self.rotation @ other.translation + self.translation
+        )
+
+    def apply(self, points: Array) -> Array:
+        """Move points (..., 3)."""
+        return points @ self.rotation.T + self.translation

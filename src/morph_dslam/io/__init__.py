@@ -1,0 +1,1 @@
+"""Files of other programs: calibrations, landmarks, videos."""

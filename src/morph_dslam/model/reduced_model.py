@@ -1,0 +1,118 @@
+"""The reduced model of one object: mesh, parameters, displacement and stress as separated fields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.model.separated import SeparatedField
+from morph_dslam.units import from_si
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One coordinate of the parameter box; all values in SI, ``unit`` is for reports.
+
+    ``quantity`` is a key of `morph_dslam.units.FACTORS` (length, angle, ratio, stress).
+    """
+
+    name: str
+    quantity: str
+    unit: str
+    lower: float
+    upper: float
+    default: float
+    description: str = ""
+
+    def display(self, value: float) -> float:
+        """``value`` (SI) in ``unit``."""
+        return from_si(value, self.unit, self.quantity)
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points on the surface mesh, by triangle and barycentric weights.
+
+    Attributes
+    ----------
+    triangles : (p,) index into `ReducedModel.triangles`.
+    weights : (p, 3) barycentric weights of the triangle's corners.
+    """
+
+    triangles: NDArray[np.int64]
+    weights: Array
+
+    def __len__(self) -> int:
+        return len(self.triangles)
+
+    def take(self, selection: NDArray) -> SurfacePoints:
+        """The points chosen by indices or a mask."""
+        return SurfacePoints(self.triangles[selection], self.weights[selection])
+
+
+@dataclass(frozen=True)
+class ReducedModel:
+    """What a `.morph` file holds.
+
+    Attributes
+    ----------
+    name : the study's name.
+    nodes : (n, 3) undeformed positions in the object frame, metres.
+    triangles : (m, 3) the visible surface, node indices.
+    parameters : the d coordinates of the box.
+    displacement : separated field with 3 components, metres.
+    stresses : second Piola-Kirchhoff stress by face ("top", "bottom"), 3 components (11, 22, 12) in the
+        material's axes, pascals; for solids that are not sheets the faces are absent.
+    certificate : held-out errors and how they were measured, plain JSON.
+    provenance : versions, study text, mesh hash, plain JSON.
+    """
+
+    name: str
+    nodes: Array
+    triangles: NDArray[np.int64]
+    parameters: tuple[Parameter, ...]
+    displacement: SeparatedField
+    stresses: dict[str, SeparatedField] = field(default_factory=dict)
+    certificate: dict[str, Any] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def lower(self) -> Array:
+        """Lower bounds of the parameters (d,), SI."""
+        return np.array([p.lower for p in self.parameters])
+
+    @property
+    def upper(self) -> Array:
+        """Upper bounds of the parameters (d,), SI."""
+        return np.array([p.upper for p in self.parameters])
+
+    @property
+    def default(self) -> Array:
+        """Parameters of the state assumed before anything is seen (d,), SI."""
+        return np.array([p.default for p in self.parameters])
+
+    def positions(self, mu: Array) -> Array:
+        """Deformed node positions (n, 3) in the object frame, metres."""
+        return self.nodes + self.displacement.value(mu)
+
+    def von_mises(self, mu: Array, face: str) -> Array:
+        """Von Mises stress (n,) in pascals on ``face``, plane stress: sqrt(s11² - s11 s22 + s22² + 3 s12²).
+
+        The second Piola-Kirchhoff stress stands for the Cauchy stress turned back with the sheet; they
+        differ by the order of the strain, below one per cent in paper.
+        """
+        s11, s22, s12 = self.stresses[face].value(mu).T
+        return np.sqrt(s11**2 - s11 * s22 + s22**2 + 3.0 * s12**2)
+
+    def rest_positions(self, points: SurfacePoints) -> Array:
+        """Undeformed positions (p, 3) of surface points, metres."""
+        return np.einsum("pc,pcx->px", points.weights, self.nodes[self.triangles[points.triangles]])
+
+    def restrict(self, points: SurfacePoints) -> SeparatedField:
+        """The displacement field at surface points only."""
+        return self.displacement.restrict(self.triangles[points.triangles], points.weights)
