@@ -69,7 +69,8 @@ class PinholeCamera:
             return np.asarray(pixels, dtype=float)
         source = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
         coefficients = np.array(self.distortion)
-        return cv2.undistortPoints(source, self.matrix, coefficients, P=self.matrix).reshape(-1, 2)
+        undistorted = cv2.undistortPoints(source, self.matrix, coefficients, P=self.matrix)
+        return np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
 
     def undistortion_maps(self) -> tuple[NDArray, NDArray] | None:
         """Maps for `cv2.remap` that undistort an image, or None when there is nothing to undistort."""

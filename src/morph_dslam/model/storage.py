@@ -65,14 +65,21 @@ def save_model(path: Path, model: ReducedModel) -> None:
     os.replace(partial, path)
 
 
+def _read_array(group: h5py.Group, name: str, dtype: type) -> np.ndarray:
+    dataset = group[name]
+    if not isinstance(dataset, h5py.Dataset):
+        raise ValueError(f"'{name}' is not a dataset")
+    return np.ascontiguousarray(dataset[()], dtype=dtype)
+
+
 def _read_field(group: h5py.Group, lower: np.ndarray, upper: np.ndarray) -> SeparatedField:
     functions = ParameterFunctions(
         lower=lower,
         upper=upper,
-        multi_indices=np.ascontiguousarray(group["multi_indices"][()], dtype=np.int64),
-        coefficients=np.ascontiguousarray(group["coefficients"][()], dtype=np.float64),
+        multi_indices=_read_array(group, "multi_indices", np.int64),
+        coefficients=_read_array(group, "coefficients", np.float64),
     )
-    return SeparatedField(np.ascontiguousarray(group["modes"][()], dtype=np.float64), functions)
+    return SeparatedField(_read_array(group, "modes", np.float64), functions)
 
 
 def _check_field(name: str, field: SeparatedField, n_nodes: int, d: int) -> None:
@@ -95,8 +102,8 @@ def _read_model(file: h5py.File) -> ReducedModel:
     parameters = tuple(Parameter(**entry) for entry in json.loads(str(file.attrs["parameters"])))
     lower = np.array([p.lower for p in parameters])
     upper = np.array([p.upper for p in parameters])
-    nodes = np.asarray(file["nodes"][()], dtype=np.float64)  # type: ignore[index]
-    triangles = np.asarray(file["triangles"][()], dtype=np.int64)  # type: ignore[index]
+    nodes = _read_array(file, "nodes", np.float64)
+    triangles = _read_array(file, "triangles", np.int64)
     if nodes.ndim != 2 or nodes.shape[1] != 3 or not np.isfinite(nodes).all():
         raise ValueError("its nodes are not finite points")
     if triangles.ndim != 2 or triangles.min() < 0 or triangles.max() >= len(nodes):

@@ -1,0 +1,47 @@
+# Everything is kept in .venv inside this folder; nothing but Python 3.11 or newer and make is needed.
+SHELL := bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DELETE_ON_ERROR:
+.PHONY: demo test test-all bench lint clean
+
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/installed.stamp
+
+# The first interpreter that is new enough and can make virtual environments.
+PYTHON ?= $(shell for p in python3.11 python3 python3.12 python3.13; do \
+	$$p -c 'import sys, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+
+# One line, rewritten in place, shows where pip is.
+PIP_PROGRESS := awk '/^ *(Collecting|Downloading|Installing)/ { \
+	printf "\r\033[K  %.76s", $$1 " " $$2; fflush() } END { printf "\r\033[K" }'
+
+demo: $(INSTALLED)
+	@echo "make demo: builds a model, films it, tracks it; minutes the first time, later runs use what is there"
+	@$(BIN)/python examples/demo/run.py
+
+test: lint
+	@$(BIN)/pytest -m "not slow"
+
+test-all: lint
+	@$(BIN)/pytest
+
+bench: $(INSTALLED)
+	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python "$$script"; done
+
+lint: $(INSTALLED)
+	@$(BIN)/ruff format --check --quiet
+	@$(BIN)/ruff check --quiet
+	@$(BIN)/pyright --warnings
+	@$(BIN)/lint-imports
+
+clean:
+	rm -rf demo examples/*/output build dist .pytest_cache .ruff_cache .import_linter_cache
+	find src tests examples -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(INSTALLED): pyproject.toml
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer, with its venv module, is needed: no such python3 was found"; exit 1; }
+	@echo "Installing into $(VENV) with $(PYTHON) (a few minutes, once)"
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off --editable '.[dev]' | $(PIP_PROGRESS)
+	@touch $@
