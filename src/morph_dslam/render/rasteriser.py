@@ -1,0 +1,181 @@
+"""The rasteriser: a z-buffer that says which triangle each pixel sees, where on it, and how far away.
+
+Edge functions decide coverage (Pineda 1988); inverse depth is linear in the image, so it both decides
+visibility and turns image-plane weights into perspective-correct barycentric weights. Pixel (0, 0) is the
+centre of the first pixel. Both faces of a triangle are drawn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Barycentric slack that keeps a pixel centre lying on a shared edge from falling between both triangles.
+EDGE_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True)
+class Buffers:
+    """What every pixel sees.
+
+    Attributes
+    ----------
+    triangle_ids : (h, w) int32, the nearest triangle, -1 where there is none.
+    weights : (h, w, 3) float32, perspective-correct barycentric weights of its corners, 0 where none.
+    depth : (h, w) float32, depth along the optical axis in the unit given, infinity where none.
+    """
+
+    triangle_ids: NDArray[np.int32]
+    weights: NDArray[np.float32]
+    depth: NDArray[np.float32]
+
+    @property
+    def covered(self) -> NDArray[np.bool_]:
+        """Pixels (h, w) that see a triangle."""
+        return self.triangle_ids >= 0
+
+
+@njit(cache=True, nogil=True)
+def _fill_triangle(triangle_id, u, v, inverse_depth, triangle_ids, weights, depth):
+    """Draw one triangle, given by its corners' pixels ``u``, ``v`` (3,) and inverse depths (3,)."""
+    height, width = depth.shape
+    area = (u[1] - u[0]) * (v[2] - v[0]) - (u[2] - u[0]) * (v[1] - v[0])
+    if not abs(area) > 1e-12:  # degenerate, or a corner is NaN
+        return
+    # Clamp before the conversion: a corner just in front of the camera lies far outside any integer.
+    left = int(np.ceil(max(min(u[0], u[1], u[2]), 0.0)))
+    right = int(np.floor(min(max(u[0], u[1], u[2]), width - 1.0)))
+    top = int(np.ceil(max(min(v[0], v[1], v[2]), 0.0)))
+    bottom = int(np.floor(min(max(v[0], v[1], v[2]), height - 1.0)))
+    b0_step, b1_step = (v[1] - v[2]) / area, (v[2] - v[0]) / area
+    q0, q1, q2 = inverse_depth[0], inverse_depth[1], inverse_depth[2]
+    for row in range(top, bottom + 1):
+        b0_row = ((u[1] - left) * (v[2] - row) - (u[2] - left) * (v[1] - row)) / area
+        b1_row = ((u[2] - left) * (v[0] - row) - (u[0] - left) * (v[2] - row)) / area
+        for column in range(left, right + 1):
+            b0 = b0_row + (column - left) * b0_step
+            b1 = b1_row + (column - left) * b1_step
+            b2 = 1.0 - b0 - b1
+            if b0 < -EDGE_TOLERANCE or b1 < -EDGE_TOLERANCE or b2 < -EDGE_TOLERANCE:
+                continue
+            z = 1.0 / (b0 * q0 + b1 * q1 + b2 * q2)
+            if z < depth[row, column]:
+                depth[row, column] = z
+                triangle_ids[row, column] = triangle_id
+                weights[row, column, 0] = b0 * q0 * z
+                weights[row, column, 1] = b1 * q1 * z
+                weights[row, column, 2] = b2 * q2 * z
+
+
+@njit(cache=True, nogil=True)
+def _fill_triangles(pixels, depths, triangles, triangle_ids, weights, depth):
+    u, v, inverse_depth = np.empty(3), np.empty(3), np.empty(3)
+    for t in range(triangles.shape[0]):
+        in_front = True
+        for corner in range(3):
+            node = triangles[t, corner]
+            in_front &= depths[node] > 0.0 and np.isfinite(pixels[node, 0] + pixels[node, 1])
+            if in_front:
+                u[corner], v[corner] = pixels[node, 0], pixels[node, 1]
+                inverse_depth[corner] = 1.0 / depths[node]
+        if in_front:
+            _fill_triangle(t, u, v, inverse_depth, triangle_ids, weights, depth)
+
+
+def _empty_buffers(height: int, width: int) -> Buffers:
+    return Buffers(
+        triangle_ids=np.full((height, width), -1, dtype=np.int32),
+        weights=np.zeros((height, width, 3), dtype=np.float32),
+        depth=np.full((height, width), np.inf, dtype=np.float32),
+    )
+
+
+def rasterise(pixels: Array, depths: Array, triangles: NDArray, height: int, width: int) -> Buffers:
+    """Draw triangles into a z-buffer.
+
+    Parameters
+    ----------
+    pixels : (n, 2) projected nodes, pixels; a node that is not in front of the camera is NaN.
+    depths : (n,) depth of the nodes along the optical axis, any length unit.
+    triangles : (m, 3) node indices. A triangle with a node not in front of the camera is left out.
+    height, width : size of the image, pixels.
+
+    Returns
+    -------
+    Buffers, whose depth is in the unit of ``depths``.
+    """
+    buffers = _empty_buffers(height, width)
+    _fill_triangles(
+        np.ascontiguousarray(pixels, dtype=np.float64),
+        np.ascontiguousarray(depths, dtype=np.float64),
+        np.ascontiguousarray(triangles, dtype=np.int64),
+        buffers.triangle_ids,
+        buffers.weights,
+        buffers.depth,
+    )
+    return buffers
+
+
+def rasterise_numpy(pixels: Array, depths: Array, triangles: NDArray, height: int, width: int) -> Buffers:
+    """The plain twin of `rasterise`: each triangle's weights by solving its 3x3 system over a window."""
+    buffers = _empty_buffers(height, width)
+    for t, nodes in enumerate(triangles):
+        corners, z = pixels[nodes], depths[nodes]
+        if not (np.isfinite(corners).all() and (z > 0.0).all()):
+            continue
+        system = np.vstack([corners.T, np.ones(3)])
+        if abs(np.linalg.det(system)) < 1e-12:
+            continue
+        low = np.ceil(np.maximum(corners.min(axis=0), 0)).astype(int)
+        high = np.floor(np.minimum(corners.max(axis=0), [width - 1, height - 1])).astype(int)
+        rows, columns = np.mgrid[low[1] : high[1] + 1, low[0] : high[0] + 1]
+        if rows.size == 0:
+            continue
+        window = (slice(low[1], high[1] + 1), slice(low[0], high[0] + 1))
+        image_weights = np.tensordot(
+            np.linalg.inv(system), np.stack([columns, rows, np.ones_like(rows)]).astype(float), axes=1
+        )
+        scaled = image_weights / z[:, None, None]
+        with np.errstate(divide="ignore"):
+            depth = 1.0 / scaled.sum(axis=0)
+        seen = (image_weights >= -EDGE_TOLERANCE).all(axis=0) & (depth < buffers.depth[window])
+        buffers.depth[window][seen] = depth[seen]
+        buffers.triangle_ids[window][seen] = t
+        buffers.weights[window][seen] = (scaled * depth).transpose(1, 2, 0)[seen]
+    return buffers
+
+
+def visible_points(
+    pixels: Array, depths: Array, depth_buffer: NDArray[np.float32], tolerance: float
+) -> NDArray[np.bool_]:
+    """Which surface points no other part of the surface hides.
+
+    Parameters
+    ----------
+    pixels : (p, 2) projected points, NaN where not in front of the camera.
+    depths : (p,) their depths, in the unit of the buffer.
+    depth_buffer : (h, w) from `rasterise`.
+    tolerance : a point this much behind the buffer still counts as seen; it makes up for the surface's
+        slope within a pixel. Same unit.
+
+    Returns
+    -------
+    (p,) bool; points outside the image are not visible.
+    """
+    height, width = depth_buffer.shape
+    inside = (
+        (pixels[:, 0] > -0.5)
+        & (pixels[:, 0] < width - 0.5)
+        & (pixels[:, 1] > -0.5)
+        & (pixels[:, 1] < height - 0.5)
+    )
+    visible = np.zeros(len(pixels), dtype=bool)
+    columns, rows = np.rint(pixels[inside]).astype(int).T
+    # A point on the outline may round to an empty pixel; its infinite depth then hides nothing.
+    visible[inside] = depths[inside] <= depth_buffer[rows, columns] + tolerance
+    return visible

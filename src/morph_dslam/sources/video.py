@@ -1,0 +1,82 @@
+"""A video file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from morph_dslam.errors import SourceError
+from morph_dslam.sources.folder import ASSUMED_FPS
+from morph_dslam.sources.frames import Frame, check_range
+
+#: Containers that only estimate their length from its duration are off by so many frames without damage.
+LENGTH_TOLERANCE = 1
+
+
+def _open(path: Path) -> cv2.VideoCapture:
+    capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        raise SourceError(
+            f"{path} cannot be opened as a video: it is damaged, cut short before its index, or of a kind that "
+            "OpenCV does not read; copy it again or convert it to mp4"
+        )
+    return capture
+
+
+def _count_frames(path: Path, capture: cv2.VideoCapture) -> int:
+    """The declared number of frames, counted where the container does not declare it."""
+    declared = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    if declared > 0:
+        return declared
+    count = 0
+    while capture.grab():
+        count += 1
+    if count == 0:
+        raise SourceError(f"{path} holds no frames")
+    return count
+
+
+class VideoFile:
+    """A video file as a `FrameSource`; frames are numbered by their position from 0."""
+
+    def __init__(self, path: Path, first: int | None = None, last: int | None = None) -> None:
+        capture = _open(path)
+        try:
+            self._declared = _count_frames(path, capture)
+            fps = capture.get(cv2.CAP_PROP_FPS)
+        finally:
+            capture.release()
+        self._path = path
+        self._first, self._last = check_range(path, range(self._declared), first, last)
+        self._open_ended = last is None
+        self.name = str(path)
+        self.fps = fps if np.isfinite(fps) and fps > 0 else ASSUMED_FPS
+
+    def __len__(self) -> int:
+        return self._last - self._first + 1
+
+    def __iter__(self) -> Iterator[Frame]:
+        capture = _open(self._path)
+        try:
+            # Decoding from the start is exact; seeking lands on the nearest key frame in some containers.
+            for index in range(self._last + 1):
+                decoded, image = capture.read() if index >= self._first else (capture.grab(), None)
+                if not decoded:
+                    self._check_end(index)
+                    return
+                if image is not None:
+                    yield Frame(index, index / self.fps, np.asarray(image, dtype=np.uint8))
+        finally:
+            capture.release()
+
+    def _check_end(self, index: int) -> None:
+        """Raise SourceError unless the stream may well end before frame ``index``."""
+        if self._open_ended and 0 < index and self._declared - index <= LENGTH_TOLERANCE:
+            return
+        raise SourceError(
+            f"{self._path} breaks off at frame {index}, though it declares {self._declared} frames: "
+            "it is cut short or damaged; copy it again, or choose a range of frames before the break"
+        )
