@@ -51,7 +51,9 @@ def _numbered_images(folder: Path) -> dict[int, Path]:
             continue
         numbers = re.findall(r"\d+", path.stem)
         if not numbers:
-            raise SourceError(f"{path} has no number in its name, which gives the frames their order: rename it")
+            raise SourceError(
+                f"{path} has no number in its name, which gives the frames their order: rename it"
+            )
         number = int(numbers[-1])
         if number in images:
             raise SourceError(

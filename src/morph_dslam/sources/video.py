@@ -74,7 +74,7 @@ class VideoFile:
 
     def _check_end(self, index: int) -> None:
         """Raise SourceError unless the stream may well end before frame ``index``."""
-        if self._open_ended and 0 < index and self._declared - index <= LENGTH_TOLERANCE:
+        if self._open_ended and index > 0 and self._declared - index <= LENGTH_TOLERANCE:
             return
         raise SourceError(
             f"{self._path} breaks off at frame {index}, though it declares {self._declared} frames: "

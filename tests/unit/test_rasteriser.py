@@ -1,0 +1,130 @@
+"""The rasteriser and texturing against closed forms and against their plain twins."""
+
+import numpy as np
+import pytest
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.render.rasteriser import rasterise, rasterise_numpy, visible_points
+from morph_dslam.render.texture import render_textured, render_textured_numpy
+from tests.support.bent_sheet import bent_sheet_model
+
+CAMERA = PinholeCamera(96, 72, 80.0, 82.0, 47.0, 36.5)
+SIZE = (CAMERA.height, CAMERA.width)
+
+
+def tilted_square():
+    """A square in the plane n·x = n·p, larger than the view, as two triangles."""
+    normal, point = np.array([0.3, -0.4, -1.0]), np.array([0.0, 0.0, 0.5])
+    xy = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * 0.7
+    z = (normal @ point - xy @ normal[:2]) / normal[2]
+    return np.column_stack([xy, z]), np.array([[0, 1, 2], [0, 2, 3]]), normal, point
+
+
+def draw(points, triangles, rasteriser=rasterise):
+    return rasteriser(CAMERA.project(points), points[:, 2], triangles, *SIZE)
+
+
+def pixel_grid():
+    rows, columns = np.indices(SIZE)
+    return np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
+
+
+def test_depth_of_a_plane_is_the_ray_plane_intersection():
+    points, triangles, normal, point = tilted_square()
+    buffers = draw(points, triangles)
+    expected = (normal @ point) / (CAMERA.rays(pixel_grid()) @ normal)
+    assert buffers.covered.all()
+    np.testing.assert_allclose(buffers.depth.ravel(), expected, rtol=1e-6)
+
+
+def test_weights_are_perspective_correct():
+    points, triangles, normal, point = tilted_square()
+    buffers = draw(points, triangles)
+    rays = CAMERA.rays(pixel_grid())
+    expected = rays * ((normal @ point) / (rays @ normal))[:, None]
+    corners = points[triangles[buffers.triangle_ids.ravel()]]
+    found = np.einsum("kc,kcx->kx", buffers.weights.reshape(-1, 3), corners)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_single_triangle_covers_exactly_the_pixels_inside_it():
+    pixels = np.array([[10.0, 10.0], [30.0, 10.0], [10.0, 20.0]])
+    triangle = np.array([[0, 1, 2]])
+    rows, columns = np.indices(SIZE)
+    inside = (columns >= 10) & (rows >= 10) & ((columns - 10) / 20 + (rows - 10) / 10 <= 1)
+    for order in ([0, 1, 2], [0, 2, 1]):
+        buffers = rasterise(pixels, np.ones(3), triangle[:, order], *SIZE)
+        np.testing.assert_array_equal(buffers.covered, inside)
+
+
+def test_nearer_triangle_wins_whatever_the_order():
+    pixels = np.array([[5.0, 5.0], [60.0, 5.0], [5.0, 60.0]] * 2)
+    depths = np.array([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
+    for triangles in ([[0, 1, 2], [3, 4, 5]], [[3, 4, 5], [0, 1, 2]]):
+        buffers = rasterise(pixels, depths, np.array(triangles), *SIZE)
+        assert set(buffers.depth[buffers.covered]) == {1.0}
+
+
+def test_triangles_that_reach_behind_the_camera_are_left_out():
+    points = np.array([[0.0, 0.0, 1.0], [0.2, 0.0, 1.0], [0.0, 0.2, -1.0], [0.0, 0.2, 1.0]])
+    buffers = draw(points, np.array([[0, 1, 2]]))
+    assert not buffers.covered.any()
+    assert np.isinf(buffers.depth).all()
+    assert set(np.unique(draw(points, np.array([[0, 1, 2], [0, 1, 3]])).triangle_ids)) == {-1, 1}
+
+
+def test_corner_almost_in_the_camera_plane_does_not_overflow():
+    points = np.array([[0.0, 0.0, 1.0], [0.2, 0.0, 1.0], [0.5, 0.2, 1e-300], [0.1, 0.3, 1e-12]])
+    buffers = draw(points, np.array([[0, 1, 2], [0, 1, 3]]))
+    assert np.isfinite(buffers.weights).all()
+
+
+def test_mesh_is_watertight():
+    model = bent_sheet_model()
+    points = model.nodes + [0.0, 0.0, 0.15]  # fills the view
+    assert draw(points, model.triangles).covered.all()
+
+
+@pytest.mark.parametrize("mu", [(0.05, 0.4, 0.2), (-0.06, -0.5, -0.3)])
+def test_rasteriser_agrees_with_its_plain_twin(mu):
+    model = bent_sheet_model(15, 11)
+    points = model.positions(np.array(mu)) @ np.diag([1.0, -1.0, -1.0]) + [0.02, 0.0, 0.4]
+    compiled, plain = (draw(points, model.triangles, function) for function in (rasterise, rasterise_numpy))
+    np.testing.assert_array_equal(compiled.triangle_ids, plain.triangle_ids)
+    np.testing.assert_allclose(compiled.depth, plain.depth, rtol=1e-6)
+    np.testing.assert_allclose(compiled.weights, plain.weights, atol=1e-6)
+
+
+def test_texture_that_is_a_ramp_reads_back_the_coordinates():
+    points, triangles, normal, point = tilted_square()
+    buffers = draw(points, triangles)
+    texture = np.tile(np.arange(200, dtype=np.uint8), (150, 1))
+    coordinates = (points[:, :2] / 0.7 + 1.0) / 2.0 * [199, 149]
+    rays = CAMERA.rays(pixel_grid())
+    x = (rays[:, 0] * (normal @ point) / (rays @ normal) / 0.7 + 1.0) / 2.0 * 199
+    image = render_textured(buffers, triangles, coordinates, texture)
+    assert np.abs(image.ravel() - x).max() <= 0.5 + 1e-4
+
+
+@pytest.mark.parametrize("channels", [None, 3])
+def test_texturing_agrees_with_its_plain_twin(channels):
+    rng = np.random.default_rng(1)
+    shape = (60, 80) if channels is None else (60, 80, channels)
+    texture = rng.integers(0, 256, shape, dtype=np.uint8)
+    model = bent_sheet_model(9, 7)
+    points = model.positions(np.array([0.04, 0.2, 0.1])) + [0.0, 0.0, 0.5]
+    buffers = draw(points, model.triangles)
+    coordinates = (model.nodes[:, :2] + [0.21, 0.1485]) * 200.0
+    compiled = render_textured(buffers, model.triangles, coordinates, texture)
+    plain = render_textured_numpy(buffers, model.triangles, coordinates, texture)
+    assert compiled.shape == SIZE + texture.shape[2:]
+    assert not compiled[~buffers.covered].any()
+    assert np.abs(compiled.astype(int) - plain).max() <= 1
+
+
+def test_points_behind_a_nearer_square_are_hidden():
+    near = np.array([[-0.1, -0.1, 0.5], [0.1, -0.1, 0.5], [0.1, 0.1, 0.5], [-0.1, 0.1, 0.5]])
+    buffers = draw(near, np.array([[0, 1, 2], [0, 2, 3]]))
+    points = np.array([[0.0, 0.0, 0.8], [0.0, 0.0, 0.5], [0.3, 0.0, 0.8], [5.0, 0.0, 0.8], [0.0, 0.0, -1.0]])
+    seen = visible_points(CAMERA.project(points), points[:, 2], buffers.depth, tolerance=0.01)
+    assert seen.tolist() == [False, True, True, False, False]
