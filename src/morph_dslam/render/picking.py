@@ -40,8 +40,8 @@ def pick_surface(camera_points: Array, triangles: NDArray[np.int64], rays: Array
         return SurfacePoints(found, weights)
     a, b, c = camera_points[triangles[in_front]].transpose(1, 0, 2)
     volume = np.einsum("mx,mx->m", a, np.cross(b, c))
-    with np.errstate(divide="ignore", invalid="ignore"):  # triangles seen edge-on have no volume
-        dual = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)]) / volume[:, None]
+    volume[volume == 0.0] = np.nan  # seen edge-on: NaN weights, which no comparison accepts
+    dual = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)]) / volume[:, None]
     step = max(1, CHUNK // len(in_front))
     for start in range(0, len(rays), step):
         chosen = slice(start, start + step)
@@ -56,10 +56,10 @@ def _nearest(rays: Array, dual: Array, triangle_ids: NDArray[np.int64]) -> tuple
     nearest = np.where(hit, inverse_range, -np.inf).argmax(axis=1)
     rows = np.arange(len(rays))
     met = hit[rows, nearest]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        weights = np.clip((scaled[:, rows, nearest] / inverse_range[rows, nearest]).T, 0.0, None)
-        weights /= weights.sum(axis=1, keepdims=True)
-    return np.where(met, triangle_ids[nearest], -1), np.where(met[:, None], weights, np.nan)
+    found, weights = np.where(met, triangle_ids[nearest], -1), np.full((len(rays), 3), np.nan)
+    inside = np.clip(scaled[:, rows[met], nearest[met]].T, 0.0, None)
+    weights[met] = inside / inside.sum(axis=1, keepdims=True)
+    return found, weights
 
 
 def nearest_on_outline(

@@ -1,0 +1,204 @@
+"""Material error: how far material points are from where the run says they are, without any alignment.
+
+Each truth point is bound to the mesh by its pixel in one frame, then followed on the estimated surface through
+the other frames. It is the paper's error measure for the sheet: a shape that is right but slides along itself
+does not pass.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import EvaluationError
+from morph_dslam.evaluation.run_folder import Run
+from morph_dslam.evaluation.truth import PointTruth
+from morph_dslam.model import SurfacePoints
+from morph_dslam.render.picking import nearest_on_outline, pick_surface
+
+Array = NDArray[np.float64]
+
+#: A truth point whose pixel misses the estimated surface by no more than this is bound to its outline.
+OUTLINE_TOLERANCE_PX = 5.0
+
+
+@dataclass(frozen=True)
+class Binding:
+    """Truth points on the mesh.
+
+    Attributes
+    ----------
+    frame : the frame whose pixels bound them.
+    columns : (b,) which truth points. points : where they are on the mesh, length b.
+    n_outline : how many of them missed the surface by at most `OUTLINE_TOLERANCE_PX`.
+    unbound : (u,) the truth points that missed it by more, which cannot be compared.
+    """
+
+    frame: int
+    columns: NDArray[np.int64]
+    points: SurfacePoints
+    n_outline: int
+    unbound: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class MaterialError:
+    """Errors in metres.
+
+    Attributes
+    ----------
+    frames : (e,) the frames compared. vectors : (e, b, 3) estimate minus truth in the camera frame, NaN where
+        a point was not measured. sight : (e, b, 3) unit directions from the camera to the truth points.
+    untracked : truth frames that the run has but did not track. outside : truth frames that it does not have.
+    """
+
+    binding: Binding
+    frames: NDArray[np.int64]
+    vectors: Array
+    sight: Array
+    untracked: tuple[int, ...]
+    outside: tuple[int, ...]
+
+    @property
+    def distances(self) -> Array:
+        """Length (e, b) of the error, metres."""
+        return np.linalg.norm(self.vectors, axis=2)
+
+    @property
+    def along_sight(self) -> Array:
+        """Signed error (e, b) along the sight line, metres; positive is too far away."""
+        return np.einsum("ebx,ebx->eb", self.vectors, self.sight)
+
+    @property
+    def across_sight(self) -> Array:
+        """Length (e, b) of the error across the sight line, metres."""
+        return np.linalg.norm(self.vectors - self.along_sight[..., None] * self.sight, axis=2)
+
+    @property
+    def mean(self) -> float:
+        """Mean error over all points and frames, metres."""
+        return float(np.nanmean(self.distances))
+
+    @property
+    def median(self) -> float:
+        """Median error over all points and frames, metres."""
+        return float(np.nanmedian(self.distances))
+
+    @property
+    def p95(self) -> float:
+        """95th percentile of the error over all points and frames, metres."""
+        return float(np.nanpercentile(self.distances, 95))
+
+
+def bind_truth(run: Run, truth: PointTruth, frame: int) -> Binding:
+    """Bind truth points to the mesh by their pixels in ``frame``, in the state estimated there.
+
+    Raises
+    ------
+    EvaluationError
+        If the truth or the run has no such frame, it was not tracked, or no pixel falls on the mesh.
+    """
+    in_truth = np.flatnonzero(truth.frames == frame)
+    if not in_truth.size:
+        known = ", ".join(str(number) for number in truth.frames)
+        raise EvaluationError(f"the truth has no frame {frame} to bind in; it has {known}")
+    row = run.row(frame)
+    if row is None:
+        raise EvaluationError(
+            f"the run has no frame {frame} to bind in; it has {run.frames[0]} to {run.frames[-1]}"
+        )
+    if not run.tracked[row]:
+        raise EvaluationError(f"frame {frame} was not tracked ({run.reasons[row]}): bind in another frame")
+    recorded = truth.pixels[in_truth[0]]
+    columns = np.flatnonzero(np.isfinite(recorded).all(axis=1))
+    pixels = run.camera.undistort_pixels(recorded[columns])
+    nodes, triangles = run.camera_points(row), run.model.triangles
+    points = pick_surface(nodes, triangles, run.camera.rays(pixels))
+    missed = np.flatnonzero(points.triangles < 0)
+    bound = points.triangles >= 0
+    if missed.size:
+        outline, distance = nearest_on_outline(nodes, run.camera.project(nodes), triangles, pixels[missed])
+        close = distance <= OUTLINE_TOLERANCE_PX
+        points.triangles[missed[close]] = outline.triangles[close]
+        points.weights[missed[close]] = outline.weights[close]
+        bound[missed[close]] = True
+    if not bound.any():
+        raise EvaluationError(f"in frame {frame} no truth pixel falls on the estimated surface")
+    unbound = np.setdiff1d(np.arange(recorded.shape[0]), columns[bound])
+    n_outline = int(bound[missed].sum())
+    return Binding(frame, columns[bound], points.take(bound), n_outline, unbound)
+
+
+def material_error(run: Run, truth: PointTruth, bind_frame: int) -> MaterialError:
+    """Compare every truth frame except the binding one with the run.
+
+    Raises
+    ------
+    EvaluationError
+        As `bind_truth`, or if no other truth frame was tracked.
+    """
+    binding = bind_truth(run, truth, bind_frame)
+    corners, weights = run.model.triangles[binding.points.triangles], binding.points.weights
+    frames, vectors, sight, untracked, outside = [], [], [], [], []
+    for index, frame in enumerate(truth.frames.tolist()):
+        row = run.row(frame)
+        if frame == bind_frame:
+            continue
+        if row is None:
+            outside.append(frame)
+        elif not run.tracked[row]:
+            untracked.append(frame)
+        else:
+            measured = truth.points[index, binding.columns]
+            predicted = np.einsum("bc,bcx->bx", weights, run.camera_points(row)[corners])
+            frames.append(frame)
+            vectors.append(predicted - measured)
+            sight.append(measured / np.linalg.norm(measured, axis=1, keepdims=True))
+    if not frames or not np.isfinite(vectors).any():
+        raise EvaluationError(
+            f"no truth frame besides {bind_frame} can be compared: "
+            f"not tracked {untracked or 'none'}, outside the run {outside or 'none'}"
+        )
+    return MaterialError(
+        binding, np.array(frames), np.array(vectors), np.array(sight), tuple(untracked), tuple(outside)
+    )
+
+
+def _millimetres(error: MaterialError, rows: slice) -> dict[str, float]:
+    distances = 1e3 * error.distances[rows]
+    return {
+        "mean_mm": float(np.nanmean(distances)),
+        "median_mm": float(np.nanmedian(distances)),
+        "p95_mm": float(np.nanpercentile(distances, 95)),
+        "max_mm": float(np.nanmax(distances)),
+        "mean_along_sight_mm": float(1e3 * np.nanmean(np.abs(error.along_sight[rows]))),
+        "mean_across_sight_mm": float(1e3 * np.nanmean(error.across_sight[rows])),
+    }
+
+
+def summarise(error: MaterialError) -> dict[str, Any]:
+    """The figures of `evaluation.json`, millimetres, plain JSON."""
+    measured = np.isfinite(error.distances)
+    per_frame = {
+        str(frame): _millimetres(error, slice(i, i + 1))
+        for i, frame in enumerate(error.frames.tolist())
+        if measured[i].any()
+    }
+    return {
+        **_millimetres(error, slice(None)),
+        "bind_frame": error.binding.frame,
+        "n_points": len(error.binding.columns) + len(error.binding.unbound),
+        "n_points_bound": len(error.binding.columns),
+        "n_points_bound_at_outline": error.binding.n_outline,
+        "outline_tolerance_px": OUTLINE_TOLERANCE_PX,
+        "points_not_bound": error.binding.unbound.tolist(),
+        "n_comparisons": int(measured.sum()),
+        "n_comparisons_without_measurement": int((~measured).sum()),
+        "frames_compared": error.frames.tolist(),
+        "truth_frames_not_tracked": list(error.untracked),
+        "truth_frames_outside_the_run": list(error.outside),
+        "per_frame": per_frame,
+    }

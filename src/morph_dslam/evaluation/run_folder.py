@@ -1,0 +1,117 @@
+"""A run folder, read back: what `morph track` found, with the model and the camera it used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import EvaluationError
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.io.calibration import load_camera
+from morph_dslam.model import ReducedModel, load_model
+
+Array = NDArray[np.float64]
+
+FORMAT = "morph-dslam run"
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Run:
+    """One tracked sequence.
+
+    Attributes
+    ----------
+    frames : (f,) frame numbers. status, reasons : one text a frame; the state exists where "tracked".
+    camera_from_object : (f, 4, 4), NaN where not tracked. parameters : (f, d), SI.
+    stage_times : (f,) milliseconds by stage name.
+    """
+
+    folder: Path
+    model: ReducedModel
+    camera: PinholeCamera
+    frames: NDArray[np.int64]
+    status: tuple[str, ...]
+    reasons: tuple[str, ...]
+    camera_from_object: Array
+    parameters: Array
+    stage_times: dict[str, Array]
+
+    @property
+    def tracked(self) -> NDArray[np.bool_]:
+        """Frames (f,) whose pose and parameters are known."""
+        known = np.isfinite(self.camera_from_object).all(axis=(1, 2)) & np.isfinite(self.parameters).all(
+            axis=1
+        )
+        return known & (np.array(self.status) == "tracked")
+
+    def row(self, frame: int) -> int | None:
+        """Where frame number ``frame`` is in the arrays, or None if the run does not have it."""
+        found = np.flatnonzero(self.frames == frame)
+        return int(found[0]) if found.size else None
+
+    def camera_points(self, row: int) -> Array:
+        """The estimated mesh nodes (n, 3) of one frame in the camera frame, metres."""
+        pose = RigidTransform.from_matrix(self.camera_from_object[row])
+        return pose.apply(self.model.positions(self.parameters[row]))
+
+
+def _texts(file: h5py.File, name: str) -> tuple[str, ...]:
+    dataset = file[name]
+    assert isinstance(dataset, h5py.Dataset)
+    return tuple(str(value) for value in dataset.asstr()[()])
+
+
+def _array(file: h5py.File, name: str) -> NDArray:
+    dataset = file[name]
+    assert isinstance(dataset, h5py.Dataset)
+    return np.asarray(dataset[()])
+
+
+def load_run(folder: Path) -> Run:
+    """Read a run folder.
+
+    Raises
+    ------
+    EvaluationError
+        If the folder has no result, or one that is damaged or of another version.
+    ModelFileError, CameraError
+        If the copies of the model or of the camera file in it cannot be read.
+    """
+    path = folder / "result.h5"
+    if not path.is_file():
+        raise EvaluationError(f"{folder} holds no result.h5: give a folder that `morph track -o` has written")
+    model, camera = load_model(folder / "model.morph"), load_camera(folder / "camera.yaml")
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != FORMAT or int(file.attrs["version"]) != VERSION:  # type: ignore[arg-type]
+                raise EvaluationError(
+                    f"{path} is not a run of version {VERSION}: track again with this release"
+                )
+            times = file["timings_ms"]
+            names = [str(name) for name in times.attrs["names"]]
+            columns = _array(file, "timings_ms").T
+            run = Run(
+                folder=folder,
+                model=model,
+                camera=camera,
+                frames=_array(file, "frame").astype(np.int64),
+                status=_texts(file, "status"),
+                reasons=_texts(file, "reason"),
+                camera_from_object=_array(file, "camera_from_object").astype(float).reshape(-1, 4, 4),
+                parameters=_array(file, "parameters").astype(float),
+                stage_times=dict(zip(names, columns, strict=True)),
+            )
+    except EvaluationError:
+        raise
+    except Exception as error:
+        # h5py raises half a dozen types on damaged files, RuntimeError and KeyError among them.
+        raise EvaluationError(f"{path} is damaged or cut short ({error}): track again") from error
+    if not len(run.frames):
+        raise EvaluationError(f"{path} holds no frames: track again")
+    return run
