@@ -1,0 +1,266 @@
+"""Parameters and pose from pixels: Levenberg-Marquardt with Huber weights inside the parameter box.
+
+The steps are taken in scaled unknowns (half a parameter range, one radian, the object's size), so that the
+damping treats them alike. Directions that the images cannot see get no step and a large standard deviation:
+the damping has a floor relative to the best-seen direction, and the iteration ends when the model predicts no
+worthwhile decrease. Bounds are kept by an active set (Nocedal & Wright, Numerical Optimization, ch. 16.7).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.model import ReducedModel, SeparatedField, SurfacePoints
+from morph_dslam.online.reprojection import linearise
+
+Array = NDArray[np.float64]
+
+#: Largest step of one iteration in scaled unknowns: keeps an unseen direction from crossing the box at once.
+LARGEST_STEP = 1.0
+#: Damping floor and eigenvalue floor, relative to the best-seen direction.
+DAMPING_FLOOR, EIGENVALUE_FLOOR = 1e-6, 1e-12
+#: A parameter nearer to its bound than this share of its range counts as being at the bound.
+BOUND_SHARE = 1e-3
+
+
+@dataclass(frozen=True)
+class State:
+    """What is estimated in every frame: parameters (d,) in SI units and the object's pose."""
+
+    parameters: Array
+    camera_from_object: RigidTransform
+
+
+@dataclass(frozen=True)
+class BoundPoints:
+    """Surface points with the displacement field restricted to them.
+
+    Attributes
+    ----------
+    surface : where the p points are on the mesh.
+    rest : (p, 3) undeformed positions, metres.
+    field : displacement at the points only, metres.
+    """
+
+    surface: SurfacePoints
+    rest: Array
+    field: SeparatedField
+
+    @classmethod
+    def from_surface(cls, model: ReducedModel, surface: SurfacePoints) -> BoundPoints:
+        return cls(surface, model.rest_positions(surface), model.restrict(surface))
+
+    def __len__(self) -> int:
+        return len(self.rest)
+
+    def in_camera(self, state: State) -> Array:
+        """Positions (p, 3) in the camera frame, metres."""
+        return state.camera_from_object.apply(self.rest + self.field.value(state.parameters))
+
+
+@dataclass(frozen=True)
+class EstimationOptions:
+    """``huber_px``: residual length where Huber's cost turns linear; ``tolerance``: relative decrease of the
+    cost below which the iteration ends."""
+
+    huber_px: float = 1.5
+    max_iterations: int = 25
+    tolerance: float = 1e-6
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The minimum that was found.
+
+    Attributes
+    ----------
+    state : parameters and pose.
+    cost : Huber cost, pixels squared.
+    residuals : (p, 2) projected minus measured, pixels.
+    sigma_px : robust standard deviation of one pixel coordinate's residual.
+    covariance : (d + 6, d + 6) of [parameters, rotation vector, translation]; infinite when undetermined.
+    at_bound : (d,) parameters that ended at a bound of the box.
+    iterations, converged : how the iteration ended.
+    """
+
+    state: State
+    cost: float
+    residuals: Array
+    sigma_px: float
+    covariance: Array
+    at_bound: NDArray[np.bool_]
+    iterations: int
+    converged: bool
+
+    @property
+    def parameter_std(self) -> Array:
+        """Standard deviations of the parameters (d,), SI; very large where the images do not tell."""
+        return np.sqrt(np.diag(self.covariance)[: len(self.state.parameters)])
+
+    @property
+    def pose_std(self) -> Array:
+        """Standard deviations (6,) of the rotation vector (rad) and the translation (m)."""
+        return np.sqrt(np.diag(self.covariance)[len(self.state.parameters) :])
+
+
+def moved(state: State, step: Array) -> State:
+    """The state after an increment (d + 6,): parameters added, pose increment on the left."""
+    d = len(state.parameters)
+    pose = state.camera_from_object
+    rotation = rotation_exp(step[d : d + 3]) @ pose.rotation
+    return State(state.parameters + step[:d], RigidTransform(rotation, pose.translation + step[d + 3 :]))
+
+
+def bounded_step(hessian: Array, gradient: Array, lower: Array, upper: Array) -> Array:
+    """Minimiser of the quadratic model, with unknowns that would leave [lower, upper] held at the bound.
+
+    Starts with all unknowns free and holds those that violate a bound until none does; unknowns already at a
+    bound (zero distance) that the gradient pushes outwards are thereby held from the start.
+    """
+    step = np.zeros_like(gradient)
+    free = ~(((lower == 0.0) & (gradient > 0.0)) | ((upper == 0.0) & (gradient < 0.0)))
+    while free.any():
+        held = ~free
+        right = -gradient[free] - hessian[np.ix_(free, held)] @ step[held]
+        step[free] = np.linalg.solve(hessian[np.ix_(free, free)], right)
+        outside = free & ((step < lower) | (step > upper))
+        if not outside.any():
+            break
+        step[outside] = np.clip(step[outside], lower[outside], upper[outside])
+        free &= ~outside
+    return step
+
+
+class Estimator:
+    """Finds states from pixels of bound points, with one camera and one model.
+
+    ``linearise`` may be replaced by its numpy twin to compare them.
+    """
+
+    def __init__(
+        self,
+        model: ReducedModel,
+        camera: PinholeCamera,
+        options: EstimationOptions | None = None,
+        linearise: Callable = linearise,
+    ) -> None:
+        self.model, self.camera = model, camera
+        self.options = options or EstimationOptions()
+        self._linearise = linearise
+        size = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
+        half_ranges = 0.5 * (model.upper - model.lower)
+        self._scale = np.concatenate([half_ranges, np.ones(3), np.full(3, size)])
+
+    def evaluate(self, points: BoundPoints, pixels: Array, weights: Array, state: State):
+        """Cost, Hessian, gradient and residuals at a state; see `reprojection.linearise`."""
+        functions = points.field.functions
+        return self._linearise(
+            state.parameters, state.camera_from_object.rotation, state.camera_from_object.translation,
+            points.rest, points.field.modes, functions.lower, functions.upper, functions.multi_indices,
+            functions.coefficients, self.camera.intrinsics, pixels, weights, self.options.huber_px,
+        )  # fmt: skip
+
+    def estimate(self, points: BoundPoints, pixels: Array, weights: Array, start: State) -> Estimate:
+        """Minimise the Huber cost from ``start``.
+
+        Parameters
+        ----------
+        pixels : (p, 2) measured, in the undistorted image.
+        weights : (p,) non-negative; points of weight 0 are ignored (their residuals are still reported).
+        """
+        options, scale = self.options, self._scale
+        state = State(np.clip(start.parameters, self.model.lower, self.model.upper), start.camera_from_object)
+        cost, hessian, gradient, residuals = self.evaluate(points, pixels, weights, state)
+        damping, iterations, converged = 1e-3, 0, False
+        while iterations < options.max_iterations and not converged:
+            iterations += 1
+            step, predicted = self._damped_step(hessian, gradient, state, damping)
+            if predicted <= options.tolerance * cost + 1e-14:
+                # A damped step predicts little although much could be gained: believe it only undamped.
+                converged = damping <= 1e-2
+                damping = min(damping * 0.01, 1e-2)
+                continue
+            trial = self._inside(moved(state, step * scale))
+            attempt = self.evaluate(points, pixels, weights, trial)
+            if attempt[0] < cost:
+                ratio = (cost - attempt[0]) / predicted
+                state, (cost, hessian, gradient, residuals) = trial, attempt
+                damping = max(damping * (0.1 if ratio > 0.5 else 1.0), 1e-9)
+            else:
+                damping *= 10.0
+                converged = damping > 1e8
+        return self._finish(state, cost, hessian, residuals, weights, iterations, converged)
+
+    def estimate_from(
+        self, points: BoundPoints, pixels: Array, weights: Array, starts: Sequence[State]
+    ) -> list[Estimate]:
+        """Minimise from several starts; the estimates in order of their cost."""
+        found = [self.estimate(points, pixels, weights, start) for start in starts]
+        return sorted(found, key=lambda estimate: estimate.cost)
+
+    def _damped_step(
+        self, hessian: Array, gradient: Array, state: State, damping: float
+    ) -> tuple[Array, float]:
+        """Step in scaled unknowns and the decrease of the cost that the quadratic model predicts for it."""
+        scale, d = self._scale, len(state.parameters)
+        scaled_hessian = hessian * np.outer(scale, scale)
+        scaled_gradient = gradient * scale
+        diagonal = np.diag(scaled_hessian)
+        floor = max(diagonal.max() * DAMPING_FLOOR, 1e-30)
+        damped = scaled_hessian + np.diag(damping * np.maximum(diagonal, floor) + 1e-3 * floor)
+        lower, upper = np.full(d + 6, -LARGEST_STEP), np.full(d + 6, LARGEST_STEP)
+        lower[:d] = np.maximum(lower[:d], (self.model.lower - state.parameters) / scale[:d])
+        upper[:d] = np.minimum(upper[:d], (self.model.upper - state.parameters) / scale[:d])
+        step = bounded_step(damped, scaled_gradient, lower, upper)
+        predicted = -(scaled_gradient @ step + 0.5 * step @ scaled_hessian @ step)
+        return step, float(predicted)
+
+    def _inside(self, state: State) -> State:
+        """Rounding may leave a parameter an ulp outside its range; bring it back exactly."""
+        return replace(state, parameters=np.clip(state.parameters, self.model.lower, self.model.upper))
+
+    def _finish(
+        self,
+        state: State,
+        cost: float,
+        hessian: Array,
+        residuals: Array,
+        weights: Array,
+        iterations: int,
+        converged: bool,
+    ) -> Estimate:
+        model = self.model
+        used = (weights > 0.0) & np.isfinite(residuals).all(axis=1)
+        sigma, covariance = self._covariance(hessian, residuals[used], weights[used])
+        margin = BOUND_SHARE * (model.upper - model.lower)
+        at_bound = (state.parameters < model.lower + margin) | (state.parameters > model.upper - margin)
+        return Estimate(state, cost, residuals, sigma, covariance, at_bound, iterations, converged)
+
+    def _covariance(self, hessian: Array, residuals: Array, weights: Array) -> tuple[float, Array]:
+        """Huber's estimate of the covariance of an M-estimator (Huber & Ronchetti, Robust Statistics, 7.6).
+
+        (sum psi² / (N - k)) / mean(psi')² (J'J)^-1; J'J is the Huber-weighted Hessian over its mean weight.
+        """
+        size = len(hessian)
+        freedom = 2 * len(residuals) - size
+        if freedom <= 0:
+            return float("inf"), np.full((size, size), np.inf)
+        length = np.linalg.norm(residuals, axis=1)
+        # The length of a Gaussian pair has the median 1.1774 sigma (Rayleigh).
+        sigma = float(np.median(length) / 1.1774 * np.sqrt(2 * len(residuals) / freedom))
+        huber = self.options.huber_px
+        factor = np.minimum(1.0, huber / np.maximum(length, 1e-300))
+        psi_squared = float(np.sum(weights * (factor * length) ** 2)) / freedom
+        mean_slope = max(float(np.mean(0.5 * (factor + (length <= huber)))), 1e-3)
+        scaled = hessian * np.outer(self._scale, self._scale)
+        eigenvalues, vectors = np.linalg.eigh(scaled)
+        floored = np.maximum(eigenvalues, max(eigenvalues[-1], 1e-30) * EIGENVALUE_FLOOR)
+        inverse = (vectors / floored) @ vectors.T
+        variance = psi_squared * float(factor.mean()) / mean_slope**2
+        return sigma, variance * inverse * np.outer(self._scale, self._scale)

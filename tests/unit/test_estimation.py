@@ -1,0 +1,232 @@
+"""The estimator against finite differences, scipy's least squares and Monte Carlo."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.model import SurfacePoints
+from morph_dslam.online.estimation import (
+    BoundPoints,
+    EstimationOptions,
+    Estimator,
+    State,
+    bounded_step,
+    moved,
+)
+from morph_dslam.online.reprojection import linearise, linearise_numpy, project_with_jacobian
+from tests.support.bent_sheet import bent_sheet_model
+
+CAMERA = PinholeCamera(640, 480, 528.0, 520.0, 320.0, 240.0)
+POSE = RigidTransform(
+    rotation_exp(np.array([0.2, -0.3, 0.05])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.02, -0.01, 0.6])
+)
+TRUTH = State(np.array([0.035, 0.3, 0.1]), POSE)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return bent_sheet_model()
+
+
+@pytest.fixture(scope="module")
+def points(model):
+    rng = np.random.default_rng(0)
+    surface = SurfacePoints(rng.integers(0, len(model.triangles), 150), rng.dirichlet(np.ones(3), size=150))
+    return BoundPoints.from_surface(model, surface)
+
+
+def arguments(points, state, pixels, weights, huber=1.5):
+    functions = points.field.functions
+    pose = state.camera_from_object
+    return (
+        state.parameters, pose.rotation, pose.translation, points.rest, points.field.modes, functions.lower,
+        functions.upper, functions.multi_indices, functions.coefficients, CAMERA.intrinsics, pixels, weights,
+        huber,
+    )  # fmt: skip
+
+
+def observed(points, state, noise, rng):
+    return CAMERA.project(points.in_camera(state)) + noise * rng.standard_normal((len(points), 2))
+
+
+def start_near(rng, scale=1.0):
+    step = scale * np.concatenate([[0.01, -0.2, 0.08], 0.1 * rng.standard_normal(3), [0.02, -0.01, 0.03]])
+    return moved(TRUTH, step)
+
+
+def test_jacobian_agrees_with_finite_differences(points):
+    _, jacobian = project_with_jacobian(*arguments(points, TRUTH, None, None)[:10])
+    for k in range(9):
+        step = np.zeros(9)
+        step[k] = 1e-6
+        ahead = CAMERA.project(points.in_camera(moved(TRUTH, step)))
+        behind = CAMERA.project(points.in_camera(moved(TRUTH, -step)))
+        np.testing.assert_allclose(jacobian[:, :, k], (ahead - behind) / 2e-6, rtol=1e-5, atol=1e-4)
+
+
+def test_compiled_and_plain_normal_equations_agree(points):
+    rng = np.random.default_rng(1)
+    pixels = observed(points, TRUTH, 2.0, rng)
+    given = arguments(points, start_near(rng), pixels, rng.uniform(0.0, 2.0, len(points)))
+    for compiled, plain in zip(linearise(*given), linearise_numpy(*given), strict=True):
+        np.testing.assert_allclose(compiled, plain, rtol=1e-9, atol=1e-9 * np.abs(plain).max())
+
+
+def test_points_behind_the_camera_are_refused_by_both_twins(points):
+    behind = State(TRUTH.parameters, RigidTransform(POSE.rotation, np.array([0.0, 0.0, -1.0])))
+    pixels = np.zeros((len(points), 2))
+    for function in (linearise, linearise_numpy):
+        cost, hessian, _, residuals = function(*arguments(points, behind, pixels, np.ones(len(points))))
+        assert cost == pytest.approx(1e9 * len(points))
+        assert np.isnan(residuals).all()
+        assert not hessian.any()
+
+
+def test_gradient_is_that_of_the_huber_cost(points):
+    rng = np.random.default_rng(2)
+    pixels, weights = observed(points, TRUTH, 1.0, rng), np.ones(len(points))
+    state = start_near(rng, 0.3)
+    gradient = linearise(*arguments(points, state, pixels, weights))[2]
+    for k in range(9):
+        step = np.zeros(9)
+        step[k] = 1e-7
+        ahead = linearise(*arguments(points, moved(state, step), pixels, weights))[0]
+        behind = linearise(*arguments(points, moved(state, -step), pixels, weights))[0]
+        assert gradient[k] == pytest.approx((ahead - behind) / 2e-7, rel=1e-4, abs=1e-2)
+
+
+def test_exact_pixels_give_the_exact_state_back(model, points):
+    rng = np.random.default_rng(3)
+    found = Estimator(model, CAMERA).estimate(
+        points, observed(points, TRUTH, 0.0, rng), np.ones(len(points)), start_near(rng)
+    )
+    assert found.converged
+    np.testing.assert_allclose(found.state.parameters, TRUTH.parameters, atol=1e-7)
+    np.testing.assert_allclose(found.state.camera_from_object.matrix, POSE.matrix, atol=1e-7)
+    assert not found.at_bound.any()
+
+
+def scipy_minimum(points, pixels, start, held=0, huber=1.5):
+    """Scipy's minimum of the same cost, the first ``held`` parameters kept; the state and the cost."""
+
+    def state(step):
+        return moved(start, np.concatenate([np.zeros(held), step]))
+
+    def root_of_loss(step):
+        """sqrt(2 rho(|r|)): its sum of squares is twice Huber's cost of the residuals' lengths."""
+        length = np.linalg.norm(CAMERA.project(points.in_camera(state(step))) - pixels, axis=1)
+        return np.sqrt(np.where(length <= huber, length**2, 2 * huber * (length - 0.5 * huber)))
+
+    scale = [0.05, 0.5, 0.3, 1, 1, 1, 0.5, 0.5, 0.5][held:]
+    tight = {"xtol": 1e-14, "ftol": 1e-14, "gtol": 1e-14, "max_nfev": 500}
+    result = least_squares(root_of_loss, np.zeros(9 - held), x_scale=scale, jac="3-point", **tight)
+    return state(result.x), result.cost
+
+
+def test_same_minimum_as_scipy_on_the_same_loss(model, points):
+    rng = np.random.default_rng(4)
+    pixels = observed(points, TRUTH, 0.8, rng)
+    pixels[:30] += rng.uniform(-40, 40, (30, 2))
+    state, cost = scipy_minimum(points, pixels, TRUTH)
+    found = Estimator(model, CAMERA, EstimationOptions(tolerance=1e-12)).estimate(
+        points, pixels, np.ones(len(points)), start_near(rng)
+    )
+    assert found.cost == pytest.approx(cost, rel=1e-4)
+    np.testing.assert_allclose(found.state.parameters, state.parameters, atol=1e-3)
+
+
+def test_outliers_hardly_move_the_estimate(model, points):
+    rng = np.random.default_rng(5)
+    pixels = observed(points, TRUTH, 0.3, rng)
+    pixels[:30] += rng.uniform(-60, 60, (30, 2))
+    found = Estimator(model, CAMERA).estimate(points, pixels, np.ones(len(points)), start_near(rng))
+    error = np.linalg.norm(points.in_camera(found.state) - points.in_camera(TRUTH), axis=1)
+    assert error.mean() < 1e-3
+    assert found.sigma_px == pytest.approx(0.3, rel=0.5)
+
+
+def test_points_of_zero_weight_do_not_count(model, points):
+    rng = np.random.default_rng(6)
+    pixels, weights = observed(points, TRUTH, 0.0, rng), np.ones(len(points))
+    pixels[::3] += 100.0
+    weights[::3] = 0.0
+    found = Estimator(model, CAMERA).estimate(points, pixels, weights, start_near(rng))
+    np.testing.assert_allclose(found.state.parameters, TRUTH.parameters, atol=1e-7)
+
+
+def test_parameters_stay_in_the_box_and_are_flagged(model, points):
+    outside = State(np.array([0.075, 0.3, 0.1]), POSE)
+    rng = np.random.default_rng(7)
+    pixels = observed(points, outside, 0.0, rng)
+    found = Estimator(model, CAMERA).estimate(points, pixels, np.ones(len(points)), start_near(rng))
+    assert found.state.parameters[0] == pytest.approx(0.060)
+    assert found.at_bound.tolist() == [True, False, False]
+    start = State(np.array([0.060, 0.3, 0.1]), POSE)
+    state, cost = scipy_minimum(points, pixels, start, held=1)
+    assert found.cost == pytest.approx(cost, rel=1e-4)
+    np.testing.assert_allclose(found.state.parameters, state.parameters, atol=2e-3)
+
+
+def test_unseen_direction_neither_moves_nor_looks_certain(model, points):
+    """At arch = 0 the skew has no effect at all."""
+    flat = State(np.array([0.0, 0.0, 0.1]), POSE)
+    rng = np.random.default_rng(8)
+    pixels = observed(points, flat, 0.1, rng)
+    start = State(np.array([0.005, 0.0, 0.05]), POSE)
+    found = Estimator(model, CAMERA).estimate(points, pixels, np.ones(len(points)), start)
+    assert np.isfinite(found.state.parameters).all()
+    assert abs(found.state.parameters[0]) < 1e-3
+    assert found.parameter_std[1] > 0.3
+    assert found.parameter_std[0] < 1e-3
+
+
+def test_too_few_points_give_infinite_deviations(model, points):
+    few = BoundPoints.from_surface(model, points.surface.take(np.arange(3)))
+    rng = np.random.default_rng(9)
+    found = Estimator(model, CAMERA).estimate(few, observed(few, TRUTH, 0.0, rng), np.ones(3), TRUTH)
+    assert np.isinf(found.parameter_std).all()
+
+
+@pytest.mark.parametrize("huber", [1.0, 20.0])
+def test_covariance_agrees_with_monte_carlo(model, points, huber):
+    estimator = Estimator(model, CAMERA, EstimationOptions(huber_px=huber))
+    rng = np.random.default_rng(10)
+    estimates = [
+        estimator.estimate(points, observed(points, TRUTH, 0.8, rng), np.ones(len(points)), TRUTH)
+        for _ in range(300)
+    ]
+    parameters = np.array([estimate.state.parameters for estimate in estimates])
+    translations = np.array([estimate.state.camera_from_object.translation for estimate in estimates])
+    stated = np.mean([estimate.parameter_std for estimate in estimates], axis=0)
+    np.testing.assert_allclose(stated, parameters.std(axis=0), rtol=0.15)
+    stated = np.mean([estimate.pose_std[3:] for estimate in estimates], axis=0)
+    np.testing.assert_allclose(stated, translations.std(axis=0), rtol=0.15)
+    assert np.mean([estimate.sigma_px for estimate in estimates]) == pytest.approx(0.8, rel=0.05)
+
+
+def test_several_starts_return_the_best_first(model, points):
+    rng = np.random.default_rng(11)
+    pixels = observed(points, TRUTH, 0.2, rng)
+    mirrored = State(
+        TRUTH.parameters * [-1, 1, 1],
+        RigidTransform(rotation_exp(np.array([0.0, 0.0, 2.0])) @ POSE.rotation, POSE.translation),
+    )
+    found = Estimator(model, CAMERA).estimate_from(points, pixels, np.ones(len(points)), [mirrored, TRUTH])
+    assert found[0].cost <= found[1].cost
+    np.testing.assert_allclose(found[0].state.parameters, TRUTH.parameters, atol=5e-3)
+
+
+def test_bounded_step_solves_the_bounded_quadratic():
+    rng = np.random.default_rng(12)
+    for _ in range(20):
+        root = rng.standard_normal((6, 4))
+        gradient = rng.standard_normal(4)
+        hessian = root.T @ root + 0.1 * np.eye(4)
+        lower, upper = np.full(4, -10.0), np.full(4, 10.0)
+        np.testing.assert_allclose(
+            bounded_step(hessian, gradient, lower, upper), np.linalg.solve(hessian, -gradient)
+        )
+    held = bounded_step(np.eye(2), np.array([-5.0, 0.3]), np.array([-1.0, 0.0]), np.array([1.0, 1.0]))
+    np.testing.assert_allclose(held, [1.0, 0.0])
