@@ -15,7 +15,7 @@ CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
 FRAMES = np.arange(10, 16)
 
 
-def states(n_frames=len(FRAMES)):
+def states(n_frames):
     """Parameters (f, 3) and camera_from_object (f, 4, 4) of a sheet that bends both ways and drifts."""
     phase = np.linspace(0.0, 1.0, n_frames)
     parameters = np.column_stack([0.03 * np.sin(6 * phase), 0.3 * phase, 0.1 * phase])

@@ -30,9 +30,8 @@ def test_pick_finds_the_point_that_the_ray_was_made_from():
 
 def test_pick_takes_the_nearer_of_two_sheets_and_survives_edge_on_and_hidden_triangles():
     square = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    nodes = np.vstack(
-        [square + [0, 0, 5], square + [0, 0, 3], square - [0, 0, 2], [[0, 0, 1], [0, 0, 2], [0, 0, 4]]]
-    )
+    z = np.array([0.0, 0.0, 1.0])
+    nodes = np.vstack([square + 5 * z, square + 3 * z, square - 2 * z, np.outer([1.0, 2, 4], z)])
     pair = np.array([[0, 1, 2], [0, 2, 3]])
     triangles = np.vstack([pair, pair + 4, pair + 8, [[12, 13, 14]]])
     rays = np.array([[0.1, 0.05, 1.0], [0.0, 0.0, 1.0], [0.9, 0.0, 1.0]])

@@ -1,8 +1,7 @@
 """Material error: how far material points are from where the run says they are, without any alignment.
 
-Each truth point is bound to the mesh by its pixel in one frame, then followed on the estimated surface through
-the other frames. It is the paper's error measure for the sheet: a shape that is right but slides along itself
-does not pass.
+Each truth point is bound to the mesh by its pixel in one frame, then followed on the estimated surface
+through the other frames: a shape that is right but slides along itself does not pass.
 """
 
 from __future__ import annotations

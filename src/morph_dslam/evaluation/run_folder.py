@@ -93,9 +93,7 @@ def load_run(folder: Path) -> Run:
                 raise EvaluationError(
                     f"{path} is not a run of version {VERSION}: track again with this release"
                 )
-            times = file["timings_ms"]
-            names = [str(name) for name in times.attrs["names"]]
-            columns = _array(file, "timings_ms").T
+            names = np.atleast_1d(np.asarray(file["timings_ms"].attrs["names"], dtype=str)).tolist()
             run = Run(
                 folder=folder,
                 model=model,
@@ -105,7 +103,7 @@ def load_run(folder: Path) -> Run:
                 reasons=_texts(file, "reason"),
                 camera_from_object=_array(file, "camera_from_object").astype(float).reshape(-1, 4, 4),
                 parameters=_array(file, "parameters").astype(float),
-                stage_times=dict(zip(names, columns, strict=True)),
+                stage_times=dict(zip(names, _array(file, "timings_ms").T, strict=True)),
             )
     except EvaluationError:
         raise

@@ -61,8 +61,8 @@ def load_truth(path: Path) -> PointTruth:
     )
     if not fits:
         raise EvaluationError(
-            f"{path}: frame {frames.shape}, points_mm {points.shape}, pixels {pixels.shape} do not fit together; "
-            f"a truth file has {LAYOUT}"
+            f"{path}: frame {frames.shape}, points_mm {points.shape}, pixels {pixels.shape} "
+            f"do not fit together; a truth file has {LAYOUT}"
         )
     if len(np.unique(frames)) != len(frames):
         raise EvaluationError(f"{path}: a frame number occurs twice")

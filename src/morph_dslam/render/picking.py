@@ -1,8 +1,8 @@
 """Picking: which material point of a mesh a pixel sees, exactly.
 
-A ray d meets the plane of the triangle A, B, C where w_A A + w_B B + w_C C is parallel to d. Cramer's rule gives
-w_A : w_B : w_C = d·(B×C) : d·(C×A) : d·(A×B), and these, scaled to sum to one, are the barycentric weights on
-the triangle in space: no image-plane weights and no pixel grid are involved.
+A ray d meets the plane of the triangle A, B, C where w_A A + w_B B + w_C C is parallel to d. Cramer's rule
+gives w_A : w_B : w_C = d·(B×C) : d·(C×A) : d·(A×B), and these, scaled to sum to one, are the barycentric
+weights on the triangle in space: no image-plane weights and no pixel grid are involved.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def nearest_on_outline(
 ) -> tuple[SurfacePoints, Array]:
     """The surface points whose image is nearest to pixels that the surface does not cover.
 
-    The nearest point of the covered region lies on the image of a triangle's edge, so only edges are searched.
+    The nearest point of the covered region lies on the image of an edge, so only edges are searched.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def nearest_on_outline(
         best = int(np.nanargmin(gap))
         edge[row], fraction[row], distance[row] = best, t[best], gap[best]
     near, far = camera_points[starts[edge], 2], camera_points[ends[edge], 2]
-    # A fraction of the edge's image is not the same fraction of the edge: inverse depth is linear in the image.
+    # Inverse depth is linear in the image, so a fraction of the edge's image is another of the edge itself.
     fraction = fraction * near / ((1.0 - fraction) * far + fraction * near)
     weights = np.zeros((len(pixels), 3))
     rows, corner = np.arange(len(pixels)), edge % 3
