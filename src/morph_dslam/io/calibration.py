@@ -14,7 +14,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import CameraError
@@ -28,7 +28,7 @@ class _CameraFile(BaseModel):
     fy: float = Field(gt=0, allow_inf_nan=False)
     cx: float = Field(allow_inf_nan=False)
     cy: float = Field(allow_inf_nan=False)
-    distortion: list[float] = []
+    distortion: list[FiniteFloat] = []
 
 
 def load_camera(path: Path) -> PinholeCamera:
