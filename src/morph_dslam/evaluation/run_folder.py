@@ -50,6 +50,11 @@ class Run:
         )
         return known & (np.array(self.status) == "tracked")
 
+    @property
+    def frame_times(self) -> Array:
+        """Time (f,) that each frame took in all, without drawing, milliseconds."""
+        return self.stage_times["total"]
+
     def row(self, frame: int) -> int | None:
         """Where frame number ``frame`` is in the arrays, or None if the run does not have it."""
         found = np.flatnonzero(self.frames == frame)

@@ -1,0 +1,171 @@
+"""The command line: `morph build | info | track | evaluate | simulate`.
+
+Each command imports what it needs when it runs, so that `morph --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from morph_dslam import __version__
+from morph_dslam.errors import MorphError
+
+USER_ERROR = 2
+INTERRUPTED = 130
+
+
+def frame_range(text: str) -> tuple[int | None, int | None]:
+    """Frame numbers "first-last", both included; "9-", "-100" and "9" are ranges too."""
+    first, dash, last = text.partition("-")
+    try:
+        numbers = (int(first) if first else None, int(last) if last else None)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a range of frames such as 9-100") from None
+    if not dash:
+        numbers = (numbers[0], numbers[0])
+    if text in ("", "-") or (None not in numbers and numbers[0] > numbers[1]):  # type: ignore[operator]
+        raise argparse.ArgumentTypeError(f"'{text}' is not a range of frames such as 9-100")
+    return numbers
+
+
+def _build(arguments: argparse.Namespace) -> None:
+    from morph_dslam.offline.build import build
+
+    build(arguments.study, arguments.output, workers=arguments.workers)
+
+
+def _info(arguments: argparse.Namespace) -> None:
+    from morph_dslam.evaluation.model_summary import summarise_model
+    from morph_dslam.model import load_model
+
+    model = load_model(arguments.model)
+    print(f"{model.name}: a reduced model of {arguments.model.stat().st_size / 1e6:.2f} MB")
+    for heading, facts in summarise_model(model).items():
+        print(f"\n{heading}")
+        width = max(len(name) for name in facts)
+        for name, value in facts.items():
+            print(f"  {name:<{width}}  {value}")
+
+
+def _track(arguments: argparse.Namespace) -> None:
+    raise NotImplementedError
+
+
+def _evaluate(arguments: argparse.Namespace) -> None:
+    from morph_dslam.evaluation.evaluate import evaluate
+    from morph_dslam.evaluation.statements import remarks, result_line
+
+    figures = evaluate(arguments.run, arguments.points, arguments.bind_frame)
+    for remark in remarks(figures):
+        print(f"note: {remark}")
+    print(f"wrote {arguments.run / 'evaluation.json'} and {arguments.run / 'report.html'}")
+    print(result_line(figures))
+
+
+def _simulate(arguments: argparse.Namespace) -> None:
+    from morph_dslam.render.simulation import simulate
+
+    simulate(arguments.scene, arguments.output)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="morph", description="Track a deformable solid in video with a physics-based reduced model."
+    )
+    parser.add_argument("--version", action="version", version=f"morph-dslam {__version__}")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    _add_offline_commands(commands)
+    _add_online_commands(commands)
+    return parser
+
+
+def _add(commands: argparse._SubParsersAction, name: str, action: Callable, kept: str, text: str):
+    command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+    command.set_defaults(action=action, kept=kept)
+    return command
+
+
+def _add_offline_commands(commands: argparse._SubParsersAction) -> None:
+    build = _add(
+        commands,
+        "build",
+        _build,
+        "the solutions found so far are kept, and the same command goes on from there",
+        "solve a study over its parameters and compress the solutions in a model file",
+    )
+    build.add_argument("study", type=Path, help="study file (docs/study-file.md)")
+    build.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="MODEL", help="model file to write"
+    )
+    build.add_argument("--workers", type=int, metavar="N", help="processes to solve in (default: one a core)")
+    info = _add(commands, "info", _info, "nothing was written", "say what a model file holds")
+    info.add_argument("model", type=Path, help="model file")
+    simulate = _add(
+        commands,
+        "simulate",
+        _simulate,
+        "the frames written so far are kept, without truth",
+        "film a model moving through given parameters and camera positions, with exact truth",
+    )
+    simulate.add_argument("scene", type=Path, help="scene file")
+    simulate.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="FOLDER", help="folder to write"
+    )
+
+
+def _add_online_commands(commands: argparse._SubParsersAction) -> None:
+    track = _add(
+        commands,
+        "track",
+        _track,
+        "the frames tracked so far are kept in the run folder",
+        "find pose and parameters of a free object in every frame, and draw the stress over the video",
+    )
+    track.add_argument("frames", type=Path, metavar="FRAMES", help="video file, or folder of numbered images")
+    track.add_argument("--model", type=Path, required=True, help="model file of `morph build`")
+    track.add_argument("--camera", type=Path, required=True, help="camera file: size, intrinsics, distortion")
+    track.add_argument(
+        "--landmarks", type=Path, required=True, help="object points and their pixels in the reference frame"
+    )
+    track.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="run folder to write")
+    track.add_argument(
+        "--range", type=frame_range, default=(None, None), metavar="FIRST-LAST", help="frames to track"
+    )
+    track.add_argument("--no-video", action="store_true", help="do not draw the augmented video")
+    evaluate = _add(
+        commands,
+        "evaluate",
+        _evaluate,
+        "the run is unchanged",
+        "compare a run with measured points, in millimetres and without alignment",
+    )
+    evaluate.add_argument("run", type=Path, help="run folder of `morph track`")
+    evaluate.add_argument("--points", type=Path, required=True, metavar="TRUTH", help="truth file (.npz)")
+    evaluate.add_argument(
+        "--bind-frame",
+        type=int,
+        required=True,
+        metavar="N",
+        help="frame whose pixels bind the truth points to the mesh",
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit status: 0, 2 for a mistake the user can mend, 130 if interrupted."""
+    parsed = _parser().parse_args(arguments)
+    try:
+        parsed.action(parsed)
+    except MorphError as error:
+        print(f"morph: {error}", file=sys.stderr)
+        return USER_ERROR
+    except KeyboardInterrupt:
+        print(f"\nmorph: interrupted; {parsed.kept}", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,48 @@
+"""The evaluation of a run: figures, pictures and a report, written into its folder."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from morph_dslam.evaluation.material_error import material_error, summarise
+from morph_dslam.evaluation.plots import plot_error_map, plot_errors_by_frame
+from morph_dslam.evaluation.run_folder import load_run
+from morph_dslam.evaluation.run_report import write_run_report
+from morph_dslam.evaluation.truth import load_truth
+
+
+def evaluate(folder: Path, truth_path: Path, bind_frame: int) -> dict[str, Any]:
+    """Compare a run with truth points and write ``evaluation.json``, pictures and ``report.html`` into it.
+
+    Parameters
+    ----------
+    folder : a run folder. truth_path : a truth file. bind_frame : the frame whose pixels bind the points.
+
+    Returns
+    -------
+    The content of ``evaluation.json``.
+
+    Raises
+    ------
+    EvaluationError
+        If the run and the truth cannot be read or do not fit together.
+    """
+    run, truth = load_run(folder), load_truth(truth_path)
+    error = material_error(run, truth, bind_frame)
+    figures = {
+        **summarise(error),
+        "truth": str(truth_path),
+        "n_frames": len(run.frames),
+        "n_frames_tracked": int(run.tracked.sum()),
+        "median_ms": float(np.nanmedian(run.frame_times)),
+        "p95_ms": float(np.nanpercentile(run.frame_times, 95)),
+    }
+    (folder / "evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
+    plot_errors_by_frame(folder / "evaluation.png", error)
+    plot_error_map(folder / "error_map.png", error, run.model)
+    write_run_report(run, figures)
+    return figures

@@ -1,0 +1,80 @@
+"""Pictures of the material error."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from morph_dslam.evaluation.material_error import MaterialError
+from morph_dslam.model import ReducedModel
+
+DPI = 110
+
+
+def plot_errors_by_frame(path: Path, error: MaterialError) -> None:
+    """A box for each truth frame (quartiles, whiskers to the 5th and 95th percentile) over its points."""
+    distances = [1e3 * row[np.isfinite(row)] for row in error.distances]
+    figure = Figure(figsize=(9.0, 4.2), layout="constrained")
+    axes = figure.add_subplot()
+    rng = np.random.default_rng(0)
+    for position, values in enumerate(distances, start=1):
+        shift = rng.uniform(-0.25, 0.25, len(values))
+        axes.plot(position + shift, values, ".", color="#8fb3d9", markersize=2.5, zorder=1)
+    axes.boxplot(
+        distances,
+        whis=(5, 95),
+        showfliers=False,
+        showmeans=True,
+        widths=0.6,
+        medianprops={"color": "#b4530a", "linewidth": 1.6},
+        meanprops={
+            "marker": "D",
+            "markerfacecolor": "#1b1f24",
+            "markeredgecolor": "#1b1f24",
+            "markersize": 4,
+        },
+    )
+    axes.axhline(1e3 * error.mean, color="#1b1f24", linewidth=0.8, linestyle="--")
+    axes.set_xticks(range(1, len(distances) + 1), [str(frame) for frame in error.frames])
+    axes.set_xlabel("frame")
+    axes.set_ylabel("material error [mm]")
+    axes.set_ylim(bottom=0.0)
+    axes.set_title(
+        f"mean {1e3 * error.mean:.2f} mm (dashed), median {1e3 * error.median:.2f} mm, "
+        f"95th percentile {1e3 * error.p95:.2f} mm; bound in frame {error.binding.frame}",
+        fontsize=10,
+    )
+    figure.savefig(path, dpi=DPI)
+
+
+def outline_edges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Edges (e, 2) that belong to one triangle only."""
+    edges = np.sort(
+        np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1
+    )
+    unique, counts = np.unique(edges, axis=0, return_counts=True)
+    return unique[counts == 1]
+
+
+def plot_error_map(path: Path, error: MaterialError, model: ReducedModel) -> None:
+    """Mean error of each material point where it lies on the undeformed object."""
+    # The two longest directions of the object span the picture.
+    first, second = sorted(np.argsort(np.ptp(model.nodes, axis=0))[-2:])
+    measured = np.isfinite(error.distances).any(axis=0)
+    mean = 1e3 * np.nanmean(error.distances[:, measured], axis=0)
+    rest = 1e3 * model.rest_positions(error.binding.points)[measured]
+    figure = Figure(figsize=(7.5, 5.2), layout="constrained")
+    axes = figure.add_subplot()
+    segments = 1e3 * model.nodes[outline_edges(model.triangles)][:, :, [first, second]]
+    axes.add_collection(LineCollection(list(segments), colors="#57606a", linewidths=1.0))
+    dots = axes.scatter(rest[:, first], rest[:, second], c=mean, s=26, cmap="viridis", vmin=0.0)
+    axes.set_aspect("equal")
+    axes.autoscale()
+    axes.set_xlabel(f"{'xyz'[first]} on the undeformed object [mm]")
+    axes.set_ylabel(f"{'xyz'[second]} [mm]")
+    figure.colorbar(dots, shrink=0.75, label="mean material error [mm]")
+    figure.savefig(path, dpi=DPI)

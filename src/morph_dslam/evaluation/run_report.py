@@ -1,0 +1,101 @@
+"""The report of a run: figures, plots, a few augmented frames, and the model it used."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from morph_dslam.evaluation.model_summary import flatten, summarise_model
+from morph_dslam.evaluation.report import Link, Picture, Section, Table, Text, write_report
+from morph_dslam.evaluation.run_folder import Run
+from morph_dslam.evaluation.statements import remarks
+
+VIDEO = "augmented.mp4"
+N_FRAMES_SHOWN = 4
+
+_CAPTIONS = {
+    "evaluation.png": "Material error in each frame with truth: points, quartiles, mean (diamond).",
+    "error_map.png": "Mean material error where each point lies on the undeformed object.",
+}
+
+
+def sample_video(path: Path, count: int) -> list[tuple[int, bytes]]:
+    """Up to ``count`` frames spread over a video, as (0-based position, JPEG); none if it cannot be read."""
+    capture = cv2.VideoCapture(str(path))
+    total = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    wanted = (
+        set(np.linspace(0, total - 1, count + 2).round().astype(int)[1:-1].tolist()) if total > 0 else set()
+    )
+    pictures = []
+    # Seeking is not exact in every container; reading on is.
+    for position in range(max(wanted, default=-1) + 1):
+        read, image = capture.read()
+        if not read:
+            break
+        if position in wanted:
+            pictures.append(
+                (position, cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes())
+            )
+    capture.release()
+    return pictures
+
+
+def _error_section(run: Run, figures: Mapping[str, Any]) -> Section:
+    rows = {
+        "mean": f"{figures['mean_mm']:.3f} mm",
+        "median": f"{figures['median_mm']:.3f} mm",
+        "95th percentile": f"{figures['p95_mm']:.3f} mm",
+        "largest": f"{figures['max_mm']:.3f} mm",
+        "mean along the sight line": f"{figures['mean_along_sight_mm']:.3f} mm",
+        "mean across the sight line": f"{figures['mean_across_sight_mm']:.3f} mm",
+        "points compared": f"{figures['n_points_bound']} of {figures['n_points']}",
+        "frames compared": f"{len(figures['frames_compared'])}, bound in frame {figures['bind_frame']}",
+        "frames tracked": f"{figures['n_frames_tracked']} of {figures['n_frames']}",
+        "time a frame": f"median {figures['median_ms']:.2f} ms, 95th percentile {figures['p95_ms']:.2f} ms",
+    }
+    notes = [Text(remark, warning=True) for remark in remarks(figures)]
+    plots = [Picture.read(run.folder / name, caption) for name, caption in _CAPTIONS.items()]
+    return Section("Material error, without alignment", [Table.of(rows), *notes, *plots])
+
+
+def _video_section(run: Run) -> Section:
+    if not (run.folder / VIDEO).is_file():
+        return Section("Augmented video", [])
+    frames = [
+        Picture(data, ".jpg", f"Frame {run.frames[min(position, len(run.frames) - 1)]}")
+        for position, data in sample_video(run.folder / VIDEO, N_FRAMES_SHOWN)
+    ]
+    return Section("Augmented video", [Link(VIDEO, f"The whole video ({VIDEO})"), *frames])
+
+
+def _lost_section(run: Run) -> Section:
+    lost = np.flatnonzero(~run.tracked)
+    rows = [(str(run.frames[row]), run.status[row], run.reasons[row]) for row in lost]
+    return Section(
+        "Frames that were not tracked", [Table(rows, ("frame", "status", "reason"))] if rows else []
+    )
+
+
+def write_run_report(run: Run, figures: Mapping[str, Any]) -> Path:
+    """Write ``report.html`` into a run folder; ``figures`` are those of ``evaluation.json``."""
+    summary_path = run.folder / "summary.json"
+    summary = json.loads(summary_path.read_text()) if summary_path.is_file() else {}
+    plots = [
+        Picture.read(path, path.stem.replace("_", " "))
+        for path in sorted((run.folder / "plots").glob("*.png"))
+    ]
+    sections = [
+        _error_section(run, figures),
+        _video_section(run),
+        _lost_section(run),
+        Section("Tracking", [Table.of(flatten(summary)), *plots] if summary or plots else []),
+        *(Section(f"Model: {name}", [Table.of(facts)]) for name, facts in summarise_model(run.model).items()),
+    ]
+    path = run.folder / "report.html"
+    write_report(path, f"{run.model.name}: tracked in {len(run.frames)} frames", sections)
+    return path

@@ -1,0 +1,38 @@
+"""The figures of an evaluation in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+
+def remarks(figures: Mapping[str, Any]) -> list[str]:
+    """What a reader of the figures must know: truth that could not be compared."""
+    lines = []
+    if figures["truth_frames_not_tracked"]:
+        lines.append(
+            f"truth frames that were not tracked and so not compared: {figures['truth_frames_not_tracked']}"
+        )
+    if figures["truth_frames_outside_the_run"]:
+        lines.append(f"truth frames outside the run: {figures['truth_frames_outside_the_run']}")
+    if figures["points_not_bound"]:
+        lines.append(
+            f"{len(figures['points_not_bound'])} of {figures['n_points']} truth points fall off the "
+            f"estimated surface in frame {figures['bind_frame']} and were not compared"
+        )
+    if figures["n_points_bound_at_outline"]:
+        lines.append(
+            f"{figures['n_points_bound_at_outline']} truth points missed the surface by up to "
+            f"{figures['outline_tolerance_px']:g} px and were bound to its outline"
+        )
+    return lines
+
+
+def result_line(figures: Mapping[str, Any]) -> str:
+    """The last line that commands and examples print."""
+    return (
+        f"mean_mm={figures['mean_mm']:.3f} median_mm={figures['median_mm']:.3f} "
+        f"p95_mm={figures['p95_mm']:.3f} "
+        f"tracked={figures['n_frames_tracked']}/{figures['n_frames']} "
+        f"median_ms={figures['median_ms']:.2f} p95_ms={figures['p95_ms']:.2f}"
+    )
