@@ -44,7 +44,7 @@ def deflection_terms(x, y):
 
 
 def bending_stress_terms(x, y):
-    """Stress terms on the top face (n, 3): -E z / (1 - nu²) (w,xx + nu w,yy) and so on at z = thickness / 2."""
+    """Stress terms on the top face (n, 3): -E z / (1 - nu²) (w,xx + nu w,yy) and so on, z = thickness / 2."""
     s = 2.0 * x / LENGTH
     zero = np.zeros_like(x)
     factor = YOUNG_MODULUS * THICKNESS / 2 / (1 - POISSON_RATIO**2)

@@ -81,7 +81,7 @@ def test_corner_almost_in_the_camera_plane_does_not_overflow():
 
 def test_mesh_is_watertight():
     model = bent_sheet_model()
-    points = model.nodes + [0.0, 0.0, 0.15]  # fills the view
+    points = model.nodes + np.array([0.0, 0.0, 0.15])  # fills the view
     assert draw(points, model.triangles).covered.all()
 
 
@@ -112,7 +112,7 @@ def test_texturing_agrees_with_its_plain_twin(channels):
     shape = (60, 80) if channels is None else (60, 80, channels)
     texture = rng.integers(0, 256, shape, dtype=np.uint8)
     model = bent_sheet_model(9, 7)
-    points = model.positions(np.array([0.04, 0.2, 0.1])) + [0.0, 0.0, 0.5]
+    points = model.positions(np.array([0.04, 0.2, 0.1])) + np.array([0.0, 0.0, 0.5])
     buffers = draw(points, model.triangles)
     coordinates = (model.nodes[:, :2] + [0.21, 0.1485]) * 200.0
     compiled = render_textured(buffers, model.triangles, coordinates, texture)

@@ -70,10 +70,8 @@ def test_truncated_video_gives_its_frames_and_then_the_break(tmp_path):
     data = path.read_bytes()
     path.write_bytes(data[: int(0.6 * len(data))])
     frames = []
-    source = open_source(path)
     with pytest.raises(SourceError, match=r"clip\.avi breaks off at frame \d+") as caught:
-        for frame in source:
-            frames.append(frame.index)
+        frames.extend(frame.index for frame in open_source(path))
     assert 5 <= len(frames) <= 14
     assert frames == list(range(len(frames)))
     assert f"frame {len(frames)}," in str(caught.value)
@@ -88,7 +86,7 @@ def test_video_without_its_index_cannot_be_opened(tmp_path):
 
 
 def test_missing_path(tmp_path):
-    with pytest.raises(SourceError, match="no folder of images and no video at .*nowhere"):
+    with pytest.raises(SourceError, match=r"no folder of images and no video at .*nowhere"):
         open_source(tmp_path / "nowhere")
 
 
@@ -134,7 +132,7 @@ def test_image_that_is_not_one(folder):
 
 def test_change_of_size(folder):
     cv2.imwrite(str(folder / "shot-3.png"), grey(30, size=(16, 16)))
-    with pytest.raises(SourceError, match="frame 3: .* is 16x16 pixels, the frames before it are 48x32"):
+    with pytest.raises(SourceError, match=r"frame 3: .* is 16x16 pixels, the frames before it are 48x32"):
         list(open_source(folder))
 
 

@@ -20,8 +20,8 @@ def _open(path: Path) -> cv2.VideoCapture:
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise SourceError(
-            f"{path} cannot be opened as a video: it is damaged, cut short before its index, or of a kind that "
-            "OpenCV does not read; copy it again or convert it to mp4"
+            f"{path} cannot be opened as a video: it is damaged, cut short before its index, or of a kind "
+            "that OpenCV does not read; copy it again or convert it to mp4"
         )
     return capture
 
