@@ -1,0 +1,113 @@
+"""Binding: which material points of the mesh belong to given positions or pixels, and which can be seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.model import ReducedModel, SurfacePoints
+from morph_dslam.online.estimation import State
+from morph_dslam.render.picking import pick_surface
+from morph_dslam.render.rasteriser import Buffers, rasterise
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class View:
+    """The mesh as the camera sees it in one state.
+
+    Attributes
+    ----------
+    nodes : (n, 3) in the camera frame, metres. pixels : (n, 2), NaN behind the camera.
+    """
+
+    nodes: Array
+    pixels: Array
+
+
+def view_of(model: ReducedModel, camera: PinholeCamera, state: State) -> View:
+    """Deform, place and project the mesh."""
+    nodes = state.camera_from_object.apply(model.positions(state.parameters))
+    return View(nodes, camera.project(nodes))
+
+
+def draw_view(view: View, triangles: NDArray[np.int64], camera: PinholeCamera) -> Buffers:
+    """The z-buffer of the whole image."""
+    return rasterise(view.pixels, view.nodes[:, 2], triangles, camera.height, camera.width)
+
+
+def bind_pixels(
+    model: ReducedModel, camera: PinholeCamera, view: View, pixels: Array
+) -> tuple[SurfacePoints, NDArray[np.bool_]]:
+    """Material points that pixels (p, 2) of the undistorted image see, and which pixels see any.
+
+    Returns
+    -------
+    points : the material points of the pixels that meet the surface, in their order.
+    met : (p,) bool.
+    """
+    points = pick_surface(view.nodes, model.triangles, camera.rays(pixels))
+    met = points.triangles >= 0
+    return points.take(met), met
+
+
+def facing(view: View, triangles: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which triangles (m,) show the side on which their corners run clockwise in the image."""
+    a, b, c = (view.pixels[triangles[:, corner]] for corner in range(3))
+    with np.errstate(invalid="ignore"):
+        area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
+        return area > 0.0
+
+
+def nearest_surface_points(
+    nodes: Array, triangles: NDArray[np.int64], positions: Array
+) -> tuple[SurfacePoints, Array]:
+    """The points of a triangle mesh nearest to positions.
+
+    Parameters
+    ----------
+    nodes : (n, 3). triangles : (m, 3) node indices. positions : (k, 3), same unit.
+
+    Returns
+    -------
+    points : SurfacePoints of length k.
+    distances : (k,) from the positions, same unit.
+    """
+    chosen, weights = np.zeros(len(positions), dtype=np.int64), np.zeros((len(positions), 3))
+    distances = np.zeros(len(positions))
+    corners = nodes[triangles]
+    for row, position in enumerate(positions):
+        candidates = _nearest_in_triangles(corners, position)
+        gaps = np.linalg.norm(np.einsum("mc,mcx->mx", candidates, corners) - position, axis=1)
+        best = int(gaps.argmin())
+        chosen[row], weights[row], distances[row] = best, candidates[best], gaps[best]
+    return SurfacePoints(chosen, weights), distances
+
+
+def _nearest_in_triangles(corners: Array, position: Array) -> Array:
+    """Barycentric weights (m, 3) of the nearest point of every triangle (m, 3, 3)."""
+    origin, u, v = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    offset = position - origin
+    uu, uv, vv = (np.einsum("mx,mx->m", p, q) for p, q in ((u, u), (u, v), (v, v)))
+    ou, ov = np.einsum("mx,mx->m", offset, u), np.einsum("mx,mx->m", offset, v)
+    determinant = np.maximum(uu * vv - uv**2, 1e-300)
+    b, c = (vv * ou - uv * ov) / determinant, (uu * ov - uv * ou) / determinant
+    best = np.column_stack([1.0 - b - c, b, c])
+    outside = (best < 0.0).any(axis=1)
+    gap = np.where(outside, np.inf, 0.0)
+    # Outside the triangle the nearest point lies on one of the three edges.
+    for start, end in ((0, 1), (1, 2), (2, 0)):
+        along = corners[:, end] - corners[:, start]
+        from_start = position - corners[:, start]
+        length = np.maximum(np.einsum("mx,mx->m", along, along), 1e-300)
+        t = np.clip(np.einsum("mx,mx->m", from_start, along) / length, 0.0, 1.0)
+        distance = np.linalg.norm(from_start - t[:, None] * along, axis=1)
+        better = outside & (distance < gap)
+        gap[better] = distance[better]
+        best[better] = 0.0
+        best[better, start], best[better, end] = 1.0 - t[better], t[better]
+    return best
