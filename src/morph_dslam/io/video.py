@@ -1,0 +1,81 @@
+"""Writing video files."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import SourceError
+
+#: MPEG-4 part 2: the wheels of OpenCV carry no H.264 encoder, and their VP9 takes 120 ms a frame.
+CODEC = "mp4v"
+
+
+class VideoWriter:
+    """An mp4 file written frame by frame, as a context manager.
+
+    Frames go to a file beside ``path``; leaving the context, by an exception or an interrupt as well,
+    completes it and gives it its name, so whatever was written plays. Without a single frame no file is left.
+
+    Parameters
+    ----------
+    path : where the video goes; a file of that name is replaced.
+    fps : frames per second. size : (width, height) in pixels.
+
+    Raises
+    ------
+    SourceError
+        On entering the context, if no video can be written there.
+    """
+
+    def __init__(self, path: Path, fps: float, size: tuple[int, int]) -> None:
+        self._path = Path(path)
+        self._partial = self._path.with_name(f"{self._path.stem}.partial.mp4")
+        self._fps = fps
+        self._size = size
+        self._writer: cv2.VideoWriter | None = None
+        self.n_frames = 0
+
+    def __enter__(self) -> VideoWriter:
+        if not self._path.parent.is_dir():
+            raise SourceError(f"cannot write the video {self._path}: there is no folder {self._path.parent}")
+        codec = cv2.VideoWriter.fourcc(*CODEC)
+        writer = cv2.VideoWriter(str(self._partial), codec, float(self._fps), self._size)
+        if not writer.isOpened():
+            raise SourceError(
+                f"cannot write the video {self._path} ({self._size[0]}x{self._size[1]}, {self._fps} frames a "
+                "second): check that the folder can be written to and that the disk is not full"
+            )
+        self._writer = writer
+        return self
+
+    def write(self, image: NDArray[np.uint8]) -> None:
+        """Append a frame (h, w, 3) uint8, blue, green, red, of the size given at the start.
+
+        OpenCV drops frames of another size without a word, so the size is checked here.
+        """
+        if self._writer is None:
+            raise RuntimeError("the video is not open: write inside its with block")
+        if image.shape != (self._size[1], self._size[0], 3):
+            raise ValueError(
+                f"the frame has shape {image.shape}, the video is {self._size[0]}x{self._size[1]}"
+            )
+        self._writer.write(np.ascontiguousarray(image))
+        self.n_frames += 1
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._writer is None:
+            return
+        self._writer.release()
+        self._writer = None
+        if self.n_frames:
+            os.replace(self._partial, self._path)
+        else:
+            self._partial.unlink(missing_ok=True)

@@ -1,0 +1,104 @@
+"""The overlay: the deformed mesh over the video, coloured by a node field, with a colour bar."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from morph_dslam.render.colour_maps import colour_bar, colour_table, text_patch
+from morph_dslam.render.rasteriser import rasterise
+
+Array = NDArray[np.float64]
+
+
+@njit(cache=True, nogil=True)
+def _blend(image, triangle_ids, weights, triangles, levels, brightness, table, alpha):
+    """Blend the surface into ``image``; ``levels`` (n,) are the node values scaled to 0..255."""
+    height, width = triangle_ids.shape
+    for row in range(height):
+        for column in range(width):
+            t = triangle_ids[row, column]
+            if t < 0:
+                continue
+            level, light = 0.0, 0.0
+            for corner in range(3):
+                node = triangles[t, corner]
+                level += weights[row, column, corner] * levels[node]
+                light += weights[row, column, corner] * brightness[node]
+            entry = int(min(max(level, 0.0), 255.0) + 0.5)
+            for channel in range(3):
+                colour = min(light * table[entry, channel], 255.0)
+                mixed = (1.0 - alpha) * image[row, column, channel] + alpha * colour
+                image[row, column, channel] = np.uint8(mixed + 0.5)
+
+
+def _draw_outline(image: NDArray[np.uint8], covered: NDArray[np.bool_]) -> None:
+    contours, _ = cv2.findContours(covered.view(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(image, contours, -1, (245, 245, 245), 1, cv2.LINE_AA)
+
+
+def _blend_panel(image: NDArray[np.uint8], panel: NDArray[np.uint8], top: int, left: int) -> None:
+    """Blend a panel into ``image``, cut where it would leave it."""
+    place = image[max(top, 0) : top + panel.shape[0], max(left, 0) : left + panel.shape[1]]
+    place[:] = cv2.addWeighted(place, 0.12, panel[: place.shape[0], : place.shape[1]], 0.88, 0.0)
+
+
+def draw_overlay(
+    image: NDArray[np.uint8],
+    pixels: Array,
+    depths: Array,
+    triangles: NDArray,
+    node_values: Array,
+    value_range: tuple[float, float],
+    *,
+    label: str,
+    colour_map: str = "turbo",
+    alpha: float = 0.65,
+    brightness: Array | None = None,
+    caption: str = "",
+) -> NDArray[np.uint8]:
+    """Draw a surface coloured by a field over an image.
+
+    Parameters
+    ----------
+    image : (h, w, 3) uint8, blue, green, red; not changed.
+    pixels, depths : (n, 2) and (n,) projected nodes, NaN where not in front of the camera.
+    triangles : (m, 3) node indices.
+    node_values : (n,) the field in the unit that ``label`` names, for example von Mises stress in MPa.
+    value_range : values at the ends of the colour map; values beyond them take its end colours.
+    label : name and unit of the field, for example "von Mises stress [MPa]".
+    colour_map : a matplotlib colour map.
+    alpha : opacity of the surface, 0 to 1.
+    brightness : (n,) factor on the colour at each node, for example from `shading.lambert`; 1 by default.
+    caption : a line of text for the lower left corner.
+
+    Returns
+    -------
+    (h, w, 3) uint8, a new image.
+    """
+    result = image.copy()
+    height, width = image.shape[:2]
+    scale = 0.42 * max(height / 480.0, 0.6)
+    low, high = value_range
+    high = high if high > low else low + 1e-9 + abs(low) * 1e-6
+    buffers = rasterise(pixels, depths, triangles, height, width)
+    _blend(
+        result,
+        buffers.triangle_ids,
+        buffers.weights,
+        np.ascontiguousarray(triangles, dtype=np.int64),
+        (np.asarray(node_values, dtype=np.float64) - low) * (255.0 / (high - low)),
+        np.ones(len(pixels)) if brightness is None else np.asarray(brightness, dtype=np.float64),
+        colour_table(colour_map),
+        float(alpha),
+    )
+    _draw_outline(result, buffers.covered)
+    margin = round(0.02 * height)
+    bar = colour_bar(round(0.6 * height), float(low), float(high), label, colour_map, scale)
+    _blend_panel(result, bar, margin, width - margin - bar.shape[1])
+    if caption:
+        line = text_patch(caption, scale)
+        _blend_panel(result, line, height - margin - line.shape[0], margin)
+    return result

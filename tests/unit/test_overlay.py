@@ -1,0 +1,86 @@
+"""The overlay: colours where the surface is, nothing changed where it is not."""
+
+import matplotlib
+import numpy as np
+import pytest
+
+from morph_dslam.render.colour_maps import colour_bar, colour_table
+from morph_dslam.render.overlay import draw_overlay
+from morph_dslam.render.shading import lambert, vertex_normals
+from tests.support.bent_sheet import LENGTH, bent_sheet_model
+
+PIXELS = np.array([[20.0, 40.0], [119.0, 40.0], [119.0, 139.0], [20.0, 139.0]])
+TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
+GREY = np.full((240, 320, 3), 90, dtype=np.uint8)
+
+
+def overlay(values, **options):
+    return draw_overlay(
+        GREY, PIXELS, np.ones(4), TRIANGLES, np.asarray(values), (0.0, 2.0), label="stress [MPa]", **options
+    )
+
+
+@pytest.mark.parametrize(("value", "position"), [(-1.0, 0.0), (0.5, 0.25), (2.0, 1.0), (9.0, 1.0)])
+def test_opaque_surface_has_the_colour_of_its_value(value, position):
+    image = overlay([value] * 4, alpha=1.0, colour_map="viridis")
+    expected = np.array(matplotlib.colormaps["viridis"](position)[:3])[::-1] * 255
+    assert np.abs(image[60:120, 40:100].astype(float) - expected).max() <= 3
+
+
+def test_transparency_mixes_and_brightness_dims():
+    opaque = overlay([1.0] * 4, alpha=1.0)[90, 70].astype(float)
+    mixed = overlay([1.0] * 4, alpha=0.25, brightness=np.full(4, 0.5))[90, 70]
+    np.testing.assert_allclose(mixed, 0.75 * 90 + 0.25 * 0.5 * opaque, atol=1.0)
+
+
+def test_the_rest_of_the_image_and_the_input_stay():
+    image = overlay([1.0] * 4)
+    assert (image[150:200, 10:150] == 90).all()
+    assert (image[:, :18] == 90).all()
+    assert (GREY == 90).all()
+
+
+def test_colours_follow_the_node_values_across_the_surface():
+    image = overlay([0.0, 2.0, 2.0, 0.0], alpha=1.0, colour_map="gray")
+    row = image[90, 25:115, 0].astype(float)
+    # A table of 256 entries may be one entry off, and matplotlib cuts its greys down to whole levels.
+    np.testing.assert_allclose(row, (np.arange(25, 115) - 20) / 99 * 255, atol=2.0)
+
+
+def test_colour_bar_runs_from_high_at_the_top_to_low_at_the_bottom():
+    bar = colour_bar(200, 0.0, 2.0, "stress [MPa]", "turbo", 0.4)
+    table = colour_table("turbo")
+    top, bottom = (np.argwhere((bar == colour).all(axis=2)) for colour in (table[255], table[0]))
+    assert top[:, 0].max() < 20
+    assert bottom[:, 0].min() > 180
+
+
+def test_surface_out_of_sight_and_flat_range_still_draw():
+    lost = draw_overlay(
+        GREY, np.full((4, 2), np.nan), -np.ones(4), TRIANGLES, np.zeros(4), (0.0, 0.0), label="stress [MPa]"
+    )
+    assert (lost[:, :200] == 90).all()
+
+
+def test_overlay_on_a_tiny_image():
+    image = np.zeros((40, 30, 3), dtype=np.uint8)
+    result = draw_overlay(
+        image, PIXELS, np.ones(4), TRIANGLES, np.ones(4), (0, 2), label="x", caption="frame 1 tracked"
+    )
+    assert result.shape == image.shape
+
+
+def test_normals_of_an_arch_are_those_of_its_surface():
+    model = bent_sheet_model(83, 5)
+    x = model.nodes[:, 0]
+    height = 0.04 * (1 - (2 * x / LENGTH) ** 2)
+    points = np.column_stack([x, model.nodes[:, 1], height])
+    slope = -0.04 * 8 * x / LENGTH**2
+    expected = np.column_stack([-slope, np.zeros_like(x), np.ones_like(x)]) / np.sqrt(1 + slope**2)[:, None]
+    inner = np.abs(x) < 0.49 * LENGTH
+    np.testing.assert_allclose(vertex_normals(points, model.triangles)[inner], expected[inner], atol=2e-3)
+
+
+def test_lambert_is_two_sided():
+    normals = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 0.6, 0.8]])
+    np.testing.assert_allclose(lambert(normals, np.array([0, 0, 5.0]), 0.3), [1.0, 1.0, 0.3, 0.3 + 0.7 * 0.8])
