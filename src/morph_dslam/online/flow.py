@@ -34,26 +34,14 @@ def flatten(grey: NDArray[np.uint8], window: int) -> NDArray[np.uint8]:
     return cv2.addWeighted(grey, 1.0, mean, -1.0, NEUTRAL)  # type: ignore[return-value]
 
 
-def build_pyramid(flat: NDArray[np.uint8], options: FlowOptions) -> tuple:
-    """The pyramid that `follow` takes, without derivatives."""
-    window = (options.window, options.window)
-    return cv2.buildOpticalFlowPyramid(flat, window, options.levels, withDerivatives=False)[1]
-
-
 def follow(
-    source: tuple,
-    target: tuple,
-    points: Array,
-    guesses: Array,
-    options: FlowOptions,
-    levels: int | None = None,
+    source: NDArray[np.uint8], target: NDArray[np.uint8], points: Array, guesses: Array, options: FlowOptions
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Follow points from one pyramid to another (Bouguet's pyramidal Lucas-Kanade).
+    """Follow points from one flattened image to another (Bouguet's pyramidal Lucas-Kanade).
 
     Parameters
     ----------
     points : (p, 2) in the source image, pixels. guesses : (p, 2) where to start in the target.
-    levels : pyramid levels to use, at most those of the pyramids (all by default).
 
     Returns
     -------
@@ -62,12 +50,12 @@ def follow(
     if not len(points):
         return np.empty((0, 2)), np.empty(0, dtype=bool)
     found, status, _ = cv2.calcOpticalFlowPyrLK(
-        source,  # type: ignore[arg-type]
-        target,  # type: ignore[arg-type]
+        source,
+        target,
         points.astype(np.float32),
         guesses.astype(np.float32),
         winSize=(options.window, options.window),
-        maxLevel=options.levels if levels is None else levels,
+        maxLevel=options.levels,
         criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.02),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )

@@ -246,7 +246,7 @@ def _flags(
             f"registration ambiguous: {len(alternatives) + 1} different shapes fit the landmarks equally "
             "well; add landmarks away from the object's outline, or take a reference frame that shows it bent"
         )
-    # A parameter that the landmarks do not determine may lie anywhere; only a determined one tells of a limit.
+    # An undetermined parameter may lie anywhere; only a determined one tells of a limit.
     determined = best.parameter_std < model.upper - model.lower
     for parameter, at_bound in zip(model.parameters, best.at_bound & determined, strict=True):
         if at_bound:

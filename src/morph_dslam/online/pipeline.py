@@ -1,0 +1,287 @@
+"""Tracking a free object: pose and parameters together in every frame, without a static scene.
+
+`Tracker.process_frame` is the method: follow the bound points from the previous frame, estimate, correct
+against the rendered reference view so that nothing drifts, and accept the result on evidence; a lost object
+is found again from the reference view's features. The estimate uses no temporal prior: the previous frames
+only say where to start.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import RegistrationError
+from morph_dslam.model import ReducedModel
+from morph_dslam.online.appearance import ReferenceAppearance
+from morph_dslam.online.binding import View, bind_pixels, draw_view, view_of
+from morph_dslam.online.estimation import BoundPoints, Estimate, EstimationOptions, Estimator, State
+from morph_dslam.online.features import interior, spread_corners
+from morph_dslam.online.flow import FlowOptions, flatten, follow
+from morph_dslam.online.measurement import (
+    Measurement,
+    MeasurementOptions,
+    compare_with_rendering,
+    visible_surface,
+)
+from morph_dslam.online.relocalisation import Relocaliser
+from morph_dslam.online.timing import StageClock
+
+Array = NDArray[np.float64]
+STAGES = ("prepare", "flow", "estimate", "render", "correct", "recover")
+
+
+@dataclass(frozen=True)
+class TrackerOptions:
+    """What the tracker follows and what it demands before it believes a frame.
+
+    Attributes
+    ----------
+    n_points : corners followed, spread over the reference view.
+    inlier_px : residual up to which a point supports the estimate.
+    least_inliers, least_share : points that must support it, as a number or a share of all, if that is fewer.
+    """
+
+    n_points: int = 350
+    inlier_px: float = 4.0
+    least_inliers: int = 30
+    least_share: float = 0.3
+    flow: FlowOptions = field(default_factory=FlowOptions)
+    measurement: MeasurementOptions = field(default_factory=MeasurementOptions)
+    estimation: EstimationOptions = field(default_factory=EstimationOptions)
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """What one frame told.
+
+    Attributes
+    ----------
+    status : "tracked" or "lost". reason : how it was found, or why it was not.
+    estimate : None when lost.
+    residual_rms_px : root mean square of the inliers' residuals, NaN when lost.
+    n_points, n_inliers : points that the object itself does not hide, and those that support the estimate.
+    timings_ms : by stage, milliseconds.
+    """
+
+    status: str
+    reason: str
+    estimate: Estimate | None
+    residual_rms_px: float
+    n_points: int
+    n_inliers: int
+    timings_ms: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """A frame made ready: the undistorted grey image (h, w), and flattened."""
+
+    grey: NDArray[np.uint8]
+    flat: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """An estimate, the measurements it rests on, and which of them support it (p,)."""
+
+    estimate: Estimate
+    measurement: Measurement
+    inliers: NDArray[np.bool_]
+
+
+class Tracker:
+    """Follows one object from its registered reference view.
+
+    Parameters
+    ----------
+    reference : the reference frame (h, w, 3) uint8, as recorded. state : the object in it.
+
+    Raises
+    ------
+    RegistrationError
+        If the object shows too few corners in the reference frame.
+    """
+
+    def __init__(
+        self,
+        model: ReducedModel,
+        camera: PinholeCamera,
+        reference: NDArray[np.uint8],
+        state: State,
+        options: TrackerOptions | None = None,
+    ) -> None:
+        self.model, self.camera, self.options = model, camera, options or TrackerOptions()
+        self.estimator = Estimator(model, camera, self.options.estimation)
+        self._undistortion = camera.undistortion_maps()
+        picture = self._prepare(reference)
+        view = view_of(model, camera, state)
+        self.appearance = ReferenceAppearance(model, camera, picture.flat, view)
+        margin = self.options.measurement.patch_half + 2
+        mask = interior(draw_view(view, model.triangles, camera).covered, margin)
+        self.points = self._choose_points(picture, mask, view)
+        self.relocaliser = Relocaliser(self.estimator, picture.grey, mask, view)
+        self._picture = picture
+        self._pixels = camera.project(self.points.in_camera(state))
+        self._supported = np.ones(len(self.points), dtype=bool)
+        self._last, self._velocity_base, self._lost = state, state, False
+
+    def process_frame(self, image: NDArray[np.uint8]) -> FrameResult:
+        """Find the object in the next frame (h, w, 3) uint8, as recorded."""
+        clock = StageClock(STAGES)
+        with clock.stage("prepare"):
+            picture = self._prepare(image)
+        attempt = self._attempt_from_last(picture, clock)
+        reason = self._refusal(attempt)
+        recovered = False
+        if reason:
+            with clock.stage("recover"):
+                state, matches = self.relocaliser.find(picture.grey, self._shapes())
+            if state is None:
+                reason += f"; {matches} features of the reference view were found again, too few"
+            else:
+                candidate = self._correct(picture, state, None, clock)
+                candidate = self._correct(picture, candidate.estimate.state, None, clock)
+                if not self._refusal(candidate):
+                    attempt, reason, recovered = candidate, "", True
+        self._remember(picture, attempt, bool(reason))
+        return self._result(attempt, reason, recovered, clock)
+
+    def _attempt_from_last(self, picture: _Picture, clock: StageClock) -> _Attempt:
+        """Estimate from the last known state; by way of the previous frame if the object was seen there."""
+        if self._lost:
+            return self._correct(picture, self._last, None, clock)
+        with clock.stage("flow"):
+            followed = self._follow(picture)
+        with clock.stage("estimate"):
+            start = self.estimator.estimate(
+                self.points, followed.pixels, followed.valid.astype(float), self._last
+            )
+        return self._correct(picture, start.state, followed, clock)
+
+    def _follow(self, picture: _Picture) -> Measurement:
+        """Follow the points that supported the previous frame's estimate from that frame to this one."""
+        rows = np.flatnonzero(self._supported)
+        guesses = self._pixels + self._expected_motion()
+        found, ok = follow(
+            self._picture.flat, picture.flat, self._pixels[rows], guesses[rows], self.options.flow
+        )
+        pixels, valid = guesses, np.zeros(len(guesses), dtype=bool)
+        pixels[rows], valid[rows] = found, ok
+        return Measurement(pixels, valid, self._supported)
+
+    def _correct(
+        self, picture: _Picture, state: State, followed: Measurement | None, clock: StageClock
+    ) -> _Attempt:
+        """Measure against the reference view rendered in ``state`` and estimate from these measurements."""
+        with clock.stage("render"):
+            view = view_of(self.model, self.camera, state)
+            rendering = self.appearance.render(view)
+        with clock.stage("correct"):
+            positions = self.points.in_camera(state)
+            predicted = self.camera.project(positions)
+            visible = visible_surface(
+                self.points.surface,
+                positions,
+                predicted,
+                view,
+                self.model.triangles,
+                self.appearance,
+                rendering,
+            )
+            guesses = (
+                predicted
+                if followed is None
+                else np.where(followed.valid[:, None], followed.pixels, predicted)
+            )
+            measurement = compare_with_rendering(
+                picture.flat,
+                rendering,
+                predicted,
+                guesses,
+                visible,
+                self.options.flow,
+                self.options.measurement,
+            )
+        with clock.stage("estimate"):
+            estimate, inliers = self._estimate_trimmed(measurement, state)
+        return _Attempt(estimate, measurement, inliers)
+
+    def _estimate_trimmed(self, measurement: Measurement, start: State) -> tuple[Estimate, NDArray[np.bool_]]:
+        """Estimate from all valid measurements, then from those that agree with the first estimate."""
+        estimate, used = None, measurement.valid
+        for _ in range(2):
+            estimate = self.estimator.estimate(self.points, measurement.pixels, used.astype(float), start)
+            with np.errstate(invalid="ignore"):
+                close = np.linalg.norm(estimate.residuals, axis=1) < self.options.inlier_px
+            agreeing = measurement.valid & close
+            if (agreeing == used).all():
+                break
+            start, used = estimate.state, agreeing
+        assert estimate is not None
+        return estimate, used
+
+    def _refusal(self, attempt: _Attempt) -> str:
+        """Why an attempt is not to be believed; empty when it is."""
+        needed = min(self.options.least_inliers, int(np.ceil(self.options.least_share * len(self.points))))
+        count, visible = int(attempt.inliers.sum()), int(attempt.measurement.visible.sum())
+        if count < needed:
+            return f"{count} of {visible} points agree, at least {needed} needed"
+        return ""
+
+    def _expected_motion(self) -> Array:
+        """Image motion (p, 2) at the velocity of the two previous frames; only a first guess."""
+        before = self.camera.project(self.points.in_camera(self._velocity_base))
+        motion = self.camera.project(self.points.in_camera(self._last)) - before
+        return np.nan_to_num(motion)
+
+    def _shapes(self) -> list[Array]:
+        """Parameters to relocalise with: the last known, the default, each parameter near both ends."""
+        lower, upper, default = self.model.lower, self.model.upper, self.model.default
+        shapes = [self._last.parameters, default]
+        for k in range(len(default)):
+            for share in (1 / 6, 5 / 6):
+                shape = default.copy()
+                shape[k] = lower[k] + share * (upper[k] - lower[k])
+                shapes.append(shape)
+        return shapes
+
+    def _remember(self, picture: _Picture, attempt: _Attempt, lost: bool) -> None:
+        """Keep what the next frame starts from; a lost frame keeps the last known state."""
+        if not lost:
+            self._velocity_base = attempt.estimate.state if self._lost else self._last
+            self._last = attempt.estimate.state
+            self._supported = attempt.inliers
+            projected = self.camera.project(self.points.in_camera(self._last))
+            self._pixels = np.where(attempt.inliers[:, None], attempt.measurement.pixels, projected)
+        self._picture, self._lost = picture, lost
+
+    def _result(self, attempt: _Attempt, refusal: str, recovered: bool, clock: StageClock) -> FrameResult:
+        visible, count = int(attempt.measurement.visible.sum()), int(attempt.inliers.sum())
+        if refusal:
+            return FrameResult("lost", f"lost: {refusal}", None, np.nan, visible, count, clock.milliseconds)
+        residuals = attempt.estimate.residuals[attempt.inliers]
+        rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
+        how = "recovered from the reference view's features" if recovered else "followed"
+        return FrameResult("tracked", how, attempt.estimate, rms, visible, count, clock.milliseconds)
+
+    def _prepare(self, image: NDArray[np.uint8]) -> _Picture:
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        if self._undistortion is not None:
+            grey = cv2.remap(grey, *self._undistortion, interpolation=cv2.INTER_LINEAR)
+        flat = flatten(grey, self.options.flow.flatten_window)  # type: ignore[arg-type]
+        return _Picture(grey, flat)  # type: ignore[arg-type]
+
+    def _choose_points(self, picture: _Picture, mask: NDArray[np.uint8], view: View) -> BoundPoints:
+        corners = spread_corners(picture.flat, mask, self.options.n_points)
+        surface, _ = bind_pixels(self.model, self.camera, view, corners)
+        if len(surface) < 2 * (len(self.model.parameters) + 6):
+            raise RegistrationError(
+                f"the object shows only {len(surface)} corners in the reference frame, too few to follow it: "
+                "take a sharper reference frame, or give the object a printed texture"
+            )
+        return BoundPoints.from_surface(self.model, surface)

@@ -1,0 +1,104 @@
+"""Relocalisation: finding a lost object again from the features of its reference view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.online.binding import View, bind_pixels
+from morph_dslam.online.estimation import BoundPoints, Estimator, State
+from morph_dslam.online.features import detect_orb, match_descriptors
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RelocalisationOptions:
+    """``pnp_px``: reprojection error that a match may have before its shape is estimated; generous, because
+    the shape is only guessed then. ``least_matches``: fewer matches that agree are not believed."""
+
+    n_features: int = 1000
+    pnp_px: float = 8.0
+    least_matches: int = 12
+
+
+class Relocaliser:
+    """Descriptors of the reference view, bound to the mesh.
+
+    Parameters
+    ----------
+    grey : the reference image (h, w). mask : 255 where the object is seen. view : the mesh in it.
+    """
+
+    def __init__(
+        self,
+        estimator: Estimator,
+        grey: NDArray[np.uint8],
+        mask: NDArray[np.uint8],
+        view: View,
+        options: RelocalisationOptions | None = None,
+    ) -> None:
+        self.options = options or RelocalisationOptions()
+        self._estimator = estimator
+        pixels, descriptors = detect_orb(grey, self.options.n_features, mask)
+        surface, met = bind_pixels(estimator.model, estimator.camera, view, pixels)
+        self._points = BoundPoints.from_surface(estimator.model, surface)
+        self._descriptors = descriptors[met]
+
+    def find(self, grey: NDArray[np.uint8], shapes: list[Array]) -> tuple[State | None, int]:
+        """The object's state in a frame from matched features alone, and how many matches support it.
+
+        Parameters
+        ----------
+        grey : (h, w). shapes : parameters (d,) to try the first pose with.
+
+        Returns
+        -------
+        None in place of the state when fewer matches than ``least_matches`` agree on one.
+        """
+        pixels, descriptors = detect_orb(grey, self.options.n_features)
+        mine, theirs = match_descriptors(self._descriptors, descriptors)
+        if len(mine) < self.options.least_matches:
+            return None, len(mine)
+        points = BoundPoints.from_surface(self._estimator.model, self._points.surface.take(mine))
+        matched = pixels[theirs]
+        best, inliers = None, np.zeros(len(mine), dtype=bool)
+        for shape in shapes:
+            pose, agreeing = self._ransac(points.rest + points.field.value(shape), matched)
+            if pose is not None and agreeing.sum() > inliers.sum():
+                best, inliers = State(shape, pose), agreeing
+        if best is None or inliers.sum() < self.options.least_matches:
+            return None, int(inliers.sum())
+        return self._refine(points, matched, best, inliers)
+
+    def _ransac(self, points: Array, pixels: Array) -> tuple[RigidTransform | None, NDArray[np.bool_]]:
+        agreeing = np.zeros(len(points), dtype=bool)
+        found, rotation, translation, rows = cv2.solvePnPRansac(
+            points,
+            pixels,
+            self._estimator.camera.matrix,
+            None,  # type: ignore[arg-type]
+            iterationsCount=200,
+            reprojectionError=self.options.pnp_px,
+            flags=cv2.SOLVEPNP_SQPNP,
+        )
+        if not found or rows is None:
+            return None, agreeing
+        agreeing[rows.ravel()] = True
+        return RigidTransform(rotation_exp(rotation.ravel()), translation.ravel()), agreeing
+
+    def _refine(
+        self, points: BoundPoints, pixels: Array, start: State, inliers: NDArray[np.bool_]
+    ) -> tuple[State | None, int]:
+        """Estimate from the agreeing matches, then once more from all that agree with the result."""
+        state = start
+        for _ in range(2):
+            estimate = self._estimator.estimate(points, pixels, inliers.astype(float), state)
+            state = estimate.state
+            inliers = np.linalg.norm(estimate.residuals, axis=1) < self.options.pnp_px
+        count = int(inliers.sum())
+        return (state if count >= self.options.least_matches else None), count

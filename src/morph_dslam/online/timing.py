@@ -1,0 +1,22 @@
+"""How long each stage of a frame takes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from time import perf_counter
+
+
+class StageClock:
+    """Adds up the wall time spent in named stages; stages must not nest."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.milliseconds = dict.fromkeys(names, 0.0)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        start = perf_counter()
+        try:
+            yield
+        finally:
+            self.milliseconds[name] += 1e3 * (perf_counter() - start)
