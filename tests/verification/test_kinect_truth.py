@@ -1,4 +1,4 @@
-"""Binding and material error on measured points: two frames of the real recording show the sheet nearly flat."""
+"""Binding and material error on measured points: in two of these frames the sheet is nearly flat."""
 
 import numpy as np
 import pytest
