@@ -45,19 +45,27 @@ def load_camera(path: Path) -> PinholeCamera:
         raise CameraError(f"cannot read the camera file {path}: {error.strerror}") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise CameraError(f"{path} is not a YAML file: {error}") from error
+    return parse_camera(content, str(path))
+
+
+def parse_camera(content: object, where: str) -> PinholeCamera:
+    """The camera that a mapping with the keys of a camera file describes; errors as of `load_camera`.
+
+    ``where`` is where the mapping was written, and begins the message.
+    """
     if not isinstance(content, dict):
-        raise CameraError(f"{path} holds no camera: it needs width, height, fx, fy, cx, cy")
+        raise CameraError(f"{where} holds no camera: it needs width, height, fx, fy, cx, cy")
     try:
         values = _CameraFile.model_validate(content)
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
         raise CameraError(
-            f"{path}: {name}: {first['msg']}; a camera file has width, height, fx, fy, cx, cy "
+            f"{where}: {name}: {first['msg']}; a camera file has width, height, fx, fy, cx, cy "
             "and optionally distortion [k1, k2, p1, p2, k3]"
         ) from error
     if len(values.distortion) not in (0, 4, 5):
-        raise CameraError(f"{path}: distortion has {len(values.distortion)} values; give 4 or 5, or none")
+        raise CameraError(f"{where}: distortion has {len(values.distortion)} values; give 4 or 5, or none")
     return PinholeCamera(
         values.width, values.height, values.fx, values.fy, values.cx, values.cy, tuple(values.distortion)
     )

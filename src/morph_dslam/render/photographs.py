@@ -1,0 +1,60 @@
+"""Photographs that texture a scene: the user's own files, or those that scikit-image packages."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import SceneError, SourceError
+from morph_dslam.sources.folder import read_image
+
+
+def _packaged_folder() -> Path | None:
+    """The folder of scikit-image's photographs, or None where it is not installed."""
+    spec = find_spec("skimage")
+    return None if spec is None or spec.origin is None else Path(spec.origin).parent / "data"
+
+
+def find_photograph(name: str, folder: Path) -> Path:
+    """The file of a photograph.
+
+    Parameters
+    ----------
+    name : a path relative to ``folder``, or the bare name of a photograph packaged with scikit-image, such
+        as "coffee". A name with a suffix or a folder is always a path.
+
+    Raises
+    ------
+    SceneError
+        If there is no such file, or a packaged photograph is wanted and scikit-image is not installed.
+    """
+    path = folder / name
+    if path.is_file():
+        return path
+    if Path(name).suffix or Path(name).name != name:
+        raise SceneError(f"there is no image {path}")
+    packaged = _packaged_folder()
+    if packaged is None:
+        raise SceneError(
+            f"'{name}' is a photograph packaged with scikit-image, which is not installed: "
+            'pip install "morph-dslam[demo]", or name an image file'
+        )
+    files = {file.stem: file for file in sorted(packaged.glob("*.png")) + sorted(packaged.glob("*.jpg"))}
+    if name not in files:
+        raise SceneError(
+            f"scikit-image packages no photograph '{name}': use one of {', '.join(sorted(files))}, "
+            "or an image file"
+        )
+    return files[name]
+
+
+def load_photograph(name: str, folder: Path) -> NDArray[np.uint8]:
+    """A photograph (H, W, 3) uint8, blue, green, red; raises SceneError as `find_photograph` does."""
+    path = find_photograph(name, folder)
+    try:
+        return read_image(path, f"photograph '{name}'")
+    except SourceError as error:
+        raise SceneError(str(error)) from error

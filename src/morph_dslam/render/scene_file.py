@@ -1,0 +1,178 @@
+"""The scene file of a simulation: what moves how, how it looks, and what camera sees it."""
+
+from __future__ import annotations
+
+import tomllib
+import types
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+
+from morph_dslam.errors import SceneError
+
+Colour = tuple[
+    Annotated[int, Field(ge=0, le=255)],
+    Annotated[int, Field(ge=0, le=255)],
+    Annotated[int, Field(ge=0, le=255)],
+]
+Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+FrameNumber = Annotated[int, Field(ge=0)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class Surface(_Section):
+    """How the sheet looks.
+
+    ``texture`` is an image file relative to the scene file, or a photograph packaged with scikit-image. It is
+    cut to the sheet's proportions and printed on the ``printed_face`` ("top" looks along +z of the object),
+    upright with x to the right, leaving a white border of ``border_mm``. The other face has ``back_colour``
+    (red, green, blue).
+    """
+
+    texture: str
+    printed_face: Literal["top", "bottom"] = "top"
+    border_mm: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+    back_colour: Colour = (226, 224, 218)
+
+
+class Background(_Section):
+    """A photograph, out of focus by ``blur_px``, or a colour (red, green, blue) where no image is named."""
+
+    image: str | None = None
+    colour: Colour = (120, 124, 128)
+    blur_px: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+
+
+class Light(_Section):
+    """A distant light in ``direction`` (towards it, in the camera frame), and ambient light (0-1)."""
+
+    direction: Vector = (-0.4, -0.6, -1.0)
+    ambient: float = Field(default=0.45, ge=0.0, le=1.0)
+
+    @model_validator(mode="after")
+    def _has_direction(self) -> Light:
+        if not any(self.direction):
+            raise ValueError("direction must not be zero")
+        return self
+
+
+class Sensor(_Section):
+    """Gaussian blur (standard deviation, pixels), then Gaussian noise (standard deviation, grey levels)."""
+
+    blur_px: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+    noise: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+
+
+class ParameterKeyFrame(BaseModel):
+    """``frame``, and the values of any of the model's parameters in the units in which it shows them."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, FiniteFloat]
+    frame: FrameNumber
+
+
+class PoseKeyFrame(_Section):
+    """Where the object is in the camera frame (x right, y down, z ahead).
+
+    The object turns about the camera's x axis first, then y, then z (degrees); (180, 0, 0) shows the top face
+    upright.
+    """
+
+    frame: FrameNumber
+    position_mm: Vector
+    rotation_deg: Vector = (180.0, 0.0, 0.0)
+
+
+class OccluderKeyFrame(_Section):
+    frame: FrameNumber
+    centre_px: tuple[FiniteFloat, FiniteFloat]
+
+
+class Occluder(_Section):
+    """A disc of one colour (red, green, blue) in front of everything, moving over the image."""
+
+    radius_px: float = Field(gt=0.0, allow_inf_nan=False)
+    colour: Colour = (196, 150, 122)
+    path: list[OccluderKeyFrame] = Field(min_length=1)
+
+
+class Scene(_Section):
+    """A scene file; paths in it are relative to the file."""
+
+    model: str
+    camera: str | dict[str, Any]
+    frames: int = Field(ge=1)
+    fps: float = Field(default=30.0, gt=0.0, allow_inf_nan=False)
+    seed: int = Field(default=0, ge=0)
+    image_format: Literal["jpg", "png"] = "jpg"
+    supersampling: int = Field(default=2, ge=1, le=4)
+    surface: Surface
+    background: Background = Background()
+    light: Light = Light()
+    sensor: Sensor = Sensor()
+    parameters: list[ParameterKeyFrame] = []
+    pose: list[PoseKeyFrame] = Field(min_length=1)
+    occluder: Occluder | None = None
+
+    @model_validator(mode="after")
+    def _key_frames_are_ordered(self) -> Scene:
+        lists = {"parameters": self.parameters, "pose": self.pose}
+        if self.occluder:
+            lists["occluder.path"] = self.occluder.path
+        for name, keys in lists.items():
+            numbers = [key.frame for key in keys]
+            if sorted(set(numbers)) != numbers:
+                raise ValueError(
+                    f"the key frames of {name} must have increasing frame numbers, not {numbers}"
+                )
+        return self
+
+
+def _section_at(section: type[BaseModel], location: tuple[int | str, ...]) -> type[BaseModel]:
+    """The section of the scene file in which the last key of a pydantic error ``location`` was written."""
+    for part in location[:-1]:
+        if isinstance(part, str):
+            pending = [section.model_fields[part].annotation]
+            while pending:
+                annotation = pending.pop()
+                if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
+                    section = annotation if issubclass(annotation, BaseModel) else section
+                pending.extend(get_args(annotation))
+    return section
+
+
+def _explain(path: Path, error: ValidationError) -> SceneError:
+    first = error.errors()[0]
+    location = first["loc"]
+    name = ".".join(str(part) for part in location)
+    if first["type"] == "extra_forbidden":
+        known = ", ".join(_section_at(Scene, location).model_fields)
+        return SceneError(f"{path}: unknown key '{name}'; known here: {known}")
+    if first["type"] == "missing":
+        return SceneError(f"{path}: the key '{name}' is missing")
+    message = first["msg"].removeprefix("Value error, ")
+    return SceneError(f"{path}: {name}: {message}" if name else f"{path}: {message}")
+
+
+def load_scene_file(path: Path) -> Scene:
+    """Read and check a scene file.
+
+    Raises
+    ------
+    SceneError
+        If the file is missing, is not TOML, or a key is unknown, missing or has an impossible value.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SceneError(f"cannot read the scene file {path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path} is not a TOML file: {error}") from error
+    try:
+        return Scene.model_validate(content)
+    except ValidationError as error:
+        raise _explain(path, error) from error

@@ -1,0 +1,197 @@
+"""Pictures of a scene: a printed, lit sheet before a background, as a camera with noise would take them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.model import ReducedModel
+from morph_dslam.render.photographs import load_photograph
+from morph_dslam.render.rasteriser import Buffers, rasterise
+from morph_dslam.render.scene_file import Background, Colour, Scene, Sensor, Surface
+from morph_dslam.render.shading import lambert, vertex_normals
+from morph_dslam.render.sheet_points import sheet_bounds, texture_coordinates
+from morph_dslam.render.texture import render_textured
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+
+def supersampled(camera: PinholeCamera, factor: int) -> PinholeCamera:
+    """The camera whose image, averaged over ``factor`` x ``factor`` pixels, is this camera's image."""
+    return replace(
+        camera,
+        width=camera.width * factor,
+        height=camera.height * factor,
+        fx=camera.fx * factor,
+        fy=camera.fy * factor,
+        cx=(camera.cx + 0.5) * factor - 0.5,
+        cy=(camera.cy + 0.5) * factor - 0.5,
+    )
+
+
+def crop_to_aspect(image: Image, aspect: float) -> Image:
+    """The largest centred part of an image with this width-to-height ratio."""
+    height, width = image.shape[:2]
+    kept_width, kept_height = min(width, round(height * aspect)), min(height, round(width / aspect))
+    left, top = (width - kept_width) // 2, (height - kept_height) // 2
+    return image[top : top + kept_height, left : left + kept_width]
+
+
+def print_texture(surface: Surface, folder: Path, size: Array, pixels_per_metre: float) -> Image:
+    """The sheet's print, with its border, at the resolution at which the camera sees it.
+
+    A finer texture would alias, so it is averaged down; a coarser one is smoothed up.
+
+    Parameters
+    ----------
+    size : (2,) of the sheet, metres. pixels_per_metre : of the image, where the sheet is seen face on.
+    """
+    photograph = load_photograph(surface.texture, folder)
+    width, height = np.maximum(np.rint(size * pixels_per_metre).astype(int), 2)
+    border = min(round(surface.border_mm * 1e-3 * pixels_per_metre), (min(width, height) - 1) // 2)
+    inner = (int(width - 2 * border), int(height - 2 * border))
+    cropped = crop_to_aspect(photograph, inner[0] / inner[1])
+    shrinks = cropped.shape[1] > inner[0]
+    resized = cv2.resize(cropped, inner, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
+    texture = np.full((height, width, 3), 244, dtype=np.uint8)
+    texture[border : border + inner[1], border : border + inner[0]] = resized
+    return texture
+
+
+def prepare_background(background: Background, folder: Path, camera: PinholeCamera) -> Image:
+    """The background (h, w, 3) filling the camera's image."""
+    if background.image is None:
+        return np.full((camera.height, camera.width, 3), background.colour[::-1], dtype=np.uint8)
+    cropped = crop_to_aspect(load_photograph(background.image, folder), camera.width / camera.height)
+    image = cv2.resize(cropped, (camera.width, camera.height), interpolation=cv2.INTER_CUBIC)
+    return blur(image, background.blur_px)
+
+
+def blur(image: NDArray, sigma: float) -> Image:
+    """Gaussian blur with this standard deviation in pixels."""
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), dtype=np.uint8) if sigma > 0.0 else image
+
+
+@njit(cache=True, nogil=True)
+def _compose(image, printed, shows_print, back, triangle_ids, weights, triangles, brightness):
+    """Paint the lit surface over ``image`` (h, w, 3)."""
+    height, width = triangle_ids.shape
+    for row in range(height):
+        for column in range(width):
+            t = triangle_ids[row, column]
+            if t < 0:
+                continue
+            light = 0.0
+            for corner in range(3):
+                light += weights[row, column, corner] * brightness[triangles[t, corner]]
+            for channel in range(3):
+                colour = float(printed[row, column, channel]) if shows_print[t] else back[channel]
+                image[row, column, channel] = np.uint8(min(light * colour, 255.0) + 0.5)
+
+
+def draw_disc(image: Image, centre: Array, radius: float, colour: Colour) -> None:
+    """Paint a disc (colour red, green, blue) exactly where `in_disc` says."""
+    rows, columns = np.indices(image.shape[:2])
+    image[in_disc(np.stack([columns, rows], axis=-1), centre, radius)] = colour[::-1]
+
+
+def in_disc(pixels: NDArray, centre: Array, radius: float) -> NDArray[np.bool_]:
+    """Which pixels (..., 2) lie in a disc."""
+    return ((pixels - centre) ** 2).sum(axis=-1) <= radius**2
+
+
+def add_sensor_noise(image: Image, sensor: Sensor, seed: tuple[int, int]) -> Image:
+    """Blur and noise, the same for the same ``seed`` (scene, frame)."""
+    image = blur(image, sensor.blur_px)
+    if sensor.noise == 0.0:
+        return image
+    noise = np.random.default_rng(seed).standard_normal(image.shape, dtype=np.float32)
+    return np.clip(np.rint(image + np.float32(sensor.noise) * noise), 0, 255).astype(np.uint8)
+
+
+class SceneRenderer:
+    """Takes the pictures of one scene.
+
+    Parameters
+    ----------
+    scene : its description. model : the sheet. camera : without lens distortion.
+    folder : what paths in the scene are relative to.
+    nearest_depth : metres; the print is made as fine as it can be seen from there.
+
+    Raises
+    ------
+    SceneError
+        If a photograph is missing or unreadable.
+    """
+
+    def __init__(
+        self, scene: Scene, model: ReducedModel, camera: PinholeCamera, folder: Path, nearest_depth: float
+    ) -> None:
+        self._scene = scene
+        self._triangles = model.triangles
+        self._factor = scene.supersampling
+        self._camera = supersampled(camera, self._factor)
+        low, high = sheet_bounds(model)
+        density = max(self._camera.fx, self._camera.fy) / nearest_depth
+        self._texture = print_texture(scene.surface, folder, high - low, density)
+        height, width = self._texture.shape[:2]
+        self._coordinates = texture_coordinates(model, scene.surface.printed_face, width, height)
+        self._background = cv2.resize(
+            prepare_background(scene.background, folder, camera),
+            (self._camera.width, self._camera.height),
+            interpolation=cv2.INTER_CUBIC if scene.background.image else cv2.INTER_NEAREST,
+        )
+        rest = model.nodes[model.triangles]
+        rest_normal_z = np.cross(rest[:, 1] - rest[:, 0], rest[:, 2] - rest[:, 0])[:, 2]
+        # +1 where the order of a triangle's nodes makes its normal leave the printed face.
+        self._sides = np.sign(rest_normal_z) * (1.0 if scene.surface.printed_face == "top" else -1.0)
+
+    def _shows_print(self, points: Array) -> NDArray[np.bool_]:
+        """Which triangles (m,) turn their printed face to the camera."""
+        corners = points[self._triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        return self._sides * np.einsum("mx,mx->m", normals, corners[:, 0]) < 0.0
+
+    def _paint_surface(self, image: Image, buffers: Buffers, points: Array) -> None:
+        light = self._scene.light
+        normals = vertex_normals(points, self._triangles)
+        _compose(
+            image,
+            render_textured(buffers, self._triangles, self._coordinates, self._texture),
+            self._shows_print(points),
+            np.array(self._scene.surface.back_colour[::-1], dtype=np.float64),
+            buffers.triangle_ids,
+            buffers.weights,
+            self._triangles,
+            lambert(normals, np.array(light.direction), light.ambient),
+        )
+
+    def render(self, points: Array, frame: int, occluder_centre: Array | None) -> Image:
+        """The picture (h, w, 3) uint8, blue, green, red.
+
+        Parameters
+        ----------
+        points : (n, 3) nodes in the camera frame, metres. frame : its number, which seeds the noise.
+        occluder_centre : (2,) pixels, or None without an occluder.
+        """
+        camera, factor = self._camera, self._factor
+        pixels = camera.project(points)
+        buffers = rasterise(pixels, points[:, 2], self._triangles, camera.height, camera.width)
+        image = np.array(self._background, dtype=np.uint8)
+        self._paint_surface(image, buffers, points)
+        occluder = self._scene.occluder
+        if occluder is not None and occluder_centre is not None:
+            centre = (occluder_centre + 0.5) * factor - 0.5
+            draw_disc(image, centre, occluder.radius_px * factor, occluder.colour)
+        size = (camera.width // factor, camera.height // factor)
+        averaged = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        return add_sensor_noise(
+            np.asarray(averaged, dtype=np.uint8), self._scene.sensor, (self._scene.seed, frame)
+        )

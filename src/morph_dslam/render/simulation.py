@@ -1,0 +1,215 @@
+"""Simulated sequences: a video of a model in motion, with everything about it known.
+
+The folder written holds `frames/`, `camera.yaml`, `landmarks.csv`, `truth.npz` and `depth.h5`; the truth is
+computed from the model, never read off the images.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import SceneError
+from morph_dslam.io.calibration import load_camera, parse_camera, save_camera
+from morph_dslam.model import ReducedModel, SurfacePoints, load_model
+from morph_dslam.render.motion import Motion, plan_motion
+from morph_dslam.render.rasteriser import rasterise, visible_points
+from morph_dslam.render.scene_file import Scene, load_scene_file
+from morph_dslam.render.scene_renderer import SceneRenderer, in_disc
+from morph_dslam.render.sheet_points import check_sheet, landmark_nodes, regular_points
+
+Array = NDArray[np.float64]
+
+N_TRUTH_POINTS = 300
+MIN_LANDMARKS = 8
+
+#: A point so far behind the depth buffer is hidden; less may be the surface's own slope within a pixel.
+HIDDEN_BY = 3e-3
+
+
+@dataclass(frozen=True)
+class _World:
+    """A scene with everything that it names read and checked."""
+
+    scene: Scene
+    folder: Path
+    model: ReducedModel
+    camera: PinholeCamera
+    motion: Motion
+
+    def node_positions(self, frame: int) -> Array:
+        """Nodes (n, 3) in the camera frame, metres."""
+        return self.motion.camera_from_object[frame].apply(
+            self.model.positions(self.motion.parameters[frame])
+        )
+
+    def nearest_depth(self) -> float:
+        """The least depth of any node in any frame, metres."""
+        return min(self.node_positions(frame)[:, 2].min() for frame in range(self.scene.frames))
+
+    def depth_image(self, points: Array) -> NDArray[np.float32]:
+        """Depth (h, w) in metres of nodes (n, 3) in the camera frame, infinity where there is no surface."""
+        pixels = self.camera.project(points)
+        return rasterise(
+            pixels, points[:, 2], self.model.triangles, self.camera.height, self.camera.width
+        ).depth
+
+    def occluded(self, frame: int, pixels: NDArray) -> NDArray[np.bool_]:
+        """Which pixels (..., 2) the occluder covers."""
+        centres, occluder = self.motion.occluder_centres, self.scene.occluder
+        if centres is None or occluder is None:
+            return np.zeros(pixels.shape[:-1], dtype=bool)
+        return in_disc(pixels, centres[frame], occluder.radius_px)
+
+    def visible(self, frame: int, points: Array, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Which surface points (p, 3), camera frame, are in the image with nothing in front of them."""
+        pixels = self.camera.project(points)
+        return visible_points(pixels, points[:, 2], depth, HIDDEN_BY) & ~self.occluded(frame, pixels)
+
+
+def _load_world(scene_path: Path) -> _World:
+    scene, folder = load_scene_file(scene_path), scene_path.parent
+    if isinstance(scene.camera, str):
+        camera = load_camera(folder / scene.camera)
+    else:
+        camera = parse_camera(scene.camera, f"{scene_path}: camera")
+    if any(camera.distortion):
+        raise SceneError(
+            f"{scene_path}: scenes are rendered without lens distortion; leave it out of the camera"
+        )
+    model = load_model(folder / scene.model)
+    check_sheet(model)
+    world = _World(scene, folder, model, camera, plan_motion(scene, model))
+    for frame in range(scene.frames):
+        points = world.node_positions(frame)
+        if points[:, 2].min() <= 0.0:
+            raise SceneError(
+                f"{scene_path}: in frame {frame} the sheet reaches behind the camera (z = "
+                f"{1e3 * points[:, 2].min():.4g} mm): move it ahead with the pose's position_mm"
+            )
+    return world
+
+
+def _prepare_folder(output: Path) -> None:
+    """Make the folders, and clear frames of an earlier simulation, which would mix with the new ones."""
+    frames = output / "frames"
+    try:
+        frames.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SceneError(f"cannot write the sequence to {output}: {error.strerror}") from error
+    for path in frames.iterdir():
+        if re.fullmatch(r"\d{6}\.(png|jpg)", path.name):
+            path.unlink()
+
+
+def _write_landmarks(path: Path, world: _World) -> None:
+    """Landmarks that frame 0 shows: rest positions in millimetres, pixels to full precision."""
+    nodes = landmark_nodes(world.model)
+    positions = world.node_positions(0)
+    nodes = nodes[world.visible(0, positions[nodes], world.depth_image(positions))]
+    if len(nodes) < MIN_LANDMARKS:
+        raise SceneError(
+            f"frame 0 shows {len(nodes)} landmarks of the sheet, and a tracker needs {MIN_LANDMARKS}: "
+            "let the first key frames show the whole sheet, without the occluder"
+        )
+    rows = np.column_stack([world.model.nodes[nodes] * 1e3, world.camera.project(positions[nodes])])
+    np.savetxt(path, rows, fmt="%.6f", delimiter=",", header="x_mm,y_mm,z_mm,u_px,v_px", comments="")
+
+
+def _truth_positions(world: _World, points: SurfacePoints) -> Array:
+    """Positions (T, p, 3) of surface points in the camera frame in all frames, metres."""
+    field, rest = world.model.restrict(points), world.model.rest_positions(points)
+    motion = world.motion
+    return np.stack(
+        [
+            pose.apply(rest + field.value(mu))
+            for pose, mu in zip(motion.camera_from_object, motion.parameters, strict=True)
+        ]
+    )
+
+
+def _write_truth(path: Path, world: _World, positions: Array, visible: NDArray[np.bool_]) -> None:
+    """Write what is known of surface points (T, p, 3), and the poses and parameters behind them."""
+    np.savez_compressed(
+        path,
+        frame=np.arange(world.scene.frames),
+        points_mm=positions * 1e3,
+        pixels=np.stack([world.camera.project(frame) for frame in positions]),
+        visible=visible,
+        parameters=world.motion.parameters,
+        camera_from_object=np.stack([pose.matrix for pose in world.motion.camera_from_object]),
+    )
+
+
+def _create_depth(file: h5py.File, world: _World) -> h5py.Dataset:
+    camera = world.camera
+    dataset = file.create_dataset(
+        "depth_m",
+        shape=(world.scene.frames, camera.height, camera.width),
+        dtype=np.float32,
+        chunks=(1, camera.height, camera.width),
+        compression="gzip",
+        compression_opts=1,
+        shuffle=True,
+    )
+    dataset.attrs["description"] = "depth along the optical axis in metres; 0 where the sheet is not seen"
+    return dataset
+
+
+def _write_image(path: Path, image: NDArray[np.uint8]) -> None:
+    options = {".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95], ".png": [cv2.IMWRITE_PNG_COMPRESSION, 3]}
+    if not cv2.imwrite(str(path), image, options[path.suffix]):
+        raise SceneError(f"cannot write {path}: is the disk full?")
+
+
+def _render_frames(world: _World, output: Path, truth: Array, progress: bool) -> NDArray[np.bool_]:
+    """Write all images and depths; says which truth points (T, p) are visible."""
+    scene, camera, centres = world.scene, world.camera, world.motion.occluder_centres
+    renderer = SceneRenderer(scene, world.model, camera, world.folder, world.nearest_depth())
+    rows, columns = np.indices((camera.height, camera.width))
+    grid = np.stack([columns, rows], axis=-1)
+    visible = np.zeros(truth.shape[:2], dtype=bool)
+    with h5py.File(output / "depth.h5", "w") as file:
+        depths = _create_depth(file, world)
+        for frame in tqdm(range(scene.frames), desc="rendering", unit="frame", disable=not progress):
+            nodes = world.node_positions(frame)
+            image = renderer.render(nodes, frame, None if centres is None else centres[frame])
+            _write_image(output / "frames" / f"{frame:06}.{scene.image_format}", image)
+            depth = world.depth_image(nodes)
+            visible[frame] = world.visible(frame, truth[frame], depth)
+            hidden = np.isinf(depth) | world.occluded(frame, grid)
+            depths[frame] = np.where(hidden, np.float32(0.0), depth)
+    return visible
+
+
+def simulate(scene_path: Path, output: Path, progress: bool = True) -> None:
+    """Render a scene and write it with its truth.
+
+    Parameters
+    ----------
+    scene_path : the scene file. output : the folder to write; made if missing, frames in it are replaced.
+    progress : show a progress bar.
+
+    Raises
+    ------
+    SceneError
+        If the scene file is wrong, or the motion it prescribes leaves the model's range or the camera's view.
+    CameraError, ModelFileError
+        If the camera or the model that it names cannot be read.
+    """
+    world = _load_world(Path(scene_path))
+    output = Path(output)
+    _prepare_folder(output)
+    save_camera(output / "camera.yaml", world.camera)
+    _write_landmarks(output / "landmarks.csv", world)
+    truth = _truth_positions(world, regular_points(world.model, N_TRUTH_POINTS))
+    visible = _render_frames(world, output, truth, progress)
+    _write_truth(output / "truth.npz", world, truth, visible)
