@@ -40,3 +40,7 @@ class SceneError(MorphError):
 
 class EvaluationError(MorphError):
     """Results and ground truth do not fit together."""
+
+
+class TrackingError(MorphError):
+    """A tracking run cannot be written where it was asked for."""

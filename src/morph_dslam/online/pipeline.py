@@ -65,7 +65,7 @@ class FrameResult:
     estimate : None when lost.
     residual_rms_px : root mean square of the inliers' residuals, NaN when lost.
     n_points, n_inliers : points that the object itself does not hide, and those that support the estimate.
-    timings_ms : by stage, milliseconds.
+    timings_ms : by stage, milliseconds. total_ms : the whole frame. recovered : found again from features.
     """
 
     status: str
@@ -74,7 +74,9 @@ class FrameResult:
     residual_rms_px: float
     n_points: int
     n_inliers: int
-    timings_ms: dict[str, float] = field(default_factory=dict)
+    timings_ms: dict[str, float]
+    total_ms: float
+    recovered: bool = False
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,8 @@ class Tracker:
     Parameters
     ----------
     reference : the reference frame (h, w, 3) uint8, as recorded. state : the object in it.
+    in_sequence : whether the first frame to process is the reference frame or follows it; if not, the object
+        is looked for as after a loss.
 
     Raises
     ------
@@ -114,6 +118,7 @@ class Tracker:
         reference: NDArray[np.uint8],
         state: State,
         options: TrackerOptions | None = None,
+        in_sequence: bool = True,
     ) -> None:
         self.model, self.camera, self.options = model, camera, options or TrackerOptions()
         self.estimator = Estimator(model, camera, self.options.estimation)
@@ -128,7 +133,7 @@ class Tracker:
         self._picture = picture
         self._pixels = camera.project(self.points.in_camera(state))
         self._supported = np.ones(len(self.points), dtype=bool)
-        self._last, self._velocity_base, self._lost = state, state, False
+        self._last, self._velocity_base, self._lost = state, state, not in_sequence
 
     def process_frame(self, image: NDArray[np.uint8]) -> FrameResult:
         """Find the object in the next frame (h, w, 3) uint8, as recorded."""
@@ -262,12 +267,13 @@ class Tracker:
 
     def _result(self, attempt: _Attempt, refusal: str, recovered: bool, clock: StageClock) -> FrameResult:
         visible, count = int(attempt.measurement.visible.sum()), int(attempt.inliers.sum())
+        times, total = clock.milliseconds, clock.total
         if refusal:
-            return FrameResult("lost", f"lost: {refusal}", None, np.nan, visible, count, clock.milliseconds)
+            return FrameResult("lost", f"lost: {refusal}", None, np.nan, visible, count, times, total)
         residuals = attempt.estimate.residuals[attempt.inliers]
         rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
         how = "recovered from the reference view's features" if recovered else "followed"
-        return FrameResult("tracked", how, attempt.estimate, rms, visible, count, clock.milliseconds)
+        return FrameResult("tracked", how, attempt.estimate, rms, visible, count, times, total, recovered)
 
     def _prepare(self, image: NDArray[np.uint8]) -> _Picture:
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)

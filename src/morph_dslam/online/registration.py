@@ -190,7 +190,9 @@ def solve_pnp(points: Array, pixels: Array, camera: PinholeCamera) -> list[Rigid
         except cv2.error:
             continue  # a degenerate configuration for this method; the others decide
         for rotation, translation in zip(rotations, translations, strict=True):
-            pose = RigidTransform(rotation_exp(rotation.ravel()), translation.ravel())
+            pose = RigidTransform(
+                rotation_exp(rotation.ravel()), np.asarray(translation, dtype=float).ravel()
+            )
             if (pose.apply(points)[:, 2] > 0.0).all():
                 poses.append(pose)
     return poses

@@ -88,8 +88,10 @@ class Relocaliser:
         )
         if not found or rows is None:
             return None, agreeing
-        agreeing[rows.ravel()] = True
-        return RigidTransform(rotation_exp(rotation.ravel()), translation.ravel()), agreeing
+        agreeing[np.asarray(rows, dtype=np.int64).ravel()] = True
+        return RigidTransform(
+            rotation_exp(rotation.ravel()), np.asarray(translation, dtype=float).ravel()
+        ), agreeing
 
     def _refine(
         self, points: BoundPoints, pixels: Array, start: State, inliers: NDArray[np.bool_]

@@ -12,6 +12,12 @@ class StageClock:
 
     def __init__(self, names: Sequence[str]) -> None:
         self.milliseconds = dict.fromkeys(names, 0.0)
+        self._start = perf_counter()
+
+    @property
+    def total(self) -> float:
+        """Milliseconds since the clock was made."""
+        return 1e3 * (perf_counter() - self._start)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

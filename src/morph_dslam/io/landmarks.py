@@ -1,0 +1,71 @@
+"""Landmark files: points of the undeformed object and where they are seen in the reference frame.
+
+x_mm,y_mm,z_mm,u_px,v_px
+-210,148.5,0,172.1,74.2
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import RegistrationError
+
+Array = NDArray[np.float64]
+HEADER = ("x_mm", "y_mm", "z_mm", "u_px", "v_px")
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """``points`` (k, 3) on the undeformed object in its frame, metres; ``pixels`` (k, 2) in the image as
+    recorded."""
+
+    points: Array
+    pixels: Array
+
+
+def load_landmarks(path: Path) -> Landmarks:
+    """Read a landmark file.
+
+    Raises
+    ------
+    RegistrationError
+        If the file is missing, has another header, or a value is not a finite number.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = [row for row in csv.reader(file) if any(cell.strip() for cell in row)]
+    except OSError as error:
+        raise RegistrationError(f"cannot read the landmarks {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise RegistrationError(f"{path} is not a text file of landmarks") from error
+    if not rows or tuple(cell.strip() for cell in rows[0]) != HEADER:
+        raise RegistrationError(f"{path}: the first line of a landmark file is {','.join(HEADER)}")
+    values = np.array([_values(path, number, row) for number, row in enumerate(rows[1:], start=1)])
+    values = values.reshape(-1, len(HEADER))
+    return Landmarks(1e-3 * values[:, :3], np.ascontiguousarray(values[:, 3:]))
+
+
+def _values(path: Path, number: int, row: list[str]) -> list[float]:
+    try:
+        values = [float(cell) for cell in row]
+    except ValueError:
+        values = []
+    if len(values) != len(HEADER) or not np.isfinite(values).all():
+        raise RegistrationError(
+            f"{path}: landmark {number} is '{','.join(row)}'; give {len(HEADER)} numbers: {','.join(HEADER)}"
+        )
+    return values
+
+
+def save_landmarks(path: Path, landmarks: Landmarks) -> None:
+    """Write a landmark file that `load_landmarks` reads."""
+    lines = [
+        ",".join([*(f"{1e3 * x:.6g}" for x in point), *(f"{x:.4f}" for x in pixel)])
+        for point, pixel in zip(landmarks.points, landmarks.pixels, strict=True)
+    ]
+    path.write_text("\n".join([",".join(HEADER), *lines]) + "\n")

@@ -1,0 +1,182 @@
+"""The run folder: everything a run found, in files that other programs read (docs/run-folder.md)."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.model import ReducedModel
+from morph_dslam.online.estimation import State
+from morph_dslam.online.pipeline import STAGES, FrameResult
+
+Array = NDArray[np.float64]
+FORMAT = "morph-dslam run"
+VERSION = 1
+
+
+@dataclass
+class RunResults:
+    """The results of all frames so far, in order."""
+
+    model: ReducedModel
+    reference_frame: int
+    frames: list[int] = field(default_factory=list)
+    timestamps: list[float] = field(default_factory=list)
+    results: list[FrameResult] = field(default_factory=list)
+
+    def add(self, frame: int, timestamp: float, result: FrameResult) -> None:
+        self.frames.append(frame)
+        self.timestamps.append(timestamp)
+        self.results.append(result)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def tracked(self) -> NDArray[np.bool_]:
+        """Frames (f,) that have an estimate."""
+        return np.array([result.estimate is not None for result in self.results], dtype=bool)
+
+    def states(self) -> list[State | None]:
+        """The state of every frame, None where it was lost."""
+        return [result.estimate.state if result.estimate else None for result in self.results]
+
+    def poses(self) -> Array:
+        """camera_from_object (f, 4, 4), NaN where lost."""
+        lost = np.full((4, 4), np.nan)
+        return np.array([s.camera_from_object.matrix if s else lost for s in self.states()])
+
+    def parameters(self) -> Array:
+        """(f, d), SI, NaN where lost."""
+        lost = np.full(len(self.model.parameters), np.nan)
+        return np.array([s.parameters if s else lost for s in self.states()])
+
+    def parameter_std(self) -> Array:
+        """(f, d), SI, NaN where lost."""
+        lost = np.full(len(self.model.parameters), np.nan)
+        return np.array([r.estimate.parameter_std if r.estimate else lost for r in self.results])
+
+    def at_bound(self) -> NDArray[np.bool_]:
+        """(f, d), false where lost."""
+        lost = np.zeros(len(self.model.parameters), dtype=bool)
+        return np.array([r.estimate.at_bound if r.estimate else lost for r in self.results])
+
+    def timings_ms(self) -> Array:
+        """(f, len(STAGES) + 1): each stage, then the whole frame."""
+        return np.array([[*(r.timings_ms[s] for s in STAGES), r.total_ms] for r in self.results])
+
+    def residuals_px(self) -> Array:
+        """Root mean square residual (f,), NaN where lost."""
+        return np.array([result.residual_rms_px for result in self.results])
+
+    def counts(self) -> NDArray[np.int64]:
+        """(f, 2): points that could be seen, and those that support the estimate."""
+        return np.array([(r.n_points, r.n_inliers) for r in self.results], dtype=np.int64).reshape(-1, 2)
+
+
+def write_hdf5(path: Path, run: RunResults) -> None:
+    """Write ``result.h5``."""
+    text = h5py.string_dtype()
+    with h5py.File(path, "w") as file:
+        file.attrs.update({"format": FORMAT, "version": VERSION, "reference_frame": run.reference_frame})
+        file.attrs.update({"first_frame": run.frames[0], "last_frame": run.frames[-1]})
+        file["frame"], file["timestamp"] = np.array(run.frames, dtype=np.int64), np.array(run.timestamps)
+        file["status"] = np.array([result.status for result in run.results], dtype=text)
+        file["reason"] = np.array([result.reason for result in run.results], dtype=text)
+        file["camera_from_object"], file["parameters"] = run.poses(), run.parameters()
+        file["parameter_std"], file["at_bound"] = run.parameter_std(), run.at_bound()
+        file["residual_rms_px"] = run.residuals_px()
+        file["n_points"], file["n_inliers"] = run.counts().T
+        file["timings_ms"] = run.timings_ms()
+        file["timings_ms"].attrs["names"] = [*STAGES, "total"]
+
+
+def write_csv(path: Path, run: RunResults) -> None:
+    """Write ``frames.csv``: millimetres, degrees, milliseconds, and parameters in their own units."""
+    from morph_dslam.geometry import rotation_log
+
+    parameters = run.model.parameters
+    header = ["frame", "timestamp_s", "status", "reason"]
+    for p in parameters:
+        header += [f"{p.name}_{p.unit}", f"{p.name}_std_{p.unit}", f"{p.name}_at_bound"]
+    header += ["x_mm", "y_mm", "z_mm", "rotation_x_deg", "rotation_y_deg", "rotation_z_deg"]
+    header += ["residual_rms_px", "n_points", "n_inliers", "time_ms"]
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        for frame, timestamp, result in zip(run.frames, run.timestamps, run.results, strict=True):
+            row: list[Any] = [frame, f"{timestamp:.6f}", result.status, result.reason]
+            if result.estimate is None:
+                row += [""] * (3 * len(parameters) + 7)
+            else:
+                state, std = result.estimate.state, result.estimate.parameter_std
+                for k, p in enumerate(parameters):
+                    row += [f"{p.display(state.parameters[k]):.6g}", f"{p.display(std[k]):.3g}"]
+                    row.append(int(result.estimate.at_bound[k]))
+                pose = state.camera_from_object
+                row += [f"{1e3 * value:.4f}" for value in pose.translation]
+                row += [f"{value:.4f}" for value in np.degrees(rotation_log(pose.rotation))]
+                row.append(f"{result.residual_rms_px:.4f}")
+            writer.writerow([*row, result.n_points, result.n_inliers, f"{result.total_ms:.3f}"])
+
+
+def summarise(run: RunResults) -> dict[str, Any]:
+    """Counts and medians of the run, with what could be wrong with it as ``flags``."""
+    tracked, times = run.tracked, run.timings_ms()
+    medians = np.median(times, axis=0)
+    summary: dict[str, Any] = {
+        "model": run.model.name,
+        "n_frames": len(run),
+        "n_tracked": int(tracked.sum()),
+        "n_lost": int((~tracked).sum()),
+        "n_recovered": sum(result.recovered for result in run.results),
+        "first_frame": run.frames[0],
+        "last_frame": run.frames[-1],
+        "reference_frame": run.reference_frame,
+        "median_ms": float(medians[-1]),
+        "p95_ms": float(np.percentile(times[:, -1], 95)),
+        "stage_median_ms": dict(zip(STAGES, medians[:-1].tolist(), strict=True)),
+    }
+    if tracked.any():
+        summary["median_residual_rms_px"] = float(np.median(run.residuals_px()[tracked]))
+        summary["median_n_inliers"] = float(np.median(run.counts()[tracked, 1]))
+    return summary | {"flags": flags(run)}
+
+
+def flags(run: RunResults) -> list[str]:
+    """What a reader of the results must know."""
+    found = []
+    lost = Counter(result.status for result in run.results)["lost"]
+    if lost:
+        found.append(f"{lost} of {len(run)} frames were lost; their reasons are in frames.csv")
+    range_width = run.model.upper - run.model.lower
+    with np.errstate(invalid="ignore"):
+        determined = run.parameter_std() < 0.5 * range_width
+    for k, parameter in enumerate(run.model.parameters):
+        count = int((run.at_bound()[:, k] & determined[:, k]).sum())
+        if count:
+            found.append(
+                f"parameter '{parameter.name}' is at a bound of the model's range in {count} frames: "
+                "the object may be outside what the model covers"
+            )
+        unseen = int((run.tracked & ~determined[:, k]).sum())
+        if unseen:
+            found.append(f"parameter '{parameter.name}' cannot be told from the images in {unseen} frames")
+    return found
+
+
+def write_summary(path: Path, run: RunResults, extra: dict[str, Any]) -> dict[str, Any]:
+    """Write ``summary.json``: `summarise`, then what the caller adds; its ``flags`` are joined."""
+    summary = summarise(run)
+    joined = [*extra.pop("flags", []), *summary["flags"]]
+    summary |= extra | {"flags": joined}
+    path.write_text(json.dumps(summary, indent=2, default=str) + "\n")
+    return summary

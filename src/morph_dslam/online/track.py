@@ -1,0 +1,178 @@
+"""`morph track`: register once, follow through all frames, write the run folder."""
+
+from __future__ import annotations
+
+import platform
+import shutil
+import sys
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numba
+import numpy as np
+from tqdm import tqdm
+
+from morph_dslam import __version__
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import SourceError, TrackingError
+from morph_dslam.io.calibration import load_camera
+from morph_dslam.io.landmarks import load_landmarks
+from morph_dslam.model import ReducedModel, load_model
+from morph_dslam.online.augmentation import write_video
+from morph_dslam.online.pipeline import Tracker, TrackerOptions
+from morph_dslam.online.plots import write_plots
+from morph_dslam.online.registration import Registration, RegistrationOptions, register
+from morph_dslam.online.results import RunResults, write_csv, write_hdf5, write_summary
+from morph_dslam.sources import Frame, FrameSource, open_source
+
+
+@dataclass(frozen=True)
+class TrackOptions:
+    """What to track, with what, and where the results go.
+
+    Attributes
+    ----------
+    frames : video file or folder of images. model, camera, landmarks : files.
+    output : the run folder. first, last : frame numbers to track, both included; all by default.
+    reference_frame : the frame that the landmarks belong to; the first one tracked by default.
+    overlay : draw the augmented video. overwrite : replace a run that is there already.
+    """
+
+    frames: Path
+    model: Path
+    camera: Path
+    landmarks: Path
+    output: Path
+    first: int | None = None
+    last: int | None = None
+    reference_frame: int | None = None
+    overlay: bool = True
+    overwrite: bool = False
+    registration: RegistrationOptions = field(default_factory=RegistrationOptions)
+    tracker: TrackerOptions = field(default_factory=TrackerOptions)
+
+
+def track(options: TrackOptions) -> dict[str, Any]:
+    """Track an object through a sequence and write the run folder.
+
+    An interrupt, or a video that ends early, keeps what was done: the run folder is completed with the frames
+    so far and the exception goes on.
+
+    Returns
+    -------
+    The content of ``summary.json``.
+
+    Raises
+    ------
+    MorphError
+        If an input cannot be used (ModelFileError, CameraError, SourceError, RegistrationError) or the run
+        folder holds a run already (TrackingError).
+    """
+    _check_output(options)
+    model, camera = load_model(options.model), load_camera(options.camera)
+    landmarks = load_landmarks(options.landmarks)
+    source = open_source(options.frames, options.first, options.last)
+    reference = _reference_frame(options)
+    camera.check_image(reference.image, f"frame {reference.index} of {options.frames}")
+    registration = register(model, camera, landmarks.points, landmarks.pixels, options.registration)
+    for flag in registration.flags:
+        print(f"note: {flag}", file=sys.stderr)
+    tracker = _ready_tracker(model, camera, reference, registration, options)
+    run = RunResults(model, reference.index)
+    try:
+        for frame in tqdm(source, total=len(source), desc="tracking", unit="frame"):
+            camera.check_image(frame.image, f"frame {frame.index} of {options.frames}")
+            run.add(frame.index, frame.timestamp, tracker.process_frame(frame.image))
+    finally:
+        summary = _write_run(options, source, camera, run, registration) if len(run) else {}
+    return summary
+
+
+def _check_output(options: TrackOptions) -> None:
+    if (options.output / "result.h5").exists() and not options.overwrite:
+        raise TrackingError(
+            f"{options.output} holds a run already: choose another folder, or allow it to be overwritten"
+        )
+    try:
+        options.output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TrackingError(f"cannot make the run folder {options.output}: {error.strerror}") from error
+
+
+def _reference_frame(options: TrackOptions) -> Frame:
+    number = options.reference_frame if options.reference_frame is not None else options.first
+    for frame in open_source(options.frames, number, number):
+        return frame
+    raise SourceError(f"{options.frames} holds no frame {number} to take as the reference")
+
+
+def _ready_tracker(
+    model: ReducedModel,
+    camera: PinholeCamera,
+    reference: Frame,
+    registration: Registration,
+    options: TrackOptions,
+) -> Tracker:
+    """A tracker whose loops are compiled, so that the first frame takes no longer than the others."""
+
+    def new() -> Tracker:
+        # A sequence that does not begin with the reference frame is entered as if the object had been lost.
+        begins = options.reference_frame in (None, options.first)
+        return Tracker(
+            model, camera, reference.image, registration.state, options.tracker, in_sequence=begins
+        )
+
+    print("preparing: compiling the inner loops (half a minute the first time) ...", file=sys.stderr)
+    new().process_frame(reference.image)
+    return new()
+
+
+def _write_run(
+    options: TrackOptions,
+    source: FrameSource,
+    camera: PinholeCamera,
+    run: RunResults,
+    registration: Registration,
+) -> dict[str, Any]:
+    """Write all files of the run folder; the video last, because it takes longest."""
+    folder = options.output
+    write_hdf5(folder / "result.h5", run)
+    write_csv(folder / "frames.csv", run)
+    _copy(options.model, folder / "model.morph")
+    _copy(options.camera, folder / "camera.yaml")
+    extra = {
+        "registration": {
+            "residual_rms_px": registration.residual_rms_px,
+            "n_landmarks": len(registration.estimate.residuals),
+            "n_alternatives": len(registration.alternatives),
+        },
+        "flags": list(registration.flags),
+        "start_of_each_frame": "previous state; the first guess of image motion assumes constant velocity",
+        "temporal_prior": "none",
+        "inputs": {name: str(getattr(options, name)) for name in ("frames", "model", "camera", "landmarks")},
+        "settings": {"registration": asdict(options.registration), "tracker": asdict(options.tracker)},
+        "versions": _versions(),
+    }
+    summary = write_summary(folder / "summary.json", run, extra)
+    write_plots(folder / "plots", run)
+    if options.overlay:
+        write_video(folder / "augmented.mp4", source, camera, run)
+    return summary
+
+
+def _copy(source: Path, target: Path) -> None:
+    if source.resolve() != target.resolve():
+        shutil.copyfile(source, target)
+
+
+def _versions() -> dict[str, Any]:
+    return {
+        "morph-dslam": __version__,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "opencv": cv2.__version__,
+        "numba": numba.__version__,
+        "opencv_threads": cv2.getNumThreads(),
+    }
