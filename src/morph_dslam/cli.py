@@ -51,7 +51,30 @@ def _info(arguments: argparse.Namespace) -> None:
 
 
 def _track(arguments: argparse.Namespace) -> None:
-    raise NotImplementedError
+    from morph_dslam.online.track import TrackOptions, track
+
+    first, last = arguments.range
+    summary = track(
+        TrackOptions(
+            frames=arguments.frames,
+            model=arguments.model,
+            camera=arguments.camera,
+            landmarks=arguments.landmarks,
+            output=arguments.output,
+            first=first,
+            last=last,
+            reference_frame=arguments.reference_frame,
+            overlay=not arguments.no_video,
+            overwrite=arguments.overwrite,
+        )
+    )
+    for flag in summary["flags"]:
+        print(f"note: {flag}")
+    print(f"wrote {arguments.output}")
+    print(
+        f"tracked={summary['n_tracked']}/{summary['n_frames']} "
+        f"median_ms={summary['median_ms']:.2f} p95_ms={summary['p95_ms']:.2f}"
+    )
 
 
 def _evaluate(arguments: argparse.Namespace) -> None:
@@ -134,6 +157,13 @@ def _add_online_commands(commands: argparse._SubParsersAction) -> None:
     track.add_argument(
         "--range", type=frame_range, default=(None, None), metavar="FIRST-LAST", help="frames to track"
     )
+    track.add_argument(
+        "--reference-frame",
+        type=int,
+        metavar="N",
+        help="frame that the landmarks belong to (default: the first one tracked)",
+    )
+    track.add_argument("--overwrite", action="store_true", help="replace a run that is in the run folder")
     track.add_argument("--no-video", action="store_true", help="do not draw the augmented video")
     evaluate = _add(
         commands,
@@ -153,18 +183,25 @@ def _add_online_commands(commands: argparse._SubParsersAction) -> None:
     )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status: 0, 2 for a mistake the user can mend, 130 if interrupted."""
-    parsed = _parser().parse_args(arguments)
+def run_and_report_errors(
+    action: Callable[[argparse.Namespace], None], arguments: argparse.Namespace, kept: str
+) -> int:
+    """Run an action; returns the exit status: 0, 2 for a mistake the user can mend, 130 if interrupted."""
     try:
-        parsed.action(parsed)
+        action(arguments)
     except MorphError as error:
         print(f"morph: {error}", file=sys.stderr)
         return USER_ERROR
     except KeyboardInterrupt:
-        print(f"\nmorph: interrupted; {parsed.kept}", file=sys.stderr)
+        print(f"\nmorph: interrupted; {kept}", file=sys.stderr)
         return INTERRUPTED
     return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit status of `run_and_report_errors`."""
+    parsed = _parser().parse_args(arguments)
+    return run_and_report_errors(parsed.action, parsed, parsed.kept)
 
 
 if __name__ == "__main__":

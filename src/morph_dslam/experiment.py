@@ -1,0 +1,129 @@
+"""Experiments: what the examples have in common, from a study to the line that says how well it went."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from morph_dslam import __version__
+
+FrameRange = tuple[int | None, int | None]
+
+
+def keep(product: Path, ingredients: Sequence[Path], make: Callable[[], object]) -> bool:
+    """Make ``product`` unless it was already made from the same ingredients by the same release.
+
+    Parameters
+    ----------
+    product : a file or folder that ``make`` writes.
+    ingredients : files whose contents decide whether it must be made anew.
+
+    Returns
+    -------
+    Whether it was made.
+    """
+    digest = hashlib.sha256(__version__.encode())
+    for path in ingredients:
+        digest.update(path.read_bytes())
+    recipe, wanted = product.with_name(product.name + ".made-from"), digest.hexdigest()
+    if product.exists() and recipe.is_file() and recipe.read_text() == wanted:
+        print(f"using {product}")
+        return False
+    product.parent.mkdir(parents=True, exist_ok=True)
+    recipe.unlink(missing_ok=True)
+    make()
+    recipe.write_text(wanted)
+    return True
+
+
+def keep_model(study: Path, model: Path) -> None:
+    """Build a model once; it is built again when the study changes."""
+    from morph_dslam.offline.build import build
+
+    keep(model, [study], lambda: build(study, model))
+
+
+def keep_sequence(scene: Path, model: Path, folder: Path) -> None:
+    """Film a model once; it is filmed again when the scene or the model changes."""
+    from morph_dslam.render.simulation import simulate
+
+    keep(folder, [scene, model], lambda: simulate(scene, folder))
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A sequence with truth.
+
+    Attributes
+    ----------
+    frames : video file or folder of images. camera, landmarks, truth : files. range : frames to track.
+    reference_frame : the frame that the landmarks belong to; the first one tracked by default.
+    """
+
+    frames: Path
+    camera: Path
+    landmarks: Path
+    truth: Path
+    range: FrameRange = (None, None)
+    reference_frame: int | None = None
+
+
+def first_truth_frame(recording: Recording) -> int:
+    """The first frame of the range that has truth; there the truth points are bound.
+
+    Raises
+    ------
+    EvaluationError
+        If the range holds no frame with truth, or the truth file cannot be read.
+    """
+    from morph_dslam.errors import EvaluationError
+    from morph_dslam.evaluation.truth import load_truth
+
+    first, last = recording.range
+    frames = sorted(load_truth(recording.truth).frames.tolist())
+    inside = [f for f in frames if (first is None or f >= first) and (last is None or f <= last)]
+    if not inside:
+        raise EvaluationError(f"{recording.truth} has no frame in the range tracked; it has {frames}")
+    return inside[0]
+
+
+def track_and_evaluate(recording: Recording, model: Path, run: Path) -> dict[str, Any]:
+    """Track a recording and compare it with its truth.
+
+    Returns
+    -------
+    The figures of ``evaluation.json``.
+    """
+    from morph_dslam.evaluation.evaluate import evaluate
+    from morph_dslam.online.track import TrackOptions, track
+
+    bind_frame = first_truth_frame(recording)
+    first, last = recording.range
+    track(
+        TrackOptions(
+            frames=recording.frames,
+            model=model,
+            camera=recording.camera,
+            landmarks=recording.landmarks,
+            output=run,
+            first=first,
+            last=last,
+            reference_frame=recording.reference_frame,
+            overwrite=True,
+        )
+    )
+    return evaluate(run, recording.truth, bind_frame)
+
+
+def report(figures: dict[str, Any], run: Path) -> None:
+    """Print where the results are and, last, the result line."""
+    from morph_dslam.evaluation.statements import remarks, result_line
+
+    for remark in remarks(figures):
+        print(f"note: {remark}")
+    print(f"video   {run / 'augmented.mp4'}")
+    print(f"report  {run / 'report.html'}")
+    print(result_line(figures))
