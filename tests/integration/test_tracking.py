@@ -1,0 +1,126 @@
+"""The whole online chain on rendered sequences whose truth is known."""
+
+import cv2
+import numpy as np
+import pytest
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import RegistrationError
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.online.estimation import State
+from morph_dslam.online.pipeline import STAGES, Tracker
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.rendered_sequence import CAMERA, SheetFilm, mean_error, sheet_state
+
+
+@pytest.fixture(scope="module")
+def model():
+    return bent_sheet_model(43, 31)
+
+
+@pytest.fixture(scope="module")
+def film(model):
+    return SheetFilm(model)
+
+
+def start(model, film):
+    return Tracker(model, CAMERA, film.frame(sheet_state(0.0)), sheet_state(0.0))
+
+
+def test_moving_bending_sheet_is_followed_within_half_a_millimetre(model, film):
+    tracker = start(model, film)
+    errors, deviations = [], []
+    for time in np.linspace(0.0, 1.0, 31)[1:]:
+        truth = sheet_state(time)
+        result = tracker.process_frame(film.frame(truth, light=1.0 - 0.25 * time))
+        assert result.status == "tracked", result.reason
+        errors.append(mean_error(model, result.estimate.state, truth))
+        deviations.append(
+            np.abs(result.estimate.state.parameters - truth.parameters) / result.estimate.parameter_std
+        )
+        assert set(result.timings_ms) == set(STAGES)
+    assert np.mean(errors) < 0.5e-3
+    assert errors[-1] < 1e-3  # nothing has accumulated
+    # The stated deviations are of the right size (systematic errors of the matching come on top).
+    assert np.median(deviations) < 3.0
+
+
+def test_points_behind_an_occluder_are_rejected_and_come_back(model, film):
+    tracker = start(model, film)
+    counts = {}
+    for step, time in enumerate(np.linspace(0.0, 0.5, 16)[1:]):
+        truth = sheet_state(time)
+        hand = (60 + 25 * step, 140, 150, 240) if 3 <= step <= 9 else None
+        result = tracker.process_frame(film.frame(truth, occluder=hand))
+        assert result.status == "tracked", result.reason
+        assert mean_error(model, result.estimate.state, truth) < 1.5e-3
+        counts[step] = result.n_inliers
+    assert min(counts[step] for step in range(3, 10)) < 0.85 * counts[2]
+    assert counts[14] > 0.9 * counts[2]
+
+
+def test_lost_object_says_why_and_is_recovered_elsewhere(model, film):
+    tracker = start(model, film)
+    assert tracker.process_frame(film.frame(sheet_state(0.03))).status == "tracked"
+    for _ in range(2):
+        result = tracker.process_frame(film.blank())
+        assert result.status == "lost"
+        assert result.estimate is None
+        assert "points agree, at least 30 needed" in result.reason
+    away = sheet_state(0.2)
+    moved = RigidTransform(
+        rotation_exp(np.array([0.0, 0.0, 0.4])) @ away.camera_from_object.rotation,
+        away.camera_from_object.translation + np.array([-0.05, 0.04, 0.1]),
+    )
+    truth = State(away.parameters, moved)
+    result = tracker.process_frame(film.frame(truth))
+    assert result.status == "tracked", result.reason
+    assert result.recovered
+    assert mean_error(model, result.estimate.state, truth) < 1.5e-3
+    following = State(
+        away.parameters, RigidTransform(moved.rotation, moved.translation + np.array([0.004, 0.0, 0.0]))
+    )
+    result = tracker.process_frame(film.frame(following))
+    assert (result.status, result.recovered) == ("tracked", False)
+
+
+def test_lens_distortion_is_undone(model):
+    """Frames warped by a lens give the same states as ideal ones."""
+    lens = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0, (-0.15, 0.05, 0.001, -0.001))
+    columns, rows = np.meshgrid(np.arange(640.0), np.arange(480.0))
+    ideal = lens.undistort_pixels(np.column_stack([columns.ravel(), rows.ravel()]))
+    maps = ideal.reshape(480, 640, 2).astype(np.float32)
+    film = SheetFilm(model)
+
+    def recorded(state):
+        return cv2.remap(film.frame(state, noise=0.0), maps[..., 0], maps[..., 1], cv2.INTER_CUBIC)
+
+    tracker = Tracker(model, lens, recorded(sheet_state(0.0)), sheet_state(0.0))
+    for time in (0.03, 0.06, 0.09):
+        result = tracker.process_frame(recorded(sheet_state(time)))
+        assert result.status == "tracked"
+    assert mean_error(model, result.estimate.state, sheet_state(0.09)) < 0.6e-3
+
+
+def test_sequence_that_does_not_begin_at_the_reference_is_entered(model, film):
+    reference = film.frame(sheet_state(0.0))
+    tracker = Tracker(model, CAMERA, reference, sheet_state(0.0), in_sequence=False)
+    truth = sheet_state(0.5)
+    result = tracker.process_frame(film.frame(truth))
+    assert result.status == "tracked", result.reason
+    assert mean_error(model, result.estimate.state, truth) < 1.5e-3
+
+
+def test_object_without_texture_is_refused_with_advice(model, film):
+    with pytest.raises(RegistrationError, match="printed texture"):
+        Tracker(model, CAMERA, film.blank(noise=0.0), sheet_state(0.0))
+
+
+def test_same_frames_give_the_same_states(model):
+    runs = []
+    for _ in range(2):
+        film = SheetFilm(model, seed=3)
+        tracker = start(model, film)
+        states = [tracker.process_frame(film.frame(sheet_state(t))).estimate.state for t in (0.03, 0.06)]
+        runs.append(np.array([state.parameters for state in states]))
+    np.testing.assert_array_equal(*runs)
