@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -13,13 +14,12 @@ from morph_dslam.evaluation.material_error import MaterialError
 from morph_dslam.model import ReducedModel
 
 DPI = 110
+MEDIAN, MEAN = "#b4530a", "#1b1f24"
+#: More frames than this are drawn as bands.
+MOST_BOXES = 30
 
 
-def plot_errors_by_frame(path: Path, error: MaterialError) -> None:
-    """A box for each truth frame (quartiles, whiskers to the 5th and 95th percentile) over its points."""
-    distances = [1e3 * row[np.isfinite(row)] for row in error.distances]
-    figure = Figure(figsize=(9.0, 4.2), layout="constrained")
-    axes = figure.add_subplot()
+def _draw_boxes(axes: Axes, frames: NDArray[np.int64], distances: list[NDArray]) -> None:
     rng = np.random.default_rng(0)
     for position, values in enumerate(distances, start=1):
         shift = rng.uniform(-0.25, 0.25, len(values))
@@ -30,16 +30,31 @@ def plot_errors_by_frame(path: Path, error: MaterialError) -> None:
         showfliers=False,
         showmeans=True,
         widths=0.6,
-        medianprops={"color": "#b4530a", "linewidth": 1.6},
-        meanprops={
-            "marker": "D",
-            "markerfacecolor": "#1b1f24",
-            "markeredgecolor": "#1b1f24",
-            "markersize": 4,
-        },
+        medianprops={"color": MEDIAN, "linewidth": 1.6},
+        meanprops={"marker": "D", "markerfacecolor": MEAN, "markeredgecolor": MEAN, "markersize": 4},
     )
-    axes.axhline(1e3 * error.mean, color="#1b1f24", linewidth=0.8, linestyle="--")
-    axes.set_xticks(range(1, len(distances) + 1), [str(frame) for frame in error.frames])
+    axes.set_xticks(range(1, len(distances) + 1), [str(frame) for frame in frames])
+
+
+def _draw_bands(axes: Axes, frames: NDArray[np.int64], distances: list[NDArray]) -> None:
+    low, lower, median, upper, high = np.array([np.percentile(v, (5, 25, 50, 75, 95)) for v in distances]).T
+    axes.fill_between(frames, low, high, color="#d4e2f1", linewidth=0.0, label="5th to 95th percentile")
+    axes.fill_between(frames, lower, upper, color="#8fb3d9", linewidth=0.0, label="quartiles")
+    axes.plot(frames, median, color=MEDIAN, linewidth=1.4, label="median")
+    axes.plot(frames, [values.mean() for values in distances], color=MEAN, linewidth=1.4, label="mean")
+    axes.margins(x=0.01)
+    axes.legend(fontsize=8, frameon=False, loc="upper left")
+
+
+def plot_errors_by_frame(path: Path, error: MaterialError) -> None:
+    """The spread of the error over the points of each truth frame; boxes for few frames, bands for many."""
+    measured = np.isfinite(error.distances).any(axis=1)
+    distances = [1e3 * row[np.isfinite(row)] for row in error.distances[measured]]
+    figure = Figure(figsize=(9.0, 4.2), layout="constrained")
+    axes = figure.add_subplot()
+    draw = _draw_boxes if len(distances) <= MOST_BOXES else _draw_bands
+    draw(axes, error.frames[measured], distances)
+    axes.axhline(1e3 * error.mean, color=MEAN, linewidth=0.8, linestyle="--")
     axes.set_xlabel("frame")
     axes.set_ylabel("material error [mm]")
     axes.set_ylim(bottom=0.0)

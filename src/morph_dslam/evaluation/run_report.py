@@ -19,7 +19,7 @@ VIDEO = "augmented.mp4"
 N_FRAMES_SHOWN = 4
 
 _CAPTIONS = {
-    "evaluation.png": "Material error in each frame with truth: points, quartiles, mean (diamond).",
+    "evaluation.png": "Material error over the points of each frame with truth.",
     "error_map.png": "Mean material error where each point lies on the undeformed object.",
 }
 
