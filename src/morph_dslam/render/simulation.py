@@ -170,10 +170,11 @@ def _write_image(path: Path, image: NDArray[np.uint8]) -> None:
         raise SceneError(f"cannot write {path}: is the disk full?")
 
 
-def _render_frames(world: _World, output: Path, truth: Array, progress: bool) -> NDArray[np.bool_]:
+def _render_frames(
+    world: _World, renderer: SceneRenderer, output: Path, truth: Array, progress: bool
+) -> NDArray[np.bool_]:
     """Write all images and depths; says which truth points (T, p) are visible."""
     scene, camera, centres = world.scene, world.camera, world.motion.occluder_centres
-    renderer = SceneRenderer(scene, world.model, camera, world.folder, world.nearest_depth())
     rows, columns = np.indices((camera.height, camera.width))
     grid = np.stack([columns, rows], axis=-1)
     visible = np.zeros(truth.shape[:2], dtype=bool)
@@ -206,10 +207,11 @@ def simulate(scene_path: Path, output: Path, progress: bool = True) -> None:
         If the camera or the model that it names cannot be read.
     """
     world = _load_world(Path(scene_path))
+    renderer = SceneRenderer(world.scene, world.model, world.camera, world.folder, world.nearest_depth())
     output = Path(output)
     _prepare_folder(output)
     save_camera(output / "camera.yaml", world.camera)
     _write_landmarks(output / "landmarks.csv", world)
     truth = _truth_positions(world, regular_points(world.model, N_TRUTH_POINTS))
-    visible = _render_frames(world, output, truth, progress)
+    visible = _render_frames(world, renderer, output, truth, progress)
     _write_truth(output / "truth.npz", world, truth, visible)

@@ -1,0 +1,202 @@
+"""Simulated sequences: pictures and truth against closed forms and against OpenCV's projection."""
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from morph_dslam.io.calibration import load_camera
+from morph_dslam.model import load_model
+from morph_dslam.render.simulation import simulate
+from morph_dslam.sources import open_source
+from tests.support.bent_sheet import LENGTH, WIDTH
+from tests.support.scenes import MOTION, write_scene
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("moving")
+    tail = "[sensor]\nnoise = 2.0\nblur_px = 0.5\n[occluder]\nradius_px = 25\n"
+    tail += "[[occluder.path]]\nframe = 1\ncentre_px = [-40, 120]\n[[occluder.path]]\nframe = 4\n"
+    tail += "centre_px = [160, 120]\n"
+    simulate(write_scene(folder, top="seed = 5\n", tail=MOTION + tail), folder / "sequence", progress=False)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def truth(moving):
+    return np.load(moving / "sequence" / "truth.npz")
+
+
+def read_depth(folder):
+    with h5py.File(folder / "sequence" / "depth.h5") as file:
+        return file["depth_m"][()]
+
+
+def test_the_folder_holds_what_a_tracker_needs(moving, truth):
+    frames = list(open_source(moving / "sequence" / "frames"))
+    assert [frame.index for frame in frames] == [0, 1, 2, 3, 4]
+    assert frames[0].image.shape == (240, 320, 3)
+    assert load_camera(moving / "sequence" / "camera.yaml").fy == 262.0
+    n_points = truth["points_mm"].shape[1]
+    assert 250 <= n_points <= 350
+    assert truth["points_mm"].shape == (5, n_points, 3)
+    assert truth["pixels"].shape == (5, n_points, 2)
+    assert truth["visible"].shape == (5, n_points)
+    assert truth["frame"].tolist() == [0, 1, 2, 3, 4]
+
+
+def test_truth_points_follow_the_sheet_equation(truth):
+    x, y = np.meshgrid(
+        ((np.arange(21) + 0.5) / 21 - 0.5) * LENGTH, ((np.arange(15) + 0.5) / 15 - 0.5) * WIDTH
+    )
+    s, y = 2 * x.ravel() / LENGTH, y.ravel()
+    for frame in range(5):
+        pose = truth["camera_from_object"][frame]
+        arch, skew, twist = truth["parameters"][frame]
+        in_object = (truth["points_mm"][frame] * 1e-3 - pose[:3, 3]) @ pose[:3, :3]
+        height = arch * (1 - s**2) * (1 + skew * s) + twist * s * y
+        # Linear triangles of 15 mm sides lie up to (15 mm)²/8 times the curvature off the smooth surface.
+        np.testing.assert_allclose(in_object[:, 2], height, atol=1.5e-4)
+
+
+def test_truth_pixels_equal_opencv_projection(moving, truth):
+    camera = load_camera(moving / "sequence" / "camera.yaml")
+    for points, pixels in zip(truth["points_mm"], truth["pixels"], strict=True):
+        expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix, np.zeros(5))
+        np.testing.assert_allclose(pixels, expected[:, 0], atol=1e-9)
+
+
+def test_key_frames_are_met_with_no_velocity_at_the_ends(truth):
+    np.testing.assert_allclose(truth["parameters"][0], [0.005, 0.3, np.radians(12)], atol=1e-12)
+    np.testing.assert_allclose(truth["parameters"][4], [0.045, 0.3, np.radians(12)], atol=1e-12)
+    # The clamped cubic between two keys is 3 t² - 2 t³.
+    np.testing.assert_allclose(truth["parameters"][1, 0], 0.005 + 0.040 * (3 / 16 - 2 / 64), atol=1e-12)
+    np.testing.assert_allclose(truth["camera_from_object"][0][:3, :3], np.diag([1.0, -1.0, -1.0]), atol=1e-12)
+
+
+def test_depth_images_hold_the_visible_truth_points(moving, truth):
+    depth = read_depth(moving)
+    for frame in range(5):
+        seen = truth["visible"][frame]
+        columns, rows = np.rint(truth["pixels"][frame][seen]).astype(int).T
+        gap = depth[frame, rows, columns] - truth["points_mm"][frame][seen][:, 2] * 1e-3
+        # Half a pixel sideways on a slope changes the depth by a millimetre or so.
+        assert np.abs(gap).max() < 2.5e-3
+
+
+def test_occluder_hides_what_it_covers(moving, truth):
+    distance = np.linalg.norm(truth["pixels"][4] - [160, 120], axis=1)
+    np.testing.assert_array_equal(truth["visible"][4], distance > 25)
+    assert truth["visible"][0].all()
+    assert read_depth(moving)[4, 120, 160] == 0.0
+    image = list(open_source(moving / "sequence" / "frames"))[4].image
+    np.testing.assert_allclose(image[110:131, 150:171].mean(axis=(0, 1)), [122, 150, 196], atol=1.0)
+
+
+def test_landmarks_are_mesh_nodes_with_their_pixels(moving, truth):
+    rows = np.loadtxt(moving / "sequence" / "landmarks.csv", delimiter=",", skiprows=1)
+    assert len(rows) >= 8
+    corners = {(x, y) for x in (-210.0, 210.0) for y in (-148.5, 148.5)}
+    assert corners <= {tuple(row[:2]) for row in rows}
+    model = load_model(moving / "sheet.morph")
+    camera = load_camera(moving / "sequence" / "camera.yaml")
+    displaced = model.positions(truth["parameters"][0])
+    for x, y, z, u, v in rows:
+        node = np.linalg.norm(model.nodes * 1e3 - [x, y, z], axis=1).argmin()
+        pose = truth["camera_from_object"][0]
+        point = pose[:3, :3] @ displaced[node] + pose[:3, 3]
+        expected = (camera.matrix @ point)[:2] / point[2]
+        np.testing.assert_allclose([u, v], expected, atol=1e-5)
+
+
+def flat_scene(folder, extra="", rotation="[180, 0, 0]"):
+    """A flat sheet face on at 0.6 m whose print is a smooth function of the place on it."""
+    x, y = np.meshgrid((np.arange(840) + 0.5) / 840 - 0.5, 0.5 - (np.arange(594) + 0.5) / 594)
+    cv2.imwrite(str(folder / "smooth.png"), np.rint(print_value(x, y)).astype(np.uint8))
+    tail = (
+        f"[[pose]]\nframe = 0\nposition_mm = [0, 0, 600]\nrotation_deg = {rotation}\n[light]\nambient = 1.0\n"
+    )
+    return write_scene(folder, top="frames = 1\n", tail=tail + extra, texture="smooth.png")
+
+
+def print_value(x, y):
+    """Grey level at fractions x, y in [-0.5, 0.5] of the sheet, x to the right and y up."""
+    return 120.0 + 60.0 * np.sin(14.0 * x) + 50.0 * np.cos(9.0 * y + 0.7)
+
+
+def expected_flat_image(folder):
+    """The picture of `flat_scene`, by the pinhole formula, and the pixels well inside the sheet."""
+    camera = load_camera(folder / "sequence" / "camera.yaml")
+    rows, columns = np.indices((240, 320))
+    x = (columns - camera.cx) / camera.fx * 0.6 / LENGTH
+    y = -(rows - camera.cy) / camera.fy * 0.6 / WIDTH
+    return print_value(x, y), (np.abs(x) < 0.48) & (np.abs(y) < 0.48)
+
+
+def test_flat_sheet_face_on_shows_its_print(tmp_path):
+    simulate(flat_scene(tmp_path), tmp_path / "sequence", progress=False)
+    expected, inside = expected_flat_image(tmp_path)
+    (frame,) = open_source(tmp_path / "sequence" / "frames")
+    difference = frame.image.astype(float) - expected[:, :, None]
+    assert np.abs(difference[inside]).max() < 2.0
+    assert abs(difference[inside].mean()) < 0.4
+    np.testing.assert_allclose(read_depth(tmp_path)[0][inside], 0.6, rtol=1e-6)
+
+
+def test_noise_has_the_deviation_asked_for(tmp_path):
+    simulate(flat_scene(tmp_path, "[sensor]\nnoise = 4.0\n"), tmp_path / "sequence", progress=False)
+    expected, inside = expected_flat_image(tmp_path)
+    (frame,) = open_source(tmp_path / "sequence" / "frames")
+    difference = (frame.image.astype(float) - expected[:, :, None])[inside]
+    assert difference.std() == pytest.approx(4.0, rel=0.03)
+
+
+def test_back_of_the_sheet_has_its_colour(tmp_path):
+    simulate(flat_scene(tmp_path, rotation="[0, 0, 0]"), tmp_path / "sequence", progress=False)
+    _, inside = expected_flat_image(tmp_path)
+    (frame,) = open_source(tmp_path / "sequence" / "frames")
+    assert (frame.image[inside] == [218, 224, 226]).all()
+
+
+def test_lambert_light_from_the_side(tmp_path):
+    light = "direction = [-0.6, 0.0, -0.8]\nambient = 0.25\n"
+    scene = flat_scene(tmp_path, rotation="[0, 0, 0]")
+    scene.write_text(scene.read_text().replace("ambient = 1.0\n", light))
+    simulate(scene, tmp_path / "sequence", progress=False)
+    _, inside = expected_flat_image(tmp_path)
+    (frame,) = open_source(tmp_path / "sequence" / "frames")
+    # 0.25 + 0.75 cos, with the light 0.8 along the normal.
+    np.testing.assert_allclose(frame.image[inside].mean(axis=0), 0.85 * np.array([218, 224, 226]), atol=0.6)
+
+
+def test_outline_is_antialiased_at_the_right_place(tmp_path):
+    scene = flat_scene(tmp_path, "[background]\ncolour = [0, 0, 0]\n")
+    simulate(scene, tmp_path / "sequence", progress=False)
+    (frame,) = open_source(tmp_path / "sequence" / "frames")
+    # The left edge falls on 158 px - 260 px * 210 mm / 600 mm = 67, the middle of a pixel.
+    row = frame.image[121, :, 0].astype(float)
+    assert row[66] == 0.0
+    assert row[67] == pytest.approx(row[68] / 2, rel=0.05)
+    assert row[68] == pytest.approx(row[69], rel=0.1)
+
+
+def test_same_seed_same_pictures_other_seed_other_noise(tmp_path):
+    images = {}
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        scene = write_scene(
+            tmp_path,
+            top=f"frames = 1\nseed = {seed}\n",
+            tail="[sensor]\nnoise = 3.0\n[[pose]]\nframe = 0\nposition_mm = [0, 0, 600]\n",
+        )
+        simulate(scene, tmp_path / name, progress=False)
+        images[name] = next(iter(open_source(tmp_path / name / "frames"))).image
+    np.testing.assert_array_equal(images["a"], images["b"])
+    assert (images["a"] != images["c"]).mean() > 0.5
+
+
+def test_frames_of_a_longer_earlier_run_do_not_stay(tmp_path):
+    pose = "[[pose]]\nframe = 0\nposition_mm = [0, 0, 600]\n"
+    for frames in (3, 2):
+        simulate(write_scene(tmp_path, f"frames = {frames}\n", pose), tmp_path / "sequence", progress=False)
+    assert len(open_source(tmp_path / "sequence" / "frames")) == 2

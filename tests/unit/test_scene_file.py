@@ -1,0 +1,163 @@
+"""What is said of wrong scene files, and photographs by name."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from morph_dslam.errors import CameraError, ModelFileError, SceneError
+from morph_dslam.model import save_model
+from morph_dslam.render.key_frames import interpolate_key_frames
+from morph_dslam.render.photographs import load_photograph
+from morph_dslam.render.scene_file import load_scene_file
+from morph_dslam.render.simulation import simulate
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.scenes import CAMERA, write_scene
+
+POSE = "[[pose]]\nframe = 0\nposition_mm = [0, 0, 620]\n"
+
+
+def message_of(folder, error=SceneError, **changes):
+    with pytest.raises(error) as caught:
+        simulate(write_scene(folder, **changes), folder / "sequence", progress=False)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("top", "tail", "key", "known"),
+    [
+        ("framez = 5\n", POSE, "framez", "supersampling"),
+        ("", POSE + "[light]\ndirecton = [0, 0, 1]\n", "light.directon", "direction"),
+        ("", POSE + "rotation = [0, 0, 1]\n", "pose.0.rotation", "rotation_deg"),
+        (
+            "",
+            POSE + "[occluder]\nradius_px = 3\n[[occluder.path]]\nframe = 0\ncentre_px = [0, 0]\nsize = 1\n",
+            "occluder.path.0.size",
+            "centre_px",
+        ),
+    ],
+)
+def test_unknown_key_is_named_with_those_known(tmp_path, top, tail, key, known):
+    path = write_scene(tmp_path, top=top, tail=tail)
+    with pytest.raises(SceneError) as caught:
+        load_scene_file(path)
+    said, listed = str(caught.value).split("; known here: ")
+    assert said == f"{path}: unknown key '{key}'"
+    assert known in listed.split(", ")
+
+
+def test_missing_key(tmp_path):
+    assert "the key 'pose' is missing" in message_of(tmp_path, tail="")
+
+
+@pytest.mark.parametrize(
+    ("tail", "expected"),
+    [
+        (POSE + "[light]\nambient = 1.5\n", "light.ambient"),
+        (POSE + "[light]\ndirection = [0, 0, 0]\n", "direction must not be zero"),
+        (POSE + "[background]\ncolour = [0, 0, 300]\n", "background.colour.2"),
+        (POSE + '[[parameters]]\nframe = 0\narch = "high"\n', "parameters.0.arch"),
+        (POSE + POSE, "pose must have increasing frame numbers, not [0, 0]"),
+    ],
+)
+def test_impossible_value_is_named(tmp_path, tail, expected):
+    assert expected in message_of(tmp_path, tail=tail)
+
+
+def test_missing_file_and_file_that_is_not_toml(tmp_path):
+    with pytest.raises(SceneError, match="cannot read the scene file"):
+        load_scene_file(tmp_path / "none.toml")
+    (tmp_path / "bad.toml").write_text("frames = = 3")
+    with pytest.raises(SceneError, match="is not a TOML file"):
+        load_scene_file(tmp_path / "bad.toml")
+
+
+def test_unknown_parameter_is_named_with_those_of_the_model(tmp_path):
+    message = message_of(tmp_path, tail=POSE + "[[parameters]]\nframe = 2\nbulge = 1.0\n")
+    assert message == "unknown parameter 'bulge' in key frame 2; the model has arch, skew, twist"
+
+
+def test_key_frame_out_of_range(tmp_path):
+    message = message_of(tmp_path, tail=POSE + "[[parameters]]\nframe = 2\ntwist = 25.0\n")
+    assert "parameter 'twist' is 25 deg in frame 2, outside the model's range -20 to 20" in message
+
+
+def test_key_frame_at_the_bound_is_in_range(tmp_path):
+    path = write_scene(tmp_path, "frames = 1\n", POSE + "[[parameters]]\nframe = 0\ntwist = 20.0\n")
+    simulate(path, tmp_path / "sequence", progress=False)
+    assert np.load(tmp_path / "sequence" / "truth.npz")["parameters"][0, 2] == np.radians(20)
+
+
+def test_curve_that_swings_out_of_range_between_key_frames(tmp_path):
+    keys = "".join(
+        f"[[parameters]]\nframe = {f}\narch = {a}\n" for f, a in ((0, 0), (10, 59), (12, 59), (22, 0))
+    )
+    message = message_of(tmp_path, top="frames = 23\n", tail=POSE + keys)
+    assert "parameter 'arch'" in message
+    assert "in frame 11" in message
+    assert "swings beyond its key frames" in message
+
+
+def test_sheet_behind_the_camera(tmp_path):
+    assert "frame 0 the sheet reaches behind the camera" in message_of(
+        tmp_path, tail=POSE.replace("620", "-620")
+    )
+
+
+def test_sheet_out_of_view(tmp_path):
+    tail = POSE.replace("[0, 0, 620]", "[2000, 0, 620]")
+    assert "frame 0 shows 0 landmarks" in message_of(tmp_path, tail=tail)
+
+
+def test_files_that_it_names(tmp_path):
+    assert "there is no image" in message_of(tmp_path, texture="none.png")
+    assert "none.yaml" in message_of(tmp_path, CameraError, camera='camera = "none.yaml"\n')
+    broken = CAMERA.replace("fx = 260.0, ", "")
+    assert "camera: fx" in message_of(tmp_path, CameraError, camera=broken)
+    lens = CAMERA.replace("121.0", "121.0, distortion = [0.1, 0, 0, 0]")
+    assert "without lens distortion" in message_of(tmp_path, camera=lens)
+    path = write_scene(tmp_path)
+    (tmp_path / "sheet.morph").write_bytes(b"no model")
+    with pytest.raises(ModelFileError):
+        simulate(path, tmp_path / "sequence", progress=False)
+
+
+def test_model_that_is_no_sheet(tmp_path):
+    model = bent_sheet_model(9, 7)
+    model.nodes[:, 2] = 0.1 * model.nodes[:, 0]
+    save_model(tmp_path / "sheet.morph", model)
+    assert "is not a sheet in its xy plane" in message_of(tmp_path)
+
+
+def test_damaged_texture_leaves_earlier_frames_alone(tmp_path):
+    path = write_scene(tmp_path, "frames = 1\n", POSE)
+    simulate(path, tmp_path / "sequence", progress=False)
+    (tmp_path / "print.png").write_bytes(b"")
+    with pytest.raises(SceneError, match=r"photograph 'print\.png'"):
+        simulate(path, tmp_path / "sequence", progress=False)
+    assert (tmp_path / "sequence" / "frames" / "000000.png").is_file()
+
+
+def test_packaged_photograph(tmp_path):
+    pytest.importorskip("skimage")
+    assert load_photograph("coffee", tmp_path).shape == (400, 600, 3)
+    with pytest.raises(SceneError, match=r"no photograph 'tea': use one of .*coffee"):
+        load_photograph("tea", tmp_path)
+
+
+def test_packaged_photograph_without_the_package(tmp_path, monkeypatch):
+    monkeypatch.delitem(sys.modules, "skimage", raising=False)
+    monkeypatch.setattr("morph_dslam.render.photographs.find_spec", lambda name: None)
+    with pytest.raises(SceneError, match=r'pip install "morph-dslam\[demo\]"'):
+        load_photograph("coffee", tmp_path)
+
+
+def test_key_frame_curve_is_smooth_to_the_second_derivative():
+    keys, values = [0, 7, 11, 30], np.array([0.0, 2.0, -1.0, 3.0])
+    step = 1e-3
+    fine = interpolate_key_frames(keys, values, np.arange(0.0, 30.0, step))
+    second = np.diff(fine, 2) / step**2
+    # A jump in the second derivative would be far larger than its change over one step.
+    assert np.abs(np.diff(second)).max() < 0.01 * np.ptp(second)
+    np.testing.assert_allclose(interpolate_key_frames(keys, values, np.array(keys)), values, atol=1e-12)
+    np.testing.assert_allclose(interpolate_key_frames(keys, values, np.array([-3, 40])), [0.0, 3.0])
