@@ -14,8 +14,15 @@ Array = NDArray[np.float64]
 
 
 @njit(cache=True, nogil=True)
-def _blend(image, triangle_ids, weights, triangles, levels, brightness, table, alpha):
-    """Blend the surface into ``image``; ``levels`` (n,) are the node values scaled to 0..255."""
+def blend_surface(image, triangle_ids, weights, triangles, levels, brightness, table, alpha):
+    """Blend the surface into ``image``.
+
+    Parameters
+    ----------
+    image : (h, w, 3) uint8. triangle_ids, weights : from `rasterise`, of ``triangles`` (m, 3).
+    levels : (n,) node values scaled to 0-255. brightness : (n,) factor on the colour.
+    table : (256, 3) colours. alpha : opacity.
+    """
     height, width = triangle_ids.shape
     for row in range(height):
         for column in range(width):
@@ -32,6 +39,18 @@ def _blend(image, triangle_ids, weights, triangles, levels, brightness, table, a
                 colour = min(light * table[entry, channel], 255.0)
                 mixed = (1.0 - alpha) * image[row, column, channel] + alpha * colour
                 image[row, column, channel] = np.uint8(mixed + 0.5)
+
+
+def blend_surface_numpy(image, triangle_ids, weights, triangles, levels, brightness, table, alpha):
+    """The plain twin of `blend_surface`."""
+    covered = triangle_ids >= 0
+    corners = triangles[triangle_ids[covered]]
+    level, light = (
+        np.einsum("kc,kc->k", weights[covered], field[corners])[:, None] for field in (levels, brightness)
+    )
+    entry = (np.clip(level[:, 0], 0.0, 255.0) + 0.5).astype(int)
+    colour = np.minimum(light * table[entry], 255.0)
+    image[covered] = ((1.0 - alpha) * image[covered] + alpha * colour + 0.5).astype(np.uint8)
 
 
 def _draw_outline(image: NDArray[np.uint8], covered: NDArray[np.bool_]) -> None:
@@ -84,7 +103,7 @@ def draw_overlay(
     low, high = value_range
     high = high if high > low else low + 1e-9 + abs(low) * 1e-6
     buffers = rasterise(pixels, depths, triangles, height, width)
-    _blend(
+    blend_surface(
         result,
         buffers.triangle_ids,
         buffers.weights,

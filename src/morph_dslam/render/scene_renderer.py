@@ -7,7 +7,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
@@ -17,7 +16,7 @@ from morph_dslam.render.rasteriser import Buffers, rasterise
 from morph_dslam.render.scene_file import Background, Colour, Scene, Sensor, Surface
 from morph_dslam.render.shading import lambert, vertex_normals
 from morph_dslam.render.sheet_points import sheet_bounds, texture_coordinates
-from morph_dslam.render.texture import render_textured
+from morph_dslam.render.texture import interpolate, render_textured
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -77,23 +76,6 @@ def prepare_background(background: Background, folder: Path, camera: PinholeCame
 def blur(image: NDArray, sigma: float) -> Image:
     """Gaussian blur with this standard deviation in pixels."""
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), dtype=np.uint8) if sigma > 0.0 else image
-
-
-@njit(cache=True, nogil=True)
-def _compose(image, printed, shows_print, back, triangle_ids, weights, triangles, brightness):
-    """Paint the lit surface over ``image`` (h, w, 3)."""
-    height, width = triangle_ids.shape
-    for row in range(height):
-        for column in range(width):
-            t = triangle_ids[row, column]
-            if t < 0:
-                continue
-            light = 0.0
-            for corner in range(3):
-                light += weights[row, column, corner] * brightness[triangles[t, corner]]
-            for channel in range(3):
-                colour = float(printed[row, column, channel]) if shows_print[t] else back[channel]
-                image[row, column, channel] = np.uint8(min(light * colour, 255.0) + 0.5)
 
 
 def draw_disc(image: Image, centre: Array, radius: float, colour: Colour) -> None:
@@ -160,18 +142,15 @@ class SceneRenderer:
         return self._sides * np.einsum("mx,mx->m", normals, corners[:, 0]) < 0.0
 
     def _paint_surface(self, image: Image, buffers: Buffers, points: Array) -> None:
-        light = self._scene.light
+        light, back = self._scene.light, self._scene.surface.back_colour[::-1]
         normals = vertex_normals(points, self._triangles)
-        _compose(
-            image,
-            render_textured(buffers, self._triangles, self._coordinates, self._texture),
-            self._shows_print(points),
-            np.array(self._scene.surface.back_colour[::-1], dtype=np.float64),
-            buffers.triangle_ids,
-            buffers.weights,
-            self._triangles,
-            lambert(normals, np.array(light.direction), light.ambient),
-        )
+        brightness = lambert(normals, np.array(light.direction), light.ambient)
+        covered = buffers.covered
+        printed = render_textured(buffers, self._triangles, self._coordinates, self._texture)[covered]
+        shows_print = self._shows_print(points)[buffers.triangle_ids[covered]]
+        colour = np.where(shows_print[:, None], printed, np.array(back, dtype=np.float32))
+        lit = colour * interpolate(buffers, self._triangles, brightness.astype(np.float32))[:, None]
+        image[covered] = (lit + np.float32(0.5)).astype(np.uint8)
 
     def render(self, points: Array, frame: int, occluder_centre: Array | None) -> Image:
         """The picture (h, w, 3) uint8, blue, green, red.

@@ -3,23 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-
-
-@njit(cache=True, nogil=True)
-def _sum_face_normals(points, triangles, normals):
-    for t in range(triangles.shape[0]):
-        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-        x1, y1, z1 = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
-        x2, y2, z2 = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
-        x, y, z = y1 * z2 - z1 * y2, z1 * x2 - x1 * z2, x1 * y2 - y1 * x2
-        for node in (a, b, c):
-            normals[node, 0] += x
-            normals[node, 1] += y
-            normals[node, 2] += z
 
 
 def vertex_normals(points: Array, triangles: NDArray) -> Array:
@@ -29,11 +15,11 @@ def vertex_normals(points: Array, triangles: NDArray) -> Array:
     ----------
     points : (n, 3) node positions. triangles : (m, 3), whose order of nodes gives the normal its side.
     """
-    normals = np.zeros((len(points), 3))
-    _sum_face_normals(
-        np.ascontiguousarray(points, dtype=np.float64),
-        np.ascontiguousarray(triangles, dtype=np.int64),
-        normals,
+    a, b, c = (points[triangles[:, corner]] for corner in range(3))
+    face_normals = np.cross(b - a, c - a)
+    nodes = triangles.T.ravel()
+    normals = np.column_stack(
+        [np.bincount(nodes, np.tile(component, 3), len(points)) for component in face_normals.T]
     )
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return normals / np.where(length > 0.0, length, 1.0)

@@ -68,7 +68,7 @@ def render_textured(
     return image if texture.ndim == 3 else image[:, :, 0]
 
 
-def interpolate(buffers: Buffers, triangles: NDArray, node_values: Array) -> Array:
+def interpolate(buffers: Buffers, triangles: NDArray, node_values: NDArray) -> NDArray:
     """Node values (n, ...) at the covered pixels (k, ...), in the order of ``buffers.covered``."""
     covered = buffers.covered
     corners = triangles[buffers.triangle_ids[covered]]
