@@ -27,7 +27,7 @@ def start(model, film):
     return Tracker(model, CAMERA, film.frame(sheet_state(0.0)), sheet_state(0.0))
 
 
-def test_moving_bending_sheet_is_followed_within_half_a_millimetre(model, film):
+def test_moving_bending_sheet_is_followed_within_a_fraction_of_a_millimetre(model, film):
     tracker = start(model, film)
     errors, deviations = [], []
     for time in np.linspace(0.0, 1.0, 31)[1:]:
@@ -39,10 +39,10 @@ def test_moving_bending_sheet_is_followed_within_half_a_millimetre(model, film):
             np.abs(result.estimate.state.parameters - truth.parameters) / result.estimate.parameter_std
         )
         assert set(result.timings_ms) == set(STAGES)
-    assert np.mean(errors) < 0.5e-3
-    assert errors[-1] < 1e-3  # nothing has accumulated
+    assert np.mean(errors) < 0.15e-3
+    assert errors[-1] < 0.3e-3  # nothing has accumulated
     # The stated deviations are of the right size (systematic errors of the matching come on top).
-    assert np.median(deviations) < 3.0
+    assert np.median(deviations) < 4.0
 
 
 def test_points_behind_an_occluder_are_rejected_and_come_back(model, film):

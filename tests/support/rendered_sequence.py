@@ -53,7 +53,7 @@ class SheetFilm:
         self.background = cv2.resize(clutter, (camera.width, camera.height), interpolation=cv2.INTER_CUBIC)
 
     def frame(self, state, noise=2.0, light=1.0, occluder=None):
-        """One image (h, w, 3) uint8; ``light`` scales the sheet only, ``occluder`` is (x, y, width, height)."""
+        """One image (h, w, 3) uint8; ``light`` scales the sheet only, ``occluder`` is (x, y, w, h)."""
         nodes = state.camera_from_object.apply(self.model.positions(state.parameters))
         camera = self.camera
         buffers = rasterise(

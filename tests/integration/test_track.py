@@ -1,0 +1,187 @@
+"""`track` from files to the run folder, whole, interrupted and refused."""
+
+import csv
+import json
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import CameraError, RegistrationError, SourceError, TrackingError
+from morph_dslam.evaluation.run_folder import load_run
+from morph_dslam.io.calibration import save_camera
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
+from morph_dslam.model import save_model
+from morph_dslam.online.pipeline import STAGES, Tracker
+from morph_dslam.online.track import TrackOptions, track
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state
+
+TIMES = np.linspace(0.0, 0.24, 7)
+BLANK = 4  # position of the frame that shows nothing
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    """Frames 20..26 in a folder, model, camera and landmarks of frame 20."""
+    folder = tmp_path_factory.mktemp("sequence")
+    model = bent_sheet_model(43, 31)
+    film = SheetFilm(model)
+    (folder / "frames").mkdir()
+    for number, time in enumerate(TIMES):
+        image = film.blank() if number == BLANK else film.frame(sheet_state(time))
+        cv2.imwrite(str(folder / "frames" / f"{20 + number:06d}.png"), image)
+    save_model(folder / "sheet.morph", model)
+    save_camera(folder / "camera.yaml", CAMERA)
+    nodes = np.random.default_rng(0).choice(len(model.nodes), 16, replace=False)
+    state = sheet_state(0.0)
+    seen = CAMERA.project(state.camera_from_object.apply(model.positions(state.parameters)))[nodes]
+    save_landmarks(folder / "landmarks.csv", Landmarks(model.nodes[nodes], seen))
+    return folder
+
+
+def options(inputs, output, **changes):
+    files = {
+        "frames": "frames",
+        "model": "sheet.morph",
+        "camera": "camera.yaml",
+        "landmarks": "landmarks.csv",
+    }
+    return TrackOptions(**{name: inputs / path for name, path in files.items()}, output=output, **changes)
+
+
+@pytest.fixture(scope="module")
+def finished(inputs, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    return folder, track(options(inputs, folder))
+
+
+def test_run_folder_holds_the_states(finished):
+    folder, _ = finished
+    run = load_run(folder)
+    assert run.frames.tolist() == list(range(20, 27))
+    assert run.tracked.tolist() == [position != BLANK for position in range(7)]
+    for position in np.flatnonzero(run.tracked):
+        truth = sheet_state(TIMES[position])
+        expected = truth.camera_from_object.apply(run.model.positions(truth.parameters))
+        assert np.linalg.norm(run.camera_points(position) - expected, axis=1).mean() < 0.5e-3
+
+
+def test_result_file_has_the_documented_layout(finished):
+    folder, _ = finished
+    with h5py.File(folder / "result.h5") as file:
+        assert dict(file.attrs) == {
+            "format": "morph-dslam run",
+            "version": 1,
+            "reference_frame": 20,
+            "first_frame": 20,
+            "last_frame": 26,
+        }
+        shapes = {name: item.shape for name, item in file.items()}
+        assert file["timings_ms"].attrs["names"].tolist() == [*STAGES, "total"]
+        assert file["reason"].asstr()[BLANK].startswith("lost: ")
+        assert np.isnan(file["parameters"][BLANK]).all()
+        assert file["parameter_std"][1].max() < 0.01
+        assert (file["n_inliers"][:BLANK] > 250).all()
+        assert (file["timings_ms"][:, :-1].sum(axis=1) <= file["timings_ms"][:, -1]).all()
+    states = {
+        "camera_from_object": (7, 4, 4),
+        "parameters": (7, 3),
+        "parameter_std": (7, 3),
+        "at_bound": (7, 3),
+    }
+    rows = ("frame", "timestamp", "status", "reason", "residual_rms_px", "n_points", "n_inliers")
+    assert shapes == {**states, **dict.fromkeys(rows, (7,)), "timings_ms": (7, len(STAGES) + 1)}
+
+
+def test_table_and_summary_are_in_display_units(finished):
+    folder, summary = finished
+    with (folder / "frames.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    truth = sheet_state(TIMES[2])
+    assert float(rows[2]["arch_mm"]) == pytest.approx(1e3 * truth.parameters[0], abs=0.3)
+    assert float(rows[2]["twist_deg"]) == pytest.approx(np.degrees(truth.parameters[2]), abs=0.2)
+    assert float(rows[2]["z_mm"]) == pytest.approx(1e3 * truth.camera_from_object.translation[2], abs=0.5)
+    assert rows[BLANK]["arch_mm"] == ""
+    assert json.loads((folder / "summary.json").read_text()) == json.loads(json.dumps(summary, default=str))
+    assert (summary["n_tracked"], summary["n_lost"]) == (6, 1)
+    assert any("1 of 7 frames were lost" in flag for flag in summary["flags"])
+
+
+def test_video_and_plots_are_there(finished):
+    folder, _ = finished
+    capture = cv2.VideoCapture(str(folder / "augmented.mp4"))
+    assert int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) == 7
+    first = capture.read()[1].astype(float)
+    capture.release()
+    # The colours of the stress lie over the grey film where the object is.
+    assert np.ptp(first[220:260, 250:390], axis=2).mean() > 20.0
+    assert {path.name for path in (folder / "plots").iterdir()} == {
+        "parameters.png",
+        "residual.png",
+        "timings.png",
+    }
+
+
+def test_a_run_is_not_overwritten_unasked(inputs, finished):
+    with pytest.raises(TrackingError, match="holds a run already"):
+        track(options(inputs, finished[0]))
+
+
+def test_interrupt_keeps_the_frames_so_far(inputs, tmp_path, monkeypatch):
+    process = Tracker.process_frame
+    calls = []
+
+    def interrupted(self, image):
+        calls.append(1)
+        if len(calls) == 5:  # one call warms up
+            raise KeyboardInterrupt
+        return process(self, image)
+
+    monkeypatch.setattr(Tracker, "process_frame", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        track(options(inputs, tmp_path / "run", overlay=False))
+    assert load_run(tmp_path / "run").frames.tolist() == [20, 21, 22]
+    assert not (tmp_path / "run" / "augmented.mp4").exists()
+
+
+def test_reference_may_lie_inside_the_range(inputs, tmp_path):
+    """Frame 23 as the reference: the landmarks' pixels there, and the sequence still starts at 21."""
+    model = bent_sheet_model(43, 31)
+    nodes = np.random.default_rng(1).choice(len(model.nodes), 16, replace=False)
+    state = sheet_state(TIMES[3])
+    seen = CAMERA.project(state.camera_from_object.apply(model.positions(state.parameters)))[nodes]
+    save_landmarks(tmp_path / "landmarks.csv", Landmarks(model.nodes[nodes], seen))
+    chosen = options(inputs, tmp_path / "run", first=21, last=23, reference_frame=23, overlay=False)
+    summary = track(TrackOptions(**{**vars(chosen), "landmarks": tmp_path / "landmarks.csv"}))
+    assert summary["n_tracked"] == 3
+    assert summary["reference_frame"] == 23
+
+
+def test_camera_of_another_size_is_refused(inputs, tmp_path):
+    save_camera(tmp_path / "camera.yaml", PinholeCamera(1280, 720, 900.0, 900.0, 640.0, 360.0))
+    chosen = {**vars(options(inputs, tmp_path / "run")), "camera": tmp_path / "camera.yaml"}
+    with pytest.raises(CameraError, match="is 640x480 pixels but the camera file is for 1280x720"):
+        track(TrackOptions(**chosen))
+
+
+def test_landmarks_off_the_object_are_refused(inputs, tmp_path):
+    (tmp_path / "landmarks.csv").write_text("x_mm,y_mm,z_mm,u_px,v_px\n" + "900,0,0,100,100\n" * 6)
+    chosen = {**vars(options(inputs, tmp_path / "run")), "landmarks": tmp_path / "landmarks.csv"}
+    with pytest.raises(RegistrationError, match=r"landmark 1 at \(900, 0, 0\) mm is 690.0 mm off"):
+        track(TrackOptions(**chosen))
+
+
+def test_broken_frame_ends_the_run_but_keeps_it(inputs, tmp_path):
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for path in sorted((inputs / "frames").iterdir())[:4]:
+        (frames / path.name).write_bytes(path.read_bytes())
+    (frames / "000022.png").write_bytes((frames / "000022.png").read_bytes()[:500])
+    chosen = {**vars(options(inputs, tmp_path / "run")), "frames": frames}
+    with pytest.raises(SourceError, match="000022"):
+        track(TrackOptions(**chosen))
+    assert load_run(tmp_path / "run").frames.tolist() == [20, 21]
+    assert (tmp_path / "run" / "augmented.mp4").is_file()

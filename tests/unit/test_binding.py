@@ -1,0 +1,70 @@
+"""Binding positions and pixels to the mesh, and which side of it is seen."""
+
+import numpy as np
+from scipy.optimize import minimize
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.online.binding import bind_pixels, draw_view, facing, nearest_surface_points, view_of
+from morph_dslam.online.estimation import BoundPoints, State
+from tests.support.bent_sheet import bent_sheet_model
+
+CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
+STATE = State(
+    np.array([0.03, 0.2, 0.1]), RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
+)
+
+
+def test_nearest_surface_point_agrees_with_a_minimiser():
+    """One triangle; scipy minimises the distance over barycentric weights."""
+    rng = np.random.default_rng(0)
+    nodes, triangles = rng.standard_normal((3, 3)), np.array([[0, 1, 2]])
+    positions = 2.0 * rng.standard_normal((40, 3))
+    points, distances = nearest_surface_points(nodes, triangles, positions)
+    for row, position in enumerate(positions):
+
+        def squared(w, target=position):
+            return np.sum(((np.array([1 - w[0] - w[1], w[0], w[1]]) @ nodes) - target) ** 2)
+
+        inside = {"type": "ineq", "fun": lambda w: [w[0], w[1], 1 - w[0] - w[1]]}
+        best = minimize(squared, [0.3, 0.3], constraints=inside, method="SLSQP", options={"ftol": 1e-14})
+        assert abs(distances[row] ** 2 - best.fun) < 1e-5
+        assert abs(points.weights[row].sum() - 1.0) < 1e-12
+        assert points.weights[row].min() >= 0.0
+
+
+def test_nearest_point_of_the_sheet_is_the_foot_of_the_normal():
+    model = bent_sheet_model(22, 16)
+    points, distances = nearest_surface_points(
+        model.nodes, model.triangles, np.array([[0.05, -0.03, 0.004], [0.3, 0.0, 0.0]])
+    )
+    np.testing.assert_allclose(
+        model.rest_positions(points), [[0.05, -0.03, 0.0], [0.21, 0.0, 0.0]], atol=1e-12
+    )
+    np.testing.assert_allclose(distances, [0.004, 0.09], atol=1e-12)
+
+
+def test_bound_pixels_project_back_onto_themselves():
+    model = bent_sheet_model(22, 16)
+    pixels = np.array([[300.25, 200.75], [320.0, 240.0], [405.5, 150.1], [5.0, 5.0]])
+    points, met = bind_pixels(model, CAMERA, view_of(model, CAMERA, STATE), pixels)
+    assert met.tolist() == [True, True, True, False]
+    bound = BoundPoints.from_surface(model, points)
+    np.testing.assert_allclose(CAMERA.project(bound.in_camera(STATE)), pixels[:3], atol=1e-9)
+
+
+def test_facing_flips_when_the_object_is_turned_over():
+    model = bent_sheet_model(22, 16)
+    front = facing(view_of(model, CAMERA, STATE), model.triangles)
+    turned = RigidTransform(np.diag([-1.0, -1.0, 1.0]), STATE.camera_from_object.translation)
+    back = facing(view_of(model, CAMERA, State(STATE.parameters, turned)), model.triangles)
+    assert not front.any()
+    assert back.all()
+
+
+def test_drawn_view_covers_the_projected_rectangle():
+    model = bent_sheet_model(22, 16)
+    flat = State(np.zeros(3), STATE.camera_from_object)
+    covered = draw_view(view_of(model, CAMERA, flat), model.triangles, CAMERA).covered
+    expected = 0.420 * 0.297 * (528.0 / 0.6) ** 2
+    assert abs(covered.sum() - expected) < 0.01 * expected

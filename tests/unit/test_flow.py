@@ -1,0 +1,142 @@
+"""Flow, patch correlation, features and the rendered appearance on images whose motion is known."""
+
+import cv2
+import numpy as np
+import pytest
+
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.online.appearance import ReferenceAppearance
+from morph_dslam.online.binding import view_of
+from morph_dslam.online.estimation import State
+from morph_dslam.online.features import detect_orb, interior, match_descriptors, spread_corners
+from morph_dslam.online.flow import (
+    NEUTRAL,
+    FlowOptions,
+    flatten,
+    follow,
+    patch_correlation,
+    patch_correlation_numpy,
+)
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.rendered_sequence import CAMERA, SheetFilm, printed_texture, sheet_state
+
+OPTIONS = FlowOptions()
+
+
+def shifted(image, x, y):
+    matrix = np.array([[1.0, 0.0, x], [0.0, 1.0, y]])
+    return cv2.warpAffine(image, matrix, image.shape[::-1], flags=cv2.INTER_CUBIC)
+
+
+@pytest.fixture(scope="module")
+def image():
+    return printed_texture(480, 640, seed=4)
+
+
+def test_flattening_removes_slow_shading(image):
+    rows = np.linspace(0.0, 40.0, 480)[:, None]
+    shaded = np.clip(image.astype(float) * 0.8 + rows, 0, 255).astype(np.uint8)
+    plain = flatten((image * 0.8).astype(np.uint8), OPTIONS.flatten_window).astype(int)
+    difference = flatten(shaded, OPTIONS.flatten_window).astype(int) - plain
+    assert np.abs(difference[20:-20, 20:-20]).max() <= 2
+
+
+def test_followed_points_move_by_the_shift(image):
+    flat = flatten(image, 31)
+    points = spread_corners(flat, np.pad(np.full((400, 560), 255, np.uint8), 40), 150)
+    found, ok = follow(flat, flatten(shifted(image, 7.25, -4.5), 31), points, points, OPTIONS)
+    assert ok.mean() > 0.95
+    np.testing.assert_allclose(np.median(found - points, axis=0), [7.25, -4.5], atol=0.06)
+    assert np.percentile(np.abs(found[ok] - points[ok] - [7.25, -4.5]), 95) < 0.15
+
+
+def test_following_no_points_is_allowed(image):
+    found, ok = follow(image, image, np.empty((0, 2)), np.empty((0, 2)), OPTIONS)
+    assert found.shape == (0, 2)
+    assert ok.shape == (0,)
+
+
+def test_compiled_and_plain_correlation_agree(image):
+    rng = np.random.default_rng(0)
+    first = rng.uniform([-5, -5], [645, 485], (80, 2))
+    second = first + rng.uniform(-2, 2, first.shape)
+    other = shifted(image, 1.0, 0.5)
+    compiled = patch_correlation(image, other, first, second, 7)
+    plain = patch_correlation_numpy(image, other, first, second, 7)
+    np.testing.assert_allclose(compiled, plain, atol=1e-6)
+
+
+def test_correlation_ignores_gain_and_offset_and_sees_difference(image):
+    centre = np.array([[320.0, 240.0], [100.0, 100.0]])
+    darker = (0.5 * image + 20).astype(np.uint8)
+    assert patch_correlation(image, darker, centre, centre, 7).min() > 0.99
+    assert patch_correlation(image, image, centre, centre + 35.0, 7).max() < 0.6
+    assert patch_correlation(image, image, centre, np.array([[-3.0, 5.0], [639.0, 5.0]]), 7).tolist() == [
+        -1,
+        -1,
+    ]
+
+
+def test_corners_are_spread_over_the_mask_and_stay_in_it(image):
+    mask = np.zeros((480, 640), np.uint8)
+    mask[100:400, 100:500] = 255
+    corners = spread_corners(flatten(image, 31), mask, 200)
+    assert 120 <= len(corners) <= 200
+    assert (corners >= [99.5, 99.5]).all()
+    assert (corners <= [499.5, 399.5]).all()
+    quarters = np.histogram2d(corners[:, 0], corners[:, 1], bins=[[100, 300, 500], [100, 250, 400]])[0]
+    assert quarters.min() > 0.15 * len(corners)
+
+
+def test_interior_keeps_away_from_the_outline_and_the_border():
+    covered = np.zeros((50, 60), dtype=bool)
+    covered[:30, 10:40] = True
+    mask = interior(covered, 5) > 0
+    expected = np.zeros_like(covered)
+    expected[5:25, 15:35] = True
+    np.testing.assert_array_equal(mask, expected)
+
+
+def test_matched_features_follow_a_turned_image(image):
+    matrix = cv2.getRotationMatrix2D((320, 240), 25.0, 0.9)
+    turned = cv2.warpAffine(image, matrix, (640, 480))
+    pixels, descriptors = detect_orb(image, 600)
+    other_pixels, other = detect_orb(turned, 600)
+    mine, theirs = match_descriptors(descriptors, other)
+    expected = pixels[mine] @ matrix[:, :2].T + matrix[:, 2]
+    good = np.linalg.norm(other_pixels[theirs] - expected, axis=1) < 3.0
+    assert good.sum() > 60
+    assert good.mean() > 0.8
+
+
+def test_no_features_give_no_matches():
+    pixels, descriptors = detect_orb(np.full((100, 100), 128, np.uint8), 100)
+    assert pixels.shape == (0, 2)
+    assert [len(rows) for rows in match_descriptors(descriptors, descriptors)] == [0, 0]
+
+
+def test_rendering_looks_like_the_frame_it_predicts():
+    """The reference view rendered in another state agrees with a film frame of that state."""
+    model = bent_sheet_model()
+    film = SheetFilm(model)
+    first, second = sheet_state(0.0), sheet_state(0.15)
+    flat = flatten(film.frame(first, noise=0.0)[..., 0], 31)
+    appearance = ReferenceAppearance(model, CAMERA, flat, view_of(model, CAMERA, first))
+    rendering = appearance.render(view_of(model, CAMERA, second))
+    actual = flatten(film.frame(second, noise=0.0)[..., 0], 31)
+    inside = interior(np.isfinite(rendering.depth), 20) > 0
+    assert inside.sum() > 50_000
+    assert np.corrcoef(rendering.image[inside], actual[inside])[0, 1] > 0.97
+    assert (rendering.image[~np.isfinite(rendering.depth)] == NEUTRAL).all()
+
+
+def test_rendering_an_object_outside_the_image_is_empty():
+    model = bent_sheet_model(22, 16)
+    state = sheet_state(0.0)
+    flat = np.full((480, 640), 90, np.uint8)
+    appearance = ReferenceAppearance(model, CAMERA, flat, view_of(model, CAMERA, state))
+    for position in ([9.0, 0.0, 0.6], [0.0, 0.0, -0.6]):
+        away = State(state.parameters, RigidTransform(state.camera_from_object.rotation, np.array(position)))
+        rendering = appearance.render(view_of(model, CAMERA, away))
+        assert (rendering.image == NEUTRAL).all()
+        assert np.isinf(rendering.depth).all()
