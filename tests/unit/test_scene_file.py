@@ -1,6 +1,7 @@
 """What is said of wrong scene files, and photographs by name."""
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -161,3 +162,12 @@ def test_key_frame_curve_is_smooth_to_the_second_derivative():
     assert np.abs(np.diff(second)).max() < 0.01 * np.ptp(second)
     np.testing.assert_allclose(interpolate_key_frames(keys, values, np.array(keys)), values, atol=1e-12)
     np.testing.assert_allclose(interpolate_key_frames(keys, values, np.array([-3, 40])), [0.0, 3.0])
+
+
+def test_the_documented_scene_is_valid_and_shows_every_key(tmp_path):
+    documentation = Path(__file__).parents[2] / "docs" / "scene-file.md"
+    example = documentation.read_text().split("```toml\n")[1].split("```")[0]
+    (tmp_path / "scene.toml").write_text(example)
+    scene = load_scene_file(tmp_path / "scene.toml")
+    for section in (scene, scene.surface, scene.background, scene.light, scene.sensor, scene.pose[0]):
+        assert section.model_fields_set == set(type(section).model_fields)

@@ -19,6 +19,7 @@ from tqdm import tqdm
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import SceneError
 from morph_dslam.io.calibration import load_camera, parse_camera, save_camera
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.model import ReducedModel, SurfacePoints, load_model
 from morph_dslam.render.motion import Motion, plan_motion
 from morph_dslam.render.rasteriser import rasterise, visible_points
@@ -111,7 +112,7 @@ def _prepare_folder(output: Path) -> None:
 
 
 def _write_landmarks(path: Path, world: _World) -> None:
-    """Landmarks that frame 0 shows: rest positions in millimetres, pixels to full precision."""
+    """Write landmarks that frame 0 shows: mesh nodes and their pixels."""
     nodes = landmark_nodes(world.model)
     positions = world.node_positions(0)
     nodes = nodes[world.visible(0, positions[nodes], world.depth_image(positions))]
@@ -120,8 +121,8 @@ def _write_landmarks(path: Path, world: _World) -> None:
             f"frame 0 shows {len(nodes)} landmarks of the sheet, and a tracker needs {MIN_LANDMARKS}: "
             "let the first key frames show the whole sheet, without the occluder"
         )
-    rows = np.column_stack([world.model.nodes[nodes] * 1e3, world.camera.project(positions[nodes])])
-    np.savetxt(path, rows, fmt="%.6f", delimiter=",", header="x_mm,y_mm,z_mm,u_px,v_px", comments="")
+    landmarks = Landmarks(world.model.nodes[nodes], world.camera.project(positions[nodes]))
+    save_landmarks(path, landmarks)
 
 
 def _truth_positions(world: _World, points: SurfacePoints) -> Array:
