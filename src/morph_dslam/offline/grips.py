@@ -1,0 +1,137 @@
+"""Rigid grips on the short edges of a sheet: how they move, and the coordinates that a model uses for it.
+
+The object frame has its origin at the sheet's centre, x along the length, y up, z out of the face.
+Each grip holds a rectangle rigidly. Its motion is described by six numbers, `GripMotion`:
+
+    bend_left, bend_right   rotation about the vertical axis, rad; both positive: the sheet arches to +z
+    twist                   relative rotation about the x axis, rad, half to each grip
+    approach                how much closer the grips are, m
+    turn_left, turn_right   rotation in the sheet's plane, rad
+
+The four coordinates of the reduced model are
+
+    bulge   signed mean height of the middle of the sheet over the line between the grips, m
+    bend    symmetric bend, as a multiple of that of a circular arc with this bulge, 1
+    skew    antisymmetric bend, (bend_left - bend_right) / 2, rad
+    slant   twist, as a multiple of twice the bend of that arc: the tangent of the angle by which the rulings
+            of the bent sheet lean, 1
+
+Why not the angles and the approach themselves: for given angles two shapes, bulging to either side, share the
+same approach, none exists below a smallest approach, and the two meet only in the flat state. A thin sheet
+stays developable, so it cannot twist without bending either. Over (bulge, bend, skew, slant) the family of
+shapes is one smooth graph that holds both sides. bend = 1 is bent by pure moments, about 0.78 is held like a
+hinge, 0 is clamped straight (Euler's column), above 1 pulled. In the flat state, bulge = 0, bend and slant
+make no difference: there the images cannot tell them.
+The approach follows from the bulge; the turns in the plane are free: no moment acts there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: End slope of a shallow circular arc over (weighted mean height / free length), see `bulge_weight`.
+ARC_SLOPE = 4.0 / (4.0 * (0.25 - (1.0 / 12.0 - 1.0 / (2.0 * np.pi**2))))
+
+MOTION = ("bend_left", "bend_right", "twist", "approach", "turn_left", "turn_right")
+COORDINATES = ("bulge", "bend", "skew", "slant")
+#: Motions that are unknowns of the equilibrium problem: found from the bulge and from zero moments.
+FREE_MOTIONS = (3, 4, 5)
+
+
+@dataclass(frozen=True)
+class Grips:
+    """Two rectangles at the ends of a sheet of ``length``.
+
+    Attributes
+    ----------
+    length : of the sheet along x, m.
+    depth : how far each grip reaches over the sheet, m.
+    height : of each grip along y, m.
+    centre_left, centre_right : y of the grips' centres, m.
+    """
+
+    length: float
+    depth: float
+    height: float
+    centre_left: float
+    centre_right: float
+
+    @property
+    def free_length(self) -> float:
+        return self.length - 2.0 * self.depth
+
+    @property
+    def centres(self) -> tuple[Array, Array]:
+        offset = self.length / 2.0 - self.depth / 2.0
+        return np.array([-offset, self.centre_left, 0.0]), np.array([offset, self.centre_right, 0.0])
+
+    def bulge_weight(self, x: Array) -> Array:
+        """Weight of the height at ``x`` in the bulge: cos^2 over the free length, zero on the grips."""
+        inside = np.abs(x) < self.free_length / 2.0
+        return np.where(inside, np.cos(np.pi * x / self.free_length) ** 2, 0.0)
+
+    def prescribed_motion(self, coordinates: Array) -> Array:
+        """Motion (6,) that the coordinates (4,) prescribe; the free motions are left zero."""
+        bulge, bend, skew, slant = coordinates
+        arc = ARC_SLOPE * bulge / self.free_length
+        return np.array([bend * arc + skew, bend * arc - skew, 2.0 * slant * arc, 0.0, 0.0, 0.0])
+
+    def prescribed_motion_gradient(self, coordinates: Array) -> Array:
+        """Derivative (6, 4) of `prescribed_motion`."""
+        bulge, bend, _, slant = coordinates
+        scale = ARC_SLOPE / self.free_length
+        gradient = np.zeros((6, 4))
+        gradient[:3, 0] = bend * scale, bend * scale, 2.0 * slant * scale
+        gradient[:2, 1] = bulge * scale
+        gradient[:2, 2] = 1.0, -1.0
+        gradient[2, 3] = 2.0 * bulge * scale
+        return gradient
+
+    def positions(self, motion: Array, left: Array, right: Array) -> Array:
+        """Positions (n_left + n_right, 3) of material points (n, 3) held by the grips."""
+        bend_left, bend_right, twist, approach, turn_left, turn_right = motion
+        centre_left, centre_right = self.centres
+        shift = np.array([approach / 2.0, 0.0, 0.0])
+        rotation_left = _about_x(-twist / 2.0) @ _about_z(turn_left) @ _about_y(-bend_left)
+        rotation_right = _about_x(twist / 2.0) @ _about_z(turn_right) @ _about_y(bend_right)
+        return np.vstack(
+            [
+                (left - centre_left) @ rotation_left.T + centre_left + shift,
+                (right - centre_right) @ rotation_right.T + centre_right - shift,
+            ]
+        )
+
+    def velocity(self, motion: Array, left: Array, right: Array) -> Array:
+        """Derivative (n_left + n_right, 3, 6) of `positions` by central differences.
+
+        The rotations are entire functions with derivatives below one: a step of 1e-5 is exact to 1e-11.
+        """
+        step = 1e-5
+        columns = []
+        for index in range(6):
+            change = np.zeros(6)
+            change[index] = step
+            forward = self.positions(motion + change, left, right)
+            backward = self.positions(motion - change, left, right)
+            columns.append((forward - backward) / (2.0 * step))
+        return np.stack(columns, axis=-1)
+
+
+def _about_x(angle: float) -> Array:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+
+
+def _about_y(angle: float) -> Array:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def _about_z(angle: float) -> Array:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -1,0 +1,193 @@
+"""The sweep: every sample solved once, each from its nearest solved neighbour, on any Executor."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+from tqdm import tqdm
+
+from morph_dslam.errors import SolverError, StudyError
+from morph_dslam.offline.continuation import advance
+from morph_dslam.offline.gripped_sheet import GrippedSheet
+from morph_dslam.offline.snapshots import load_state, save_snapshot, snapshot_key, take_snapshot
+from morph_dslam.offline.study import Study
+
+Array = NDArray[np.float64]
+
+#: Smallest |bulge| that is solved, over the largest: in the flat state itself the equations are singular.
+SMALLEST_BULGE = 0.02
+
+
+@dataclass
+class SweepResult:
+    """Which samples were solved (paths by sample index) and why others were not."""
+
+    solved: dict[int, Path] = field(default_factory=dict)
+    failed: dict[int, str] = field(default_factory=dict)
+
+
+def sample_box(study: Study, count: int, seed: int, towards_edges: float) -> Array:
+    """Scrambled Sobol samples (count, 4) of the box.
+
+    ``towards_edges`` in [0, 1] moves them from uniform to the Chebyshev density, at which polynomial
+    regression is best conditioned.
+    """
+    sobol = qmc.Sobol(4, rng=seed)
+    unit = 2.0 * sobol.random_base2(int(np.ceil(np.log2(count))))[:count] - 1.0
+    xi = (1.0 - towards_edges) * unit + towards_edges * np.sin(np.pi / 2.0 * unit)
+    bounds = study.parameters.bounds
+    samples = bounds.mean(axis=1) + xi * np.diff(bounds, axis=1).ravel() / 2.0
+    smallest = SMALLEST_BULGE * np.abs(bounds[0]).max()
+    bulge = samples[:, 0]
+    samples[:, 0] = np.where(np.abs(bulge) < smallest, np.copysign(smallest, bulge), bulge)
+    return samples
+
+
+def canonical(samples: Array) -> Array:
+    """The mirror image with positive bulge of each sample (n, 4); the sheet does not know its sides apart."""
+    sign = np.where(samples[:, :1] < 0.0, -1.0, 1.0)
+    return samples * np.where([True, False, True, False], sign, 1.0)
+
+
+def neighbour_tree(samples: Array, scale: Array, root: Array) -> tuple[list[int], list[int]]:
+    """Prim's order of the samples and the neighbour that each starts from (-1: the root state)."""
+    points = samples / scale
+    distance = np.linalg.norm(points - root / scale, axis=1)
+    parent = np.full(len(points), -1)
+    waiting = np.ones(len(points), dtype=bool)
+    order: list[int] = []
+    for _ in range(len(points)):
+        nearest = int(np.argmin(np.where(waiting, distance, np.inf)))
+        order.append(nearest)
+        waiting[nearest] = False
+        to_new = np.linalg.norm(points - points[nearest], axis=1)
+        closer = waiting & (to_new < distance)
+        distance[closer], parent[closer] = to_new[closer], nearest
+    return order, parent.tolist()
+
+
+def root_coordinates(study: Study) -> Array:
+    """The gentle circular arch that every path starts from."""
+    bulge = min(0.03 * study.sheet.length, 0.5 * max(abs(b) for b in study.parameters.bulge))
+    return np.array([bulge, 1.0, 0.0, 0.0])
+
+
+@lru_cache(maxsize=1)
+def _worker_problem(study: Study) -> GrippedSheet:
+    """The problem of a worker process, built once; one thread, since the workers fill the cores."""
+    import ngsolve
+
+    ngsolve.SetNumThreads(1)
+    return study.problem()
+
+
+def _solve_sample(study: Study, coordinates: Array, start: Path | None, result: Path) -> str | None:
+    """Solve one sample and write its snapshot; returns why it could not be solved, or None."""
+    problem = _worker_problem(study)  # type: ignore[arg-type]
+    try:
+        state = load_state(start) if start else problem.first_state(root_coordinates(study)[0])
+        state, _ = advance(problem, state, coordinates)
+    except SolverError as error:
+        return str(error)
+    save_snapshot(result, state, take_snapshot(problem, study, state))
+    return None
+
+
+@contextmanager
+def default_executor(workers: int | None) -> Iterator[Executor]:
+    """Worker processes, one a core unless ``workers`` says otherwise; cancelled cleanly on interruption."""
+    context = multiprocessing.get_context("spawn")
+    executor = ProcessPoolExecutor(workers or os.cpu_count(), mp_context=context)
+    try:
+        yield executor
+    except BaseException:
+        executor.shutdown(wait=False, cancel_futures=True)
+        for process in multiprocessing.active_children():
+            process.terminate()
+        raise
+    executor.shutdown()
+
+
+class _Sweep:
+    """Bookkeeping of one sweep: which samples wait for which neighbour."""
+
+    def __init__(self, study: Study, samples: Array, folder: Path) -> None:
+        self.study, self.samples = study, samples
+        self.paths = [folder / f"{snapshot_key(study, sample)}.npz" for sample in samples]
+        order, self.parent = neighbour_tree(samples, _box_size(study), root_coordinates(study))
+        self.children: dict[int, list[int]] = {}
+        for sample in order:
+            self.children.setdefault(self.parent[sample], []).append(sample)
+        self.result = SweepResult()
+
+    def start_of(self, sample: int) -> Path | None:
+        """The nearest solved ancestor: a failed neighbour's own neighbour is the next best start."""
+        ancestor = self.parent[sample]
+        while ancestor >= 0 and ancestor in self.result.failed:
+            ancestor = self.parent[ancestor]
+        return self.paths[ancestor] if ancestor >= 0 else None
+
+
+def _box_size(study: Study) -> Array:
+    bounds = study.parameters.bounds
+    size = np.diff(bounds, axis=1).ravel()
+    size[0] = np.abs(bounds[0]).max()
+    return size
+
+
+def run_sweep(study: Study, samples: Array, folder: Path, executor: Executor) -> SweepResult:
+    """Solve all ``samples`` (n, 4), canonical, keeping each as soon as it is solved.
+
+    Samples found in ``folder`` are not solved again. One that does not converge is reported in the result
+    and its neighbours start from the next solved one.
+
+    Raises
+    ------
+    StudyError
+        If not even half of the samples converge.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    sweep = _Sweep(study, samples, folder)
+    result = sweep.result
+    running: dict[Future, int] = {}
+    ready = list(sweep.children.get(-1, []))
+    with tqdm(total=len(samples), desc="solving", unit="sample", smoothing=0.05) as progress:
+        while ready or running:
+            for sample in ready:
+                if sweep.paths[sample].is_file():
+                    future: Future = Future()
+                    future.set_result(None)
+                else:
+                    arguments = (study, samples[sample], sweep.start_of(sample), sweep.paths[sample])
+                    future = executor.submit(_solve_sample, *arguments)
+                running[future] = sample
+            ready = []
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                sample = running.pop(future)
+                reason = future.result()
+                if reason is None:
+                    result.solved[sample] = sweep.paths[sample]
+                else:
+                    result.failed[sample] = reason
+                ready += sweep.children.get(sample, [])
+                progress.update()
+            progress.set_postfix(failed=len(result.failed))
+    if len(result.solved) < 0.5 * len(samples):
+        first = next(iter(result.failed.values()))
+        raise StudyError(
+            f"only {len(result.solved)} of {len(samples)} samples could be solved; the first failure: "
+            f"{first}. The solved ones are kept in {folder}. Narrow the ranges of the parameters, refine "
+            "solver.divisions, or raise solver.thickness"
+        )
+    return result
