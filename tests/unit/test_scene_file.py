@@ -75,7 +75,8 @@ def test_missing_file_and_file_that_is_not_toml(tmp_path):
 
 def test_unknown_parameter_is_named_with_those_of_the_model(tmp_path):
     message = message_of(tmp_path, tail=POSE + "[[parameters]]\nframe = 2\nbulge = 1.0\n")
-    assert message == "unknown parameter 'bulge' in key frame 2; the model has arch, skew, twist"
+    expected = "unknown parameter 'bulge' in key frame 2; the model has arch, skew, twist"
+    assert message == f"{tmp_path / 'scene.toml'}: {expected}"
 
 
 def test_key_frame_out_of_range(tmp_path):

@@ -13,7 +13,7 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.model import ReducedModel
 from morph_dslam.render.photographs import load_photograph
 from morph_dslam.render.rasteriser import Buffers, rasterise
-from morph_dslam.render.scene_file import Background, Colour, Scene, Sensor, Surface
+from morph_dslam.render.scene_file import Background, Scene, Sensor, Surface
 from morph_dslam.render.shading import lambert, vertex_normals
 from morph_dslam.render.sheet_points import sheet_bounds, texture_coordinates
 from morph_dslam.render.texture import interpolate, render_textured
@@ -78,15 +78,14 @@ def blur(image: NDArray, sigma: float) -> Image:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), dtype=np.uint8) if sigma > 0.0 else image
 
 
-def draw_disc(image: Image, centre: Array, radius: float, colour: Colour) -> None:
-    """Paint a disc (colour red, green, blue) exactly where `in_disc` says."""
-    rows, columns = np.indices(image.shape[:2])
-    image[in_disc(np.stack([columns, rows], axis=-1), centre, radius)] = colour[::-1]
+def in_disc(columns: NDArray, rows: NDArray, centre: Array, radius: float) -> NDArray[np.bool_]:
+    """Which pixels lie in a disc; ``columns`` and ``rows`` broadcast against each other."""
+    return (columns - centre[0]) ** 2 + (rows - centre[1]) ** 2 <= radius**2
 
 
-def in_disc(pixels: NDArray, centre: Array, radius: float) -> NDArray[np.bool_]:
-    """Which pixels (..., 2) lie in a disc."""
-    return ((pixels - centre) ** 2).sum(axis=-1) <= radius**2
+def pixel_axes(height: int, width: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Columns (1, w) and rows (h, 1) of an image, which broadcast to all its pixels."""
+    return np.arange(width)[None, :], np.arange(height)[:, None]
 
 
 def add_sensor_noise(image: Image, sensor: Sensor, seed: tuple[int, int]) -> Image:
@@ -168,7 +167,8 @@ class SceneRenderer:
         occluder = self._scene.occluder
         if occluder is not None and occluder_centre is not None:
             centre = (occluder_centre + 0.5) * factor - 0.5
-            draw_disc(image, centre, occluder.radius_px * factor, occluder.colour)
+            disc = in_disc(*pixel_axes(*image.shape[:2]), centre, occluder.radius_px * factor)
+            image[disc] = occluder.colour[::-1]
         size = (camera.width // factor, camera.height // factor)
         averaged = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         return add_sensor_noise(

@@ -24,7 +24,7 @@ from morph_dslam.model import ReducedModel, SurfacePoints, load_model
 from morph_dslam.render.motion import Motion, plan_motion
 from morph_dslam.render.rasteriser import rasterise, visible_points
 from morph_dslam.render.scene_file import Scene, load_scene_file
-from morph_dslam.render.scene_renderer import SceneRenderer, in_disc
+from morph_dslam.render.scene_renderer import SceneRenderer, in_disc, pixel_axes
 from morph_dslam.render.sheet_points import check_sheet, landmark_nodes, regular_points
 
 Array = NDArray[np.float64]
@@ -63,17 +63,18 @@ class _World:
             pixels, points[:, 2], self.model.triangles, self.camera.height, self.camera.width
         ).depth
 
-    def occluded(self, frame: int, pixels: NDArray) -> NDArray[np.bool_]:
-        """Which pixels (..., 2) the occluder covers."""
+    def occluded(self, frame: int, columns: NDArray, rows: NDArray) -> NDArray[np.bool_]:
+        """Which pixels the occluder covers; ``columns`` and ``rows`` broadcast against each other."""
         centres, occluder = self.motion.occluder_centres, self.scene.occluder
         if centres is None or occluder is None:
-            return np.zeros(pixels.shape[:-1], dtype=bool)
-        return in_disc(pixels, centres[frame], occluder.radius_px)
+            return np.zeros(np.broadcast_shapes(columns.shape, rows.shape), dtype=bool)
+        return in_disc(columns, rows, centres[frame], occluder.radius_px)
 
     def visible(self, frame: int, points: Array, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Which surface points (p, 3), camera frame, are in the image with nothing in front of them."""
         pixels = self.camera.project(points)
-        return visible_points(pixels, points[:, 2], depth, HIDDEN_BY) & ~self.occluded(frame, pixels)
+        seen = visible_points(pixels, points[:, 2], depth, HIDDEN_BY)
+        return seen & ~self.occluded(frame, pixels[:, 0], pixels[:, 1])
 
 
 def _load_world(scene_path: Path) -> _World:
@@ -88,7 +89,11 @@ def _load_world(scene_path: Path) -> _World:
         )
     model = load_model(folder / scene.model)
     check_sheet(model)
-    world = _World(scene, folder, model, camera, plan_motion(scene, model))
+    try:
+        motion = plan_motion(scene, model)
+    except SceneError as error:
+        raise SceneError(f"{scene_path}: {error}") from error
+    world = _World(scene, folder, model, camera, motion)
     for frame in range(scene.frames):
         points = world.node_positions(frame)
         if points[:, 2].min() <= 0.0:
@@ -176,8 +181,7 @@ def _render_frames(
 ) -> NDArray[np.bool_]:
     """Write all images and depths; says which truth points (T, p) are visible."""
     scene, camera, centres = world.scene, world.camera, world.motion.occluder_centres
-    rows, columns = np.indices((camera.height, camera.width))
-    grid = np.stack([columns, rows], axis=-1)
+    columns, rows = pixel_axes(camera.height, camera.width)
     visible = np.zeros(truth.shape[:2], dtype=bool)
     with h5py.File(output / "depth.h5", "w") as file:
         depths = _create_depth(file, world)
@@ -187,7 +191,7 @@ def _render_frames(
             _write_image(output / "frames" / f"{frame:06}.{scene.image_format}", image)
             depth = world.depth_image(nodes)
             visible[frame] = world.visible(frame, truth[frame], depth)
-            hidden = np.isinf(depth) | world.occluded(frame, grid)
+            hidden = np.isinf(depth) | world.occluded(frame, columns, rows)
             depths[frame] = np.where(hidden, np.float32(0.0), depth)
     return visible
 
