@@ -12,6 +12,7 @@ import yaml
 
 from morph_dslam import cli
 from morph_dslam.io.video import VideoWriter
+from tests.support.real_data import ROOT
 from tests.support.scenes import write_scene
 
 CAMERA = "camera = { width = 480, height = 360, fx = 430.0, fy = 430.0, cx = 239.5, cy = 179.5 }\n"
@@ -249,3 +250,28 @@ def test_bad_scenes_are_one_message(sequence, tmp_path, capsys, change, expected
     (tmp_path / "scene.toml").write_text(text.replace(*change))
     message = refused(capsys, ["simulate", tmp_path / "scene.toml", "-o", tmp_path / "seq"])
     assert re.search(expected, message)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (("[grips]", "[grips]\ncolour = 3"), "unknown key grips.colour; known here: depth, height"),
+        (('length = "297 mm"', "length = 297"), "sheet.length: write the value with its unit"),
+        (('length = "297 mm"', 'length = "297 deg"'), "'deg' is not a unit of length"),
+        (('length = "297 mm"\n', ""), "sheet.length is missing"),
+        (('bulge = ["-40 mm", "40 mm"]', 'bulge = ["40 mm", "-40 mm"]'), "bulge"),
+        (("[sheet]", "[sheet"), "not a TOML file"),
+    ],
+)
+def test_bad_studies_are_one_message(tmp_path, capsys, change, expected):
+    text = (ROOT / "examples" / "demo" / "study.toml").read_text()
+    assert change[0] in text
+    (tmp_path / "study.toml").write_text(text.replace(*change))
+    message = refused(capsys, ["build", tmp_path / "study.toml", "-o", tmp_path / "sheet.morph"])
+    assert expected in message
+    assert "study.toml" in message
+
+
+def test_a_study_that_is_not_there_is_one_message(tmp_path, capsys):
+    message = refused(capsys, ["build", tmp_path / "absent.toml", "-o", tmp_path / "sheet.morph"])
+    assert "cannot read the study file" in message

@@ -54,6 +54,8 @@ def test_certificates_are_flattened_with_their_units():
             "displacement": {"mean_mm": 0.0123456, "n_held_out": 40},
             "compression_percent": 99.5,
             "orders": [1.5, 2],
+            "failed": [],
+            "notes": [{"a": 1}, {"a": 2}],
             "study": "line one\nline two",
         }
     )
@@ -62,4 +64,6 @@ def test_certificates_are_flattened_with_their_units():
         "displacement: n held out": "40",
         "compression": "99.5 %",
         "orders": "1.5, 2",
+        "failed": "none",
+        "notes": "2 entries",
     }

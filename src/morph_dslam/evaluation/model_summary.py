@@ -30,7 +30,9 @@ def _value(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, list):
-        return ", ".join(_value(item) for item in value)
+        if any(isinstance(item, Mapping) for item in value):
+            return f"{len(value)} entries"
+        return ", ".join(_value(item) for item in value) or "none"
     return str(value)
 
 
