@@ -108,7 +108,7 @@ def test_exact_pixels_give_the_exact_state_back(model, points):
     assert not found.at_bound.any()
 
 
-def scipy_minimum(points, pixels, start, held=0, huber=1.5):
+def scipy_minimum(points, pixels, start, held=0, huber=2.0):
     """Scipy's minimum of the same cost, the first ``held`` parameters kept; the state and the cost."""
 
     def state(step):

@@ -69,7 +69,7 @@ class EstimationOptions:
     """``huber_px``: residual length where Huber's cost turns linear; ``tolerance``: relative decrease of the
     cost below which the iteration ends."""
 
-    huber_px: float = 1.5
+    huber_px: float = 2.0
     max_iterations: int = 25
     tolerance: float = 1e-6
 

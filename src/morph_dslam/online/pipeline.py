@@ -42,12 +42,15 @@ class TrackerOptions:
     Attributes
     ----------
     n_points : corners followed, spread over the reference view.
-    inlier_px : residual up to which a point supports the estimate.
+    inlier_sigmas, inlier_px : a point supports the estimate when its residual is below so many robust
+        standard deviations, within these limits in pixels: a model that is a pixel off must not cost it good
+        points, and occluders that happen to look alike must not get in where it fits well.
     least_inliers, least_share : points that must support it, as a number or a share of all, if that is fewer.
     """
 
     n_points: int = 350
-    inlier_px: float = 4.0
+    inlier_sigmas: float = 6.0
+    inlier_px: tuple[float, float] = (2.0, 8.0)
     least_inliers: int = 30
     least_share: float = 0.3
     flow: FlowOptions = field(default_factory=FlowOptions)
@@ -221,8 +224,9 @@ class Tracker:
         estimate, used = None, measurement.valid
         for _ in range(2):
             estimate = self.estimator.estimate(self.points, measurement.pixels, used.astype(float), start)
+            limit = np.clip(self.options.inlier_sigmas * estimate.sigma_px, *self.options.inlier_px)
             with np.errstate(invalid="ignore"):
-                close = np.linalg.norm(estimate.residuals, axis=1) < self.options.inlier_px
+                close = np.linalg.norm(estimate.residuals, axis=1) < limit
             agreeing = measurement.valid & close
             if (agreeing == used).all():
                 break
