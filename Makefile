@@ -27,7 +27,7 @@ test-all: lint
 	@$(BIN)/pytest
 
 bench: $(INSTALLED)
-	@shopt -s nullglob; for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python "$$script"; done
+	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python "$$script"; done
 
 lint: $(INSTALLED)
 	@$(BIN)/ruff format --check --quiet
