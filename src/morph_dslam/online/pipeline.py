@@ -32,6 +32,9 @@ from morph_dslam.online.relocalisation import Relocaliser
 from morph_dslam.online.timing import StageClock
 
 Array = NDArray[np.float64]
+_FOLLOWED = "followed from the previous frame"
+_FOUND_AGAIN = "found again where it was last seen"
+_RECOVERED = "recovered from the reference view's features"
 STAGES = ("prepare", "flow", "estimate", "render", "correct", "recover")
 
 
@@ -68,7 +71,7 @@ class FrameResult:
     estimate : None when lost.
     residual_rms_px : root mean square of the inliers' residuals, NaN when lost.
     n_points, n_inliers : points that the object itself does not hide, and those that support the estimate.
-    timings_ms : by stage, milliseconds. total_ms : the whole frame. recovered : found again from features.
+    timings_ms : by stage, milliseconds. total_ms : the whole frame. recovered : found again after a loss.
     """
 
     status: str
@@ -144,20 +147,19 @@ class Tracker:
         with clock.stage("prepare"):
             picture = self._prepare(image)
         attempt = self._attempt_from_last(picture, clock)
-        reason = self._refusal(attempt)
-        recovered = False
-        if reason:
+        refusal, how = self._refusal(attempt), _FOUND_AGAIN if self._lost else _FOLLOWED
+        if refusal:
             with clock.stage("recover"):
                 state, matches = self.relocaliser.find(picture.grey, self._shapes())
             if state is None:
-                reason += f"; {matches} features of the reference view were found again, too few"
+                refusal += f"; only {matches} features of the reference view were found again"
             else:
                 candidate = self._correct(picture, state, None, clock)
                 candidate = self._correct(picture, candidate.estimate.state, None, clock)
                 if not self._refusal(candidate):
-                    attempt, reason, recovered = candidate, "", True
-        self._remember(picture, attempt, bool(reason))
-        return self._result(attempt, reason, recovered, clock)
+                    attempt, refusal, how = candidate, "", _RECOVERED
+        self._remember(picture, attempt, bool(refusal))
+        return self._result(attempt, refusal, how, clock)
 
     def _attempt_from_last(self, picture: _Picture, clock: StageClock) -> _Attempt:
         """Estimate from the last known state; by way of the previous frame if the object was seen there."""
@@ -269,14 +271,14 @@ class Tracker:
             self._pixels = np.where(attempt.inliers[:, None], attempt.measurement.pixels, projected)
         self._picture, self._lost = picture, lost
 
-    def _result(self, attempt: _Attempt, refusal: str, recovered: bool, clock: StageClock) -> FrameResult:
+    def _result(self, attempt: _Attempt, refusal: str, how: str, clock: StageClock) -> FrameResult:
         visible, count = int(attempt.measurement.visible.sum()), int(attempt.inliers.sum())
         times, total = clock.milliseconds, clock.total
         if refusal:
             return FrameResult("lost", f"lost: {refusal}", None, np.nan, visible, count, times, total)
         residuals = attempt.estimate.residuals[attempt.inliers]
         rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
-        how = "recovered from the reference view's features" if recovered else "followed"
+        recovered = how != _FOLLOWED
         return FrameResult("tracked", how, attempt.estimate, rms, visible, count, times, total, recovered)
 
     def _prepare(self, image: NDArray[np.uint8]) -> _Picture:
