@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 from morph_dslam.cli import frame_range, run_and_report_errors
-from morph_dslam.experiment import Recording, keep_model, report, track_and_evaluate
+from morph_dslam.experiment import Recording, check_recording, keep_model, report, track_and_evaluate
 
 HERE = Path(__file__).resolve().parent
 OUTPUT = HERE / "output"
@@ -42,6 +42,7 @@ def run(arguments: argparse.Namespace) -> None:
         range=arguments.frames,
         reference_frame=REFERENCE_FRAME,
     )
+    check_recording(recording)
     keep_model(HERE / "study.toml", model)
     report(track_and_evaluate(recording, model, folder), folder)
 

@@ -90,6 +90,24 @@ def first_truth_frame(recording: Recording) -> int:
     return inside[0]
 
 
+def check_recording(recording: Recording) -> None:
+    """Find mistakes in a recording before anything long begins.
+
+    Raises
+    ------
+    MorphError
+        If a file is missing or malformed, or the range does not fit the frames or the truth.
+    """
+    from morph_dslam.io.calibration import load_camera
+    from morph_dslam.io.landmarks import load_landmarks
+    from morph_dslam.sources import open_source
+
+    open_source(recording.frames, *recording.range)
+    load_camera(recording.camera)
+    load_landmarks(recording.landmarks)
+    first_truth_frame(recording)
+
+
 def track_and_evaluate(recording: Recording, model: Path, run: Path) -> dict[str, Any]:
     """Track a recording and compare it with its truth.
 

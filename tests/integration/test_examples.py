@@ -1,0 +1,47 @@
+"""The examples, run as a user runs them."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+
+from tests.support.real_data import ROOT, real_data
+
+RESULT = r"mean_mm=([\d.]+) median_mm=[\d.]+ p95_mm=[\d.]+ tracked=(\d+)/(\d+) median_ms=[\d.]+ p95_ms=[\d.]+"
+
+
+def run_example(name, *options):
+    program = ROOT / "examples" / name / "run.py"
+    return subprocess.run([sys.executable, str(program), *options], capture_output=True, text=True)
+
+
+def result_of(done):
+    """Mean error (mm), frames tracked, frames, from the last line."""
+    assert done.returncode == 0, done.stderr[-2000:]
+    found = re.fullmatch(RESULT, done.stdout.splitlines()[-1])
+    assert found
+    return float(found[1]), int(found[2]), int(found[3])
+
+
+@pytest.mark.slow
+def test_the_demo_follows_its_truth_within_a_millimetre():
+    mean, tracked, frames = result_of(run_example("demo"))
+    assert tracked == frames == 150
+    assert mean <= 1.0
+    assert (ROOT / "demo" / "run" / "augmented.mp4").is_file()
+    assert (ROOT / "demo" / "run" / "report.html").is_file()
+
+
+@pytest.mark.slow
+def test_the_real_sheet_is_followed_within_four_millimetres():
+    mean, tracked, frames = result_of(run_example("kinect_paper", "--data", str(real_data("kinect_paper"))))
+    assert tracked == frames == 92
+    assert mean <= 4.0
+
+
+def test_a_recording_that_is_not_there_is_one_message_before_the_model_is_built(tmp_path):
+    done = run_example("kinect_paper", "--data", str(tmp_path / "absent"))
+    assert done.returncode == 2
+    assert re.fullmatch(r"morph: there is no folder .*absent/rgb\n", done.stderr)
+    assert done.stdout == ""
