@@ -68,37 +68,30 @@ class GrippedSheet:
         order: int = 3,
     ) -> None:
         self.grips, self.width = grips, width
-        x_lines, y_lines = mesh_lines(grips, width, divisions)
-        self.shell = KoiterSheet(rectangle_mesh(x_lines, y_lines), material, order)
-        self._find_held_dofs()
+        mesh = rectangle_mesh(*mesh_lines(grips, width, divisions))
+        self._held_vertices = _vertices_under(grips, mesh)
+        rigid = _elements_within(mesh, np.concatenate(self._held_vertices))
+        self.shell = KoiterSheet(mesh, material, order, rigid_elements=rigid)
+        self._find_held_dofs(rigid)
         self._bulge_row = self._bulge_functional()
 
     # -- set-up ---------------------------------------------------------------------------------------
 
-    def _find_held_dofs(self) -> None:
-        """Dofs of the elements under the grips: vertices move with the grip, all others stay zero."""
-        mesh, scalar, grips = self.shell.mesh, self.shell.scalar_space, self.grips
+    def _find_held_dofs(self, rigid_elements: list[int]) -> None:
+        """Dofs under the grips: those of vertices move with the grip, those of higher order stay zero."""
+        mesh, scalar = self.shell.mesh, self.shell.scalar_space
         vertices = np.array([v.point for v in mesh.vertices])
-        half = grips.length / 2.0
-        tolerance = 1e-9 * grips.length
-
-        def within(sign: float, centre: float) -> NDArray[np.bool_]:
-            return (sign * vertices[:, 0] >= half - grips.depth - tolerance) & (
-                np.abs(vertices[:, 1] - centre) <= grips.height / 2.0 + tolerance
-            )
-
-        held = within(-1.0, grips.centre_left), within(1.0, grips.centre_right)
-        self._held_vertices = [np.flatnonzero(mask) for mask in held]
-        inside = held[0] | held[1]
-        higher: set[int] = set()
-        for element in mesh.Elements(ngs.VOL):
-            if all(inside[v.nr] for v in element.vertices):
-                higher.update(d for d in scalar.GetDofNrs(element) if d >= mesh.nv)
         material_points = np.column_stack([vertices, np.zeros(len(vertices))])
         self._held_points = [material_points[indices] for indices in self._held_vertices]
-        held_all = np.concatenate(self._held_vertices)
+        higher = {
+            dof
+            for number in rigid_elements
+            for dof in scalar.GetDofNrs(ngs.ElementId(ngs.VOL, number))
+            if dof >= mesh.nv
+        }
+        held = np.concatenate(self._held_vertices)
         starts = [self.shell.displacement_dofs(i).start for i in range(3)]
-        self._held_dofs = np.concatenate([start + held_all for start in starts])
+        self._held_dofs = np.concatenate([start + held for start in starts])
         fixed = [self._held_dofs] + [start + np.array(sorted(higher), dtype=int) for start in starts]
         free = ngs.BitArray(self.shell.space.FreeDofs(True))
         for dof in np.concatenate(fixed):
@@ -245,17 +238,52 @@ class GrippedSheet:
         return motions @ response.per_motion, motions
 
     def first_state(self, bulge: float) -> EquilibriumState:
-        """Equilibrium of the gently arched sheet, bend = 1, from a circular arc as the first guess."""
-        shell, grips = self.shell, self.grips
-        half = grips.free_length / 2.0
-        curvature = ngs.Parameter(bulge * (1.0 / 0.869) / half**2)
+        """Equilibrium of the gently arched sheet, bend = 1, from a circular arc as the first guess.
+
+        Should Newton's method not converge from there, a flatter arch is tried: the state returned may bulge
+        less than asked.
+
+        Raises
+        ------
+        SolverError
+            If no arch converges.
+        """
+        shell = self.shell
+        half = self.grips.free_length / 2.0
+        arc = ngs.IfPos(half * half - ngs.x * ngs.x, 1.0 - ngs.x * ngs.x / (half * half), 0.0)
         guess = ngs.GridFunction(shell.scalar_space)
-        inside = ngs.IfPos(half * half - ngs.x * ngs.x, curvature * (half * half - ngs.x * ngs.x), 0.0)
-        guess.Set(inside)
+        guess.Set(arc)
         dofs = np.zeros(shell.space.ndof)
         dofs[shell.displacement_dofs(2)] = guess.vec.FV().NumPy()
-        coordinates = np.array([bulge, 1.0, 0.0, 0.0])
-        return self.solve(coordinates, EquilibriumState(coordinates, np.zeros(6), dofs))
+        dofs /= float(self._bulge_row @ dofs)
+        for reduction in (1.0, 0.5, 0.25, 0.125):
+            coordinates = np.array([reduction * bulge, 1.0, 0.0, 0.0])
+            start = EquilibriumState(coordinates, np.zeros(6), coordinates[0] * dofs)
+            try:
+                return self.solve(coordinates, start)
+            except SolverError:
+                continue
+        raise SolverError("not even a gently arched sheet converges: refine solver.divisions")
+
+
+def _vertices_under(grips: Grips, mesh: ngs.Mesh) -> list[NDArray[np.intp]]:
+    """Mesh vertices under the left and the right grip."""
+    vertices = np.array([v.point for v in mesh.vertices])
+    tolerance = 1e-9 * grips.length
+    inner = grips.length / 2.0 - grips.depth - tolerance
+    return [
+        np.flatnonzero(
+            (sign * vertices[:, 0] >= inner)
+            & (np.abs(vertices[:, 1] - centre) <= grips.height / 2.0 + tolerance)
+        )
+        for sign, centre in ((-1.0, grips.centre_left), (1.0, grips.centre_right))
+    ]
+
+
+def _elements_within(mesh: ngs.Mesh, vertices: NDArray[np.intp]) -> list[int]:
+    """Elements all of whose vertices are in ``vertices``."""
+    inside = set(vertices.tolist())
+    return [element.nr for element in mesh.Elements(ngs.VOL) if all(v.nr in inside for v in element.vertices)]
 
 
 def _describe(coordinates: Array) -> str:

@@ -1,7 +1,8 @@
 """Rigid grips on the short edges of a sheet: how they move, and the coordinates that a model uses for it.
 
 The object frame has its origin at the sheet's centre, x along the length, y up, z out of the face.
-Each grip holds a rectangle rigidly. Its motion is described by six numbers, `GripMotion`:
+Each grip holds a rectangle rigidly. Its motion is described by six numbers, turning about
+the middle of its inner edge:
 
     bend_left, bend_right   rotation about the vertical axis, rad; both positive: the sheet arches to +z
     twist                   relative rotation about the x axis, rad, half to each grip
@@ -66,8 +67,9 @@ class Grips:
         return self.length - 2.0 * self.depth
 
     @property
-    def centres(self) -> tuple[Array, Array]:
-        offset = self.length / 2.0 - self.depth / 2.0
+    def pivots(self) -> tuple[Array, Array]:
+        """Middles of the grips' inner edges, about which they turn, metres."""
+        offset = self.length / 2.0 - self.depth
         return np.array([-offset, self.centre_left, 0.0]), np.array([offset, self.centre_right, 0.0])
 
     def bulge_weight(self, x: Array) -> Array:
@@ -95,14 +97,14 @@ class Grips:
     def positions(self, motion: Array, left: Array, right: Array) -> Array:
         """Positions (n_left + n_right, 3) of material points (n, 3) held by the grips."""
         bend_left, bend_right, twist, approach, turn_left, turn_right = motion
-        centre_left, centre_right = self.centres
+        pivot_left, pivot_right = self.pivots
         shift = np.array([approach / 2.0, 0.0, 0.0])
         rotation_left = _about_x(-twist / 2.0) @ _about_z(turn_left) @ _about_y(-bend_left)
         rotation_right = _about_x(twist / 2.0) @ _about_z(turn_right) @ _about_y(bend_right)
         return np.vstack(
             [
-                (left - centre_left) @ rotation_left.T + centre_left + shift,
-                (right - centre_right) @ rotation_right.T + centre_right - shift,
+                (left - pivot_left) @ rotation_left.T + pivot_left + shift,
+                (right - pivot_right) @ rotation_right.T + pivot_right - shift,
             ]
         )
 

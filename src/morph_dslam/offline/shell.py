@@ -81,6 +81,14 @@ def rectangle_mesh(x_lines: Array, y_lines: Array) -> ngs.Mesh:
     return MakeStructured2DMesh(quads=True, nx=nx, ny=ny, mapping=place)
 
 
+def _bending_compliance(mesh: ngs.Mesh, rigid_elements: list[int]) -> ngs.GridFunction:
+    """1 in elements that bend; nearly 0 in rigid ones (not quite: their moments must stay determined)."""
+    result = ngs.GridFunction(ngs.L2(mesh, order=0))
+    result.Set(ngs.CF(1.0))
+    result.vec.FV().NumPy()[rigid_elements] *= 1e-6
+    return result
+
+
 def _unit(vector: Any) -> Any:
     return vector / ngs.Norm(vector)
 
@@ -108,6 +116,8 @@ class KoiterSheet:
     order : polynomial degree of the displacements (moments: one less).
     clamped : names of mesh boundaries held in place and direction, "left|right" say, or "".
     dead_load : boundary name -> force per length (3,), N/m; scaled by `load_factor`.
+    rigid_elements : elements whose displacements the caller prescribes as rigid. They must not bend at their
+        edges either, which the moments would let them.
     """
 
     def __init__(
@@ -117,6 +127,7 @@ class KoiterSheet:
         order: int = 3,
         clamped: str = "",
         dead_load: dict[str, Array] | None = None,
+        rigid_elements: list[int] | None = None,
     ) -> None:
         self.mesh, self.material, self.order = mesh, material, order
         self.load_factor = ngs.Parameter(1.0)
@@ -128,9 +139,9 @@ class KoiterSheet:
         self.space = scalar * scalar * scalar * moments * hybrid * force * force * force
         self.state = ngs.GridFunction(self.space)
         self._normals = _AveragedNormals(mesh, order, clamped, self.state)
-        self._build_energy(dead_load or {})
+        self._build_energy(dead_load or {}, _bending_compliance(mesh, rigid_elements or []))
 
-    def _build_energy(self, dead_load: dict[str, Array]) -> None:
+    def _build_energy(self, dead_load: dict[str, Array], bending_compliance: ngs.GridFunction) -> None:
         material = self.material
         t, stiffness = material.thickness, material.stiffness
         # Bending stiffness sets the unit of energy: conditioning then does not depend on units.
@@ -158,7 +169,7 @@ class KoiterSheet:
         membrane = sum(n * e for n, e in zip(force, strain, strict=True))
         membrane -= _quadratic(0.5 / t * compliance, *force)
         bending = m11 * kappa[0] + m22 * kappa[1] + 2.0 * m12 * kappa[2]
-        bending -= _quadratic(6.0 / t**3 * compliance, m11, m22, m12)
+        bending -= bending_compliance * _quadratic(6.0 / t**3 * compliance, m11, m22, m12)
         hinge = -(ngs.asin(conormal * averaged) - h * edge_normal) * m_nn
         form = ngs.BilinearForm(self.space, symmetric=True, condense=True)
         form += ngs.Variation(membrane.Compile() * ngs.dx)
