@@ -1,0 +1,112 @@
+"""What a run says about itself: flags, the side of the object that is seen, and hidden points."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.model import ReducedModel, SeparatedField, SurfacePoints
+from morph_dslam.model.functions import ParameterFunctions
+from morph_dslam.online.appearance import ReferenceAppearance
+from morph_dslam.online.augmentation import seen_field, value_range
+from morph_dslam.online.binding import view_of
+from morph_dslam.online.estimation import BoundPoints, Estimate, State
+from morph_dslam.online.measurement import visible_surface
+from morph_dslam.online.pipeline import STAGES, FrameResult
+from morph_dslam.online.results import RunResults, flags, summarise
+from tests.support.bent_sheet import PARAMETERS, bent_sheet_model
+
+CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
+FRONT = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
+BACK = RigidTransform(np.diag([-1.0, -1.0, 1.0]), np.array([0.0, 0.0, 0.6]))
+
+
+def frame_result(parameters, deviations, at_bound, milliseconds=2.0):
+    state = State(np.array(parameters), FRONT)
+    covariance = np.diag([*np.square(deviations), *[1e-8] * 6])
+    estimate = Estimate(state, 1.0, np.zeros((9, 2)), 0.3, covariance, np.array(at_bound), 4, True)
+    times = dict.fromkeys(STAGES, milliseconds)
+    return FrameResult("tracked", "", estimate, 0.4, 300, 280, times, milliseconds * len(STAGES) + 0.5)
+
+
+def lost_result():
+    return FrameResult("lost", "lost: why", None, np.nan, 300, 4, dict.fromkeys(STAGES, 1.0), 7.0)
+
+
+def test_summary_counts_and_flags():
+    run = RunResults(bent_sheet_model(22, 16), reference_frame=3)
+    run.add(3, 0.0, frame_result([0.01, 0.1, 0.0], [1e-3, 0.05, 0.01], [False, False, False]))
+    run.add(4, 0.1, frame_result([0.06, 0.1, 0.0], [1e-3, 5.0, 0.01], [True, False, False], 4.0))
+    run.add(5, 0.2, lost_result())
+    summary = summarise(run)
+    assert (summary["n_frames"], summary["n_tracked"], summary["n_lost"]) == (3, 2, 1)
+    assert summary["median_ms"] == pytest.approx(2.0 * len(STAGES) + 0.5)
+    assert summary["median_n_inliers"] == 280
+    told = flags(run)
+    assert "1 of 3 frames were lost" in told[0]
+    assert "'arch' is at a bound of the model's range in 1 frames" in told[1]
+    assert "'skew' cannot be told from the images in 1 frames" in told[2]
+    assert len(told) == 3
+
+
+def test_stress_shown_is_that_of_the_side_turned_to_the_camera():
+    model = bent_sheet_model(22, 16)
+    # Make the faces tell apart: nothing on the bottom.
+    top = model.stresses["top"]
+    model = replace(model, stresses={"top": top, "bottom": replace(top, modes=0.0 * top.modes)})
+    parameters = np.array([0.04, 0.0, 0.0])
+    for pose, expected in ((FRONT, True), (BACK, False)):
+        state = State(parameters, pose)
+        values, label = seen_field(model, state, view_of(model, CAMERA, state))
+        assert label == "von Mises stress [MPa]"
+        assert (values.max() > 0.0) == expected
+
+
+def test_models_without_stress_show_the_displacement():
+    model = replace(bent_sheet_model(22, 16), stresses={})
+    state = State(np.array([0.04, 0.0, 0.0]), FRONT)
+    values, label = seen_field(model, state, view_of(model, CAMERA, state))
+    assert label == "displacement [mm]"
+    assert values.max() == pytest.approx(40.0, rel=0.02)
+    low, high = value_range(model, CAMERA, [None, state])
+    assert low == 0.0
+    assert 30.0 < high <= values.max()
+    assert value_range(model, CAMERA, [None]) == (0.0, 1.0)
+
+
+def two_layers():
+    """Two parallel squares of 0.2 m, the second 0.1 m behind the first for a camera at +z."""
+    square = np.array([[-0.1, -0.1, 0.0], [0.1, -0.1, 0.0], [0.1, 0.1, 0.0], [-0.1, 0.1, 0.0]])
+    nodes = np.concatenate([square, square - [0.0, 0.0, 0.1]])
+    triangles = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    functions = ParameterFunctions(-np.ones(3), np.ones(3), np.zeros((1, 3), np.int64), np.zeros((1, 1)))
+    field = SeparatedField(np.zeros((1, 8, 3)), functions)
+    return ReducedModel("layers", nodes, triangles, PARAMETERS, field)
+
+
+def test_points_hidden_by_the_object_or_turned_away_are_not_visible():
+    model = two_layers()
+    points = BoundPoints.from_surface(
+        model, SurfacePoints(np.arange(4), np.array([[0.4, 0.3, 0.3]] * 3 + [[0.3, 0.4, 0.3]]))
+    )
+    front = State(np.zeros(3), FRONT)
+    flat = np.full((480, 640), 90, np.uint8)
+    appearance = ReferenceAppearance(model, CAMERA, flat, view_of(model, CAMERA, front))
+
+    def visible(state):
+        view = view_of(model, CAMERA, state)
+        positions = points.in_camera(state)
+        return visible_surface(
+            points.surface,
+            positions,
+            CAMERA.project(positions),
+            view,
+            model.triangles,
+            appearance,
+            appearance.render(view),
+        ).tolist()
+
+    assert visible(front) == [True, True, False, False]
+    assert visible(State(np.zeros(3), BACK)) == [False, False, False, False]
