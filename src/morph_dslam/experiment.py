@@ -8,13 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from morph_dslam import __version__
-
 FrameRange = tuple[int | None, int | None]
 
 
+def sources(*packages: str) -> list[Path]:
+    """The source files of subpackages of morph_dslam."""
+    root = Path(__file__).parent
+    return [path for package in packages for path in sorted((root / package).glob("*.py"))]
+
+
 def keep(product: Path, ingredients: Sequence[Path], make: Callable[[], object]) -> bool:
-    """Make ``product`` unless it was already made from the same ingredients by the same release.
+    """Make ``product`` unless it was already made from the same ingredients.
 
     Parameters
     ----------
@@ -25,7 +29,7 @@ def keep(product: Path, ingredients: Sequence[Path], make: Callable[[], object])
     -------
     Whether it was made.
     """
-    digest = hashlib.sha256(__version__.encode())
+    digest = hashlib.sha256()
     for path in ingredients:
         digest.update(path.read_bytes())
     recipe, wanted = product.with_name(product.name + ".made-from"), digest.hexdigest()
@@ -40,17 +44,17 @@ def keep(product: Path, ingredients: Sequence[Path], make: Callable[[], object])
 
 
 def keep_model(study: Path, model: Path) -> None:
-    """Build a model once; it is built again when the study changes."""
+    """Build a model once; it is built again when the study, or the code that builds it, changes."""
     from morph_dslam.offline.build import build
 
-    keep(model, [study], lambda: build(study, model))
+    keep(model, [study, *sources("offline", "model")], lambda: build(study, model))
 
 
 def keep_sequence(scene: Path, model: Path, folder: Path) -> None:
-    """Film a model once; it is filmed again when the scene or the model changes."""
+    """Film a model once; it is filmed again when the scene, the model or the renderer changes."""
     from morph_dslam.render.simulation import simulate
 
-    keep(folder, [scene, model], lambda: simulate(scene, folder))
+    keep(folder, [scene, model, *sources("render")], lambda: simulate(scene, folder))
 
 
 @dataclass(frozen=True)
