@@ -139,9 +139,10 @@ class KoiterSheet:
         self.space = scalar * scalar * scalar * moments * hybrid * force * force * force
         self.state = ngs.GridFunction(self.space)
         self._normals = _AveragedNormals(mesh, order, clamped, self.state)
-        self._build_energy(dead_load or {}, _bending_compliance(mesh, rigid_elements or []))
+        self._bending_compliance = _bending_compliance(mesh, rigid_elements or [])
+        self._build_energy(dead_load or {})
 
-    def _build_energy(self, dead_load: dict[str, Array], bending_compliance: ngs.GridFunction) -> None:
+    def _build_energy(self, dead_load: dict[str, Array]) -> None:
         material = self.material
         t, stiffness = material.thickness, material.stiffness
         # Bending stiffness sets the unit of energy: conditioning then does not depend on units.
@@ -169,7 +170,7 @@ class KoiterSheet:
         membrane = sum(n * e for n, e in zip(force, strain, strict=True))
         membrane -= _quadratic(0.5 / t * compliance, *force)
         bending = m11 * kappa[0] + m22 * kappa[1] + 2.0 * m12 * kappa[2]
-        bending -= bending_compliance * _quadratic(6.0 / t**3 * compliance, m11, m22, m12)
+        bending -= self._bending_compliance * _quadratic(6.0 / t**3 * compliance, m11, m22, m12)
         hinge = -(ngs.asin(conormal * averaged) - h * edge_normal) * m_nn
         form = ngs.BilinearForm(self.space, symmetric=True, condense=True)
         form += ngs.Variation(membrane.Compile() * ngs.dx)
@@ -218,7 +219,8 @@ class KoiterSheet:
         t = self.material.thickness
         m = self.state.components[3]
         compliance = np.linalg.inv(self.material.stiffness) * self.energy_scale**2 * 6.0 / t**3
-        return ngs.Integrate(_quadratic(compliance, m[0, 0], m[1, 1], m[0, 1]), self.mesh)
+        density = _quadratic(compliance, m[0, 0], m[1, 1], m[0, 1])
+        return ngs.Integrate(self._bending_compliance * density, self.mesh)
 
 
 def _tangents(displacements: Any) -> tuple[Any, Any]:
