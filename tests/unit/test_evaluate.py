@@ -17,6 +17,12 @@ def run_and_truth(tmp_path):
     truth = exact_truth(model)
     truth["points_mm"] = truth["points_mm"] + np.array([0.0, 3.0, 4.0])
     np.savez(tmp_path / "truth.npz", **truth)
+    flags = {
+        "flags": ["the object may be <outside> the model"],
+        "n_recovered": 3,
+        "versions": {"numpy": "9.9"},
+    }
+    (run / "summary.json").write_text(json.dumps(flags))
     return run, tmp_path / "truth.npz"
 
 
@@ -34,6 +40,9 @@ def test_evaluate_writes_figures_pictures_and_report_and_ends_with_the_result(ru
     page = (run / "report.html").read_text()
     assert "5.000 mm" in page
     assert "too few points" in page
+    assert '<p class="warning">the object may be &lt;outside&gt; the model</p>' in page
+    assert "<tr><td>n recovered</td><td>3</td></tr>" in page
+    assert page.index("n recovered") < page.index("9.9")
     assert page.count("data:image/png;base64,") == 2
     assert not re.search(r'(src|href)="(http|/)', page)  # self-contained
 

@@ -131,6 +131,8 @@ def test_truth_pixels_off_the_object(tracked, tmp_path):
         lambda t: t | {"pixels": t["pixels"][:, :-1]},
         lambda t: t | {"frame": t["frame"][:-1]},
         lambda t: t | {"frame": t["frame"] * 0},
+        lambda t: t | {"frame": t["frame"] + 0.5},
+        lambda t: t | {"pixels": t["pixels"].astype(str)},
         lambda t: {"frame": t["frame"], "pixels": t["pixels"]},
     ],
 )

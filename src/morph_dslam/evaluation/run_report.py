@@ -18,6 +18,9 @@ from morph_dslam.evaluation.statements import remarks
 VIDEO = "augmented.mp4"
 N_FRAMES_SHOWN = 4
 
+#: Keys of ``summary.json`` that the figures of the evaluation repeat.
+_SHOWN_ABOVE = ("model", "n_frames", "n_tracked", "median_ms", "p95_ms")
+
 _CAPTIONS = {
     "evaluation.png": "Material error over the points of each frame with truth.",
     "error_map.png": "Mean material error where each point lies on the undeformed object.",
@@ -81,20 +84,29 @@ def _lost_section(run: Run) -> Section:
     )
 
 
+def _tracking_sections(run: Run) -> list[Section]:
+    path = run.folder / "summary.json"
+    summary = json.loads(path.read_text()) if path.is_file() else {}
+    flags = [Text(str(flag), warning=True) for flag in summary.pop("flags", [])]
+    background = {key: summary.pop(key) for key in ("inputs", "settings", "versions") if key in summary}
+    facts = flatten({key: value for key, value in summary.items() if key not in _SHOWN_ABOVE})
+    plots = [Picture.read(plot, plot.stem) for plot in sorted((run.folder / "plots").glob("*.png"))]
+    return [
+        Section("Tracking", [*flags, *([Table.of(facts)] if facts else []), *plots]),
+        Section("Settings and versions", [Table.of(flatten(background))] if background else []),
+    ]
+
+
 def write_run_report(run: Run, figures: Mapping[str, Any]) -> Path:
     """Write ``report.html`` into a run folder; ``figures`` are those of ``evaluation.json``."""
-    summary_path = run.folder / "summary.json"
-    summary = json.loads(summary_path.read_text()) if summary_path.is_file() else {}
-    plots = [
-        Picture.read(path, path.stem.replace("_", " "))
-        for path in sorted((run.folder / "plots").glob("*.png"))
-    ]
+    tracking, settings = _tracking_sections(run)
     sections = [
         _error_section(run, figures),
         _video_section(run),
         _lost_section(run),
-        Section("Tracking", [Table.of(flatten(summary)), *plots] if summary or plots else []),
+        tracking,
         *(Section(f"Model: {name}", [Table.of(facts)]) for name, facts in summarise_model(run.model).items()),
+        settings,
     ]
     path = run.folder / "report.html"
     write_report(path, f"{run.model.name}: tracked in {len(run.frames)} frames", sections)

@@ -13,7 +13,7 @@ from morph_dslam.errors import EvaluationError
 
 Array = NDArray[np.float64]
 
-LAYOUT = "frame (t,), points_mm (t, p, 3) in the camera frame, pixels (t, p, 2)"
+LAYOUT = "frame (t,) whole numbers, points_mm (t, p, 3) in the camera frame, pixels (t, p, 2)"
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,13 @@ def load_truth(path: Path) -> PointTruth:
         and points.shape[::2] == (len(frames), 3)
         and pixels.shape == (*points.shape[:2], 2)
         and points.size > 0
+        and frames.dtype.kind in "iu"
+        and points.dtype.kind == pixels.dtype.kind == "f"
     )
     if not fits:
         raise EvaluationError(
-            f"{path}: frame {frames.shape}, points_mm {points.shape}, pixels {pixels.shape} "
+            f"{path}: frame {frames.dtype}{frames.shape}, points_mm {points.dtype}{points.shape}, "
+            f"pixels {pixels.dtype}{pixels.shape} "
             f"do not fit together; a truth file has {LAYOUT}"
         )
     if len(np.unique(frames)) != len(frames):
