@@ -1,0 +1,94 @@
+"""Regression and POD against functions and decompositions known in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from morph_dslam.offline.pod import compute_pod
+from morph_dslam.offline.regression import fit_functions
+
+LOWER, UPPER = np.array([-2.0, 0.5, 10.0]), np.array([1.0, 1.5, 40.0])
+
+
+def smooth(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two functions (n, 2) of three parameters and their gradients (n, 3, 2)."""
+    a, b, c = x.T
+    values = np.column_stack([np.sin(a) * b, np.exp(-c / 30.0) * a**2])
+    gradients = np.empty((len(x), 3, 2))
+    gradients[:, :, 0] = np.column_stack([np.cos(a) * b, np.sin(a), 0.0 * c])
+    gradients[:, :, 1] = np.column_stack(
+        [2.0 * a * np.exp(-c / 30.0), 0.0 * b, -np.exp(-c / 30.0) * a**2 / 30.0]
+    )
+    return values, gradients
+
+
+def samples(count: int, seed: int) -> np.ndarray:
+    return LOWER + (UPPER - LOWER) * np.random.default_rng(seed).random((count, 3))
+
+
+def test_polynomials_are_recovered_exactly() -> None:
+    x = samples(60, 0)
+    a, b, c = x.T
+    values = (a**2 * b - 0.1 * c)[:, None]
+    gradients = np.column_stack([2.0 * a * b, a**2, np.full(len(x), -0.1)])[:, :, None]
+    functions, errors = fit_functions(x, values, gradients, LOWER, UPPER, 5, np.arange(60))
+    assert errors[2] > 1e-3
+    assert errors[3] < 1e-6
+    new = samples(20, 1)
+    for mu in new:
+        value, gradient = functions.evaluate(mu)
+        assert value == pytest.approx(mu[0] ** 2 * mu[1] - 0.1 * mu[2], abs=1e-5)
+        assert gradient[:, 0] == pytest.approx([2.0 * mu[0] * mu[1], mu[0] ** 2, -0.1], abs=1e-4)
+
+
+def test_smooth_functions_converge_with_the_degree() -> None:
+    x = samples(150, 2)
+    values, gradients = smooth(x)
+    functions, errors = fit_functions(x, values, gradients, LOWER, UPPER, 8, np.arange(150))
+    assert errors[8] < 1e-2 * errors[3]
+    new = samples(50, 3)
+    expected, slopes = smooth(new)
+    for i, mu in enumerate(new):
+        value, gradient = functions.evaluate(mu)
+        assert value == pytest.approx(expected[i], abs=2e-4)
+        assert gradient * (UPPER - LOWER)[:, None] == pytest.approx(
+            slopes[i] * (UPPER - LOWER)[:, None], abs=5e-3
+        )
+
+
+def test_too_high_a_degree_is_not_chosen_for_noisy_values() -> None:
+    """Cross-validation must notice that noise is not worth fitting."""
+    rng = np.random.default_rng(4)
+    x = samples(80, 5)
+    values = x[:, :1] ** 2 + 0.2 * rng.normal(size=(80, 1))
+    gradients = np.zeros((80, 3, 1))
+    gradients[:, 0, 0] = 2.0 * x[:, 0]
+    gradients += 0.5 * rng.normal(size=gradients.shape)
+    functions, errors = fit_functions(x, values, gradients, LOWER, UPPER, 8, np.arange(80))
+    assert functions.multi_indices.sum(axis=1).max() <= 4
+    assert errors[2] < errors[max(errors)]
+
+
+def test_pod_finds_the_rank_and_keeps_the_weights() -> None:
+    rng = np.random.default_rng(6)
+    weights = rng.uniform(0.5, 2.0, 90)
+    left, right = rng.normal(size=(40, 3)), rng.normal(size=(3, 90))
+    snapshots = (left * [10.0, 1.0, 0.1]) @ right
+    pod = compute_pod(snapshots, weights, tolerance=1e-10, max_modes=20)
+    assert len(pod.modes) == 3
+    assert (pod.modes * weights) @ pod.modes.T == pytest.approx(np.eye(3), abs=1e-12)
+    assert pod.project(snapshots) @ pod.modes == pytest.approx(snapshots, abs=1e-9)
+
+
+def test_pod_error_equals_the_singular_values_left_out() -> None:
+    """Eckart-Young: the best rank-r error is the root of the discarded squared singular values."""
+    rng = np.random.default_rng(7)
+    snapshots = rng.normal(size=(30, 60)) * np.exp(-0.3 * np.arange(60))
+    singular = np.linalg.svd(snapshots, compute_uv=False)
+    pod = compute_pod(snapshots, np.ones(60), tolerance=0.05, max_modes=60)
+    count = len(pod.modes)
+    missed = np.linalg.norm(snapshots - pod.project(snapshots) @ pod.modes)
+    assert missed == pytest.approx(np.sqrt(np.sum(singular[count:] ** 2)), rel=1e-9)
+    total = np.linalg.norm(singular)
+    assert missed <= 0.05 * total < np.sqrt(np.sum(singular[count - 1 :] ** 2))
