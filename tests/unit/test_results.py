@@ -13,8 +13,8 @@ from morph_dslam.online.appearance import ReferenceAppearance
 from morph_dslam.online.augmentation import seen_field, value_range
 from morph_dslam.online.binding import view_of
 from morph_dslam.online.estimation import BoundPoints, Estimate, State
+from morph_dslam.online.frame_result import STAGES, FrameResult
 from morph_dslam.online.measurement import visible_surface
-from morph_dslam.online.pipeline import STAGES, FrameResult
 from morph_dslam.online.results import RunResults, flags, summarise
 from tests.support.bent_sheet import PARAMETERS, bent_sheet_model
 

@@ -8,7 +8,7 @@ only say where to start.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -22,6 +22,7 @@ from morph_dslam.online.binding import View, bind_pixels, draw_view, view_of
 from morph_dslam.online.estimation import BoundPoints, Estimate, EstimationOptions, Estimator, State
 from morph_dslam.online.features import interior, spread_corners
 from morph_dslam.online.flow import FlowOptions, flatten, follow
+from morph_dslam.online.frame_result import FOLLOWED, FOUND_AGAIN, RECOVERED, STAGES, FrameResult
 from morph_dslam.online.measurement import (
     Measurement,
     MeasurementOptions,
@@ -29,13 +30,13 @@ from morph_dslam.online.measurement import (
     visible_surface,
 )
 from morph_dslam.online.relocalisation import Relocaliser
+from morph_dslam.online.shape_search import ShapeSearch, with_undetermined_at_default
 from morph_dslam.online.timing import StageClock
 
 Array = NDArray[np.float64]
-_FOLLOWED = "followed from the previous frame"
-_FOUND_AGAIN = "found again where it was last seen"
-_RECOVERED = "recovered from the reference view's features"
-STAGES = ("prepare", "flow", "estimate", "render", "correct", "recover")
+
+#: Share of the cost below which another shape is a better explanation and not the same one.
+CLEARLY_BETTER = 0.95
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,8 @@ class TrackerOptions:
     inlier_sigmas, inlier_px : a point supports the estimate when its residual is below so many robust
         standard deviations, within these limits in pixels: a model that is a pixel off must not cost it good
         points, and occluders that happen to look alike must not get in where it fits well.
+    search_above_px, searches : where the residuals' spread exceeds this, so many other shapes are tried in
+        the frame as starts, in turn, lest the estimate stay in a local minimum.
     least_inliers, least_share : points that must support it, as a number or a share of all, if that is fewer.
     """
 
@@ -56,33 +59,11 @@ class TrackerOptions:
     inlier_px: tuple[float, float] = (2.0, 8.0)
     least_inliers: int = 30
     least_share: float = 0.3
+    search_above_px: float = 0.25
+    searches: int = 2
     flow: FlowOptions = field(default_factory=FlowOptions)
     measurement: MeasurementOptions = field(default_factory=MeasurementOptions)
     estimation: EstimationOptions = field(default_factory=EstimationOptions)
-
-
-@dataclass(frozen=True)
-class FrameResult:
-    """What one frame told.
-
-    Attributes
-    ----------
-    status : "tracked" or "lost". reason : how it was found, or why it was not.
-    estimate : None when lost.
-    residual_rms_px : root mean square of the inliers' residuals, NaN when lost.
-    n_points, n_inliers : points that the object itself does not hide, and those that support the estimate.
-    timings_ms : by stage, milliseconds. total_ms : the whole frame. recovered : found again after a loss.
-    """
-
-    status: str
-    reason: str
-    estimate: Estimate | None
-    residual_rms_px: float
-    n_points: int
-    n_inliers: int
-    timings_ms: dict[str, float]
-    total_ms: float
-    recovered: bool = False
 
 
 @dataclass(frozen=True)
@@ -95,11 +76,11 @@ class _Picture:
 
 @dataclass(frozen=True)
 class _Attempt:
-    """An estimate, the measurements it rests on, and which of them support it (p,)."""
+    """An estimate, which measurements support it (p,), and all the measurements."""
 
     estimate: Estimate
-    measurement: Measurement
     inliers: NDArray[np.bool_]
+    measurement: Measurement
 
 
 class Tracker:
@@ -139,7 +120,11 @@ class Tracker:
         self._picture = picture
         self._pixels = camera.project(self.points.in_camera(state))
         self._supported = np.ones(len(self.points), dtype=bool)
+        self._search = ShapeSearch(model, self.options.searches)
+        brief = replace(self.options.estimation, max_iterations=10, tolerance=1e-3)
+        self._scout = Estimator(model, camera, brief)
         self._last, self._velocity_base, self._lost = state, state, not in_sequence
+        self._start = state
 
     def process_frame(self, image: NDArray[np.uint8]) -> FrameResult:
         """Find the object in the next frame (h, w, 3) uint8, as recorded."""
@@ -147,7 +132,9 @@ class Tracker:
         with clock.stage("prepare"):
             picture = self._prepare(image)
         attempt = self._attempt_from_last(picture, clock)
-        refusal, how = self._refusal(attempt), _FOUND_AGAIN if self._lost else _FOLLOWED
+        with clock.stage("search"):
+            attempt = self._search_other_shapes(attempt)
+        refusal, how = self._refusal(attempt), FOUND_AGAIN if self._lost else FOLLOWED
         if refusal:
             with clock.stage("recover"):
                 state, matches = self.relocaliser.find(picture.grey, self._shapes())
@@ -157,7 +144,7 @@ class Tracker:
                 candidate = self._correct(picture, state, None, clock)
                 candidate = self._correct(picture, candidate.estimate.state, None, clock)
                 if not self._refusal(candidate):
-                    attempt, refusal, how = candidate, "", _RECOVERED
+                    attempt, refusal, how = candidate, "", RECOVERED
         self._remember(picture, attempt, bool(refusal))
         return self._result(attempt, refusal, how, clock)
 
@@ -169,7 +156,7 @@ class Tracker:
             followed = self._follow(picture)
         with clock.stage("estimate"):
             start = self.estimator.estimate(
-                self.points, followed.pixels, followed.valid.astype(float), self._last
+                self.points, followed.pixels, followed.valid.astype(float), self._start
             )
         return self._correct(picture, start.state, followed, clock)
 
@@ -219,7 +206,7 @@ class Tracker:
             )
         with clock.stage("estimate"):
             estimate, inliers = self._estimate_trimmed(measurement, state)
-        return _Attempt(estimate, measurement, inliers)
+        return _Attempt(estimate, inliers, measurement)
 
     def _estimate_trimmed(self, measurement: Measurement, start: State) -> tuple[Estimate, NDArray[np.bool_]]:
         """Estimate from all valid measurements, then from those that agree with the first estimate."""
@@ -235,6 +222,19 @@ class Tracker:
             start, used = estimate.state, agreeing
         assert estimate is not None
         return estimate, used
+
+    def _search_other_shapes(self, attempt: _Attempt) -> _Attempt:
+        """The attempt, or a clearly better explanation of its measurements reached from another shape."""
+        measurement, estimate = attempt.measurement, attempt.estimate
+        if not self.options.search_above_px < estimate.sigma_px < np.inf:
+            return attempt
+        weights = measurement.valid.astype(float)
+        cost = self.estimator.evaluate(self.points, measurement.pixels, weights, estimate.state)[0]
+        starts = self._search.next_starts(estimate.state.camera_from_object)
+        best = self._scout.estimate_from(self.points, measurement.pixels, weights, starts)[0]
+        if best.cost > CLEARLY_BETTER * cost:
+            return attempt
+        return _Attempt(*self._estimate_trimmed(measurement, best.state), measurement)
 
     def _refusal(self, attempt: _Attempt) -> str:
         """Why an attempt is not to be believed; empty when it is."""
@@ -266,6 +266,7 @@ class Tracker:
         if not lost:
             self._velocity_base = attempt.estimate.state if self._lost else self._last
             self._last = attempt.estimate.state
+            self._start = with_undetermined_at_default(self.model, attempt.estimate)
             self._supported = attempt.inliers
             projected = self.camera.project(self.points.in_camera(self._last))
             self._pixels = np.where(attempt.inliers[:, None], attempt.measurement.pixels, projected)
@@ -278,7 +279,7 @@ class Tracker:
             return FrameResult("lost", f"lost: {refusal}", None, np.nan, visible, count, times, total)
         residuals = attempt.estimate.residuals[attempt.inliers]
         rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
-        recovered = how != _FOLLOWED
+        recovered = how != FOLLOWED
         return FrameResult("tracked", how, attempt.estimate, rms, visible, count, times, total, recovered)
 
     def _prepare(self, image: NDArray[np.uint8]) -> _Picture:

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from morph_dslam.online.pipeline import STAGES
+from morph_dslam.online.frame_result import STAGES
 from morph_dslam.online.results import RunResults
 
 DPI = 110

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.model import ReducedModel
 from morph_dslam.online.estimation import State
-from morph_dslam.online.pipeline import STAGES, FrameResult
+from morph_dslam.online.frame_result import STAGES, FrameResult
 
 Array = NDArray[np.float64]
 FORMAT = "morph-dslam run"
