@@ -1,0 +1,55 @@
+"""Starts against local minima."""
+
+import numpy as np
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.model import SurfacePoints
+from morph_dslam.online.estimation import BoundPoints, EstimationOptions, Estimator, State
+from morph_dslam.online.registration import shape_starts
+from morph_dslam.online.shape_search import ShapeSearch, with_undetermined_at_default
+from tests.support.bent_sheet import bent_sheet_model
+
+CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
+POSE = RigidTransform(
+    rotation_exp(np.array([0.3, -0.2, 0.0])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6])
+)
+
+
+def test_every_shape_is_handed_out_once_before_any_is_repeated():
+    model = bent_sheet_model(22, 16)
+    search = ShapeSearch(model, 3)
+    count = len(shape_starts(model))
+    given = [state.parameters for _ in range(count) for state in search.next_starts(POSE)]
+    np.testing.assert_array_equal(given[0], model.default)
+    assert len(np.unique(np.round(given[:count], 9), axis=0)) == len(np.unique(shape_starts(model), axis=0))
+    np.testing.assert_array_equal(given[:count], given[count : 2 * count])
+
+
+def test_a_mirrored_bend_is_left_by_way_of_another_start():
+    """From the wrong sign of the arch in the pose that hides it best, other starts find the right one."""
+    model = bent_sheet_model(22, 16)
+    rng = np.random.default_rng(0)
+    surface = SurfacePoints(rng.integers(0, len(model.triangles), 150), rng.dirichlet(np.ones(3), 150))
+    points = BoundPoints.from_surface(model, surface)
+    truth = State(np.array([0.03, 0.2, 0.05]), POSE)
+    pixels, weights = CAMERA.project(points.in_camera(truth)), np.ones(150)
+    estimator = Estimator(model, CAMERA, EstimationOptions(max_iterations=10, tolerance=1e-3))
+    starts = ShapeSearch(model, 4).next_starts(POSE)
+    best = estimator.estimate_from(points, pixels, weights, starts)[0]
+    np.testing.assert_allclose(best.state.parameters, truth.parameters, atol=5e-3)
+
+
+def test_only_undetermined_parameters_return_to_their_default():
+    """Without an arch the skew has no effect; its estimate is dropped, the twist's is kept."""
+    model = bent_sheet_model(22, 16)
+    rng = np.random.default_rng(1)
+    surface = SurfacePoints(rng.integers(0, len(model.triangles), 150), rng.dirichlet(np.ones(3), 150))
+    points = BoundPoints.from_surface(model, surface)
+    truth = State(np.array([0.0, 0.0, 0.2]), POSE)
+    pixels = CAMERA.project(points.in_camera(truth)) + 0.1 * rng.standard_normal((150, 2))
+    start = State(np.array([0.001, 0.5, 0.2]), POSE)
+    found = Estimator(model, CAMERA).estimate(points, pixels, np.ones(150), start)
+    kept = with_undetermined_at_default(model, found)
+    assert kept.parameters[1] == 0.0
+    np.testing.assert_array_equal(kept.parameters[[0, 2]], found.state.parameters[[0, 2]])
