@@ -29,6 +29,7 @@ from morph_dslam.online.measurement import (
     compare_with_rendering,
     visible_surface,
 )
+from morph_dslam.online.reference_refinement import Keyframe
 from morph_dslam.online.relocalisation import Relocaliser
 from morph_dslam.online.shape_search import ShapeSearch, with_undetermined_at_default
 from morph_dslam.online.timing import StageClock
@@ -118,7 +119,8 @@ class Tracker:
         self.points = self._choose_points(picture, mask, view)
         self.relocaliser = Relocaliser(self.estimator, picture.grey, mask, view)
         self._picture = picture
-        self._pixels = camera.project(self.points.in_camera(state))
+        self._pixels = self.reference_pixels = camera.project(self.points.in_camera(state))
+        self.last_seen: Keyframe | None = None
         self._supported = np.ones(len(self.points), dtype=bool)
         self._search = ShapeSearch(model, self.options.searches)
         brief = replace(self.options.estimation, max_iterations=10, tolerance=1e-3)
@@ -264,6 +266,8 @@ class Tracker:
     def _remember(self, picture: _Picture, attempt: _Attempt, lost: bool) -> None:
         """Keep what the next frame starts from; a lost frame keeps the last known state."""
         if not lost:
+            estimate, weights = attempt.estimate, attempt.inliers.astype(float)
+            self.last_seen = Keyframe(attempt.measurement.pixels, weights, estimate.state, estimate.sigma_px)
             self._velocity_base = attempt.estimate.state if self._lost else self._last
             self._last = attempt.estimate.state
             self._start = with_undetermined_at_default(self.model, attempt.estimate)

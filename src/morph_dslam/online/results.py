@@ -24,10 +24,11 @@ VERSION = 1
 
 @dataclass
 class RunResults:
-    """The results of all frames so far, in order."""
+    """The results of all frames so far, in order; ``refined``: the reference state was refined over them."""
 
     model: ReducedModel
     reference_frame: int
+    refined: bool = False
     frames: list[int] = field(default_factory=list)
     timestamps: list[float] = field(default_factory=list)
     results: list[FrameResult] = field(default_factory=list)

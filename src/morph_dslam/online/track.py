@@ -18,12 +18,19 @@ from morph_dslam import __version__
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import SourceError, TrackingError
 from morph_dslam.io.calibration import load_camera
-from morph_dslam.io.landmarks import load_landmarks
+from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.online.augmentation import write_video
+from morph_dslam.online.estimation import State
 from morph_dslam.online.pipeline import Tracker, TrackerOptions
 from morph_dslam.online.plots import write_plots
-from morph_dslam.online.registration import Registration, RegistrationOptions, register
+from morph_dslam.online.reference_refinement import (
+    Keyframe,
+    RefinementOptions,
+    choose_keyframes,
+    refine_reference,
+)
+from morph_dslam.online.registration import Registration, RegistrationOptions, bind_landmarks, register
 from morph_dslam.online.results import RunResults, write_csv, write_hdf5, write_summary
 from morph_dslam.sources import Frame, FrameSource, open_source
 
@@ -37,6 +44,7 @@ class TrackOptions:
     frames : video file or folder of images. model, camera, landmarks : files.
     output : the run folder. first, last : frame numbers to track, both included; all by default.
     reference_frame : the frame that the landmarks belong to; the first one tracked by default.
+    refine_reference : after tracking, refine the reference state over the whole sequence and track once more.
     overlay : draw the augmented video. overwrite : replace a run that is there already.
     """
 
@@ -48,9 +56,11 @@ class TrackOptions:
     first: int | None = None
     last: int | None = None
     reference_frame: int | None = None
+    refine_reference: bool = False
     overlay: bool = True
     overwrite: bool = False
     registration: RegistrationOptions = field(default_factory=RegistrationOptions)
+    refinement: RefinementOptions = field(default_factory=RefinementOptions)
     tracker: TrackerOptions = field(default_factory=TrackerOptions)
 
 
@@ -79,15 +89,61 @@ def track(options: TrackOptions) -> dict[str, Any]:
     registration = register(model, camera, landmarks.points, landmarks.pixels, options.registration)
     for flag in registration.flags:
         print(f"note: {flag}", file=sys.stderr)
-    tracker = _ready_tracker(model, camera, reference, registration, options)
+    _warm_up(model, camera, reference, registration.state, options)
     run = RunResults(model, reference.index)
     try:
-        for frame in tqdm(source, total=len(source), desc="tracking", unit="frame"):
-            camera.check_image(frame.image, f"frame {frame.index} of {options.frames}")
-            run.add(frame.index, frame.timestamp, tracker.process_frame(frame.image))
+        keyframes = _follow(source, camera, reference, registration.state, options, run)
+        if options.refine_reference:
+            state = _refined(model, camera, landmarks, registration, keyframes, reference, options)
+            again = RunResults(model, reference.index, refined=True)
+            _follow(source, camera, reference, state, options, again)
+            run = again
     finally:
         summary = _write_run(options, source, camera, run, registration) if len(run) else {}
     return summary
+
+
+def _follow(
+    source: FrameSource,
+    camera: PinholeCamera,
+    reference: Frame,
+    state: State,
+    options: TrackOptions,
+    run: RunResults,
+) -> list[Keyframe]:
+    """Track all frames into ``run``; returns where the points were seen if the reference is to be refined."""
+    tracker = _new_tracker(run.model, camera, reference, state, options)
+    keyframes = []
+    for frame in tqdm(source, total=len(source), desc="tracking", unit="frame"):
+        camera.check_image(frame.image, f"frame {frame.index} of {options.frames}")
+        result = tracker.process_frame(frame.image)
+        run.add(frame.index, frame.timestamp, result)
+        if options.refine_reference and result.estimate is not None and tracker.last_seen is not None:
+            keyframes.append(tracker.last_seen)
+    return keyframes
+
+
+def _refined(
+    model: ReducedModel,
+    camera: PinholeCamera,
+    landmarks: Landmarks,
+    registration: Registration,
+    keyframes: list[Keyframe],
+    reference: Frame,
+    options: TrackOptions,
+) -> State:
+    """The reference state refined over the sequence."""
+    print("refining the reference state over the sequence ...", file=sys.stderr)
+    tracker = _new_tracker(model, camera, reference, registration.state, options)
+    return refine_reference(
+        tracker.estimator,
+        bind_landmarks(model, landmarks.points, options.registration),
+        camera.undistort_pixels(landmarks.pixels),
+        tracker.reference_pixels,
+        registration.state,
+        choose_keyframes(keyframes, options.refinement.n_keyframes),
+        options.refinement,
+    )
 
 
 def _check_output(options: TrackOptions) -> None:
@@ -108,25 +164,20 @@ def _reference_frame(options: TrackOptions) -> Frame:
     raise SourceError(f"{options.frames} holds no frame {number} to take as the reference")
 
 
-def _ready_tracker(
-    model: ReducedModel,
-    camera: PinholeCamera,
-    reference: Frame,
-    registration: Registration,
-    options: TrackOptions,
+def _new_tracker(
+    model: ReducedModel, camera: PinholeCamera, reference: Frame, state: State, options: TrackOptions
 ) -> Tracker:
-    """A tracker whose loops are compiled, so that the first frame takes no longer than the others."""
+    # A sequence that does not begin with the reference frame is entered as if the object had been lost.
+    begins = options.reference_frame in (None, options.first)
+    return Tracker(model, camera, reference.image, state, options.tracker, in_sequence=begins)
 
-    def new() -> Tracker:
-        # A sequence that does not begin with the reference frame is entered as if the object had been lost.
-        begins = options.reference_frame in (None, options.first)
-        return Tracker(
-            model, camera, reference.image, registration.state, options.tracker, in_sequence=begins
-        )
 
+def _warm_up(
+    model: ReducedModel, camera: PinholeCamera, reference: Frame, state: State, options: TrackOptions
+) -> None:
+    """Compile the inner loops, so that the first frame takes no longer than the others."""
     print("preparing: compiling the inner loops (half a minute the first time) ...", file=sys.stderr)
-    new().process_frame(reference.image)
-    return new()
+    _new_tracker(model, camera, reference, state, options).process_frame(reference.image)
 
 
 def _write_run(
@@ -148,11 +199,16 @@ def _write_run(
             "n_landmarks": len(registration.estimate.residuals),
             "n_alternatives": len(registration.alternatives),
         },
+        "reference_refined_over_the_sequence": run.refined,
         "flags": list(registration.flags),
         "start_of_each_frame": "previous state; the first guess of image motion assumes constant velocity",
         "temporal_prior": "none",
         "inputs": {name: str(getattr(options, name)) for name in ("frames", "model", "camera", "landmarks")},
-        "settings": {"registration": asdict(options.registration), "tracker": asdict(options.tracker)},
+        "settings": {
+            "registration": asdict(options.registration),
+            "refinement": asdict(options.refinement),
+            "tracker": asdict(options.tracker),
+        },
         "versions": _versions(),
     }
     summary = write_summary(folder / "summary.json", run, extra)
