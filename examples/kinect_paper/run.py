@@ -41,6 +41,7 @@ def run(arguments: argparse.Namespace) -> None:
         truth=arguments.data / "ground_truth.npz",
         range=arguments.frames,
         reference_frame=REFERENCE_FRAME,
+        refine_reference=True,
     )
     check_recording(recording)
     keep_model(HERE / "study.toml", model)

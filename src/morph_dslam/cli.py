@@ -64,6 +64,7 @@ def _track(arguments: argparse.Namespace) -> None:
             first=first,
             last=last,
             reference_frame=arguments.reference_frame,
+            refine_reference=arguments.refine,
             overlay=not arguments.no_video,
             overwrite=arguments.overwrite,
         )
@@ -164,6 +165,11 @@ def _add_online_commands(commands: argparse._SubParsersAction) -> None:
         help="frame that the landmarks belong to (default: the first one tracked)",
     )
     track.add_argument("--overwrite", action="store_true", help="replace a run that is in the run folder")
+    track.add_argument(
+        "--refine",
+        action="store_true",
+        help="refine the reference state over the whole sequence and track once more",
+    )
     track.add_argument("--no-video", action="store_true", help="do not draw the augmented video")
     evaluate = _add(
         commands,

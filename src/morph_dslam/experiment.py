@@ -65,6 +65,7 @@ class Recording:
     ----------
     frames : video file or folder of images. camera, landmarks, truth : files. range : frames to track.
     reference_frame : the frame that the landmarks belong to; the first one tracked by default.
+    refine_reference : refine the reference state over the sequence; for landmarks set by hand.
     """
 
     frames: Path
@@ -73,6 +74,7 @@ class Recording:
     truth: Path
     range: FrameRange = (None, None)
     reference_frame: int | None = None
+    refine_reference: bool = False
 
 
 def first_truth_frame(recording: Recording) -> int:
@@ -134,6 +136,7 @@ def track_and_evaluate(recording: Recording, model: Path, run: Path) -> dict[str
             first=first,
             last=last,
             reference_frame=recording.reference_frame,
+            refine_reference=recording.refine_reference,
             overwrite=True,
         )
     )

@@ -186,3 +186,13 @@ def test_broken_frame_ends_the_run_but_keeps_it(inputs, tmp_path):
         track(TrackOptions(**chosen))
     assert load_run(tmp_path / "run").frames.tolist() == [20, 21]
     assert (tmp_path / "run" / "augmented.mp4").is_file()
+
+
+def test_refined_reference_is_named_and_still_right(inputs, tmp_path):
+    summary = track(options(inputs, tmp_path / "run", refine_reference=True, overlay=False))
+    assert summary["reference_refined_over_the_sequence"]
+    run = load_run(tmp_path / "run")
+    assert run.tracked.sum() == 6
+    truth = sheet_state(TIMES[-1])
+    expected = truth.camera_from_object.apply(run.model.positions(truth.parameters))
+    assert np.linalg.norm(run.camera_points(6) - expected, axis=1).mean() < 1e-3

@@ -43,7 +43,7 @@ class RefinementOptions:
 
     Attributes
     ----------
-    landmark_px : standard deviation of a landmark.
+    landmark_px : standard deviation of a landmark; `track` takes it from the registration's residuals.
     effective_points : how many independent points a keyframe counts for; its residuals are mostly the
         model's, which are alike over wide parts of the surface.
     least_sigma_px : residuals smaller than this tell no more.

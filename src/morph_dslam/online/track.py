@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import shutil
 import sys
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -135,6 +135,10 @@ def _refined(
     """The reference state refined over the sequence."""
     print("refining the reference state over the sequence ...", file=sys.stderr)
     tracker = _new_tracker(model, camera, reference, registration.state, options)
+    # How well the landmarks fit tells how carefully they were set, where they are enough to tell.
+    sigma = registration.estimate.sigma_px
+    stated = options.refinement.landmark_px
+    trust = replace(options.refinement, landmark_px=max(sigma, 0.1) if np.isfinite(sigma) else stated)
     return refine_reference(
         tracker.estimator,
         bind_landmarks(model, landmarks.points, options.registration),
@@ -142,7 +146,7 @@ def _refined(
         tracker.reference_pixels,
         registration.state,
         choose_keyframes(keyframes, options.refinement.n_keyframes),
-        options.refinement,
+        trust,
     )
 
 
