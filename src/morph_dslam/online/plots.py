@@ -74,7 +74,7 @@ def plot_residual(path: Path, run: RunResults) -> None:
     lower.plot(run.frames, counts[:, 0], color="#888888", linewidth=1.2, label="not hidden by the object")
     lower.plot(run.frames, counts[:, 1], color="#1f4e79", linewidth=1.4, label="supporting the estimate")
     lower.set_ylabel("points")
-    lower.set_ylim(bottom=0.0)
+    lower.set_ylim(0.0, 1.1 * max(float(counts.max()), 1.0))
     lower.legend(loc="lower left", fontsize=8)
     lower.set_xlabel("frame")
     for axes in (upper, lower):
