@@ -152,7 +152,8 @@ def test_hopeless_range_is_refused_and_solved_samples_stay(tmp_path: Path, monke
     assert not (tmp_path / "tiny.morph").exists()
 
 
-def test_mirrored_snapshot_is_the_solution_on_the_other_side(built: Path) -> None:
+@pytest.mark.parametrize("which", [1, 2, 3])
+def test_mirrored_snapshots_are_solutions(built: Path, which: int) -> None:
     """Solve at the mirrored coordinates directly and compare everything."""
     study = load_study(built / "study.toml")
     problem = study.problem()
@@ -161,17 +162,18 @@ def test_mirrored_snapshot_is_the_solution_on_the_other_side(built: Path) -> Non
         for path in sorted((built / "tiny.morph.snapshots").glob("*.npz"))
         if (snapshot := load_snapshot(path)).coordinates[0] > 4e-3
     )
-    mirrored = snapshot.mirrored()
-    state, _ = sweep.advance(problem, problem.first_state(-6e-3), mirrored.coordinates)
+    mirrored = snapshot.images(study)[which]
+    side = np.sign(mirrored.coordinates[0])
+    state, _ = sweep.advance(problem, problem.first_state(6e-3 * side), mirrored.coordinates)
     other = sweep.take_snapshot(problem, study, state)
     assert mirrored.motion == pytest.approx(other.motion, abs=1e-7)
     assert mirrored.displacement == pytest.approx(other.displacement, abs=1e-7)
-    for name in ("displacement_sensitivity",):
-        ours, theirs = getattr(mirrored, name), getattr(other, name)
-        assert np.abs(ours - theirs).max() < 1e-3 * np.abs(theirs).max()
+    ours, theirs = mirrored.displacement_sensitivity, other.displacement_sensitivity
+    assert np.abs(ours - theirs).max() < 1e-3 * np.abs(theirs).max()
     for face in ("top", "bottom"):
         ours, theirs = mirrored.stress[face], other.stress[face]
-        assert np.abs(ours - theirs).max() < 1e-4 * np.abs(theirs).max()
+        # Where stresses jump between elements, the two grids see the jump from slightly different sides.
+        assert np.abs(ours - theirs).max() < 1e-3 * np.abs(theirs).max()
         ours, theirs = mirrored.stress_sensitivity[face], other.stress_sensitivity[face]
         assert np.abs(ours - theirs).max() < 2e-3 * np.abs(theirs).max()
 
@@ -191,7 +193,7 @@ def test_changed_study_solves_again_only_what_it_must(built: Path) -> None:
 
 def test_samples_are_canonical_and_start_from_neighbours(built: Path) -> None:
     study = load_study(built / "study.toml")
-    samples = canonical(sample_box(study, 32, 0, 0.5))
+    samples = canonical(study, sample_box(study, 32, 0, 0.5))
     assert np.all(samples[:, 0] > 0.0)
     size = np.diff(study.parameters.bounds, axis=1).ravel()
     order, parent = neighbour_tree(samples, size, sweep.root_coordinates(study))

@@ -45,9 +45,9 @@ def build(
     folder = output.with_name(output.name + ".snapshots")
     if executor is None:
         with default_executor(workers) as processes:
-            result = run_sweep(study, canonical(samples), folder, processes)
+            result = run_sweep(study, canonical(study, samples), folder, processes)
     else:
-        result = run_sweep(study, canonical(samples), folder, executor)
+        result = run_sweep(study, canonical(study, samples), folder, executor)
 
     seen = _gather(study, samples, result, range(len(training)))
     unseen = _gather(study, samples, result, range(len(training), len(samples)))
@@ -71,19 +71,22 @@ def build(
 
 
 def _gather(study: Study, samples: Array, result: SweepResult, which: range) -> list[list[Snapshot]]:
-    """For each solved sample its snapshot, and its mirror image when that lies in the box too."""
-    bounds = study.parameters.bounds
+    """For each solved sample its snapshot, followed by those mirror images that lie in the box too."""
+    lower, upper = study.parameters.bounds.T
+    tolerance = 1e-9 * (upper - lower)
     groups = []
     for index in which:
-        if index not in result.solved:
-            continue
-        snapshot = load_snapshot(result.solved[index])
-        pair = [snapshot, snapshot.mirrored()]
-        if samples[index, 0] < 0.0:
-            pair.reverse()
-        second = pair[1].coordinates
-        inside = np.all((second >= bounds[:, 0]) & (second <= bounds[:, 1]))
-        groups.append(pair if inside else pair[:1])
+        if index in result.solved:
+            images = load_snapshot(result.solved[index]).images(study)
+            images.sort(key=lambda image: float(np.abs(image.coordinates - samples[index]).max()))
+            groups.append(
+                [
+                    image
+                    for image in images
+                    if np.all(image.coordinates >= lower - tolerance)
+                    and np.all(image.coordinates <= upper + tolerance)
+                ]
+            )
     return groups
 
 

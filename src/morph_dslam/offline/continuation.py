@@ -13,7 +13,7 @@ from morph_dslam.offline.gripped_sheet import EquilibriumState
 Array = NDArray[np.float64]
 
 #: The path is given up when an increment falls below this part of it.
-SMALLEST_INCREMENT = 1.0 / 64.0
+SMALLEST_INCREMENT = 1.0 / 24.0
 
 
 class Problem(Protocol):

@@ -14,8 +14,8 @@ The four coordinates of the reduced model are
     bulge   signed mean height of the middle of the sheet over the line between the grips, m
     bend    symmetric bend, as a multiple of that of a circular arc with this bulge, 1
     skew    antisymmetric bend, (bend_left - bend_right) / 2, rad
-    slant   twist, as a multiple of twice the bend of that arc: the tangent of the angle by which the rulings
-            of the bent sheet lean, 1
+    slant   twist, as a multiple of twice the bend of that arc: in a gently bent sheet the tangent of the
+            angle by which the rulings lean, 1; levelled off at large bulges (`LEVELLING`)
 
 Why not the angles and the approach themselves: for given angles two shapes, bulging to either side, share the
 same approach, none exists below a smallest approach, and the two meet only in the flat state. A thin sheet
@@ -37,6 +37,10 @@ Array = NDArray[np.float64]
 
 #: End slope of a shallow circular arc over (weighted mean height / free length), see `bulge_weight`.
 ARC_SLOPE = 4.0 / (4.0 * (0.25 - (1.0 / 12.0 - 1.0 / (2.0 * np.pi**2))))
+
+#: The twist grows in proportion to the bulge up to about this part of the free length, then levels off: what
+#: a slightly bent sheet can follow would tear a strongly bent one apart.
+LEVELLING = 0.1
 
 MOTION = ("bend_left", "bend_right", "twist", "approach", "turn_left", "turn_right")
 COORDINATES = ("bulge", "bend", "skew", "slant")
@@ -81,17 +85,19 @@ class Grips:
         """Motion (6,) that the coordinates (4,) prescribe; the free motions are left zero."""
         bulge, bend, skew, slant = coordinates
         arc = ARC_SLOPE * bulge / self.free_length
-        return np.array([bend * arc + skew, bend * arc - skew, 2.0 * slant * arc, 0.0, 0.0, 0.0])
+        twist = 2.0 * slant * arc / np.sqrt(1.0 + (bulge / (LEVELLING * self.free_length)) ** 2)
+        return np.array([bend * arc + skew, bend * arc - skew, twist, 0.0, 0.0, 0.0])
 
     def prescribed_motion_gradient(self, coordinates: Array) -> Array:
         """Derivative (6, 4) of `prescribed_motion`."""
         bulge, bend, _, slant = coordinates
         scale = ARC_SLOPE / self.free_length
+        root = np.sqrt(1.0 + (bulge / (LEVELLING * self.free_length)) ** 2)
         gradient = np.zeros((6, 4))
-        gradient[:3, 0] = bend * scale, bend * scale, 2.0 * slant * scale
+        gradient[:3, 0] = bend * scale, bend * scale, 2.0 * slant * scale / root**3
         gradient[:2, 1] = bulge * scale
         gradient[:2, 2] = 1.0, -1.0
-        gradient[2, 3] = 2.0 * bulge * scale
+        gradient[2, 3] = 2.0 * bulge * scale / root
         return gradient
 
     def positions(self, motion: Array, left: Array, right: Array) -> Array:

@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,9 @@ from morph_dslam.offline.study import Study
 Array = NDArray[np.float64]
 
 FACES = ("top", "bottom")
+#: Signs that the coordinates take when the sheet is mirrored in its own plane, and in the plane x = 0.
+MIRROR_Z = np.array([-1.0, 1.0, -1.0, 1.0])
+MIRROR_X = np.array([1.0, 1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
@@ -43,8 +47,8 @@ class Snapshot:
     stress_sensitivity: dict[str, Array]
 
     def mirrored(self) -> Snapshot:
-        """The same state seen from behind: z -> -z, which turns bulge and skew about and swaps the faces."""
-        flip = np.array([-1.0, 1.0, -1.0, 1.0])
+        """The mirror image z -> -z: another state of the same sheet, with its faces swapped."""
+        flip = MIRROR_Z
         z = np.array([1.0, 1.0, -1.0])
         swap = {"top": "bottom", "bottom": "top"}
         return Snapshot(
@@ -56,6 +60,38 @@ class Snapshot:
             {face: self.stress_sensitivity[swap[face]] * flip[:, None, None] for face in FACES},
         )
 
+    def reversed(self, columns: int) -> Snapshot:
+        """The mirror image x -> -x: another state of the same sheet if its grips are at the same height.
+
+        Parameters
+        ----------
+        columns : points along x of the output grid.
+        """
+        flip, x = MIRROR_X, np.array([-1.0, 1.0, 1.0])
+        shear = np.array([1.0, 1.0, -1.0])
+
+        def turned(fields: Array) -> Array:
+            grid = fields.reshape(*fields.shape[:-2], -1, columns, 3)
+            return grid[..., ::-1, :].reshape(fields.shape)
+
+        left, right, twist, approach, turn_left, turn_right = self.motion
+        return Snapshot(
+            self.coordinates * flip,
+            np.array([right, left, -twist, approach, -turn_right, -turn_left]),
+            turned(self.displacement) * x,
+            turned(self.displacement_sensitivity) * x * flip[:, None, None],
+            {face: turned(self.stress[face]) * shear for face in FACES},
+            {face: turned(self.stress_sensitivity[face]) * shear * flip[:, None, None] for face in FACES},
+        )
+
+    def images(self, study: Study) -> list[Snapshot]:
+        """This state and its mirror images that are states of the same sheet."""
+        result = [self, self.mirrored()]
+        if study.grips.symmetric:
+            columns = study.reduction.grid[0] + 1
+            result += [snapshot.reversed(columns) for snapshot in result]
+        return result
+
 
 def output_points(study: Study) -> Array:
     """Grid points (n, 2) of the model's mesh, x fastest, metres."""
@@ -65,10 +101,18 @@ def output_points(study: Study) -> Array:
     return np.column_stack([np.tile(x, ny + 1), np.repeat(y, nx + 1)])
 
 
+@cache
+def _solver_fingerprint() -> str:
+    """Hash of the code that solves, so that snapshots of another release are never mixed in."""
+    modules = ("shell", "grips", "gripped_sheet", "snapshots")
+    texts = [Path(__file__).with_name(f"{module}.py").read_bytes() for module in modules]
+    return hashlib.sha256(b"".join(texts)).hexdigest()
+
+
 def snapshot_key(study: Study, coordinates: Array) -> str:
-    """Name of a sample: hash of the mechanical problem, the output grid and the coordinates."""
+    """Name of a sample: hash of the mechanical problem, the solver, the output grid and the coordinates."""
     problem = study.model_dump(include={"sheet", "material", "grips", "solver"})
-    problem["grid"] = study.reduction.grid
+    problem |= {"grid": study.reduction.grid, "code": _solver_fingerprint()}
     text = json.dumps(problem, sort_keys=True) + np.round(coordinates, 12).tobytes().hex()
     return hashlib.sha256(text.encode()).hexdigest()[:24]
 

@@ -70,6 +70,11 @@ class GripsSection(_Section):
     centre_left: Length = 0.0
     centre_right: Length = 0.0
 
+    @property
+    def symmetric(self) -> bool:
+        """Whether left and right are mirror images."""
+        return self.centre_left == self.centre_right
+
 
 class ParametersSection(_Section):
     """Ranges of the four coordinates (`morph_dslam.offline.grips` says what they mean)."""

@@ -19,7 +19,14 @@ from tqdm import tqdm
 from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.offline.continuation import advance
 from morph_dslam.offline.gripped_sheet import GrippedSheet
-from morph_dslam.offline.snapshots import load_state, save_snapshot, snapshot_key, take_snapshot
+from morph_dslam.offline.snapshots import (
+    MIRROR_X,
+    MIRROR_Z,
+    load_state,
+    save_snapshot,
+    snapshot_key,
+    take_snapshot,
+)
 from morph_dslam.offline.study import Study
 
 Array = NDArray[np.float64]
@@ -53,10 +60,16 @@ def sample_box(study: Study, count: int, seed: int, towards_edges: float) -> Arr
     return samples
 
 
-def canonical(samples: Array) -> Array:
-    """The mirror image with positive bulge of each sample (n, 4); the sheet does not know its sides apart."""
-    sign = np.where(samples[:, :1] < 0.0, -1.0, 1.0)
-    return samples * np.where([True, False, True, False], sign, 1.0)
+def canonical(study: Study, samples: Array) -> Array:
+    """The mirror image of each sample (n, 4) that is solved in its place.
+
+    The sheet does not know its sides apart, so bulge can be made positive; if its grips are at the same
+    height, slant too.
+    """
+    samples = np.where(samples[:, :1] < 0.0, samples * MIRROR_Z, samples)
+    if study.grips.symmetric:
+        samples = np.where(samples[:, 3:] < 0.0, samples * MIRROR_X, samples)
+    return samples
 
 
 def neighbour_tree(samples: Array, scale: Array, root: Array) -> tuple[list[int], list[int]]:

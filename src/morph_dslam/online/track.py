@@ -87,8 +87,6 @@ def track(options: TrackOptions) -> dict[str, Any]:
     reference = _reference_frame(options)
     camera.check_image(reference.image, f"frame {reference.index} of {options.frames}")
     registration = register(model, camera, landmarks.points, landmarks.pixels, options.registration)
-    for flag in registration.flags:
-        print(f"note: {flag}", file=sys.stderr)
     _warm_up(model, camera, reference, registration.state, options)
     run = RunResults(model, reference.index)
     try:
