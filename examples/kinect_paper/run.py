@@ -42,6 +42,7 @@ def run(arguments: argparse.Namespace) -> None:
         range=arguments.frames,
         reference_frame=REFERENCE_FRAME,
         refine_reference=True,
+        use_outline=True,
     )
     check_recording(recording)
     keep_model(HERE / "study.toml", model)

@@ -65,6 +65,7 @@ def _track(arguments: argparse.Namespace) -> None:
             last=last,
             reference_frame=arguments.reference_frame,
             refine_reference=arguments.refine,
+            use_outline=arguments.outline,
             overlay=not arguments.no_video,
             overwrite=arguments.overwrite,
         )
@@ -169,6 +170,11 @@ def _add_online_commands(commands: argparse._SubParsersAction) -> None:
         "--refine",
         action="store_true",
         help="refine the reference state over the whole sequence and track once more",
+    )
+    track.add_argument(
+        "--outline",
+        action="store_true",
+        help="let the object's outline count too, where it stands out from the background",
     )
     track.add_argument("--no-video", action="store_true", help="do not draw the augmented video")
     evaluate = _add(

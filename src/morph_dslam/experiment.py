@@ -66,6 +66,7 @@ class Recording:
     frames : video file or folder of images. camera, landmarks, truth : files. range : frames to track.
     reference_frame : the frame that the landmarks belong to; the first one tracked by default.
     refine_reference : refine the reference state over the sequence; for landmarks set by hand.
+    use_outline : let the outline count; for surfaces with bare margins.
     """
 
     frames: Path
@@ -75,6 +76,7 @@ class Recording:
     range: FrameRange = (None, None)
     reference_frame: int | None = None
     refine_reference: bool = False
+    use_outline: bool = False
 
 
 def first_truth_frame(recording: Recording) -> int:
@@ -137,6 +139,7 @@ def track_and_evaluate(recording: Recording, model: Path, run: Path) -> dict[str
             last=last,
             reference_frame=recording.reference_frame,
             refine_reference=recording.refine_reference,
+            use_outline=recording.use_outline,
             overwrite=True,
         )
     )

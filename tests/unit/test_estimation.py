@@ -37,13 +37,14 @@ def points(model):
     return BoundPoints.from_surface(model, surface)
 
 
-def arguments(points, state, pixels, weights, huber=1.5):
+def arguments(points, state, pixels, weights, huber=1.5, normals=None):
     functions = points.field.functions
     pose = state.camera_from_object
+    normals = np.zeros((len(points), 2)) if normals is None else normals
     return (
         state.parameters, pose.rotation, pose.translation, points.rest, points.field.modes, functions.lower,
         functions.upper, functions.multi_indices, functions.coefficients, CAMERA.intrinsics, pixels, weights,
-        huber,
+        normals, huber,
     )  # fmt: skip
 
 
@@ -72,6 +73,52 @@ def test_compiled_and_plain_normal_equations_agree(points):
     given = arguments(points, start_near(rng), pixels, rng.uniform(0.0, 2.0, len(points)))
     for compiled, plain in zip(linearise(*given), linearise_numpy(*given), strict=True):
         np.testing.assert_allclose(compiled, plain, rtol=1e-9, atol=1e-9 * np.abs(plain).max())
+
+
+def directions(count, rng):
+    """Unit normals for every other point, none for the rest."""
+    angle = rng.uniform(0.0, 2.0 * np.pi, count)
+    normals = np.column_stack([np.cos(angle), np.sin(angle)])
+    normals[::2] = 0.0
+    return normals
+
+
+def test_points_with_a_normal_count_only_along_it(points):
+    """Moving their pixels across the normal changes nothing; the gradient is that of the cost."""
+    rng = np.random.default_rng(11)
+    normals = directions(len(points), rng)
+    pixels, weights = observed(points, TRUTH, 1.0, rng), np.ones(len(points))
+    state = start_near(rng, 0.3)
+    across = np.column_stack([-normals[:, 1], normals[:, 0]])
+    slid = pixels + 7.0 * across
+    first = linearise(*arguments(points, state, pixels, weights, normals=normals))
+    second = linearise(*arguments(points, state, slid, weights, normals=normals))
+    plain = linearise_numpy(*arguments(points, state, pixels, weights, normals=normals))
+    for a, b, c in zip(first, second, plain, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
+        np.testing.assert_allclose(a, c, rtol=1e-9, atol=1e-9 * np.abs(c).max())
+    for k in range(9):
+        step = np.zeros(9)
+        step[k] = 1e-7
+        costs = [
+            linearise(*arguments(points, moved(state, sign * step), pixels, weights, normals=normals))[0]
+            for sign in (1.0, -1.0)
+        ]
+        assert first[2][k] == pytest.approx((costs[0] - costs[1]) / 2e-7, rel=1e-4, abs=1e-2)
+
+
+def test_normals_alone_determine_the_state(model, points):
+    """One number a point, in all directions: exact measurements slid along the outline give it back."""
+    rng = np.random.default_rng(12)
+    angle = rng.uniform(0.0, 2.0 * np.pi, len(points))
+    normals = np.column_stack([np.cos(angle), np.sin(angle)])
+    slid = observed(points, TRUTH, 0.0, rng) + rng.normal(size=(len(points), 1)) * np.column_stack(
+        [-normals[:, 1], normals[:, 0]]
+    )
+    found = Estimator(model, CAMERA).estimate(
+        points, slid, np.ones(len(points)), start_near(rng, 0.3), normals
+    )
+    np.testing.assert_allclose(found.state.parameters, TRUTH.parameters, atol=1e-6)
 
 
 def test_points_behind_the_camera_are_refused_by_both_twins(points):

@@ -13,7 +13,7 @@ from morph_dslam.offline.gripped_sheet import EquilibriumState
 Array = NDArray[np.float64]
 
 #: The path is given up when an increment falls below this part of it.
-SMALLEST_INCREMENT = 1.0 / 24.0
+SMALLEST_INCREMENT = 1.0 / 64.0
 
 
 class Problem(Protocol):
@@ -42,12 +42,12 @@ def advance(
         try:
             state = problem.solve(origin + (done + step) * (target - origin), state)
         except SolverError as error:
-            increment = step / 2.0
+            increment = step / 4.0
             if increment < SMALLEST_INCREMENT:
                 raise SolverError(
                     f"{error}, {100.0 * done:.0f} % of the way from a solved neighbour"
                 ) from error
             continue
         done += step
-        increment = min(1.0, 1.5 * step)
+        increment = min(1.0, 2.0 * step)
     return state, solves

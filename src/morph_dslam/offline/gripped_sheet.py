@@ -25,6 +25,9 @@ Array = NDArray[np.float64]
 #: Newton has converged when no dof changes by more than this part of the sheet's length.
 TOLERANCE = 1e-7
 MAX_ITERATIONS = 14
+#: After so many iterations the update must be below this part of the first: an iteration that wanders hardly
+#: ever comes back, and a smaller increment is cheaper than waiting for it.
+PATIENCE, PROGRESS = 6, 0.25
 #: Longest displacement update, as a part of the length; longer ones are scaled back.
 MAX_UPDATE = 0.06
 #: An update longer than this means divergence; NaN does too.
@@ -207,12 +210,15 @@ class GrippedSheet:
         motion = prescribed.copy()
         motion[free] = start.motion[free]
         n_displacement = 3 * shell.scalar_space.ndof
-        for _ in range(MAX_ITERATIONS):
+        first = np.inf
+        for iteration in range(MAX_ITERATIONS):
             response = self._respond(motion, coordinates)
             change = -np.linalg.solve(response.border[:, free], response.border_residual)
             update = response.correction + change @ response.per_motion[free]
             largest = np.abs(update[:n_displacement]).max()
-            if not largest < DIVERGED * length:
+            first = largest if iteration == 0 else first
+            stalled = iteration >= PATIENCE and largest > PROGRESS * first
+            if stalled or not largest < DIVERGED * length:
                 break
             scale = min(1.0, MAX_UPDATE * length / largest)
             vector += scale * update

@@ -59,6 +59,16 @@ class BoundPoints:
     def __len__(self) -> int:
         return len(self.rest)
 
+    def joined(self, other: BoundPoints) -> BoundPoints:
+        """These points followed by ``other`` ones of the same model."""
+        surface = SurfacePoints(
+            np.concatenate([self.surface.triangles, other.surface.triangles]),
+            np.concatenate([self.surface.weights, other.surface.weights]),
+        )
+        modes = np.ascontiguousarray(np.concatenate([self.field.modes, other.field.modes], axis=1))
+        rest = np.concatenate([self.rest, other.rest])
+        return BoundPoints(surface, rest, replace(self.field, modes=modes))
+
     def in_camera(self, state: State) -> Array:
         """Positions (p, 3) in the camera frame, metres."""
         return state.camera_from_object.apply(self.rest + self.field.value(state.parameters))
@@ -157,26 +167,33 @@ class Estimator:
         half_ranges = 0.5 * (model.upper - model.lower)
         self._scale = np.concatenate([half_ranges, np.ones(3), np.full(3, size)])
 
-    def evaluate(self, points: BoundPoints, pixels: Array, weights: Array, state: State):
+    def evaluate(
+        self, points: BoundPoints, pixels: Array, weights: Array, state: State, normals: Array | None = None
+    ):
         """Cost, Hessian, gradient and residuals at a state; see `reprojection.linearise`."""
         functions = points.field.functions
+        normals = np.zeros_like(pixels) if normals is None else normals
         return self._linearise(
             state.parameters, state.camera_from_object.rotation, state.camera_from_object.translation,
             points.rest, points.field.modes, functions.lower, functions.upper, functions.multi_indices,
-            functions.coefficients, self.camera.intrinsics, pixels, weights, self.options.huber_px,
+            functions.coefficients, self.camera.intrinsics, pixels, weights, normals, self.options.huber_px,
         )  # fmt: skip
 
-    def estimate(self, points: BoundPoints, pixels: Array, weights: Array, start: State) -> Estimate:
+    def estimate(
+        self, points: BoundPoints, pixels: Array, weights: Array, start: State, normals: Array | None = None
+    ) -> Estimate:
         """Minimise the Huber cost from ``start``.
 
         Parameters
         ----------
         pixels : (p, 2) measured, in the undistorted image.
         weights : (p,) non-negative; points of weight 0 are ignored (their residuals are still reported).
+        normals : (p, 2), for points that count only along a direction; see `reprojection.linearise`.
         """
         options, scale = self.options, self._scale
         state = State(np.clip(start.parameters, self.model.lower, self.model.upper), start.camera_from_object)
-        cost, hessian, gradient, residuals = self.evaluate(points, pixels, weights, state)
+        normals = np.zeros_like(pixels) if normals is None else normals
+        cost, hessian, gradient, residuals = self.evaluate(points, pixels, weights, state, normals)
         damping, iterations, converged = 1e-3, 0, False
         while iterations < options.max_iterations and not converged:
             iterations += 1
@@ -187,7 +204,7 @@ class Estimator:
                 damping = min(damping * 0.01, 1e-2)
                 continue
             trial = self._inside(moved(state, step * scale))
-            attempt = self.evaluate(points, pixels, weights, trial)
+            attempt = self.evaluate(points, pixels, weights, trial, normals)
             if attempt[0] < cost:
                 ratio = (cost - attempt[0]) / predicted
                 state, (cost, hessian, gradient, residuals) = trial, attempt
@@ -195,7 +212,9 @@ class Estimator:
             else:
                 damping *= 10.0
                 converged = damping > 1e8
-        return self._finish(state, cost, hessian, residuals, weights, iterations, converged)
+        # A point on an outline gives one number, all others give two.
+        numbers = np.where((normals != 0.0).any(axis=1), 1, 2)
+        return self._finish(state, cost, hessian, residuals, weights, numbers, iterations, converged)
 
     def estimate_from(
         self, points: BoundPoints, pixels: Array, weights: Array, starts: Sequence[State]
@@ -232,28 +251,33 @@ class Estimator:
         hessian: Array,
         residuals: Array,
         weights: Array,
+        numbers: NDArray[np.integer],
         iterations: int,
         converged: bool,
     ) -> Estimate:
         model = self.model
         used = (weights > 0.0) & np.isfinite(residuals).all(axis=1)
-        sigma, covariance = self._covariance(hessian, residuals[used], weights[used])
+        sigma, covariance = self._covariance(hessian, residuals[used], weights[used], numbers[used])
         margin = BOUND_SHARE * (model.upper - model.lower)
         at_bound = (state.parameters < model.lower + margin) | (state.parameters > model.upper - margin)
         return Estimate(state, cost, residuals, sigma, covariance, at_bound, iterations, converged)
 
-    def _covariance(self, hessian: Array, residuals: Array, weights: Array) -> tuple[float, Array]:
+    def _covariance(
+        self, hessian: Array, residuals: Array, weights: Array, numbers: NDArray[np.integer]
+    ) -> tuple[float, Array]:
         """Huber's estimate of the covariance of an M-estimator (Huber & Ronchetti, Robust Statistics, 7.6).
 
         (sum psi² / (N - k)) / mean(psi')² (J'J)^-1; J'J is the Huber-weighted Hessian over its mean weight.
         """
         size = len(hessian)
-        freedom = 2 * len(residuals) - size
+        count = int(numbers.sum())
+        freedom = count - size
         if freedom <= 0:
             return float("inf"), np.full((size, size), np.inf)
         length = np.linalg.norm(residuals, axis=1)
         # The length of a Gaussian pair has the median 1.1774 sigma (Rayleigh).
-        sigma = float(np.median(length) / 1.1774 * np.sqrt(2 * len(residuals) / freedom))
+        pairs = length[numbers == 2]
+        sigma = float(np.median(pairs) / 1.1774 * np.sqrt(count / freedom)) if len(pairs) else float("inf")
         huber = self.options.huber_px
         factor = np.minimum(1.0, huber / np.maximum(length, 1e-300))
         psi_squared = float(np.sum(weights * (factor * length) ** 2)) / freedom

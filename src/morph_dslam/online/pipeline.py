@@ -29,6 +29,7 @@ from morph_dslam.online.measurement import (
     compare_with_rendering,
     visible_surface,
 )
+from morph_dslam.online.outline import Outline, OutlineOptions
 from morph_dslam.online.reference_refinement import Keyframe
 from morph_dslam.online.relocalisation import Relocaliser
 from morph_dslam.online.shape_search import ShapeSearch, with_undetermined_at_default
@@ -53,6 +54,7 @@ class TrackerOptions:
     search_above_px, searches : where the residuals' spread exceeds this, so many other shapes are tried in
         the frame as starts, in turn, lest the estimate stay in a local minimum.
     least_inliers, least_share : points that must support it, as a number or a share of all, if that is fewer.
+    use_outline : whether the object's outline counts too; it needs a background that it stands out from.
     """
 
     n_points: int = 350
@@ -62,8 +64,10 @@ class TrackerOptions:
     least_share: float = 0.3
     search_above_px: float = 0.25
     searches: int = 2
+    use_outline: bool = False
     flow: FlowOptions = field(default_factory=FlowOptions)
     measurement: MeasurementOptions = field(default_factory=MeasurementOptions)
+    outline: OutlineOptions = field(default_factory=OutlineOptions)
     estimation: EstimationOptions = field(default_factory=EstimationOptions)
 
 
@@ -118,6 +122,10 @@ class Tracker:
         mask = interior(draw_view(view, model.triangles, camera).covered, margin)
         self.points = self._choose_points(picture, mask, view)
         self.relocaliser = Relocaliser(self.estimator, picture.grey, mask, view)
+        self.outline = None
+        if self.options.use_outline:
+            self.outline = Outline(model, camera, picture.grey, state, self.options.outline)
+            self._with_outline = self.points.joined(self.outline.points)
         self._picture = picture
         self._pixels = self.reference_pixels = camera.project(self.points.in_camera(state))
         self.last_seen: Keyframe | None = None
@@ -147,6 +155,9 @@ class Tracker:
                 candidate = self._correct(picture, candidate.estimate.state, None, clock)
                 if not self._refusal(candidate):
                     attempt, refusal, how = candidate, "", RECOVERED
+        if not refusal and self.outline is not None:
+            with clock.stage("outline"):
+                attempt = self._fit_outline(picture, attempt, self.outline)
         self._remember(picture, attempt, bool(refusal))
         return self._result(attempt, refusal, how, clock)
 
@@ -237,6 +248,20 @@ class Tracker:
         if best.cost > CLEARLY_BETTER * cost:
             return attempt
         return _Attempt(*self._estimate_trimmed(measurement, best.state), measurement)
+
+    def _fit_outline(self, picture: _Picture, attempt: _Attempt, outline: Outline) -> _Attempt:
+        """Estimate from the supporting points and the outline together; searched far first, then near."""
+        estimate, count = attempt.estimate, len(self.points)
+        for reach in (self.options.outline.reach_px, self.options.outline.reach_px // 2):
+            seen = outline.measure(picture.grey, estimate.state, reach)
+            estimate = self.estimator.estimate(
+                self._with_outline,
+                np.concatenate([attempt.measurement.pixels, seen.pixels]),
+                np.concatenate([attempt.inliers, self.options.outline.weight * seen.valid]).astype(float),
+                estimate.state,
+                np.concatenate([np.zeros((count, 2)), seen.normals]),
+            )
+        return replace(attempt, estimate=replace(estimate, residuals=estimate.residuals[:count]))
 
     def _refusal(self, attempt: _Attempt) -> str:
         """Why an attempt is not to be believed; empty when it is."""

@@ -58,7 +58,7 @@ def _point_jacobian(jacobian, fields, j, rotation, turned, inverse_depth, x, y, 
 @njit(cache=True, nogil=True)
 def linearise(
     parameters, rotation, translation, rest, modes, lower, upper, multi_indices, coefficients,
-    intrinsics, pixels, weights, huber,
+    intrinsics, pixels, weights, normals, huber,
 ):  # fmt: skip
     """Huber cost of the reprojection error, its gradient and Gauss-Newton Hessian, compiled.
 
@@ -69,13 +69,16 @@ def linearise(
     lower, upper, multi_indices, coefficients : the parameter functions, see `evaluate_functions`.
     intrinsics : (4,) fx, fy, cx, cy in pixels.
     pixels, weights : (p, 2) measurements in pixels and (p,) weights; points of weight 0 do not count.
+    normals : (p, 2) unit vectors; a point with one counts only along it (a point of an outline, which may
+        slide); (0, 0) for points that count in both directions.
     huber : residual length in pixels beyond which the cost grows linearly.
 
     Returns
     -------
     cost : sum of weight * rho(|r|), rho Huber's function.
     hessian, gradient : (d + 6, d + 6) and (d + 6,) of the cost, Gauss-Newton with Huber weights.
-    residuals : (p, 2) projected minus measured, pixels; NaN behind the camera.
+    residuals : (p, 2) projected minus measured, along the normal where there is one, pixels; NaN behind
+        the camera.
     """
     functions = evaluate_functions(parameters, lower, upper, multi_indices, coefficients)
     fields = combine_modes(functions, modes)
@@ -96,6 +99,11 @@ def linearise(
         x, y = (turned[0] + translation[0]) / depth, (turned[1] + translation[1]) / depth
         residuals[j, 0] = intrinsics[0] * x + intrinsics[2] - pixels[j, 0]
         residuals[j, 1] = intrinsics[1] * y + intrinsics[3] - pixels[j, 1]
+        n0, n1 = normals[j, 0], normals[j, 1]
+        directed = n0 != 0.0 or n1 != 0.0
+        if directed:
+            along = n0 * residuals[j, 0] + n1 * residuals[j, 1]
+            residuals[j, 0], residuals[j, 1] = n0 * along, n1 * along
         if weights[j] == 0.0:
             continue
         length = np.hypot(residuals[j, 0], residuals[j, 1])
@@ -106,6 +114,10 @@ def linearise(
             cost += weight * huber * (length - 0.5 * huber)
             weight *= huber / length
         _point_jacobian(jacobian, fields, j, rotation, turned, 1.0 / depth, x, y, intrinsics)
+        if directed:
+            for a in range(size):
+                slope = n0 * jacobian[0, a] + n1 * jacobian[1, a]
+                jacobian[0, a], jacobian[1, a] = n0 * slope, n1 * slope
         for a in range(size):
             gradient[a] += weight * (jacobian[0, a] * residuals[j, 0] + jacobian[1, a] * residuals[j, 1])
             for b in range(a + 1):
@@ -140,13 +152,16 @@ def project_with_jacobian(
 
 def linearise_numpy(
     parameters, rotation, translation, rest, modes, lower, upper, multi_indices, coefficients,
-    intrinsics, pixels, weights, huber,
+    intrinsics, pixels, weights, normals, huber,
 ):  # fmt: skip
     """The plain twin of `linearise`."""
     projected, jacobian = project_with_jacobian(
         parameters, rotation, translation, rest, modes, lower, upper, multi_indices, coefficients, intrinsics
     )
     residuals = projected - pixels
+    directed = (normals != 0.0).any(axis=1)
+    onto = np.where(directed[:, None, None], normals[:, :, None] * normals[:, None, :], np.eye(2))
+    residuals, jacobian = np.einsum("pab,pb->pa", onto, residuals), onto @ jacobian
     length = np.linalg.norm(residuals, axis=1)
     seen = np.isfinite(length)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -45,6 +45,7 @@ class TrackOptions:
     output : the run folder. first, last : frame numbers to track, both included; all by default.
     reference_frame : the frame that the landmarks belong to; the first one tracked by default.
     refine_reference : after tracking, refine the reference state over the whole sequence and track once more.
+    use_outline : let the object's outline count beside its texture.
     overlay : draw the augmented video. overwrite : replace a run that is there already.
     """
 
@@ -57,6 +58,7 @@ class TrackOptions:
     last: int | None = None
     reference_frame: int | None = None
     refine_reference: bool = False
+    use_outline: bool = False
     overlay: bool = True
     overwrite: bool = False
     registration: RegistrationOptions = field(default_factory=RegistrationOptions)
@@ -171,7 +173,8 @@ def _new_tracker(
 ) -> Tracker:
     # A sequence that does not begin with the reference frame is entered as if the object had been lost.
     begins = options.reference_frame in (None, options.first)
-    return Tracker(model, camera, reference.image, state, options.tracker, in_sequence=begins)
+    settings = replace(options.tracker, use_outline=options.use_outline)
+    return Tracker(model, camera, reference.image, state, settings, in_sequence=begins)
 
 
 def _warm_up(
@@ -202,6 +205,7 @@ def _write_run(
             "n_alternatives": len(registration.alternatives),
         },
         "reference_refined_over_the_sequence": run.refined,
+        "outline_used": options.use_outline,
         "flags": list(registration.flags),
         "start_of_each_frame": "previous state; the first guess of image motion assumes constant velocity",
         "temporal_prior": "none",
