@@ -42,7 +42,7 @@ def advance(
         try:
             state = problem.solve(origin + (done + step) * (target - origin), state)
         except SolverError as error:
-            increment = step / 4.0
+            increment = step / 2.0
             if increment < SMALLEST_INCREMENT:
                 raise SolverError(
                     f"{error}, {100.0 * done:.0f} % of the way from a solved neighbour"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 
 #: Smallest |bulge| that is solved, over the largest: in the flat state itself the equations are singular.
 SMALLEST_BULGE = 0.02
+#: A sample is given up after so many attempts from different neighbours.
+MOST_ATTEMPTS = 2
 
 
 @dataclass
@@ -72,17 +74,32 @@ def canonical(study: Study, samples: Array) -> Array:
     return samples
 
 
-def neighbour_tree(samples: Array, scale: Array, root: Array) -> tuple[list[int], list[int]]:
-    """Prim's order of the samples and the neighbour that each starts from (-1: the root state)."""
+def neighbour_tree(
+    samples: Array, scale: Array, root: Array, solved: Collection[int] = (), failed: Collection[int] = ()
+) -> tuple[list[int], list[int]]:
+    """Prim's order of the samples that are not solved yet, and the neighbour that each starts from.
+
+    Parameters
+    ----------
+    solved, failed : samples that may be started from already, and samples that nothing is to start from.
+
+    Returns
+    -------
+    order : the unsolved samples. parent : for every sample, another one or -1 for the root state.
+    """
     points = samples / scale
     distance = np.linalg.norm(points - root / scale, axis=1)
     parent = np.full(len(points), -1)
     waiting = np.ones(len(points), dtype=bool)
     order: list[int] = []
-    for _ in range(len(points)):
-        nearest = int(np.argmin(np.where(waiting, distance, np.inf)))
-        order.append(nearest)
+    for step in range(len(points)):
+        known = sorted(solved)
+        nearest = known[step] if step < len(known) else int(np.argmin(np.where(waiting, distance, np.inf)))
+        if step >= len(known):
+            order.append(nearest)
         waiting[nearest] = False
+        if nearest in failed:
+            continue
         to_new = np.linalg.norm(points - points[nearest], axis=1)
         closer = waiting & (to_new < distance)
         distance[closer], parent[closer] = to_new[closer], nearest
@@ -131,26 +148,6 @@ def default_executor(workers: int | None) -> Iterator[Executor]:
     executor.shutdown()
 
 
-class _Sweep:
-    """Bookkeeping of one sweep: which samples wait for which neighbour."""
-
-    def __init__(self, study: Study, samples: Array, folder: Path) -> None:
-        self.study, self.samples = study, samples
-        self.paths = [folder / f"{snapshot_key(study, sample)}.npz" for sample in samples]
-        order, self.parent = neighbour_tree(samples, _box_size(study), root_coordinates(study))
-        self.children: dict[int, list[int]] = {}
-        for sample in order:
-            self.children.setdefault(self.parent[sample], []).append(sample)
-        self.result = SweepResult()
-
-    def start_of(self, sample: int) -> Path | None:
-        """The nearest solved ancestor: a failed neighbour's own neighbour is the next best start."""
-        ancestor = self.parent[sample]
-        while ancestor >= 0 and ancestor in self.result.failed:
-            ancestor = self.parent[ancestor]
-        return self.paths[ancestor] if ancestor >= 0 else None
-
-
 def _box_size(study: Study) -> Array:
     bounds = study.parameters.bounds
     size = np.diff(bounds, axis=1).ravel()
@@ -161,8 +158,9 @@ def _box_size(study: Study) -> Array:
 def run_sweep(study: Study, samples: Array, folder: Path, executor: Executor) -> SweepResult:
     """Solve all ``samples`` (n, 4), canonical, keeping each as soon as it is solved.
 
-    Samples found in ``folder`` are not solved again. One that does not converge is reported in the result
-    and its neighbours start from the next solved one.
+    Samples found in ``folder`` are not solved again. Each starts from its nearest neighbour in a tree; what
+    lies behind a sample that did not converge is tried in the next pass from other neighbours, and so is the
+    sample itself, once. Which sample starts from which does not depend on the workers' timing.
 
     Raises
     ------
@@ -170,32 +168,23 @@ def run_sweep(study: Study, samples: Array, folder: Path, executor: Executor) ->
         If not even half of the samples converge.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    sweep = _Sweep(study, samples, folder)
-    result = sweep.result
-    running: dict[Future, int] = {}
-    ready = list(sweep.children.get(-1, []))
+    paths = [folder / f"{snapshot_key(study, sample)}.npz" for sample in samples]
+    result = SweepResult()
+    tried: dict[int, list[int]] = {}
     with tqdm(total=len(samples), desc="solving", unit="sample", smoothing=0.05) as progress:
-        while ready or running:
-            for sample in ready:
-                if sweep.paths[sample].is_file():
-                    future: Future = Future()
-                    future.set_result(None)
-                else:
-                    arguments = (study, samples[sample], sweep.start_of(sample), sweep.paths[sample])
-                    future = executor.submit(_solve_sample, *arguments)
-                running[future] = sample
-            ready = []
-            done, _ = wait(running, return_when=FIRST_COMPLETED)
-            for future in done:
-                sample = running.pop(future)
-                reason = future.result()
-                if reason is None:
-                    result.solved[sample] = sweep.paths[sample]
-                else:
-                    result.failed[sample] = reason
-                ready += sweep.children.get(sample, [])
-                progress.update()
-            progress.set_postfix(failed=len(result.failed))
+        while len(result.solved) < len(samples):
+            size, root = _box_size(study), root_coordinates(study)
+            order, parent = neighbour_tree(samples, size, root, result.solved, result.failed)
+            children: dict[int, list[int]] = {}
+            for sample in order:
+                starts = tried.get(sample, [])
+                if parent[sample] not in starts and len(starts) < MOST_ATTEMPTS:
+                    children.setdefault(parent[sample], []).append(sample)
+            if not children.keys() & {-1, *result.solved}:
+                break
+            _run_pass(study, samples, paths, children, executor, result, tried, progress)
+    for sample in set(range(len(samples))) - set(result.solved) - set(result.failed):
+        result.failed[sample] = "not reached: no neighbour of it could be solved"
     if len(result.solved) < 0.5 * len(samples):
         first = next(iter(result.failed.values()))
         raise StudyError(
@@ -204,3 +193,44 @@ def run_sweep(study: Study, samples: Array, folder: Path, executor: Executor) ->
             "solver.divisions, or raise solver.thickness"
         )
     return result
+
+
+def _run_pass(
+    study: Study,
+    samples: Array,
+    paths: list[Path],
+    children: dict[int, list[int]],
+    executor: Executor,
+    result: SweepResult,
+    tried: dict[int, list[int]],
+    progress: tqdm,
+) -> None:
+    """Walk a tree of samples from the solved ones outwards; branches behind a failure are left."""
+    running: dict[Future, int] = {}
+
+    def start(parent: int) -> None:
+        for sample in children.get(parent, []):
+            tried.setdefault(sample, []).append(parent)
+            if paths[sample].is_file():
+                future: Future = Future()
+                future.set_result(None)
+            else:
+                origin = paths[parent] if parent >= 0 else None
+                future = executor.submit(_solve_sample, study, samples[sample], origin, paths[sample])
+            running[future] = sample
+
+    for origin in [-1, *sorted(result.solved)]:
+        start(origin)
+    while running:
+        done, _ = wait(running, return_when=FIRST_COMPLETED)
+        for future in done:
+            sample = running.pop(future)
+            reason = future.result()
+            if reason is None:
+                result.solved[sample] = paths[sample]
+                result.failed.pop(sample, None)
+                progress.update()
+                start(sample)
+            else:
+                result.failed[sample] = reason
+        progress.set_postfix(failed=len(result.failed))
