@@ -177,7 +177,7 @@ def test_same_minimum_as_scipy_on_the_same_loss(model, points):
     pixels = observed(points, TRUTH, 0.8, rng)
     pixels[:30] += rng.uniform(-40, 40, (30, 2))
     state, cost = scipy_minimum(points, pixels, TRUTH)
-    found = Estimator(model, CAMERA, EstimationOptions(tolerance=1e-12)).estimate(
+    found = Estimator(model, CAMERA, EstimationOptions(huber_px=2.0, tolerance=1e-12)).estimate(
         points, pixels, np.ones(len(points)), start_near(rng)
     )
     assert found.cost == pytest.approx(cost, rel=1e-4)
@@ -207,7 +207,9 @@ def test_parameters_stay_in_the_box_and_are_flagged(model, points):
     outside = State(np.array([0.075, 0.3, 0.1]), POSE)
     rng = np.random.default_rng(7)
     pixels = observed(points, outside, 0.0, rng)
-    found = Estimator(model, CAMERA).estimate(points, pixels, np.ones(len(points)), start_near(rng))
+    found = Estimator(model, CAMERA, EstimationOptions(huber_px=2.0)).estimate(
+        points, pixels, np.ones(len(points)), start_near(rng)
+    )
     assert found.state.parameters[0] == pytest.approx(0.060)
     assert found.at_bound.tolist() == [True, False, False]
     # Scipy, started there with the held parameter kept, finds nothing lower nearby.

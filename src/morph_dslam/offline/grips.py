@@ -15,14 +15,14 @@ The four coordinates of the reduced model are
     bend    symmetric bend, as a multiple of that of a circular arc with this bulge, 1
     skew    antisymmetric bend, (bend_left - bend_right) / 2, rad
     slant   twist, as a multiple of twice the bend of that arc: in a gently bent sheet the tangent of the
-            angle by which the rulings lean, 1; levelled off at large bulges (`LEVELLING`)
+            angle by which the rulings lean, 1; levelled off at both ends (`LEVELLING`, `FLAT_TWIST`)
 
 Why not the angles and the approach themselves: for given angles two shapes, bulging to either side, share the
 same approach, none exists below a smallest approach, and the two meet only in the flat state. A thin sheet
 stays developable, so it cannot twist without bending either. Over (bulge, bend, skew, slant) the family of
 shapes is one smooth graph that holds both sides. bend = 1 is bent by pure moments, about 0.78 is held like a
-hinge, 0 is clamped straight (Euler's column), above 1 pulled. In the flat state, bulge = 0, bend and slant
-make no difference: there the images cannot tell them.
+hinge, 0 is clamped straight (Euler's column), above 1 pulled. In the flat state, bulge = 0, bend makes hardly
+any difference: there the images cannot tell it.
 The approach follows from the bulge; the turns in the plane are free: no moment acts there.
 """
 
@@ -41,6 +41,9 @@ ARC_SLOPE = 4.0 / (4.0 * (0.25 - (1.0 / 12.0 - 1.0 / (2.0 * np.pi**2))))
 #: The twist grows in proportion to the bulge up to about this part of the free length, then levels off: what
 #: a slightly bent sheet can follow would tear a strongly bent one apart.
 LEVELLING = 0.1
+#: Below this part of the free length the bulge no longer limits the twist: a nearly flat sheet follows a
+#: small twist by stretching a little.
+FLAT_TWIST = 0.006
 
 MOTION = ("bend_left", "bend_right", "twist", "approach", "turn_left", "turn_right")
 COORDINATES = ("bulge", "bend", "skew", "slant")
@@ -85,19 +88,26 @@ class Grips:
         """Motion (6,) that the coordinates (4,) prescribe; the free motions are left zero."""
         bulge, bend, skew, slant = coordinates
         arc = ARC_SLOPE * bulge / self.free_length
-        twist = 2.0 * slant * arc / np.sqrt(1.0 + (bulge / (LEVELLING * self.free_length)) ** 2)
+        twist = 2.0 * slant * ARC_SLOPE * self._twist_scale(bulge)[0]
         return np.array([bend * arc + skew, bend * arc - skew, twist, 0.0, 0.0, 0.0])
+
+    def _twist_scale(self, bulge: float) -> tuple[float, float]:
+        """About |bulge| over the free length, smooth at 0 and levelled off; and its derivative."""
+        x = bulge / self.free_length
+        square = (x**2 + FLAT_TWIST**2) / (1.0 + (x / LEVELLING) ** 2)
+        slope = x * (1.0 - (FLAT_TWIST / LEVELLING) ** 2) / (1.0 + (x / LEVELLING) ** 2) ** 2
+        return float(np.sqrt(square)), float(slope / np.sqrt(square) / self.free_length)
 
     def prescribed_motion_gradient(self, coordinates: Array) -> Array:
         """Derivative (6, 4) of `prescribed_motion`."""
         bulge, bend, _, slant = coordinates
         scale = ARC_SLOPE / self.free_length
-        root = np.sqrt(1.0 + (bulge / (LEVELLING * self.free_length)) ** 2)
+        twist, twist_slope = self._twist_scale(bulge)
         gradient = np.zeros((6, 4))
-        gradient[:3, 0] = bend * scale, bend * scale, 2.0 * slant * scale / root**3
+        gradient[:3, 0] = bend * scale, bend * scale, 2.0 * slant * ARC_SLOPE * twist_slope
         gradient[:2, 1] = bulge * scale
         gradient[:2, 2] = 1.0, -1.0
-        gradient[2, 3] = 2.0 * bulge * scale / root
+        gradient[2, 3] = 2.0 * ARC_SLOPE * twist
         return gradient
 
     def positions(self, motion: Array, left: Array, right: Array) -> Array:

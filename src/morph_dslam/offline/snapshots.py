@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 FACES = ("top", "bottom")
 #: Signs that the coordinates take when the sheet is mirrored in its own plane, and in the plane x = 0.
-MIRROR_Z = np.array([-1.0, 1.0, -1.0, 1.0])
+MIRROR_Z = np.array([-1.0, 1.0, -1.0, -1.0])
 MIRROR_X = np.array([1.0, 1.0, -1.0, -1.0])
 
 

@@ -76,10 +76,16 @@ class BoundPoints:
 
 @dataclass(frozen=True)
 class EstimationOptions:
-    """``huber_px``: residual length where Huber's cost turns linear; ``tolerance``: relative decrease of the
-    cost below which the iteration ends."""
+    """When to stop, and what is too far off.
 
-    huber_px: float = 2.0
+    Attributes
+    ----------
+    huber_px : residual length where Huber's cost turns linear; above what a model that is a little off leaves
+        over wide parts of the surface, which are no outliers.
+    tolerance : relative decrease of the cost below which the iteration ends.
+    """
+
+    huber_px: float = 3.0
     max_iterations: int = 25
     tolerance: float = 1e-6
 

@@ -31,7 +31,8 @@ class OutlineOptions:
     least_contrast : grey levels by which the two sides must differ.
     brightness_tolerance : largest difference of the inner side from its brightness in the reference view,
         relative to that; shading changes it as the surface bends.
-    weight : of an outline point relative to a texture point.
+    weight : of an outline point relative to a texture point: it gives one number, not two, and stands for
+        all of the bare margin behind it.
     """
 
     n_points: int = 120
@@ -39,7 +40,7 @@ class OutlineOptions:
     side_px: int = 4
     least_contrast: float = 10.0
     brightness_tolerance: float = 0.35
-    weight: float = 1.0
+    weight: float = 2.0
 
 
 @dataclass(frozen=True)

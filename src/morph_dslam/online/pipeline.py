@@ -29,7 +29,7 @@ from morph_dslam.online.measurement import (
     compare_with_rendering,
     visible_surface,
 )
-from morph_dslam.online.outline import Outline, OutlineOptions
+from morph_dslam.online.outline import Outline, OutlineMeasurement, OutlineOptions
 from morph_dslam.online.reference_refinement import Keyframe
 from morph_dslam.online.relocalisation import Relocaliser
 from morph_dslam.online.shape_search import ShapeSearch, with_undetermined_at_default
@@ -86,6 +86,7 @@ class _Attempt:
     estimate: Estimate
     inliers: NDArray[np.bool_]
     measurement: Measurement
+    outline: OutlineMeasurement | None = None
 
 
 class Tracker:
@@ -251,7 +252,7 @@ class Tracker:
 
     def _fit_outline(self, picture: _Picture, attempt: _Attempt, outline: Outline) -> _Attempt:
         """Estimate from the supporting points and the outline together; searched far first, then near."""
-        estimate, count = attempt.estimate, len(self.points)
+        estimate, count, seen = attempt.estimate, len(self.points), None
         for reach in (self.options.outline.reach_px, self.options.outline.reach_px // 2):
             seen = outline.measure(picture.grey, estimate.state, reach)
             estimate = self.estimator.estimate(
@@ -261,7 +262,8 @@ class Tracker:
                 estimate.state,
                 np.concatenate([np.zeros((count, 2)), seen.normals]),
             )
-        return replace(attempt, estimate=replace(estimate, residuals=estimate.residuals[:count]))
+        estimate = replace(estimate, residuals=estimate.residuals[:count])
+        return replace(attempt, estimate=estimate, outline=seen)
 
     def _refusal(self, attempt: _Attempt) -> str:
         """Why an attempt is not to be believed; empty when it is."""
@@ -292,7 +294,9 @@ class Tracker:
         """Keep what the next frame starts from; a lost frame keeps the last known state."""
         if not lost:
             estimate, weights = attempt.estimate, attempt.inliers.astype(float)
-            self.last_seen = Keyframe(attempt.measurement.pixels, weights, estimate.state, estimate.sigma_px)
+            self.last_seen = Keyframe(
+                attempt.measurement.pixels, weights, estimate.state, estimate.sigma_px, attempt.outline
+            )
             self._velocity_base = attempt.estimate.state if self._lost else self._last
             self._last = attempt.estimate.state
             self._start = with_undetermined_at_default(self.model, attempt.estimate)

@@ -17,6 +17,7 @@ from scipy.optimize import least_squares
 
 from morph_dslam.online.binding import bind_pixels, view_of
 from morph_dslam.online.estimation import BoundPoints, EstimationOptions, Estimator, State, moved
+from morph_dslam.online.outline import Outline, OutlineMeasurement
 
 Array = NDArray[np.float64]
 
@@ -29,12 +30,14 @@ class Keyframe:
     ----------
     pixels : (p, 2). weights : (p,), 0 for points that were not seen. state : estimated there.
     sigma_px : robust standard deviation of the residuals in it.
+    outline : where the outline was seen, if it was looked for: it ties the texture to the object's edges.
     """
 
     pixels: Array
     weights: Array
     state: State
     sigma_px: float
+    outline: OutlineMeasurement | None = None
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,7 @@ def refine_reference(
     start: State,
     keyframes: Sequence[Keyframe],
     options: RefinementOptions | None = None,
+    outline: Outline | None = None,
 ) -> State:
     """The reference state that explains the landmarks and the keyframes best.
 
@@ -77,7 +81,7 @@ def refine_reference(
     ----------
     landmarks, landmark_pixels : (k) as registered; pixels (k, 2) undistorted.
     reference_pixels : (p, 2) of the followed points in the reference view.
-    start : the registered state.
+    start : the registered state. outline : of the object, if the keyframes saw it.
     """
     options = options or RefinementOptions()
     model, camera = estimator.model, estimator.camera
@@ -97,7 +101,7 @@ def refine_reference(
         surface, met = bind_pixels(model, camera, view_of(model, camera, state), reference_pixels)
         points = BoundPoints.from_surface(model, surface)
         for frame in keyframes:
-            parts.append(_frame_residuals(inner, points, met, frame, options))
+            parts.append(_frame_residuals(inner, points, met, frame, options, outline))
         return np.concatenate(parts)
 
     bounds = np.full((2, d + 6), np.inf) * [[-1.0], [1.0]]
@@ -110,15 +114,26 @@ def refine_reference(
 
 
 def _frame_residuals(
-    inner: Estimator, points: BoundPoints, met: NDArray[np.bool_], frame: Keyframe, options: RefinementOptions
+    inner: Estimator,
+    points: BoundPoints,
+    met: NDArray[np.bool_],
+    frame: Keyframe,
+    options: RefinementOptions,
+    outline: Outline | None,
 ) -> Array:
-    """Scaled residuals (2 p,) of a keyframe at its best state, with Huber weights; 0 for points unused."""
-    weights = frame.weights[met]
-    estimate = inner.estimate(points, frame.pixels[met], weights, frame.state)
+    """Scaled residuals of a keyframe at its best state, with Huber weights; 0 for points unused."""
+    pixels, weights, normals = frame.pixels[met], frame.weights[met], np.zeros((int(met.sum()), 2))
+    if outline is not None and frame.outline is not None:
+        points = points.joined(outline.points)
+        pixels = np.concatenate([pixels, frame.outline.pixels])
+        weights = np.concatenate([weights, outline.options.weight * frame.outline.valid]).astype(float)
+        normals = np.concatenate([normals, frame.outline.normals])
+    estimate = inner.estimate(points, pixels, weights, frame.state, normals)
     length = np.linalg.norm(estimate.residuals, axis=1)
     huber = np.minimum(1.0, inner.options.huber_px / np.maximum(length, 1e-12))
     sigma = max(frame.sigma_px, options.least_sigma_px)
     share = np.sqrt(options.effective_points / max(weights.sum(), 1.0)) / sigma
-    scaled = np.zeros((len(met), 2))
-    scaled[met] = (share * np.sqrt(weights * huber))[:, None] * np.nan_to_num(estimate.residuals)
+    found = (share * np.sqrt(weights * huber))[:, None] * np.nan_to_num(estimate.residuals)
+    scaled = np.zeros((len(met) + len(found) - int(met.sum()), 2))
+    scaled[: len(met)][met], scaled[len(met) :] = found[: met.sum()], found[met.sum() :]
     return scaled.ravel()

@@ -147,6 +147,7 @@ def _refined(
         registration.state,
         choose_keyframes(keyframes, options.refinement.n_keyframes),
         trust,
+        tracker.outline,
     )
 
 
