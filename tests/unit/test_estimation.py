@@ -188,7 +188,9 @@ def test_outliers_hardly_move_the_estimate(model, points):
     rng = np.random.default_rng(5)
     pixels = observed(points, TRUTH, 0.3, rng)
     pixels[:30] += rng.uniform(-60, 60, (30, 2))
-    found = Estimator(model, CAMERA).estimate(points, pixels, np.ones(len(points)), start_near(rng))
+    found = Estimator(model, CAMERA, EstimationOptions(huber_px=2.0)).estimate(
+        points, pixels, np.ones(len(points)), start_near(rng)
+    )
     error = np.linalg.norm(points.in_camera(found.state) - points.in_camera(TRUTH), axis=1)
     assert error.mean() < 1e-3
     assert found.sigma_px == pytest.approx(0.3, rel=0.5)
