@@ -21,10 +21,10 @@ demo: $(INSTALLED)
 	@$(BIN)/python examples/demo/run.py
 
 test: lint
-	@$(BIN)/pytest -m "not slow"
+	@$(BIN)/pytest -q -m "not slow"
 
 test-all: lint
-	@$(BIN)/pytest
+	@$(BIN)/pytest -q
 
 bench: $(INSTALLED)
 	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python "$$script"; done
