@@ -106,8 +106,8 @@ def _quadratic(matrix: Array, a: Any, b: Any, c: Any) -> Any:
 class KoiterSheet:
     """The discrete shell: spaces, residual, condensed tangent and recovery of stresses.
 
-    Lengths are scaled by ``length_scale`` and energies by ``energy_scale`` of the bending energy, so that the
-    solver sees numbers near one whatever the thickness; every public quantity is SI.
+    Energies are counted in units of the bending stiffness, ``energy_scale``, so that conditioning does not
+    depend on the material's units; every public quantity is SI.
 
     Parameters
     ----------
