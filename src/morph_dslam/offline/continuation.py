@@ -22,9 +22,7 @@ class Problem(Protocol):
     def solve(self, coordinates: Array, start: EquilibriumState) -> EquilibriumState: ...
 
 
-def advance(
-    problem: Problem, start: EquilibriumState, target: Array, first_increment: float = 1.0
-) -> tuple[EquilibriumState, int]:
+def advance(problem: Problem, start: EquilibriumState, target: Array) -> tuple[EquilibriumState, int]:
     """Solve at ``target`` (d,) along the straight line from ``start``.
 
     Returns the state and how many solves it took.
@@ -34,7 +32,7 @@ def advance(
     SolverError
         Naming the last coordinates that converged.
     """
-    state, done, increment, solves = start, 0.0, first_increment, 0
+    state, done, increment, solves = start, 0.0, 1.0, 0
     origin = start.coordinates
     while done < 1.0:
         step = min(increment, 1.0 - done)

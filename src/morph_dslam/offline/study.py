@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from morph_dslam.errors import StudyError
+from morph_dslam.io.toml_file import read_toml
 from morph_dslam.model import Parameter
 from morph_dslam.offline.gripped_sheet import GrippedSheet
 from morph_dslam.offline.grips import COORDINATES, Grips
@@ -205,12 +205,7 @@ def load_study(path: Path) -> Study:
     StudyError
         If it is missing, is not TOML, has an unknown or missing key, or a value that cannot be.
     """
-    try:
-        content = tomllib.loads(path.read_text())
-    except OSError as error:
-        raise StudyError(f"cannot read the study file {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise StudyError(f"{path} is not a TOML file: {error}") from error
+    content = read_toml(path, "study file", StudyError)
     try:
         return Study.model_validate(content)
     except ValidationError as error:

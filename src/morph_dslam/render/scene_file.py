@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 import types
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -10,6 +9,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from morph_dslam.errors import SceneError
+from morph_dslam.io.toml_file import read_toml
 
 Colour = tuple[
     Annotated[int, Field(ge=0, le=255)],
@@ -166,12 +166,7 @@ def load_scene_file(path: Path) -> Scene:
     SceneError
         If the file is missing, is not TOML, or a key is unknown, missing or has an impossible value.
     """
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SceneError(f"cannot read the scene file {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SceneError(f"{path} is not a TOML file: {error}") from error
+    content = read_toml(path, "scene file", SceneError)
     try:
         return Scene.model_validate(content)
     except ValidationError as error:
