@@ -1,0 +1,1 @@
+"""Materials as strain-energy densities: each law is written once and differentiated by NGSolve."""

@@ -1,0 +1,203 @@
+"""What every material offers to the solvers.
+
+A material is its strain-energy density W(F), in joule per cubic metre of the undeformed solid; stresses and
+tangents are derivatives of W and are never written by hand. So that nearly incompressible solids can be solved
+without locking, W is split:
+
+    W(F) = remainder(F) + K/2 g(F)^2
+
+with g the volumetric strain and K its modulus. The displacement form uses W; the mixed form uses
+remainder(F) + p g(F) - p^2 / (2 K), whose stationary value in the pressure p is W.
+"""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import ngsolve as ngs
+import numpy as np
+from ngsolve.meshes import Make1DMesh
+from numpy.typing import NDArray
+
+from morph_dslam.errors import StudyError
+
+if TYPE_CHECKING:
+    from morph_dslam.offline.materials.viscoelastic import Prony
+
+Array = NDArray[np.float64]
+#: A material constant: a number, or an NGSolve parameter (or an expression of parameters) that a study varies.
+Constant = Any
+
+#: Voigt's order of the components of a symmetric tensor.
+VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Material(ABC):
+    """Base of all laws.
+
+    Attributes
+    ----------
+    density : kg/m3 in the undeformed solid; weight and inertia need it.
+    prony : viscoelasticity over the law, whose constants are then the instantaneous ones.
+    """
+
+    density: Constant = 0.0
+    prony: Prony | None = None
+
+    @abstractmethod
+    def remainder(self, F: Any) -> Any:
+        """Strain energy without the volumetric part, Pa; F is a 3x3 coefficient function."""
+
+    def volumetric(self, F: Any) -> Any:
+        """Volumetric strain g(F): zero where the volume is unchanged. Most laws use ln J or J - 1."""
+        raise StudyError(
+            f"{self.name} has no separate volumetric part, so it cannot be used in mixed elements"
+        )
+
+    @property
+    def volumetric_modulus(self) -> Constant | None:
+        """Modulus K of the volumetric part, Pa; None for a law that has no such split."""
+        return None
+
+    def energy(self, F: Any) -> Any:
+        """Strain energy per undeformed volume, Pa; F is a 3x3 coefficient function."""
+        if self.volumetric_modulus is None:
+            return self.remainder(F)
+        return self.remainder(F) + 0.5 * self.volumetric_modulus * self.volumetric(F) ** 2
+
+    def first_piola_kirchhoff(self, F: Any) -> Any:
+        """P = dW/dF (3x3), Pa, of the law without its viscosity; F must not be a trial function."""
+        F = F.MakeVariable()
+        return self.energy(F).Diff(F)
+
+    @property
+    def name(self) -> str:
+        """The law's name in study files and messages: its class in snake case."""
+        return law_name(type(self))
+
+    @property
+    def fibres(self) -> tuple[str, ...]:
+        """Names of the fibre fields that the law still waits for; `with_fibres` gives them."""
+        return ()
+
+    def at_a_point(self) -> Material:
+        """The law with any field of directions replaced by constant ones, to examine it without a mesh."""
+        return self
+
+    def small_strain_stiffness(self) -> Array:
+        """Stiffness (6, 6) at F = 1 in Voigt's order and engineering shears, Pa, from the energy's derivatives."""
+        F = ngs.Id(3).MakeVariable()
+        stress = self.at_a_point().energy(F).Diff(F)
+        stiffness = np.empty((6, 6))
+        for column, (i, j) in enumerate(VOIGT):
+            strain = np.zeros((3, 3))
+            strain[i, j] += 0.5
+            strain[j, i] += 0.5
+            direction = ngs.CF(tuple(strain.ravel()), dims=(3, 3))
+            slope = evaluate(stress.Diff(F, direction)).reshape(3, 3)
+            stiffness[:, column] = [0.5 * (slope[a, b] + slope[b, a]) for a, b in VOIGT]
+        return stiffness
+
+    @property
+    def equivalent_poisson(self) -> float:
+        """Poisson's ratio at small strain (Voigt's average over directions for anisotropic laws)."""
+        bulk, shear = isotropic_average(self.small_strain_stiffness())
+        return float((3.0 * bulk - 2.0 * shear) / (2.0 * (3.0 * bulk + shear)))
+
+    def check(self) -> None:
+        """Refuse constants for which the undeformed solid is unstable; parameters count at their present values.
+
+        Raises
+        ------
+        StudyError : a constant is not finite, or some small strain would lower the energy.
+        """
+        for name, constant in self.constants().items():
+            if not np.all(np.isfinite(evaluate(constant))):
+                raise StudyError(f"{self.name}: {name} is not a finite number")
+        if evaluate(self.density) < 0.0:
+            raise StudyError(f"{self.name}: density = {evaluate(self.density):g} must not be negative")
+        self.check_constants()
+        stiffness = self.small_strain_stiffness()
+        lowest = np.linalg.eigvalsh(0.5 * (stiffness + stiffness.T))[0]
+        if not lowest > 0.0:
+            raise StudyError(
+                f"{self.name} is unstable with these constants: a small strain has the negative stiffness "
+                f"{lowest:g} Pa; check their signs, units and Poisson's ratios"
+            )
+
+    def check_constants(self) -> None:
+        """Refuse single constants that are out of range, with a message that names them (StudyError)."""
+        return
+
+    def constants(self) -> dict[str, Constant]:
+        """The numbers and parameters of the law by name, density included."""
+        assert is_dataclass(self)
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if _is_constant(value)}
+
+    def require_positive(self, *names: str) -> None:
+        """Refuse constants that are not above zero (StudyError)."""
+        for name in names:
+            value = evaluate(getattr(self, name))
+            if not value > 0.0:
+                raise StudyError(f"{self.name}: {name} = {value:g} must be positive")
+
+    def require_poisson(self, name: str = "poisson") -> None:
+        """Refuse an isotropic Poisson's ratio outside of (-1, 0.5), StudyError."""
+        value = evaluate(getattr(self, name))
+        if not -1.0 < value < 0.5:
+            raise StudyError(
+                f"{self.name}: {name} = {value:g} must lie between -1 and 0.5 "
+                "(0.4999 for a nearly incompressible solid, in mixed elements)"
+            )
+
+
+def law_name(law: type[Material]) -> str:
+    """`NeoHookean` is `neo_hookean` in a study file."""
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", law.__name__).lower()
+
+
+def _is_constant(value: Any) -> bool:
+    return isinstance(value, (int, float, ngs.Parameter)) and not isinstance(value, bool)
+
+
+def isotropic_average(stiffness: Array) -> tuple[float, float]:
+    """Bulk and shear modulus of the average of a stiffness (6, 6) over all orientations (Voigt 1889)."""
+    bulk = stiffness[:3, :3].sum() / 9.0
+    normal, shear = np.trace(stiffness[:3, :3]), np.trace(stiffness[3:, 3:])
+    return float(bulk), float((normal - 3.0 * bulk + 2.0 * shear) / 10.0)
+
+
+def lame(young: Constant, poisson: Constant) -> tuple[Constant, Constant]:
+    """Lame's constants lambda and mu (the shear modulus), Pa, from Young's modulus and Poisson's ratio."""
+    shear = young / (2.0 * (1.0 + poisson))
+    return young * poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson)), shear
+
+
+@cache
+def _unit_mesh() -> ngs.Mesh:
+    return Make1DMesh(1)
+
+
+def evaluate(coefficient: Any) -> Any:
+    """Value of a number or of a coefficient function that does not vary in space: a float, or an array (k,)."""
+    if isinstance(coefficient, (int, float)):
+        return float(coefficient)
+    mesh = _unit_mesh()
+    value = ngs.CF(coefficient)(mesh(0.5))
+    return np.array(value) if isinstance(value, tuple) else float(value)
+
+
+def right_cauchy_green(F: Any) -> Any:
+    """C = F'F."""
+    return F.trans * F
+
+
+def green_lagrange(F: Any) -> Any:
+    """E = (F'F - 1)/2."""
+    return 0.5 * (F.trans * F - ngs.Id(3))
