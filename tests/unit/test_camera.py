@@ -1,5 +1,7 @@
 """The pinhole camera against OpenCV and finite differences."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,6 +11,8 @@ from morph_dslam.errors import CameraError
 
 PLAIN = PinholeCamera(640, 480, 528.0, 531.0, 318.5, 241.2)
 BARREL = PinholeCamera(640, 480, 528.0, 531.0, 318.5, 241.2, (-0.28, 0.09, 1e-3, -5e-4, 0.02))
+RATIONAL = replace(BARREL, distortion=(0.4, -0.1, 1e-3, -5e-4, 0.02, 0.6, -0.05, 0.01))
+FISHEYE = replace(BARREL, distortion=(0.03, -0.02, 0.008, -0.001), lens_model="fisheye")
 
 
 def points_in_view(n=200, seed=0):
@@ -19,6 +23,10 @@ def points_in_view(n=200, seed=0):
 
 def opencv_pixels(camera, points):
     coefficients = np.array(camera.distortion) if camera.distortion else None
+    if camera.lens_model == "fisheye":
+        zero = np.zeros((1, 1, 3))
+        pixels, _ = cv2.fisheye.projectPoints(points[:, None], zero, zero, camera.matrix, coefficients)
+        return pixels.reshape(-1, 2)
     return cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix, coefficients)[0].reshape(-1, 2)
 
 
@@ -53,12 +61,69 @@ def test_undistorted_pixels_are_the_ideal_projections():
     points = points_in_view()
     distorted = opencv_pixels(BARREL, points)
     assert np.abs(distorted - BARREL.project(points)).max() > 5.0
-    # OpenCV's inverse iterates a fixed number of times; a tenth of a pixel is left at the image's corners.
-    inner = np.abs(points[:, :2] / points[:, 2:]).max(axis=1) < 0.3
-    np.testing.assert_allclose(
-        BARREL.undistort_pixels(distorted)[inner], BARREL.project(points)[inner], atol=0.05
-    )
+    np.testing.assert_allclose(BARREL.undistort_pixels(distorted), BARREL.project(points), atol=1e-6)
     np.testing.assert_array_equal(PLAIN.undistort_pixels(distorted), distorted)
+
+
+@pytest.mark.parametrize("camera", [PLAIN, BARREL, RATIONAL, FISHEYE])
+def test_recorded_projection_is_opencvs(camera):
+    points = points_in_view()
+    np.testing.assert_allclose(camera.project_recorded(points), opencv_pixels(camera, points), atol=1e-9)
+    ideal = camera.project(points)
+    np.testing.assert_allclose(camera.distort_pixels(ideal), opencv_pixels(camera, points), atol=1e-9)
+    np.testing.assert_allclose(camera.undistort_pixels(camera.distort_pixels(ideal)), ideal, atol=1e-5)
+
+
+@pytest.mark.parametrize("camera", [PLAIN, BARREL, RATIONAL, FISHEYE])
+def test_recorded_jacobian_by_central_differences(camera):
+    points, step = points_in_view(20), 1e-6
+    jacobian = camera.recorded_jacobian(points)
+    for axis in range(3):
+        offset = step * np.eye(3)[axis]
+        difference = (camera.project_recorded(points + offset) - camera.project_recorded(points - offset)) / (
+            2 * step
+        )
+        np.testing.assert_allclose(jacobian[:, :, axis], difference, rtol=1e-5, atol=1e-4)
+
+
+def test_a_fisheye_sees_more_than_a_pinhole_does():
+    # Equidistant with k = 0: the image radius is the angle itself, here 120 degrees to the right.
+    lens = PinholeCamera(640, 480, 100.0, 100.0, 320.0, 240.0, (0.0, 0.0, 0.0, 0.0), "fisheye")
+    aside = np.array([[np.sin(2.0 * np.pi / 3.0), 0.0, np.cos(2.0 * np.pi / 3.0)], [0.0, 0.0, 1.0]])
+    expected = [[320.0 + 100.0 * 2.0 * np.pi / 3.0, 240.0], [320.0, 240.0]]
+    np.testing.assert_allclose(lens.project_recorded(aside), expected, atol=1e-9)
+    np.testing.assert_allclose(lens.recorded_jacobian(aside)[1], [[100, 0, 0], [0, 100, 0]], atol=1e-9)
+    assert np.isnan(lens.undistort_pixels(np.array(expected))[0]).all()
+    np.testing.assert_allclose(lens.undistort_pixels(np.array(expected))[1], [320.0, 240.0])
+
+
+def test_pixels_beyond_the_fold_of_the_distortion_are_not_undistorted():
+    # r (1 - r^2 / 3) is largest, 2/3, at r = 1: nothing is imaged farther out.
+    folding = PinholeCamera(640, 480, 300.0, 300.0, 320.0, 240.0, (-1.0 / 3.0, 0.0, 0.0, 0.0))
+    inside, outside = [320.0 + 300.0 * 0.5 * (1 - 0.25 / 3.0), 240.0], [320.0 + 300.0 * 0.7, 240.0]
+    found = folding.undistort_pixels(np.array([inside, outside]))
+    np.testing.assert_allclose(found[0], [470.0, 240.0], atol=1e-6)
+    assert np.isnan(found[1]).all()
+
+
+@pytest.mark.parametrize("camera", [BARREL, FISHEYE])
+def test_undistortion_maps_are_opencvs(camera):
+    coefficients, size = np.array(camera.distortion), (camera.width, camera.height)
+    arguments = (camera.matrix, coefficients, np.eye(3), camera.matrix, size, cv2.CV_32FC1)
+    make = cv2.fisheye.initUndistortRectifyMap if camera is FISHEYE else cv2.initUndistortRectifyMap
+    image = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (480, 640), np.uint8), (0, 0), 3.0)
+    ours, theirs = (
+        cv2.remap(image, *m, cv2.INTER_LINEAR) for m in (camera.undistortion_maps(), make(*arguments))
+    )
+    # The maps are stored to 1/32 pixel.
+    assert np.abs(ours.astype(int) - theirs)[5:-5, 5:-5].max() <= 2
+
+
+def test_wrong_lenses_are_refused():
+    with pytest.raises(CameraError, match="unknown lens model 'mirror'"):
+        PinholeCamera(640, 480, 500.0, 500.0, 320.0, 240.0, (), "mirror")
+    with pytest.raises(CameraError, match="fisheye distortion has 0 values; give 4"):
+        PinholeCamera(640, 480, 500.0, 500.0, 320.0, 240.0, (), "fisheye")
 
 
 def test_undistortion_maps_bring_a_distorted_dot_to_its_ideal_pixel():

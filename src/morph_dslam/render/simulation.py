@@ -83,7 +83,7 @@ def _load_world(scene_path: Path) -> _World:
         camera = load_camera(folder / scene.camera)
     else:
         camera = parse_camera(scene.camera, f"{scene_path}: camera")
-    if any(camera.distortion):
+    if any(camera.distortion) or camera.lens_model == "fisheye":
         raise SceneError(
             f"{scene_path}: scenes are rendered without lens distortion; leave it out of the camera"
         )

@@ -1,0 +1,253 @@
+"""Calibrations of other programs: the numbers read, and what is refused.
+
+Files are written as those programs write them; OpenCV's by OpenCV itself.
+"""
+
+import cv2
+import numpy as np
+import pytest
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import CameraError
+from morph_dslam.io.calibration import load_camera, save_camera
+from tests.support.real_data import real_data
+
+ROS = """image_width: 640
+image_height: 480
+camera_name: narrow_stereo
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [458.654, 0, 367.215, 0, 457.296, 248.375, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.28, 0.07, 0.0002, 1.76e-05, 0]
+rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
+"""
+ROS_TOPIC = """header: {frame_id: cam}
+height: 480
+width: 640
+distortion_model: equidistant
+d: [0.01, -0.02, 0.003, 1e-05]
+k: [300.0, 0.0, 320.0, 0.0, 301.0, 240.0, 0.0, 0.0, 1.0]
+"""
+ORB_SLAM2 = """%YAML:1.0
+
+# Camera calibration
+Camera.fx: 458.654
+Camera.fy: 457.296
+Camera.cx: 367.215
+Camera.cy: 248.375
+Camera.k1: -0.28
+Camera.k2: 0.07
+Camera.p1: 0.0002
+Camera.p2: 1.76e-05
+Camera.width: 752
+Camera.height: 480
+Camera.fps: 20.0
+ORBextractor.nFeatures: 1000
+"""
+ORB_SLAM3 = """%YAML:1.0
+File.version: "1.0"
+Camera.type: "KannalaBrandt8"
+Camera1.fx: 190.97
+Camera1.fy: 190.97
+Camera1.cx: 254.93
+Camera1.cy: 256.89
+Camera1.k1: 0.0034
+Camera1.k2: 0.0007
+Camera1.k3: -0.002
+Camera1.k4: 0.0002
+Camera.width: 512
+Camera.height: 512
+"""
+KALIBR = """cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.28, 0.07, 0.0002, 1e-05]
+  distortion_model: radtan
+  intrinsics: [458.654, 457.296, 367.215, 248.375]
+  resolution: [752, 480]
+  rostopic: /cam0/image_raw
+cam1:
+  T_cn_cnm1:
+  - [1.0, 0.0, 0.0, -0.11]
+  - [0.0, 1.0, 0.0, 0.0]
+  - [0.0, 0.0, 1.0, 0.0]
+  - [0.0, 0.0, 0.0, 1.0]
+  camera_model: pinhole
+  distortion_coeffs: [0.01, -0.02, 0.003, 0.0]
+  distortion_model: equidistant
+  intrinsics: [380.0, 381.0, 370.0, 250.0]
+  resolution: [752, 480]
+  rostopic: /cam1/image_raw
+"""
+EUROC = """%YAML:1.0
+sensor_type: camera
+comment: VI-Sensor cam0 (MT9M034)
+T_BS:
+  cols: 4
+  rows: 4
+  data: [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+rate_hz: 20
+resolution: [752, 480]
+camera_model: pinhole
+intrinsics: [458.654, 457.296, 367.215, 248.375] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
+"""
+BROWN = (-0.28, 0.07, 0.0002, 1.76e-05)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (ROS, PinholeCamera(640, 480, 458.654, 457.296, 367.215, 248.375, BROWN)),
+        (ROS_TOPIC, PinholeCamera(640, 480, 300, 301, 320, 240, (0.01, -0.02, 0.003, 1e-5), "fisheye")),
+        (ROS.replace("-0.28, 0.07, 0.0002, 1.76e-05, 0", "0, 0, 0, 0, 0"), (458.654, ())),
+        (ORB_SLAM2, PinholeCamera(752, 480, 458.654, 457.296, 367.215, 248.375, BROWN)),
+        (
+            ORB_SLAM3,
+            PinholeCamera(
+                512, 512, 190.97, 190.97, 254.93, 256.89, (0.0034, 0.0007, -0.002, 0.0002), "fisheye"
+            ),
+        ),
+        (EUROC, (458.654, (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05))),
+    ],
+)
+def test_yaml_of_other_programs(tmp_path, text, expected):
+    path = tmp_path / "camera.yaml"
+    path.write_text(text)
+    camera = load_camera(path)
+    if isinstance(expected, tuple):
+        assert (camera.fx, camera.distortion) == expected
+    else:
+        assert camera == expected
+    # What was read is kept by our own format.
+    save_camera(tmp_path / "own.yaml", camera)
+    assert load_camera(tmp_path / "own.yaml") == camera
+
+
+def test_a_camera_chosen_from_a_chain(tmp_path):
+    path = tmp_path / "camchain.yaml"
+    path.write_text(KALIBR)
+    assert load_camera(tmp_path / "camchain.yaml#cam0").distortion == (-0.28, 0.07, 0.0002, 1e-5)
+    second = load_camera(tmp_path / "camchain.yaml#cam1")
+    assert second == PinholeCamera(752, 480, 380, 381, 370, 250, (0.01, -0.02, 0.003, 0.0), "fisheye")
+    with pytest.raises(CameraError, match=r"holds the cameras cam0, cam1: choose one, .*camchain\.yaml#cam0"):
+        load_camera(path)
+    with pytest.raises(CameraError, match="holds the cameras cam0, cam1"):
+        load_camera(tmp_path / "camchain.yaml#cam2")
+
+
+@pytest.mark.parametrize("n_coefficients", [4, 5, 8, 14])
+def test_what_opencv_writes(tmp_path, n_coefficients):
+    path = tmp_path / "opencv.yml"
+    matrix = np.array([[535.9157, 0.0, 342.283], [0.0, 534.1, 235.571], [0.0, 0.0, 1.0]])
+    coefficients = np.zeros((n_coefficients, 1))
+    used = min(n_coefficients, 8)
+    coefficients[:used, 0] = [-0.266, -0.0386, 1.8e-3, -2.8e-4, 0.238, 0.01, 0.02, 0.03][:used]
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_width", 640)
+    storage.write("image_height", 480)
+    storage.write("camera_matrix", matrix)
+    storage.write("distortion_coefficients", coefficients)
+    storage.release()
+    camera = load_camera(path)
+    np.testing.assert_allclose(camera.matrix, matrix, rtol=1e-14)
+    np.testing.assert_allclose(camera.distortion, coefficients[:used, 0], rtol=1e-14)
+    assert (camera.width, camera.height) == (640, 480)
+
+
+@pytest.mark.parametrize(
+    ("line", "distortion", "lens"),
+    [
+        ("SIMPLE_PINHOLE 640 480 500 320 240", (), "radial-tangential"),
+        ("PINHOLE 640 480 500 500 320 240", (), "radial-tangential"),
+        ("SIMPLE_RADIAL 640 480 500 320 240 -0.1", (-0.1, 0, 0, 0), "radial-tangential"),
+        ("RADIAL 640 480 500 320 240 -0.1 0.02", (-0.1, 0.02, 0, 0), "radial-tangential"),
+        ("OPENCV 640 480 500 500 320 240 -0.1 0.02 3e-4 4e-4", (-0.1, 0.02, 3e-4, 4e-4), "radial-tangential"),
+        (
+            "FULL_OPENCV 640 480 500 500 320 240 1 2 3 4 5 6 7 8",
+            (1, 2, 3, 4, 5, 6, 7, 8),
+            "radial-tangential",
+        ),
+        ("OPENCV_FISHEYE 640 480 500 500 320 240 1 2 3 4", (1, 2, 3, 4), "fisheye"),
+        ("RADIAL_FISHEYE 640 480 500 320 240 0.1 0.2", (0.1, 0.2, 0, 0), "fisheye"),
+    ],
+)
+def test_colmap_cameras(tmp_path, line, distortion, lens):
+    path = tmp_path / "cameras.txt"
+    path.write_text(f"# Camera list\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 {line}\n")
+    # COLMAP's centre of a 640x480 image is (320, 240); with pixel centres at whole numbers (319.5, 239.5).
+    assert load_camera(path) == PinholeCamera(640, 480, 500, 500, 319.5, 239.5, distortion, lens)
+
+
+def test_a_camera_chosen_from_a_colmap_model(tmp_path):
+    path = tmp_path / "cameras.txt"
+    path.write_text("1 PINHOLE 640 480 500 500 320 240\n7 PINHOLE 640 480 600 600 320 240\n")
+    assert load_camera(tmp_path / "cameras.txt#7").fx == 600.0
+    with pytest.raises(CameraError, match="holds the cameras 1, 7: choose one"):
+        load_camera(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (ROS.replace("plumb_bob", "omni"), "unknown distortion model 'omni'; known are plumb_bob"),
+        (ROS.replace("image_width: 640\n", ""), "does not say for what image size"),
+        (ROS.replace("458.654, 0, 367", "458.654, 3, 367"), "skew is not modelled"),
+        (ROS.replace(", 0, 0, 1]\ndist", ", 0, 0]\ndist"), "camera matrix has 8 values, not 9"),
+        (ROS.replace("458.654", "'wide'"), "camera matrix is not a list of numbers"),
+        (ROS.replace("458.654", "-458.654"), "fx: Input should be greater than 0"),
+        (ROS.replace("1.76e-05, 0]", "1, 2, 3]"), "distortion has 6 values; give 4 or 5 or 8, or none"),
+        (ROS_TOPIC.replace(", 1e-05]", "]"), "fisheye distortion has 3 values; give 4"),
+        (ROS_TOPIC.replace("equidistant", "''"), "but no distortion model"),
+        (ORB_SLAM2.replace("Camera.width: 752\n", ""), "add the lines Camera.width: and Camera.height:"),
+        (ORB_SLAM2.replace("Camera.fx: 458.654\n", ""), "Camera.fx is missing"),
+        (ORB_SLAM2.replace("Camera.fy: 457.296\n", ""), "fy: Field required"),
+        (ORB_SLAM3.replace("KannalaBrandt8", "Omni"), "unknown Camera.type 'Omni'"),
+        (EUROC.replace("pinhole", "eucm"), "unknown camera model 'eucm'"),
+        (EUROC.replace("[752, 480]", "752"), "resolution is not a list of numbers"),
+        ("M1: [1]\nM2: [1]\n", "stereo calibration without single cameras"),
+    ],
+)
+def test_yaml_that_is_refused(tmp_path, text, message):
+    path = tmp_path / "camera.yaml"
+    path.write_text(text)
+    with pytest.raises(CameraError, match=message) as caught:
+        load_camera(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("# nothing\n", "holds no camera"),
+        ("1 PINHOLE 640\n", r"line 1: a camera is ID MODEL"),
+        ("1 FOV 640 480 500 500 320 240 1\n", "line 1: unknown camera model 'FOV'"),
+        ("1 PINHOLE 640 480 500 320 240\n", "line 1: PINHOLE has width, height, then fx, fy, cx, cy"),
+        ("1 PINHOLE 640 480 500 x 320 240\n", "line 1: PINHOLE has width"),
+    ],
+)
+def test_colmap_cameras_that_are_refused(tmp_path, text, message):
+    path = tmp_path / "cameras.txt"
+    path.write_text(text)
+    with pytest.raises(CameraError, match=message):
+        load_camera(path)
+
+
+def test_a_name_where_there_is_one_camera(tmp_path):
+    (tmp_path / "camera.yaml").write_text(ROS)
+    with pytest.raises(CameraError, match="holds one camera only: leave out #cam1"):
+        load_camera(tmp_path / "camera.yaml#cam1")
+
+
+def test_the_published_calibration_of_opencvs_samples():
+    camera = load_camera(real_data("opencv_calib") / "left_intrinsics.yml")
+    assert camera.fx == pytest.approx(535.91573396163199, rel=1e-15)
+    assert camera.distortion[0] == pytest.approx(-0.26637260909660682, rel=1e-15)
+    assert (camera.width, camera.height) == (640, 480)
