@@ -7,63 +7,26 @@ only then bends it into shape, so that second-order cells have their middle node
 from __future__ import annotations
 
 from dataclasses import replace
+from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.cell_types import cell_type
-from morph_dslam.offline.mesh_conversion import FIRST_ORDER, to_second_order
 from morph_dslam.offline.meshes import CellBlock, Mesh
+from morph_dslam.offline.revolution import Collar, revolution
+from morph_dslam.offline.structured_grid import (
+    CUTS,
+    SOLIDS,
+    check_divisions,
+    check_type,
+    unit_grid,
+    with_surfaces,
+)
 
-Array = NDArray[np.float64]
+__all__ = ["Collar", "block", "revolution", "sheet", "tube"]
+
 Indices = NDArray[np.int64]
-
-#: How a unit cube, its corners numbered as a hex8's, is cut into cells; cubes side by side match.
-_CUTS: dict[str, tuple[tuple[int, ...], ...]] = {
-    "hex8": ((0, 1, 2, 3, 4, 5, 6, 7),),
-    "prism6": ((0, 1, 2, 4, 5, 6), (0, 2, 3, 4, 6, 7)),
-    "tet4": (
-        (0, 1, 2, 6), (0, 2, 3, 6), (0, 3, 7, 6), (0, 7, 4, 6), (0, 4, 5, 6), (0, 5, 1, 6),
-    ),
-    "quad4": ((0, 1, 2, 3),),
-    "tri3": ((0, 1, 2), (0, 2, 3)),
-}  # fmt: skip
-
-
-def _check_divisions(divisions: tuple[int, ...], count: int, names: str) -> None:
-    if len(divisions) != count or any(int(n) != n or n < 1 for n in divisions):
-        raise StudyError(
-            f"divisions are {tuple(divisions)}; give {count} whole numbers of at least 1: {names}"
-        )
-
-
-def _check_type(name: str, known: tuple[str, ...]) -> None:
-    if name not in known:
-        raise StudyError(f"'{name}' is not a cell type of this generator; use one of {', '.join(known)}")
-
-
-_SOLIDS = ("hex8", "hex20", "hex27", "tet4", "tet10", "prism6", "prism15", "prism18")
-
-
-def _grid(divisions: tuple[int, int, int], name: str, kept: NDArray[np.bool_] | None = None) -> Mesh:
-    """Unit cubes at whole-number coordinates, cut into cells; only the cubes where ``kept`` is true."""
-    shape = tuple(n + 1 for n in divisions)
-    corner = np.argwhere(np.ones(shape, dtype=bool))
-    cubes = np.argwhere(np.ones(divisions, dtype=bool) if kept is None else kept)
-    offsets = cell_type("hex8").nodes.astype(np.int64)
-    strides = np.array([shape[1] * shape[2], shape[2], 1])
-    numbers = (cubes[:, None, :] + offsets) @ strides
-    first_order = FIRST_ORDER.get(name, name)
-    connectivity = numbers[:, np.array(_CUTS[first_order])].reshape(-1, cell_type(first_order).corners)
-    mesh = Mesh(corner.astype(np.float64), (CellBlock(first_order, connectivity),)).without_unused_nodes()
-    return mesh if first_order == name else to_second_order(mesh, name)
-
-
-def _with_surfaces(mesh: Mesh, surfaces: dict[str, Indices]) -> Mesh:
-    """Name surfaces, and the set of nodes of each by the same name; empty ones are left out."""
-    mesh = replace(mesh, surfaces={name: faces for name, faces in surfaces.items() if len(faces)})
-    return replace(mesh, node_sets={name: mesh.surface_nodes(name) for name in mesh.surfaces})
 
 
 def _plane_surfaces(grid: Mesh, names: dict[str, tuple[int, int]]) -> dict[str, Indices]:
@@ -94,12 +57,72 @@ def block(
     StudyError
         If a size or a division is not positive, or the cell type is unknown.
     """
-    _check_type(cell_type, _SOLIDS)
-    _check_divisions(divisions, 3, "along x, y and z")
+    check_type(cell_type, SOLIDS)
+    check_divisions(divisions, 3, "along x, y and z")
     if len(size) != 3 or min(size) <= 0.0:
         raise StudyError(f"the block's size is {tuple(size)} m; give three positive lengths")
-    grid = _grid(divisions, cell_type)
+    grid = unit_grid(np.ones(divisions, dtype=bool), cell_type)
     names = {f"{axis}_min": (i, 0) for i, axis in enumerate("xyz")}
     names |= {f"{axis}_max": (i, divisions[i]) for i, axis in enumerate("xyz")}
     mesh = replace(grid, nodes=grid.nodes * (np.array(size) / np.array(divisions)))
-    return _with_surfaces(mesh, _plane_surfaces(grid, names))
+    return with_surfaces(mesh, _plane_surfaces(grid, names))
+
+
+def sheet(size: tuple[float, float], divisions: tuple[int, int], cell_type: str = "quad4") -> Mesh:
+    """A flat rectangle in the plane z = 0 with one corner at the origin, seen from +z.
+
+    Parameters
+    ----------
+    size : extents along x and y, metres.
+    divisions : cells along x and y; each square is cut in two for "tri3".
+    cell_type : "quad4" or "tri3".
+
+    Returns
+    -------
+    Mesh
+        Node sets "x_min", "x_max", "y_min", "y_max" of its edges; surface "top", all of it.
+
+    Raises
+    ------
+    StudyError
+        As `block`.
+    """
+    check_type(cell_type, ("quad4", "tri3"))
+    check_divisions(divisions, 2, "along x and y")
+    if len(size) != 2 or min(size) <= 0.0:
+        raise StudyError(f"the sheet's size is {tuple(size)} m; give two positive lengths")
+    shape = np.array(divisions) + 1
+    corners = np.argwhere(np.ones(shape, dtype=bool))
+    squares = np.argwhere(np.ones(divisions, dtype=bool))
+    numbers = (squares[:, None, :] + np.array([[0, 0], [1, 0], [1, 1], [0, 1]])) @ np.array([shape[1], 1])
+    cut = np.array(CUTS[cell_type])
+    flat = corners * (np.array(size) / np.array(divisions))
+    mesh = Mesh(
+        np.column_stack([flat, np.zeros(len(flat))]),
+        (CellBlock(cell_type, numbers[:, cut].reshape(-1, cut.shape[1])),),
+    )
+    edges = {f"{axis}_min": np.flatnonzero(corners[:, i] == 0) for i, axis in enumerate("xy")}
+    edges |= {f"{axis}_max": np.flatnonzero(corners[:, i] == divisions[i]) for i, axis in enumerate("xy")}
+    return replace(mesh, node_sets=edges, surfaces={"top": mesh.all_faces()})
+
+
+def tube(
+    inner_radius: float,
+    outer_radius: float,
+    length: float,
+    divisions: tuple[int, int, int],
+    cell_type: str = "hex20",
+    angles: tuple[float, float] = (0.0, 2.0 * pi),
+) -> Mesh:
+    """A straight tube around the z axis from z = 0 to ``length`` (metres).
+
+    Divisions are along z, through the wall and around; angles, sets and errors are those of `revolution`.
+    """
+    if not 0.0 < inner_radius < outer_radius or length <= 0.0:
+        raise StudyError(
+            f"a tube of radii {inner_radius} and {outer_radius} m and length {length} m cannot be; "
+            "give 0 < inner_radius < outer_radius and a positive length"
+        )
+    middle = 0.5 * (inner_radius + outer_radius)
+    profile = [(middle, 0.0), (middle, length)]
+    return revolution(profile, outer_radius - inner_radius, divisions, cell_type, angles)
