@@ -84,7 +84,8 @@ class _FreeBlock:
 
     @staticmethod
     def of(indices: Integers, indptr: Integers, free: NDArray[np.bool_], symmetric: bool) -> _FreeBlock:
-        rows = np.repeat(np.arange(len(free)), np.diff(indptr))
+        # NGSolve's row pointers are unsigned.
+        rows = np.repeat(np.arange(len(free)), np.diff(np.asarray(indptr, dtype=np.int64)))
         columns = np.asarray(indices, dtype=np.int64)
         if symmetric and not np.any(columns > rows):
             rows, columns = columns, rows  # only the lower triangle is stored: its transpose is the upper one
