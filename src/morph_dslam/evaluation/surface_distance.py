@@ -1,4 +1,4 @@
-"""Distance from measured points to a triangulated surface, as the paper measures it against a depth sensor."""
+"""Distance from measured points to a triangulated surface: the paper's error against a depth sensor."""
 
 from __future__ import annotations
 
