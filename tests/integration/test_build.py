@@ -11,12 +11,13 @@ import pytest
 
 from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.model import load_model
-from morph_dslam.offline import sweep
 from morph_dslam.offline.build import build
+from morph_dslam.offline.continuation import advance
 from morph_dslam.offline.gripped_sheet import GrippedSheet
+from morph_dslam.offline.problem import bounds
 from morph_dslam.offline.snapshots import load_snapshot
 from morph_dslam.offline.study import load_study
-from morph_dslam.offline.sweep import canonical, neighbour_tree, sample_box
+from morph_dslam.offline.sweep import neighbour_tree, sample_box
 
 STUDY = """
 name = "tiny sheet"
@@ -81,7 +82,7 @@ def test_model_predicts_solutions_that_it_has_not_seen(built: Path) -> None:
     for _ in range(3):
         mu = model.lower + (model.upper - model.lower) * rng.uniform(0.1, 0.9, 4)
         mu[0] = abs(mu[0]) + 1e-3
-        state, _ = sweep.advance(problem, start, mu)
+        state, _ = advance(problem, start, mu)
         displacement, stress = problem.shell.sample(state.dofs, points)
         largest = np.abs(displacement).max()
         assert np.linalg.norm(model.displacement.value(mu) - displacement, axis=1).mean() < 5e-3 * largest
@@ -156,25 +157,25 @@ def test_hopeless_range_is_refused_and_solved_samples_stay(tmp_path: Path, monke
 def test_mirrored_snapshots_are_solutions(built: Path, which: int) -> None:
     """Solve at the mirrored coordinates directly and compare everything."""
     study = load_study(built / "study.toml")
-    problem = study.problem()
+    problem = study.sweep_problem()
     snapshot = next(
         snapshot
         for path in sorted((built / "tiny.morph.snapshots").glob("*.npz"))
         if (snapshot := load_snapshot(path)).coordinates[0] > 4e-3
     )
-    mirrored = snapshot.images(study)[which]
+    mirrored = study.images(snapshot)[which]
     side = np.sign(mirrored.coordinates[0])
-    state, _ = sweep.advance(problem, problem.first_state(6e-3 * side), mirrored.coordinates)
-    other = sweep.take_snapshot(problem, study, state)
-    assert mirrored.motion == pytest.approx(other.motion, abs=1e-7)
-    assert mirrored.displacement == pytest.approx(other.displacement, abs=1e-7)
-    ours, theirs = mirrored.displacement_sensitivity, other.displacement_sensitivity
+    state = problem.advance(problem.sheet.first_state(6e-3 * side), mirrored.coordinates)
+    other = problem.take_snapshot(state)
+    assert mirrored.outputs["motion"] == pytest.approx(other.outputs["motion"], abs=1e-7)
+    assert mirrored.fields["displacement"] == pytest.approx(other.fields["displacement"], abs=1e-7)
+    ours, theirs = mirrored.sensitivities["displacement"], other.sensitivities["displacement"]
     assert np.abs(ours - theirs).max() < 1e-3 * np.abs(theirs).max()
-    for face in ("top", "bottom"):
-        ours, theirs = mirrored.stress[face], other.stress[face]
+    for face in ("stress_top", "stress_bottom"):
+        ours, theirs = mirrored.fields[face], other.fields[face]
         # Where stresses jump between elements, the two grids see the jump from slightly different sides.
         assert np.abs(ours - theirs).max() < 1e-3 * np.abs(theirs).max()
-        ours, theirs = mirrored.stress_sensitivity[face], other.stress_sensitivity[face]
+        ours, theirs = mirrored.sensitivities[face], other.sensitivities[face]
         assert np.abs(ours - theirs).max() < 2e-3 * np.abs(theirs).max()
 
 
@@ -193,10 +194,10 @@ def test_changed_study_solves_again_only_what_it_must(built: Path) -> None:
 
 def test_samples_are_canonical_and_start_from_neighbours(built: Path) -> None:
     study = load_study(built / "study.toml")
-    samples = canonical(study, sample_box(study, 32, 0, 0.5))
+    samples = study.canonical(sample_box(study, 32, 0, 0.5))
     assert np.all(samples[:, 0] > 0.0)
-    size = np.diff(study.parameters.bounds, axis=1).ravel()
-    order, parent = neighbour_tree(samples, size, sweep.root_coordinates(study))
+    size = np.diff(bounds(study), axis=1).ravel()
+    order, parent = neighbour_tree(samples, size, study.root())
     assert sorted(order) == list(range(32))
     solved: set[int] = {-1}
     for sample in order:
@@ -206,7 +207,7 @@ def test_samples_are_canonical_and_start_from_neighbours(built: Path) -> None:
     from scipy.sparse.csgraph import minimum_spanning_tree
     from scipy.spatial.distance import cdist
 
-    points = np.vstack([samples, sweep.root_coordinates(study)]) / size
+    points = np.vstack([samples, study.root()]) / size
     expected = minimum_spanning_tree(cdist(points, points)).sum()
     length = sum(np.linalg.norm(points[s] - points[parent[s]]) for s in order)
     assert length == pytest.approx(expected, rel=1e-12)

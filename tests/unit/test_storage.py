@@ -45,11 +45,13 @@ def test_a_file_cut_short_is_refused(path, fraction):
         load_model(path)
 
 
-@pytest.mark.parametrize(("version", "advice"), [(2, "update morph-dslam"), (0, "build it again")])
+@pytest.mark.parametrize(("version", "advice"), [(3, "update morph-dslam"), (0, "build it again")])
 def test_another_version_is_refused(path, version, advice):
     with h5py.File(path, "r+") as file:
         file.attrs["version"] = version
-    with pytest.raises(ModelFileError, match=f"version {version}, this release reads version 1: {advice}"):
+    with pytest.raises(
+        ModelFileError, match=f"version {version}, this release reads versions 1 to 2: {advice}"
+    ):
         load_model(path)
 
 

@@ -10,9 +10,9 @@ import pytest
 
 from morph_dslam.errors import StudyError
 from morph_dslam.offline import sweep
-from morph_dslam.offline.study import Study
+from morph_dslam.offline.sheet_study import SheetStudy
 
-STUDY = Study.model_validate(
+STUDY = SheetStudy.model_validate(
     {
         "name": "stand-in",
         "sheet": {"length": "200 mm", "width": "100 mm", "thickness": "0.2 mm"},

@@ -14,6 +14,13 @@ _UNITS = {"_mm": "mm", "_percent": "%", "_MPa": "MPa", "_seconds": "s", "_ms": "
 #: Provenance longer than this (a study's text) is for programs, not for a summary.
 _LONGEST_TEXT = 120
 
+#: Fields of the model file in words.
+_FIELDS = {
+    "stress_top": "stress, top face",
+    "stress_bottom": "stress, bottom face",
+    "stress_solid": "Cauchy stress",
+}
+
 Facts = dict[str, str]
 
 
@@ -57,18 +64,16 @@ def flatten(content: Mapping[str, Any], prefix: str = "") -> Facts:
 def summarise_model(model: ReducedModel) -> dict[str, Facts]:
     """Facts of a model by heading, in the order in which they are read; empty headings are left out."""
     extent = 1e3 * np.ptp(model.nodes, axis=0)
-    fields = {"displacement": model.displacement} | {
-        f"stress, {face} face": field for face, field in model.stresses.items()
-    }
     summary = {
         "mesh": {
             "nodes": str(len(model.nodes)),
             "triangles": str(len(model.triangles)),
+            **{f"{name} cells": str(len(cells)) for name, cells in model.cells.items()},
             "extent": " x ".join(f"{length:.4g}" for length in extent) + " mm",
             "units in the file": "metres, pascals, radians",
         },
         "parameters": {parameter.name: _range(parameter) for parameter in model.parameters},
-        "modes": {name: str(field.n_modes) for name, field in fields.items()},
+        "modes": {_FIELDS.get(name, name): str(field.n_modes) for name, field in model.fields.items()},
         "certificate": flatten(model.certificate),
         "provenance": flatten(model.provenance),
     }

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 class Parameter:
     """One coordinate of the parameter box; all values in SI, ``unit`` is for reports.
 
-    ``quantity`` is a key of `morph_dslam.units.FACTORS` (length, angle, ratio, stress).
+    ``quantity`` is a key of `morph_dslam.units.FACTORS` (length, angle, ratio, stress, force ...).
     """
 
     name: str
@@ -55,6 +55,16 @@ class SurfacePoints:
         return SurfacePoints(self.triangles[selection], self.weights[selection])
 
 
+def von_mises(stress: Array) -> Array:
+    """Von Mises stress (...) of (..., 3) plane (11, 22, 12) or (..., 6) components (normal ones first)."""
+    if stress.shape[-1] == 3:
+        s11, s22, s12 = np.moveaxis(stress, -1, 0)
+        return np.sqrt(s11**2 - s11 * s22 + s22**2 + 3.0 * s12**2)
+    x, y, z, *shears = np.moveaxis(stress, -1, 0)
+    normal = ((x - y) ** 2 + (y - z) ** 2 + (z - x) ** 2) / 2.0
+    return np.sqrt(normal + 3.0 * sum(shear**2 for shear in shears))
+
+
 @dataclass(frozen=True)
 class ReducedModel:
     """What a `.morph` file holds.
@@ -66,8 +76,11 @@ class ReducedModel:
     triangles : (m, 3) the visible surface, node indices.
     parameters : the d coordinates of the box.
     displacement : separated field with 3 components, metres.
-    stresses : second Piola-Kirchhoff stress by face ("top", "bottom"), 3 components (11, 22, 12) in the
-        material's axes, pascals; for solids that are not sheets the faces are absent.
+    stresses : for sheets the second Piola-Kirchhoff stress by face ("top", "bottom"), 3 components
+        (11, 22, 12) in the material's axes; for solids the Cauchy stress under "solid", 6 components
+        (xx, yy, zz, yz, xz, xy) in the object frame; pascals. Empty where none was computed.
+    cells : volume cells (k, c) by type ("hex8", "tet10"), nodes in VTK's order; empty for sheets.
+    strain : Green-Lagrange strain of a solid, 6 components as of the stress (tensor shears), or None.
     certificate : held-out errors and how they were measured, plain JSON.
     provenance : versions, study text, mesh hash, plain JSON.
     """
@@ -78,6 +91,8 @@ class ReducedModel:
     parameters: tuple[Parameter, ...]
     displacement: SeparatedField
     stresses: dict[str, SeparatedField] = field(default_factory=dict)
+    cells: dict[str, NDArray[np.int64]] = field(default_factory=dict)
+    strain: SeparatedField | None = None
     certificate: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
 
@@ -100,14 +115,21 @@ class ReducedModel:
         """Deformed node positions (n, 3) in the object frame, metres."""
         return self.nodes + self.displacement.value(mu)
 
-    def von_mises(self, mu: Array, face: str) -> Array:
-        """Von Mises stress (n,) in pascals on ``face``, plane stress: sqrt(s11² - s11 s22 + s22² + 3 s12²).
+    @property
+    def fields(self) -> dict[str, SeparatedField]:
+        """Every field under its name in the model file: "displacement", "stress_top", "strain" and so on."""
+        result = {"displacement": self.displacement}
+        result |= {f"stress_{place}": field for place, field in self.stresses.items()}
+        return result if self.strain is None else result | {"strain": self.strain}
 
-        The second Piola-Kirchhoff stress stands for the Cauchy stress turned back with the sheet; they
-        differ by the order of the strain, below one per cent in paper.
+    def von_mises(self, mu: Array, place: str) -> Array:
+        """Von Mises stress (n,) in pascals at ``place``, a key of `stresses`.
+
+        On the faces of sheets, plane stress: sqrt(s11² - s11 s22 + s22² + 3 s12²); there the second
+        Piola-Kirchhoff stress stands for the Cauchy stress turned back with the sheet; they differ by the
+        order of the strain, below one per cent in paper.
         """
-        s11, s22, s12 = self.stresses[face].value(mu).T
-        return np.sqrt(s11**2 - s11 * s22 + s22**2 + 3.0 * s12**2)
+        return von_mises(self.stresses[place].value(mu))
 
     def rest_positions(self, points: SurfacePoints) -> Array:
         """Undeformed positions (p, 3) of surface points, metres."""

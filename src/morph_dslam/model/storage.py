@@ -1,8 +1,8 @@
 """The `.morph` file: HDF5, versioned, without pickles, and checked in full when loaded.
 
 Layout (documented in docs/model-file.md): attributes `format`, `version`, `name`, `content_sha256` and the
-JSON texts `parameters`, `certificate`, `provenance` on the root; datasets `nodes`, `triangles`; one group per
-field under `fields/` with `modes`, `multi_indices`, `coefficients`.
+JSON texts `parameters`, `certificate`, `provenance` on the root; datasets `nodes`, `triangles` and, for
+solids, `cells/TYPE`; one group per field under `fields/` with `modes`, `multi_indices`, `coefficients`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ from morph_dslam.model.reduced_model import Parameter, ReducedModel
 from morph_dslam.model.separated import SeparatedField
 
 FORMAT = "morph-dslam reduced model"
-VERSION = 1
+#: Version 1 had sheets only: no cells, no strain. Its files are read as they are.
+VERSION = 2
+OLDEST_VERSION = 1
 
 
 def _content_hash(file: h5py.File) -> str:
@@ -58,9 +60,10 @@ def save_model(path: Path, model: ReducedModel) -> None:
         file.attrs["provenance"] = json.dumps(model.provenance)
         file.create_dataset("nodes", data=model.nodes)
         file.create_dataset("triangles", data=model.triangles.astype(np.int32))
-        _write_field(file.create_group("fields/displacement"), model.displacement)
-        for face, field in model.stresses.items():
-            _write_field(file.create_group(f"fields/stress_{face}"), field)
+        for cell_type, connectivity in model.cells.items():
+            file.create_dataset(f"cells/{cell_type}", data=connectivity.astype(np.int32))
+        for name, field in model.fields.items():
+            _write_field(file.create_group(f"fields/{name}"), field)
         file.attrs["content_sha256"] = _content_hash(file)
     os.replace(partial, path)
 
@@ -108,6 +111,10 @@ def _read_model(file: h5py.File) -> ReducedModel:
         raise ValueError("its nodes are not finite points")
     if triangles.ndim != 2 or triangles.min() < 0 or triangles.max() >= len(nodes):
         raise ValueError("its triangles name nodes that do not exist")
+    cells = {name: _read_array(file["cells"], name, np.int64) for name in file.get("cells", {})}  # type: ignore[arg-type]
+    for name, connectivity in cells.items():
+        if connectivity.ndim != 2 or connectivity.min() < 0 or connectivity.max() >= len(nodes):
+            raise ValueError(f"its {name} cells name nodes that do not exist")
     fields_group = file["fields"]
     assert isinstance(fields_group, h5py.Group)
     fields = {name: _read_field(group, lower, upper) for name, group in fields_group.items()}
@@ -118,8 +125,14 @@ def _read_model(file: h5py.File) -> ReducedModel:
         nodes=nodes,
         triangles=triangles,
         parameters=parameters,
-        displacement=fields.pop("displacement"),
-        stresses={name.removeprefix("stress_"): field for name, field in fields.items()},
+        displacement=fields["displacement"],
+        stresses={
+            name.removeprefix("stress_"): field
+            for name, field in fields.items()
+            if name.startswith("stress_")
+        },
+        cells=cells,
+        strain=fields.get("strain"),
         certificate=json.loads(str(file.attrs["certificate"])),
         provenance=json.loads(str(file.attrs["provenance"])),
     )
@@ -143,9 +156,10 @@ def load_model(path: Path) -> ReducedModel:
             if file.attrs.get("format") != FORMAT:
                 raise ModelFileError(f"{path} is an HDF5 file but not a morph-dslam model")
             version = int(file.attrs["version"])  # type: ignore[arg-type]
-            if version != VERSION:
+            if not OLDEST_VERSION <= version <= VERSION:
                 raise ModelFileError(
-                    f"{path} has model file version {version}, this release reads version {VERSION}: "
+                    f"{path} has model file version {version}, this release reads versions {OLDEST_VERSION} "
+                    f"to {VERSION}: "
                     f"{'update morph-dslam' if version > VERSION else rebuild}"
                 )
             return _read_model(file)

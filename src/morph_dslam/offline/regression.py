@@ -6,6 +6,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
+from morph_dslam.errors import StudyError
 from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
 
 Array = NDArray[np.float64]
@@ -47,7 +48,7 @@ def _solve(design: Array, targets: Array, gradient_weight: float) -> Array:
 def fit_functions(
     samples: Array,
     values: Array,
-    gradients: Array,
+    gradients: Array | None,
     lower: Array,
     upper: Array,
     max_degree: int,
@@ -58,32 +59,42 @@ def fit_functions(
 
     Parameters
     ----------
-    samples : (n, d). values : (n, n_functions). gradients : (n, d, n_functions), by the parameters.
+    samples : (n, d). values : (n, n_functions). gradients : (n, d, n_functions), by the parameters; None
+        where they are unknown.
     groups : (n,) label of the fold that each sample is left out with; mirror images share one.
     gradient_weight : weight of gradients (over the half range) relative to values.
 
     Returns
     -------
     The functions and, by degree, the relative root-mean-square error of cross-validation.
+
+    Raises
+    ------
+    StudyError
+        If there are too few samples for polynomials of degree 2.
     """
     half = (upper - lower) / 2.0
-    targets = np.concatenate([values[None], np.moveaxis(gradients * half[None, :, None], 1, 0)])
+    targets = values[None]
+    if gradients is not None:
+        targets = np.concatenate([targets, np.moveaxis(gradients * half[None, :, None], 1, 0)])
     d = samples.shape[1]
     errors: dict[int, float] = {}
     folds = groups % 5
     for degree in range(2, max_degree + 1):
         indices = total_degree_indices(d, degree)
-        if len(indices) > 0.8 * (1 + d) * np.mean(folds != 0) * len(samples):
+        if len(indices) > 0.8 * len(targets) * np.mean(folds != 0) * len(samples):
             break
-        design = design_matrix(samples, lower, upper, indices)
+        design = design_matrix(samples, lower, upper, indices)[: len(targets)]
         missed = 0.0
         for fold in range(5):
             left = folds == fold
             coefficients = _solve(design[:, ~left], targets[:, ~left], gradient_weight)
             missed += float(np.sum((design[0, left] @ coefficients - values[left]) ** 2))
         errors[degree] = float(np.sqrt(missed / np.sum(values**2)))
+    if not errors:
+        raise StudyError(f"{len(samples)} training samples are too few for {d} parameters: solve more")
     best = min(errors, key=lambda degree: errors[degree])
     indices = total_degree_indices(d, best)
-    design = design_matrix(samples, lower, upper, indices)
+    design = design_matrix(samples, lower, upper, indices)[: len(targets)]
     coefficients = _solve(design, targets, gradient_weight)
     return ParameterFunctions(lower, upper, indices, coefficients), errors

@@ -17,22 +17,11 @@ from scipy.stats import qmc
 from tqdm import tqdm
 
 from morph_dslam.errors import SolverError, StudyError
-from morph_dslam.offline.continuation import advance
-from morph_dslam.offline.gripped_sheet import GrippedSheet
-from morph_dslam.offline.snapshots import (
-    MIRROR_X,
-    MIRROR_Z,
-    load_state,
-    save_snapshot,
-    snapshot_key,
-    take_snapshot,
-)
-from morph_dslam.offline.study import Study
+from morph_dslam.offline.problem import ParametricStudy, SweepProblem, bounds
+from morph_dslam.offline.snapshots import load_state, save_snapshot, snapshot_key
 
 Array = NDArray[np.float64]
 
-#: Smallest |bulge| that is solved, over the largest: in the flat state itself the equations are singular.
-SMALLEST_BULGE = 0.02
 #: A sample is given up after so many attempts from different neighbours.
 MOST_ATTEMPTS = 2
 
@@ -45,33 +34,35 @@ class SweepResult:
     failed: dict[int, str] = field(default_factory=dict)
 
 
-def sample_box(study: Study, count: int, seed: int, towards_edges: float) -> Array:
-    """Scrambled Sobol samples (count, 4) of the box.
+def training_samples(study: ParametricStudy) -> Array:
+    """The samples (n, d) that the model is made from."""
+    sampling = study.sampling
+    if sampling.scheme == "sobol":
+        return sample_box(study, sampling.training, sampling.seed, towards_edges=0.5)
+    box = bounds(study)
+    if len(box) != 1:
+        raise StudyError(
+            f'sampling.scheme = "even" is for one parameter, and this study has {len(box)}: use "sobol"'
+        )
+    return study.admissible(np.linspace(box[0, 0], box[0, 1], sampling.training)[:, None])
+
+
+def held_out_samples(study: ParametricStudy) -> Array:
+    """The samples (n, d) that only measure the error: uniform, as the certificate's statement assumes."""
+    return sample_box(study, study.sampling.held_out, study.sampling.seed + 1, towards_edges=0.0)
+
+
+def sample_box(study: ParametricStudy, count: int, seed: int, towards_edges: float) -> Array:
+    """Scrambled Sobol samples (count, d) of the box.
 
     ``towards_edges`` in [0, 1] moves them from uniform to the Chebyshev density, at which polynomial
     regression is best conditioned.
     """
-    sobol = qmc.Sobol(4, rng=seed)
+    box = bounds(study)
+    sobol = qmc.Sobol(len(box), rng=seed)
     unit = 2.0 * sobol.random_base2(int(np.ceil(np.log2(count))))[:count] - 1.0
     xi = (1.0 - towards_edges) * unit + towards_edges * np.sin(np.pi / 2.0 * unit)
-    bounds = study.parameters.bounds
-    samples = bounds.mean(axis=1) + xi * np.diff(bounds, axis=1).ravel() / 2.0
-    smallest = SMALLEST_BULGE * np.abs(bounds[0]).max()
-    bulge = samples[:, 0]
-    samples[:, 0] = np.where(np.abs(bulge) < smallest, np.copysign(smallest, bulge), bulge)
-    return samples
-
-
-def canonical(study: Study, samples: Array) -> Array:
-    """The mirror image of each sample (n, 4) that is solved in its place.
-
-    The sheet does not know its sides apart, so bulge can be made positive; if its grips are at the same
-    height, slant too.
-    """
-    samples = np.where(samples[:, :1] < 0.0, samples * MIRROR_Z, samples)
-    if study.grips.symmetric:
-        samples = np.where(samples[:, 3:] < 0.0, samples * MIRROR_X, samples)
-    return samples
+    return study.admissible(box.mean(axis=1) + xi * np.diff(box, axis=1).ravel() / 2.0)
 
 
 def neighbour_tree(
@@ -106,36 +97,50 @@ def neighbour_tree(
     return order, parent.tolist()
 
 
-def root_coordinates(study: Study) -> Array:
-    """The gentle circular arch that every path starts from."""
-    bulge = min(0.03 * study.sheet.length, 0.5 * max(abs(b) for b in study.parameters.bulge))
-    return np.array([bulge, 1.0, 0.0, 0.0])
-
-
 @lru_cache(maxsize=1)
-def _worker_problem(study: Study) -> GrippedSheet:
-    """The problem of a worker process, built once; one thread, since the workers fill the cores."""
+def _worker_problem(study: ParametricStudy) -> SweepProblem:
+    """The problem of a worker process, built once."""
     import ngsolve
 
-    ngsolve.SetNumThreads(1)
-    return study.problem()
+    ngsolve.SetNumThreads(study.work.threads or os.cpu_count() or 1)
+    return study.sweep_problem()
 
 
-def _solve_sample(study: Study, coordinates: Array, start: Path | None, result: Path) -> str | None:
+def _solve_sample(study: ParametricStudy, coordinates: Array, start: Path | None, result: Path) -> str | None:
     """Solve one sample and write its snapshot; returns why it could not be solved, or None."""
-    problem = _worker_problem(study)  # type: ignore[arg-type]
+    problem = _worker_problem(study)
     try:
-        state = load_state(start) if start else problem.first_state(root_coordinates(study)[0])
-        state, _ = advance(problem, state, coordinates)
+        state = problem.unpack(load_state(start)) if start else problem.first_state()
+        state = problem.advance(state, coordinates)
     except SolverError as error:
         return str(error)
-    save_snapshot(result, state, take_snapshot(problem, study, state))
+    save_snapshot(result, problem.take_snapshot(state), problem.pack(state))
     return None
+
+
+class SerialExecutor(Executor):
+    """Runs each task here, when it is submitted: no second process, so the least memory."""
+
+    def submit(self, fn, /, *args, **kwargs) -> Future:
+        future: Future = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Give back the memory of the problem."""
+        _worker_problem.cache_clear()
 
 
 @contextmanager
 def default_executor(workers: int | None) -> Iterator[Executor]:
-    """Worker processes, one a core unless ``workers`` says otherwise; cancelled cleanly on interruption."""
+    """Worker processes, one a core unless ``workers`` says otherwise; cancelled cleanly on interruption.
+
+    A single worker is this process itself.
+    """
+    if workers == 1:
+        with SerialExecutor() as executor:
+            yield executor
+        return
     context = multiprocessing.get_context("spawn")
     executor = ProcessPoolExecutor(workers or os.cpu_count(), mp_context=context)
     try:
@@ -148,15 +153,8 @@ def default_executor(workers: int | None) -> Iterator[Executor]:
     executor.shutdown()
 
 
-def _box_size(study: Study) -> Array:
-    bounds = study.parameters.bounds
-    size = np.diff(bounds, axis=1).ravel()
-    size[0] = np.abs(bounds[0]).max()
-    return size
-
-
-def run_sweep(study: Study, samples: Array, folder: Path, executor: Executor) -> SweepResult:
-    """Solve all ``samples`` (n, 4), canonical, keeping each as soon as it is solved.
+def run_sweep(study: ParametricStudy, samples: Array, folder: Path, executor: Executor) -> SweepResult:
+    """Solve all ``samples`` (n, d), canonical, keeping each as soon as it is solved.
 
     Samples found in ``folder`` are not solved again. Each starts from its nearest neighbour in a tree; what
     lies behind a sample that did not converge is tried in the next pass from other neighbours, and so is the
@@ -173,8 +171,7 @@ def run_sweep(study: Study, samples: Array, folder: Path, executor: Executor) ->
     tried: dict[int, list[int]] = {}
     with tqdm(total=len(samples), desc="solving", unit="sample", smoothing=0.05) as progress:
         while len(result.solved) < len(samples):
-            size, root = _box_size(study), root_coordinates(study)
-            order, parent = neighbour_tree(samples, size, root, result.solved, result.failed)
+            order, parent = neighbour_tree(samples, study.scale(), study.root(), result.solved, result.failed)
             children: dict[int, list[int]] = {}
             for sample in order:
                 starts = tried.get(sample, [])
@@ -185,18 +182,32 @@ def run_sweep(study: Study, samples: Array, folder: Path, executor: Executor) ->
             _run_pass(study, samples, paths, children, executor, result, tried, progress)
     for sample in set(range(len(samples))) - set(result.solved) - set(result.failed):
         result.failed[sample] = "not reached: no neighbour of it could be solved"
+    _check_reach(study, samples, result, folder)
+    return result
+
+
+def _check_reach(study: ParametricStudy, samples: Array, result: SweepResult, folder: Path) -> None:
+    """Refuse a box of which too much could not be solved."""
     if len(result.solved) < 0.5 * len(samples):
         first = next(iter(result.failed.values()))
         raise StudyError(
             f"only {len(result.solved)} of {len(samples)} samples could be solved; the first failure: "
-            f"{first}. The solved ones are kept in {folder}. Narrow the ranges of the parameters, refine "
-            "solver.divisions, or raise solver.thickness"
+            f"{first}. The solved ones are kept in {folder}. {study.advice}"
         )
-    return result
+    if samples.shape[1] == 1 and result.failed:
+        parameter, solved = study.model_parameters()[0], samples[list(result.solved), 0]
+        beyond = [i for i in result.failed if not solved.min() < samples[i, 0] < solved.max()]
+        if beyond:
+            reached = [parameter.display(value) for value in (solved.min(), solved.max())]
+            raise StudyError(
+                f"{parameter.name} could only be followed from {reached[0]:.4g} to {reached[1]:.4g} "
+                f"{parameter.unit}: {result.failed[beyond[0]]}. The solutions up to there are kept in {folder}; "
+                f"with that range the same command goes on from them. {study.advice}"
+            )
 
 
 def _run_pass(
-    study: Study,
+    study: ParametricStudy,
     samples: Array,
     paths: list[Path],
     children: dict[int, list[int]],

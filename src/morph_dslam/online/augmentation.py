@@ -27,14 +27,15 @@ Array = NDArray[np.float64]
 def seen_field(model: ReducedModel, state: State, view: View) -> tuple[Array, str]:
     """The node field (n,) to show and its label.
 
-    Von Mises stress in MPa of the face turned to the camera; where the model carries no stress on faces, the
-    length of the displacement in mm.
+    Von Mises stress in MPa, for a sheet that of the face turned to the camera; where the model carries no
+    stress, the length of the displacement in mm.
     """
     # Triangles run anticlockwise seen from their top face, that is clockwise in neither y-up nor y-down
     # images: on the image's y-down axes a top face seen from the front has a negative area.
     face = "bottom" if facing(view, model.triangles).mean() > 0.5 else "top"
-    if face in model.stresses:
-        return 1e-6 * model.von_mises(state.parameters, face), "von Mises stress [MPa]"
+    place = "solid" if "solid" in model.stresses else face
+    if place in model.stresses:
+        return 1e-6 * model.von_mises(state.parameters, place), "von Mises stress [MPa]"
     displacement = model.displacement.value(state.parameters)
     return 1e3 * np.linalg.norm(displacement, axis=1), "displacement [mm]"
 
