@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from morph_dslam import __version__
-from morph_dslam.errors import MorphError
+from morph_dslam.errors import EvaluationError, MorphError
 
 USER_ERROR = 2
 INTERRUPTED = 130
@@ -80,9 +80,18 @@ def _track(arguments: argparse.Namespace) -> None:
 
 
 def _evaluate(arguments: argparse.Namespace) -> None:
+    if arguments.trajectory is not None:
+        from morph_dslam.evaluation.trajectory_report import evaluate_trajectory, trajectory_line
+
+        print(trajectory_line(evaluate_trajectory(arguments.run, arguments.trajectory)))
+        return
     from morph_dslam.evaluation.evaluate import evaluate
     from morph_dslam.evaluation.statements import remarks, result_line
 
+    if arguments.bind_frame is None:
+        raise EvaluationError(
+            "--points needs --bind-frame N, the frame whose pixels bind the points to the mesh"
+        )
     figures = evaluate(arguments.run, arguments.points, arguments.bind_frame)
     for remark in remarks(figures):
         print(f"note: {remark}")
@@ -182,16 +191,19 @@ def _add_online_commands(commands: argparse._SubParsersAction) -> None:
         "evaluate",
         _evaluate,
         "the run is unchanged",
-        "compare a run with measured points, in millimetres and without alignment",
+        "compare a run with measured points, without alignment, or its camera path with the true one",
     )
-    evaluate.add_argument("run", type=Path, help="run folder of `morph track`")
-    evaluate.add_argument("--points", type=Path, required=True, metavar="TRUTH", help="truth file (.npz)")
+    evaluate.add_argument("run", type=Path, help="run folder, or a trajectory file")
+    truth = evaluate.add_mutually_exclusive_group(required=True)
+    truth.add_argument("--points", type=Path, metavar="TRUTH", help="truth file (.npz)")
+    truth.add_argument(
+        "--trajectory", type=Path, metavar="TRUTH", help="true camera path (TUM, KITTI, COLMAP or 7-Scenes)"
+    )
     evaluate.add_argument(
         "--bind-frame",
         type=int,
-        required=True,
         metavar="N",
-        help="frame whose pixels bind the truth points to the mesh",
+        help="with --points: frame whose pixels bind the truth points to the mesh",
     )
 
 

@@ -44,3 +44,7 @@ class EvaluationError(MorphError):
 
 class TrackingError(MorphError):
     """A tracking run cannot be written where it was asked for."""
+
+
+class TrajectoryError(MorphError):
+    """A camera trajectory is missing or malformed."""

@@ -1,0 +1,178 @@
+"""Camera trajectories: TUM files, COLMAP's images.txt, KITTI files, and 7-Scenes folders of poses."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from morph_dslam.errors import TrajectoryError
+from morph_dslam.geometry import RigidTransform
+
+Array = NDArray[np.float64]
+
+#: Quaternions and matrices are written with few digits; more than this off, they are no rotations.
+ROTATION_TOLERANCE = 0.02
+
+#: 7-Scenes were recorded at 30 frames a second and carry no timestamps.
+SEVEN_SCENES_FPS = 30.0
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Camera poses over time.
+
+    Attributes
+    ----------
+    timestamps : (n,) ascending, seconds; frame numbers where the file has no times.
+    world_from_camera : (n, 4, 4), translations in metres, or in the map's unit where it has no scale.
+    """
+
+    timestamps: Array
+    world_from_camera: Array
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    @property
+    def positions(self) -> Array:
+        """Camera centres (n, 3) in the world."""
+        return self.world_from_camera[:, :3, 3]
+
+    @property
+    def length(self) -> float:
+        """Length of the path through the camera centres."""
+        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+
+def load_trajectory(path: Path) -> Trajectory:
+    """Read a trajectory.
+
+    Parameters
+    ----------
+    path : a TUM file (timestamp tx ty tz qx qy qz qw), a KITTI file (twelve numbers a line, stamped with the
+        line's number from 0), COLMAP's images.txt (stamped with the last number in each image's name), or a
+        folder of 7-Scenes with `frame-000000.pose.txt` (stamped with the frame's number / 30).
+
+    Raises
+    ------
+    TrajectoryError
+        If it is missing, empty, or of none of these kinds, or a line is no pose.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return _make(path, _seven_scenes_rows(path))
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise TrajectoryError(f"cannot read the trajectory {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise TrajectoryError(f"{path} is not a text file of camera poses") from error
+    lines = text.splitlines()
+    if path.name == "images.txt" or any(line.startswith("# Image list") for line in lines[:5]):
+        return _make(path, _colmap_rows(path, lines))
+    return _make(path, _table_rows(path, lines))
+
+
+def save_trajectory(path: Path, trajectory: Trajectory) -> None:
+    """Write a TUM file that `load_trajectory` and other programs read."""
+    quaternions = Rotation.from_matrix(trajectory.world_from_camera[:, :3, :3]).as_quat(canonical=True)
+    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    rows = zip(trajectory.timestamps, trajectory.positions, quaternions, strict=True)
+    for timestamp, position, quaternion in rows:
+        lines.append(" ".join([f"{timestamp:.6f}", *(f"{x:.9g}" for x in (*position, *quaternion))]))
+    path.write_text("\n".join(lines) + "\n")
+
+
+def _make(path: Path, rows: Iterator[tuple[float, Array]]) -> Trajectory:
+    """The trajectory of timed matrices (4, 4), in the order of time."""
+    timed = sorted(rows, key=lambda row: row[0])
+    if not timed:
+        raise TrajectoryError(f"{path} holds no camera poses")
+    timestamps, poses = zip(*timed, strict=True)
+    return Trajectory(np.array(timestamps), np.array(poses))
+
+
+def _table_rows(path: Path, lines: list[str]) -> Iterator[tuple[float, Array]]:
+    """Poses of a TUM or a KITTI file."""
+    row = 0
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        where = f"{path}, line {number}"
+        values = _numbers(line.replace(",", " ").split(), where)
+        if len(values) == 8:
+            yield values[0], _pose(values[4:], values[1:4], where)
+        elif len(values) == 12:
+            yield float(row), _rigid(values.reshape(3, 4), where)
+        else:
+            raise TrajectoryError(
+                f"{where} has {len(values)} numbers: a TUM file has timestamp tx ty tz qx qy qz qw, "
+                "a KITTI file twelve"
+            )
+        row += 1
+
+
+def _colmap_rows(path: Path, lines: list[str]) -> Iterator[tuple[float, Array]]:
+    """Poses of COLMAP's images.txt, which holds camera_from_world, w first, in every other line."""
+    is_image = True
+    for number, line in enumerate(lines, start=1):
+        if line.startswith("#"):
+            continue
+        if is_image and not line.strip():
+            continue
+        if is_image:
+            where, words = f"{path}, line {number}", line.split(maxsplit=9)
+            if len(words) != 10:
+                raise TrajectoryError(f"{where}: an image is ID QW QX QY QZ TX TY TZ CAMERA NAME")
+            digits = re.findall(r"\d+", Path(words[9]).stem)
+            if not digits:
+                raise TrajectoryError(f"{where}: {words[9]} has no number, which says which frame it is")
+            values = _numbers(words[1:8], where)
+            camera_from_world = _pose(np.roll(values[:4], -1), values[4:], where)
+            yield float(digits[-1]), RigidTransform.from_matrix(camera_from_world).inverse.matrix
+        is_image = not is_image
+
+
+def _seven_scenes_rows(folder: Path) -> Iterator[tuple[float, Array]]:
+    for path in sorted(folder.glob("frame-*.pose.txt")):
+        number = int(re.findall(r"\d+", path.name)[-1])
+        values = _numbers(path.read_text().split(), str(path))
+        if len(values) != 16:
+            raise TrajectoryError(f"{path} has {len(values)} numbers: a pose has 4 x 4")
+        yield number / SEVEN_SCENES_FPS, _rigid(values.reshape(4, 4)[:3], str(path))
+
+
+def _numbers(words: list[str], where: str) -> Array:
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise TrajectoryError(f"{where}: {error}") from error
+    if not np.isfinite(values).all():
+        raise TrajectoryError(f"{where} holds a value that is not finite")
+    return values
+
+
+def _pose(quaternion: Array, translation: Array, where: str) -> Array:
+    """The matrix (4, 4) of a quaternion, w last, and a translation."""
+    if abs(np.linalg.norm(quaternion) - 1.0) > ROTATION_TOLERANCE:
+        raise TrajectoryError(f"{where}: the quaternion's norm is {np.linalg.norm(quaternion):.3g}, not 1")
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+    pose[:3, 3] = translation
+    return pose
+
+
+def _rigid(matrix: Array, where: str) -> Array:
+    """The pose (4, 4) of a matrix (3, 4), its rotation made orthonormal."""
+    u, singular, vt = np.linalg.svd(matrix[:, :3])
+    if np.abs(singular - 1.0).max() > ROTATION_TOLERANCE or np.linalg.det(u @ vt) < 0.0:
+        raise TrajectoryError(f"{where}: the first three columns are not a rotation")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = u @ vt, matrix[:, 3]
+    return pose

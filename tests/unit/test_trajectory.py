@@ -1,0 +1,103 @@
+"""Trajectory files: each kind read to known poses, and what is refused."""
+
+import numpy as np
+import pytest
+
+from morph_dslam.errors import TrajectoryError
+from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
+
+# A quarter turn about z: x goes to y.
+QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+HALF = np.sqrt(0.5)
+
+
+def write(path, text):
+    path.write_text(text)
+    return path
+
+
+def test_tum(tmp_path):
+    path = write(
+        tmp_path / "truth.txt",
+        "# timestamp tx ty tz qx qy qz qw\n"
+        f"1305031102.2 1 2 3 0 0 {HALF} {HALF}\n\n"
+        "1305031102.1 0 0 0 0 0 0 1\n",
+    )
+    trajectory = load_trajectory(path)
+    np.testing.assert_array_equal(trajectory.timestamps, [1305031102.1, 1305031102.2])
+    np.testing.assert_allclose(trajectory.world_from_camera[1, :3, :3], QUARTER, atol=1e-12)
+    np.testing.assert_allclose(trajectory.positions, [[0, 0, 0], [1, 2, 3]])
+    assert trajectory.length == pytest.approx(np.sqrt(14.0))
+
+
+def test_kitti(tmp_path):
+    path = write(tmp_path / "00.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n0 -1 0 5 1 0 0 6 0 0 1 7\n")
+    trajectory = load_trajectory(path)
+    np.testing.assert_array_equal(trajectory.timestamps, [0.0, 1.0])
+    np.testing.assert_allclose(trajectory.world_from_camera[1, :3, :3], QUARTER, atol=1e-12)
+    np.testing.assert_allclose(trajectory.positions[1], [5, 6, 7])
+
+
+def test_colmap_holds_the_inverse_pose(tmp_path):
+    # The camera stands at (0, 0, 3) turned a quarter about z: x_camera = R^T (x - c).
+    path = write(
+        tmp_path / "images.txt",
+        "# Image list with two lines of data per image:\n"
+        "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
+        f"2 {HALF} 0 0 {-HALF} 0 0 -3 1 left/frame_0012.png\n"
+        "100 200 -1 50 60 7\n"
+        "1 1 0 0 0 -1 -2 -3 1 left/frame_0011.png\n"
+        "\n",
+    )
+    trajectory = load_trajectory(path)
+    np.testing.assert_array_equal(trajectory.timestamps, [11, 12])
+    np.testing.assert_allclose(trajectory.positions, [[1, 2, 3], [0, 0, 3]], atol=1e-12)
+    np.testing.assert_allclose(trajectory.world_from_camera[1, :3, :3], QUARTER, atol=1e-12)
+
+
+def test_seven_scenes_poses_are_made_orthonormal(tmp_path):
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = 1.0002 * QUARTER, [1, 2, 3]
+    np.savetxt(tmp_path / "frame-000030.pose.txt", pose)
+    trajectory = load_trajectory(tmp_path)
+    np.testing.assert_array_equal(trajectory.timestamps, [1.0])
+    np.testing.assert_allclose(trajectory.world_from_camera[0, :3, :3], QUARTER, atol=1e-12)
+
+
+def test_what_is_saved_is_read_back(tmp_path):
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, :3, :3], poses[1, :3, 3] = QUARTER, [0.1, -0.2, 0.3]
+    save_trajectory(tmp_path / "t.txt", Trajectory(np.array([1305031102.160407, 1305031102.19433]), poses))
+    read = load_trajectory(tmp_path / "t.txt")
+    np.testing.assert_allclose(read.timestamps, [1305031102.160407, 1305031102.19433], atol=1e-6, rtol=0)
+    np.testing.assert_allclose(read.world_from_camera, poses, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "holds no camera poses"),
+        ("1 2 3\n", "line 1 has 3 numbers: a TUM file has timestamp"),
+        ("# x\n1 0 0 0 0 0 0 word\n", "line 2: could not convert"),
+        ("1 0 0 nan 0 0 0 1\n", "line 1 holds a value that is not finite"),
+        ("1 0 0 0 0 0 0 0\n", "line 1: the quaternion's norm is 0, not 1"),
+        ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "line 1: the first three columns are not a rotation"),
+        ("# Image list\n1 1 0 0 0 0 0 0\n", "line 2: an image is ID QW"),
+        ("# Image list\n1 1 0 0 0 0 0 0 1 left.png\n", "line 2: left.png has no number"),
+    ],
+)
+def test_files_that_are_refused(tmp_path, text, message):
+    path = write(tmp_path / "poses.txt", text)
+    with pytest.raises(TrajectoryError, match=message) as caught:
+        load_trajectory(path)
+    assert str(path) in str(caught.value)
+
+
+def test_missing_binary_and_empty_folder(tmp_path):
+    with pytest.raises(TrajectoryError, match="cannot read the trajectory"):
+        load_trajectory(tmp_path / "absent.txt")
+    (tmp_path / "image.txt").write_bytes(bytes(range(128, 256)))
+    with pytest.raises(TrajectoryError, match="not a text file"):
+        load_trajectory(tmp_path / "image.txt")
+    with pytest.raises(TrajectoryError, match="holds no camera poses"):
+        load_trajectory(tmp_path)

@@ -1,0 +1,146 @@
+"""Trajectory errors: closed forms, and the published figures of a TUM recording."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from morph_dslam import cli
+from morph_dslam.errors import EvaluationError
+from morph_dslam.evaluation.trajectory_error import (
+    Statistics,
+    absolute_error,
+    associate,
+    match,
+    relative_error,
+)
+from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
+from tests.support.real_data import real_data
+
+
+def helix(n=61, start=100.0, step=0.1):
+    """A camera that climbs round a circle of 1 m, looking along its way."""
+    angle = np.linspace(0.0, 4.0, n)
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("z", angle[:, None]).as_matrix()
+    poses[:, :3, 3] = np.column_stack([np.cos(angle), np.sin(angle), 0.2 * angle])
+    return Trajectory(start + step * np.arange(n), poses)
+
+
+def moved(trajectory, scale=1.0):
+    """The same path in another world, smaller by ``scale``."""
+    change = np.eye(4)
+    change[:3, :3] = Rotation.from_rotvec([0.3, 1.0, -2.0]).as_matrix()
+    change[:3, 3] = [4.0, -1.0, 0.5]
+    poses = change @ trajectory.world_from_camera
+    poses[:, :3, 3] /= scale
+    return Trajectory(trajectory.timestamps, poses)
+
+
+def test_association_takes_the_closest_once():
+    first, second = np.array([0.0, 0.10, 0.20, 5.0]), np.array([0.004, 0.093, 0.104, 0.196, 6.0])
+    np.testing.assert_array_equal(associate(first, second, 0.01), [[0, 0], [1, 2], [2, 3]])
+    # Two on one: the closer has it, the other goes without.
+    np.testing.assert_array_equal(associate(np.array([0.0, 0.01]), np.array([0.009]), 0.02), [[1, 0]])
+    assert associate(np.array([0.0]), np.zeros(0)).shape == (0, 2)
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.5])
+def test_a_moved_copy_has_no_error(scale):
+    truth = helix()
+    estimate = moved(truth, scale)
+    error = absolute_error(estimate, truth, with_scale=True)
+    assert error.truth_from_estimate.scale == pytest.approx(scale, rel=1e-12)
+    np.testing.assert_allclose(error.distances, 0.0, atol=1e-12)
+    drift = relative_error(estimate, truth, 1.0, scale)
+    np.testing.assert_allclose(drift.translations, 0.0, atol=1e-12)
+    np.testing.assert_allclose(drift.rotations, 0.0, atol=1e-12)
+    assert len(drift.timestamps) == 51
+
+
+def test_rigid_alignment_keeps_a_wrong_scale():
+    # Points on a circle, estimated at half size: alignment makes the centres meet, so each is off by 1/2.
+    angle = 2.0 * np.pi * np.arange(40) / 40
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:, :2, 3] = np.column_stack([np.cos(angle), np.sin(angle)])
+    truth = Trajectory(np.arange(40.0), poses)
+    error = absolute_error(moved(truth, 2.0), truth, with_scale=False)
+    np.testing.assert_allclose(error.distances, 0.5, atol=1e-12)
+
+
+def test_relative_error_of_a_known_drift():
+    # The estimate turns 0.01 rad more about its own x axis and goes 3 mm more along it at every step.
+    truth = helix()
+    step = np.eye(4)
+    step[:3, :3], step[0, 3] = Rotation.from_rotvec([0.01, 0.0, 0.0]).as_matrix(), 0.003
+    poses = [np.eye(4)]
+    for before, after in zip(truth.world_from_camera, truth.world_from_camera[1:], strict=False):
+        poses.append(poses[-1] @ np.linalg.inv(before) @ after @ step)
+    drift = relative_error(Trajectory(truth.timestamps, np.array(poses)), truth, 0.1)
+    np.testing.assert_allclose(drift.rotations, 0.01, atol=1e-12)
+    np.testing.assert_allclose(drift.translations, 0.003, atol=1e-12)
+
+
+def test_motions_over_gaps_are_left_out():
+    truth = helix()
+    kept = np.r_[0:20, 40:61]
+    broken = Trajectory(truth.timestamps[kept], truth.world_from_camera[kept])
+    drift = relative_error(broken, broken, 0.5)
+    assert len(drift.timestamps) == (20 - 5) + (21 - 5)
+    with pytest.raises(EvaluationError, match="no two poses of the estimate are 50 s apart"):
+        relative_error(broken, broken, 50.0)
+
+
+def test_statistics():
+    found = Statistics.of(np.array([3.0, 4.0, 0.0, 5.0]))
+    assert found == Statistics(np.sqrt(12.5), 3.0, 3.5, pytest.approx(np.sqrt(3.5)), 0.0, 5.0)
+
+
+def test_clocks_that_do_not_meet():
+    with pytest.raises(
+        EvaluationError, match=r"only 0 poses .* spans 100\.000 to 106\.000 s, the truth 0\.000"
+    ):
+        match(helix(), helix(start=0.0))
+
+
+def test_the_command_writes_figures_and_a_picture(tmp_path, capsys):
+    run = tmp_path / "run"
+    run.mkdir()
+    save_trajectory(run / "trajectory.txt", moved(helix(), 2.0))
+    save_trajectory(tmp_path / "truth.txt", helix())
+    command = ["evaluate", str(run), "--trajectory", str(tmp_path / "truth.txt")]
+    assert cli.main(command) == 0
+    line = capsys.readouterr().out
+    assert line.startswith("pairs=61/61 ate_se3_mm=")
+    assert "ate_sim3_mm=0.00 scale=2.0000 rpe_mm=0.00 rpe_deg=0.000" in line
+    figures = json.loads((run / "trajectory_evaluation.json").read_text())
+    assert figures["truth_length_m"] == pytest.approx(4.0 * np.sqrt(1.04), rel=1e-3)
+    assert figures["sim3"]["absolute_mm"]["max"] < 1e-3
+    assert (run / "trajectory_evaluation.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["absent", "--trajectory", "truth.txt"], "there is no trajectory absent"),
+        (["absent", "--points", "truth.npz"], "--points needs --bind-frame N"),
+    ],
+)
+def test_the_command_refuses(words, message, capsys):
+    assert cli.main(["evaluate", *words]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_published_figures_of_freiburg1_xyz():
+    folder = real_data("trajectories")
+    estimate, truth = match(
+        load_trajectory(folder / "freiburg1_xyz-rgbdslam.txt"),
+        load_trajectory(folder / "freiburg1_xyz-groundtruth.txt"),
+    )
+    assert len(estimate) == 785
+    rigid = Statistics.of(absolute_error(estimate, truth, False).distances)
+    similar = absolute_error(estimate, truth, True)
+    assert rigid.rmse == pytest.approx(0.01347, abs=5e-6)
+    assert Statistics.of(similar.distances).rmse == pytest.approx(0.01339, abs=5e-6)
+    assert similar.truth_from_estimate.scale == pytest.approx(1.0080, abs=5e-5)
