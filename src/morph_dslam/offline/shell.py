@@ -11,6 +11,8 @@ forces (t C : E), independent unknowns too: Newton's method on a thin sheet then
 the displacement form needs tens (Magisano, Leonetti, Garcea, IJNME 109, 2017), and membrane locking goes:
 
     int  N:E - 1/(2t) N:C^-1:N  +  m:kappa - 6/t^3 m:C^-1:m   -   sum_edges int (angle - h.n) m_nn
+
+If the meshed surface lies off the middle of the thickness, m + offset N takes m's place in the fourth term.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class OrthotropicSheet:
-    """Orthotropic plane-stress material of a sheet, fibres along x.
+    """Orthotropic plane-stress material of a sheet.
 
     Attributes
     ----------
@@ -38,6 +40,8 @@ class OrthotropicSheet:
     poisson : contraction across under tension along the fibres, nu_12.
     shear : shear modulus G_12, Pa.
     thickness : metres.
+    fibre_angle : of the fibres from the x axis towards y, rad.
+    offset : height of the middle of the thickness above the surface that is meshed and held, m.
     """
 
     young_fibre: float
@@ -45,6 +49,8 @@ class OrthotropicSheet:
     poisson: float
     shear: float
     thickness: float
+    fibre_angle: float = 0.0
+    offset: float = 0.0
 
     def __post_init__(self) -> None:
         if 1.0 - self.poisson**2 * self.young_cross / self.young_fibre <= 0.0:
@@ -55,17 +61,23 @@ class OrthotropicSheet:
 
     @property
     def stiffness(self) -> Array:
-        """C (3, 3) in Pa: (S11, S22, S12) = C (E11, E22, 2 E12)."""
+        """C (3, 3) in Pa: (S11, S22, S12) = C (E11, E22, 2 E12), in the sheet's axes x and y."""
         minor = self.poisson * self.young_cross / self.young_fibre
         det = 1.0 - self.poisson * minor
         coupling = self.poisson * self.young_cross / det
-        return np.array(
+        along_fibres = np.array(
             [
                 [self.young_fibre / det, coupling, 0.0],
                 [coupling, self.young_cross / det, 0.0],
                 [0.0, 0.0, self.shear],
             ]
         )
+        c, s = np.cos(self.fibre_angle), np.sin(self.fibre_angle)
+        # Strains (E11, E22, 2 E12) in the fibres' axes from those in the sheet's.
+        strains = np.array(
+            [[c * c, s * s, c * s], [s * s, c * c, -c * s], [-2 * c * s, 2 * c * s, c * c - s * s]]
+        )
+        return strains.T @ along_fibres @ strains
 
 
 def rectangle_mesh(x_lines: Array, y_lines: Array) -> ngs.Mesh:
@@ -94,12 +106,14 @@ def _unit(vector: Any) -> Any:
 
 
 def _quadratic(matrix: Array, a: Any, b: Any, c: Any) -> Any:
-    """Energy a 3x3 form takes on the Voigt vector (a, b, c); only the entries of orthotropy are used."""
+    """Energy that a symmetric 3x3 form takes on the Voigt vector (a, b, c)."""
     return (
         float(matrix[0, 0]) * a * a
         + float(matrix[1, 1]) * b * b
         + float(2.0 * matrix[0, 1]) * a * b
         + float(matrix[2, 2]) * c * c
+        + float(2.0 * matrix[0, 2]) * a * c
+        + float(2.0 * matrix[1, 2]) * b * c
     )
 
 
@@ -170,7 +184,7 @@ class KoiterSheet:
         membrane = sum(n * e for n, e in zip(force, strain, strict=True))
         membrane -= _quadratic(0.5 / t * compliance, *force)
         bending = m11 * kappa[0] + m22 * kappa[1] + 2.0 * m12 * kappa[2]
-        bending -= self._bending_compliance * _quadratic(6.0 / t**3 * compliance, m11, m22, m12)
+        bending -= self._bending_compliance * _quadratic(6.0 / t**3 * compliance, *self._middle(m, force))
         hinge = -(ngs.asin(conormal * averaged) - h * edge_normal) * m_nn
         form = ngs.BilinearForm(self.space, symmetric=True, condense=True)
         form += ngs.Variation(membrane.Compile() * ngs.dx)
@@ -180,6 +194,11 @@ class KoiterSheet:
             density = sum(float(f / self.energy_scale) * u for f, u in zip(force, (u1, u2, u3), strict=True))
             form += ngs.Variation(-self.load_factor * density * ngs.ds(name))
         self.form = form
+
+    def _middle(self, moment: Any, force: Any) -> list[Any]:
+        """Moments (m11, m22, m12) about the middle of the thickness."""
+        about_surface = moment[0, 0], moment[1, 1], moment[0, 1]
+        return [m + self.material.offset * n for m, n in zip(about_surface, force, strict=True)]
 
     def refresh_normals(self) -> None:
         """Average the edge normals of the current state; due before an edge has turned by 90 degrees."""
@@ -213,6 +232,7 @@ class KoiterSheet:
             force += np.column_stack([part(where).ravel() for part in parts[5:8]]) / 4.0
             moment += parts[3](where).reshape(len(points), 4)[:, [0, 3, 1]] / 4.0
         membrane = force * self.energy_scale / t
+        moment += self.material.offset * force
         # E(z) = E - z kappa, so the moments load the top face with the opposite sign.
         bending = 6.0 / t**2 * self.energy_scale * moment
         return displacement, {"top": membrane - bending, "bottom": membrane + bending}
@@ -229,9 +249,9 @@ class KoiterSheet:
     def bending_energy(self) -> float:
         """Elastic energy of bending at the current state, joule."""
         t = self.material.thickness
-        m = self.state.components[3]
+        middle = self._middle(self.state.components[3], self.state.components[5:8])
         compliance = np.linalg.inv(self.material.stiffness) * self.energy_scale**2 * 6.0 / t**3
-        density = _quadratic(compliance, m[0, 0], m[1, 1], m[0, 1])
+        density = _quadratic(compliance, *middle)
         return ngs.Integrate(self._bending_compliance * density, self.mesh)
 
 
