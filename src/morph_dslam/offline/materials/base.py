@@ -1,8 +1,8 @@
 """What every material offers to the solvers.
 
-A material is its strain-energy density W(F), in joule per cubic metre of the undeformed solid; stresses and
-tangents are derivatives of W and are never written by hand. So that nearly incompressible solids can be solved
-without locking, W is split:
+A material is its strain-energy density W(F), in joule per cubic metre of the undeformed solid; stresses
+and tangents are derivatives of W and are never written by hand. So that nearly incompressible solids can be
+solved without locking, W is split:
 
     W(F) = remainder(F) + K/2 g(F)^2
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from morph_dslam.offline.materials.viscoelastic import Prony
 
 Array = NDArray[np.float64]
-#: A material constant: a number, or an NGSolve parameter (or an expression of parameters) that a study varies.
+#: A material constant: a number, or an NGSolve parameter (or an expression of some) that a study varies.
 Constant = Any
 
 #: Voigt's order of the components of a symmetric tensor.
@@ -73,7 +73,7 @@ class Material(ABC):
     def first_piola_kirchhoff(self, F: Any) -> Any:
         """P = dW/dF (3x3), Pa, of the law without its viscosity; F must not be a trial function."""
         F = F.MakeVariable()
-        return self.energy(F).Diff(F)
+        return self.energy(F).Diff(F).Compile()
 
     @property
     def name(self) -> str:
@@ -85,22 +85,25 @@ class Material(ABC):
         """Names of the fibre fields that the law still waits for; `with_fibres` gives them."""
         return ()
 
+    def with_fibres(self, fields: dict[str, Any]) -> Material:
+        """The law with the named fields of directions filled in, each a vector coefficient function (3)."""
+        return self
+
     def at_a_point(self) -> Material:
         """The law with any field of directions replaced by constant ones, to examine it without a mesh."""
         return self
 
     def small_strain_stiffness(self) -> Array:
-        """Stiffness (6, 6) at F = 1 in Voigt's order and engineering shears, Pa, from the energy's derivatives."""
+        """Stiffness (6, 6) at F = 1, Pa, in Voigt's order with engineering shears."""
         F = ngs.Id(3).MakeVariable()
-        stress = self.at_a_point().energy(F).Diff(F)
+        # Derivatives by the whole of F share their sub-expressions; directional ones grow exponentially.
+        slope = evaluate(self.at_a_point().energy(F).Diff(F).Diff(F)).reshape(3, 3, 3, 3)
         stiffness = np.empty((6, 6))
-        for column, (i, j) in enumerate(VOIGT):
-            strain = np.zeros((3, 3))
-            strain[i, j] += 0.5
-            strain[j, i] += 0.5
-            direction = ngs.CF(tuple(strain.ravel()), dims=(3, 3))
-            slope = evaluate(stress.Diff(F, direction)).reshape(3, 3)
-            stiffness[:, column] = [0.5 * (slope[a, b] + slope[b, a]) for a, b in VOIGT]
+        for row, (i, j) in enumerate(VOIGT):
+            for column, (k, m) in enumerate(VOIGT):
+                stiffness[row, column] = 0.25 * (
+                    slope[i, j, k, m] + slope[j, i, k, m] + slope[i, j, m, k] + slope[j, i, m, k]
+                )
         return stiffness
 
     @property
@@ -110,7 +113,7 @@ class Material(ABC):
         return float((3.0 * bulk - 2.0 * shear) / (2.0 * (3.0 * bulk + shear)))
 
     def check(self) -> None:
-        """Refuse constants for which the undeformed solid is unstable; parameters count at their present values.
+        """Refuse constants that make the undeformed solid unstable; parameters at their present values.
 
         Raises
         ------
@@ -163,7 +166,9 @@ def law_name(law: type[Material]) -> str:
 
 
 def _is_constant(value: Any) -> bool:
-    return isinstance(value, (int, float, ngs.Parameter)) and not isinstance(value, bool)
+    if isinstance(value, ngs.CoefficientFunction):
+        return value.dim == 1
+    return isinstance(value, (int, float))
 
 
 def isotropic_average(stiffness: Array) -> tuple[float, float]:
@@ -185,12 +190,12 @@ def _unit_mesh() -> ngs.Mesh:
 
 
 def evaluate(coefficient: Any) -> Any:
-    """Value of a number or of a coefficient function that does not vary in space: a float, or an array (k,)."""
+    """Value of a number or of a coefficient function that is constant in space: a float or an array (k,)."""
     if isinstance(coefficient, (int, float)):
         return float(coefficient)
-    mesh = _unit_mesh()
-    value = ngs.CF(coefficient)(mesh(0.5))
-    return np.array(value) if isinstance(value, tuple) else float(value)
+    # Only the evaluation of many points at once runs compiled code.
+    value = ngs.CF(coefficient).Compile()(_unit_mesh()(np.array([0.5])))[0]
+    return float(value[0]) if value.size == 1 else value
 
 
 def right_cauchy_green(F: Any) -> Any:
