@@ -65,6 +65,26 @@ def test_video_frames_in_order(tmp_path):
     )
 
 
+def test_video_timestamps_are_the_containers(tmp_path, monkeypatch):
+    path, times = make_video(tmp_path / "clip.avi", "MJPG", n_frames=4), iter([0.0, 33.0, 100.0, 0.0])
+    original = cv2.VideoCapture
+
+    class Varying:
+        """A video filmed at a varying rate, whose last frame has lost its time."""
+
+        def __init__(self, name):
+            self.capture = original(name)
+
+        def __getattr__(self, name):
+            return getattr(self.capture, name)
+
+        def get(self, what):
+            return next(times) if what == cv2.CAP_PROP_POS_MSEC else self.capture.get(what)
+
+    monkeypatch.setattr(cv2, "VideoCapture", Varying)
+    assert [frame.timestamp for frame in open_source(path)] == pytest.approx([0.0, 0.033, 0.1, 3 / 25.0])
+
+
 def test_truncated_video_gives_its_frames_and_then_the_break(tmp_path):
     path = make_video(tmp_path / "clip.avi", "MJPG", n_frames=20)
     data = path.read_bytes()

@@ -105,7 +105,7 @@ def match(
         spans = [f"{t.timestamps[0]:.3f} to {t.timestamps[-1]:.3f} s" for t in (estimate, truth)]
         raise EvaluationError(
             f"only {len(pairs)} poses of estimate and truth are within {most:g} s of each other; the "
-            f"estimate spans {spans[0]}, the truth {spans[1]}: give the truth of this recording, on the same clock"
+            f"estimate spans {spans[0]}, the truth {spans[1]}: give the truth of this recording, on its clock"
         )
     rows, columns = pairs.T
     return (

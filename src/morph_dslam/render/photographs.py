@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SceneError, SourceError
-from morph_dslam.sources.folder import read_image
+from morph_dslam.sources.images import read_image
 
 
 def _packaged_folder() -> Path | None:

@@ -20,26 +20,34 @@ class Frame:
     Attributes
     ----------
     index : its number in the sequence.
-    timestamp : seconds since frame 0.
+    timestamp : seconds, by the recording's clock where it has one, else since frame 0.
     image : (h, w, 3) uint8, blue, green, red.
+    depth : (h, w) metres along the optical axis, NaN where not measured; None without a depth camera.
+    right : (h, w, 3) uint8, what the right camera of a stereo pair saw; None without one.
     """
 
     index: int
     timestamp: float
     image: NDArray[np.uint8]
+    depth: NDArray[np.float32] | None = None
+    right: NDArray[np.uint8] | None = None
 
 
-class FrameSource(Protocol):
-    """A sequence of frames that can be iterated more than once."""
+class FrameStream(Protocol):
+    """Frames one after the other, recorded or live."""
 
     name: str
     fps: float
 
+    def __iter__(self) -> Iterator[Frame]: ...
+
+
+class FrameSource(FrameStream, Protocol):
+    """A recorded sequence of frames, which can be iterated more than once and drops none."""
+
     def __len__(self) -> int:
         """Number of frames expected; fewer may come when a video is cut short, and then SourceError."""
         ...
-
-    def __iter__(self) -> Iterator[Frame]: ...
 
 
 def check_range(where: Path, available: range, first: int | None, last: int | None) -> tuple[int, int]:

@@ -68,9 +68,15 @@ class VideoFile:
                     self._check_end(index)
                     return
                 if image is not None:
-                    yield Frame(index, index / self.fps, np.asarray(image, dtype=np.uint8))
+                    yield Frame(index, self._timestamp(capture, index), np.asarray(image, dtype=np.uint8))
         finally:
             capture.release()
+
+    def _timestamp(self, capture: cv2.VideoCapture, index: int) -> float:
+        """Seconds since frame 0, by the container, for telephones film at a varying rate."""
+        milliseconds = capture.get(cv2.CAP_PROP_POS_MSEC)
+        # Some containers tell no times.
+        return 1e-3 * milliseconds if milliseconds > 0.0 else index / self.fps
 
     def _check_end(self, index: int) -> None:
         """Raise SourceError unless the stream may well end before frame ``index``."""

@@ -1,0 +1,101 @@
+"""A live camera drops frames rather than falling behind; a recording never does. A fake sets the pace."""
+
+import threading
+
+import cv2
+import numpy as np
+import pytest
+
+from morph_dslam.errors import SourceError
+from morph_dslam.sources import open_source, open_stream
+from morph_dslam.sources.live import LiveCamera
+
+
+class FakeCapture:
+    """Delivers frame after frame, each when the test lets it; image k is filled with k."""
+
+    def __init__(self):
+        self.allowed = threading.Semaphore(0)
+        self.delivered = 0
+        self.lost = False
+        self.released = False
+        self.image = np.zeros((4, 6, 3), dtype=np.uint8)
+
+    def read(self):
+        self.allowed.acquire()
+        if self.lost:
+            return False, None
+        # The same memory again and again, as drivers do.
+        self.image[:] = self.delivered
+        self.delivered += 1
+        return True, self.image
+
+    def get(self, propId):
+        return 25.0
+
+    def release(self):
+        self.released = True
+
+
+def deliver(capture, camera, n_frames):
+    """Let ``n_frames`` more come, and wait until the last of them is there to be taken."""
+    for _ in range(n_frames):
+        capture.allowed.release()
+    wanted = capture.delivered_goal = getattr(capture, "delivered_goal", 0) + n_frames
+    with camera._changed:
+        assert camera._changed.wait_for(
+            lambda: camera._newest is not None and camera._newest.index == wanted - 1, timeout=10.0
+        )
+
+
+def test_a_slow_consumer_gets_the_newest_frame():
+    capture, clock = FakeCapture(), iter(range(100, 200))
+    camera = LiveCamera(capture, "webcam 0", clock=lambda: float(next(clock)))
+    frames = iter(camera)
+    deliver(capture, camera, 1)
+    first = next(frames)
+    deliver(capture, camera, 9)
+    second = next(frames)
+    deliver(capture, camera, 1)
+    third = next(frames)
+    assert [frame.index for frame in (first, second, third)] == [0, 9, 10]
+    assert [int(frame.image[0, 0, 0]) for frame in (first, second, third)] == [0, 9, 10]
+    assert [frame.timestamp for frame in (first, second, third)] == [0.0, 9.0, 10.0]
+    assert camera.dropped == 8
+    assert camera.fps == 25.0
+    capture.allowed.release()
+    camera.close()
+    assert capture.released
+
+
+def test_a_camera_that_is_unplugged():
+    capture = FakeCapture()
+    with LiveCamera(capture, "webcam 0") as camera:
+        deliver(capture, camera, 1)
+        frames = iter(camera)
+        next(frames)
+        capture.lost = True
+        capture.allowed.release()
+        with pytest.raises(SourceError, match="webcam 0 stopped delivering after frame 0"):
+            next(frames)
+    assert capture.released
+
+
+def test_a_recording_gives_every_frame_to_a_slow_consumer(tmp_path):
+    for number in range(5):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((4, 6, 3), number, dtype=np.uint8))
+    frames = iter(open_stream(tmp_path))
+    seen = [next(frames).index]
+    # Whatever happens between two frames, the next one is the next one.
+    threading.Event().wait(0.05)
+    seen += [frame.index for frame in frames]
+    assert seen == [0, 1, 2, 3, 4]
+
+
+def test_webcams_that_cannot_be_opened():
+    with pytest.raises(SourceError, match="webcam 97 cannot be opened"):
+        open_stream("webcam:97")
+    with pytest.raises(SourceError, match="is live and has no range"):
+        open_stream("webcam:0", 3, 4)
+    with pytest.raises(SourceError, match="no folder of images and no video at webcam:x"):
+        open_source("webcam:x")
