@@ -25,12 +25,14 @@ class Constants:
     """A law and its constants, named as the Abaqus manual names them, in file units.
 
     ``law`` is an elastic type ("ISOTROPIC", "ENGINEERING CONSTANTS", "ORTHOTROPIC") or a hyperelastic model
-    ("NEO HOOKE", "MOONEY-RIVLIN", "YEOH", "OGDEN"). Constants that the card leaves out are 0.
+    ("NEO HOOKE", "MOONEY-RIVLIN", "YEOH", "OGDEN"). Constants that the card leaves out are 0. They hold in
+    the long term of a viscoelastic material unless ``instantaneous``.
     """
 
     law: str
     values: dict[str, float]
     line: Line
+    instantaneous: bool = False
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,8 @@ def _constants(card: Card, law: str, names: tuple[str, ...], needed: int) -> Con
             f"{law} needs at least {needed} constants ({', '.join(names)}); {len(values)} given"
         )
     padded = values + (0.0,) * len(names)
-    return Constants(law, dict(zip(names, padded, strict=False)), card.line)
+    instantaneous = card.parameters.get("MODULI", "LONG TERM").upper() == "INSTANTANEOUS"
+    return Constants(law, dict(zip(names, padded, strict=False)), card.line, instantaneous)
 
 
 def _elastic(card: Card) -> Constants:

@@ -125,6 +125,8 @@ class Material(ABC):
         if evaluate(self.density) < 0.0:
             raise StudyError(f"{self.name}: density = {evaluate(self.density):g} must not be negative")
         self.check_constants()
+        if self.prony is not None:
+            self.prony.check()
         stiffness = self.small_strain_stiffness()
         lowest = np.linalg.eigvalsh(0.5 * (stiffness + stiffness.T))[0]
         if not lowest > 0.0:
