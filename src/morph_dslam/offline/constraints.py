@@ -92,6 +92,21 @@ class Constraints:
         slopes = self._shape.coordinate_slopes(self._symbols)
         return weights @ self._shape.coordinates(self._symbols), np.einsum("n,dnc->dc", weights, slopes)
 
+    def resultant(
+        self, name: str, forces: Array, displacement: Array, about: Array | None
+    ) -> tuple[Array, Array]:
+        """Force (3,) and moment (3,) of a set's part of dof ``forces`` (3, n_scalar), N.
+
+        The moment is taken at the deformed positions, ``about`` a point (3,), m, or the set's centroid.
+        """
+        if about is None:
+            about = self.centroid(name)[0]
+        dofs = self.dofs_of(name)
+        constant, f = self._constant[dofs], forces[:, dofs]
+        arms = (self._shape.coordinates(self._symbols)[dofs] + displacement[:, dofs].T).T
+        arms = arms - np.outer(about, constant)
+        return f @ constant, np.cross(arms.T, f.T).sum(axis=0)
+
     def check_rigid_motions(self) -> None:
         """Refuse supports that leave the body free to move as a whole (StudyError)."""
         modes = self._rigid_modes()

@@ -1,6 +1,6 @@
 """The finite element space of the displacements of a solid, and its relation to the mesh's nodes.
 
-NGSolve's basis is hierarchical: vertex functions have nodal values for coefficients, and edges, faces and cells
+NGSolve's basis is hierarchical: vertex functions have nodal values for coefficients; edges, faces and cells
 add bubbles (Zaglmayr, High Order Finite Element Methods for Electromagnetic Field Computation, PhD thesis,
 Linz 2006, chapter 5). A solid knows nodes: this module translates in both directions, says which coefficients
 a set of nodes holds, and hands NGSolve the curved shape of second-order cells.
@@ -62,7 +62,7 @@ class DisplacementSpace:
     ----------
     scalar, vector : NGSolve's spaces.
     node_values : sparse (n_nodes, n_scalar): values at nodes from coefficients.
-    coefficients : sparse (n_scalar, n_nodes): coefficients of the isoparametric interpolation of nodal values.
+    coefficients : sparse (n_scalar, n_nodes): coefficients of the interpolation of nodal values.
     coordinates : (n_scalar, 3) coefficients of the position X, m.
 
     Raises
@@ -141,8 +141,8 @@ class DisplacementSpace:
     def dofs_on(self, nodes: Indices) -> Indices:
         """Scalar dofs (sorted) that a set of nodes holds.
 
-        Those of its own nodes; and where elements have functions beyond the nodes of the cells, those on edges
-        and faces all of whose nodes are in the set. Functions inside of cells are never held.
+        Those of its own nodes; and where elements have functions beyond the nodes of the cells, those on
+        edges and faces all of whose nodes are in the set. Functions inside of cells are never held.
         """
         inside = np.zeros(self.geometry.mesh.n_nodes, dtype=bool)
         inside[nodes] = True

@@ -1,8 +1,8 @@
 """Kinematics of a solid whose undeformed shape may itself depend on parameters.
 
-The mesh is posed at fixed points Xi. The undeformed solid has its points at X(Xi) = Xi + sum a_k d_k(Xi), with
-amplitudes a_k (expressions of parameters) and given fields d_k; the deformed one at x = X + u. Energies are
-integrated over the mesh, with
+The mesh is posed at fixed points Xi. The undeformed solid has its points at X(Xi) = Xi + sum a_k d_k(Xi),
+with amplitudes a_k (expressions of parameters) and given fields d_k; the deformed one at x = X + u. Energies
+are integrated over the mesh, with
 
     G = dX/dXi,   F = 1 + du/dXi G^-1,   dV = det G dXi,   N dA = cof(G) n da.
 
@@ -105,12 +105,15 @@ class Kinematics:
         return result
 
     @property
+    def displacement_gradient(self) -> Any:
+        """du/dX (3x3) in the volume."""
+        shape = self._shape_gradient(trace=False)
+        return self.gradient if shape is None else self.gradient * ngs.Inv(ngs.Id(3) + shape)
+
+    @property
     def deformation_gradient(self) -> Any:
         """F = dx/dX (3x3) in the volume."""
-        shape = self._shape_gradient(trace=False)
-        if shape is None:
-            return ngs.Id(3) + self.gradient
-        return ngs.Id(3) + self.gradient * ngs.Inv(ngs.Id(3) + shape)
+        return ngs.Id(3) + self.displacement_gradient
 
     @property
     def volume_ratio(self) -> Any:

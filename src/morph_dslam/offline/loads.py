@@ -7,7 +7,7 @@ volumes are those of the undeformed solid, whatever its shape parameters.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import ngsolve as ngs
 import numpy as np
@@ -99,9 +99,9 @@ class PointLoad:
 class MovingPatch:
     """Dead force spread around a point that moves over a surface, with a Gaussian density.
 
-    t(X) = force exp(-r^2 / 2 w^2) / (2 pi w^2), r the distance of X from the centre: the whole force on a flat
-    surface that reaches 4 widths around the centre; nearer to its rim the rest falls beside it. Smooth in the
-    position, so that solutions have derivatives by it.
+    t(X) = force exp(-r^2 / 2 w^2) / (2 pi w^2), r the distance of X from the centre: the whole force on a
+    flat surface that reaches 4 widths around the centre; nearer to its rim the rest falls beside it.
+    Smooth in the position, so that solutions have derivatives by it.
 
     Attributes
     ----------
@@ -161,13 +161,7 @@ class MovingLine:
         return -density * (ngs.CF(self.force) * kinematics.displacement) * kinematics.area_ratio
 
 
-class DeadSurfaceLoad(Protocol):
-    """A load on a surface that has an energy."""
-
-    on: str
-    bonus_order: int
-
-    def energy(self, kinematics: Kinematics) -> Any: ...
+Load = DeadTraction | MovingPatch | MovingLine | FollowerPressure | BodyForce | Gravity | PointLoad
 
 
 def _check_width(on: str, width: float) -> None:

@@ -10,10 +10,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import netgen.meshing as netgen_meshing
 import ngsolve as ngs
 import numpy as np
-from netgen.meshing import FaceDescriptor
-from netgen.meshing import Mesh as NetgenMesh
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
@@ -39,7 +38,7 @@ class NgsolveMesh:
     mesh : the mesh it was made from.
     ngs : NGSolve's mesh of the corners.
     node_of_vertex : (n_vertices,) node index of each of NGSolve's vertices.
-    element_of_cell : (n_cells,) NGSolve's element number of each cell.
+    element_of_cell : (n_cells,) NGSolve's element number of each cell; ``cell_of_element`` is its inverse.
 
     Raises
     ------
@@ -56,33 +55,32 @@ class NgsolveMesh:
         self.node_of_vertex: Indices = np.unique(np.concatenate([c.ravel() for c in corners]))
         self._vertex = np.full(mesh.n_nodes, -1, dtype=np.int64)
         self._vertex[self.node_of_vertex] = np.arange(len(self.node_of_vertex))
-        netgen = NetgenMesh(dim=3)
-        netgen.AddPoints(np.ascontiguousarray(mesh.nodes[self.node_of_vertex]))
-        self._regions = _Combinations(
-            {name: cells for name, cells in mesh.cell_sets.items()}, np.arange(mesh.n_cells)
-        )
-        self.element_of_cell = self._add_cells(netgen)
-        self._boundaries = self._add_faces(netgen)
-        self.ngs = ngs.Mesh(netgen)
+        target: Any = netgen_meshing.Mesh(dim=3)  # pyright: ignore[reportAttributeAccessIssue]
+        target.AddPoints(np.ascontiguousarray(mesh.nodes[self.node_of_vertex]))
+        self._regions = _Combinations(mesh.cell_sets, mesh.n_cells)
+        self.element_of_cell = self._add_cells(target)
+        self.cell_of_element: Indices = np.argsort(self.element_of_cell)
+        self._boundaries = self._add_faces(target)
+        self.ngs = ngs.Mesh(target)
 
-    def _add_cells(self, netgen: Any) -> Indices:
+    def _add_cells(self, target: Any) -> Indices:
         mesh, element_of_cell, count = self.mesh, np.empty(self.mesh.n_cells, dtype=np.int64), 0
         for region in range(self._regions.count):
-            netgen.SetMaterial(region + 1, _region_name(region))
+            target.SetMaterial(region + 1, _region_name(region))
         starts = mesh.block_starts()
         for block, start in zip(mesh.blocks, starts[:-1], strict=True):
             corners = self._vertex[block.connectivity[:, : block.type.corners]].astype(np.int32)
             of_region = self._regions.number[start : start + len(corners)]
             for region in np.unique(of_region):
                 rows = np.flatnonzero(of_region == region)
-                netgen.AddElements(
+                target.AddElements(
                     dim=3, index=int(region) + 1, data=np.ascontiguousarray(corners[rows]), base=0
                 )
                 element_of_cell[start + rows] = count + np.arange(len(rows))
                 count += len(rows)
         return element_of_cell
 
-    def _add_faces(self, netgen: Any) -> _Combinations:
+    def _add_faces(self, target: Any) -> _Combinations:
         """Every outer face, and every named one inside; a face that two surfaces share is added once."""
         mesh = self.mesh
         faces = np.concatenate([mesh.boundary_faces(), *mesh.surfaces.values()]).astype(np.int64)
@@ -93,15 +91,18 @@ class NgsolveMesh:
         for name, surface in mesh.surfaces.items():
             members[name] = which[position : position + len(surface)]
             position += len(surface)
-        combinations = _Combinations(members, np.arange(len(first)))
+        combinations = _Combinations(members, len(first))
         for region in range(combinations.count):
-            netgen.Add(FaceDescriptor(surfnr=region + 1, domin=1, domout=0, bc=region + 1))
-            netgen.SetBCName(region, _region_name(region))
+            face = netgen_meshing.FaceDescriptor(  # pyright: ignore[reportAttributeAccessIssue]
+                surfnr=region + 1, domin=1, domout=0, bc=region + 1
+            )
+            target.Add(face)
+            target.SetBCName(region, _region_name(region))
             vertices = np.where(nodes >= 0, self._vertex[nodes], -1)[first[combinations.number == region]]
             for corners in (3, 4):
                 data = vertices[(vertices >= 0).sum(axis=1) == corners][:, :corners].astype(np.int32)
                 if len(data):
-                    netgen.AddElements(dim=2, index=region + 1, data=np.ascontiguousarray(data), base=0)
+                    target.AddElements(dim=2, index=region + 1, data=np.ascontiguousarray(data), base=0)
         return combinations
 
     def region(self, cell_set: str) -> ngs.Region:
@@ -110,7 +111,7 @@ class NgsolveMesh:
         return self.ngs.Materials(".*" if cell_set == "all" else self._regions.pattern(cell_set))
 
     def partition(self, owners: Indices) -> dict[int, ngs.Region]:
-        """Regions of the cells by their ``owners`` (n_cells,), which must follow from the cell sets they are in."""
+        """Regions of cells by owner, ``owners`` (n_cells,): cells in the same sets must have the same."""
         regions = {}
         for owner in np.unique(owners):
             groups = np.unique(self._regions.number[owners == owner])
@@ -123,7 +124,7 @@ class NgsolveMesh:
         return self.ngs.Boundaries(self._boundaries.pattern(surface))
 
     def cell_field(self, values: Array) -> Any:
-        """Coefficient function that is constant in each cell: a number (n_cells,) or a vector (n_cells, c)."""
+        """Coefficient function constant in each cell: a number (n_cells,) or a vector (n_cells, c)."""
         values = np.asarray(values, dtype=np.float64)
         columns = values.reshape(self.mesh.n_cells, -1)
         parts = []
@@ -133,6 +134,16 @@ class NgsolveMesh:
             parts.append(part)
         return parts[0] if values.ndim == 1 else ngs.CF(tuple(parts))
 
+    def mesh_points(self, elements: Indices, reference: Array) -> NDArray:
+        """NGSolve's points (p,) in ``elements`` (p,) at its own reference coordinates (p, 3)."""
+        pattern = self.ngs.MapToAllElements(
+            {kind: ngs.IntegrationRule(kind, 0) for kind in (ngs.HEX, ngs.TET, ngs.PRISM)}, ngs.VOL
+        )
+        points = np.repeat(pattern[:1], len(elements))
+        points["nr"] = elements
+        points["x"], points["y"], points["z"] = reference.T
+        return points
+
 
 def _region_name(number: int) -> str:
     return f"region{number}"
@@ -141,8 +152,8 @@ def _region_name(number: int) -> str:
 class _Combinations:
     """Items grouped by which of some overlapping sets they are in."""
 
-    def __init__(self, sets: Mapping[str, Indices], items: Indices) -> None:
-        membership = np.zeros((len(items), max(len(sets), 1)), dtype=bool)
+    def __init__(self, sets: Mapping[str, Indices], n_items: int) -> None:
+        membership = np.zeros((n_items, max(len(sets), 1)), dtype=bool)
         for column, indices in enumerate(sets.values()):
             membership[np.asarray(indices, dtype=np.int64), column] = True
         rows, number = np.unique(membership, axis=0, return_inverse=True)

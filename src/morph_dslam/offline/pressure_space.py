@@ -3,9 +3,9 @@
 The energy remainder(F) + p g(F) - p^2 / (2 K) (see `materials.base`) needs displacements rich enough for the
 pressures (the inf-sup condition of Ladyzhenskaya, Babuska and Brezzi). Pairs used here:
 
-hexahedra, second order   27 nodes with a linear pressure in each cell, discontinuous: stable, and condensed
-                          cell by cell so that it costs next to nothing (Boffi, Brezzi and Fortin, Mixed Finite
-                          Element Methods and Applications, 2013, section 8.6)
+hexahedra, second order   27 nodes with a linear pressure in each cell, discontinuous: stable (Boffi, Brezzi
+                          and Fortin, Mixed Finite Element Methods and Applications, 2013, section 8.6), and
+                          condensed cell by cell so that it costs next to nothing
 tetrahedra and prisms,    Taylor and Hood's: pressures linear in each cell and continuous within a material
 second order
 hexahedra, first order    one pressure a cell (mean dilatation: Simo, Taylor and Pister, 1985). Displacements

@@ -11,7 +11,6 @@ by NGSolve; derivatives by parameters are taken of the same integrands. `SolidPr
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,28 +20,25 @@ import ngsolve as ngs
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.errors import StudyError
 from morph_dslam.offline.constraints import Constraints
 from morph_dslam.offline.displacement_space import DisplacementSpace
 from morph_dslam.offline.kinematics import Kinematics, Shape, ShapeField
 from morph_dslam.offline.linear_solver import LinearSolver
-from morph_dslam.offline.loads import BodyForce, DeadSurfaceLoad, FollowerPressure, Gravity, PointLoad
-from morph_dslam.offline.materials.base import Material, evaluate
+from morph_dslam.offline.loads import BodyForce, FollowerPressure, Gravity, Load, PointLoad
+from morph_dslam.offline.materials.base import Material
 from morph_dslam.offline.meshes import Mesh
 from morph_dslam.offline.newton import Linearisation, State
 from morph_dslam.offline.ngsolve_mesh import NgsolveMesh
+from morph_dslam.offline.nodal_forces import NodalForces
 from morph_dslam.offline.parameters import ParameterSymbols
-from morph_dslam.offline.pressure_space import PressureSpace, check_mixed
+from morph_dslam.offline.recovery import Recovery
 from morph_dslam.offline.solid_assembly import Assembly, Term
+from morph_dslam.offline.solid_materials import owners_of_cells, place_materials
 from morph_dslam.offline.supports import ElasticFoundation, PrescribedMotion
 
 Array = NDArray[np.float64]
 
-#: Poisson's ratio from which plain displacement elements lock noticeably.
-NEARLY_INCOMPRESSIBLE = 0.49
-
 Support = PrescribedMotion | ElasticFoundation
-Load = DeadSurfaceLoad | FollowerPressure | BodyForce | Gravity | PointLoad
 
 
 @dataclass(frozen=True)
@@ -63,28 +59,6 @@ class SolidOptions:
     threads: int | None = None
 
 
-class NearlyIncompressibleWarning(UserWarning):
-    """A nearly incompressible material in elements that lock."""
-
-
-@dataclass(frozen=True)
-class _MaterialRegion:
-    """A material, where it is, and its pressure (None in the displacement form)."""
-
-    material: Material
-    region: ngs.Region
-    pressures: PressureSpace | None
-    pressure_unit: float
-
-    def energy(self, F: Any, pressure_unknowns: list[Any]) -> Any:
-        """Strain energy density, Pa; in the mixed form, the density whose stationary value it is."""
-        if self.pressures is None:
-            return self.material.energy(F)
-        p = self.pressure_unit * self.pressures.combine(pressure_unknowns)
-        modulus = self.material.volumetric_modulus
-        return self.material.remainder(F) + p * self.material.volumetric(F) - p * p / (2.0 * modulus)
-
-
 class SolidProblem:
     """A solid with its materials, supports, loads and parameters.
 
@@ -97,6 +71,7 @@ class SolidProblem:
     parameters : the symbols that materials, supports, loads and shapes were written with.
     options : see `SolidOptions`.
     shape : how the undeformed shape depends on parameters.
+    directions : fibre fields that materials name, a direction for each cell (n_cells, 3).
 
     Attributes
     ----------
@@ -119,6 +94,7 @@ class SolidProblem:
         parameters: ParameterSymbols | None = None,
         options: SolidOptions | None = None,
         shape: Sequence[ShapeField] = (),
+        directions: Mapping[str, Array] | None = None,
     ) -> None:
         options = options or SolidOptions()
         self.mesh, self.supports, self.loads, self.options = mesh, tuple(supports), tuple(loads), options
@@ -127,69 +103,24 @@ class SolidProblem:
         self.displacements = DisplacementSpace(self.geometry, options.order, full=options.mixed)
         self.shape = Shape(self.displacements, shape)
         self.length = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
-        self.flags: tuple[str, ...] = ()
-        self.regions = self._place_materials(materials)
+        self.cell_materials = owners_of_cells(mesh, materials)
+        self.regions = place_materials(
+            self.displacements, self.cell_materials, materials, directions or {}, options.mixed
+        )
+        self.flags = tuple(region.flag for region in self.regions if region.flag)
         self.space = self._product_space()
         self.n_dofs: int = self.space.ndof
         self.constraints = Constraints(self.displacements, self.shape, self.supports, self.symbols)
         self.constraints.check_rigid_motions()
         self.assembly = Assembly(self.space, self._terms(), self.symbols)
         self.free: NDArray[np.bool_] = self._free_dofs()
-        self.scale: Array = np.full(self.n_dofs, np.inf)
-        self.scale[: 3 * self.displacements.n_scalar] = self.length
-        self._point_loads = [load for load in loads if isinstance(load, PointLoad)]
+        scale = np.full(self.n_dofs, np.inf)
+        scale[: 3 * self.displacements.n_scalar] = self.length
+        self.scale: Array | float = scale
+        points = [load for load in loads if isinstance(load, PointLoad)]
+        self._nodal_forces = NodalForces(self.displacements, points, self.symbols)
 
     # -- set-up ---------------------------------------------------------------------------------------
-
-    def _place_materials(self, materials: Mapping[str, Material]) -> list[_MaterialRegion]:
-        owners = np.full(self.mesh.n_cells, -1)
-        names = sorted(materials, key=lambda name: name == "all")
-        for number, name in enumerate(names):
-            cells = self.mesh.cells(name)
-            taken = cells[owners[cells] >= 0]
-            if name == "all":
-                cells = cells[owners[cells] < 0]
-            elif len(taken):
-                other = names[owners[taken[0]]]
-                raise StudyError(
-                    f"{len(taken)} cells are in both '{other}' and '{name}', each with a material"
-                )
-            owners[cells] = number
-        if (owners < 0).any():
-            raise StudyError(
-                f"{int((owners < 0).sum())} of {len(owners)} cells have no material; "
-                "give one to their cell set, or one to 'all'"
-            )
-        self.cell_materials = owners
-        regions = self.geometry.partition(owners)
-        return [
-            self._material_region(name, materials[name], regions[number])
-            for number, name in enumerate(names)
-            if number in regions
-        ]
-
-    def _material_region(self, name: str, material: Material, region: ngs.Region) -> _MaterialRegion:
-        try:
-            material.check()
-        except StudyError as error:
-            raise StudyError(f"material of '{name}': {error}") from error
-        poisson = material.equivalent_poisson
-        mixed = self.options.mixed and material.volumetric_modulus is not None
-        if not mixed and poisson >= NEARLY_INCOMPRESSIBLE:
-            flag = (
-                f"the material of '{name}' is nearly incompressible (Poisson's ratio {poisson:.4f}) "
-                "in displacement elements, which lock; use mixed elements"
-            )
-            self.flags += (flag,)
-            warnings.warn(flag, NearlyIncompressibleWarning, stacklevel=4)
-        if not mixed:
-            return _MaterialRegion(material, region, None, 0.0)
-        check_mixed(self.mesh, self.displacements.order)
-        # Pressures are counted in units that make them about as large as displacements in metres.
-        stiffness = material.small_strain_stiffness()[3, 3]
-        return _MaterialRegion(
-            material, region, PressureSpace(self.displacements, region), stiffness / self.length
-        )
 
     def _product_space(self) -> ngs.FESpace:
         spaces = [self.displacements.vector]
@@ -215,7 +146,7 @@ class SolidProblem:
         kinematics = Kinematics(trial, self.shape)
         F, ratio = kinematics.deformation_gradient, kinematics.volume_ratio
         terms = [
-            Term(region.energy(F, unknowns) * ratio, region.region)
+            Term(region.energy(F, region.pressure(unknowns)) * ratio, region.region)
             for region, unknowns in zip(self.regions, pressures, strict=True)
         ]
         for support in self.supports:
@@ -230,8 +161,7 @@ class SolidProblem:
 
     def _load_terms(self, load: Load, kinematics: Kinematics, test: Any) -> list[Term]:
         if isinstance(load, PointLoad):
-            self.mesh.set_nodes(load.on)
-            return []
+            return []  # see `NodalForces`
         u, ratio = kinematics.displacement, kinematics.volume_ratio
         if isinstance(load, BodyForce):
             return [Term(-(ngs.CF(load.force) * u) * ratio, self.geometry.region(load.on))]
@@ -272,15 +202,15 @@ class SolidProblem:
 
     def residual(self, x: Array, mu: Array) -> Array:
         self.symbols.set(mu)
-        return self.assembly.residual(x) - self._padded(self._nodal_forces())
+        return self.assembly.residual(x) - self._padded(self._nodal_forces.values())
 
     def linearise(self, x: Array, mu: Array) -> Linearisation:
         self.symbols.set(mu)
-        return self.assembly.linearise(x, mu, self._padded(self._nodal_forces()), self.solver)
+        return self.assembly.linearise(x, mu, self._padded(self._nodal_forces.values()), self.solver)
 
     def residual_slopes(self, x: Array, mu: Array) -> Array:
         self.symbols.set(mu)
-        return self.assembly.residual_slopes(x) - self._padded(self._nodal_force_slopes())
+        return self.assembly.residual_slopes(x) - self._padded(self._nodal_forces.slopes())
 
     def _padded(self, displacement_part: Array) -> Array:
         """(..., 3 n_scalar) with zeros for the pressures."""
@@ -288,20 +218,45 @@ class SolidProblem:
         result[..., : displacement_part.shape[-1]] = displacement_part
         return result
 
-    def _nodal_forces(self) -> Array:
-        forces = np.zeros((3, self.displacements.n_scalar))
-        for load in self._point_loads:
-            forces += np.outer([evaluate(f) for f in load.force], self._share(load))
-        return forces.ravel()
+    # -- results ----------------------------------------------------------------------------------------
 
-    def _nodal_force_slopes(self) -> Array:
-        slopes = np.zeros((len(self.symbols), 3, self.displacements.n_scalar))
-        for load in self._point_loads:
-            by_parameter = np.column_stack([self.symbols.slopes(f) for f in load.force])
-            slopes += by_parameter[:, :, None] * self._share(load)
-        return slopes.reshape(len(self.symbols), -1)
+    @cached_property
+    def recovery(self) -> Recovery:
+        """Fields at nodes and points, made when first needed."""
+        return Recovery(self)
 
-    def _share(self, load: PointLoad) -> Array:
-        """(n_scalar,) work that a unit force, shared by the load's nodes, does on each scalar dof."""
-        nodes = self.mesh.set_nodes(load.on)
-        return np.asarray(self.displacements.node_values[nodes].sum(axis=0)).ravel() / len(nodes)
+    def nodal_displacement(self, dofs: Array) -> Array:
+        """(n_nodes, 3), m; linear in ``dofs`` (n_dofs,), so it maps their derivatives too."""
+        parts = dofs[: 3 * self.displacements.n_scalar].reshape(3, -1)
+        return self.displacements.node_values @ parts.T
+
+    def sample(self, dofs: Array, mu: Array) -> dict[str, Array]:
+        """Displacement (n, 3) m, strain (n, 6), stress (n, 6) Pa and von_mises (n,) Pa at the nodes.
+
+        Green-Lagrange strain and Cauchy stress are in Voigt's order; `recovery` says how they come to nodes.
+        """
+        return self.recovery.at_nodes(dofs, mu)
+
+    def sample_slopes(self, dofs: Array, mu: Array, dof_slopes: Array) -> dict[str, Array]:
+        """Total derivatives (d, n, c) of displacement, strain and stress at the nodes by the parameters.
+
+        ``dof_slopes`` (d, n_dofs) are those of the solution: `newton.sensitivities`.
+        """
+        return self.recovery.slopes_at_nodes(dofs, mu, dof_slopes)
+
+    def reactions(self, dofs: Array, mu: Array, name: str, about: Array | None = None) -> tuple[Array, Array]:
+        """Force (3,) N and moment (3,) Nm that the supports of a set exert on the solid.
+
+        Parameters
+        ----------
+        name : node set or surface; only what prescribed motions hold of it counts.
+        about : point of the moment (3,), m; None for the centroid of the set's undeformed nodes.
+        """
+        n_scalar = self.displacements.n_scalar
+        forces = np.where(self.constraints.held, self.residual(dofs, mu)[: 3 * n_scalar], 0.0).reshape(3, -1)
+        return self.constraints.resultant(name, forces, dofs[: 3 * n_scalar].reshape(3, -1), about)
+
+    def strain_energy(self, dofs: Array, mu: Array) -> float:
+        """Elastic energy, J."""
+        self.symbols.set(mu)
+        return self.assembly.energy(dofs, len(self.regions))

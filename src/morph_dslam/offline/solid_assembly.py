@@ -94,6 +94,12 @@ class Assembly:
         """(n,) at ``x`` (n,) and the present parameters, without nodal forces."""
         return self._apply(self._form, x)
 
+    def energy(self, x: Array, n_terms: int) -> float:
+        """Energy of the first ``n_terms`` terms at ``x`` and the present parameters, J."""
+        form = self._make_form(self._terms[:n_terms], False)
+        self._state.vec.FV().NumPy()[:] = x
+        return float(form.Energy(self._state.vec))
+
     def residual_slopes(self, x: Array) -> Array:
         """(d, n) derivatives by the parameters at fixed ``x``."""
         if self._slope_forms is None:
@@ -108,7 +114,7 @@ class Assembly:
         return result
 
     def linearise(self, x: Array, mu: Array, forces: Array, solver: LinearSolver) -> Linearisation:
-        """Residual, less nodal ``forces`` (n,), and tangent at ``x``; the parameters are at ``mu`` already."""
+        """Residual, less nodal ``forces`` (n,), and tangent at ``x``; ``mu`` is set already."""
         residual = self.residual(x) - forces
         linearisation = AssembledLinearisation(residual, self.tangent(x), solver)
         if not self.condensed:

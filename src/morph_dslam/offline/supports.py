@@ -1,8 +1,8 @@
 """What holds a solid: prescribed displacement and rigid rotation of named sets, elastic foundations.
 
 Every prescribed motion is affine in the position, u(X) = A X + b, so that second-order elements, whose shapes
-are isoparametric, take it exactly. Where two supports hold the same component of the same node, the one listed
-first decides.
+are isoparametric, take it exactly. Where two supports hold the same component of the same node, the one
+listed first decides.
 """
 
 from __future__ import annotations
