@@ -64,7 +64,7 @@ class Section:
 
 @dataclass(frozen=True)
 class SurfacePart:
-    """Labels of elements and the face that each gives to a surface: "S1" to "S6", "SPOS", "SNEG", "" for all."""
+    """Labels of elements and the face that each gives to a surface: S1 to S6, SPOS, SNEG, or "" for all."""
 
     elements: Labels
     face: str
