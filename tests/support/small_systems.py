@@ -90,3 +90,31 @@ def von_mises_truss(height: float, moved: bool = False) -> SmallSystem:
         lambda _, mu: np.zeros((len(mu), 2)),
         prescribed_dof=1,
     )
+
+
+def spring_column(imperfection: float = 0.0) -> SmallSystem:
+    """A rigid column of length 1 on a rotational spring of stiffness 1, turned by x under the dead weight mu.
+
+    x - x0 = mu sin x: the upright column bifurcates at mu = 1; with an imperfection x0 the path stays stable.
+    """
+    return SmallSystem(
+        1,
+        lambda x, mu: np.array([x[0] - imperfection - mu[0] * np.sin(x[0])]),
+        lambda x, mu: np.array([[1.0 - mu[0] * np.cos(x[0])]]),
+        lambda x, _: np.array([[-np.sin(x[0])]]),
+    )
+
+
+def link_chain(stiffness: float, length: float) -> SmallSystem:
+    """Three rigid links in line on lateral springs at the two joints, pressed by mu, for small deflections.
+
+    It buckles at mu = k L / 3 with the joints on opposite sides, and at k L with both on one side.
+    """
+    springs = stiffness * np.eye(2)
+    geometric = np.array([[2.0, -1.0], [-1.0, 2.0]]) / length
+    return SmallSystem(
+        2,
+        lambda x, mu: (springs - mu[0] * geometric) @ x,
+        lambda _, mu: springs - mu[0] * geometric,
+        lambda x, _: -(geometric @ x)[None],
+    )

@@ -164,14 +164,15 @@ class Factorisation:
         if not np.all(np.isfinite(right)):
             raise SolverError("the right-hand side of a linear solve is not finite")
         for engine in self._solver.engines_to_try(self._matrix):
-            solution = engine.solve(right)
-            for _ in range(REFINEMENTS):
+            solution = np.zeros_like(right)
+            residual = right
+            for _ in range(1 + REFINEMENTS):
+                solution = solution + engine.solve(residual)
+                if not np.all(np.isfinite(solution)):
+                    break
                 residual = right - multiply(self._matrix, solution, self._triangular)
                 if self._good(residual, solution, right):
                     return solution
-                solution = solution + engine.solve(residual)
-            if self._good(right - multiply(self._matrix, solution, self._triangular), solution, right):
-                return solution
         raise SolverError(
             "the tangent matrix is singular: the body may lack supports, or be at a limit point"
         )
