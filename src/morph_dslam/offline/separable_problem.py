@@ -1,0 +1,255 @@
+"""Linear problems with separated parameters: [sum_q A_q (x) theta_q] U = sum_j h_j (x) g_j.
+
+Every theta_q and g_j is a product over the parameters. A parameter is discretised by a `ParameterAxis`: a
+basis and the quadrature of the integral over it. On an axis theta_q is multiplication with a function (a
+stiffness, a position) or, for time, the derivative; both are given as what they make of the basis functions.
+
+`galerkin_system` and `minimal_residual_system` turn a problem into the symmetric algebraic form that the
+alternating directions of `pgd` work on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, reduce
+from typing import Protocol
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
+
+from morph_dslam.errors import SolverError
+from morph_dslam.model.basis_functions import Basis, hat_basis
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ParameterAxis:
+    """One parameter: its basis, and the points (p,) and weights (p,) of the integral over it.
+
+    ``fixed`` functions of the basis are left out: their coefficients are zero, as an initial condition asks.
+    """
+
+    basis: Basis
+    points: Array
+    weights: Array
+    fixed: tuple[int, ...] = ()
+
+    @cached_property
+    def free(self) -> NDArray[np.int64]:
+        """Indices of the functions in use (n_free,)."""
+        return np.setdiff1d(np.arange(self.basis.size), self.fixed)
+
+    @cached_property
+    def values(self) -> Array:
+        """The functions in use at the points (p, n_free)."""
+        return self.basis.evaluate(self.points)[:, self.free]
+
+    def multiplied_by(self, theta: ArrayLike) -> Array:
+        """Images (..., p, n_free) of the functions, multiplied with ``theta`` (..., p) at the points."""
+        return np.asarray(theta, dtype=float)[..., None] * self.values
+
+    def differentiated(self) -> Array:
+        """Images (p, n_free) of the functions under differentiation."""
+        return self.basis.evaluate(self.points, order=1)[:, self.free]
+
+    def integrate(self, tests: Array, images: Array) -> Array:
+        """Weighted products of ``tests`` (p, a) and ``images`` (p, b): (a, b)."""
+        return (tests * self.weights[:, None]).T @ images
+
+    def all_coefficients(self, free: Array) -> Array:
+        """Coefficients (size, m) of the whole basis from those in use (n_free, m)."""
+        result = np.zeros((self.basis.size, free.shape[1]))
+        result[self.free] = free
+        return result
+
+
+def galerkin_axis(basis: Basis, fixed: tuple[int, ...] = ()) -> ParameterAxis:
+    """An axis on which the problem holds in the mean, weighted with the basis functions."""
+    return ParameterAxis(basis, *basis.quadrature(), fixed)
+
+
+def collocation_axis(nodes: ArrayLike) -> ParameterAxis:
+    """An axis of hats on which the problem holds at the ``nodes`` (n,) themselves, all of equal weight."""
+    nodes = np.asarray(nodes, dtype=float)
+    return ParameterAxis(hat_basis(nodes), nodes, np.full(len(nodes), 1.0 / len(nodes)))
+
+
+@dataclass(frozen=True)
+class SeparableProblem:
+    """[sum_q A_q (x) theta_q] U = sum_j h_j (x) g_j.
+
+    Attributes
+    ----------
+    axes : the d parameters.
+    matrices : the Q sparse matrices A_q (n, n), on the free degrees of freedom.
+    images : per axis (Q, p_k, n_free), what the factor of theta_q makes of the axis' functions.
+    loads : (n, J), the vectors h_j.
+    load_functions : per axis (J, p_k), the factors of g_j at the axis' points.
+    metric : K0 (n, n), symmetric positive definite: residuals are measured in the norm of its inverse. The
+        operator in the middle of the box is the natural choice, its symmetric part if it is not symmetric.
+    """
+
+    axes: tuple[ParameterAxis, ...]
+    matrices: tuple[sp.csc_array, ...]
+    images: tuple[Array, ...]
+    loads: Array
+    load_functions: tuple[Array, ...]
+    metric: sp.csc_array
+
+    def __post_init__(self) -> None:
+        n, n_loads = self.loads.shape
+        for k, axis in enumerate(self.axes):
+            expected = (len(self.matrices), *axis.values.shape)
+            if self.images[k].shape != expected:
+                raise ValueError(f"images of axis {k} must be {expected}, not {self.images[k].shape}")
+            if self.load_functions[k].shape != (n_loads, len(axis.points)):
+                raise ValueError(f"load functions of axis {k} must be ({n_loads}, {len(axis.points)})")
+        if any(matrix.shape != (n, n) for matrix in (*self.matrices, self.metric)):
+            raise ValueError(f"all matrices must be ({n}, {n}), as the loads have {n} rows")
+
+
+class SpaceOperators(Protocol):
+    """Sums over terms of c_t L_t, symmetric and positive definite for the weights c that occur."""
+
+    n_terms: int
+
+    def apply(self, term: int, vectors: Array) -> Array:
+        """L_t times ``vectors`` (n, ...)."""
+        ...
+
+    def solve(self, weights: Array, right: Array) -> Array:
+        """Solve [sum_t weights_t L_t] x = right (n,)."""
+        ...
+
+
+@dataclass(frozen=True)
+class SeparatedSystem:
+    """sum_t L_t (x) Theta_t^1 (x) ... U = sum_j h_j (x) l_j^1 (x) ..., symmetric as a whole.
+
+    Attributes
+    ----------
+    operators : the L_t. grams : per axis (T, n_free, n_free). masses : per axis (n_free, n_free), the norm.
+    loads : (n, J). load_vectors : per axis (J, n_free).
+    """
+
+    operators: SpaceOperators
+    grams: tuple[Array, ...]
+    masses: tuple[Array, ...]
+    loads: Array
+    load_vectors: tuple[Array, ...]
+
+
+def weighted_sum(weights: ArrayLike, matrices: Sequence[sp.csc_array]) -> sp.csc_array:
+    """sum_q weights_q A_q."""
+    scaled = [w * m for w, m in zip(np.asarray(weights), matrices, strict=True)]
+    return sp.csc_array(reduce(lambda a, b: a + b, scaled))
+
+
+def factorise(matrix: sp.csc_array, symmetric: bool) -> SuperLU:
+    """Sparse LU factors; without pivoting where the matrix is symmetric and positive definite."""
+    if symmetric:
+        return splu(
+            matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+    return splu(matrix)
+
+
+class GalerkinOperators:
+    """L_q = A_q themselves: the energy is minimised; sums must be symmetric and positive definite."""
+
+    def __init__(self, problem: SeparableProblem) -> None:
+        self.matrices = problem.matrices
+        self.n_terms = len(problem.matrices)
+        self._single = factorise(problem.matrices[0], True) if self.n_terms == 1 else None
+
+    def apply(self, term: int, vectors: Array) -> Array:
+        return self.matrices[term] @ vectors
+
+    def solve(self, weights: Array, right: Array) -> Array:
+        if self._single is not None:
+            return self._single.solve(right) / weights[0]
+        return factorise(weighted_sum(weights, self.matrices), True).solve(right)
+
+
+class MinimalResidualOperators:
+    """L_pq = A_p^T K0^-1 A_q: the residual is minimised in K0^-1, for operators that are not symmetric."""
+
+    def __init__(self, problem: SeparableProblem) -> None:
+        self.matrices = problem.matrices
+        self.metric = problem.metric
+        self.inverse_metric = factorise(problem.metric, True)
+        count = len(problem.matrices)
+        self.pairs = [(p, q) for p in range(count) for q in range(count)]
+        self.n_terms = len(self.pairs)
+
+    def apply(self, term: int, vectors: Array) -> Array:
+        p, q = self.pairs[term]
+        return self.matrices[p].T @ self.inverse_metric.solve(self.matrices[q] @ vectors)
+
+    def solve(self, weights: Array, right: Array) -> Array:
+        """Conjugate gradients, preconditioned by B^T K0^-1 B with B the leading combination of the A_q."""
+        table = weights.reshape(len(self.matrices), len(self.matrices))
+        table = (table + table.T) / 2.0
+        values, vectors = np.linalg.eigh(table)
+        lead = factorise(weighted_sum(np.sqrt(values[-1]) * vectors[:, -1], self.matrices), False)
+
+        def operator(x: Array) -> Array:
+            images = np.column_stack([m @ x for m in self.matrices])
+            mixed = self.inverse_metric.solve(images @ table)
+            return np.sum([m.T @ mixed[:, q] for q, m in enumerate(self.matrices)], axis=0)
+
+        def precondition(x: Array) -> Array:
+            return lead.solve(self.metric @ lead.solve(x, trans="T"))
+
+        shape = (len(right), len(right))
+        solution, failed = cg(
+            LinearOperator(shape, matvec=operator, dtype=float),  # pyright: ignore[reportCallIssue]
+            right,
+            rtol=1e-8,
+            maxiter=200,
+            M=LinearOperator(shape, matvec=precondition, dtype=float),  # pyright: ignore[reportCallIssue]
+        )
+        if failed:
+            raise SolverError(
+                "the minimal-residual step of PGD did not converge in 200 iterations: "
+                "narrow the range of the parameters, or scale the operators alike"
+            )
+        return solution
+
+
+def galerkin_system(problem: SeparableProblem) -> SeparatedSystem:
+    """The problem tested with its own functions: for symmetric positive definite operators."""
+    axes = problem.axes
+    return SeparatedSystem(
+        GalerkinOperators(problem),
+        tuple(
+            np.stack([a.integrate(a.values, image) for image in images])
+            for a, images in zip(axes, problem.images, strict=True)
+        ),
+        tuple(a.integrate(a.values, a.values) for a in axes),
+        problem.loads,
+        tuple((g * a.weights) @ a.values for a, g in zip(axes, problem.load_functions, strict=True)),
+    )
+
+
+def minimal_residual_system(problem: SeparableProblem) -> SeparatedSystem:
+    """The normal equations of |f - A U| in K0^-1: for any operator that is not singular."""
+    axes, operators = problem.axes, MinimalResidualOperators(problem)
+    lifted = operators.inverse_metric.solve(problem.loads)
+    return SeparatedSystem(
+        operators,
+        tuple(
+            np.stack([a.integrate(images[p], images[q]) for p, q in operators.pairs])
+            for a, images in zip(axes, problem.images, strict=True)
+        ),
+        tuple(a.integrate(a.values, a.values) for a in axes),
+        np.concatenate([m.T @ lifted for m in problem.matrices], axis=1),
+        tuple(
+            np.concatenate([(g * a.weights) @ image for image in images])
+            for a, g, images in zip(axes, problem.load_functions, problem.images, strict=True)
+        ),
+    )

@@ -1,0 +1,224 @@
+"""A-priori PGD against closed forms, direct solves and the optimal (SVD) separation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+
+from morph_dslam.model.basis_functions import chebyshev_basis, cubic_spline_basis, hat_basis
+from morph_dslam.offline.pgd import PgdOptions, PgdSolution, solve_pgd
+from morph_dslam.offline.separable_problem import (
+    ParameterAxis,
+    SeparableProblem,
+    collocation_axis,
+    galerkin_axis,
+)
+
+
+def quiet(**options) -> PgdOptions:
+    return PgdOptions(progress=False, **options)
+
+
+def on_grid(solution: PgdSolution, *grids: np.ndarray) -> np.ndarray:
+    """The separated solution (n, g_1, ..., g_d) at all points of the grids."""
+    result = solution.modes.T
+    for basis, factor, grid in zip(solution.functions.bases, solution.functions.factors, grids, strict=True):
+        values = basis.evaluate(grid) @ factor
+        result = result[..., None, :] * values
+    return result.sum(axis=-1)
+
+
+# --- a Euler-Bernoulli cantilever; Hermite elements are exact at their nodes ---
+
+LENGTH, RIGIDITY, ELEMENTS = 2.0, 3.0, 40
+
+
+def hermite_stiffness(rigidity: np.ndarray) -> sp.csc_array:
+    """Of a clamped beam, degrees of freedom (w, w') of the nodes behind the clamp."""
+    h = LENGTH / ELEMENTS
+    element = np.array([[12, 6 * h, -12, 6 * h], [6 * h, 4 * h * h, -6 * h, 2 * h * h]] * 2, dtype=float)
+    element[2] = -element[0]
+    element[3] = [6 * h, 2 * h * h, -6 * h, 4 * h * h]
+    matrix = np.zeros((2 * ELEMENTS + 2, 2 * ELEMENTS + 2))
+    for e in range(ELEMENTS):
+        matrix[2 * e : 2 * e + 4, 2 * e : 2 * e + 4] += rigidity[e] / h**3 * element
+    return sp.csc_array(matrix[2:, 2:])
+
+
+def beam_with_moving_load() -> tuple[SeparableProblem, np.ndarray]:
+    """A unit force at each of the nodes in turn; the problem and the nodes' positions."""
+    positions = np.linspace(0.0, LENGTH, ELEMENTS + 1)[1:]
+    axis = collocation_axis(positions)
+    matrix = hermite_stiffness(np.full(ELEMENTS, RIGIDITY))
+    loads = np.zeros((2 * ELEMENTS, ELEMENTS))
+    loads[2 * np.arange(ELEMENTS), np.arange(ELEMENTS)] = 1.0
+    ones = axis.multiplied_by(np.ones((1, ELEMENTS)))
+    return SeparableProblem((axis,), (matrix,), (ones,), loads, (np.eye(ELEMENTS),), matrix), positions
+
+
+def test_the_tip_of_a_cantilever_follows_the_influence_function_of_euler_and_bernoulli() -> None:
+    problem, s = beam_with_moving_load()
+    solution = solve_pgd(problem, quiet(max_modes=20, tolerance=1e-5))
+    tip = on_grid(solution, s)[-2]
+    np.testing.assert_allclose(tip, s**2 * (3.0 * LENGTH - s) / (6.0 * RIGIDITY), rtol=1e-4, atol=1e-6)
+
+
+def test_pgd_is_the_optimal_separation_in_energy_and_its_dual_residual_the_error() -> None:
+    problem, s = beam_with_moving_load()
+    stiffness = problem.matrices[0].toarray()
+    root = scipy.linalg.cholesky(stiffness)
+    exact = np.linalg.solve(stiffness, problem.loads)
+    singular = np.linalg.svd(root @ exact, compute_uv=False)
+    for n_modes in (1, 3, 5, 10, 20):
+        solution = solve_pgd(problem, quiet(max_modes=n_modes, tolerance=0.0))
+        error = np.linalg.norm(root @ (exact - on_grid(solution, s))) / np.linalg.norm(singular)
+        optimum = np.linalg.norm(singular[n_modes:]) / np.linalg.norm(singular)
+        assert optimum * (1.0 - 1e-6) <= error <= 1.02 * optimum
+        assert solution.residuals[-1] == pytest.approx(error, rel=0.01)
+
+
+def test_a_stiffness_as_second_parameter_and_a_cubic_spline_axis() -> None:
+    """Outer half 0.2 to 5 times as stiff; compared off the axis' nodes with direct solves."""
+    problem, s = beam_with_moving_load()
+    outer = np.arange(ELEMENTS) >= ELEMENTS // 2
+    inner_half, outer_half = hermite_stiffness(RIGIDITY * ~outer), hermite_stiffness(RIGIDITY * outer)
+    log_kappa = galerkin_axis(cubic_spline_basis(np.linspace(np.log(0.2), np.log(5.0), 12)))
+    n_points = len(log_kappa.points)
+    problem = SeparableProblem(
+        (problem.axes[0], log_kappa),
+        (inner_half, outer_half),
+        (
+            problem.axes[0].multiplied_by(np.ones((2, ELEMENTS))),
+            log_kappa.multiplied_by([np.ones(n_points), np.exp(log_kappa.points)]),
+        ),
+        problem.loads,
+        (np.eye(ELEMENTS), np.ones((ELEMENTS, n_points))),
+        sp.csc_array(inner_half + outer_half),
+    )
+    solution = solve_pgd(problem, quiet(max_modes=25, tolerance=0.0))
+    samples = np.log([0.2, 0.37, 1.3, 2.9, 5.0])
+    exact = np.stack(
+        [splu(sp.csc_array(inner_half + np.exp(k) * outer_half)).solve(problem.loads) for k in samples], 2
+    )
+    found = on_grid(solution, s, samples)
+    assert np.linalg.norm(found - exact) <= 1e-3 * np.linalg.norm(exact)
+    mu, h = np.array([1.3, 0.4]), 1e-5
+    _, slopes = solution.functions.evaluate(mu)
+    up, down = (solution.functions.evaluate(mu + np.array([0.0, step]))[0] for step in (h, -h))
+    np.testing.assert_allclose(slopes[1], (up - down) / (2.0 * h), rtol=1e-5, atol=1e-7)
+
+
+# --- advection and diffusion: not symmetric ---
+
+
+def advection_diffusion(nodes: int = 15) -> tuple[SeparableProblem, tuple[sp.csc_array, ...], np.ndarray]:
+    """-laplace u + v (1, 2) . grad u = 1 on the unit square, upwind differences, v a parameter in [0, 50]."""
+    h = 1.0 / (nodes + 1)
+    second = sp.diags_array(
+        [-np.ones(nodes - 1), 2.0 * np.ones(nodes), -np.ones(nodes - 1)], offsets=[-1, 0, 1]
+    )
+    upwind = sp.diags_array([-np.ones(nodes - 1), np.ones(nodes)], offsets=[-1, 0])
+    unit = sp.eye_array(nodes)
+    diffusion = sp.csc_array((sp.kron(second, unit) + sp.kron(unit, second)) / h**2)
+    advection = sp.csc_array((sp.kron(upwind, unit) + 2.0 * sp.kron(unit, upwind)) / h)
+    axis = galerkin_axis(chebyshev_basis(0.0, 50.0, 40))
+    points = len(axis.points)
+    problem = SeparableProblem(
+        (axis,),
+        (diffusion, advection),
+        (axis.multiplied_by([np.ones(points), axis.points]),),
+        np.ones((nodes**2, 1)),
+        (np.ones((1, points)),),
+        diffusion,
+    )
+    return problem, (diffusion, advection), np.linspace(0.0, 50.0, 11)
+
+
+def test_advection_and_diffusion_converge_by_minimal_residual() -> None:
+    problem, (diffusion, advection), speeds = advection_diffusion()
+    exact = np.stack(
+        [splu(sp.csc_array(diffusion + v * advection)).solve(problem.loads[:, 0]) for v in speeds], 1
+    )
+    errors = {}
+    for n_modes in (2, 4, 8, 16):
+        solution = solve_pgd(problem, quiet(max_modes=n_modes, tolerance=0.0, method="minimal_residual"))
+        errors[n_modes] = np.linalg.norm(on_grid(solution, speeds) - exact) / np.linalg.norm(exact)
+    assert errors[2] > 5.0 * errors[4] > 25.0 * errors[8]
+    assert errors[16] <= 1e-5
+
+
+def test_the_minimal_residual_never_grows_with_the_modes() -> None:
+    problem, _, _ = advection_diffusion(8)
+    residuals = solve_pgd(problem, quiet(max_modes=8, tolerance=0.0, method="minimal_residual")).residuals
+    assert (np.diff(residuals) < 0.0).all()
+
+
+# --- time as a coordinate ---
+
+
+def test_time_is_a_coordinate_like_another() -> None:
+    """Heat on a rod from u0 = sin(pi x): u_t = c u_xx, so u = exp(-c pi^2 t) sin(pi x).
+
+    Posed for w = u - u0: w_t - c w_xx = c u0_xx, w(0) = 0. Parameters: time and the conductivity c.
+    """
+    nodes = 30
+    h = 1.0 / (nodes + 1)
+    x = h * np.arange(1, nodes + 1)
+    mass = sp.csc_array(sp.eye_array(nodes) * h)
+    laplace = sp.csc_array(
+        sp.diags_array([-np.ones(nodes - 1), 2.0 * np.ones(nodes), -np.ones(nodes - 1)], offsets=[-1, 0, 1])
+        / h
+    )
+    start = np.sin(np.pi * x)
+    rate = (start @ (laplace @ start)) / (
+        start @ (mass @ start)
+    )  # the discrete pi^2: start is an eigenvector
+    knots = np.linspace(0.0, 0.2, 14)
+    time = galerkin_axis(cubic_spline_basis(knots), fixed=(0,))
+    conductivity = galerkin_axis(chebyshev_basis(0.5, 2.0, 8))
+    n_times, n_conductivities = len(time.points), len(conductivity.points)
+    problem = SeparableProblem(
+        (time, conductivity),
+        (mass, laplace),
+        (
+            np.stack([time.differentiated(), time.multiplied_by(np.ones(n_times))]),
+            conductivity.multiplied_by([np.ones(n_conductivities), conductivity.points]),
+        ),
+        -(laplace @ start)[:, None],
+        (np.ones((1, n_times)), conductivity.points[None, :]),
+        laplace,
+    )
+    solution = solve_pgd(problem, quiet(max_modes=12, tolerance=1e-6, method="minimal_residual"))
+    times, values = np.linspace(0.0, 0.2, 9), np.array([0.5, 0.9, 1.7, 2.0])
+    found = start[:, None, None] + on_grid(solution, times, values)
+    exact = start[:, None, None] * np.exp(-rate * np.outer(times, values))
+    np.testing.assert_allclose(found, exact, atol=1e-3)
+    np.testing.assert_allclose(found[:, 0], np.repeat(start[:, None], 4, axis=1), atol=1e-12)
+
+
+# --- the interface ---
+
+
+def test_it_stops_at_the_tolerance_and_says_whether_it_got_there() -> None:
+    problem, _ = beam_with_moving_load()
+    reached = solve_pgd(problem, quiet(max_modes=40, tolerance=0.05))
+    assert reached.converged
+    assert reached.residuals[-1] <= 0.05 < reached.residuals[-2]
+    assert len(reached.modes) == len(reached.residuals) == reached.functions.n_functions
+    short = solve_pgd(problem, quiet(max_modes=2, tolerance=1e-6))
+    assert not short.converged
+    assert len(short.modes) == 2
+
+
+def test_arrays_that_do_not_fit_are_refused() -> None:
+    problem, _ = beam_with_moving_load()
+    axis = ParameterAxis(hat_basis([0.0, 1.0, 2.0]), np.array([0.5, 1.5]), np.ones(2))
+    with pytest.raises(ValueError, match="images of axis 0"):
+        SeparableProblem(
+            (axis,), problem.matrices, problem.images, problem.loads, problem.load_functions, problem.metric
+        )
+    with pytest.raises(ValueError, match="not 'newton'"):
+        PgdOptions(method="newton")
