@@ -6,13 +6,39 @@ from math import pi
 
 from morph_dslam.errors import StudyError
 
+_STRESS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "N/mm2": 1e6}
+
 #: Factor from each accepted unit to SI, by the quantity it measures.
 FACTORS: dict[str, dict[str, float]] = {
-    "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
-    "stress": {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9},
+    "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6},
+    "stress": _STRESS,
+    "pressure": _STRESS,
     "angle": {"rad": 1.0, "deg": pi / 180.0},
     "ratio": {"1": 1.0},
+    "force": {"N": 1.0, "mN": 1e-3, "kN": 1e3},
+    "moment": {"N.m": 1.0, "N.mm": 1e-3},
+    "density": {"kg/m3": 1.0, "g/cm3": 1e3},
+    "acceleration": {"m/s2": 1.0, "mm/s2": 1e-3},
+    "force per length": {"N/m": 1.0, "N/mm": 1e3},
+    "force per volume": {"N/m3": 1.0, "N/mm3": 1e9},
+    "stiffness per area": {"N/m3": 1.0, "N/mm3": 1e9, "Pa/m": 1.0, "MPa/mm": 1e9},
+    "time": {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0},
 }
+
+
+def quantity_of(unit: str) -> str:
+    """The quantity that ``unit`` measures, "stress" for "MPa".
+
+    Raises
+    ------
+    StudyError
+        If it is not a unit known here.
+    """
+    for quantity, known in FACTORS.items():
+        if unit in known:
+            return quantity
+    units = dict.fromkeys(unit for known in FACTORS.values() for unit in known)
+    raise StudyError(f"'{unit}' is not a known unit; known are {', '.join(units)}")
 
 
 def to_si(value: float, unit: str, quantity: str) -> float:

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterable
 from concurrent.futures import Executor
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
-from morph_dslam.model import ReducedModel, save_model
+from morph_dslam.model import Parameter, ReducedModel, save_model
 from morph_dslam.offline.certificate import certify, compression_percent
-from morph_dslam.offline.problem import ParametricStudy, Snapshot, bounds
+from morph_dslam.offline.external import ExternalStudy
+from morph_dslam.offline.problem import ModelMesh, ParametricStudy, Snapshot, bounds
 from morph_dslam.offline.reduction import reduce
 from morph_dslam.offline.snapshots import load_snapshot
 from morph_dslam.offline.study import Study, load_study
+from morph_dslam.offline.study_sections import ReductionSection
 from morph_dslam.offline.sweep import (
     SweepResult,
     default_executor,
@@ -30,6 +33,23 @@ from morph_dslam.offline.sweep import (
 Array = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class Solutions:
+    """Snapshots of a study, solved or read.
+
+    Attributes
+    ----------
+    seen : to make the model from; mirror images of one solution form a group. unseen : to measure its error.
+    failed : coordinates and reason of each sample that could not be solved.
+    """
+
+    mesh: ModelMesh
+    parameters: tuple[Parameter, ...]
+    seen: list[list[Snapshot]]
+    unseen: list[Snapshot]
+    failed: list[dict[str, Any]] = field(default_factory=list)
+
+
 def build(
     study: Path | Study, output: Path, workers: int | None = None, executor: Executor | None = None
 ) -> ReducedModel:
@@ -39,37 +59,61 @@ def build(
 
     Parameters
     ----------
-    study : a study, or the file of one. output : the model file. workers : processes, the study's own
-        number if absent. executor : what to solve on in their place, a Dask cluster's say.
+    study : a study, its file, or the folder of a file study.toml. output : the model file.
+    workers : processes, the study's own number if absent.
+    executor : what to solve on in their place, a Dask cluster's say.
 
     Raises
     ------
     StudyError
         If the study is wrong or too few samples converge.
     """
-    text = study.read_text() if isinstance(study, Path) and study.is_file() else None
+    text = None
     if isinstance(study, Path):
-        study = load_study(study)
+        path = study / "study.toml" if study.is_dir() else study
+        study = load_study(path)
+        text = path.read_text()
     if not output.parent.is_dir():
         raise StudyError(f"the folder {output.parent} for the model file does not exist: make it first")
+    if isinstance(study, ExternalStudy):
+        solutions = _read(study)
+    else:
+        solutions = _solve(study, output.with_name(output.name + ".snapshots"), workers, executor)
+    model = _certified(solutions, study.reduction, study.name)
+    model.provenance.update(_provenance(text or study.model_dump_json(), model))
+    save_model(output, model)
+    return model
+
+
+def _solve(study: ParametricStudy, folder: Path, workers: int | None, executor: Executor | None) -> Solutions:
+    """Solve all samples of a study, or find them in ``folder``."""
     training, held_out = training_samples(study), held_out_samples(study)
     samples = np.vstack([training, held_out])
-    folder = output.with_name(output.name + ".snapshots")
     if executor is None:
         with default_executor(workers or study.work.workers) as processes:
             result = run_sweep(study, study.canonical(samples), folder, processes)
     else:
         result = run_sweep(study, study.canonical(samples), folder, executor)
-    seen = _gather(study, samples, result, range(len(training)))
     unseen = _gather(study, samples, result, range(len(training), len(samples)))
-    model = _certified(study, seen, [images[0] for images in unseen])
-    model.certificate["samples"]["failed"] = [
-        {"coordinates": samples[index].tolist(), "reason": reason}
-        for index, reason in sorted(result.failed.items())
-    ]
-    model.provenance.update(_provenance(text or json.dumps(study.model_dump(mode="json")), model))
-    save_model(output, model)
-    return model
+    return Solutions(
+        study.model_mesh(),
+        study.model_parameters(),
+        _gather(study, samples, result, range(len(training))),
+        [images[0] for images in unseen],
+        [
+            {"coordinates": samples[index].tolist(), "reason": reason}
+            for index, reason in sorted(result.failed.items())
+        ],
+    )
+
+
+def _read(study: ExternalStudy) -> Solutions:
+    """The solutions of another program, those that measure the error drawn by chance."""
+    mesh, parameters, snapshots = study.solutions()
+    training, held_out = study.split(len(snapshots))
+    return Solutions(
+        mesh, parameters, [[snapshots[index]] for index in training], [snapshots[index] for index in held_out]
+    )
 
 
 def _gather(
@@ -94,14 +138,15 @@ def _gather(
     return groups
 
 
-def _certified(study: ParametricStudy, seen: list[list[Snapshot]], unseen: list[Snapshot]) -> ReducedModel:
-    """The reduced model of the snapshots ``seen``, with its errors at those ``unseen``."""
+def _certified(solutions: Solutions, options: ReductionSection, name: str) -> ReducedModel:
+    """The reduced model of the solutions seen, with its errors at those unseen."""
+    seen, unseen = solutions.seen, solutions.unseen
     if len(unseen) < 4:
         raise StudyError(f"only {len(unseen)} held-out samples converged: too few to certify the model")
-    model = reduce(study, study.model_mesh(), seen)
+    model = reduce(solutions.mesh, solutions.parameters, seen, options, name)
     certificate = certify(model, unseen)
     certificate["compression_percent"] = compression_percent(model, len(seen) + len(unseen))
-    certificate["samples"] = {"training": len(seen), "held_out": len(unseen), "failed": []}
+    certificate["samples"] = {"training": len(seen), "held_out": len(unseen), "failed": solutions.failed}
     model.certificate.update(certificate)
     return model
 

@@ -5,51 +5,62 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.model import ReducedModel, SeparatedField
+from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.offline.pod import Pod, compute_pod
-from morph_dslam.offline.problem import ModelMesh, ParametricStudy, Snapshot, bounds
+from morph_dslam.offline.problem import ModelMesh, Snapshot
 from morph_dslam.offline.regression import fit_functions
+from morph_dslam.offline.study_sections import ReductionSection
 
 Array = NDArray[np.float64]
 
 STRESS = "stress_"
 
 
-def reduce(study: ParametricStudy, mesh: ModelMesh, groups: list[list[Snapshot]]) -> ReducedModel:
+def reduce(
+    mesh: ModelMesh,
+    parameters: tuple[Parameter, ...],
+    groups: list[list[Snapshot]],
+    options: ReductionSection,
+    name: str = "",
+) -> ReducedModel:
     """A reduced model of every field that the snapshots hold.
 
     Parameters
     ----------
+    parameters : with the box that the functions are fitted in.
     groups : snapshots; those of one group (mirror images) are left out together in cross-validation.
     """
     snapshots = [snapshot for group in groups for snapshot in group]
     fold = np.concatenate([np.full(len(group), index) for index, group in enumerate(groups)])
     fields, summaries = {}, {}
-    for name in snapshots[0].fields:
-        fields[name], summaries[name] = _reduce_field(study, mesh.weights, snapshots, name, fold)
+    box = np.array([[parameter.lower, parameter.upper] for parameter in parameters])
+    for key in snapshots[0].fields:
+        fields[key], summaries[key] = _reduce_field(mesh.weights, box, snapshots, key, fold, options)
     return ReducedModel(
-        name=study.name,
+        name=name,
         nodes=mesh.nodes,
         triangles=mesh.triangles,
         cells=mesh.cells,
-        parameters=study.model_parameters(),
+        parameters=parameters,
         displacement=fields["displacement"],
-        stresses={
-            name.removeprefix(STRESS): field for name, field in fields.items() if name.startswith(STRESS)
-        },
+        stresses={key.removeprefix(STRESS): field for key, field in fields.items() if key.startswith(STRESS)},
         strain=fields.get("strain"),
         certificate={"reduction": summaries["displacement"]},
     )
 
 
 def _reduce_field(
-    study: ParametricStudy, node_weights: Array, snapshots: list[Snapshot], name: str, fold: NDArray[np.int64]
+    node_weights: Array,
+    box: Array,
+    snapshots: list[Snapshot],
+    name: str,
+    fold: NDArray[np.int64],
+    options: ReductionSection,
 ) -> tuple[SeparatedField, dict]:
     """One separated field, and how it was chosen."""
     values = np.array([snapshot.fields[name] for snapshot in snapshots], dtype=np.float64)
     n_snapshots, n_points, n_components = values.shape
     weights = np.repeat(node_weights, n_components)
-    options, box = study.reduction, bounds(study)
     values = values.reshape(n_snapshots, -1)
     pod = compute_pod(values, weights, options.tolerance, options.max_modes)
     slopes = None

@@ -15,9 +15,11 @@ from pydantic import BaseModel, ValidationError
 
 from morph_dslam.errors import StudyError
 from morph_dslam.io.toml_file import read_toml
+from morph_dslam.offline.external import ExternalStudy
 from morph_dslam.offline.sheet_study import SheetStudy
+from morph_dslam.offline.solid_study import SolidStudy
 
-Study = SheetStudy
+Study = SheetStudy | SolidStudy | ExternalStudy
 
 
 def load_study(path: Path) -> Study:
@@ -53,7 +55,9 @@ def make_study(content: Mapping[str, Any], folder: Path = Path(), where: str = "
 
 
 def _kind(content: Mapping[str, Any]) -> type[Study]:
-    return SheetStudy
+    if "external" in content:
+        return ExternalStudy
+    return SheetStudy if "sheet" in content else SolidStudy
 
 
 def _explain(kind: type[BaseModel], entry: Any) -> str:

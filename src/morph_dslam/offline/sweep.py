@@ -201,8 +201,8 @@ def _check_reach(study: ParametricStudy, samples: Array, result: SweepResult, fo
             reached = [parameter.display(value) for value in (solved.min(), solved.max())]
             raise StudyError(
                 f"{parameter.name} could only be followed from {reached[0]:.4g} to {reached[1]:.4g} "
-                f"{parameter.unit}: {result.failed[beyond[0]]}. The solutions up to there are kept in {folder}; "
-                f"with that range the same command goes on from them. {study.advice}"
+                f"{parameter.unit}: {result.failed[beyond[0]]}. The solutions up to there are kept in "
+                f"{folder}; with that range the same command goes on from them. {study.advice}"
             )
 
 

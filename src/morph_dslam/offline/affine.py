@@ -1,0 +1,145 @@
+"""Quantities that depend on the parameters: linear expressions as study files write them.
+
+"3 MPa" is a number, "pressure" the parameter of that name, "0.5 * pressure + 2 kPa" and "10 N * share" (of a
+parameter without unit) are sums of both.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import StudyError
+from morph_dslam.model import Parameter
+from morph_dslam.units import FACTORS, quantity_of, to_si
+
+Array = NDArray[np.float64]
+
+_NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_WORD = r"[A-Za-z_][\w./]*"
+_TERM = re.compile(
+    rf"(?:(?P<number>{_NUMBER})(?:\s+(?P<unit>{_WORD}))?(?:\s*\*\s*(?P<factor>{_WORD}))?|(?P<name>{_WORD}))"
+)
+
+
+@dataclass(frozen=True)
+class Affine:
+    """constant + slopes . mu.
+
+    Attributes
+    ----------
+    constant : SI. slopes : (d,) by the parameters, SI.
+    """
+
+    constant: float
+    slopes: tuple[float, ...]
+
+    def __call__(self, mu: Array) -> float:
+        return self.constant + float(np.dot(self.slopes, mu))
+
+    @property
+    def fixed(self) -> bool:
+        """Whether no parameter changes it."""
+        return not any(self.slopes)
+
+    def expression(self, parameters: Sequence[Any]) -> Any:
+        """The same in other variables, `ngs.Parameter` say: a number if fixed, else a sum over them."""
+        result: Any = self.constant
+        for slope, parameter in zip(self.slopes, parameters, strict=True):
+            if slope:
+                result = result + slope * parameter
+        return result
+
+
+def read_affine(value: Any, quantity: str | None, parameters: Sequence[Parameter]) -> Affine:
+    """An expression of a study file.
+
+    Parameters
+    ----------
+    value : a text; for ratios a number too.
+    quantity : a key of `morph_dslam.units.FACTORS` that it must measure; None: whatever its first term does.
+
+    Raises
+    ------
+    StudyError
+        If it cannot be read, names an unknown parameter, or measures something else.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        raise StudyError(f"{value!r} is not a number with a unit, nor an expression of parameters")
+    if not isinstance(value, str):
+        if quantity not in ("ratio", None):
+            unit = next(iter(FACTORS[quantity]))
+            raise StudyError(f'write {value} with its unit, "{value} {unit}" for example')
+        return Affine(float(value), (0.0,) * len(parameters))
+    known = {parameter.name: index for index, parameter in enumerate(parameters)}
+    quantity = quantity or _own_quantity(value, known, parameters)
+    constant, slopes = 0.0, np.zeros(len(parameters))
+    for sign, term in _terms(value):
+        number, name = _read_term(term, value, quantity, known, parameters)
+        if name is None:
+            constant += sign * number
+        else:
+            slopes[known[name]] += sign * number
+    return Affine(constant, tuple(slopes.tolist()))
+
+
+def _own_quantity(text: str, known: Mapping[str, int], parameters: Sequence[Parameter]) -> str:
+    """What the first term of an expression measures."""
+    _, term = _terms(text)[0]
+    if term["unit"] is not None:
+        return quantity_of(term["unit"])
+    name = term["factor"] or term["name"]
+    return parameters[known[name]].quantity if name in known else "ratio"
+
+
+def _terms(text: str) -> list[tuple[float, re.Match]]:
+    """The terms of a sum with their signs."""
+    result, position, rest = [], 0, text.strip()
+    while position < len(rest):
+        sign = re.compile(r"\s*([+-]?)\s*").match(rest, position)
+        assert sign is not None
+        term = _TERM.match(rest, sign.end())
+        if term is None or (result and not sign.group(1)):
+            raise StudyError(
+                f"'{text}' is not a number with a unit, nor a sum such as \"0.5 * pressure + 2 kPa\""
+            )
+        result.append((-1.0 if sign.group(1) == "-" else 1.0, term))
+        position = term.end()
+    if not result:
+        raise StudyError("an empty text is no quantity")
+    return result
+
+
+def _read_term(
+    term: re.Match, text: str, quantity: str, known: Mapping[str, int], parameters: Sequence[Parameter]
+) -> tuple[float, str | None]:
+    """Number (SI) and parameter's name, if any, of one term."""
+    number, unit = term["number"], term["unit"]
+    name = term["factor"] or term["name"]
+    if name is not None and name not in known:
+        raise StudyError(f"'{text}' names '{name}', which is no parameter; {_listed(known)}")
+    if unit is not None:
+        value = to_si(float(number), unit, quantity)
+        if name is not None and parameters[known[name]].quantity != "ratio":
+            raise StudyError(f"'{text}': only a parameter without unit can be multiplied by {number} {unit}")
+        return value, name
+    value = 1.0 if number is None else float(number)
+    if name is None:
+        if quantity != "ratio":
+            raise StudyError(f"'{text}' lacks a unit of {quantity}: {', '.join(FACTORS[quantity])}")
+        return value, None
+    if FACTORS[parameters[known[name]].quantity] is not FACTORS[quantity]:
+        raise StudyError(
+            f"'{text}': the parameter {name} is of {parameters[known[name]].quantity}, "
+            f"and {quantity} is wanted here"
+        )
+    return value, name
+
+
+def _listed(names: Mapping[str, int]) -> str:
+    return f"the parameters are {', '.join(names)}" if names else "the study has no parameters"

@@ -1,0 +1,102 @@
+"""A solid as the sweep sees it: paths from neighbour to neighbour, and snapshots of its fields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import SolverError
+from morph_dslam.offline.load_ramp import loaded_state
+from morph_dslam.offline.newton import PathError, State, advance, sensitivities, solve
+from morph_dslam.offline.problem import Snapshot
+from morph_dslam.offline.solid import SolidProblem
+
+Array = NDArray[np.float64]
+
+#: Fields of a snapshot and what they are called when recovered.
+_FIELDS = {"displacement": "displacement", "stress_solid": "stress", "strain": "strain"}
+
+
+@dataclass(frozen=True)
+class SolidState:
+    """A solution and its derivatives.
+
+    Attributes
+    ----------
+    mu : (d,). dofs : (n,). slopes : (d, n) of the dofs by the parameters. negative_pivots : of the tangent.
+    """
+
+    mu: Array
+    dofs: Array
+    slopes: Array
+    negative_pivots: int | None
+
+
+class SolidSweep:
+    """Solves a solid at one parameter point after another (`morph_dslam.offline.problem.SweepProblem`)."""
+
+    def __init__(self, problem: SolidProblem) -> None:
+        self.problem = problem
+
+    def first_state(self) -> SolidState:
+        """Equilibrium at the parameters' defaults, all loads grown together."""
+        return self._with_slopes(loaded_state(self.problem, self.problem.symbols.default))
+
+    def pack(self, state: SolidState) -> dict[str, Array]:
+        pivots = -1 if state.negative_pivots is None else state.negative_pivots
+        return {"mu": state.mu, "dofs": state.dofs, "slopes": state.slopes, "pivots": np.array(pivots)}
+
+    def unpack(self, arrays: dict[str, Array]) -> SolidState:
+        pivots = int(arrays["pivots"])
+        return SolidState(arrays["mu"], arrays["dofs"], arrays["slopes"], None if pivots < 0 else pivots)
+
+    def advance(self, start: SolidState, target: Array) -> SolidState:
+        """Solve at ``target``: at once from the prediction of the sensitivities, or in increments."""
+        predicted = State(target, start.dofs + (target - start.mu) @ start.slopes)
+        try:
+            state = solve(self.problem, target, predicted)
+        except SolverError:
+            state = self._in_increments(start, target)
+        return self._with_slopes(state)
+
+    def _in_increments(self, start: SolidState, target: Array) -> State:
+        try:
+            return advance(self.problem, State(start.mu, start.dofs), target).states[-1]
+        except PathError as error:
+            last = self._describe(error.path.states[-1].mu)
+            raise SolverError(
+                f"no equilibrium found beyond {last}, where the last solution converged"
+            ) from error
+
+    def _describe(self, mu: Array) -> str:
+        parameters = self.problem.symbols.parameters
+        return ", ".join(
+            f"{parameter.name} {parameter.display(value):.5g} {parameter.unit}".removesuffix(" 1")
+            for parameter, value in zip(parameters, mu, strict=True)
+        )
+
+    def _with_slopes(self, state: State) -> SolidState:
+        return SolidState(state.mu, state.dofs, sensitivities(self.problem, state), state.negative_pivots)
+
+    def take_snapshot(self, state: SolidState) -> Snapshot:
+        """Displacement, Cauchy stress and Green-Lagrange strain at nodes, their slopes, and reactions."""
+        fields = self.problem.sample(state.dofs, state.mu)
+        slopes = self.problem.sample_slopes(state.dofs, state.mu, state.slopes)
+        return Snapshot(
+            state.mu,
+            {name: fields[recovered] for name, recovered in _FIELDS.items()},
+            {name: slopes[recovered] for name, recovered in _FIELDS.items()},
+            self._outputs(state),
+        )
+
+    def _outputs(self, state: SolidState) -> dict[str, Array]:
+        """Forces (N) and moments (N m, about the object frame's origin) of the sets that are held."""
+        outputs = {}
+        if state.negative_pivots is not None:
+            outputs["negative_pivots"] = np.array(state.negative_pivots)
+        for support in self.problem.supports:
+            force, moment = self.problem.reactions(state.dofs, state.mu, support.on, np.zeros(3))
+            outputs[f"force_{support.on}"], outputs[f"moment_{support.on}"] = force, moment
+        return outputs
