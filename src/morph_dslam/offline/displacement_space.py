@@ -64,6 +64,7 @@ class DisplacementSpace:
     node_values : sparse (n_nodes, n_scalar): values at nodes from coefficients.
     coefficients : sparse (n_scalar, n_nodes): coefficients of the interpolation of nodal values.
     coordinates : (n_scalar, 3) coefficients of the position X, m.
+    bonus_order : what integrals over cells need beyond NGSolve's own order of quadrature.
 
     Raises
     ------
@@ -94,6 +95,7 @@ class DisplacementSpace:
         self.n_scalar: int = self.scalar.ndof
         self._blocks = self._make_blocks()
         self._relate_nodes()
+        self.bonus_order = 0
         self.coordinates: Array = self.coefficients @ mesh.nodes
         self._curve()
 
@@ -130,13 +132,18 @@ class DisplacementSpace:
             )
 
     def _curve(self) -> None:
-        """Give NGSolve the cells' true shape: coefficients of the position beyond the corners."""
+        """Give NGSolve the cells' true shape: coefficients of the position beyond the corners.
+
+        It goes on choosing quadrature for straight cells, which on tetrahedra is too low for curved ones.
+        """
         bubbles = self.coordinates.copy()
         bubbles[: self.geometry.ngs.nv] = 0.0
         if np.abs(bubbles).max() > STRAIGHT * np.ptp(self.geometry.mesh.nodes, axis=0).max():
             self._deformation = ngs.GridFunction(self.vector)
             self._deformation.vec.FV().NumPy()[:] = bubbles.T.ravel()
             self.geometry.ngs.SetDeformation(self._deformation)
+            if any(basis.type.shape == "tet" for basis in self._blocks):
+                self.bonus_order = 2
 
     def dofs_on(self, nodes: Indices) -> Indices:
         """Scalar dofs (sorted) that a set of nodes holds.

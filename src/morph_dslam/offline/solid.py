@@ -146,7 +146,11 @@ class SolidProblem:
         kinematics = Kinematics(trial, self.shape)
         F, ratio = kinematics.deformation_gradient, kinematics.volume_ratio
         terms = [
-            Term(region.energy(F, region.pressure(unknowns)) * ratio, region.region)
+            Term(
+                region.energy(F, region.pressure(unknowns)) * ratio,
+                region.region,
+                self.displacements.bonus_order,
+            )
             for region, unknowns in zip(self.regions, pressures, strict=True)
         ]
         for support in self.supports:

@@ -1,0 +1,94 @@
+"""Small solids for tests: meshes, supports that tests need and users do not, and the usual solution path."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.model import Parameter
+from morph_dslam.offline.materials.isotropic import NeoHookean
+from morph_dslam.offline.mesh_generators import block
+from morph_dslam.offline.meshes import CellBlock, Mesh
+from morph_dslam.offline.newton import State, advance
+from morph_dslam.offline.parameters import ParameterSymbols
+from morph_dslam.offline.solid import SolidProblem
+from morph_dslam.offline.supports import AffineMotion
+
+Array = NDArray[np.float64]
+
+SOLID_CELLS = ("hex8", "hex20", "hex27", "tet4", "tet10", "prism6", "prism15", "prism18")
+FACES = ("x_min", "x_max", "y_min", "y_max", "z_min", "z_max")
+RUBBER = NeoHookean(young=3e6, poisson=0.45)
+
+
+def load_parameter(**defaults: float) -> ParameterSymbols:
+    """Symbols of parameters without units, by name."""
+    return ParameterSymbols([Parameter(name, "ratio", "1", -9.0, 9.0, v) for name, v in defaults.items()])
+
+
+@dataclass(frozen=True, eq=False)
+class AffineSupport:
+    """Moves a set by u = amount * gradient X, ``amount`` a symbol."""
+
+    on: str
+    gradient: Array
+    amount: object
+    components = (True, True, True)
+    centred_on = None
+
+    def motion(self, symbols: ParameterSymbols, centroid: Array, centroid_slopes: Array) -> AffineMotion:
+        d = len(symbols)
+        return AffineMotion(
+            symbols.value(self.amount) * self.gradient,
+            np.zeros(3),
+            symbols.slopes(self.amount)[:, None, None] * self.gradient,
+            np.zeros((d, 3)),
+        )
+
+
+def distorted(mesh: Mesh, amount: float, seed: int = 0, corners_only: bool = False) -> Mesh:
+    """The mesh with the nodes inside of it moved at random by up to ``amount``.
+
+    ``corners_only`` keeps edges straight: middle nodes stay in the middle.
+    """
+    moves = amount * np.random.default_rng(seed).uniform(-1.0, 1.0, mesh.nodes.shape)
+    moves[np.unique(mesh.face_nodes(mesh.boundary_faces()))] = 0.0
+    if corners_only:
+        for cells in mesh.blocks:
+            corners = cells.type.corners
+            for i, parents in enumerate(cells.type.parents):
+                moves[cells.connectivity[:, corners + i]] = moves[cells.connectivity[:, parents]].mean(axis=1)
+    return replace(mesh, nodes=mesh.nodes + moves)
+
+
+def mapped_block(divisions: tuple[int, int, int], cell_type: str, place: Callable[[Array], Array]) -> Mesh:
+    """A unit block with its nodes moved by ``place``, (n, 3) -> (n, 3)."""
+    mesh = block((1.0, 1.0, 1.0), divisions, cell_type)
+    return replace(mesh, nodes=place(mesh.nodes))
+
+
+def merged(meshes: list[Mesh]) -> Mesh:
+    """Meshes of one cell type that meet at equal nodes, as one; surfaces of the same name are joined."""
+    starts = np.cumsum([0] + [mesh.n_nodes for mesh in meshes])
+    nodes = np.concatenate([mesh.nodes for mesh in meshes])
+    _, first, number = np.unique(np.round(nodes, 9), axis=0, return_index=True, return_inverse=True)
+    connectivity = np.concatenate(
+        [
+            number.ravel()[mesh.blocks[0].connectivity + start]
+            for mesh, start in zip(meshes, starts, strict=False)
+        ]
+    )
+    cells = np.cumsum([0] + [mesh.n_cells for mesh in meshes])
+    surfaces = {}
+    for name in meshes[0].surfaces:
+        shifted = [m.surfaces[name] + [start, 0] for m, start in zip(meshes, cells, strict=False)]
+        surfaces[name] = np.concatenate(shifted)
+    return Mesh(nodes[first], (CellBlock(meshes[0].blocks[0].cell_type, connectivity),), surfaces=surfaces)
+
+
+def solved(problem: SolidProblem, *mu: float) -> State:
+    """The solution at ``mu``, along a straight line from the parameters' defaults."""
+    return advance(problem, problem.initial_state(), np.array(mu, dtype=float)).states[-1]

@@ -1,0 +1,82 @@
+"""Homogeneous deformations of a block of neo-Hookean rubber against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from morph_dslam.offline.loads import DeadTraction
+from morph_dslam.offline.materials.isotropic import NeoHookean
+from morph_dslam.offline.mesh_generators import block
+from morph_dslam.offline.solid import SolidOptions, SolidProblem
+from morph_dslam.offline.supports import PrescribedDisplacement
+from tests.support.solids import FACES, RUBBER, AffineSupport, distorted, load_parameter, solved
+
+ROLLERS = (
+    PrescribedDisplacement("x_min", x=0.0),
+    PrescribedDisplacement("y_min", y=0.0),
+    PrescribedDisplacement("z_min", z=0.0),
+)
+#: Lame's constants 4 and 1 (MPa): Poisson's ratio lambda / 2(lambda + mu), E = 2 mu (1 + nu).
+STIFF = NeoHookean(young=2.8e6, poisson=0.4)
+
+
+@pytest.mark.parametrize(
+    ("material", "lateral", "stress"), [(RUBBER, 0.830679, 1.075843e6), (STIFF, 0.846028, 1.022825e6)]
+)
+@pytest.mark.parametrize(("cell_type", "mixed"), [("hex8", False), ("hex20", True), ("tet10", False)])
+def test_uniaxial_stretch(
+    material: NeoHookean, lateral: float, stress: float, cell_type: str, mixed: bool
+) -> None:
+    symbols = load_parameter(pull=0.0)
+    mesh = distorted(block((1.0, 1.0, 1.0), (2, 2, 2), cell_type), 0.05)
+    supports = [*ROLLERS, PrescribedDisplacement("x_max", x=symbols["pull"])]
+    problem = SolidProblem(
+        mesh, {"all": material}, supports, parameters=symbols, options=SolidOptions(mixed=mixed)
+    )
+    state = solved(problem, 0.5)
+    displacement = problem.nodal_displacement(state.dofs)
+    np.testing.assert_allclose(displacement[:, 1], (lateral - 1.0) * mesh.nodes[:, 1], atol=1e-6)
+    force, _ = problem.reactions(state.dofs, state.mu, "x_max")
+    assert force[0] == pytest.approx(stress, rel=1e-6)
+    fields = problem.recovery.at_nodes(state.dofs, state.mu, ("first_piola_kirchhoff", "stress"))
+    np.testing.assert_allclose(fields["first_piola_kirchhoff"][:, 0], stress, rtol=2e-6)
+    np.testing.assert_allclose(fields["von_mises"], stress / lateral**2, rtol=3e-6)
+
+
+def test_uniaxial_traction_is_the_inverse_of_stretch() -> None:
+    symbols = load_parameter(share=0.0)
+    mesh = block((1.0, 1.0, 1.0), (2, 1, 1), "hex8")
+    load = DeadTraction("x_max", (1.075843e6 * symbols["share"], 0.0, 0.0))
+    problem = SolidProblem(mesh, {"all": RUBBER}, ROLLERS, [load], symbols)
+    state = solved(problem, 1.0)
+    at_end = problem.nodal_displacement(state.dofs)[mesh.set_nodes("x_max"), 0]
+    np.testing.assert_allclose(at_end, 0.5, rtol=2e-6)
+
+
+def test_simple_shear() -> None:
+    symbols = load_parameter(shear=0.0)
+    gradient = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    mesh = distorted(block((1.0, 1.0, 1.0), (2, 2, 2), "hex8"), 0.1)
+    supports = [AffineSupport(face, gradient, symbols["shear"]) for face in FACES]
+    problem = SolidProblem(mesh, {"all": RUBBER}, supports, parameters=symbols)
+    state = solved(problem, 0.5)
+    fields = problem.recovery.at_nodes(state.dofs, state.mu, ("deformation_gradient", "stress"))
+    F = fields["deformation_gradient"].reshape(-1, 3, 3)
+    np.testing.assert_allclose(np.linalg.det(F), 1.0, rtol=1e-10)
+    xx, yy, zz, yz, xz, xy = fields["stress"].T / 1e6
+    np.testing.assert_allclose(xy, 0.517241, atol=1e-6)
+    np.testing.assert_allclose(xx, 0.258621, atol=1e-6)
+    np.testing.assert_allclose([yy, zz, yz, xz], 0.0, atol=1e-9)
+
+
+def test_strain_energy_is_the_work_of_the_load() -> None:
+    symbols = load_parameter(pull=0.0)
+    supports = [*ROLLERS, PrescribedDisplacement("x_max", x=symbols["pull"])]
+    mesh = block((1.0, 1.0, 1.0), (1, 1, 1), "hex20")
+    problem = SolidProblem(mesh, {"all": RUBBER}, supports, parameters=symbols)
+    points, weights = np.polynomial.legendre.leggauss(6)
+    states = [solved(problem, 0.25 * (1.0 + p)) for p in points]
+    forces = [problem.reactions(s.dofs, s.mu, "x_max")[0][0] for s in states]
+    end = solved(problem, 0.5)
+    assert problem.strain_energy(end.dofs, end.mu) == pytest.approx(0.25 * weights @ forces, rel=1e-7)
