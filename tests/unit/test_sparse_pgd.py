@@ -1,0 +1,138 @@
+"""Sparse PGD on functions whose separation is known."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy.stats import qmc
+
+from morph_dslam.model.basis_functions import (
+    chebyshev_basis,
+    hat_basis,
+    kriging_basis,
+    p_spline_basis,
+)
+from morph_dslam.offline.sparse_pgd import (
+    SamplingWarning,
+    SparsePgd,
+    SparsePgdOptions,
+    fit_sparse_pgd,
+    smoothed_fit,
+)
+
+SPACE = np.linspace(0.0, 1.0, 25)
+MODES = np.stack([np.sin(np.pi * SPACE), SPACE**2])
+NODES = np.linspace(-1.0, 1.0, 10)
+BASES = {
+    "chebyshev": chebyshev_basis(-1.0, 1.0, 9),
+    "p-splines": p_spline_basis(-1.0, 1.0, 10),
+    "kriging": kriging_basis(-1.0, 1.0, NODES, 1.0),
+    "hats": hat_basis(NODES),
+}
+
+
+def ishigami(mu: np.ndarray) -> np.ndarray:
+    """Ishigami's function on a shorter range, a sum of two products in space (n, 25).
+
+    (sin a (1 + 0.1 c^4)) sin(pi X) + 7 sin^2 b X^2 with a, b, c = 2 mu.
+    """
+    a, b, c = (2.0 * mu).T
+    return np.column_stack([np.sin(a) * (1.0 + 0.1 * c**4), 7.0 * np.sin(b) ** 2]) @ MODES
+
+
+def ishigami_slope_of_c(mu: np.ndarray) -> np.ndarray:
+    a, _, c = (2.0 * mu).T
+    return np.outer(2.0 * np.sin(a) * 0.4 * c**3, MODES[0])
+
+
+def samples(count: int, seed: int = 0) -> np.ndarray:
+    """Scattered points, denser towards the faces of the box."""
+    return -np.cos(np.pi * qmc.Halton(3, rng=seed).random(count))
+
+
+def predicted(fit: SparsePgd, mu: np.ndarray) -> np.ndarray:
+    return np.stack([fit.functions.evaluate(m)[0] for m in mu]) @ fit.pod.modes
+
+
+def relative(error: np.ndarray, reference: np.ndarray) -> float:
+    return float(np.linalg.norm(error) / np.linalg.norm(reference))
+
+
+@pytest.mark.parametrize(
+    ("name", "tolerance"), [("chebyshev", 4e-4), ("p-splines", 3e-3), ("kriging", 1e-2), ("hats", 3e-2)]
+)
+def test_ishigamis_function_is_found_from_scattered_samples(name: str, tolerance: float) -> None:
+    mu, new = samples(150), np.random.default_rng(1).uniform(-0.95, 0.95, (100, 3))
+    fit = fit_sparse_pgd(mu, ishigami(mu), (BASES[name],) * 3, SparsePgdOptions(max_modes=6))
+    assert len(fit.pod.modes) == 2  # the field has two modes in space
+    assert relative(predicted(fit, new) - ishigami(new), ishigami(new)) <= tolerance
+
+
+def test_its_sensitivities_are_those_of_the_function() -> None:
+    mu, new = samples(150), np.random.default_rng(1).uniform(-0.95, 0.95, (50, 3))
+    fit = fit_sparse_pgd(mu, ishigami(mu), (BASES["chebyshev"],) * 3, SparsePgdOptions(max_modes=6))
+    slopes = np.stack([fit.functions.evaluate(m)[1][2] for m in new]) @ fit.pod.modes
+    assert relative(slopes - ishigami_slope_of_c(new), ishigami_slope_of_c(new)) <= 2e-3
+
+
+def test_two_products_are_enough_for_a_sum_of_two() -> None:
+    def field(mu: np.ndarray) -> np.ndarray:
+        a, b, c = mu.T
+        return np.column_stack([np.exp(a) * (1.0 + b) * c, (2.0 + a) * np.cos(b)]) @ MODES
+
+    mu, new = samples(120), np.random.default_rng(2).uniform(-1.0, 1.0, (50, 3))
+    options = SparsePgdOptions(max_modes=2, refit_every=2, refit_sweeps=60)
+    fit = fit_sparse_pgd(mu, field(mu), (BASES["chebyshev"],) * 3, options)
+    assert fit.n_products == 2
+    assert relative(predicted(fit, new) - field(new), field(new)) <= 1e-5
+
+
+def test_noise_stops_the_enrichment_and_is_smoothed() -> None:
+    """More products than the signal has would fit the noise: the samples kept aside must say so."""
+    rng = np.random.default_rng(3)
+    mu, new = samples(200), rng.uniform(-0.95, 0.95, (100, 3))
+    scale = np.sqrt(np.mean(ishigami(mu) ** 2))
+    noisy = ishigami(mu) + 0.05 * scale * rng.normal(size=(len(mu), len(SPACE)))
+    options = SparsePgdOptions(max_modes=30, pod_tolerance=0.05)
+    fit = fit_sparse_pgd(mu, noisy, (BASES["p-splines"],) * 3, options)
+    assert fit.n_products <= 9
+    assert fit.n_products == min(fit.validation_errors, key=lambda n: fit.validation_errors[n])
+    assert relative(predicted(fit, new) - ishigami(new), ishigami(new)) <= 0.03
+
+
+def test_too_few_samples_are_warned_of() -> None:
+    mu = samples(30)
+    options = SparsePgdOptions(max_modes=6, validation_fraction=0.1)
+    with pytest.warns(SamplingWarning, match="30 samples for . products of 10 functions"):
+        fit_sparse_pgd(mu, ishigami(mu), (BASES["p-splines"],) * 3, options)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit_sparse_pgd(samples(150), ishigami(samples(150)), (BASES["p-splines"],) * 3, options)
+
+
+def test_the_smoothing_weight_has_the_least_score_of_cross_validation() -> None:
+    """Against GCV written out with the hat matrix on a fine grid of weights."""
+    rng = np.random.default_rng(4)
+    x = np.sort(rng.uniform(-1.0, 1.0, 80))
+    y = np.sin(3.0 * x) + 0.1 * rng.normal(size=80)
+    basis = p_spline_basis(-1.0, 1.0, 15)
+    w, p = basis.evaluate(x), basis.penalty()
+    scores, fits = [], []
+    for weight in np.logspace(-8.0, 2.0, 400):
+        hat = w @ np.linalg.solve(w.T @ w + weight * p, w.T)
+        fits.append(hat @ y)
+        scores.append(np.sum((y - hat @ y) ** 2) / (80.0 - np.trace(hat)) ** 2)
+    found = w @ smoothed_fit(w.T @ w, w.T @ y, y @ y, 80, p)
+    np.testing.assert_allclose(found, fits[int(np.argmin(scores))], atol=0.02)
+    # and that is nearer the truth than the unsmoothed fit
+    plain = w @ np.linalg.lstsq(w, y, rcond=None)[0]
+    assert np.linalg.norm(found - np.sin(3.0 * x)) < np.linalg.norm(plain - np.sin(3.0 * x))
+
+
+def test_one_parameter_is_allowed() -> None:
+    x = np.linspace(-1.0, 1.0, 40)[:, None]
+    field = np.column_stack([np.exp(x[:, 0]), np.cos(2.0 * x[:, 0])]) @ MODES
+    fit = fit_sparse_pgd(x, field, (BASES["chebyshev"],), SparsePgdOptions(max_modes=3))
+    assert predicted(fit, x) == pytest.approx(field, abs=1e-5)
