@@ -32,7 +32,7 @@ def test_quadrature_integrates_the_volume_and_the_square_of_a_coordinate(name):
     kind = cell_type(name)
     points, weights = kind.quadrature()
     assert weights.sum() == pytest.approx(VOLUMES[kind.shape], rel=1e-13)
-    # Integrals of x^2: 2! / (2 + dim)! over a simplex (Dirichlet), 1/3 over a cube; a prism's is its triangle's.
+    # Of x^2: 2! / (2 + dim)! over a simplex (Dirichlet), 1/3 over a cube; a prism has its triangle's.
     simplex = {"tri": 2 / factorial(4), "prism": 2 / factorial(4), "tet": 2 / factorial(5)}
     assert weights @ points[:, 0] ** 2 == pytest.approx(simplex.get(kind.shape, 1 / 3), rel=1e-12)
 

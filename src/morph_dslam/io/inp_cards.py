@@ -25,13 +25,19 @@ class Line:
         """A StudyError that begins with the file and the line."""
         return StudyError(f"{self.path}, line {self.number}: {message}")
 
+    def text(self, position: int) -> str:
+        """The field at a position; StudyError if the line ends before it."""
+        if position >= len(self.fields):
+            raise self.error(f"value {position + 1} is missing")
+        return self.fields[position]
+
     def integer(self, position: int) -> int:
         """The field at a position as a whole number; StudyError if it is not one."""
         return int(self._parsed(position, int, "a whole number"))
 
     def real(self, position: int) -> float:
         """The field at a position as a finite number (an empty one is 0); StudyError if it is not one."""
-        if not self.fields[position]:
+        if not self.text(position):
             return 0.0
         # Abaqus takes Fortran's exponent letter too.
         value = float(self._parsed(position, lambda text: float(text.upper().replace("D", "E")), "a number"))
@@ -41,7 +47,7 @@ class Line:
 
     def _parsed(self, position: int, kind, what: str):
         try:
-            return kind(self.fields[position])
+            return kind(self.text(position))
         except ValueError:
             raise self.error(f"'{self.fields[position]}' is not {what}") from None
 
@@ -124,7 +130,9 @@ def read_cards(path: Path) -> list[Card]:
         if text.startswith("*"):
             cards.append(_card(source, number, text))
             continue
-        line = Line(_split(text), source, number)
+        fields = _split(text)
+        # A comma at the end says that more may follow, not that an empty field does.
+        line = Line(fields[:-1] if len(fields) > 1 and not fields[-1] else fields, source, number)
         if not cards:
             raise line.error("the file begins with data; an input file begins with a keyword such as *NODE")
         cards[-1].data.append(line)

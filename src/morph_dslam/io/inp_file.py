@@ -234,7 +234,7 @@ def read_inp(path: Path) -> InpFile:
     labels, nodes = _read_nodes(by_keyword.get("NODE", []), node_sets)
     element_cards = by_keyword.get("ELEMENT", [])
     elements = tuple(_read_elements(card) for card in element_cards)
-    if not len(labels) or not elements:
+    if not len(labels) or not any(len(part.labels) for part in elements):
         raise StudyError(
             f"{path} holds no {'elements' if len(labels) else 'nodes'}; it is no mesh, or is cut short"
         )

@@ -70,7 +70,7 @@ class LabelSets:
 
     def entry(self, line: Line, position: int, defined: Labels) -> Labels:
         """Labels that a field stands for: itself, or a set's."""
-        text = line.fields[position]
+        text = line.text(position)
         single = _Set(text, entries=[(line, line.integer(position) if _is_label(text) else text)])
         return self._expand(single, defined, ())
 
