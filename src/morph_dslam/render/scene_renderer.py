@@ -1,4 +1,4 @@
-"""Pictures of a scene: a printed, lit sheet before a background, as a camera with noise would take them."""
+"""Pictures of a scene: a printed, lit object before a background, as a camera with noise would take them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from morph_dslam.render.photographs import load_photograph
 from morph_dslam.render.rasteriser import Buffers, rasterise
 from morph_dslam.render.scene_file import Background, Scene, Sensor, Surface
 from morph_dslam.render.shading import lambert, vertex_normals
-from morph_dslam.render.sheet_points import sheet_bounds, texture_coordinates
+from morph_dslam.render.sheet_points import is_sheet, sheet_bounds, texture_coordinates
+from morph_dslam.render.solid_points import TexturedSurface, box_projection, surface_size
 from morph_dslam.render.texture import interpolate, render_textured
 
 Array = NDArray[np.float64]
@@ -97,12 +98,38 @@ def add_sensor_noise(image: Image, sensor: Sensor, seed: tuple[int, int]) -> Ima
     return np.clip(np.rint(image + np.float32(sensor.noise) * noise), 0, 255).astype(np.uint8)
 
 
+def _print(
+    surface: Surface, model: ReducedModel, folder: Path, density: float
+) -> tuple[Image, TexturedSurface]:
+    """The texture of a sheet's rectangle, or of a solid's box, and how it lies on the surface."""
+    if is_sheet(model):
+        low, high = sheet_bounds(model)
+        texture = print_texture(surface, folder, high - low, density)
+        height, width = texture.shape[:2]
+        coordinates = texture_coordinates(model, surface.printed_face, width, height)
+        return texture, TexturedSurface(np.arange(len(model.nodes)), model.triangles, coordinates)
+    texture = print_texture(surface, folder, np.full(2, surface_size(model)), density)
+    return texture, box_projection(model, len(texture))
+
+
+def _printed_sides(model: ReducedModel, printed_face: str) -> Array:
+    """+1 for each triangle (m,) whose nodes, by their order, make its normal leave the printed face.
+
+    A solid is printed all over, and its triangles turn outwards.
+    """
+    if not is_sheet(model):
+        return np.ones(len(model.triangles))
+    rest = model.nodes[model.triangles]
+    normal_z = np.cross(rest[:, 1] - rest[:, 0], rest[:, 2] - rest[:, 0])[:, 2]
+    return np.sign(normal_z) * (1.0 if printed_face == "top" else -1.0)
+
+
 class SceneRenderer:
     """Takes the pictures of one scene.
 
     Parameters
     ----------
-    scene : its description. model : the sheet. camera : without lens distortion.
+    scene : its description. model : the object. camera : without lens distortion.
     folder : what paths in the scene are relative to.
     nearest_depth : metres; the print is made as fine as it can be seen from there.
 
@@ -119,20 +146,14 @@ class SceneRenderer:
         self._triangles = model.triangles
         self._factor = scene.supersampling
         self._camera = supersampled(camera, self._factor)
-        low, high = sheet_bounds(model)
         density = max(self._camera.fx, self._camera.fy) / nearest_depth
-        self._texture = print_texture(scene.surface, folder, high - low, density)
-        height, width = self._texture.shape[:2]
-        self._coordinates = texture_coordinates(model, scene.surface.printed_face, width, height)
+        self._texture, self._surface = _print(scene.surface, model, folder, density)
         self._background = cv2.resize(
             prepare_background(scene.background, folder, camera),
             (self._camera.width, self._camera.height),
             interpolation=cv2.INTER_CUBIC if scene.background.image else cv2.INTER_NEAREST,
         )
-        rest = model.nodes[model.triangles]
-        rest_normal_z = np.cross(rest[:, 1] - rest[:, 0], rest[:, 2] - rest[:, 0])[:, 2]
-        # +1 where the order of a triangle's nodes makes its normal leave the printed face.
-        self._sides = np.sign(rest_normal_z) * (1.0 if scene.surface.printed_face == "top" else -1.0)
+        self._sides = _printed_sides(model, scene.surface.printed_face)
 
     def _shows_print(self, points: Array) -> NDArray[np.bool_]:
         """Which triangles (m,) turn their printed face to the camera."""
@@ -145,7 +166,8 @@ class SceneRenderer:
         normals = vertex_normals(points, self._triangles)
         brightness = lambert(normals, np.array(light.direction), light.ambient)
         covered = buffers.covered
-        printed = render_textured(buffers, self._triangles, self._coordinates, self._texture)[covered]
+        surface = self._surface
+        printed = render_textured(buffers, surface.triangles, surface.coordinates, self._texture)[covered]
         shows_print = self._shows_print(points)[buffers.triangle_ids[covered]]
         colour = np.where(shows_print[:, None], printed, np.array(back, dtype=np.float32))
         lit = colour * interpolate(buffers, self._triangles, brightness.astype(np.float32))[:, None]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.errors import SceneError
 from morph_dslam.model import ReducedModel, SurfacePoints
 
 Array = NDArray[np.float64]
@@ -14,15 +13,10 @@ Array = NDArray[np.float64]
 FLATNESS = 0.02
 
 
-def check_sheet(model: ReducedModel) -> None:
-    """Raise SceneError unless the model at rest is a sheet in the plane z = constant."""
+def is_sheet(model: ReducedModel) -> bool:
+    """Whether the model at rest is a sheet in the plane z = constant."""
     extent = np.ptp(model.nodes[np.unique(model.triangles)], axis=0)
-    if extent[2] > FLATNESS * extent[:2].min():
-        size = " x ".join(f"{1e3 * side:.4g}" for side in extent)
-        raise SceneError(
-            f"the model '{model.name}' ({size} mm at rest) is not a sheet in its xy plane: "
-            "textures can be laid on sheets only"
-        )
+    return not model.cells and bool(extent[2] <= FLATNESS * extent[:2].min())
 
 
 def sheet_bounds(model: ReducedModel) -> tuple[Array, Array]:

@@ -25,7 +25,8 @@ from morph_dslam.render.motion import Motion, plan_motion
 from morph_dslam.render.rasteriser import rasterise, visible_points
 from morph_dslam.render.scene_file import Scene, load_scene_file
 from morph_dslam.render.scene_renderer import SceneRenderer, in_disc, pixel_axes
-from morph_dslam.render.sheet_points import check_sheet, landmark_nodes, regular_points
+from morph_dslam.render.sheet_points import is_sheet, landmark_nodes, regular_points
+from morph_dslam.render.solid_points import scattered_points, spread_nodes
 
 Array = NDArray[np.float64]
 
@@ -88,7 +89,6 @@ def _load_world(scene_path: Path) -> _World:
             f"{scene_path}: scenes are rendered without lens distortion; leave it out of the camera"
         )
     model = load_model(folder / scene.model)
-    check_sheet(model)
     try:
         motion = plan_motion(scene, model)
     except SceneError as error:
@@ -98,7 +98,7 @@ def _load_world(scene_path: Path) -> _World:
         points = world.node_positions(frame)
         if points[:, 2].min() <= 0.0:
             raise SceneError(
-                f"{scene_path}: in frame {frame} the sheet reaches behind the camera (z = "
+                f"{scene_path}: in frame {frame} the object reaches behind the camera (z = "
                 f"{1e3 * points[:, 2].min():.4g} mm): move it ahead with the pose's position_mm"
             )
     return world
@@ -118,13 +118,13 @@ def _prepare_folder(output: Path) -> None:
 
 def _write_landmarks(path: Path, world: _World) -> None:
     """Write landmarks that frame 0 shows: mesh nodes and their pixels."""
-    nodes = landmark_nodes(world.model)
+    nodes = landmark_nodes(world.model) if is_sheet(world.model) else spread_nodes(world.model)
     positions = world.node_positions(0)
     nodes = nodes[world.visible(0, positions[nodes], world.depth_image(positions))]
     if len(nodes) < MIN_LANDMARKS:
         raise SceneError(
-            f"frame 0 shows {len(nodes)} landmarks of the sheet, and a tracker needs {MIN_LANDMARKS}: "
-            "let the first key frames show the whole sheet, without the occluder"
+            f"frame 0 shows {len(nodes)} landmarks of the object, and a tracker needs {MIN_LANDMARKS}: "
+            "let the first key frames show all of it, without the occluder"
         )
     landmarks = Landmarks(world.model.nodes[nodes], world.camera.project(positions[nodes]))
     save_landmarks(path, landmarks)
@@ -166,7 +166,7 @@ def _create_depth(file: h5py.File, world: _World) -> h5py.Dataset:
         compression_opts=1,
         shuffle=True,
     )
-    dataset.attrs["description"] = "depth along the optical axis in metres; 0 where the sheet is not seen"
+    dataset.attrs["description"] = "depth along the optical axis in metres; 0 where the object is not seen"
     return dataset
 
 
@@ -217,6 +217,7 @@ def simulate(scene_path: Path, output: Path, progress: bool = True) -> None:
     _prepare_folder(output)
     save_camera(output / "camera.yaml", world.camera)
     _write_landmarks(output / "landmarks.csv", world)
-    truth = _truth_positions(world, regular_points(world.model, N_TRUTH_POINTS))
+    spread = regular_points if is_sheet(world.model) else scattered_points
+    truth = _truth_positions(world, spread(world.model, N_TRUTH_POINTS))
     visible = _render_frames(world, renderer, output, truth, progress)
     _write_truth(output / "truth.npz", world, truth, visible)
