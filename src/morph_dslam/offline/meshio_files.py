@@ -23,7 +23,7 @@ Indices = NDArray[np.int64]
 #: Our cell types by meshio's names; its node order is VTK's, save that linear prisms are as Abaqus's.
 _CELLS = {
     "tetra": "tet4", "tetra10": "tet10", "triangle": "tri3", "quad": "quad4",
-    "wedge": "prism6", "wedge15": "prism15", "wedge18": "prism18",
+    "wedge": "prism6", "wedge18": "prism18",
     "hexahedron": "hex8", "hexahedron20": "hex20", "hexahedron27": "hex27",
 }  # fmt: skip
 #: Dimension of the cells that may only bound others.
@@ -81,10 +81,18 @@ def _read(path: Path) -> Any:
         raise StudyError(f"cannot read the mesh {path}: {error.strerror or error}") from error
     except StudyError:
         raise
+    except KeyError as error:  # a cell type without a place in meshio's tables, or a damaged file
+        if "wedge15" in error.args:
+            raise StudyError(f"{path} holds prisms of 15 nodes; save it as .inp, or with 18 nodes") from error
+        raise _damaged(path, error) from error
     except Exception as error:  # a damaged file ends meshio's readers in errors of every kind
-        raise StudyError(
-            f"{path} is damaged, cut short, or no {path.suffix} file ({type(error).__name__}: {error})"
-        ) from error
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, error: Exception) -> StudyError:
+    return StudyError(
+        f"{path} is damaged, cut short, or no {path.suffix} file ({type(error).__name__}: {error})"
+    )
 
 
 def _check_sections_closed(path: Path) -> None:

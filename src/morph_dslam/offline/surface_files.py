@@ -78,7 +78,8 @@ def _read_obj(path: Path) -> tuple[Array, Indices]:
 def _read_stl_or_ply(path: Path) -> tuple[Array, Indices]:
     reader = meshio.stl.read if path.suffix.lower() == ".stl" else meshio.ply.read
     try:
-        content = reader(str(path))
+        with np.errstate(over="ignore"):  # meshio takes the text of an ASCII file for a count of triangles
+            content = reader(str(path))
     except OSError:
         raise
     except Exception as error:  # a damaged file ends meshio's readers in errors of every kind

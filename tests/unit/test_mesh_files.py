@@ -1,0 +1,360 @@
+"""Mesh files of every kind, written here or by other libraries, give metres, cells and named sets."""
+
+from math import pi
+
+import meshio
+import netgen.occ as occ
+import numpy as np
+import pytest
+
+from morph_dslam.errors import StudyError
+from morph_dslam.offline.mesh_checks import check_mesh
+from morph_dslam.offline.mesh_files import load_mesh
+from morph_dslam.offline.mesh_generators import block
+from morph_dslam.offline.mesh_geometry import cell_volumes, surface_area
+from tests.support.real_data import real_data
+
+ABAQUS = {
+    "hex8": "C3D8", "hex20": "C3D20R", "hex27": "C3D27", "tet4": "C3D4", "tet10": "C3D10M",
+    "prism6": "C3D6", "prism15": "C3D15",
+}  # fmt: skip
+MESHIO = {
+    "hex8": "hexahedron", "hex20": "hexahedron20", "hex27": "hexahedron27", "tet4": "tetra",
+    "tet10": "tetra10", "prism6": "wedge", "prism18": "wedge18",
+}  # fmt: skip
+FILE_KINDS = ("inp", "msh", "vtk", "vtu", "stl", "obj", "step")
+#: Gmsh 2.2: a bar of two hexahedra of 10 mm, its left half "soft", its right end "grip", a line "edge".
+GMSH = """$MeshFormat
+2.2 0 8
+$EndMeshFormat
+$PhysicalNames
+4
+1 4 "edge"
+2 3 "grip"
+3 1 "soft"
+3 2 "hard"
+$EndPhysicalNames
+$Nodes
+12
+1 0 0 0
+2 10 0 0
+3 20 0 0
+4 0 10 0
+5 10 10 0
+6 20 10 0
+7 0 0 10
+8 10 0 10
+9 20 0 10
+10 0 10 10
+11 10 10 10
+12 20 10 10
+$EndNodes
+$Elements
+4
+1 1 2 4 1 1 2
+2 3 2 3 1 3 6 12 9
+3 5 2 1 1 1 2 5 4 7 8 11 10
+4 5 2 2 2 2 3 6 5 8 9 12 11
+$EndElements
+"""
+
+
+def inp_text(name):
+    """A block of 20 x 20 x 30 mm as an input file; its nodes are numbered from 5 in steps of 3."""
+    mesh = block((20.0, 20.0, 30.0), (1, 2, 2), name)
+    cells = mesh.blocks[0].connectivity
+    if name == "hex27":  # Abaqus: the centre, then faces S1 to S6 (z-, z+, y-, x+, y+, x-)
+        cells = cells[:, [*range(20), 26, 24, 25, 22, 21, 23, 20]]
+    lines = ["*NODE"] + [f"{5 + 3 * i}, {x}, {y}, {z}" for i, (x, y, z) in enumerate(mesh.nodes.tolist())]
+    lines.append(f"*ELEMENT, TYPE={ABAQUS[name]}, ELSET=body")
+    for i, cell in enumerate(cells.tolist()):
+        row = [str(7 + 2 * i), *(str(5 + 3 * node) for node in cell)]
+        lines += [
+            ", ".join(row[k : k + 12]) + ("," if k + 12 < len(row) else "") for k in range(0, len(row), 12)
+        ]
+    for surface, faces in mesh.surfaces.items():
+        lines += [f"*SURFACE, NAME={surface}", *(f"{7 + 2 * c}, S{f + 1}" for c, f in faces.tolist())]
+    return "\n".join([*lines, "*SURFACE, NAME=skin", "body,", ""]), mesh
+
+
+@pytest.mark.parametrize("name", ABAQUS)
+def test_an_input_file_gives_the_block_that_was_written_in_metres(tmp_path, name):
+    text, drawn = inp_text(name)
+    (tmp_path / "block.inp").write_text(text)
+    mesh = load_mesh(tmp_path / "block.inp", "mm")
+    check_mesh(mesh, sets=("x_min", "skin"), regions=("body",))
+    np.testing.assert_allclose(mesh.nodes, drawn.nodes * 1e-3, rtol=1e-12)
+    np.testing.assert_array_equal(mesh.blocks[0].connectivity, drawn.blocks[0].connectivity)
+    assert cell_volumes(mesh).sum() == pytest.approx(12e-6, rel=1e-12)
+    areas = [surface_area(mesh, s) for s in ("x_max", "y_min", "z_max", "skin")]
+    assert areas == pytest.approx([6e-4, 6e-4, 4e-4, 32e-4], rel=1e-12)
+    np.testing.assert_allclose(mesh.nodes[mesh.surface_nodes("z_max"), 2], 0.03)
+
+
+def test_a_face_that_an_element_does_not_have_is_named_with_its_line(tmp_path):
+    text, _ = inp_text("tet4")
+    (tmp_path / "block.inp").write_text(text + "*SURFACE, NAME=wrong\nbody, S6\n")
+    with pytest.raises(
+        StudyError, match=r"block\.inp, line \d+: a tet4 element has no face S6; use S1, S2, S3, S4"
+    ):
+        load_mesh(tmp_path / "block.inp", "mm")
+
+
+@pytest.mark.parametrize("name", MESHIO)
+@pytest.mark.parametrize("kind", ["vtk", "vtu", "msh"])
+def test_meshes_written_by_meshio_are_read_back(tmp_path, name, kind):
+    drawn = block((2.0, 2.0, 3.0), (1, 2, 2), name)
+    regions = [np.arange(drawn.n_cells) % 2]
+    data = {"gmsh:physical": regions, "gmsh:geometrical": regions} if kind == "msh" else {"part": regions}
+    content = meshio.Mesh(
+        drawn.nodes,
+        [(MESHIO[name], drawn.blocks[0].connectivity)],
+        cell_data=data,
+        point_data={} if kind == "msh" else {"held": (drawn.nodes[:, 0] == 0).astype(int)},
+        field_data={"part_0": np.array([0, 3]), "part_1": np.array([1, 3])} if kind == "msh" else {},
+    )
+    path = tmp_path / f"block.{kind}"
+    content.write(path, **({"file_format": "gmsh22"} if kind == "msh" else {}))
+    mesh = load_mesh(path, "cm")
+    check_mesh(mesh, regions=("part_0", "part_1"))
+    np.testing.assert_allclose(mesh.nodes, drawn.nodes * 1e-2, rtol=1e-12)
+    np.testing.assert_array_equal(mesh.blocks[0].connectivity, drawn.blocks[0].connectivity)
+    np.testing.assert_array_equal(mesh.cells("part_1"), np.arange(1, drawn.n_cells, 2))
+    if kind != "msh":
+        np.testing.assert_array_equal(mesh.set_nodes("held_1"), np.flatnonzero(drawn.nodes[:, 0] == 0))
+
+
+def test_the_physical_groups_of_gmsh_become_sets_by_their_dimension(tmp_path):
+    (tmp_path / "bar.msh").write_text(GMSH)
+    mesh = load_mesh(tmp_path / "bar.msh", "mm")
+    check_mesh(mesh)
+    assert cell_volumes(mesh) == pytest.approx([1e-6, 1e-6], rel=1e-12)
+    assert {name: cells.tolist() for name, cells in mesh.cell_sets.items()} == {"soft": [0], "hard": [1]}
+    assert list(mesh.surfaces) == ["grip"]
+    assert surface_area(mesh, "grip") == pytest.approx(1e-4, rel=1e-12)
+    np.testing.assert_allclose(mesh.nodes[mesh.surface_nodes("grip"), 0], 0.02)
+    np.testing.assert_allclose(mesh.nodes[mesh.set_nodes("edge")], [[0, 0, 0], [0.01, 0, 0]])
+
+
+def test_gmsh_4_files_keep_every_group_of_an_entity(tmp_path):
+    # Both hexahedra are "all_of_it", volume entities 1 and 2; the second is "hard" too.
+    names = GMSH[GMSH.index("$Nodes") :].splitlines()[2:14]
+    lines = [
+        "$MeshFormat", "4.1 0 8", "$EndMeshFormat",
+        "$PhysicalNames", "3", '2 3 "grip"', '3 1 "all_of_it"', '3 2 "hard"', "$EndPhysicalNames",
+        "$Entities", "0 0 1 2",
+        "5 20 0 0 20 10 10 1 3 0",
+        "1 0 0 0 10 10 10 1 1 0",
+        "2 10 0 0 20 10 10 2 1 2 0",
+        "$EndEntities",
+        "$Nodes", "1 12 1 12", "3 1 0 12", *(line.split()[0] for line in names),
+        *(" ".join(line.split()[1:]) for line in names), "$EndNodes",
+        "$Elements", "3 3 1 3",
+        "2 5 3 1", "1 3 6 12 9", "3 1 5 1", "2 1 2 5 4 7 8 11 10", "3 2 5 1", "3 2 3 6 5 8 9 12 11",
+        "$EndElements", "",
+    ]  # fmt: skip
+    (tmp_path / "bar.msh").write_text("\n".join(lines))
+    mesh = load_mesh(tmp_path / "bar.msh", "mm")
+    check_mesh(mesh)
+    assert {name: cells.tolist() for name, cells in mesh.cell_sets.items()} == {
+        "all_of_it": [0, 1],
+        "hard": [1],
+    }
+    assert surface_area(mesh, "grip") == pytest.approx(1e-4, rel=1e-12)
+
+
+def test_prisms_of_15_nodes_are_refused_where_meshio_cannot_read_them(tmp_path):
+    (tmp_path / "wedge.vtk").write_text(
+        "# vtk DataFile Version 2.0\nprism\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 15 double\n"
+        + "0 0 0\n" * 15 + "CELLS 1 16\n15 " + " ".join(map(str, range(15))) + "\nCELL_TYPES 1\n26\n"
+    )  # fmt: skip
+    with pytest.raises(StudyError, match=r"prisms of 15 nodes; save it as \.inp"):
+        load_mesh(tmp_path / "wedge.vtk", "mm")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            GMSH[: GMSH.index("$EndElements")],
+            r"line 26: the section \$Elements is not closed; the file is cut",
+        ),
+        (GMSH[:200], r"the section \$Nodes is not closed"),
+        (GMSH.replace("3 6 12 9", "1 6 12 9"), "1 faces of group 'grip' are faces of no solid cell"),
+        (
+            GMSH.replace("4 5 2 2 2 2 3 6 5 8 9 12 11", "4 7 2 2 2 2 3 6 5 8"),
+            "pyramid cells, which are not known",
+        ),
+        (GMSH.replace("4 5 2 2 2 2 3", "4 5 2 2 2 2 77"), "damaged, cut short|nodes which it does not hold"),
+        ("$MeshFormat\n2.2 0 8\n$EndMeshFormat\n", "holds no solid or sheet cells"),
+        ("not a mesh", "damaged, cut short, or no .msh file"),
+    ],
+)
+def test_damaged_gmsh_files_are_refused(tmp_path, text, message):
+    (tmp_path / "bar.msh").write_text(text)
+    with pytest.raises(StudyError, match=f"bar.msh.*({message})"):
+        load_mesh(tmp_path / "bar.msh", "mm")
+
+
+def test_vtk_files_that_are_cut_short_are_refused(tmp_path):
+    drawn = block((2.0, 2.0, 3.0), (1, 2, 2), "hex8")
+    content = meshio.Mesh(drawn.nodes, [("hexahedron", drawn.blocks[0].connectivity)])
+    for kind in ("vtk", "vtu"):
+        path = tmp_path / f"block.{kind}"
+        content.write(path)
+        whole = path.read_bytes()
+        for part in (0, len(whole) // 5, len(whole) // 2, len(whole) - 40):
+            path.write_bytes(whole[:part])
+            with pytest.raises(StudyError, match=rf"block\.{kind} is damaged, cut short"):
+                load_mesh(path, "mm")
+
+
+def icosphere(refinements):
+    """Triangles on the unit sphere: an octahedron, each triangle cut in four, pushed out to the sphere."""
+    points = [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]
+    points = np.array(points, dtype=float)
+    faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+    for _ in range(refinements):
+        edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+        edges, number = np.unique(edges, axis=0, return_inverse=True)
+        middle = points[edges].mean(axis=1)
+        d, e, f = number.reshape(3, -1) + len(points)
+        points = np.vstack([points, middle / np.linalg.norm(middle, axis=1)[:, None]])
+        a, b, c = faces.T
+        faces = np.concatenate([np.stack(t, axis=1) for t in ((a, d, f), (d, b, e), (f, e, c), (d, e, f))])
+    return points, faces
+
+
+def polyhedron_volume(points, faces):
+    a, b, c = np.moveaxis(points[faces], 1, 0)
+    return np.einsum("ti,ti->", a, np.cross(b, c)) / 6.0
+
+
+@pytest.mark.parametrize("kind", ["stl", "obj", "ply"])
+def test_a_sphere_is_filled_to_its_volume(tmp_path, kind):
+    points, faces = icosphere(2)
+    path = tmp_path / f"sphere.{kind}"
+    meshio.Mesh(20.0 * points, [("triangle", faces)]).write(path)
+    mesh = load_mesh(path, "mm")
+    check_mesh(mesh)
+    assert mesh.blocks[0].cell_type == "tet4"
+    inscribed = 0.02**3 * polyhedron_volume(points, faces)
+    assert cell_volumes(mesh).sum() == pytest.approx(inscribed, rel=1e-6)
+    # Triangles of edge h on a sphere cut off about (h / r)^2 / 4 of it.
+    assert inscribed == pytest.approx(4 / 3 * pi * 0.02**3, rel=0.1)
+    outer = mesh.nodes[mesh.surface_nodes("face_1")]
+    np.testing.assert_allclose(np.linalg.norm(outer, axis=1), 0.02, rtol=1e-6)
+
+
+def test_a_cube_of_twelve_triangles_is_meshed_anew_where_a_cell_size_is_given(tmp_path):
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+    squares = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    faces = "".join("f " + " ".join(str(i + 1) for i in square) + "\n" for square in squares)
+    path = tmp_path / "cube.obj"
+    path.write_text("".join("v {} {} {}\n".format(*corner) for corner in corners) + faces)
+    mesh = load_mesh(path, "cm", size=0.004)
+    check_mesh(mesh)
+    assert cell_volumes(mesh).sum() == pytest.approx(1e-6, rel=1e-6)
+    assert mesh.n_nodes > 30
+    assert [surface_area(mesh, f"face_{i + 1}") for i in range(6)] == pytest.approx([1e-4] * 6, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda faces: faces[:-1], "not watertight: 3 edges have a triangle on one side only"),
+        (
+            lambda faces: np.vstack([faces, faces[:1]]),
+            "bounds no volume: 3 edges have more than two triangles",
+        ),
+        (lambda faces: np.vstack([faces[:-1], faces[-1:, ::-1]]), "do not all turn the same way"),
+        (lambda faces: faces[:, ::-1], "face inwards; flip its normals"),
+        (lambda faces: faces[:0], "holds no faces"),
+        (lambda faces: faces + 1, "refer to points which it does not hold"),
+    ],
+)
+def test_surfaces_that_bound_no_volume_are_refused(tmp_path, change, message):
+    points, faces = icosphere(1)
+    path = tmp_path / "sphere.obj"
+    text = "".join("v {} {} {}\n".format(*point) for point in points)
+    path.write_text(text + "".join("f {} {} {}\n".format(*(face + 1)) for face in change(faces)))
+    with pytest.raises(StudyError, match=message):
+        load_mesh(path, "mm")
+
+
+def test_a_damaged_surface_file_is_refused(tmp_path):
+    points, faces = icosphere(1)
+    for kind in ("stl", "ply"):
+        path = tmp_path / f"sphere.{kind}"
+        meshio.Mesh(points, [("triangle", faces)]).write(path, binary=True)
+        path.write_bytes(path.read_bytes()[:-30])
+        with pytest.raises(StudyError, match=f"sphere.{kind} is damaged, cut short"):
+            load_mesh(path, "mm")
+    (tmp_path / "a.obj").write_text("v 1 2\n")
+    with pytest.raises(StudyError, match=r"a\.obj, line 1: 'v 1 2' is no vertex or face"):
+        load_mesh(tmp_path / "a.obj", "mm")
+
+
+def test_a_step_solid_is_meshed_and_its_unit_checked(tmp_path):
+    path = tmp_path / "plate.step"
+    plate = occ.Box((0, 0, 0), (40, 20, 10)) - occ.Cylinder((20, 10, 0), occ.Z, r=5, h=10)
+    plate.WriteStep(str(path))
+    mesh = load_mesh(path, "mm", size=0.004)
+    check_mesh(mesh)
+    assert cell_volumes(mesh).sum() == pytest.approx(8e-6 - pi * 25e-6 * 0.01, rel=5e-3)
+    assert len(mesh.surfaces) == 7
+    assert sum(len(faces) for faces in mesh.surfaces.values()) == len(mesh.boundary_faces())
+    with pytest.raises(StudyError, match="states that its unit of length is mm, but 'm' is declared"):
+        load_mesh(path, "m")
+    path.write_text(path.read_text()[:2000])
+    with pytest.raises(StudyError, match="is cut short"):
+        load_mesh(path, "mm")
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "size", "message"),
+    [
+        ("a.xyz", "mm", None, r"a\.xyz is no mesh file that is read; use \.inp, "),
+        ("a.inp", "inch", None, "'inch' is not a unit of length"),
+        ("a.vtk", "mm", 0.1, "is meshed already"),
+        ("a.stl", "mm", -1.0, "a cell size of -1"),
+        *((f"a.{kind}", "mm", None, "cannot read the") for kind in FILE_KINDS),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_read_is_refused(tmp_path, name, unit, size, message):
+    with pytest.raises(StudyError, match=message):
+        load_mesh(tmp_path / name, unit, size)
+
+
+def test_the_rubber_spring_is_mended_and_sound():
+    path = real_data("fem_reference") / "felupe" / "ex06_rubber-metal-spring_mesh.vtk"
+    mesh = load_mesh(path, "mm")
+    check_mesh(mesh)
+    # Its cells around the axis are hexahedra collapsed to prisms, and all are mirrored.
+    content = meshio.vtk.read(path)
+    assert [b.cell_type for b in mesh.blocks] == ["hex8", "prism6"]
+    assert mesh.n_cells == len(content.cells[0].data)
+    np.testing.assert_allclose(np.ptp(mesh.nodes, axis=0), 1e-3 * np.ptp(content.points, axis=0))
+    triangles = mesh.nodes[mesh.surface_triangles()]
+    assert cell_volumes(mesh).sum() == pytest.approx(
+        np.einsum("ti,ti->", triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2])) / 6, rel=1e-3
+    )
+    with pytest.raises(StudyError, match="240 x 120 x 120 m, which is hardly meant"):
+        check_mesh(load_mesh(path, "m"))
+
+
+def test_the_engine_mounts_loose_rings_are_reported():
+    path = real_data("fem_reference") / "felupe" / "ex07_engine-mount_mesh-metal.vtk"
+    mesh = load_mesh(path, "mm")
+    assert [b.cell_type for b in mesh.blocks] == ["quad4"]
+    with pytest.raises(StudyError, match="falls into 2 parts"):
+        check_mesh(mesh)
+
+
+def test_the_liver_is_read_and_its_sculpted_surface_refused():
+    folder = real_data("fem_reference") / "sofa_mor"
+    mesh = load_mesh(folder / "liverFine.vtu", "cm")
+    check_mesh(mesh)
+    assert (mesh.n_nodes, mesh.n_cells) == (4293, 22019)
+    with pytest.raises(StudyError, match="cuts through itself"):
+        load_mesh(folder / "liver-smoothUV.obj", "cm")
