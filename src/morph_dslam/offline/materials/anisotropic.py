@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import ngsolve as ngs
 
@@ -36,7 +36,7 @@ class Directed(Material):
         found = {name: fields[d] for name, d in self._given().items() if isinstance(d, str) and d in fields}
         return replace(self, **found)
 
-    def at_a_point(self) -> Material:
+    def at_a_point(self) -> Self:
         fields = [n for n, d in self._given().items() if isinstance(d, (str, ngs.CoefficientFunction))]
         return replace(self, **{name: self.directions[name] for name in fields})
 
@@ -117,6 +117,10 @@ class Orthotropic(Directed):
     def check_constants(self) -> None:
         super().check_constants()
         self.require_positive(*(f"{kind}_{i}" for kind, i in _MODULI))
+        point = self.at_a_point()
+        first, second = (unit_direction(axis, self.name) for axis in (point.axis_1, point.axis_2))
+        if not evaluate(ngs.Norm(ngs.Cross(first, second))) > 1e-9:
+            raise StudyError(f"{self.name}: axis_1 and axis_2 are parallel; give two that span a plane")
         if not evaluate(self._determinant()) > 0.0:
             raise StudyError(
                 f"{self.name}: poisson_12 = {evaluate(self.poisson_12):g}, poisson_13 = "
@@ -139,8 +143,8 @@ class TransverselyIsotropic(Directed):
     Stress  S = mu (1 - C^-1) + (lambda ln J + beta (I4 - 1)) C^-1
                 + 2 (alpha + beta ln J + 2 gamma (I4 - 1)) a x a - alpha (a x C a + C a x a)
 
-    Form of Bonet and Burton, Comput. Methods Appl. Mech. Engrg. 162, 1998, who tie the two Poisson's ratios
-    together; here lambda, mu, alpha, beta, gamma follow from all five small-strain constants. The quadratic
+    Form of Bonet and Burton, Comput. Methods Appl. Mech. Engrg. 162, 1998, who give both Poisson's ratios one
+    value; here lambda, mu, alpha, beta, gamma follow from all five small-strain constants. The quadratic
     in I4 takes compression of the fibres too.
 
     Attributes

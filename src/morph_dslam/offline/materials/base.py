@@ -16,7 +16,7 @@ import re
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import ngsolve as ngs
 import numpy as np
@@ -89,7 +89,7 @@ class Material(ABC):
         """The law with the named fields of directions filled in, each a vector coefficient function (3)."""
         return self
 
-    def at_a_point(self) -> Material:
+    def at_a_point(self) -> Self:
         """The law with any field of directions replaced by constant ones, to examine it without a mesh."""
         return self
 

@@ -1,8 +1,8 @@
 """Uniaxial tension of an incompressible solid: what a tension test measures, for fits and checks.
 
-At stretch l the sides contract by l^-1/2 whatever the law, and the pressure that frees them is eliminated: with
-S1 and S2 the axial and lateral second Piola-Kirchhoff stress of the law's remainder, the nominal stress is
-P = l S1 - S2 / l^2. With a Prony series S1 and S2 are advanced in time by the recurrence of `viscoelastic`.
+At stretch l the sides contract by l^-1/2 whatever the law, and the pressure that frees them is eliminated:
+with S1 and S2 the axial and lateral second Piola-Kirchhoff stress of the law's remainder, the nominal stress
+is P = l S1 - S2 / l^2. With a Prony series S1 and S2 advance in time by the recurrence of `viscoelastic`.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import ngsolve as ngs
 import numpy as np
-from numba import njit
 from ngsolve.meshes import Make1DMesh
+from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.offline.materials.base import Material, evaluate
