@@ -75,8 +75,8 @@ def _read(path: Path) -> Any:
     try:
         if path.suffix.lower() == ".msh":
             _check_sections_closed(path)
-        with redirect_stdout(StringIO()), redirect_stderr(StringIO()):  # meshio's own warnings
-            return readers[path.suffix.lower()](str(path))
+        with redirect_stdout(StringIO()), redirect_stderr(StringIO()) as warnings:
+            content = readers[path.suffix.lower()](str(path))
     except OSError as error:
         raise StudyError(f"cannot read the mesh {path}: {error.strerror or error}") from error
     except StudyError:
@@ -87,6 +87,11 @@ def _read(path: Path) -> Any:
         raise _damaged(path, error) from error
     except Exception as error:  # a damaged file ends meshio's readers in errors of every kind
         raise _damaged(path, error) from error
+    if (
+        "cannot handle" in warnings.getvalue()
+    ):  # meshio leaves out cells that it does not know, such as voxels
+        raise StudyError(f"{path} holds cells that are not known; use {', '.join(_CELLS)}")
+    return content
 
 
 def _damaged(path: Path, error: Exception) -> StudyError:
