@@ -112,7 +112,8 @@ def bind_truth(run: Run, truth: PointTruth, frame: int) -> Binding:
     if not run.tracked[row]:
         raise EvaluationError(f"frame {frame} was not tracked ({run.reasons[row]}): bind in another frame")
     recorded = truth.pixels[in_truth[0]]
-    columns = np.flatnonzero(np.isfinite(recorded).all(axis=1))
+    # The pixel of a hidden point belongs to whatever hides it, the front of the object itself for instance.
+    columns = np.flatnonzero(np.isfinite(recorded).all(axis=1) & ~truth.hidden[in_truth[0]])
     pixels = run.camera.undistort_pixels(recorded[columns])
     nodes, triangles = run.camera_points(row), run.model.triangles
     points = pick_surface(nodes, triangles, run.camera.rays(pixels))

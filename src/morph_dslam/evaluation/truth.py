@@ -13,7 +13,7 @@ from morph_dslam.errors import EvaluationError
 
 Array = NDArray[np.float64]
 
-LAYOUT = "frame (t,) whole numbers, points_mm (t, p, 3) in the camera frame, pixels (t, p, 2)"
+LAYOUT = "frame (t,) whole numbers, points_mm (t, p, 3) in the camera frame, pixels (t, p, 2); visible (t, p) if known"
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,13 @@ class PointTruth:
     frames : (t,) frame numbers.
     points : (t, p, 3) in the camera frame, metres; NaN where a point was not measured.
     pixels : (t, p, 2) where the points are in the images, as recorded (with lens distortion).
+    hidden : (t, p) which of them something else hides there; where the file does not say, none.
     """
 
     frames: NDArray[np.int64]
     points: Array
     pixels: Array
+    hidden: NDArray[np.bool_]
 
 
 def load_truth(path: Path) -> PointTruth:
@@ -46,6 +48,7 @@ def load_truth(path: Path) -> PointTruth:
             if missing:
                 raise EvaluationError(f"{path} has no array {', '.join(missing)}; a truth file has {LAYOUT}")
             frames, points, pixels = archive["frame"], archive["points_mm"], archive["pixels"]
+            visible = archive["visible"] if "visible" in archive else np.ones(points.shape[:2], dtype=bool)
     except FileNotFoundError as error:
         raise EvaluationError(f"there is no truth file {path}") from error
     except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
@@ -60,6 +63,8 @@ def load_truth(path: Path) -> PointTruth:
         and points.size > 0
         and frames.dtype.kind in "iu"
         and points.dtype.kind == pixels.dtype.kind == "f"
+        and visible.shape == points.shape[:2]
+        and visible.dtype.kind == "b"
     )
     if not fits:
         raise EvaluationError(
@@ -69,4 +74,4 @@ def load_truth(path: Path) -> PointTruth:
         )
     if len(np.unique(frames)) != len(frames):
         raise EvaluationError(f"{path}: a frame number occurs twice")
-    return PointTruth(frames.astype(np.int64), points.astype(float) / 1000.0, pixels.astype(float))
+    return PointTruth(frames.astype(np.int64), points.astype(float) / 1000.0, pixels.astype(float), ~visible)
