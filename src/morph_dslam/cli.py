@@ -1,4 +1,4 @@
-"""The command line: `morph build | info | track | evaluate | simulate`.
+"""The command line: `morph build | info | track | evaluate | simulate | calibrate`.
 
 Each command imports what it needs when it runs, so that `morph --help` answers at once.
 """
@@ -105,6 +105,19 @@ def _simulate(arguments: argparse.Namespace) -> None:
     simulate(arguments.scene, arguments.output)
 
 
+def _calibrate(arguments: argparse.Namespace) -> None:
+    from morph_dslam.calibration.board import parse_board
+    from morph_dslam.calibration.calibrate import calibrate
+
+    board = parse_board(arguments.board, arguments.square)
+    calibration = calibrate(arguments.source, board, arguments.output, arguments.lens)
+    print(calibration.table())
+    for remark in calibration.remarks():
+        print(f"note: {remark}")
+    print(f"wrote {arguments.output} and {arguments.output.with_suffix('.png')}")
+    print(calibration.line())
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="morph", description="Track a deformable solid in video with a physics-based reduced model."
@@ -113,6 +126,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _add_offline_commands(commands)
     _add_online_commands(commands)
+    _add_camera_commands(commands)
     return parser
 
 
@@ -204,6 +218,34 @@ def _add_online_commands(commands: argparse._SubParsersAction) -> None:
         type=int,
         metavar="N",
         help="with --points: frame whose pixels bind the truth points to the mesh",
+    )
+
+
+def _add_camera_commands(commands: argparse._SubParsersAction) -> None:
+    calibrate = _add(
+        commands,
+        "calibrate",
+        _calibrate,
+        "nothing was written",
+        "find a camera's intrinsics and distortion from pictures of a checkerboard",
+    )
+    calibrate.add_argument(
+        "source", type=Path, nargs="+", help="images, a folder of images, or a video (docs/cameras.md)"
+    )
+    calibrate.add_argument(
+        "--board", required=True, metavar="9x6", help="inner corners, where four squares meet, each way"
+    )
+    calibrate.add_argument(
+        "--square", required=True, metavar="'25 mm'", help="side of one square, with its unit"
+    )
+    calibrate.add_argument(
+        "--lens",
+        choices=("radial-tangential", "fisheye"),
+        default="radial-tangential",
+        help="lens model: fisheye for views of more than about 120 degrees",
+    )
+    calibrate.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="CAMERA", help="camera file to write (.yaml)"
     )
 
 

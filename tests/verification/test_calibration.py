@@ -1,0 +1,206 @@
+"""Calibration against boards rendered with known cameras, and against OpenCV's published calibration."""
+
+import cv2
+import numpy as np
+import pytest
+
+from morph_dslam import cli
+from morph_dslam.calibration.board import Board, find_corners, parse_board
+from morph_dslam.calibration.calibrate import calibrate
+from morph_dslam.calibration.solve import solve_intrinsics
+from morph_dslam.calibration.views import View, select_by_coverage
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import CameraError
+from morph_dslam.io.calibration import load_camera
+from tests.support.real_data import real_data
+from tests.support.rendered_board import board_image, board_poses
+
+BOARD = Board(9, 6, 0.025)
+CAMERA = PinholeCamera(640, 480, 541.0, 538.5, 327.3, 236.1, (-0.27, 0.09, 8e-4, -5e-4))
+FISHEYE = PinholeCamera(640, 480, 260.0, 259.0, 322.0, 237.0, (0.02, -0.008, 0.003, -0.0006), "fisheye")
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    """Pictures of the board by `CAMERA`, and the poses."""
+    poses = board_poses(CAMERA, BOARD, 16, 40.0, seed=2)
+    return [board_image(CAMERA, BOARD, pose, seed) for seed, pose in enumerate(poses)], poses
+
+
+def write_all(folder, images):
+    folder.mkdir()
+    for number, image in enumerate(images):
+        cv2.imwrite(str(folder / f"{number:02}.png"), image)
+    return folder
+
+
+def exact_views(camera, poses, board=BOARD):
+    """Views with the exact corners."""
+    return [View(f"view {k}", camera.project_recorded(p.apply(board.points))) for k, p in enumerate(poses)]
+
+
+def test_corners_are_where_the_board_is(pictures):
+    images, poses = pictures
+    for image, pose in zip(images, poses, strict=True):
+        corners = find_corners(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), BOARD)
+        # The same corner is first, so that they compare one by one.
+        distances = np.linalg.norm(corners - CAMERA.project_recorded(pose.apply(BOARD.points)), axis=1)
+        assert np.sqrt((distances**2).mean()) < 0.06
+        assert distances.max() < 0.3
+
+
+def test_the_command_finds_the_camera(pictures, tmp_path, capsys):
+    folder, output = write_all(tmp_path / "images", pictures[0]), tmp_path / "cam.yaml"
+    command = ["calibrate", str(folder), "--board", "9x6", "--square", "25 mm", "-o", str(output)]
+    assert cli.main(command) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1].startswith("fx=54")
+    assert "views=16/16" in lines[-1]
+    assert lines[1].startswith("00.png")
+    found = load_camera(output)
+    assert found.fx == pytest.approx(CAMERA.fx, rel=2e-3)
+    assert found.fy == pytest.approx(CAMERA.fy, rel=2e-3)
+    assert (found.cx, found.cy) == pytest.approx((CAMERA.cx, CAMERA.cy), abs=1.0)
+    # The whole mapping, where the board was seen, not only its coefficients, which trade with each other.
+    grid = np.stack(np.meshgrid(np.linspace(60, 580, 9), np.linspace(60, 420, 7)), axis=-1).reshape(-1, 2)
+    rays = CAMERA.rays(CAMERA.undistort_pixels(grid))
+    assert np.linalg.norm(found.project_recorded(rays) - grid, axis=1).max() < 1.5
+    assert output.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_video_is_calibrated_from_a_selection_of_its_frames(pictures, tmp_path):
+    path = tmp_path / "board.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (640, 480))
+    for image in [np.full_like(pictures[0][0], 90), *pictures[0]]:
+        writer.write(image)
+    writer.release()
+    calibration = calibrate([path], BOARD, tmp_path / "cam.yaml")
+    assert calibration.solution.camera.fx == pytest.approx(CAMERA.fx, rel=3e-3)
+    assert calibration.found.n_searched == 17
+    assert [view.name for view in calibration.found.views][:2] == ["frame 1", "frame 2"]
+
+
+@pytest.mark.parametrize(
+    ("camera", "lens"), [(CAMERA, "radial-tangential"), (FISHEYE, "fisheye")], ids=["pinhole", "fisheye"]
+)
+def test_exact_corners_give_the_exact_camera(camera, lens):
+    poses = board_poses(camera, BOARD, 15, 40.0, seed=4)
+    solution = solve_intrinsics(exact_views(camera, poses), BOARD, (640, 480), lens)
+    np.testing.assert_allclose(solution.camera.intrinsics, camera.intrinsics, rtol=2e-4)
+    assert solution.rms < 2e-3
+    np.testing.assert_allclose(
+        [pose.translation for pose in solution.camera_from_board],
+        [pose.translation for pose in poses],
+        atol=2e-4,
+    )
+
+
+@pytest.mark.parametrize(
+    ("camera", "lens"), [(CAMERA, "radial-tangential"), (FISHEYE, "fisheye")], ids=["pinhole", "fisheye"]
+)
+def test_the_stated_deviation_is_that_of_repeated_calibrations(camera, lens):
+    board = Board(8, 6, 0.025)  # of no orientation, so that the board's shape is not solved for
+    exact = exact_views(camera, board_poses(camera, board, 12, 40.0, seed=5), board)
+    rng, focal, stated = np.random.default_rng(0), [], []
+    for _ in range(16):
+        noisy = [View(v.name, v.corners + rng.normal(scale=0.1, size=v.corners.shape)) for v in exact]
+        solution = solve_intrinsics(noisy, board, (640, 480), lens)
+        focal.append(solution.camera.fx)
+        stated.append(solution.focal_deviation[0])
+    assert np.mean(focal) == pytest.approx(camera.fx, abs=3 * np.std(focal) / np.sqrt(16) + 0.05)
+    # The standard deviation of 16 values is itself known to 18 per cent.
+    assert np.mean(stated) == pytest.approx(np.std(focal, ddof=1), rel=0.5)
+
+
+def test_a_bent_board_is_solved_for():
+    # An arch of 1 mm over the board's length; as a flat board it shifts the focal length.
+    bent = BOARD.points.copy()
+    bent[:, 2] = 1e-3 * (1.0 - ((bent[:, 0] - 0.1) / 0.1) ** 2)
+    poses = board_poses(CAMERA, BOARD, 15, 40.0, seed=6)
+    views = [View(f"{k}", CAMERA.project_recorded(pose.apply(bent))) for k, pose in enumerate(poses)]
+    solution = solve_intrinsics(views, BOARD, (640, 480))
+    assert solution.camera.fx == pytest.approx(CAMERA.fx, rel=5e-4)
+    assert solution.flatness > 0.5e-3
+    flat = solve_intrinsics(views[:7], BOARD, (640, 480))
+    assert abs(flat.camera.fx - CAMERA.fx) > 3.0 * abs(solution.camera.fx - CAMERA.fx)
+
+
+def test_views_that_fit_no_camera_are_left_out():
+    views = exact_views(CAMERA, board_poses(CAMERA, BOARD, 12, 40.0, seed=7))
+    moved = views[3].corners + np.random.default_rng(0).normal(scale=3.0, size=(54, 2))
+    views[3] = View("moving", moved)
+    solution = solve_intrinsics(views, BOARD, (640, 480))
+    assert solution.left_out == ("moving",)
+    assert solution.camera.fx == pytest.approx(CAMERA.fx, rel=1e-3)
+
+
+def test_face_on_views_are_refused(tmp_path, capsys):
+    poses = board_poses(CAMERA, BOARD, 8, 2.0, seed=8)
+    images = [board_image(CAMERA, BOARD, pose, seed) for seed, pose in enumerate(poses)]
+    folder = write_all(tmp_path / "images", images)
+    output = tmp_path / "cam.yaml"
+    command = ["calibrate", str(folder), "--board", "9x6", "--square", "25 mm", "-o", str(output)]
+    assert cli.main(command) == 2
+    message = capsys.readouterr().err
+    assert "the focal length is not determined" in message
+    assert "tilt the board" in message
+    assert not output.exists()
+
+
+def test_boards_that_are_not_found_or_too_seldom(pictures, tmp_path):
+    few = write_all(tmp_path / "few", pictures[0][:3])
+    with pytest.raises(CameraError, match=r"the board was found in 3 images only; 5 are needed"):
+        calibrate([few], BOARD, tmp_path / "cam.yaml")
+    with pytest.raises(CameraError, match=r"no board of 10x7 inner corners was found in 3 images: count"):
+        calibrate([few], Board(10, 7, 0.025), tmp_path / "cam.yaml")
+    cv2.imwrite(str(few / "99.png"), pictures[0][0][:240])
+    with pytest.raises(CameraError, match=r"99\.png is 640x240 pixels, the images before it are 640x480"):
+        calibrate([few], BOARD, tmp_path / "cam.yaml")
+    with pytest.raises(CameraError, match="there is no folder"):
+        calibrate([few], BOARD, tmp_path / "absent" / "cam.yaml")
+
+
+@pytest.mark.parametrize(
+    ("board", "square", "message"),
+    [
+        ("9", "25 mm", "'9' is no board: give its inner corners, 9x6 say"),
+        ("2x6", "25 mm", "too small"),
+        ("9x6", "25", "'25' is no length"),
+        ("9x6", "25 inch", "one of m, cm, mm"),
+        ("9x6", "-3 mm", "impossible"),
+    ],
+)
+def test_boards_that_are_refused(board, square, message):
+    with pytest.raises(CameraError, match=message):
+        parse_board(board, square)
+
+
+def test_boards_as_users_write_them():
+    assert parse_board(" 9 x 6", "25mm") == parse_board("9X6", "0.025 m") == BOARD
+
+
+def test_selection_prefers_views_that_differ():
+    # Twenty almost equal views and four others: the four are taken first.
+    rng = np.random.default_rng(0)
+    rest = board_poses(CAMERA, BOARD, 1, 5.0, seed=9)[0]
+    corners = CAMERA.project_recorded(rest.apply(BOARD.points))
+    same = [corners + rng.normal(scale=0.2, size=corners.shape) for _ in range(20)]
+    others = [view.corners for view in exact_views(CAMERA, board_poses(CAMERA, BOARD, 4, 40.0, seed=10))]
+    chosen = select_by_coverage([*same[:10], *others, *same[10:]], 9, (640, 480), most=5)
+    assert set(range(10, 14)) <= set(chosen)
+    assert len(chosen) == 5
+    assert select_by_coverage(others, 9, (640, 480), most=30) == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_opencvs_pictures_give_the_published_focal_length(side, tmp_path):
+    folder = real_data("opencv_calib")
+    calibration = calibrate(sorted(folder.glob(f"{side}??.jpg")), BOARD, tmp_path / "cam.yaml")
+    # Of the pair, solved together with one focal length for both cameras (intrinsics.yml).
+    published = 534.80326845051309
+    camera = calibration.solution.camera
+    assert camera.fx == pytest.approx(published, rel=5e-3)
+    assert camera.fy == pytest.approx(published, rel=5e-3)
+    if side == "left":
+        alone = load_camera(folder / "left_intrinsics.yml")
+        assert camera.fx == pytest.approx(alone.fx, rel=5e-3)
