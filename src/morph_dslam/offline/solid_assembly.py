@@ -9,6 +9,7 @@ dofs, only S = K_cc - K_ci K_ii^-1 K_ic is factorised. NGSolve keeps the factors
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,9 @@ from morph_dslam.offline.newton import Linearisation
 from morph_dslam.offline.parameters import ParameterSymbols
 
 Array = NDArray[np.float64]
+
+#: Dofs up to which one thread assembles faster than several.
+SMALL = 5000
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,10 @@ class Assembly:
         self._pattern: tuple[NDArray[np.int32], NDArray[np.int32]] | None = None
         self.latest: Linearisation | None = None
 
+    def _threads(self) -> AbstractContextManager:
+        """NGSolve's threads; none for small problems, where starting them takes longer than the work."""
+        return ngs.TaskManager() if self._space.ndof > SMALL else nullcontext()
+
     def _make_form(self, terms: Sequence[Term], condensed: bool) -> ngs.BilinearForm:
         form = ngs.BilinearForm(
             self._space, symmetric=self.symmetric, condense=condensed, store_inner=condensed
@@ -86,7 +94,7 @@ class Assembly:
 
     def _apply(self, form: ngs.BilinearForm, x: Array) -> Array:
         self._state.vec.FV().NumPy()[:] = x
-        with ngs.TaskManager():
+        with self._threads():
             form.Apply(self._state.vec, self._result)
         return self._result.FV().NumPy().copy()
 
@@ -126,7 +134,7 @@ class Assembly:
     def tangent(self, x: Array) -> sp.csr_matrix:
         """K, or S where inner dofs are condensed, (n, n) with all entries stored."""
         self._state.vec.FV().NumPy()[:] = x
-        with ngs.TaskManager():
+        with self._threads():
             self._form.AssembleLinearization(self._state.vec)
         data, indices, indptr = self._form.mat.CSR()
         if self._pattern is None:
@@ -141,7 +149,7 @@ class Assembly:
     def multiply(self, operators: str, vector: Array) -> Array:
         """Sum of NGSolve's condensation operators, named, applied to ``vector`` (n,)."""
         self._state.vec.FV().NumPy()[:] = vector
-        with ngs.TaskManager():
+        with self._threads():
             self._result.data = getattr(self._form, operators) * self._state.vec
         return self._result.FV().NumPy().copy()
 

@@ -1,0 +1,143 @@
+"""What a solid refuses, and what it warns of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morph_dslam.errors import StudyError
+from morph_dslam.model import Parameter
+from morph_dslam.offline.kinematics import ShapeField
+from morph_dslam.offline.loads import DeadTraction, FollowerPressure, MovingPatch, PointLoad
+from morph_dslam.offline.materials.isotropic import NeoHookean
+from morph_dslam.offline.mesh_generators import block, sheet
+from morph_dslam.offline.newton import PathError
+from morph_dslam.offline.parameters import ParameterSymbols
+from morph_dslam.offline.solid import SolidOptions, SolidProblem
+from morph_dslam.offline.solid_materials import NearlyIncompressibleWarning
+from morph_dslam.offline.supports import ElasticFoundation, PrescribedDisplacement, RigidRotation, fixed
+from tests.support.solids import RUBBER, load_parameter, solved
+
+MESH = block((1.0, 1.0, 1.0), (2, 1, 1), "hex8")
+HALVES = replace(MESH, cell_sets={"left": np.array([0]), "right": np.array([1])})
+SOFT = NeoHookean(young=1e6, poisson=0.4999)
+
+
+def test_unknown_sets_are_named_with_the_known_ones() -> None:
+    with pytest.raises(StudyError, match=r"no node set or surface 'lid'; it has: .*z_max"):
+        SolidProblem(MESH, {"all": RUBBER}, [fixed("lid")])
+    with pytest.raises(StudyError, match=r"no surface 'lid'"):
+        SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")], [FollowerPressure("lid", 1.0)])
+    with pytest.raises(StudyError, match=r"no node set or surface 'lid'"):
+        SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")], [PointLoad("lid", (1.0, 0.0, 0.0))])
+    with pytest.raises(StudyError, match=r"no cell set 'core'"):
+        SolidProblem(MESH, {"core": RUBBER}, [fixed("x_min")])
+
+
+def test_every_cell_has_one_material() -> None:
+    with pytest.raises(StudyError, match="1 of 2 cells have no material"):
+        SolidProblem(HALVES, {"left": RUBBER}, [fixed("x_min")])
+    overlap = replace(HALVES, cell_sets={"left": np.array([0]), "both": np.array([0, 1])})
+    with pytest.raises(StudyError, match="both 'left' and 'both'"):
+        SolidProblem(overlap, {"left": RUBBER, "both": RUBBER}, [fixed("x_min")])
+
+
+def test_two_materials_in_series_stretch_in_inverse_proportion_to_their_stiffness() -> None:
+    symbols = load_parameter(load=0.0)
+    stiff = NeoHookean(young=3e6, poisson=0.0)
+    materials = {"all": NeoHookean(young=1e6, poisson=0.0), "right": stiff}
+    load = DeadTraction("x_max", (symbols["load"], 0.0, 0.0))
+    problem = SolidProblem(HALVES, materials, [fixed("x_min")], [load], symbols)
+    state = solved(problem, 1.0)
+    u = problem.nodal_displacement(state.dofs)
+    middle, end = u[np.isclose(MESH.nodes[:, 0], 0.5), 0], u[MESH.set_nodes("x_max"), 0]
+    np.testing.assert_allclose(middle, 0.5e-6, rtol=1e-5)
+    np.testing.assert_allclose(end - middle, 0.5e-6 / 3.0, rtol=1e-5)
+
+
+def test_an_unstable_material_is_refused_by_its_set() -> None:
+    with pytest.raises(StudyError, match=r"material of 'all'.*young"):
+        SolidProblem(MESH, {"all": NeoHookean(young=-1e6, poisson=0.3)}, [fixed("x_min")])
+    with pytest.raises(StudyError, match=r"material of 'all'.*poisson"):
+        SolidProblem(MESH, {"all": NeoHookean(young=1e6, poisson=0.6)}, [fixed("x_min")])
+
+
+@pytest.mark.parametrize(
+    ("supports", "words"),
+    [
+        ([], "move along x, y, z and to turn about x, y, z"),
+        ([PrescribedDisplacement("z_min", z=0.0)], "move along x, y and to turn about z"),
+        ([ElasticFoundation("x_min", 1e6, normal_only=True)], "move along y, z and to turn about x"),
+    ],
+)
+def test_missing_supports_are_described(supports: list, words: str) -> None:
+    with pytest.raises(StudyError, match=f"free to {words}"):
+        SolidProblem(MESH, {"all": RUBBER}, supports)
+
+
+def test_an_elastic_foundation_is_support_enough() -> None:
+    """A stiff block on springs sinks by its load over their stiffness."""
+    symbols = load_parameter(load=0.0)
+    supports = [ElasticFoundation("z_min", 1e3)]
+    load = DeadTraction("z_max", (0.0, 0.0, -symbols["load"]))
+    problem = SolidProblem(MESH, {"all": NeoHookean(young=1e12, poisson=0.0)}, supports, [load], symbols)
+    state = solved(problem, 1.0)
+    np.testing.assert_allclose(problem.nodal_displacement(state.dofs)[:, 2], -1e-3, rtol=1e-6)
+
+
+def test_locking_elements_are_flagged_and_mixed_ones_are_not() -> None:
+    with pytest.warns(NearlyIncompressibleWarning, match=r"0\.4999.*use mixed elements"):
+        problem = SolidProblem(MESH, {"all": SOFT}, [fixed("x_min")])
+    assert "nearly incompressible" in problem.flags[0]
+    mixed = SolidProblem(MESH, {"all": SOFT}, [fixed("x_min")], options=SolidOptions(mixed=True))
+    assert mixed.flags == ()
+
+
+def test_cells_that_do_not_serve_are_refused() -> None:
+    with pytest.raises(StudyError, match="quad4 are no solids"):
+        SolidProblem(sheet((1.0, 1.0), (1, 1)), {"all": RUBBER})
+    tetrahedra = block((1.0, 1.0, 1.0), (1, 1, 1), "tet4")
+    with pytest.raises(StudyError, match="use tet10"):
+        SolidProblem(tetrahedra, {"all": SOFT}, [fixed("x_min")], options=SolidOptions(mixed=True))
+    quadratic = block((1.0, 1.0, 1.0), (1, 1, 1), "hex20")
+    with pytest.raises(StudyError, match="order 1 on cells of order 2"):
+        SolidProblem(quadratic, {"all": RUBBER}, [fixed("x_min")], options=SolidOptions(order=1))
+
+
+def test_parameters_shapes_and_directions_are_checked() -> None:
+    symbols = load_parameter(a=0.0)
+    with pytest.raises(StudyError, match="no parameter 'b'; there are: a"):
+        symbols["b"]
+    twice = Parameter("a", "ratio", "1", 0.0, 1.0, 0.0)
+    with pytest.raises(StudyError, match="same name"):
+        ParameterSymbols([twice, twice])
+    with pytest.raises(StudyError, match=r"shape field 0 has shape \(4, 3\)"):
+        SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")], shape=[ShapeField(1.0, np.zeros((4, 3)))])
+    with pytest.raises(StudyError, match="'x_max' has no direction"):
+        RigidRotation("x_max", (0.0, 0.0, 0.0), 0.1)
+    with pytest.raises(StudyError, match="width 0 m"):
+        MovingPatch("z_max", (0.0, 0.0, 1.0), (0.0, 0.0, 1.0), 0.0)
+
+
+def test_a_point_outside_is_named() -> None:
+    problem = SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")])
+    with pytest.raises(StudyError, match=r"1 of 2 points lie outside .*\(1500, 0, 0\) mm"):
+        problem.recovery.at_points(
+            np.zeros(problem.n_dofs), np.zeros(0), np.array([[0.5, 0.5, 0.5], [1.5, 0, 0]])
+        )
+
+
+def test_a_load_that_cannot_be_carried_keeps_what_converged() -> None:
+    """A column pushed far past its buckling load: the last converged load is said and its state kept."""
+    symbols = load_parameter(load=0.0)
+    mesh = block((1.0, 0.1, 0.1), (6, 1, 1), "hex20")
+    load = DeadTraction("x_max", (-1e6 * symbols["load"], 0.0, 1e3 * symbols["load"]))
+    problem = SolidProblem(mesh, {"all": RUBBER}, [fixed("x_min")], [load], symbols)
+    with pytest.raises(PathError, match="last parameters that converged") as caught:
+        solved(problem, 200.0)
+    kept = caught.value.path.states[-1]
+    assert 0.0 < kept.mu[0] < 200.0
+    residual = problem.residual(kept.dofs, kept.mu)
+    assert np.abs(residual[problem.free]).max() < 1e-6 * np.abs(residual).max()

@@ -1,0 +1,185 @@
+"""Tangents, and derivatives of solutions and fields by every kind of parameter, against differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from morph_dslam.offline.kinematics import ShapeField
+from morph_dslam.offline.loads import (
+    BodyForce,
+    DeadTraction,
+    FollowerPressure,
+    Gravity,
+    MovingLine,
+    MovingPatch,
+    PointLoad,
+)
+from morph_dslam.offline.materials.anisotropic import HolzapfelGasserOgden
+from morph_dslam.offline.materials.directions import turned_direction
+from morph_dslam.offline.materials.isotropic import NeoHookean
+from morph_dslam.offline.mesh_generators import block
+from morph_dslam.offline.newton import NewtonOptions, advance, sensitivities, solve
+from morph_dslam.offline.parameters import ParameterSymbols
+from morph_dslam.offline.solid import SolidOptions, SolidProblem
+from morph_dslam.offline.supports import ElasticFoundation, PrescribedDisplacement, RigidRotation, fixed
+from tests.support.solids import RUBBER, distorted, load_parameter
+
+EXACT = NewtonOptions(tolerance=1e-13)
+MESH = distorted(block((1.0, 0.5, 0.5), (3, 2, 2), "hex8"), 0.04)
+DOWN = (0.0, 0.0, -2e4)
+
+
+def by_rotation(mu: ParameterSymbols) -> SolidProblem:
+    turn = RigidRotation("x_max", (0.2, 1.0, 0.3), mu["p"], translation=(0.1 * mu["p"], 0.0, 0.0))
+    return SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min"), turn], parameters=mu)
+
+
+def by_displacement(mu: ParameterSymbols) -> SolidProblem:
+    push = PrescribedDisplacement("x_max", x=-0.2 * mu["p"], z=0.3 * mu["p"] * mu["p"])
+    return SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min"), push], parameters=mu)
+
+
+def by_dead_loads(mu: ParameterSymbols) -> SolidProblem:
+    p = 1e5 * mu["p"]
+    loads = [
+        DeadTraction("x_max", (0.0, p, 0.2 * p)),
+        BodyForce((0.0, p, 0.0)),
+        PointLoad("x_max", (0.1 * p, 0.0, -0.1 * p)),
+    ]
+    return SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")], loads, mu)
+
+
+def by_pressure(mu: ParameterSymbols) -> SolidProblem:
+    load = FollowerPressure("z_max", 1e5 * mu["p"])
+    return SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")], [load], mu)
+
+
+def by_patch_position(mu: ParameterSymbols) -> SolidProblem:
+    load = MovingPatch("z_max", (0.0, 0.0, -1e4), (0.8 * mu["p"] + 0.3, 0.25, 0.5), 0.15)
+    return SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")], [load], mu)
+
+
+def by_line_position(mu: ParameterSymbols) -> SolidProblem:
+    load = MovingLine("z_max", DOWN, (0.8 * mu["p"] + 0.3, 0.0, 0.5), (0.0, 1.0, 0.0), 0.15)
+    return SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")], [load], mu)
+
+
+def by_material_constant(mu: ParameterSymbols) -> SolidProblem:
+    material = NeoHookean(young=3e6 * mu["p"], poisson=0.4 + 0.1 * mu["p"], density=1200.0)
+    loads = [DeadTraction("x_max", (0.0, 0.0, 3e4)), Gravity()]
+    return SolidProblem(MESH, {"all": material}, [fixed("x_min")], loads, mu)
+
+
+def by_pressure_unknowns(mu: ParameterSymbols) -> SolidProblem:
+    material = NeoHookean(young=3e6 * (1.0 + mu["p"]), poisson=0.4999)
+    load = FollowerPressure("z_max", 1e5)
+    mesh = block((1.0, 0.5, 0.5), (2, 1, 1), "hex20")
+    return SolidProblem(
+        mesh, {"all": material}, [fixed("x_min")], [load], mu, options=SolidOptions(mixed=True)
+    )
+
+
+def by_fibre_angle(mu: ParameterSymbols) -> SolidProblem:
+    fibre = turned_direction(mu["p"], (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    material = HolzapfelGasserOgden(shear=1e6, bulk=5e6, k1=2e6, k2=0.5, dispersion=0.1, fibre=fibre)
+    load = DeadTraction("x_max", (2e5, 0.0, 0.0))
+    return SolidProblem(MESH, {"all": material}, [fixed("x_min")], [load], mu)
+
+
+def by_foundation(mu: ParameterSymbols) -> SolidProblem:
+    supports = [ElasticFoundation("z_min", 1e6 * mu["p"]), ElasticFoundation("y_min", 1e6, normal_only=True)]
+    return SolidProblem(MESH, {"all": RUBBER}, supports, [DeadTraction("x_max", DOWN)], mu)
+
+
+def by_shape(mu: ParameterSymbols) -> SolidProblem:
+    thicker = MESH.nodes * [0.0, 0.3, 1.0] + 0.1 * np.sin(2.0 * MESH.nodes)
+    loads = [FollowerPressure("z_max", 3e4), DeadTraction("y_max", (0.0, 1e4, 0.0)), BodyForce((0, 0, 1e4))]
+    supports = [
+        fixed("x_min"),
+        RigidRotation("x_max", (0.0, 1.0, 0.0), 0.2),
+        ElasticFoundation("z_min", 1e6, normal_only=True),
+    ]
+    return SolidProblem(
+        MESH, {"all": RUBBER}, supports, loads, mu, shape=[ShapeField(mu["p"] - 0.1, thicker)]
+    )
+
+
+MAKERS = [value for name, value in sorted(globals().items()) if name.startswith("by_")]
+
+
+@pytest.mark.parametrize("make", MAKERS, ids=lambda make: make.__name__[3:])
+def test_derivatives_by_a_parameter(make: Callable[[ParameterSymbols], SolidProblem]) -> None:
+    problem = make(load_parameter(p=0.0 if make in (by_rotation, by_displacement) else 0.3))
+    start = problem.initial_state()
+    mu = np.array([0.3])
+    state = solve(problem, mu, advance(problem, start, mu).states[-1], EXACT)
+    slopes = sensitivities(problem, state)
+    fields = problem.sample_slopes(state.dofs, state.mu, slopes)
+    step = 1e-4
+    sides = [solve(problem, mu + h, state, EXACT) for h in (-2 * step, -step, step, 2 * step)]
+
+    def difference(values: list) -> np.ndarray:
+        return (values[0] - 8.0 * values[1] + 8.0 * values[2] - values[3]) / (12.0 * step)
+
+    expected = difference([s.dofs for s in sides])
+    assert np.abs(expected).max() > 0.0
+    np.testing.assert_allclose(slopes[0], expected, atol=1e-6 * np.abs(expected).max())
+    samples = [problem.sample(s.dofs, s.mu) for s in sides]
+    for name in ("displacement", "strain", "stress"):
+        expected = difference([s[name] for s in samples])
+        np.testing.assert_allclose(fields[name][0], expected, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("make", [by_pressure, by_pressure_unknowns, by_foundation, by_shape])
+def test_tangent(make: Callable[[ParameterSymbols], SolidProblem]) -> None:
+    problem = make(load_parameter(p=0.3))
+    rng = np.random.default_rng(1)
+    x = rng.uniform(-0.02, 0.02, problem.n_dofs)
+    direction = rng.uniform(-1.0, 1.0, problem.n_dofs)
+    mu, step = np.array([0.3]), 1e-5
+    sides = [problem.residual(x + h * direction, mu) for h in (-2 * step, -step, step, 2 * step)]
+    expected = (sides[0] - 8.0 * sides[1] + 8.0 * sides[2] - sides[3]) / (12.0 * step)
+    linearisation = problem.linearise(x, mu)
+    np.testing.assert_allclose(linearisation.apply(direction), expected, atol=1e-8 * np.abs(expected).max())
+    right = np.where(problem.free, expected, 0.0)
+    solution = linearisation.solve(right)
+    back = np.where(problem.free, linearisation.apply(solution), 0.0)
+    np.testing.assert_allclose(back, right, atol=1e-9 * np.abs(right).max())
+
+
+def test_follower_pressure_makes_the_tangent_unsymmetric() -> None:
+    assert not by_pressure(load_parameter(p=0.3)).assembly.symmetric
+    assert by_dead_loads(load_parameter(p=0.3)).assembly.symmetric
+
+
+def test_an_earlier_linearisation_survives_a_later_one() -> None:
+    problem = by_pressure_unknowns(load_parameter(p=0.3))
+    mu, right = np.array([0.3]), np.ones(problem.n_dofs)
+    earlier = problem.linearise(np.zeros(problem.n_dofs), mu)
+    expected = earlier.solve(right)
+    other = np.random.default_rng(2).uniform(-0.01, 0.01, problem.n_dofs)
+    problem.linearise(other, mu).solve(right)
+    np.testing.assert_allclose(earlier.solve(right), expected, rtol=1e-10)
+
+
+def test_reactions_balance_the_loads() -> None:
+    """Forces and moments about any point, of supports and of the pressure on the deformed surface."""
+    mu = load_parameter(p=0.3)
+    loads = [DeadTraction("y_max", (1e4, 2e4, -5e3))]
+    supports = [fixed("x_min"), RigidRotation("x_max", (0.0, 0.0, 1.0), mu["p"])]
+    problem = SolidProblem(MESH, {"all": RUBBER}, supports, loads, mu)
+    state = advance(problem, problem.initial_state(), np.array([0.3])).states[-1]
+    about = np.array([0.3, -0.2, 0.7])
+    reactions = [problem.reactions(state.dofs, state.mu, name, about) for name in ("x_min", "x_max")]
+    applied = 0.5 * np.array([1e4, 2e4, -5e3])  # the face is 1 m by 0.5 m
+    np.testing.assert_allclose(sum(force for force, _ in reactions), -applied, rtol=1e-8)
+    faces = MESH.face_nodes(MESH.surface("y_max"))
+    corners = (MESH.nodes + problem.nodal_displacement(state.dofs))[faces]
+    areas = np.linalg.norm(
+        np.cross(*(MESH.nodes[faces[:, i]] - MESH.nodes[faces[:, 0]] for i in (1, 3))), axis=1
+    )
+    moment = np.cross(areas @ corners.mean(axis=1) / 0.5 - about, applied)
+    np.testing.assert_allclose(sum(moment for _, moment in reactions), -moment, rtol=1e-8)
