@@ -1,7 +1,7 @@
 """Intrinsics from views of a board: least squares over intrinsics and poses (Zhang 2000).
 
-Printed boards are bent: half a millimetre on A4 shifts the focal length by half a per cent. Where there are
-enough views the board's own shape is solved for as well (Strobl and Hirzinger 2011).
+Printed boards are bent, and a third of a millimetre can shift the focal length by 0.2 per cent. Where there
+are enough views the board's own shape is solved for as well (Strobl and Hirzinger 2011).
 """
 
 from __future__ import annotations
