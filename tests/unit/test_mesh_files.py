@@ -1,6 +1,8 @@
 """Mesh files of every kind, written here or by other libraries, give metres, cells and named sets."""
 
+import re
 from math import pi
+from pathlib import Path
 
 import meshio
 import netgen.occ as occ
@@ -91,6 +93,18 @@ def test_an_input_file_gives_the_block_that_was_written_in_metres(tmp_path, name
     np.testing.assert_allclose(mesh.nodes[mesh.surface_nodes("z_max"), 2], 0.03)
 
 
+def test_the_documented_program_reads_a_mesh(tmp_path, monkeypatch):
+    page = Path(__file__).parents[2] / "docs" / "meshes.md"
+    (program,) = re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL)
+    text, drawn = inp_text("hex20")
+    sets = "*ELSET, ELSET=rubber\nbody\n*NSET, NSET=grip, ELSET=rubber\n"
+    (tmp_path / "mount.inp").write_text(text + sets)
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(program, names)
+    assert len(names["mesh"].set_nodes("grip")) == drawn.n_nodes
+
+
 def test_a_face_that_an_element_does_not_have_is_named_with_its_line(tmp_path):
     text, _ = inp_text("tet4")
     (tmp_path / "block.inp").write_text(text + "*SURFACE, NAME=wrong\nbody, S6\n")
@@ -136,31 +150,39 @@ def test_the_physical_groups_of_gmsh_become_sets_by_their_dimension(tmp_path):
     np.testing.assert_allclose(mesh.nodes[mesh.set_nodes("edge")], [[0, 0, 0], [0.01, 0, 0]])
 
 
-def test_gmsh_4_files_keep_every_group_of_an_entity(tmp_path):
-    # Both hexahedra are "all_of_it", volume entities 1 and 2; the second is "hard" too.
-    names = GMSH[GMSH.index("$Nodes") :].splitlines()[2:14]
+def gmsh_4_text(first_groups):
+    """The bar of `GMSH` as version 4.1, the first hexahedron's entity in the groups given by "count tags"."""
+    nodes = GMSH[GMSH.index("$Nodes") :].splitlines()[2:14]
     lines = [
         "$MeshFormat", "4.1 0 8", "$EndMeshFormat",
         "$PhysicalNames", "3", '2 3 "grip"', '3 1 "all_of_it"', '3 2 "hard"', "$EndPhysicalNames",
         "$Entities", "0 0 1 2",
         "5 20 0 0 20 10 10 1 3 0",
-        "1 0 0 0 10 10 10 1 1 0",
+        f"1 0 0 0 10 10 10 {first_groups} 0",
         "2 10 0 0 20 10 10 2 1 2 0",
         "$EndEntities",
-        "$Nodes", "1 12 1 12", "3 1 0 12", *(line.split()[0] for line in names),
-        *(" ".join(line.split()[1:]) for line in names), "$EndNodes",
+        "$Nodes", "1 12 1 12", "3 1 0 12", *(line.split()[0] for line in nodes),
+        *(" ".join(line.split()[1:]) for line in nodes), "$EndNodes",
         "$Elements", "3 3 1 3",
         "2 5 3 1", "1 3 6 12 9", "3 1 5 1", "2 1 2 5 4 7 8 11 10", "3 2 5 1", "3 2 3 6 5 8 9 12 11",
         "$EndElements", "",
     ]  # fmt: skip
-    (tmp_path / "bar.msh").write_text("\n".join(lines))
+    return "\n".join(lines)
+
+
+def test_gmsh_4_files_keep_every_group_of_an_entity(tmp_path):
+    (tmp_path / "bar.msh").write_text(gmsh_4_text(first_groups="1 1"))
     mesh = load_mesh(tmp_path / "bar.msh", "mm")
     check_mesh(mesh)
-    assert {name: cells.tolist() for name, cells in mesh.cell_sets.items()} == {
-        "all_of_it": [0, 1],
-        "hard": [1],
-    }
+    sets = {name: cells.tolist() for name, cells in mesh.cell_sets.items()}
+    assert sets == {"all_of_it": [0, 1], "hard": [1]}
     assert surface_area(mesh, "grip") == pytest.approx(1e-4, rel=1e-12)
+
+
+def test_gmsh_4_cells_of_no_group_beside_grouped_ones_are_refused_with_the_remedy(tmp_path):
+    (tmp_path / "bar.msh").write_text(gmsh_4_text(first_groups="0"))
+    with pytest.raises(StudyError, match="cells of no physical group beside cells of some; put every entity"):
+        load_mesh(tmp_path / "bar.msh", "mm")
 
 
 def test_vtk_prisms_of_15_nodes_which_meshio_cannot_read_are_refused(tmp_path):

@@ -125,8 +125,8 @@ def test_the_boot_seal_has_the_papers_nodes_and_cells(name, nodes):
         collars=(Collar(0.0, 36 / 91, 0.75e-3), Collar(70 / 91, 1.0, 0.75e-3)),
     )  # fmt: skip
     check_mesh(mesh, sets=("top", "bottom", "inner", "outer"))
-    # Each of 77 slices has 335 nodes, 239 squares and so, by Euler, 573 edges in its section; the second-order
-    # mesh has a node more on each of those edges and on each of the 335 edges to the next slice.
+    # Each of 77 slices has 335 nodes, 239 squares and so, by Euler, 573 edges in its section; at second order
+    # there is a node more on each of those edges and on each of the 335 edges to the next slice.
     assert nodes in (77 * 335, 77 * (335 + 573 + 335))
     assert (mesh.n_nodes, mesh.n_cells) == (nodes, 18403)
     # The hole through it makes the surface a torus: V - E + F = 0, with 2 E = 4 F for quadrilaterals.

@@ -81,6 +81,13 @@ def _read(path: Path) -> Any:
         raise StudyError(f"cannot read the mesh {path}: {error.strerror or error}") from error
     except StudyError:
         raise
+    except ValueError as error:
+        if "gmsh:physical" in str(error):  # meshio counts the groups wrongly where an entity has none
+            raise StudyError(
+                f"{path} holds cells of no physical group beside cells of some; put every entity that is "
+                "saved into a group, or save the groups alone (Mesh.SaveAll = 0)"
+            ) from error
+        raise _damaged(path, error) from error
     except KeyError as error:  # a cell type without a place in meshio's tables, or a damaged file
         if "wedge15" in error.args:
             raise StudyError(f"{path} holds prisms of 15 nodes; save it as .inp, or with 18 nodes") from error
