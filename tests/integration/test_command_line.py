@@ -171,7 +171,7 @@ BAD_INPUTS = {
     "camera of another size": (spoiled_camera, "480x360 pixels but the camera file is for 640x480"),
     "camera missing": (lambda f, t: {"camera": t / "absent.yaml"}, "cannot read the camera file"),
     "half a model": (halved_model, "is damaged or cut short"),
-    "newer model": (newer_model, "version 7, this release reads version 1: update morph-dslam"),
+    "newer model": (newer_model, "version 7, this release reads versions 1 to 2: update morph-dslam"),
     "landmarks missing": (lambda f, t: {"landmarks": t / "absent.csv"}, "cannot read the landmarks"),
     "landmarks off the object": (off_the_object, "landmark"),
     "landmarks at random pixels": (scattered_pixels, "landmark"),

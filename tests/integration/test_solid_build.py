@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -136,21 +137,37 @@ def test_info_tells_of_a_solid(built, capsys):
     assert "bend    -25 to 25 deg" in text
 
 
-def test_a_solid_is_filmed_and_tracked(built):
+@pytest.fixture(scope="module")
+def filmed(built):
+    """The block filmed; the options that `morph track` needs."""
     write_texture(built)
     (built / "scene.toml").write_text(SCENE)
-    assert cli.main(["simulate", str(built / "scene.toml"), "-o", str(built / "seq")]) == 0
     sequence = built / "seq"
-    command = ["track", str(sequence / "frames"), "--model", str(built / "block.morph")]
-    command += ["--camera", str(sequence / "camera.yaml"), "--landmarks", str(sequence / "landmarks.csv")]
-    assert cli.main([*command, "-o", str(built / "run")]) == 0
+    assert cli.main(["simulate", str(built / "scene.toml"), "-o", str(sequence)]) == 0
+    options = [str(sequence / "frames"), "--model", str(built / "block.morph")]
+    return [
+        *options,
+        "--camera",
+        str(sequence / "camera.yaml"),
+        "--landmarks",
+        str(sequence / "landmarks.csv"),
+    ]
+
+
+def test_a_solid_is_filmed_and_tracked(built, filmed):
+    assert cli.main(["track", *filmed, "-o", str(built / "run")]) == 0
     assert (built / "run" / "augmented.mp4").stat().st_size > 1000
     run = load_run(built / "run")
     assert run.tracked.all()
-    points = ["--points", str(sequence / "truth.npz"), "--bind-frame", "0"]
+    points = ["--points", str(built / "seq" / "truth.npz"), "--bind-frame", "0"]
     assert cli.main(["evaluate", str(built / "run"), *points]) == 0
     figures = json.loads((built / "run" / "evaluation.json").read_text())
     assert figures["mean_mm"] < 0.5
+
+
+def test_a_closed_surface_has_no_outline_to_track(built, filmed, capsys):
+    assert cli.main(["track", *filmed, "--outline", "-o", str(built / "outlined")]) == 2
+    assert "is closed and has no rim" in capsys.readouterr().err
 
 
 def test_uniaxial_stretch_reaches_the_closed_form_through_the_whole_chain(tmp_path):
@@ -174,3 +191,90 @@ def test_uniaxial_stretch_reaches_the_closed_form_through_the_whole_chain(tmp_pa
     assert model.strain is not None
     green = [(0.830679**2 - 1) / 2, (0.830679**2 - 1) / 2, (1.5**2 - 1) / 2, 0, 0, 0]
     assert model.strain.value(mu) == pytest.approx(np.tile(green, (len(model.nodes), 1)), abs=1e-4)
+
+
+MISTAKES = {
+    "unknown set": ('on = "z_min"', 'on = "floor"', r"no node set or surface 'floor'; it has: .*z_max"),
+    "unit slip": ('["40 mm", "40 mm", "80 mm"]', '["40 m", "40 m", "80 m"]', r"measures 40 x 40 x 80 m"),
+    "no unit": ('young = "3 MPa"', "young = 3.0", r"materials\.rubber: young: write 3\.0 with its unit"),
+    "other unit": ('young = "3 MPa"', 'young = "3 mm"', r"'mm' is not a unit of stress; use one of Pa"),
+    "unstable": ("poisson = 0.45", "poisson = 0.55", r"poisson = 0\.55 must lie between"),
+    "negative modulus": ('young = "3 MPa"', 'young = "-3 MPa"', r"young = -3e\+06 must be positive"),
+    "unknown law": ('"neo_hookean"', '"neo_hooke"', r"not a known material law; known are neo_hookean"),
+    "unknown constant": ("poisson = 0.45", 'poisson = 0.45\nshear = "1 MPa"', r"has no constant 'shear'"),
+    "unknown key": (
+        "[solver]",
+        "[solver]\nspeed = 3",
+        r"unknown key solver\.speed; known here: workers, thr",
+    ),
+    "unknown mesh key": (
+        "divisions =",
+        "division =",
+        r"unknown key mesh\.division; known here: generator, size",
+    ),
+    "unknown support": ('kind = "rotation"', 'kind = "spin"', r"supports\.1.*'spin'"),
+    "unknown parameter": (
+        'angle = "bend"',
+        'angle = "bent"',
+        r"names 'bent', which is no parameter; the par",
+    ),
+    "parameter of another quantity": (
+        'angle = "bend"',
+        'angle = "squash"',
+        r"squash is of length, and angle",
+    ),
+    "falling range": ('["0 mm", "8 mm"]', '["8 mm", "0 mm"]', r"range must rise"),
+}
+
+
+@pytest.mark.parametrize("mistake", sorted(MISTAKES))
+def test_a_mistake_in_a_study_is_one_message(tmp_path, capsys, mistake):
+    before, after, message = MISTAKES[mistake]
+    assert before in BLOCK
+    (tmp_path / "study.toml").write_text(BLOCK.replace(before, after))
+    assert cli.main(["build", str(tmp_path / "study.toml"), "-o", str(tmp_path / "x.morph")]) == 2
+    printed = capsys.readouterr().err.splitlines()[-1]
+    assert printed.startswith("morph: ")
+    assert re.search(message, printed)
+
+
+def test_an_inverted_mesh_is_one_message(tmp_path, capsys):
+    inverted = "0 1 3 2 4 5 6 7"  # the top face crosses itself
+    lines = ["*NODE"] + [
+        f"{1 + i + 2 * j + 4 * k}, {10 * i}, {10 * j}, {10 * k}"
+        for k in (0, 1)
+        for j in (0, 1)
+        for i in (0, 1)
+    ]
+    lines += [
+        "*ELEMENT, TYPE=C3D8, ELSET=all_of_it",
+        "1, " + ", ".join(str(1 + int(n)) for n in inverted.split()),
+    ]
+    lines += ["*NSET, NSET=z_min", "1, 2, 3, 4", "*NSET, NSET=z_max", "5, 6, 7, 8"]
+    (tmp_path / "cube.inp").write_text("\n".join(lines) + "\n")
+    start, end = BLOCK.index("generator"), BLOCK.index("[materials")
+    (tmp_path / "study.toml").write_text(BLOCK[:start] + 'file = "cube.inp"\nunit = "mm"\n' + BLOCK[end:])
+    assert cli.main(["build", str(tmp_path / "study.toml"), "-o", str(tmp_path / "x.morph")]) == 2
+    assert re.search(r"morph: .*(inverted|folded|inside out)", capsys.readouterr().err)
+
+
+def test_a_load_past_its_limit_point_names_the_last_value_that_converged(tmp_path, capsys):
+    """A long tube under inner pressure: with a thin wall p = (wall / radius) mu (1 - stretch^-4) at most."""
+    text = BLOCK[: BLOCK.index("generator")] + 'generator = "tube"\ninner_radius = "19 mm"\n'
+    text += 'outer_radius = "21 mm"\nlength = "5 mm"\ndivisions = [1, 1, 6]\ncells = "hex20"\n'
+    text += 'angles = ["0 deg", "90 deg"]\n' + BLOCK[BLOCK.index("[materials") : BLOCK.index("[[supports]]")]
+    for on, axis in (("bottom", "z"), ("top", "z"), ("start", "y"), ("end", "x")):
+        text += f'[[supports]]\nkind = "displacement"\non = "{on}"\n{axis} = "0 mm"\n'
+    text += '[[loads]]\nkind = "pressure"\non = "inner"\npressure = "inside"\n'
+    text += '[parameters.inside]\nrange = ["0 kPa", "150 kPa"]\n[solver]\nthreads = 1\n'
+    text += '[sampling]\nscheme = "even"\ntraining = 16\nheld_out = 4\n'
+    (tmp_path / "study.toml").write_text(text)
+    assert cli.main(["build", str(tmp_path / "study.toml"), "-o", str(tmp_path / "x.morph")]) == 2
+    message = capsys.readouterr().err.splitlines()[-1]
+    found = re.search(
+        r"inside could only be followed from 0 to ([\d.]+) kPa: no equilibrium found beyond", message
+    )
+    assert found
+    limit = 100.0 * 3e6 / 2.9 * 1e-6
+    assert 0.9 * limit < float(found[1]) < 1.05 * limit
+    assert list((tmp_path / "x.morph.snapshots").glob("*.npz"))

@@ -13,7 +13,10 @@ from morph_dslam.errors import EvaluationError
 
 Array = NDArray[np.float64]
 
-LAYOUT = "frame (t,) whole numbers, points_mm (t, p, 3) in the camera frame, pixels (t, p, 2); visible (t, p) if known"
+LAYOUT = (
+    "frame (t,) whole numbers, points_mm (t, p, 3) in the camera frame, pixels (t, p, 2) and, if known, "
+    "visible (t, p)"
+)
 
 
 @dataclass(frozen=True)

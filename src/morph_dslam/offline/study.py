@@ -61,22 +61,47 @@ def _kind(content: Mapping[str, Any]) -> type[Study]:
 
 
 def _explain(kind: type[BaseModel], entry: Any) -> str:
-    where = ".".join(str(part) for part in entry["loc"]) or "study"
+    location, section = _without_tags(kind, entry["loc"])
+    where = ".".join(str(part) for part in location) or "study"
     if entry["type"] == "extra_forbidden":
-        return f"unknown key {where}; known here: {', '.join(_section_at(kind, entry['loc']).model_fields)}"
+        return f"unknown key {where}; known here: {', '.join(section.model_fields)}"
     if entry["type"] == "missing":
         return f"{where} is missing"
     return f"{where}: {entry['msg'].removeprefix('Value error, ')}"
 
 
-def _section_at(section: type[BaseModel], location: tuple[int | str, ...]) -> type[BaseModel]:
-    """The section in which the last key of a pydantic error ``location`` was written."""
-    for part in location[:-1]:
-        if isinstance(part, str) and part in section.model_fields:
-            pending = [section.model_fields[part].annotation]
-            while pending:
-                annotation = pending.pop()
-                if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
-                    section = annotation if issubclass(annotation, BaseModel) else section
-                pending.extend(get_args(annotation))
-    return section
+def _without_tags(
+    section: type[BaseModel], location: tuple[int | str, ...]
+) -> tuple[list[int | str], type[BaseModel]]:
+    """The keys of a pydantic error's location as they stand in the file, and the section of the last one.
+
+    Where a section is one of several kinds, pydantic puts the tag of its kind in between.
+    """
+    keys: list[int | str] = []
+    kinds: dict[str, type[BaseModel]] = {}
+    for position, part in enumerate(location):
+        if part in kinds:
+            section, kinds = kinds[str(part)], {}
+            continue
+        keys.append(part)
+        if isinstance(part, str) and part in section.model_fields and position < len(location) - 1:
+            kinds = _kinds(section.model_fields[part].annotation)
+            section = next(iter(kinds.values()), section)
+    return keys, section
+
+
+def _kinds(annotation: Any) -> dict[str, type[BaseModel]]:
+    """The sections that an annotation allows, by the tag of their kind."""
+    found: dict[str, type[BaseModel]] = {}
+    pending = [annotation]
+    while pending:
+        item = pending.pop(0)
+        if (
+            isinstance(item, type)
+            and not isinstance(item, types.GenericAlias)
+            and issubclass(item, BaseModel)
+        ):
+            tag = item.model_fields.get("kind") or item.model_fields.get("generator")
+            found[get_args(tag.annotation)[0] if tag else "file"] = item
+        pending += get_args(item)
+    return found

@@ -22,6 +22,7 @@ from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.online.augmentation import write_video
 from morph_dslam.online.estimation import State
+from morph_dslam.online.outline import rim
 from morph_dslam.online.pipeline import Tracker, TrackerOptions
 from morph_dslam.online.plots import write_plots
 from morph_dslam.online.reference_refinement import (
@@ -85,6 +86,10 @@ def track(options: TrackOptions) -> dict[str, Any]:
     _check_output(options)
     model, camera = load_model(options.model), load_camera(options.camera)
     landmarks = load_landmarks(options.landmarks)
+    if options.use_outline and not len(rim(model.triangles)):
+        raise TrackingError(
+            f"the surface of '{model.name}' is closed and has no rim: track it without the outline"
+        )
     source = open_source(options.frames, options.first, options.last)
     reference = _reference_frame(options)
     camera.check_image(reference.image, f"frame {reference.index} of {options.frames}")
