@@ -16,6 +16,7 @@ from morph_dslam.offline.separable_problem import (
     collocation_axis,
     galerkin_axis,
 )
+from morph_dslam.offline.tensor_formats import khatri_rao
 
 
 def quiet(**options) -> PgdOptions:
@@ -24,11 +25,13 @@ def quiet(**options) -> PgdOptions:
 
 def on_grid(solution: PgdSolution, *grids: np.ndarray) -> np.ndarray:
     """The separated solution (n, g_1, ..., g_d) at all points of the grids."""
-    result = solution.modes.T
-    for basis, factor, grid in zip(solution.functions.bases, solution.functions.factors, grids, strict=True):
-        values = basis.evaluate(grid) @ factor
-        result = result[..., None, :] * values
-    return result.sum(axis=-1)
+    tables = tuple(
+        basis.evaluate(grid) @ factor
+        for basis, factor, grid in zip(
+            solution.functions.bases, solution.functions.factors, grids, strict=True
+        )
+    )
+    return (solution.modes.T @ khatri_rao(tables).T).reshape(-1, *(len(grid) for grid in grids))
 
 
 # --- a Euler-Bernoulli cantilever; Hermite elements are exact at their nodes ---

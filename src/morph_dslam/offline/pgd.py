@@ -50,8 +50,8 @@ class PgdOptions:
 
     max_modes: int = 40
     tolerance: float = 1e-4
-    inner_tolerance: float = 1e-2
-    inner_iterations: int = 8
+    inner_tolerance: float = 1e-3
+    inner_iterations: int = 25
     refit_every: int = 5
     method: str = "galerkin"
     progress: bool = True

@@ -4,7 +4,7 @@ u(mu) = sum_m f_m prod_k phi_k(mu_k) . a_{k,m} is found by enrichment and altern
 al., "A multidimensional data-driven sparse identification technique: the sparse proper generalized
 decomposition", Complexity 2018). Roughness is penalised, with a weight chosen by generalised cross-validation
 (GCV); after every few enrichments all modes are refitted together; the number of modes is the one that
-predicts samples kept aside best. The samples are compressed by POD first: the least-squares problem is the same.
+predicts samples kept aside best. The samples are compressed by POD first, which changes no fit.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ class _Fit:
         return a / np.sqrt(np.mean((table @ a) ** 2))
 
     def refit(self, max_sweeps: int) -> None:
-        """All modes together, one parameter after the other and the amplitudes in between, until it settles."""
+        """All modes together, one parameter after the other, the amplitudes in between, until it settles."""
         previous = np.inf
         for _ in range(max_sweeps):
             for k in range(len(self.tables)):
@@ -166,7 +166,7 @@ class _Fit:
         products = self._products()
         gram = products.T @ products
         gram[np.diag_indices_from(gram)] += 1e-12 * np.trace(gram) / len(gram)
-        self.mixing = np.linalg.solve(gram, products.T @ self.data)
+        self.mixing = np.asarray(np.linalg.solve(gram, products.T @ self.data), dtype=np.float64)
 
     def _refit_parameter(self, k: int) -> None:
         table, others, m = self.tables[k], self._products(skip=k), len(self.mixing)
