@@ -251,3 +251,14 @@ def test_the_axes_of_orthotropy_are_those_given():
     stretched = stress(law, np.eye(3) + 1e-7 * np.outer(AXES[:, 2], AXES[:, 2]))
     expected = orthotropic_stiffness((9.0, 4.0, 2.5), (0.3, 0.25, 0.2), (1.7, 1.2, 0.9))[2, 2]
     assert AXES[:, 2] @ stretched @ AXES[:, 2] / 1e-7 == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", ["neo_hookean", "mooney_rivlin", "gent", "ogden", "transversely_isotropic"])
+def test_an_inverted_cell_has_no_stress_that_could_be_taken_for_sound(name):
+    assert np.isnan(stress(ELASTIC[name], np.diag([1.0, 1.0, -0.5]))).any()
+    assert np.isnan(tangent(ELASTIC[name], np.diag([1.0, 1.0, -0.5]))).any()
+
+
+def test_chains_beyond_their_limit_have_no_stress():
+    # I1~ - 3 = 13.5 at this stretch; the limit is 12.
+    assert np.isnan(stress(ELASTIC["gent"], np.diag([4.0, 0.5, 0.5]))).any()

@@ -13,6 +13,7 @@ from morph_dslam.offline.materials.base import (
     Material,
     evaluate,
     green_lagrange,
+    log_volume,
     right_cauchy_green,
 )
 from morph_dslam.offline.materials.directions import Direction, unit_direction
@@ -168,14 +169,14 @@ class TransverselyIsotropic(Directed):
     def remainder(self, F: Any) -> Any:
         mu, alpha, beta, gamma = self._moduli()
         fibre = unit_direction(self.fibre, self.name)
-        C, log_J = right_cauchy_green(F), ngs.log(ngs.Det(F))
+        C, log_J = right_cauchy_green(F), log_volume(F)
         stretched = C * fibre
         i4, i5 = fibre * stretched - 1.0, stretched * stretched - 1.0
         matrix = 0.5 * mu * (ngs.Trace(C) - 3.0) - mu * log_J
         return matrix + (alpha + beta * log_J + gamma * i4) * i4 - 0.5 * alpha * i5
 
     def volumetric(self, F: Any) -> Any:
-        return ngs.log(ngs.Det(F))
+        return log_volume(F)
 
     @property
     def volumetric_modulus(self) -> Constant:

@@ -200,6 +200,19 @@ def evaluate(coefficient: Any) -> Any:
     return float(value[0]) if value.size == 1 else value
 
 
+def positive_or_nan(x: Any) -> Any:
+    """x where it is positive, elsewhere not a number, and its derivatives neither.
+
+    The derivative of ln x is finite for negative x too, so an inverted cell would pass for a sound one.
+    """
+    return ngs.IfPos(x, x, np.nan)
+
+
+def log_volume(F: Any) -> Any:
+    """ln det F; not a number in an inverted cell, nor are its derivatives."""
+    return ngs.log(positive_or_nan(ngs.Det(F)))
+
+
 def right_cauchy_green(F: Any) -> Any:
     """C = F'F."""
     return F.trans * F

@@ -10,6 +10,7 @@ import ngsolve as ngs
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from tqdm import tqdm
 
 from morph_dslam.errors import StudyError
 from morph_dslam.offline.materials.base import Material
@@ -121,7 +122,8 @@ def _best_of(differences: Callable[[Array], Array], size: int, starts: int, seed
     points = random.random((starts, size))
     points[0] = 0.5
     results = [
-        least_squares(differences, point, bounds=(0.0, 1.0), x_scale="jac", max_nfev=200) for point in points
+        least_squares(differences, point, bounds=(0.0, 1.0), x_scale="jac", max_nfev=200)
+        for point in tqdm(points, desc="fitting, starts", leave=False)
     ]
     best = min(results, key=lambda result: result.cost)
     if not best.cost < 1e3:

@@ -7,7 +7,7 @@ from typing import Any
 
 import ngsolve as ngs
 
-from morph_dslam.offline.materials.base import Constant, Material, green_lagrange, lame
+from morph_dslam.offline.materials.base import Constant, Material, green_lagrange, lame, log_volume
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,10 +49,10 @@ class NeoHookean(_Lame):
     """
 
     def remainder(self, F: Any) -> Any:
-        return 0.5 * self.shear * (ngs.InnerProduct(F, F) - 3.0) - self.shear * ngs.log(ngs.Det(F))
+        return 0.5 * self.shear * (ngs.InnerProduct(F, F) - 3.0) - self.shear * log_volume(F)
 
     def volumetric(self, F: Any) -> Any:
-        return ngs.log(ngs.Det(F))
+        return log_volume(F)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

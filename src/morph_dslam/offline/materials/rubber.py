@@ -12,7 +12,7 @@ from typing import Any
 
 import ngsolve as ngs
 
-from morph_dslam.offline.materials.base import Constant, Material, right_cauchy_green
+from morph_dslam.offline.materials.base import Constant, Material, positive_or_nan, right_cauchy_green
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -101,8 +101,8 @@ class Gent(Rubber):
     Energy  W = -mu Jm/2 ln(1 - (I1~ - 3)/Jm) + kappa/2 (J - 1)^2
     Stress  incompressible uniaxial: P = mu Jm (l - l^-2) / (Jm - I1 + 3)
 
-    Gent, Rubber Chemistry and Technology 69, 1996. Beyond the limit the energy is not a number, and the
-    solver halves its step.
+    Gent, Rubber Chemistry and Technology 69, 1996. Beyond the limit energy and stress are not a number, and
+    the solver shortens its step.
 
     Attributes
     ----------
@@ -114,7 +114,8 @@ class Gent(Rubber):
     limit: Constant
 
     def remainder(self, F: Any) -> Any:
-        return -0.5 * self.shear * self.limit * ngs.log(1.0 - (first_invariant(F) - 3.0) / self.limit)
+        left = positive_or_nan(1.0 - (first_invariant(F) - 3.0) / self.limit)
+        return -0.5 * self.shear * self.limit * ngs.log(left)
 
     def check_constants(self) -> None:
         self.require_positive("shear", "limit", "bulk")

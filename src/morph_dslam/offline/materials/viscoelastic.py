@@ -111,7 +111,7 @@ class ViscousState:
     """
 
     def __init__(self, mesh: ngs.Mesh, materials: dict[str, Material], order: int) -> None:
-        self.mesh, self.materials = mesh, materials
+        self.mesh, self.materials, self.order = mesh, materials, order
         self.time_step = ngs.Parameter(0.0)
         series = [m.prony for m in materials.values() if m.prony is not None]
         if not series:
@@ -156,12 +156,16 @@ class ViscousState:
 
     def history(self, region: str, F: Any) -> Any:
         """H : E, the work of the stresses remembered from earlier steps."""
+        return ngs.InnerProduct(self.remembered(region), green_lagrange(F))
+
+    def remembered(self, region: str) -> Any:
+        """H (3x3), Pa, of a viscous region."""
         prony = self.materials[region].prony
         assert prony is not None
         remembered = ngs.CF(tuple([0.0] * 9), dims=(3, 3))
         for g, k, decay, overstress in self._terms(prony):
             remembered += decay**2 * overstress - decay * (g * self._instant[0] + k * self._instant[1])
-        return ngs.InnerProduct(remembered, green_lagrange(F))
+        return remembered
 
     def first_piola_kirchhoff(self, region: str, F: Any) -> Any:
         """P (3x3), Pa, in the step that ends at F; to be asked before `advance`."""

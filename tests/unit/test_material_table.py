@@ -1,0 +1,186 @@
+"""Materials from a study's table and from Abaqus cards."""
+
+import ngsolve as ngs
+import numpy as np
+import pytest
+
+from morph_dslam.errors import StudyError
+from morph_dslam.io.inp_cards import read_cards
+from morph_dslam.io.inp_materials import read_materials
+from morph_dslam.offline.materials.anisotropic import HolzapfelGasserOgden, Orthotropic
+from morph_dslam.offline.materials.cards import material_from_card
+from morph_dslam.offline.materials.isotropic import NeoHookean, StVenantKirchhoff
+from morph_dslam.offline.materials.ogden import Ogden
+from morph_dslam.offline.materials.rubber import MooneyRivlin, Yeoh
+from morph_dslam.offline.materials.table import LAWS, constant_quantities, material_from_table
+from tests.support.material_laws import stress
+
+F = np.array([[1.3, 0.2, -0.1], [0.05, 0.85, 0.3], [0.15, -0.2, 1.1]])
+
+
+def test_every_law_has_its_name():
+    assert list(LAWS) == [
+        "neo_hookean", "st_venant_kirchhoff", "linear_elastic", "mooney_rivlin", "yeoh", "gent", "ogden",
+        "orthotropic", "transversely_isotropic", "holzapfel_gasser_ogden", "user_material",
+    ]  # fmt: skip
+
+
+def test_a_table_becomes_its_material():
+    prony = {"relative_moduli": [0.5], "times": [2.0]}
+    law = material_from_table(
+        {"law": "neo_hookean", "young": 3.0, "poisson": 0.3, "density": 9.0, "prony": prony}
+    )
+    assert isinstance(law, NeoHookean)
+    assert (law.density, law.prony.times, law.prony.bulk) == (9.0, (2.0,), (0.5,))
+    np.testing.assert_array_equal(stress(law, F), stress(NeoHookean(young=3.0, poisson=0.3), F))
+
+
+def test_lists_parameters_and_directions_are_taken():
+    law = material_from_table({"law": "ogden", "moduli": [0.4, 0.1], "exponents": [1.6, -2.0], "bulk": 7.0})
+    same = Ogden(moduli=(0.4, 0.1), exponents=(1.6, -2.0), bulk=7.0)
+    np.testing.assert_array_equal(stress(law, F), stress(same, F))
+    angle = ngs.Parameter(0.5)
+    table = {"law": "holzapfel_gasser_ogden", "shear": 0.5, "k1": 1.3, "k2": 0.7, "bulk": 7.0}
+    turned = {"angle": angle, "from": [1, 0, 0], "towards": [0, 1, 0]}
+    law = material_from_table(table | {"fibre": turned, "fibre_2": [0, 0, 1]})
+    same = HolzapfelGasserOgden(
+        shear=0.5, k1=1.3, k2=0.7, bulk=7.0, fibre=(np.cos(0.5), np.sin(0.5), 0), fibre_2=(0, 0, 1)
+    )
+    np.testing.assert_allclose(stress(law, F), stress(same, F), rtol=1e-13)
+    assert material_from_table(table | {"fibre": "grain"}).fibres == ("grain",)
+
+
+def test_a_users_function_is_loaded_from_its_file(tmp_path):
+    (tmp_path / "law.py").write_text(
+        "import ngsolve as ngs\n"
+        "def energy(F, mu):\n"
+        "    return 0.5 * mu * (ngs.InnerProduct(F, F) - 3.0) - mu * ngs.log(ngs.Det(F))\n"
+    )
+    table = {"law": "user_material", "function": "law.py:energy", "mu": 1.0, "bulk": 2.0}
+    material = material_from_table(table, tmp_path)
+    material.check()
+    inverse, J = np.linalg.inv(F).T, np.linalg.det(F)
+    np.testing.assert_allclose(stress(material, F), F - inverse + 2.0 * (J - 1.0) * J * inverse, rtol=1e-12)
+    for reference, message in (
+        ("law.py:other", "has no function other"),
+        ("none.py:energy", "no file"),
+        (7, "lacks its function"),
+    ):
+        with pytest.raises(StudyError, match=message):
+            material_from_table(table | {"function": reference}, tmp_path)
+    (tmp_path / "law.py").write_text("1 / 0\n")
+    with pytest.raises(StudyError, match="cannot be run: division by zero"):
+        material_from_table(table, tmp_path)
+
+
+def test_a_users_function_without_its_constant_is_one_message(tmp_path):
+    (tmp_path / "law.py").write_text("def energy(F, mu):\n    return mu\n")
+    with pytest.raises(StudyError, match="missing 1 required positional argument: 'mu'"):
+        material_from_table({"law": "user_material", "function": "law.py:energy"}, tmp_path).check()
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"young": 3.0}, "names no law; set law to one of neo_hookean, st_venant"),
+        ({"law": "neohook"}, "'neohook' is not a known material law; known are neo_hookean, "),
+        ({"law": "neo_hookean", "young": 3.0}, "neo_hookean lacks its constant 'poisson'"),
+        ({"law": "neo_hookean", "young": 3.0, "poison": 0.3}, "has no constant 'poison'; it has .*poisson"),
+        ({"law": "neo_hookean", "young": "3 MPa", "poisson": 0.3}, "young = 3 MPa is not a number"),
+        ({"law": "ogden", "moduli": 0.4, "exponents": [2.0], "bulk": 7.0}, "moduli = 0.4 must be a list"),
+        (
+            {"law": "gent", "shear": 1, "limit": 5, "bulk": 7, "prony": {"times": [1]}},
+            "needs relative_moduli",
+        ),
+        ({"law": "user_material"}, "lacks its function"),
+        (
+            {"law": "holzapfel_gasser_ogden", "shear": 1, "k1": 1, "k2": 1, "bulk": 7, "fibre": {"angle": 1}},
+            "needs angle, from and towards",
+        ),
+    ],
+)
+def test_a_wrong_table_is_refused(table, message):
+    with pytest.raises(StudyError, match=message):
+        material_from_table(table)
+
+
+def test_the_quantities_of_constants_are_told():
+    assert constant_quantities("gent") == {
+        "density": "density", "bulk": "stress", "shear": "stress", "limit": "ratio"
+    }  # fmt: skip
+    assert constant_quantities("ogden")["exponents"] == "ratio"
+    assert constant_quantities("orthotropic")["poisson_23"] == "ratio"
+    assert set(constant_quantities("holzapfel_gasser_ogden")) == {
+        "density", "bulk", "shear", "k1", "k2", "dispersion"
+    }  # fmt: skip
+
+
+def card(tmp_path, text):
+    path = tmp_path / "deck.inp"
+    path.write_text("*MATERIAL, NAME=RUBBER\n" + text)
+    return read_materials(read_cards(path))["RUBBER"]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("*HYPERELASTIC, NEO HOOKE\n0.3, 0.2\n", MooneyRivlin(c10=3e5, bulk=1e7)),
+        ("*HYPERELASTIC, MOONEY-RIVLIN\n0.3, 0.1, 0.2\n", MooneyRivlin(c10=3e5, c01=1e5, bulk=1e7)),
+        ("*HYPERELASTIC, YEOH\n0.3, -0.01, 0.001, 0.2\n", Yeoh(c10=3e5, c20=-1e4, c30=1e3, bulk=1e7)),
+        (
+            "*HYPERELASTIC, OGDEN, N=2\n0.4, 1.6, 0.1, -2., 0.2, 0.\n",
+            Ogden(moduli=(4e5, 1e5), exponents=(1.6, -2.0), bulk=1e7),
+        ),
+        ("*ELASTIC\n3., 0.3\n", StVenantKirchhoff(young=3e6, poisson=0.3)),
+    ],
+)
+def test_cards_in_millimetres_become_materials_in_si(tmp_path, text, expected):
+    material = material_from_card(card(tmp_path, text + "*DENSITY\n1.1e-9\n"), "mm")
+    assert type(material) is type(expected)
+    assert material.density == pytest.approx(1100.0)
+    np.testing.assert_allclose(stress(material, F), stress(expected, F), rtol=1e-12)
+
+
+def test_both_orthotropic_cards_state_the_same_solid(tmp_path):
+    constants = "9., 4., 2.5, 0.3, 0.25, 0.2, 1.7, 1.2,\n0.9\n"
+    law = material_from_card(card(tmp_path, "*ELASTIC, TYPE=ENGINEERING CONSTANTS\n" + constants), "m")
+    assert isinstance(law, Orthotropic)
+    c = law.small_strain_stiffness()
+    # Abaqus's order: D1111, D1122, D2222, D1133, D2233, D3333, D1212, D1313, D2323.
+    entries = [c[0, 0], c[0, 1], c[1, 1], c[0, 2], c[1, 2], c[2, 2], c[5, 5], c[4, 4], c[3, 3]]
+    text = ", ".join(f"{e!r}" for e in map(float, entries[:8])) + f",\n{float(entries[8])!r}\n"
+    other = material_from_card(card(tmp_path, "*ELASTIC, TYPE=ORTHOTROPIC\n" + text), "m")
+    np.testing.assert_allclose(other.small_strain_stiffness(), c, rtol=1e-12, atol=1e-13)
+
+
+def test_viscous_cards_give_long_term_constants_unless_they_say_otherwise(tmp_path):
+    prony = "*VISCOELASTIC, TIME=PRONY\n0.5, 0.2, 1.0\n0.1, 0.0, 10.\n"
+    law = material_from_card(card(tmp_path, "*HYPERELASTIC, NEO HOOKE\n0.3, 0.2\n" + prony), "m")
+    assert law.prony.relative_moduli == (0.5, 0.1)
+    assert law.prony.bulk == (0.2, 0.0)
+    assert law.prony.times == (1.0, 10.0)
+    assert law.c10 * (1.0 - 0.6) == pytest.approx(0.3)
+    assert law.bulk * (1.0 - 0.2) == pytest.approx(10.0)
+    text = "*HYPERELASTIC, NEO HOOKE, MODULI=INSTANTANEOUS\n0.3, 0.2\n"
+    law = material_from_card(card(tmp_path, text + prony), "m")
+    assert (law.c10, law.bulk) == (0.3, 10.0)
+
+
+def test_full_incompressibility_becomes_nearly_so(tmp_path):
+    law = material_from_card(card(tmp_path, "*HYPERELASTIC, NEO HOOKE\n0.3\n"), "m")
+    assert law.equivalent_poisson == pytest.approx(0.4999, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "message"),
+    [
+        ("*DENSITY\n1.\n", "m", "neither .ELASTIC nor .HYPERELASTIC"),
+        ("*ELASTIC\n3., 0.3\n", "cm", "not in cm"),
+        ("*HYPERELASTIC, YEOH\n0.3, 0., 0., 0.2, 0.1, 0.\n", "m", "D2, D3, ... other than 0"),
+        ("*ELASTIC\n3., 0.3\n*VISCOELASTIC, TIME=PRONY\n0.5, 0., 1.\n", "m", "k = g"),
+        ("*ELASTIC\n3., 0.3\n*VISCOELASTIC, TIME=PRONY\n1.5, 1.5, 1.\n", "m", "sum to less than 1"),
+    ],
+)
+def test_cards_without_a_counterpart_are_refused(tmp_path, text, unit, message):
+    with pytest.raises(StudyError, match=message):
+        material_from_card(card(tmp_path, text), unit)
