@@ -107,14 +107,14 @@ def _simulate(arguments: argparse.Namespace) -> None:
 
 def _calibrate(arguments: argparse.Namespace) -> None:
     from morph_dslam.calibration.board import parse_board
-    from morph_dslam.calibration.calibrate import calibrate
+    from morph_dslam.calibration.calibrate import calibrate, picture_path
 
     board = parse_board(arguments.board, arguments.square)
     calibration = calibrate(arguments.source, board, arguments.output, arguments.lens)
     print(calibration.table())
     for remark in calibration.remarks():
         print(f"note: {remark}")
-    print(f"wrote {arguments.output} and {arguments.output.with_suffix('.png')}")
+    print(f"wrote {arguments.output} and {picture_path(arguments.output)}")
     print(calibration.line())
 
 

@@ -81,7 +81,7 @@ class Calibration:
 def calibrate(
     sources: Sequence[Path], board: Board, output: Path, lens_model: LensModel = "radial-tangential"
 ) -> Calibration:
-    """Calibrate a camera and write the camera file and, beside it, a picture of the same name.
+    """Calibrate a camera and write the camera file and, beside it, a picture (`picture_path`).
 
     Parameters
     ----------
@@ -97,8 +97,17 @@ def calibrate(
     """
     if not output.parent.is_dir():
         raise CameraError(f"cannot write {output}: there is no folder {output.parent}")
-    found = collect_views(sources, board)
+    picture = picture_path(output)
+    found = collect_views(sources, board, ignored=picture)
     calibration = Calibration(solve_intrinsics(found.views, board, found.size, lens_model), found, board)
-    save_camera(output, calibration.solution.camera)
-    plot_calibration(output.with_suffix(".png"), calibration.solution)
+    try:
+        save_camera(output, calibration.solution.camera)
+        plot_calibration(picture, calibration.solution)
+    except OSError as error:
+        raise CameraError(f"cannot write {error.filename}: {error.strerror}") from error
     return calibration
+
+
+def picture_path(output: Path) -> Path:
+    """Where the picture of a calibration goes, by its camera file."""
+    return output.with_name(f"{output.stem}_calibration.png")

@@ -42,10 +42,11 @@ class Views:
     n_searched: int
 
 
-def collect_views(sources: Sequence[Path], board: Board) -> Views:
+def collect_views(sources: Sequence[Path], board: Board, ignored: Path | None = None) -> Views:
     """The views in images, in a folder of images, or in a video or another recording.
 
-    Of a recording with many views, those are kept that cover positions, distances and tilts best.
+    Of a recording with many views, those are kept that cover positions, distances and tilts best. The image
+    ``ignored`` is passed over: a picture that an earlier calibration left in the folder.
 
     Raises
     ------
@@ -54,7 +55,7 @@ def collect_views(sources: Sequence[Path], board: Board) -> Views:
     SourceError
         If an image or a video cannot be read.
     """
-    files = _image_files(sources)
+    files = [path for path in _image_files(sources) if ignored is None or path.resolve() != ignored.resolve()]
     images, total = (_read(files), len(files)) if files else _sampled(sources)
     views, size, n_searched = [], None, 0
     for name, image in tqdm(images, total=total, desc="searching the board", unit="image", disable=None):
