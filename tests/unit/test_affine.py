@@ -1,0 +1,68 @@
+"""Expressions of parameters in study files."""
+
+import numpy as np
+import pytest
+
+from morph_dslam.errors import StudyError
+from morph_dslam.model import Parameter
+from morph_dslam.offline.affine import read_affine
+
+PARAMETERS = (
+    Parameter("load", "pressure", "kPa", 0.0, 5e3, 0.0),
+    Parameter("share", "ratio", "1", 0.0, 1.0, 0.0),
+    Parameter("tilt", "angle", "deg", -1.0, 1.0, 0.0),
+)
+MU = np.array([2000.0, 0.25, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("text", "quantity", "value"),
+    [
+        ("3 MPa", "stress", 3e6),
+        ("-3 MPa", "stress", -3e6),
+        (0.45, "ratio", 0.45),
+        ("0.45", "ratio", 0.45),
+        ("load", "stress", 2000.0),
+        ("-load", "pressure", -2000.0),
+        ("-1 * load", "pressure", -2000.0),
+        ("0.5 * load + 2 kPa", "pressure", 3000.0),
+        ("2 kPa - 0.5*load", "pressure", 1000.0),
+        ("10 N * share", "force", 2.5),
+        ("1e-2 m * share - 1 mm", "length", 0.0015),
+        ("1 - share", "ratio", 0.75),
+        ("90 deg - 2 * tilt", "angle", np.pi / 2 - 1.0),
+        ("2.5e-1 N/mm3", "stiffness per area", 2.5e8),
+        ("7 g/cm3", None, 7000.0),
+        ("load + 1 kPa", None, 3000.0),
+    ],
+)
+def test_values(text, quantity, value):
+    assert read_affine(text, quantity, PARAMETERS)(MU) == pytest.approx(value, rel=1e-14)
+
+
+def test_expression_is_the_same_function_of_other_variables():
+    affine = read_affine("3 kPa + 0.5 * load + 1 kPa * share", "stress", PARAMETERS)
+    assert affine.slopes == (0.5, 1000.0, 0.0)
+    assert affine.expression(MU.tolist()) == pytest.approx(affine(MU), rel=1e-15)
+    assert read_affine("3 kPa", "stress", PARAMETERS).expression(["not", "looked", "at"]) == 3000.0
+
+
+@pytest.mark.parametrize(
+    ("text", "quantity", "message"),
+    [
+        ("3", "stress", r"'3' lacks a unit of stress: Pa, kPa"),
+        (3.0, "length", r'with its unit, "3\.0 m" for example'),
+        (True, "ratio", r"True is not a number"),
+        ("3 mm", "stress", r"'mm' is not a unit of stress"),
+        ("weight", "stress", r"names 'weight', which is no parameter; the parameters are load, share, tilt"),
+        ("tilt", "stress", r"the parameter tilt is of angle, and stress is wanted"),
+        ("3 kPa * load", "stress", r"only a parameter without unit can be multiplied by 3 kPa"),
+        ("load * load", "stress", r"is not a number with a unit, nor a sum"),
+        ("3 MPa 4", "stress", r"is not a number with a unit, nor a sum"),
+        ("", "stress", r"an empty text"),
+        ("load +", "stress", r"is not a number with a unit, nor a sum"),
+    ],
+)
+def test_mistakes(text, quantity, message):
+    with pytest.raises(StudyError, match=message):
+        read_affine(text, quantity, PARAMETERS)
