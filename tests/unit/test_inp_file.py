@@ -201,6 +201,15 @@ def test_what_is_wrong_is_named_with_file_and_line(write, text, message):
         read_inp(write(text))
 
 
+def test_a_part_and_its_one_instance_are_read_as_flat(write):
+    head, mesh = CUBE.split("*Node", 1)
+    part = f"{head}*Part, name=P\n*Node{mesh}*End Part\n*Assembly, name=A\n*Instance, name=P-1, part=P\n"
+    sets = "*End Instance\n*Nset, nset=Held, instance=P-1\n 1, 2,\n*Elset, elset=_s_S2, internal\n 9,\n"
+    whole = read_inp(write(f"{part}{sets}*Surface, type=ELEMENT, name=s\n_s_S2, S2\n*End Assembly\n"))
+    assert whole.node_sets["Held"].tolist() == [1, 2]
+    assert [(p.elements.tolist(), p.face) for p in whole.surfaces["s"]] == [([9], "S2")]
+
+
 def test_a_missing_or_binary_file_is_refused(tmp_path):
     with pytest.raises(StudyError, match="cannot read the mesh"):
         read_inp(tmp_path / "none.inp")

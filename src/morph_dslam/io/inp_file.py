@@ -123,9 +123,9 @@ def element_type(card: Card) -> tuple[str, int]:
     name = card.required("TYPE").upper()
     match = re.fullmatch(r"(C3D\d+|S[34])([A-Z]*\d?)", name)
     if match is None or match[1] not in ELEMENTS:
-        known = ", ".join(ELEMENTS)
         raise card.line.error(
-            f"element type {name} is not known; use {known} (with any suffix), or drop these"
+            f"element type {name} is not known; use {', '.join(ELEMENTS)} (with any suffix), or take these "
+            "elements out (Gmsh adds lines and surfaces to an .inp: save a .msh instead)"
         )
     return ELEMENTS[match[1]]
 
