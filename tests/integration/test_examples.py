@@ -45,3 +45,12 @@ def test_a_recording_that_is_not_there_is_one_message_before_the_model_is_built(
     assert done.returncode == 2
     assert re.fullmatch(r"morph: there is no folder .*absent/rgb\n", done.stderr)
     assert done.stdout == ""
+
+
+@pytest.mark.slow
+def test_the_hanging_silicone_bar_is_where_its_depth_image_shows_it():
+    done = run_example("diffcal_silicone", "--data", str(real_data("diffcal_silicone")))
+    assert done.returncode == 0, done.stderr[-2000:]
+    found = dict(re.findall(r"(\w+)=(-?[\d.]+)", done.stdout.splitlines()[-1]))
+    assert float(found["published_mean_mm"]) <= 3.0
+    assert float(found["fitted_mean_mm"]) <= 2.5
