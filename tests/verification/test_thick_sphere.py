@@ -1,7 +1,8 @@
 """Thick sphere of incompressible neo-Hookean rubber under inner pressure, through its limit point.
 
 With A and B the radii, a = lambda_a A and b those of the deformed sphere and f(l) = 2/l + 1/(2 l^4),
-equilibrium gives p / mu = f(lambda_b) - f(lambda_a) (Green and Zerna, Theoretical Elasticity, 1954, section 3.10).
+equilibrium gives p / mu = f(lambda_b) - f(lambda_a) (Green and Zerna, Theoretical Elasticity, 1954, section
+3.10).
 """
 
 from __future__ import annotations

@@ -40,8 +40,25 @@ COMPONENTS = {
     "second_piola_kirchhoff": 6,
     "stress": 6,
 }
+STRESSES = ("first_piola_kirchhoff", "second_piola_kirchhoff", "stress")
 _VOIGT_COLUMNS = [3 * i + j for i, j in VOIGT]
 _ELEMENT_TYPES = {"hex": ngs.HEX, "tet": ngs.TET, "prism": ngs.PRISM}
+
+
+def overstress(name: str, F: Array, remembered: Array) -> Array:
+    """Part (p, 3, 3) of a stress due to a ``remembered`` second Piola-Kirchhoff stress (p, 3, 3), Pa."""
+    if name == "second_piola_kirchhoff":
+        return remembered
+    first = F @ remembered
+    if name == "first_piola_kirchhoff":
+        return first
+    return first @ np.swapaxes(F, 1, 2) / np.linalg.det(F)[:, None, None]
+
+
+def _components(name: str, tensors: Array) -> Array:
+    """Columns (p, c) of a field's 3x3 values."""
+    values = tensors.reshape(-1, 9)
+    return values[:, _VOIGT_COLUMNS] if COMPONENTS[name] == 6 else values
 
 
 def von_mises(stress: Array) -> Array:
@@ -84,7 +101,7 @@ class Recovery:
         F = self._kinematics.deformation_gradient.MakeVariable()
         pressure = region.pressure(unknowns)
         pressure = pressure.MakeVariable() if pressure is not None else None
-        P = region.energy(F, pressure).Diff(F)
+        P = region.elastic_energy(F, pressure).Diff(F)
         fields = {
             "deformation_gradient": F,
             "strain": green_lagrange(F),
@@ -147,9 +164,19 @@ class Recovery:
         self._problem.symbols.set(mu)
         self._state.vec.FV().NumPy()[:] = dofs
 
+    def deformation_gradient(self, dofs: Array) -> Any:
+        """F (3x3) of a solution as a coefficient function, until the next call."""
+        self._state.vec.FV().NumPy()[:] = dofs
+        return self._kinematics.deformation_gradient
+
     def _evaluate(self, name: str, dofs: Array, mu: Array, points: NDArray) -> Array:
         self._set(dofs, mu)
-        return self._by_region(name, [region.fields[name] for region in self._regions], points)
+        values = self._by_region([region.fields[name] for region in self._regions], points)
+        history = self._problem.history
+        if history and name in STRESSES:
+            F = self._by_region([region.gradient for region in self._regions], points)
+            values += overstress(name, F, history.remembered_at(points))
+        return _components(name, values)
 
     def _slopes(self, name: str, dofs: Array, mu: Array, dof_slopes: Array, points: NDArray) -> list[Array]:
         self._set(dofs, mu)
@@ -160,12 +187,14 @@ class Recovery:
         result = []
         for index, slope in enumerate(dof_slopes):
             self._direction.vec.FV().NumPy()[:] = slope
-            total = self._by_region(name, through_state, points)
+            total = self._by_region(through_state, points)
             explicit = [self._problem.symbols.derivatives(r.fields[name]).get(index) for r in self._regions]
             if any(e is not None for e in explicit):
                 zero = ngs.CF((0.0,) * 9, dims=(3, 3))
-                total += self._by_region(name, [zero if e is None else e for e in explicit], points)
-            result.append(total)
+                total += self._by_region([zero if e is None else e for e in explicit], points)
+            if self._problem.history and name in STRESSES:
+                total += self._overstress_slope(name, index, points)
+            result.append(_components(name, total))
         return result
 
     def _directional(self, region: _RegionFields, field: Any, pressure_direction: Any | None) -> Any:
@@ -174,14 +203,26 @@ class Recovery:
             change = change + field.Diff(region.pressure, pressure_direction)
         return change
 
-    def _by_region(self, name: str, expressions: list[Any], points: NDArray) -> Array:
-        """Values (p, c) of one 3x3 expression for each region at mesh points."""
+    def _overstress_slope(self, name: str, index: int, points: NDArray) -> Array:
+        """Derivative (p, 3, 3) of the remembered stress's part, in the direction that is set."""
+        history = self._problem.history
+        assert history is not None
+        F = self._by_region([region.gradient for region in self._regions], points)
+        dF = self._by_region([self._gradient_direction] * len(self._regions), points)
+        explicit = self._problem.symbols.derivatives(self._kinematics.deformation_gradient).get(index)
+        if explicit is not None:
+            dF += self._by_region([explicit] * len(self._regions), points)
+        H, step = history.remembered_at(points), 1e-6
+        return (overstress(name, F + step * dF, H) - overstress(name, F - step * dF, H)) / (2.0 * step)
+
+    def _by_region(self, expressions: list[Any], points: NDArray) -> Array:
+        """Values (p, 3, 3) of one 3x3 expression for each region at mesh points."""
         owners = self._problem.cell_materials[self._problem.geometry.cell_of_element[points["nr"]]]
         values = np.zeros((len(points), 9))
         for number, expression in zip(np.unique(self._problem.cell_materials), expressions, strict=True):
             rows = np.flatnonzero(owners == number)
             values[rows] = np.asarray(expression.Compile()(points[rows])).reshape(len(rows), 9)
-        return values[:, _VOIGT_COLUMNS] if COMPONENTS[name] == 6 else values
+        return values.reshape(-1, 3, 3)
 
     # -- where ------------------------------------------------------------------------------------------
 

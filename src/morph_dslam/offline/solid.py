@@ -30,9 +30,10 @@ from morph_dslam.offline.meshes import Mesh
 from morph_dslam.offline.newton import Linearisation, State
 from morph_dslam.offline.ngsolve_mesh import NgsolveMesh
 from morph_dslam.offline.nodal_forces import NodalForces
-from morph_dslam.offline.parameters import ParameterSymbols
+from morph_dslam.offline.parameters import ParameterSymbols, Scalar
 from morph_dslam.offline.recovery import Recovery
 from morph_dslam.offline.solid_assembly import Assembly, Term
+from morph_dslam.offline.solid_history import SolidHistory
 from morph_dslam.offline.solid_materials import owners_of_cells, place_materials
 from morph_dslam.offline.supports import ElasticFoundation, PrescribedMotion
 
@@ -72,6 +73,7 @@ class SolidProblem:
     options : see `SolidOptions`.
     shape : how the undeformed shape depends on parameters.
     directions : fibre fields that materials name, a direction for each cell (n_cells, 3).
+    time : expression of the parameters that is the time, s; viscous materials need it.
 
     Attributes
     ----------
@@ -95,6 +97,7 @@ class SolidProblem:
         options: SolidOptions | None = None,
         shape: Sequence[ShapeField] = (),
         directions: Mapping[str, Array] | None = None,
+        time: Scalar | None = None,
     ) -> None:
         options = options or SolidOptions()
         self.mesh, self.supports, self.loads, self.options = mesh, tuple(supports), tuple(loads), options
@@ -107,6 +110,7 @@ class SolidProblem:
         self.regions = place_materials(
             self.displacements, self.cell_materials, materials, directions or {}, options.mixed
         )
+        self.history = self._make_history(time)
         self.flags = tuple(region.flag for region in self.regions if region.flag)
         self.space = self._product_space()
         self.n_dofs: int = self.space.ndof
@@ -121,6 +125,13 @@ class SolidProblem:
         self._nodal_forces = NodalForces(self.displacements, points, self.symbols)
 
     # -- set-up ---------------------------------------------------------------------------------------
+
+    def _make_history(self, time: Scalar | None) -> SolidHistory | None:
+        if all(region.material.prony is None for region in self.regions):
+            return None
+        history = SolidHistory(self.displacements, self.regions, time, self.symbols)
+        self.regions = history.regions
+        return history
 
     def _product_space(self) -> ngs.FESpace:
         spaces = [self.displacements.vector]
@@ -150,6 +161,7 @@ class SolidProblem:
                 region.energy(F, region.pressure(unknowns)) * ratio,
                 region.region,
                 self.displacements.bonus_order,
+                rules=self.history.rules if self.history else {},
             )
             for region, unknowns in zip(self.regions, pressures, strict=True)
         ]
@@ -205,16 +217,27 @@ class SolidProblem:
         return self._padded(self.constraints.slopes())
 
     def residual(self, x: Array, mu: Array) -> Array:
-        self.symbols.set(mu)
+        self._set(mu)
         return self.assembly.residual(x) - self._padded(self._nodal_forces.values())
 
     def linearise(self, x: Array, mu: Array) -> Linearisation:
-        self.symbols.set(mu)
+        self._set(mu)
         return self.assembly.linearise(x, mu, self._padded(self._nodal_forces.values()), self.solver)
 
     def residual_slopes(self, x: Array, mu: Array) -> Array:
-        self.symbols.set(mu)
+        self._set(mu)
         return self.assembly.residual_slopes(x) - self._padded(self._nodal_forces.slopes())
+
+    def advance_history(self, x: Array, mu: Array) -> None:
+        """Accept a solution: viscous materials remember it. Derivatives are those at a fixed history."""
+        if self.history:
+            self._set(mu)
+            self.history.advance(self.recovery.deformation_gradient(x))
+
+    def _set(self, mu: Array) -> None:
+        self.symbols.set(mu)
+        if self.history:
+            self.history.check_time()
 
     def _padded(self, displacement_part: Array) -> Array:
         """(..., 3 n_scalar) with zeros for the pressures."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import ngsolve as ngs
@@ -37,23 +37,25 @@ class Term:
     integrand : an energy of the trial function, or virtual work: of trial and test function.
     region : volume or boundary region that it is integrated over.
     bonus_order : added to NGSolve's order of quadrature.
+    rules : quadrature rules by element type, instead of NGSolve's own; empty for these.
     """
 
     integrand: Any
     region: ngs.Region
     bonus_order: int = 0
     has_energy: bool = True
+    rules: dict[Any, ngs.IntegrationRule] = field(default_factory=dict)
 
     def add_to(self, form: ngs.BilinearForm) -> None:
         symbol = ngs.dx if self.region.VB() == ngs.VOL else ngs.ds
-        measure = symbol(definedon=self.region, bonus_intorder=self.bonus_order)
+        measure = symbol(definedon=self.region, bonus_intorder=self.bonus_order, intrules=self.rules)
         integral = self.integrand.Compile() * measure
         form += ngs.Variation(integral) if self.has_energy else integral
 
     def derivatives(self, symbols: ParameterSymbols) -> dict[int, Term]:
         """The terms of the residual's derivatives, by the index of each parameter that matters."""
         return {
-            index: Term(slope, self.region, self.bonus_order, self.has_energy)
+            index: replace(self, integrand=slope)
             for index, slope in symbols.derivatives(self.integrand).items()
         }
 

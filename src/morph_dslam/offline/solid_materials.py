@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
 from morph_dslam.offline.displacement_space import DisplacementSpace
-from morph_dslam.offline.materials.base import Material
+from morph_dslam.offline.materials.base import Material, green_lagrange
 from morph_dslam.offline.meshes import Mesh
 from morph_dslam.offline.pressure_space import PressureSpace, check_mixed
 
@@ -36,6 +36,9 @@ class MaterialRegion:
     pressures : None in the displacement form.
     pressure_unit : Pa; makes pressure unknowns about as large as displacements in metres.
     flag : what results must be doubted for; empty if nothing.
+    factors : of remainder and volumetric part, in a step of a viscous material.
+    remembered : second Piola-Kirchhoff stress (3x3), Pa, that a viscous material remembers, at the points of
+        its quadrature rules; see `solid_history`.
     """
 
     material: Material
@@ -43,6 +46,8 @@ class MaterialRegion:
     pressures: PressureSpace | None = None
     pressure_unit: float = 0.0
     flag: str = ""
+    factors: tuple[Any, Any] = (1.0, 1.0)
+    remembered: Any | None = None
 
     def pressure(self, unknowns: list[Any]) -> Any | None:
         """Pressure (Pa, positive in tension) of the functions of its space; None in the displacement form."""
@@ -50,11 +55,25 @@ class MaterialRegion:
 
     def energy(self, F: Any, pressure: Any | None) -> Any:
         """Strain energy density, Pa; in the mixed form, the density whose stationary value it is."""
-        modulus = self.material.volumetric_modulus
-        if pressure is None or modulus is None:
+        energy = self.elastic_energy(F, pressure)
+        return energy if self.remembered is None else energy + self.remembered_energy(F)
+
+    def elastic_energy(self, F: Any, pressure: Any | None) -> Any:
+        """`energy` without what the material remembers."""
+        if pressure is None and self.remembered is None:
             return self.material.energy(F)
-        volumetric = pressure * self.material.volumetric(F) - pressure * pressure / (2.0 * modulus)
-        return self.material.remainder(F) + volumetric
+        (shear, bulk), modulus = self.factors, self.material.volumetric_modulus
+        remainder = shear * self.material.remainder(F)
+        if modulus is None:
+            return remainder
+        g = self.material.volumetric(F)
+        if pressure is None:
+            return remainder + 0.5 * bulk * modulus * g**2
+        return remainder + pressure * g - pressure * pressure / (2.0 * modulus)
+
+    def remembered_energy(self, F: Any) -> Any:
+        """Work of the remembered stress."""
+        return ngs.InnerProduct(self.remembered, green_lagrange(F))
 
 
 def owners_of_cells(mesh: Mesh, materials: Mapping[str, Material]) -> NDArray[np.int64]:
