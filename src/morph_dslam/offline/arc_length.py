@@ -43,6 +43,7 @@ class ArcOptions:
     max_corrections : more than these, and the step is halved.
     contraction : the tangent is renewed where a correction is larger than this part of the one before.
     tolerance : size of the last correction.
+    smallest_cosine : of the angle by which the path may turn in a step; more, and the step is halved.
     """
 
     first: float = 1e-3
@@ -52,6 +53,7 @@ class ArcOptions:
     max_corrections: int = 20
     contraction: float = 0.3
     tolerance: float = 1e-8
+    smallest_cosine: float = 0.9
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,7 @@ class PathPoint:
     state : parameters, dofs and negative pivots, these of the tangent at this very point.
     length : of the path from its start.
     tangent, rate : derivatives of the dofs (n,) and of the path's parameter by the length.
+    step : length of the step that led here, 0 at the start.
     corrections : back-substitutions that the step took.
     """
 
@@ -70,6 +73,7 @@ class PathPoint:
     length: float
     tangent: Array
     rate: float
+    step: float = 0.0
     corrections: int = 0
 
 
@@ -153,6 +157,19 @@ class ArcLength:
         """The path's first point, the parameter growing from there (``sense`` = 1) or falling (-1)."""
         return self._point(start.dofs, start.mu, lambda _: sense, length=0.0)
 
+    def locate(self, point: PathPoint, length: float) -> State:
+        """The solution at ``length`` along the tangent of ``point``, without a tangent or pivots of its own.
+
+        Between two points of a path it costs corrections only, the first point's factorisation serving all.
+
+        Raises
+        ------
+        SolverError
+            If the corrections do not converge.
+        """
+        x, mu, _ = self._correct(point, length)
+        return State(mu, x)
+
     def step(self, point: PathPoint, length: float) -> PathPoint:
         """One step of ``length`` along the path.
 
@@ -162,13 +179,17 @@ class ArcLength:
             If the corrections do not converge; a shorter step may.
         """
         x, mu, count = self._correct(point, length)
-        return self._point(
+        following = self._point(
             x,
             mu,
             lambda response: self._product(point.tangent, response),
             length=point.length + length,
+            step=length,
             corrections=count,
         )
+        if self._product(point.tangent, following.tangent) < self.options.smallest_cosine:
+            raise SolverError(f"the path turns sharply, or was lost for another, beyond {point.state.mu}")
+        return following
 
     def advance(self, point: PathPoint, length: float) -> PathPoint:
         """The point at ``length`` further on, in one step or, where that fails, in shorter ones.
@@ -185,21 +206,26 @@ class ArcLength:
 
         return step_towards(attempt, point)[0]
 
-    def follow(self, start: State, end: Callable[[State], float], sense: float = 1.0) -> Iterator[PathPoint]:
+    def follow(
+        self, start: State | PathPoint, end: Callable[[State], float], sense: float = 1.0
+    ) -> Iterator[PathPoint]:
         """Points of the path, its start first, with steps as long as they converge quickly.
 
         Parameters
         ----------
+        start : the path's first solution, or a point of a path to go on from.
         end : a function of the state that is negative before the path's end and grows through zero at it: the
             last point is where it vanishes. ``lambda state: state.mu[0] - target`` ends at a parameter.
+        sense : whether the parameter first grows (1) or falls (-1); a point knows its own.
 
         Raises
         ------
         SolverError
             Naming the last parameters that converged, when steps become too short.
         """
-        options, length = self.options, self.options.first
-        point = self.begin(start, sense)
+        options = self.options
+        point = self.begin(start, sense) if isinstance(start, State) else start
+        length = point.step or options.first
         yield point
         while True:
             try:
@@ -225,8 +251,7 @@ class ArcLength:
         def remaining(part: float) -> float:
             if part == 0.0:
                 return end(point.state)
-            x, mu, _ = self._correct(point, part)
-            return end(State(mu, x))
+            return end(self.locate(point, part))
 
         return self.step(point, float(brentq(remaining, 0.0, length, xtol=1e-12, rtol=1e-9)))  # type: ignore[arg-type]
 

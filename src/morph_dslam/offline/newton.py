@@ -51,9 +51,14 @@ class Equations(Protocol):
     infinity for a dof that follows from the others (a multiplier), whose change is not measured.
     """
 
-    n_dofs: int
-    free: NDArray[np.bool_]
-    scale: Array | float
+    @property
+    def n_dofs(self) -> int: ...
+
+    @property
+    def free(self) -> NDArray[np.bool_]: ...
+
+    @property
+    def scale(self) -> Array | float: ...
 
     def prescribed(self, mu: Array) -> Array:
         """(n,) values at prescribed dofs, 0 at free ones."""

@@ -57,6 +57,7 @@ class SheetEquations:
             self.scale[shell.displacement_dofs(component)] = length
         self._motion = self._edge_motion(motion)
         self._initial = np.zeros(self.n_dofs)
+        self.unloaded = np.zeros(self.n_dofs)
         self.assembled: CondensedLinearisation | None = None
         still, loaded = np.zeros(self.n_dofs), np.array([0.0, 1.0])
         self._load_slope = self.residual(still, loaded) - self.residual(still, np.zeros(2))
@@ -73,7 +74,7 @@ class SheetEquations:
     def set_imperfection(self, dofs: Array) -> None:
         """Make the displacement in ``dofs`` (n,) the stress-free shape; its other entries do not matter.
 
-        It must be level along clamped edges. A solution then starts from `unloaded_dofs`.
+        It must be level along clamped edges. A solution then starts from `unloaded`.
         """
         shape = np.zeros(self.n_dofs)
         for component in range(3):
@@ -87,15 +88,15 @@ class SheetEquations:
         # The rotations of edges between elements are unknowns too, but nothing is taken off their equations.
         rotations = self.shell.space.Range(4)
         initial[rotations.start : rotations.stop] = 0.0
-        self._initial, self._shape = initial, shape
+        self._initial, self.unloaded = initial, shape
 
     # -- Equations --------------------------------------------------------------------------------------
 
     def prescribed(self, mu: Array) -> Array:
         return mu[0] * self._motion
 
-    def prescribed_slopes(self, _: Array) -> Array:
-        return np.array([self._motion, np.zeros(self.n_dofs)])
+    def prescribed_slopes(self, mu: Array) -> Array:
+        return np.array([self._motion, np.zeros(self.n_dofs)])[: len(mu)]
 
     def residual(self, x: Array, mu: Array) -> Array:
         self._use(x, mu)
@@ -103,8 +104,8 @@ class SheetEquations:
         self.form.Apply(self.shell.state.vec, result)
         return result.FV().NumPy() - self._initial
 
-    def residual_slopes(self, _: Array, __: Array) -> Array:
-        return np.array([np.zeros(self.n_dofs), self._load_slope])
+    def residual_slopes(self, x: Array, mu: Array) -> Array:
+        return np.array([np.zeros_like(x), self._load_slope])[: len(mu)]
 
     def linearise(self, x: Array, mu: Array) -> Linearisation:
         """Tangent at ``x``; the frozen edge normals are averaged there first.
