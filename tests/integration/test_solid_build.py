@@ -278,3 +278,19 @@ def test_a_load_past_its_limit_point_names_the_last_value_that_converged(tmp_pat
     limit = 100.0 * 3e6 / 2.9 * 1e-6
     assert 0.9 * limit < float(found[1]) < 1.05 * limit
     assert list((tmp_path / "x.morph.snapshots").glob("*.npz"))
+
+
+def test_python_states_the_same_study(built):
+    """A dictionary in place of the file: the same solutions are found again, none is solved anew."""
+    import tomllib
+
+    from morph_dslam import build, load_study, make_study
+
+    study = make_study(tomllib.loads(BLOCK))
+    assert study == load_study(built / "study.toml")
+    before = sorted((built / "block.morph.snapshots").glob("*.npz"))
+    model = build(study, built / "block.morph")
+    assert sorted((built / "block.morph.snapshots").glob("*.npz")) == before
+    mu = np.array([0.1, 0.002])
+    kept = load_model(built / "block.morph").positions(mu)
+    assert model.positions(mu) == pytest.approx(kept, abs=1e-8)
