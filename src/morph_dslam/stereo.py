@@ -33,7 +33,7 @@ class RectifiedPair:
     right_maps: tuple[NDArray, NDArray]
 
     def depth(self, disparity: Array) -> Array:
-        """Depth, metres, of disparities, left minus right column, pixels; infinite where they are not positive."""
+        """Depth, metres, of disparities, left minus right column, pixels; infinite where not positive."""
         positive = np.where(disparity > 0.0, disparity, np.nan)
         return np.where(disparity > 0.0, self.camera.fx * self.baseline / positive, np.inf)
 
