@@ -1,7 +1,8 @@
 """Snapshots of the gripped sheet: fields on the output grid, and their mirror images.
 
 A sheet does not know its two sides apart, so the mirror image of a solution is a solution; if its grips are
-at the same height, it does not know left from right either.
+at the same height, it does not know left from right either, and if that is half its width, nor top from
+bottom.
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ from morph_dslam.offline.problem import Snapshot
 Array = NDArray[np.float64]
 
 FACES = ("top", "bottom")
-#: Signs that the coordinates take when the sheet is mirrored in its own plane, and in the plane x = 0.
+#: Signs that the coordinates take when the sheet is mirrored in its own plane, in x = 0 and in y = 0.
 MIRROR_Z = np.array([-1.0, 1.0, -1.0, -1.0])
 MIRROR_X = np.array([1.0, 1.0, -1.0, -1.0])
+MIRROR_Y = np.array([1.0, 1.0, 1.0, -1.0])
 
 
 def output_points(length: float, width: float, grid: tuple[int, int]) -> Array:
@@ -104,4 +106,31 @@ def reversed_ends(snapshot: Snapshot, columns: int) -> Snapshot:
         image(snapshot.fields, 1.0),
         image(snapshot.sensitivities, flip),
         {"motion": np.array([right, left, -twist, approach, -turn_right, -turn_left])},
+    )
+
+
+def upside_down(snapshot: Snapshot, columns: int) -> Snapshot:
+    """The mirror image y -> -y: another state of the same sheet if its grips are at the middle of its edges.
+
+    Parameters
+    ----------
+    columns : points along x of the output grid.
+    """
+    flip, y, shear = MIRROR_Y[:, None, None], np.array([1.0, -1.0, 1.0]), np.array([1.0, 1.0, -1.0])
+
+    def turned(field: Array) -> Array:
+        grid = field.reshape(*field.shape[:-2], -1, columns, 3)
+        return grid[..., ::-1, :, :].reshape(field.shape)
+
+    def image(fields: dict[str, Array], sign: Array | float) -> dict[str, Array]:
+        return {
+            name: turned(field) * (y if name == "displacement" else shear) * sign
+            for name, field in fields.items()
+        }
+
+    return Snapshot(
+        snapshot.coordinates * MIRROR_Y,
+        image(snapshot.fields, 1.0),
+        image(snapshot.sensitivities, flip),
+        {"motion": snapshot.outputs["motion"] * np.array([1.0, 1.0, -1.0, 1.0, -1.0, -1.0])},
     )

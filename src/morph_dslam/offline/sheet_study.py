@@ -17,11 +17,13 @@ from morph_dslam.offline.grips import COORDINATES, Grips
 from morph_dslam.offline.problem import ModelMesh, Snapshot
 from morph_dslam.offline.sheet_snapshots import (
     MIRROR_X,
+    MIRROR_Y,
     MIRROR_Z,
     mirrored,
     output_points,
     reversed_ends,
     take_snapshot,
+    upside_down,
 )
 from morph_dslam.offline.shell import OrthotropicSheet
 from morph_dslam.offline.snapshots import source_fingerprint
@@ -71,6 +73,11 @@ class GripsSection(Section):
     def symmetric(self) -> bool:
         """Whether left and right are mirror images."""
         return self.centre_left == self.centre_right
+
+    @property
+    def centred(self) -> bool:
+        """Whether the halves of the sheet above and below the grips' middles are mirror images too."""
+        return self.centre_left == self.centre_right == 0.0
 
 
 class SheetParametersSection(Section):
@@ -230,19 +237,23 @@ class SheetStudy(Section):
         """The mirror image of each sample (n, 4) that is solved in its place.
 
         The sheet does not know its sides apart, so bulge can be made positive; if its grips are at the same
-        height, slant too.
+        height, slant too, and if that is the middle, skew as well.
         """
         samples = np.where(samples[:, :1] < 0.0, samples * MIRROR_Z, samples)
         if self.grips.symmetric:
             samples = np.where(samples[:, 3:] < 0.0, samples * MIRROR_X, samples)
+        if self.grips.centred:
+            samples = np.where(samples[:, 2:3] < 0.0, samples * MIRROR_X * MIRROR_Y, samples)
         return samples
 
     def images(self, snapshot: Snapshot) -> list[Snapshot]:
         """This state and its mirror images that are states of the same sheet."""
         result = [snapshot, mirrored(snapshot)]
+        columns = self.reduction.grid[0] + 1
         if self.grips.symmetric:
-            columns = self.reduction.grid[0] + 1
             result += [reversed_ends(image, columns) for image in result]
+        if self.grips.centred:
+            result += [upside_down(image, columns) for image in result]
         return result
 
     def model_mesh(self) -> ModelMesh:
