@@ -125,3 +125,11 @@ def test_the_assembled_tangent_is_the_difference_of_assembled_forces(name):
     np.testing.assert_allclose(
         slope, (sides[0] - sides[1]) / (2 * h), rtol=0, atol=1e-6 * np.abs(slope).max()
     )
+
+
+def test_forces_of_an_inverted_element_are_not_numbers():
+    bar = elastic_bar(LAWS["neo_hookean"][0])
+    bar.displacement.Set(ngs.CF((-1.5 * ngs.x, 0, 0)))
+    force = bar.displacement.vec.CreateVector()
+    bar.form.Apply(bar.displacement.vec, force)
+    assert np.isnan(force.FV().NumPy()).any()

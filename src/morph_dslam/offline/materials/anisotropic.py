@@ -78,14 +78,14 @@ class Orthotropic(Directed):
 
     directions: ClassVar = {"axis_1": (1.0, 0.0, 0.0), "axis_2": (0.0, 1.0, 0.0)}
 
-    def remainder(self, F: Any) -> Any:
+    def parts(self, F: Any) -> tuple[Any, Any]:
         strain = green_lagrange(F)
         axes = self._axes()
         e = [[a * (strain * b) for b in axes] for a in axes]
         stiffness = self._normal_stiffness()
         normal = sum(stiffness[i][j] * e[i][i] * e[j][j] for i in range(3) for j in range(3))
         shear = self.shear_12 * e[0][1] ** 2 + self.shear_13 * e[0][2] ** 2 + self.shear_23 * e[1][2] ** 2
-        return 0.5 * normal + 2.0 * shear
+        return 0.5 * normal + 2.0 * shear, None
 
     def _axes(self) -> list[Any]:
         first, second = unit_direction(self.axis_1, self.name), unit_direction(self.axis_2, self.name)
@@ -166,17 +166,14 @@ class TransverselyIsotropic(Directed):
 
     directions: ClassVar = {"fibre": (1.0, 0.0, 0.0)}
 
-    def remainder(self, F: Any) -> Any:
+    def parts(self, F: Any) -> tuple[Any, Any]:
         mu, alpha, beta, gamma = self._moduli()
         fibre = unit_direction(self.fibre, self.name)
         C, log_J = right_cauchy_green(F), log_volume(F)
         stretched = C * fibre
         i4, i5 = fibre * stretched - 1.0, stretched * stretched - 1.0
         matrix = 0.5 * mu * (ngs.Trace(C) - 3.0) - mu * log_J
-        return matrix + (alpha + beta * log_J + gamma * i4) * i4 - 0.5 * alpha * i5
-
-    def volumetric(self, F: Any) -> Any:
-        return log_volume(F)
+        return matrix + (alpha + beta * log_J + gamma * i4) * i4 - 0.5 * alpha * i5, log_J
 
     @property
     def volumetric_modulus(self) -> Constant:
@@ -237,9 +234,9 @@ class HolzapfelGasserOgden(Rubber, Directed):
 
     directions: ClassVar = {"fibre": (1.0, 0.0, 0.0), "fibre_2": (0.0, 1.0, 0.0)}
 
-    def remainder(self, F: Any) -> Any:
+    def distortional(self, F: Any, J: Any) -> Any:
         C = right_cauchy_green(F)
-        energy = 0.5 * self.shear * (first_invariant(F) - 3.0)
+        energy = 0.5 * self.shear * (first_invariant(F, J) - 3.0)
         for direction in self._given().values():
             fibre = unit_direction(direction, self.name)
             stretch = self.dispersion * ngs.Trace(C) + (1.0 - 3.0 * self.dispersion) * (fibre * (C * fibre))

@@ -50,14 +50,20 @@ class Material(ABC):
     prony: Prony | None = None
 
     @abstractmethod
+    def parts(self, F: Any) -> tuple[Any, Any]:
+        """Remainder of the energy, Pa, and volumetric strain g (None without a split); the law itself.
+
+        F is a 3x3 coefficient function. Both come from one call so that they share what they have in common:
+        NGSolve evaluates a shared expression once.
+        """
+
     def remainder(self, F: Any) -> Any:
         """Strain energy without the volumetric part, Pa; F is a 3x3 coefficient function."""
+        return self.parts(F)[0]
 
     def volumetric(self, F: Any) -> Any:
         """Volumetric strain g(F): zero where the volume is unchanged. Most laws use ln J or J - 1."""
-        raise StudyError(
-            f"{self.name} has no separate volumetric part, so it cannot be used in mixed elements"
-        )
+        return self.parts(F)[1]
 
     @property
     def volumetric_modulus(self) -> Constant | None:
@@ -66,9 +72,10 @@ class Material(ABC):
 
     def energy(self, F: Any) -> Any:
         """Strain energy per undeformed volume, Pa; F is a 3x3 coefficient function."""
+        remainder, strain = self.parts(F)
         if self.volumetric_modulus is None:
-            return self.remainder(F)
-        return self.remainder(F) + 0.5 * self.volumetric_modulus * self.volumetric(F) ** 2
+            return remainder
+        return remainder + 0.5 * self.volumetric_modulus * strain**2
 
     def first_piola_kirchhoff(self, F: Any) -> Any:
         """P = dW/dF (3x3), Pa, of the law without its viscosity; F must not be a trial function."""

@@ -48,11 +48,9 @@ class NeoHookean(_Lame):
     Bonet and Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2nd ed. 2008, section 6.4.3.
     """
 
-    def remainder(self, F: Any) -> Any:
-        return 0.5 * self.shear * (ngs.InnerProduct(F, F) - 3.0) - self.shear * log_volume(F)
-
-    def volumetric(self, F: Any) -> Any:
-        return log_volume(F)
+    def parts(self, F: Any) -> tuple[Any, Any]:
+        log_J = log_volume(F)
+        return self.shear * (0.5 * (ngs.InnerProduct(F, F) - 3.0) - log_J), log_J
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,12 +64,9 @@ class StVenantKirchhoff(_Lame):
     (Ciarlet, Mathematical Elasticity I, 1988, section 3.9).
     """
 
-    def remainder(self, F: Any) -> Any:
+    def parts(self, F: Any) -> tuple[Any, Any]:
         strain = green_lagrange(F)
-        return self.shear * ngs.InnerProduct(strain, strain)
-
-    def volumetric(self, F: Any) -> Any:
-        return ngs.Trace(green_lagrange(F))
+        return self.shear * ngs.InnerProduct(strain, strain), ngs.Trace(strain)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,9 +80,6 @@ class LinearElastic(_Lame):
     Timoshenko and Goodier, Theory of Elasticity, 3rd ed. 1970, section 6.
     """
 
-    def remainder(self, F: Any) -> Any:
+    def parts(self, F: Any) -> tuple[Any, Any]:
         strain = ngs.Sym(F) - ngs.Id(3)
-        return self.shear * ngs.InnerProduct(strain, strain)
-
-    def volumetric(self, F: Any) -> Any:
-        return ngs.Trace(F) - 3.0
+        return self.shear * ngs.InnerProduct(strain, strain), ngs.Trace(strain)

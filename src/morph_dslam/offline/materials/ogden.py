@@ -25,11 +25,11 @@ from morph_dslam.offline.materials.base import Constant, evaluate, right_cauchy_
 from morph_dslam.offline.materials.rubber import Rubber
 
 #: Where the series take over: relative size of the deviator, and (q / mean of the pair)^2.
-_NEARLY_SPHERICAL = 0.1
-_NEARLY_PAIRED = 0.01
+_NEARLY_SPHERICAL = 0.03
+_NEARLY_PAIRED = 1e-3
 #: Terms that bring the series to double precision at those bounds.
-_SPHERICAL_TERMS = 16
-_PAIR_TERMS = 9
+_SPHERICAL_TERMS = 10
+_PAIR_TERMS = 5
 #: Newton steps from a straight line to double precision of a root and its second derivative.
 _ROOT_STEPS = 5
 
@@ -126,9 +126,9 @@ class Ogden(Rubber):
     moduli: tuple[Constant, ...]
     exponents: tuple[Constant, ...]
 
-    def remainder(self, F: Any) -> Any:
+    def distortional(self, F: Any, J: Any) -> Any:
         # The volume is taken out of the sums rather than of the tensor, whose entries are then polynomials.
-        spectrum, J = Spectrum(right_cauchy_green(F)), ngs.Det(F)
+        spectrum = Spectrum(right_cauchy_green(F))
         energy: Any = ngs.CF(0.0)
         for modulus, exponent in zip(self.moduli, self.exponents, strict=True):
             stretches = _power(J, -exponent / 3.0) * spectrum.power_sum(0.5 * exponent)

@@ -7,6 +7,7 @@ modulus is some thousand times its shear modulus.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,8 +27,13 @@ class Rubber(Material):
 
     bulk: Constant
 
-    def volumetric(self, F: Any) -> Any:
-        return ngs.Det(F) - 1.0
+    @abstractmethod
+    def distortional(self, F: Any, J: Any) -> Any:
+        """Energy of the change of shape, Pa; J = det F."""
+
+    def parts(self, F: Any) -> tuple[Any, Any]:
+        J = ngs.Det(F)
+        return self.distortional(F, J), J - 1.0
 
     @property
     def volumetric_modulus(self) -> Constant:
@@ -37,15 +43,15 @@ class Rubber(Material):
         self.require_positive("bulk")
 
 
-def first_invariant(F: Any) -> Any:
+def first_invariant(F: Any, J: Any) -> Any:
     """I1~ = J^(-2/3) tr C, 3 without distortion."""
-    return ngs.Det(F) ** (-2.0 / 3.0) * ngs.InnerProduct(F, F)
+    return J ** (-2.0 / 3.0) * ngs.InnerProduct(F, F)
 
 
-def second_invariant(F: Any) -> Any:
+def second_invariant(F: Any, J: Any) -> Any:
     """I2~ = J^(-4/3) (tr(C)^2 - C:C)/2, 3 without distortion."""
     C = right_cauchy_green(F)
-    return ngs.Det(F) ** (-4.0 / 3.0) * 0.5 * (ngs.Trace(C) ** 2 - ngs.InnerProduct(C, C))
+    return J ** (-4.0 / 3.0) * 0.5 * (ngs.Trace(C) ** 2 - ngs.InnerProduct(C, C))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,8 +72,8 @@ class MooneyRivlin(Rubber):
     c10: Constant
     c01: Constant = 0.0
 
-    def remainder(self, F: Any) -> Any:
-        return self.c10 * (first_invariant(F) - 3.0) + self.c01 * (second_invariant(F) - 3.0)
+    def distortional(self, F: Any, J: Any) -> Any:
+        return self.c10 * (first_invariant(F, J) - 3.0) + self.c01 * (second_invariant(F, J) - 3.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -89,8 +95,8 @@ class Yeoh(Rubber):
     c20: Constant = 0.0
     c30: Constant = 0.0
 
-    def remainder(self, F: Any) -> Any:
-        x = first_invariant(F) - 3.0
+    def distortional(self, F: Any, J: Any) -> Any:
+        x = first_invariant(F, J) - 3.0
         return x * (self.c10 + x * (self.c20 + x * self.c30))
 
 
@@ -113,8 +119,8 @@ class Gent(Rubber):
     shear: Constant
     limit: Constant
 
-    def remainder(self, F: Any) -> Any:
-        left = positive_or_nan(1.0 - (first_invariant(F) - 3.0) / self.limit)
+    def distortional(self, F: Any, J: Any) -> Any:
+        left = positive_or_nan(1.0 - (first_invariant(F, J) - 3.0) / self.limit)
         return -0.5 * self.shear * self.limit * ngs.log(left)
 
     def check_constants(self) -> None:

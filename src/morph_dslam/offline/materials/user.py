@@ -38,7 +38,7 @@ class UserMaterial(Rubber):
     values: dict[str, Constant] = field(default_factory=dict)
     bulk: Constant | None = None
 
-    def remainder(self, F: Any) -> Any:
+    def distortional(self, F: Any, J: Any) -> Any:
         return self.function(F, **self.values)
 
     def constants(self) -> dict[str, Constant]:

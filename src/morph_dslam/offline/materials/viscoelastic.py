@@ -130,9 +130,10 @@ class ViscousState:
         if material.prony is None:
             return material.energy(F)
         shear, bulk = material.prony.step_factors(self.time_step)
-        energy = shear * material.remainder(F) + self.history(region, F)
+        remainder, strain = material.parts(F)
+        energy = shear * remainder + self.history(region, F)
         if material.volumetric_modulus is not None:
-            energy += 0.5 * bulk * material.volumetric_modulus * material.volumetric(F) ** 2
+            energy += 0.5 * bulk * material.volumetric_modulus * strain**2
         return energy
 
     def remainder(self, region: str, F: Any) -> Any:
