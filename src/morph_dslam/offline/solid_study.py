@@ -26,13 +26,14 @@ from morph_dslam.offline.mesh_checks import check_mesh
 from morph_dslam.offline.mesh_section import MeshSection, make_mesh, mesh_fingerprint
 from morph_dslam.offline.meshes import Mesh
 from morph_dslam.offline.model_meshes import model_mesh_of
+from morph_dslam.offline.parameter_section import ParameterSection, TimeSection
 from morph_dslam.offline.parameters import ParameterSymbols
 from morph_dslam.offline.problem import ModelMesh, Snapshot
 from morph_dslam.offline.snapshots import source_fingerprint
 from morph_dslam.offline.solid import SolidOptions, SolidProblem
 from morph_dslam.offline.solid_sweep import SolidSweep
 from morph_dslam.offline.study_sections import ReductionSection, SamplingSection, Section, WorkSection
-from morph_dslam.units import quantity_of
+from morph_dslam.offline.viscous_sweep import ViscousSweep
 
 Array = NDArray[np.float64]
 
@@ -49,59 +50,12 @@ _SOLVER = (
     "supports",
     "solid",
     "solid_assembly",
+    "solid_materials",
+    "solid_history",
     "recovery",
     "solid_sweep",
+    "viscous_sweep",
 )
-
-
-class ParameterSection(Section):
-    """A parameter of the study.
-
-    ``range`` are its ends, each a number with its unit, which says what it measures; plain numbers for a
-    ratio. ``default`` is the state that nothing is known about (the value nearest to zero if absent); every
-    path of solutions starts there.
-    """
-
-    range: tuple[Value, Value]
-    default: Value | None = None
-    description: str = ""
-
-    @model_validator(mode="after")
-    def _check(self) -> ParameterSection:
-        try:
-            self.parameter("parameter")
-        except StudyError as error:
-            raise ValueError(str(error)) from error
-        return self
-
-    def parameter(self, name: str) -> Parameter:
-        """The parameter as the model file states it.
-
-        Raises
-        ------
-        StudyError
-            If the ends measure different things, or are not in order.
-        """
-        unit = _unit(self.range[0])
-        quantity = quantity_of(unit)
-        lower, upper = (read_affine(end, quantity, ()).constant for end in self.range)
-        if not lower < upper:
-            raise StudyError("the range must rise: its lower end is not below its upper end")
-        default = min(max(0.0, lower), upper)
-        if self.default is not None:
-            default = read_affine(self.default, quantity, ()).constant
-        if not lower <= default <= upper:
-            raise StudyError(f"the default {self.default} lies outside of the range")
-        return Parameter(name, quantity, unit, lower, upper, default, self.description)
-
-
-def _unit(value: Value) -> str:
-    if not isinstance(value, str):
-        return "1"
-    parts = value.split()
-    if len(parts) != 2:
-        raise StudyError(f"'{value}' is not a number and a unit")
-    return parts[1]
 
 
 class SolidSolverSection(WorkSection):
@@ -126,6 +80,7 @@ class SolidStudy(Section):
     supports: tuple[SupportSection, ...] = ()
     loads: tuple[LoadSection, ...] = ()
     parameters: dict[str, ParameterSection] = Field(min_length=1)
+    time: TimeSection | None = None
     solver: SolidSolverSection = SolidSolverSection()
     sampling: SamplingSection = SamplingSection()
     reduction: ReductionSection = ReductionSection()
@@ -151,9 +106,27 @@ class SolidStudy(Section):
                 section.make(read)
             except StudyError as error:
                 raise ValueError(f"{where}: {error}") from error
+        self._check_time(parameters)
         if len({material.on for material in self.materials.values()}) < len(self.materials):
             raise ValueError("two materials are on the same cell set: give each its own")
         return self
+
+    def _check_time(self, parameters: tuple[Parameter, ...]) -> None:
+        """Viscous materials need a clock that starts at the lower end of its range."""
+        viscous = [name for name, material in self.materials.items() if "prony" in material.constants]
+        if self.time is None:
+            if viscous:
+                raise ValueError(
+                    f"materials.{viscous[0]} is viscoelastic: say in [time] which parameter is the time"
+                )
+            return
+        clock = next((p for p in parameters if p.name == self.time.parameter), None)
+        if clock is None or clock.quantity != "time":
+            raise ValueError(f"time.parameter: '{self.time.parameter}' is no parameter that measures time")
+        if not viscous:
+            raise ValueError("[time] is for viscoelastic materials, and none has a prony series")
+        if clock.default != clock.lower:
+            raise ValueError(f"parameters.{clock.name}: time starts at the lower end; leave out the default")
 
     def _parts(self) -> list[tuple[str, Any]]:
         """Materials, supports and loads with what messages call them."""
@@ -211,6 +184,8 @@ class SolidStudy(Section):
         content["functions"] = [material.source for material in self.materials.values()]
         content["elements"] = self.solver.order, self.solver.formulation
         content["parameters"] = list(self.parameters)
+        content["root"] = self.root().tolist() if self.time else None
+        content["time"] = self.time.model_dump() if self.time else None
         content["mesh"] = mesh_fingerprint(self.solid_mesh())
         content["code"] = source_fingerprint(_SOLVER)
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
@@ -256,11 +231,14 @@ class SolidStudy(Section):
                 mixed=self.solver.formulation == "mixed",
                 threads=self.solver.threads,
             ),
+            time=symbols[self.time.parameter] if self.time else None,
         )
 
-    def sweep_problem(self) -> SolidSweep:
+    def sweep_problem(self) -> SolidSweep | ViscousSweep:
         """What the sweep solves with."""
-        return SolidSweep(self.problem())
+        if self.time is None:
+            return SolidSweep(self.problem())
+        return ViscousSweep(self.problem(), list(self.parameters).index(self.time.parameter), self.time.step)
 
     def model_mesh(self) -> ModelMesh:
         """The nodes of the mesh, its outer surface, its cells, and the volume of each node."""

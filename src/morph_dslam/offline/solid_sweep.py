@@ -58,45 +58,52 @@ class SolidSweep:
         try:
             state = solve(self.problem, target, predicted)
         except SolverError:
-            state = self._in_increments(start, target)
+            state = follow(self.problem, State(start.mu, start.dofs), target)
         return self._with_slopes(state)
-
-    def _in_increments(self, start: SolidState, target: Array) -> State:
-        try:
-            return advance(self.problem, State(start.mu, start.dofs), target).states[-1]
-        except PathError as error:
-            last = self._describe(error.path.states[-1].mu)
-            raise SolverError(
-                f"no equilibrium found beyond {last}, where the last solution converged"
-            ) from error
-
-    def _describe(self, mu: Array) -> str:
-        parameters = self.problem.symbols.parameters
-        return ", ".join(
-            f"{parameter.name} {parameter.display(value):.5g} {parameter.unit}".removesuffix(" 1")
-            for parameter, value in zip(parameters, mu, strict=True)
-        )
 
     def _with_slopes(self, state: State) -> SolidState:
         return SolidState(state.mu, state.dofs, sensitivities(self.problem, state), state.negative_pivots)
 
     def take_snapshot(self, state: SolidState) -> Snapshot:
         """Displacement, Cauchy stress and Green-Lagrange strain at nodes, their slopes, and reactions."""
-        fields = self.problem.sample(state.dofs, state.mu)
-        slopes = self.problem.sample_slopes(state.dofs, state.mu, state.slopes)
-        return Snapshot(
-            state.mu,
-            {name: fields[recovered] for name, recovered in _FIELDS.items()},
-            {name: slopes[recovered] for name, recovered in _FIELDS.items()},
-            self._outputs(state),
-        )
-
-    def _outputs(self, state: SolidState) -> dict[str, Array]:
-        """Forces (N) and moments (N m, about the object frame's origin) of the sets that are held."""
-        outputs = {}
+        outputs = support_reactions(self.problem, state.dofs, state.mu)
         if state.negative_pivots is not None:
             outputs["negative_pivots"] = np.array(state.negative_pivots)
-        for support in self.problem.supports:
-            force, moment = self.problem.reactions(state.dofs, state.mu, support.on, np.zeros(3))
-            outputs[f"force_{support.on}"], outputs[f"moment_{support.on}"] = force, moment
-        return outputs
+        return Snapshot(
+            state.mu,
+            snapshot_fields(self.problem.sample(state.dofs, state.mu)),
+            snapshot_fields(self.problem.sample_slopes(state.dofs, state.mu, state.slopes)),
+            outputs,
+        )
+
+
+def follow(problem: SolidProblem, start: State, target: Array) -> State:
+    """Solve at ``target`` (d,) in increments from ``start``.
+
+    Raises
+    ------
+    SolverError
+        Naming, in the parameters' units, where the last solution converged.
+    """
+    try:
+        return advance(problem, start, target).states[-1]
+    except PathError as error:
+        last = ", ".join(
+            f"{parameter.name} {parameter.display(value):.5g} {parameter.unit}".removesuffix(" 1")
+            for parameter, value in zip(problem.symbols.parameters, error.path.states[-1].mu, strict=True)
+        )
+        raise SolverError(f"no equilibrium found beyond {last}, where the last solution converged") from error
+
+
+def snapshot_fields(recovered: dict[str, Array]) -> dict[str, Array]:
+    """Recovered fields under the names that they have in snapshots and model files."""
+    return {name: recovered[key] for name, key in _FIELDS.items()}
+
+
+def support_reactions(problem: SolidProblem, dofs: Array, mu: Array) -> dict[str, Array]:
+    """Force (N) and moment (N m, about the object frame's origin) on each set that is held."""
+    outputs = {}
+    for support in problem.supports:
+        force, moment = problem.reactions(dofs, mu, support.on, np.zeros(3))
+        outputs[f"force_{support.on}"], outputs[f"moment_{support.on}"] = force, moment
+    return outputs
