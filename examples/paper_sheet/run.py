@@ -58,7 +58,7 @@ DPI = 110
 def run(arguments: argparse.Namespace) -> None:
     began = time.perf_counter()
     sheet = BuckledSheet(0.420, 0.297, PAPER, cells=tuple(arguments.cells))
-    folder = BucklingFolder(arguments.output)
+    folder = BucklingFolder.of(arguments.output, sheet, HEIGHT, arguments.positions)
     eigenvalue, _ = folder.buckling(sheet)
     path = trace(sheet, folder)
     solve_all(sheet, folder, [record.point for record in path], arguments.positions, arguments.workers)

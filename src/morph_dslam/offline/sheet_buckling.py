@@ -7,6 +7,7 @@ for; whatever was solved is kept and not solved again.
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,10 +27,21 @@ from morph_dslam.offline.problem import Snapshot
 from morph_dslam.offline.sheet_equations import SheetEquations
 from morph_dslam.offline.sheet_snapshots import output_points
 from morph_dslam.offline.shell import KoiterSheet, OrthotropicSheet, rectangle_mesh
-from morph_dslam.offline.snapshots import save_snapshot
+from morph_dslam.offline.snapshots import save_snapshot, source_fingerprint
 
 Array = NDArray[np.float64]
 
+#: What the results depend on.
+SOURCES = (
+    "arc_length",
+    "buckling",
+    "linear_solver",
+    "newton",
+    "sheet_buckling",
+    "sheet_equations",
+    "shell",
+    "sparse_engines",
+)
 #: The end force needs the ends' distance far more precisely than the shape: the sheet is stiff along itself.
 PATH_OPTIONS = ArcOptions(first=2e-7, smallest=1e-10, largest=0.005, corrections=10, tolerance=1e-11)
 
@@ -103,9 +115,21 @@ class PathRecord:
 
 @dataclass(frozen=True)
 class BucklingFolder:
-    """What is kept of one run: the eigenvalue, the path's points, and the positions."""
+    """What is kept of one run: the eigenvalue, the path's points, and the positions.
+
+    Attributes
+    ----------
+    root : see `of`. count : number of positions.
+    """
 
     root: Path
+    count: int
+
+    @staticmethod
+    def of(output: Path, sheet: BuckledSheet, height: float, count: int) -> BucklingFolder:
+        """The folder in ``output`` for one sheet, final height and release of the code that solves it."""
+        recipe = f"{sheet} {height} {source_fingerprint(SOURCES)}"
+        return BucklingFolder(output / hashlib.sha256(recipe.encode()).hexdigest()[:16], count)
 
     def buckling(self, sheet: BuckledSheet) -> tuple[float, Array]:
         """`BuckledSheet.first_buckling`, worked out once."""
@@ -121,7 +145,7 @@ class BucklingFolder:
         return self.root / "path" / f"{number:04d}.npz"
 
     def position_file(self, number: int) -> Path:
-        return self.root / "positions" / f"{number:04d}.npz"
+        return self.root / f"positions-{self.count}" / f"{number:04d}.npz"
 
     def save_point(self, number: int, record: PathRecord) -> None:
         point, file = record.point, self.path_file(number)

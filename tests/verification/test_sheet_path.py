@@ -1,0 +1,195 @@
+"""The sheet's buckling and post-buckling against Euler's column and the elastica, and its derivatives."""
+
+from __future__ import annotations
+
+import ngsolve as ngs
+import numpy as np
+import pytest
+
+from morph_dslam.errors import SolverError
+from morph_dslam.offline.arc_length import ArcLength, ArcOptions, missed_bifurcations
+from morph_dslam.offline.newton import NewtonOptions, State, advance, sensitivities
+from morph_dslam.offline.sheet_buckling import (
+    BuckledSheet,
+    BucklingFolder,
+    follow_path,
+    positions_by_point,
+    solve_positions,
+    southwell_load,
+)
+from morph_dslam.offline.sheet_equations import SheetEquations
+from morph_dslam.offline.shell import KoiterSheet, OrthotropicSheet, rectangle_mesh
+from morph_dslam.offline.snapshots import load_snapshot
+
+#: For differences of solutions.
+PRECISE = NewtonOptions(tolerance=1e-12)
+
+
+def isotropic(young: float, poisson: float, thickness: float, **more: float) -> OrthotropicSheet:
+    return OrthotropicSheet(young, young, poisson, young / (2.0 * (1.0 + poisson)), thickness, **more)
+
+
+def small_sheet(condensed: bool = True) -> SheetEquations:
+    """A few elements, clamped at both ends, fibres askew, loaded sideways at one of its free edges."""
+    material = OrthotropicSheet(5e9, 2.5e9, 0.3, 1.4e9, 1e-3, fibre_angle=0.4, offset=2e-4)
+    mesh = rectangle_mesh(np.linspace(-0.15, 0.15, 5), np.linspace(-0.1, 0.1, 4))
+    load = {"top": np.array([0.0, 0.0, 5.0])}
+    shell = KoiterSheet(mesh, material, order=2, clamped="left|right", dead_load=load)
+    motion = {"left": np.array([0.5, 0.0, 0.0]), "right": np.array([-0.5, 0.0, 0.0])}
+    return SheetEquations(shell, motion, length=0.3, condensed=condensed)
+
+
+def arched(equations: SheetEquations) -> State:
+    start = State(np.zeros(2), np.zeros(equations.n_dofs))
+    return advance(equations, start, np.array([1e-4, 1.0]), PRECISE).states[-1]
+
+
+def test_condensed_and_whole_tangents_agree_and_match_differences() -> None:
+    condensed, whole = small_sheet(), small_sheet(condensed=False)
+    state = arched(condensed)
+    one = condensed.linearise(state.dofs, state.mu)
+    other = whole.linearise(state.dofs, state.mu)
+    rng = np.random.default_rng(0)
+    vector = 1e-4 * rng.standard_normal(condensed.n_dofs)
+    product = other.apply(vector)
+    np.testing.assert_allclose(one.apply(vector), product, atol=1e-8 * np.abs(product).max())
+    solution = other.solve(product)
+    np.testing.assert_allclose(one.solve(product), solution, atol=1e-8 * np.abs(solution).max())
+    # An older linearisation is restored before it is used.
+    condensed.linearise(np.zeros_like(vector), np.zeros(2)).solve(product)
+    np.testing.assert_allclose(one.solve(product), solution, atol=1e-8 * np.abs(solution).max())
+    step = 1e-3
+    residuals = [whole.residual(state.dofs + s * vector, state.mu) for s in (step, -step)]
+    difference = (residuals[0] - residuals[1]) / (2.0 * step)
+    np.testing.assert_allclose(product, difference, atol=1e-6 * np.abs(product).max())
+
+
+def test_sensitivities_match_differences() -> None:
+    equations = small_sheet()
+    state = arched(equations)
+    slopes = sensitivities(equations, state)
+    up = equations.shell.displacement_dofs(2)
+    for parameter, step in ((0, 1e-7), (1, 1e-4)):
+        change = np.zeros(2)
+        change[parameter] = step
+        above, below = (
+            advance(equations, state, state.mu + sign * change, PRECISE).states[-1].dofs
+            for sign in (1.0, -1.0)
+        )
+        difference = (above - below) / (2.0 * step)
+        error = np.abs(slopes[parameter] - difference)[up].max()
+        assert error < 1e-5 * np.abs(difference[up]).max()
+
+
+def test_post_buckled_cantilever_follows_the_elastica() -> None:
+    """P / P_cr at tip offsets of the elastica whose end has turned by 20, 40, 60 and 90 degrees."""
+    length, width, thickness, young = 0.1, 0.01, 1e-4, 1e9
+    mesh = rectangle_mesh(np.linspace(0.0, length, 9), np.array([0.0, width]))
+    euler = np.pi**2 * young * width * thickness**3 / 12.0 / (4.0 * length**2)
+    push = {"right": np.array([-euler / width, 0.0, 0.0])}
+    shell = KoiterSheet(mesh, isotropic(young, 0.0, thickness), 3, clamped="left", dead_load=push)
+    equations = SheetEquations(shell, {}, length)
+    bow = ngs.GridFunction(shell.scalar_space)
+    bow.Set(1e-6 * (1.0 - ngs.cos(0.5 * np.pi * ngs.x / length)))
+    shape = np.zeros(equations.n_dofs)
+    shape[shell.displacement_dofs(2)] = bow.vec.FV().NumPy()
+    equations.set_imperfection(shape)
+    tip = shell.mesh(length, width / 2.0)
+
+    def offset(state: State) -> float:
+        field = ngs.GridFunction(shell.scalar_space)
+        field.vec.FV().NumPy()[:] = state.dofs[shell.displacement_dofs(2)]
+        return float(field(tip)) / length
+
+    arc = ArcLength(equations, 1, ArcOptions(first=1e-5, largest=0.03, corrections=8))
+    start: State = State(np.zeros(2), equations.unloaded)
+    for wanted, load in ((0.219413, 1.01540), (0.422240, 1.06366), (0.593208, 1.15172), (0.762760, 1.39320)):
+        points = list(arc.follow(start, lambda state, wanted=wanted: offset(state) - wanted))
+        assert points[-1].state.mu[1] == pytest.approx(load, rel=5e-4)
+        assert not missed_bifurcations(points)
+        assert {point.state.negative_pivots for point in points} == {0}
+        start = points[-1]  # type: ignore[assignment]
+
+
+def strip(imperfection: float = 2e-6) -> BuckledSheet:
+    """297 x 210 x 0.1 mm, E = 5 GPa, nu = 0: a column whose Euler load is 0.0391611 N."""
+    return BuckledSheet(0.297, 0.210, isotropic(5e9, 0.0, 1e-4), (10, 2), 3, imperfection)
+
+
+def test_clamped_strip_buckles_at_eulers_load_into_eulers_mode() -> None:
+    sheet = strip()
+    force, mode = sheet.first_buckling()
+    assert force == pytest.approx(0.0391611, rel=1e-3)
+    x = np.linspace(-0.14, 0.14, 15)
+    height, _ = sheet.shell.sample(mode, np.column_stack([x, np.zeros_like(x)]))
+    np.testing.assert_allclose(height[:, 2], np.cos(np.pi * x / 0.297) ** 2, atol=2e-3)
+
+
+def test_imperfect_strip_deflects_as_columns_do_and_goes_on_where_it_was(tmp_path) -> None:
+    """w = w0 / (1 - P / P_cr) for an imperfection in the shape of the mode; Southwell's load is Euler's."""
+    sheet = strip()
+    folder = BucklingFolder.of(tmp_path, sheet, 2e-3, count=4)
+    path = list(follow_path(sheet, folder, 2e-3))
+    heights, forces = (np.array([getattr(r, name) for r in path]) for name in ("height", "end_force"))
+    early = (heights > 1.5 * sheet.imperfection) & (heights < 5e-5)
+    expected = sheet.imperfection / (1.0 - forces[early] / 0.0391611)
+    np.testing.assert_allclose(heights[early], expected, rtol=0.03)
+    assert southwell_load(heights, forces, sheet.imperfection, 5e-5) == pytest.approx(0.0391611, rel=2e-3)
+    assert heights[-1] == pytest.approx(2e-3, rel=1e-6)
+
+    folder.path_file(len(path) - 1).unlink()
+    again = list(follow_path(sheet, folder, 2e-3))
+    assert len(again) == len(path)
+    assert again[-1].end_force == pytest.approx(path[-1].end_force, rel=1e-6)
+
+    points = [record.point for record in path]
+    for number, positions in positions_by_point(points, folder.count):
+        solve_positions(sheet, folder, number, positions, points[-1].length)
+    last = load_snapshot(folder.position_file(3))
+    assert last.coordinates == pytest.approx([1.0])
+    assert last.outputs["height"] == pytest.approx(2e-3, rel=1e-6)
+    # Bending energy of the mode at height w: E I w^2 pi^4 / L^3.
+    energy = 5e9 * 0.210 * 1e-12 / 12.0 * np.pi**4 * 4e-6 / 0.297**3
+    assert last.outputs["bending_energy"] == pytest.approx(energy, rel=5e-3)
+    # Stress on the upper face at the crest: E t / 2 times the curvature 2 pi^2 w / L^2.
+    crest = np.argmax(last.fields["displacement"][:, 2])
+    stress = 5e9 * 5e-5 * 2.0 * np.pi**2 * 2e-3 / 0.297**2
+    assert last.fields["stress_top"][crest, 0] == pytest.approx(stress, rel=0.02)
+
+
+def test_a_sheet_that_cannot_arch_so_high_says_how_high_it_can(tmp_path) -> None:
+    """The elastica of length L arches to 0.40315 L at most."""
+    sheet = BuckledSheet(0.297, 0.02, isotropic(5e9, 0.0, 1e-4), (10, 1), 3, 1e-5)
+    folder = BucklingFolder.of(tmp_path, sheet, 0.15, count=4)
+    with pytest.raises(SolverError, match=r"rises to 119\.[5-9]\d mm and falls again"):
+        list(follow_path(sheet, folder, 0.15))
+
+
+def test_fibres_askew_give_the_off_axis_modulus() -> None:
+    angle, c, s = 0.5, np.cos(0.5), np.sin(0.5)
+    material = OrthotropicSheet(5e9, 2.5e9, 0.3, 1.4e9, 1e-4, fibre_angle=angle)
+    # Jones, Mechanics of Composite Materials (1999), eq. 2.97.
+    along = c**4 / 5e9 + (1.0 / 1.4e9 - 0.6 / 5e9) * c**2 * s**2 + s**4 / 2.5e9
+    assert 1.0 / np.linalg.inv(material.stiffness)[0, 0] == pytest.approx(1.0 / along, rel=1e-12)
+    turned = OrthotropicSheet(5e9, 2.5e9, 0.3, 1.4e9, 1e-4, fibre_angle=np.pi / 2.0).stiffness
+    straight = OrthotropicSheet(5e9, 2.5e9, 0.3, 1.4e9, 1e-4).stiffness
+    np.testing.assert_allclose(turned, straight[np.ix_([1, 0, 2], [1, 0, 2])], atol=1.0)
+
+
+def test_a_strip_pulled_off_its_middle_bends() -> None:
+    """Pulled at the meshed surface, offset e from the middle: moment P e, tip rising by P e L^2 / 2 E I."""
+    length, thickness, young, offset, pull = 0.1, 1e-3, 1e9, 3e-4, 0.01
+    mesh = rectangle_mesh(np.linspace(0.0, length, 5), np.array([0.0, 0.02]))
+    material = isotropic(young, 0.0, thickness, offset=offset)
+    load = {"right": np.array([pull, 0.0, 0.0])}
+    equations = SheetEquations(KoiterSheet(mesh, material, 3, clamped="left", dead_load=load), {}, length)
+    state = advance(equations, State(np.zeros(2), np.zeros(equations.n_dofs)), np.array([0.0, 1.0])).states[
+        -1
+    ]
+    displacement, stress = equations.shell.sample(state.dofs, np.array([[length, 0.01], [0.05, 0.01]]))
+    stiffness = young * thickness**3 / 12.0
+    # The middle lies above the pull, so that the tip turns up.
+    assert displacement[0, 2] == pytest.approx(pull * offset * length**2 / (2.0 * stiffness), rel=2e-3)
+    direct, bending = pull / thickness, 6.0 * pull * offset / thickness**2
+    assert stress["top"][1, 0] == pytest.approx(direct - bending, rel=5e-3)
+    assert stress["bottom"][1, 0] == pytest.approx(direct + bending, rel=5e-3)
