@@ -150,6 +150,20 @@ def test_tangent(make: Callable[[ParameterSymbols], SolidProblem]) -> None:
     np.testing.assert_allclose(back, right, atol=1e-9 * np.abs(right).max())
 
 
+def test_pressures_do_not_count_as_instability() -> None:
+    """Taylor and Hood's pressures each add a negative pivot that says nothing of the solid."""
+    material = NeoHookean(young=3e6, poisson=0.4999)
+    for cell_type in ("tet10", "hex27"):
+        problem = SolidProblem(
+            block((1.0, 1.0, 1.0), (1, 1, 1), cell_type),
+            {"all": material},
+            [fixed("x_min")],
+            options=SolidOptions(mixed=True),
+        )
+        linearisation = problem.linearise(np.zeros(problem.n_dofs), np.zeros(0))
+        assert linearisation.negative_pivots == 0
+
+
 def test_follower_pressure_makes_the_tangent_unsymmetric() -> None:
     assert not by_pressure(load_parameter(p=0.3)).assembly.symmetric
     assert by_dead_loads(load_parameter(p=0.3)).assembly.symmetric

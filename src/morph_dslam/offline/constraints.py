@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import StudyError
 from morph_dslam.offline.displacement_space import DisplacementSpace
 from morph_dslam.offline.kinematics import Shape
+from morph_dslam.offline.morphing import surface_normals
 from morph_dslam.offline.parameters import ParameterSymbols
 from morph_dslam.offline.supports import ElasticFoundation, PrescribedMotion
 
@@ -111,12 +112,12 @@ class Constraints:
         """Refuse supports that leave the body free to move as a whole (StudyError)."""
         modes = self._rigid_modes()
         rows = [modes[self.held.reshape(3, -1)]]
-        normals = self._foundation_normals()
         for foundation in self._foundations:
             nodes = self._mesh.surface_nodes(foundation.on)
             at_nodes = np.stack([self._space.node_values[nodes] @ mode for mode in modes], axis=1)
             if foundation.normal_only:
-                rows.append(np.einsum("kc,kcm->km", normals[foundation.on], at_nodes))
+                normals = surface_normals(self._mesh, foundation.on)[nodes]
+                rows.append(np.einsum("kc,kcm->km", normals, at_nodes))
             else:
                 rows.append(at_nodes.reshape(-1, 6))
         held = np.concatenate(rows)
@@ -138,20 +139,6 @@ class Constraints:
             modes[j, :, 3 + axis] = centred[:, i]
             modes[i, :, 3 + axis] = -centred[:, j]
         return modes
-
-    def _foundation_normals(self) -> dict[str, Array]:
-        """Mean normal (k, 3) at the nodes of each foundation that resists normal displacement only."""
-        result = {}
-        for foundation in self._foundations:
-            faces = self._mesh.surface(foundation.on)
-            triangles = self._mesh.face_triangles(faces)
-            a, b, c = (self._mesh.nodes[triangles[:, i]] for i in range(3))
-            normals = np.zeros(self._mesh.nodes.shape)
-            for corner in range(3):
-                np.add.at(normals, triangles[:, corner], np.cross(b - a, c - a))
-            normals = normals[self._mesh.surface_nodes(foundation.on)]
-            result[foundation.on] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-        return result
 
 
 def _describe(free: Array) -> str:

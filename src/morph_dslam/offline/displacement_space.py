@@ -142,8 +142,12 @@ class DisplacementSpace:
             self._deformation = ngs.GridFunction(self.vector)
             self._deformation.vec.FV().NumPy()[:] = bubbles.T.ravel()
             self.geometry.ngs.SetDeformation(self._deformation)
-            if any(basis.type.shape == "tet" for basis in self._blocks):
-                self.bonus_order = 2
+            self.bonus_order = self.curved_bonus_order
+
+    @property
+    def curved_bonus_order(self) -> int:
+        """`bonus_order` where cells are curved, by their nodes or by a shape parameter."""
+        return 2 if any(basis.type.shape == "tet" for basis in self._blocks) else 0
 
     def dofs_on(self, nodes: Indices) -> Indices:
         """Scalar dofs (sorted) that a set of nodes holds.

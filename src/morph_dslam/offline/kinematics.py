@@ -66,6 +66,11 @@ class Shape:
             function.vec.FV().NumPy()[:] = coefficients.T.ravel()
             self.functions.append(function)
 
+    @property
+    def bonus_order(self) -> int:
+        """What integrals over cells need beyond NGSolve's own order of quadrature."""
+        return self._space.curved_bonus_order if self.functions else self._space.bonus_order
+
     def coordinates(self, symbols: ParameterSymbols) -> Array:
         """Coefficients (n_scalar, 3) of the undeformed position at the present parameters, m."""
         result = self._space.coordinates.copy()

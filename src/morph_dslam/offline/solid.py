@@ -116,10 +116,11 @@ class SolidProblem:
         self.n_dofs: int = self.space.ndof
         self.constraints = Constraints(self.displacements, self.shape, self.supports, self.symbols)
         self.constraints.check_rigid_motions()
-        self.assembly = Assembly(self.space, self._terms(), self.symbols)
+        n_displacements = 3 * self.displacements.n_scalar
+        self.assembly = Assembly(self.space, self._terms(), self.symbols, n_displacements)
         self.free: NDArray[np.bool_] = self._free_dofs()
         scale = np.full(self.n_dofs, np.inf)
-        scale[: 3 * self.displacements.n_scalar] = self.length
+        scale[:n_displacements] = self.length
         self.scale: Array | float = scale
         points = [load for load in loads if isinstance(load, PointLoad)]
         self._nodal_forces = NodalForces(self.displacements, points, self.symbols)
@@ -160,7 +161,7 @@ class SolidProblem:
             Term(
                 region.energy(F, region.pressure(unknowns)) * ratio,
                 region.region,
-                self.displacements.bonus_order,
+                self.shape.bonus_order,
                 rules=self.history.rules if self.history else {},
             )
             for region, unknowns in zip(self.regions, pressures, strict=True)

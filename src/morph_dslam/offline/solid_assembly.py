@@ -63,14 +63,20 @@ class Term:
 class Assembly:
     """The forms of a solid.
 
+    Parameters
+    ----------
+    n_displacements : how many of the dofs, the first ones, are displacements; the others are pressures.
+
     Attributes
     ----------
     symmetric : whether all terms have an energy.
     coupled : (n,) dofs that are not condensed.
     """
 
-    def __init__(self, space: ngs.FESpace, terms: Sequence[Term], symbols: ParameterSymbols) -> None:
-        self._space, self._symbols = space, symbols
+    def __init__(
+        self, space: ngs.FESpace, terms: Sequence[Term], symbols: ParameterSymbols, n_displacements: int
+    ) -> None:
+        self._space, self._symbols, self._n_displacements = space, symbols, n_displacements
         self.symmetric = all(term.has_energy for term in terms)
         self.coupled = np.array(space.FreeDofs(coupling=True), dtype=bool)
         self.condensed = bool(np.any(np.array(space.FreeDofs(), dtype=bool) & ~self.coupled))
@@ -126,7 +132,8 @@ class Assembly:
     def linearise(self, x: Array, mu: Array, forces: Array, solver: LinearSolver) -> Linearisation:
         """Residual, less nodal ``forces`` (n,), and tangent at ``x``; ``mu`` is set already."""
         residual = self.residual(x) - forces
-        linearisation = AssembledLinearisation(residual, self.tangent(x), solver)
+        multipliers = int(np.count_nonzero(solver.free[self._n_displacements :]))
+        linearisation = _MixedLinearisation(residual, self.tangent(x), solver, multipliers)
         if not self.condensed:
             return linearisation
         condensed = _CondensedLinearisation(self, linearisation, x.copy(), mu.copy(), solver)
@@ -154,6 +161,25 @@ class Assembly:
         with self._threads():
             self._result.data = getattr(self._form, operators) * self._state.vec
         return self._result.FV().NumPy().copy()
+
+
+class _MixedLinearisation(AssembledLinearisation):
+    """A linearisation with pressures, whose block of K is negative: each adds a negative pivot of its own.
+
+    K has as many more than K_uu - K_up K_pp^-1 K_pu, which tells the solid's stability, as there are
+    pressures (Haynsworth, Linear Algebra and its Applications 1, 1968).
+    """
+
+    def __init__(
+        self, residual: Array, matrix: sp.csr_matrix, solver: LinearSolver, multipliers: int
+    ) -> None:
+        super().__init__(residual, matrix, solver)
+        self._multipliers = multipliers
+
+    @property
+    def negative_pivots(self) -> int | None:
+        found = super().negative_pivots
+        return None if found is None else found - self._multipliers
 
 
 class _CondensedLinearisation:

@@ -57,7 +57,7 @@ class SolidHistory:
         self._mesh, self._time, self._symbols = space.geometry.ngs, time, symbols
         names = [_names(region.region) for region in regions]
         materials = {name: r.material for group, r in zip(names, regions, strict=True) for name in group}
-        self._state = ViscousState(self._mesh, materials, order=space.order + space.bonus_order // 2)
+        self._state = ViscousState(self._mesh, materials, order=space.order)
         self._accepted = ngs.Parameter(symbols.value(time))
         self._state.time_step = self._time - self._accepted
         self.rules = self._state.rules

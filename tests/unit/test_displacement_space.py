@@ -1,0 +1,130 @@
+"""The mesh in NGSolve's hands: numbering, regions, curved cells, and where points lie."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import ngsolve as ngs
+import numpy as np
+import pytest
+
+from morph_dslam.errors import StudyError
+from morph_dslam.offline.displacement_space import DisplacementSpace
+from morph_dslam.offline.loads import DeadTraction
+from morph_dslam.offline.materials.isotropic import NeoHookean
+from morph_dslam.offline.mesh_generators import block, tube
+from morph_dslam.offline.mesh_geometry import cell_volumes
+from morph_dslam.offline.meshes import CellBlock, Mesh
+from morph_dslam.offline.newton import solve
+from morph_dslam.offline.ngsolve_mesh import NgsolveMesh, reference_points
+from morph_dslam.offline.point_location import locate
+from morph_dslam.offline.solid import SolidOptions, SolidProblem
+from morph_dslam.offline.supports import fixed
+from tests.support.solids import SOLID_CELLS, distorted
+
+
+@pytest.mark.parametrize("cell_type", SOLID_CELLS)
+def test_fields_are_the_cells_own_interpolation(cell_type: str) -> None:
+    """NGSolve's field of given nodal values is the cells' shape functions times these values."""
+    mesh = distorted(block((1.0, 1.0, 1.0), (2, 2, 2), cell_type), 0.05)
+    space = DisplacementSpace(NgsolveMesh(mesh))
+    values = np.random.default_rng(0).uniform(-1.0, 1.0, (mesh.n_nodes, 3))
+    coefficients = space.coefficients @ values
+    np.testing.assert_allclose(space.node_values @ coefficients, values, atol=1e-13)
+    volume = ngs.Integrate(ngs.CF(1.0), space.geometry.ngs, order=6)
+    assert volume == pytest.approx(cell_volumes(mesh).sum(), rel=1e-9)
+    field = ngs.GridFunction(space.vector)
+    field.vec.FV().NumPy()[:] = coefficients.T.ravel()
+    cells = mesh.blocks[0]
+    reference, _ = cells.type.quadrature()
+    weights = cells.type.shape_functions(reference)
+    expected = np.einsum("pk,mka->mpa", weights, values[cells.connectivity]).reshape(-1, 3)
+    places = np.einsum("pk,mka->mpa", weights, mesh.nodes[cells.connectivity]).reshape(-1, 3)
+    points = space.geometry.mesh_points(
+        np.repeat(space.geometry.element_of_cell, len(reference)),
+        np.tile(reference_points(cells.type.shape, reference), (mesh.n_cells, 1)),
+    )
+    np.testing.assert_allclose(field(points), expected, atol=1e-12)
+    np.testing.assert_allclose(ngs.CF((ngs.x, ngs.y, ngs.z))(points), places, atol=1e-12)
+
+
+@pytest.mark.parametrize("cell_type", SOLID_CELLS)
+def test_a_set_holds_its_own_nodes(cell_type: str) -> None:
+    mesh = block((1.0, 1.0, 1.0), (2, 2, 2), cell_type)
+    space = DisplacementSpace(NgsolveMesh(mesh))
+    nodes = mesh.set_nodes("x_min")
+    held = space.dofs_on(nodes)
+    assert len(held) == len(nodes)
+    free_function = np.ones(space.n_scalar)
+    free_function[held] = 0.0
+    np.testing.assert_allclose((space.node_values @ free_function)[nodes], 0.0, atol=1e-15)
+
+
+def test_higher_order_on_straight_cells_holds_the_whole_face() -> None:
+    mesh = block((1.0, 1.0, 1.0), (2, 2, 2), "hex8")
+    space = DisplacementSpace(NgsolveMesh(mesh), order=2)
+    assert space.n_scalar == 5**3
+    assert len(space.dofs_on(mesh.set_nodes("x_min"))) == 5**2
+
+
+def test_order_2_on_hex8_is_hex27() -> None:
+    solutions = []
+    for cell_type, order in (("hex8", 2), ("hex27", None)):
+        mesh = block((1.0, 0.2, 0.2), (3, 1, 1), cell_type)
+        problem = SolidProblem(
+            mesh,
+            {"all": NeoHookean(young=1e6, poisson=0.3)},
+            [fixed("x_min")],
+            [DeadTraction("x_max", (0.0, 0.0, 100.0))],
+            options=SolidOptions(order=order),
+        )
+        state = solve(problem, np.zeros(0), problem.initial_state())
+        tip = problem.recovery.at_points(state.dofs, state.mu, np.array([[1.0, 0.1, 0.1]]))
+        solutions.append(tip["displacement"])
+    np.testing.assert_allclose(solutions[0], solutions[1], rtol=1e-9, atol=1e-12)
+
+
+def test_overlapping_sets_become_regions() -> None:
+    mesh = block((3.0, 1.0, 1.0), (3, 1, 1), "hex8")
+    faces = mesh.surfaces["z_max"]
+    mesh = replace(
+        mesh,
+        cell_sets={"a": np.array([0, 1]), "b": np.array([1, 2])},
+        surfaces={**mesh.surfaces, "part": faces[:1]},
+    )
+    geometry = NgsolveMesh(mesh)
+    for name, volume in (("a", 2.0), ("b", 2.0), ("all", 3.0)):
+        assert ngs.Integrate(1.0 * ngs.dx(geometry.region(name)), geometry.ngs) == pytest.approx(volume)
+    for name, area in (("part", 1.0), ("z_max", 3.0), ("x_min", 1.0)):
+        assert ngs.Integrate(1.0 * ngs.ds(geometry.boundary(name)), geometry.ngs) == pytest.approx(area)
+    numbers = geometry.cell_field(np.array([1.0, 10.0, 100.0]))
+    found = [ngs.Integrate(numbers, geometry.ngs, definedon=geometry.region(name)) for name in "ab"]
+    assert found == pytest.approx([11.0, 110.0])
+
+
+def test_normals_point_out_of_curved_cells() -> None:
+    mesh = tube(0.02, 0.03, 0.05, (1, 1, 24), cell_type="hex20")
+    space = DisplacementSpace(NgsolveMesh(mesh))
+    outward = ngs.specialcf.normal(3) * ngs.CF((ngs.x, ngs.y, 0.0))
+    for name, flux in (("outer", 0.03**2), ("inner", -(0.02**2))):
+        found = ngs.Integrate(outward * ngs.ds(space.geometry.boundary(name)), space.geometry.ngs)
+        assert found == pytest.approx(2.0 * np.pi * flux * 0.05, rel=2e-4)
+
+
+@pytest.mark.parametrize("cell_type", ["hex20", "tet10", "prism18"])
+def test_points_are_found_in_curved_cells(cell_type: str) -> None:
+    mesh = distorted(block((1.0, 1.0, 1.0), (3, 3, 3), cell_type), 0.03)
+    points = np.random.default_rng(3).uniform(0.01, 0.99, (200, 3))
+    found = locate(mesh, points)
+    cells = mesh.blocks[0]
+    weights = cells.type.shape_functions(found.reference)
+    back = np.einsum("pk,pka->pa", weights, mesh.nodes[cells.connectivity[found.cells]])
+    np.testing.assert_allclose(back, points, atol=1e-10)
+
+
+def test_cells_that_do_not_go_together_are_refused() -> None:
+    one, two = block((1.0, 1.0, 1.0), (1, 1, 1), "hex8"), block((1.0, 1.0, 1.0), (1, 1, 1), "hex20")
+    nodes = np.concatenate([one.nodes, two.nodes])
+    second = CellBlock("hex20", two.blocks[0].connectivity + len(one.nodes))
+    with pytest.raises(StudyError, match="first- and second-order cells meet"):
+        DisplacementSpace(NgsolveMesh(Mesh(nodes, (one.blocks[0], second))))
