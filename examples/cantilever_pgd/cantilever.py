@@ -55,7 +55,7 @@ class Cantilever:
         return on_top[np.argsort(self.vertices[on_top, 0])]
 
 
-def _matrix(form: ngs.CoefficientFunction, space: ngs.FESpace, free: NDArray[np.int64]) -> sp.csc_array:
+def _matrix(form: ngs.comp.SumOfIntegrals, space: ngs.FESpace, free: NDArray[np.int64]) -> sp.csc_array:
     assembled = ngs.BilinearForm(form).Assemble()  # kept alive: its arrays are views
     values, columns, rows = assembled.mat.CSR()
     whole = sp.csr_array((np.array(values), np.array(columns), np.array(rows)), shape=(space.ndof,) * 2)
@@ -88,11 +88,13 @@ def build_cantilever() -> Cantilever:
     stress = 2.0 * shear * strain(u) + lame * ngs.Trace(strain(u)) * ngs.Id(2)
     energy = THICKNESS * ngs.InnerProduct(stress, strain(v))
     is_outer = ngs.IfPos(ngs.x - LENGTH / 2.0, 1.0, 0.0)
-    free = np.flatnonzero(np.array(list(space.FreeDofs())))
+    free_dofs = space.FreeDofs()
+    free = np.array([dof for dof in range(space.ndof) if free_dofs[dof]])
     positions = LENGTH * np.arange(1, N_POSITIONS + 1) / N_POSITIONS
     vertices = np.array([vertex.point for vertex in mesh.vertices])
     quads = np.array([[vertex.nr for vertex in element.vertices] for element in mesh.Elements(ngs.VOL)])
-    vertical = sp.eye_array(space.ndof, format="csr")[space.Range(1).start :][: len(vertices)]
+    whole = sp.csr_array(sp.eye_array(space.ndof))
+    vertical = whole[space.Range(1).start :][: len(vertices)]
     return Cantilever(
         inner=_matrix((1.0 - is_outer) * energy * ngs.dx, space, free),
         outer=_matrix(is_outer * energy * ngs.dx, space, free),
@@ -116,7 +118,8 @@ def moving_load(beam: Cantilever) -> SeparableProblem:
 def moving_load_and_stiffness(beam: Cantilever) -> SeparableProblem:
     """Two parameters: the position and the logarithm of the stiffness ratio (a C2 spline on 15 nodes)."""
     position = collocation_axis(beam.positions)
-    ratio = galerkin_axis(cubic_spline_basis(np.linspace(*np.log(STIFFNESS_RATIO), 15)))
+    softest, stiffest = np.log(STIFFNESS_RATIO)
+    ratio = galerkin_axis(cubic_spline_basis(np.linspace(softest, stiffest, 15)))
     n_points = len(ratio.points)
     return SeparableProblem(
         axes=(position, ratio),

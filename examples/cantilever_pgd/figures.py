@@ -17,9 +17,11 @@ SLICE = 0.6  # position of the load that is cut out of the response surface, in 
 def draw_modes(beam: Cantilever, solution: PgdSolution, path: Path) -> None:
     """(a) vertical modes in space, (b) modes in the load's position, (c) the response surface and a slice."""
     figure = Figure(figsize=(11.5, 7.2), layout="constrained")
-    left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.1))
+    halves = figure.add_gridspec(1, 2, width_ratios=(1.0, 1.1))
+    left, right = (figure.add_subfigure(halves[0, i]) for i in (0, 1))
     _draw_space(left, beam, solution)
-    upper, lower = right.subfigures(2, 1, height_ratios=(1.0, 1.5))
+    parts = right.add_gridspec(2, 1, height_ratios=(1.0, 1.5))
+    upper, lower = (right.add_subfigure(parts[i, 0]) for i in (0, 1))
     _draw_positions(upper, beam, solution)
     _draw_response(lower, beam, solution)
     figure.savefig(path, dpi=110)

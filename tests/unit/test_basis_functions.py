@@ -141,7 +141,9 @@ def test_the_kriging_penalty_is_the_kernel_between_its_centres() -> None:
 def test_mistaken_bases_are_refused() -> None:
     with pytest.raises(ValueError, match="must grow"):
         chebyshev_basis(1.0, 1.0, 3)
-    with pytest.raises(ValueError, match="at least 4 nodes"):
+    with pytest.raises(ValueError, match="at least 4 growing nodes"):
         cubic_spline_basis([0.0, 1.0, 2.0])
+    with pytest.raises(ValueError, match="growing"):
+        hat_basis([0.0, 1.0, 1.0])
     with pytest.raises(ValueError, match="not 'wavelet'"):
         Basis("wavelet", 0.0, 1.0, 3)

@@ -116,6 +116,25 @@ def test_mixed_second_derivatives_follow_finite_differences(form: str) -> None:
         )
 
 
+@every_form
+def test_a_wrong_number_of_parameters_is_refused(form: str) -> None:
+    with pytest.raises(ValueError, match="3 parameters are needed"):
+        make(form, 3).evaluate([0.1, 0.2])
+
+
+def test_arrays_that_do_not_fit_are_refused() -> None:
+    bases, rng = BASES[3], np.random.default_rng(0)
+    factors = tuple(rng.normal(size=(b.size, 2)) for b in bases)
+    with pytest.raises(ValueError, match="functions, the coefficients"):
+        CPFunctions(bases, factors[::-1], np.eye(2))
+    with pytest.raises(ValueError, match="terms, the mixing 3"):
+        CPFunctions(bases, factors, np.eye(3))
+    with pytest.raises(ValueError, match="ranks"):
+        TuckerFunctions(bases, factors, rng.normal(size=(4, 2, 2, 3)))
+    with pytest.raises(ValueError, match="do not follow each other"):
+        TensorTrainFunctions(bases, tuple(rng.normal(size=(2, b.size, 2)) for b in bases))
+
+
 def test_leaving_the_box_is_flagged_for_each_parameter() -> None:
     functions = make("cp", 4)
     assert functions.inside([0.5, 9.0, 0.5, 0.0]).tolist() == [True, True, True, True]  # an angle has no end

@@ -54,12 +54,12 @@ class TensorField:
 
     def value(self, mu: ArrayLike) -> Array:
         """The field (n_points, n_components) at parameters ``mu`` (d,)."""
-        rows = self.functions.rows(np.asarray(mu, dtype=float))
+        rows = self.functions.rows(mu)
         return combine_modes(rows[:1], self.modes.reshape(self.n_modes, -1)).reshape(self.modes.shape[1:])
 
     def value_and_sensitivities(self, mu: ArrayLike) -> tuple[Array, Array]:
         """The field (n_points, n_components) and its derivatives (d, n_points, n_components)."""
-        rows = self.functions.rows(np.asarray(mu, dtype=float))
+        rows = self.functions.rows(mu)
         result = combine_modes(rows, self.modes.reshape(self.n_modes, -1))
         result = result.reshape(len(rows), *self.modes.shape[1:])
         return result[0], result[1:]

@@ -15,152 +15,20 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from morph_dslam.model.basis_functions import KINDS, Basis, evaluate_numpy, fill_basis
+from morph_dslam.model.basis_functions import Basis, evaluate_numpy
+from morph_dslam.model.tensor_kernels import (
+    PackedBases,
+    evaluate_cp,
+    evaluate_tensor_train,
+    evaluate_tucker,
+    pack_bases,
+)
 
 Array = NDArray[np.float64]
-
-
-class PackedBases(NamedTuple):
-    """The bases of all parameters as plain arrays, for compiled code; ``starts`` delimit their functions."""
-
-    kinds: NDArray[np.int64]
-    degrees: NDArray[np.int64]
-    starts: NDArray[np.int64]
-    lower: Array
-    upper: Array
-    knots: Array
-    knot_starts: NDArray[np.int64]
-
-
-def pack_bases(bases: tuple[Basis, ...]) -> PackedBases:
-    """Arrays of the bases, in order."""
-    return PackedBases(
-        kinds=np.array([KINDS[b.kind] for b in bases]),
-        degrees=np.array([b.degree for b in bases]),
-        starts=np.concatenate([[0], np.cumsum([b.size for b in bases])]),
-        lower=np.array([b.lower for b in bases]),
-        upper=np.array([b.upper for b in bases]),
-        knots=np.concatenate([b.knots for b in bases]),
-        knot_starts=np.concatenate([[0], np.cumsum([len(b.knots) for b in bases])]),
-    )
-
-
-@njit(cache=True, nogil=True)
-def fill_bases(packed, mu):
-    """Values and slopes (3, total size) of the functions of all parameters at ``mu`` (d,)."""
-    out = np.empty((3, packed.starts[-1]))
-    for k in range(len(mu)):
-        a, b = packed.starts[k], packed.starts[k + 1]
-        knots = packed.knots[packed.knot_starts[k] : packed.knot_starts[k + 1]]
-        fill_basis(
-            packed.kinds[k],
-            packed.degrees[k],
-            b - a,
-            packed.lower[k],
-            packed.upper[k],
-            knots,
-            mu[k],
-            out[:, a:b],
-        )
-    return out
-
-
-@njit(cache=True, nogil=True)
-def evaluate_cp(packed, mu, factors, mixing):
-    """Values and gradient (1 + d, n); ``factors`` (total size, n_terms), ``mixing`` (n_terms, n)."""
-    d, n_terms = len(mu), factors.shape[1]
-    table = fill_bases(packed, mu)
-    values, slopes = np.zeros((d, n_terms)), np.zeros((d, n_terms))
-    for k in range(d):
-        for j in range(packed.starts[k], packed.starts[k + 1]):
-            phi, dphi = table[0, j], table[1, j]
-            if phi != 0.0 or dphi != 0.0:  # most splines vanish here
-                for t in range(n_terms):
-                    values[k, t] += phi * factors[j, t]
-                    slopes[k, t] += dphi * factors[j, t]
-    rows = np.ones((1 + d, n_terms))
-    for k in range(d):
-        for row in range(1 + d):
-            for t in range(n_terms):
-                rows[row, t] *= slopes[k, t] if row == k + 1 else values[k, t]
-    result = np.zeros((1 + d, mixing.shape[1]))
-    for row in range(1 + d):
-        for t in range(n_terms):
-            for i in range(mixing.shape[1]):
-                result[row, i] += rows[row, t] * mixing[t, i]
-    return result
-
-
-@njit(cache=True, nogil=True)
-def evaluate_tucker(packed, mu, ranks, factors, core, n_functions):
-    """Values and gradient (1 + d, n_functions); ``factors`` and ``core`` flattened in C order."""
-    d = len(mu)
-    table = fill_bases(packed, mu)
-    below = core.reshape(1, core.size)
-    end = len(factors)
-    for k in range(d - 1, -1, -1):
-        rank, a, b = ranks[k], packed.starts[k], packed.starts[k + 1]
-        factor = factors[end - (b - a) * rank : end].reshape(b - a, rank)
-        end -= (b - a) * rank
-        value, slope = np.zeros(rank), np.zeros(rank)
-        for j in range(b - a):
-            if table[0, a + j] != 0.0 or table[1, a + j] != 0.0:
-                for q in range(rank):
-                    value[q] += table[0, a + j] * factor[j, q]
-                    slope[q] += table[1, a + j] * factor[j, q]
-        # rows of `next_`: value, derivative by parameter k, derivatives by the parameters after k
-        n_rows, length = below.shape[0], below.shape[1] // rank
-        next_ = np.zeros((n_rows + 1, length))
-        for i in range(length):
-            for q in range(rank):
-                next_[1, i] += below[0, i * rank + q] * slope[q]
-        for row in range(n_rows):
-            target = row if row == 0 else row + 1
-            for i in range(length):
-                for q in range(rank):
-                    next_[target, i] += below[row, i * rank + q] * value[q]
-        below = next_
-    return below.reshape(1 + d, n_functions)
-
-
-@njit(cache=True, nogil=True)
-def evaluate_tensor_train(packed, mu, ranks, cores):
-    """Values and gradient (1 + d, n_functions); core k, (ranks[k], size, ranks[k + 1]), flattened."""
-    d = len(mu)
-    table = fill_bases(packed, mu)
-    after = np.ones((1, 1))
-    end = len(cores)
-    for k in range(d - 1, -1, -1):
-        left, right = ranks[k], ranks[k + 1]
-        a, size = packed.starts[k], packed.starts[k + 1] - packed.starts[k]
-        core = cores[end - left * size * right : end].reshape(left, size, right)
-        end -= left * size * right
-        value, slope = np.zeros((left, right)), np.zeros((left, right))
-        for i in range(left):
-            for j in range(size):
-                phi, dphi = table[0, a + j], table[1, a + j]
-                if phi != 0.0 or dphi != 0.0:
-                    for q in range(right):
-                        value[i, q] += phi * core[i, j, q]
-                        slope[i, q] += dphi * core[i, j, q]
-        n_rows = after.shape[0]
-        next_ = np.zeros((n_rows + 1, left))
-        for i in range(left):
-            for q in range(right):
-                next_[1, i] += slope[i, q] * after[0, q]
-        for row in range(n_rows):
-            target = row if row == 0 else row + 1
-            for i in range(left):
-                for q in range(right):
-                    next_[target, i] += value[i, q] * after[row, q]
-        after = next_
-    return after
 
 
 @dataclass(frozen=True)
@@ -180,8 +48,8 @@ class TensorFunctions(ABC):
         """Numbers stored, for the compression factor."""
 
     @abstractmethod
-    def rows(self, mu: Array) -> Array:
-        """Values, then the derivative by each parameter (1 + d, n_functions), compiled."""
+    def _compiled(self, mu: Array) -> Array:
+        """`rows` without the check."""
 
     @abstractmethod
     def _contract(self, vectors: list[Array]) -> Array:
@@ -191,12 +59,24 @@ class TensorFunctions(ABC):
     def _packed(self) -> PackedBases:
         return pack_bases(self.bases)
 
+    def rows(self, mu: ArrayLike) -> Array:
+        """Values, then the derivative by each parameter (1 + d, n_functions) at ``mu`` (d,), compiled."""
+        mu = np.asarray(mu, dtype=np.float64)
+        if mu.shape != (len(self.bases),):  # compiled code would read beyond the arrays
+            raise ValueError(f"{len(self.bases)} parameters are needed, not an array of shape {mu.shape}")
+        return self._compiled(mu)
+
+    def _check_sizes(self, arrays: tuple[Array, ...], axis: int) -> None:
+        sizes, found = [b.size for b in self.bases], [a.shape[axis] for a in arrays]
+        if sizes != found:
+            raise ValueError(f"the bases have {sizes} functions, the coefficients {found}")
+
     def evaluate(self, mu: ArrayLike) -> tuple[Array, Array]:
         """Values (n_functions,) and gradient (d, n_functions) at ``mu`` (d,).
 
         Outside the box each parameter's functions go on as their tangents; see `inside`.
         """
-        rows = self.rows(np.asarray(mu, dtype=float))
+        rows = self.rows(mu)
         return rows[0], rows[1:]
 
     def partial(self, mu: ArrayLike, orders: tuple[int, ...]) -> Array:
@@ -242,7 +122,13 @@ class CPFunctions(TensorFunctions):
     def _stacked(self) -> Array:
         return np.ascontiguousarray(np.concatenate(self.factors))
 
-    def rows(self, mu: Array) -> Array:
+    def __post_init__(self) -> None:
+        self._check_sizes(self.factors, axis=0)
+        terms = {f.shape[1] for f in self.factors}
+        if terms != {len(self.mixing)}:
+            raise ValueError(f"the factors have {terms} terms, the mixing {len(self.mixing)}")
+
+    def _compiled(self, mu: Array) -> Array:
         return evaluate_cp(self._packed, mu, self._stacked, self.mixing)
 
     def _contract(self, vectors: list[Array]) -> Array:
@@ -276,7 +162,13 @@ class TuckerFunctions(TensorFunctions):
         ranks = np.array(self.core.shape[1:])
         return ranks, np.concatenate([f.ravel() for f in self.factors]), self.core.ravel()
 
-    def rows(self, mu: Array) -> Array:
+    def __post_init__(self) -> None:
+        self._check_sizes(self.factors, axis=0)
+        ranks = tuple(f.shape[1] for f in self.factors)
+        if self.core.shape[1:] != ranks:
+            raise ValueError(f"the factors have ranks {ranks}, the core {self.core.shape[1:]}")
+
+    def _compiled(self, mu: Array) -> Array:
         return evaluate_tucker(self._packed, mu, *self._flat, self.n_functions)
 
     def _contract(self, vectors: list[Array]) -> Array:
@@ -310,7 +202,13 @@ class TensorTrainFunctions(TensorFunctions):
         ranks = np.array([c.shape[0] for c in self.cores] + [1])
         return ranks, np.concatenate([c.ravel() for c in self.cores])
 
-    def rows(self, mu: Array) -> Array:
+    def __post_init__(self) -> None:
+        self._check_sizes(self.cores, axis=1)
+        left, right = [c.shape[0] for c in self.cores], [c.shape[2] for c in self.cores]
+        if right != [*left[1:], 1]:
+            raise ValueError(f"the cores' ranks {left} and {right} do not follow each other")
+
+    def _compiled(self, mu: Array) -> Array:
         return evaluate_tensor_train(self._packed, mu, *self._flat)
 
     def _contract(self, vectors: list[Array]) -> Array:
