@@ -94,9 +94,13 @@ def test_overlapping_sets_become_regions() -> None:
     )
     geometry = NgsolveMesh(mesh)
     for name, volume in (("a", 2.0), ("b", 2.0), ("all", 3.0)):
-        assert ngs.Integrate(1.0 * ngs.dx(geometry.region(name)), geometry.ngs) == pytest.approx(volume)
+        assert ngs.Integrate(ngs.CF(1.0) * ngs.dx(geometry.region(name)), geometry.ngs) == pytest.approx(
+            volume
+        )
     for name, area in (("part", 1.0), ("z_max", 3.0), ("x_min", 1.0)):
-        assert ngs.Integrate(1.0 * ngs.ds(geometry.boundary(name)), geometry.ngs) == pytest.approx(area)
+        assert ngs.Integrate(ngs.CF(1.0) * ngs.ds(geometry.boundary(name)), geometry.ngs) == pytest.approx(
+            area
+        )
     numbers = geometry.cell_field(np.array([1.0, 10.0, 100.0]))
     found = [ngs.Integrate(numbers, geometry.ngs, definedon=geometry.region(name)) for name in "ab"]
     assert found == pytest.approx([11.0, 110.0])
