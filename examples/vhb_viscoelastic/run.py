@@ -29,6 +29,7 @@ from morph_dslam.offline.materials.uniaxial import TensionTest, evaluate_tests, 
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.lines import Line2D
 
 HERE = Path(__file__).resolve().parent
 OUTPUT = HERE / "output"
@@ -123,12 +124,13 @@ def draw(parts: dict[str, tuple[list[TensionTest], list[np.ndarray]]], path: Pat
         for test, computed in zip(tests, stresses, strict=True):
             relaxing = test.name.startswith("relaxation")
             axis = panels["relaxation" if relaxing else test.name.split()[1]]
-            x = test.time if relaxing else test.stretch
+            x = test.time if relaxing and test.time is not None else test.stretch
             colour = "tab:blue" if part == "fitted" else "tab:red"
             axis.plot(x[1:], test.stress[1:] / KILOPASCAL, ".", color="0.45", markersize=4)
             axis.plot(x[1:], computed[1:] / KILOPASCAL, color=colour, lw=1.4)
             if relaxing:
-                axis.annotate(test.name.split()[-1], (x[-1], test.stress[-1] / KILOPASCAL), fontsize=8)
+                end = (x[-1], test.stress[-1] / KILOPASCAL)
+                axis.annotate(test.name.split()[-1], end, (5, -3), textcoords="offset points", fontsize=8)
     for name, axis in panels.items():
         relaxing = name == "relaxation"
         axis.set_title(
@@ -137,11 +139,11 @@ def draw(parts: dict[str, tuple[list[TensionTest], list[np.ndarray]]], path: Pat
         axis.set_xlabel("time, s" if relaxing else "stretch")
         axis.set_ylabel("nominal stress, kPa")
     axes[0, 0].set_xscale("log")
-    axes[0, 0].set_xlim(0.45, 600.0)
+    axes[0, 0].set_xlim(0.45, 700.0)
     handles = [
-        plt.Line2D([], [], color="0.45", ls="", marker=".", label="measured"),
-        plt.Line2D([], [], color="tab:blue", label="fitted"),
-        plt.Line2D([], [], color="tab:red", label="predicted"),
+        Line2D([], [], color="0.45", ls="", marker=".", label="measured"),
+        Line2D([], [], color="tab:blue", label="fitted"),
+        Line2D([], [], color="tab:red", label="predicted"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     figure.savefig(path, dpi=110)

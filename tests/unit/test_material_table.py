@@ -1,5 +1,7 @@
 """Materials from a study's table and from Abaqus cards."""
 
+import re
+
 import ngsolve as ngs
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from morph_dslam.offline.materials.ogden import Ogden
 from morph_dslam.offline.materials.rubber import MooneyRivlin, Yeoh
 from morph_dslam.offline.materials.table import LAWS, constant_quantities, material_from_table
 from tests.support.material_laws import stress
+from tests.support.real_data import ROOT
 
 F = np.array([[1.3, 0.2, -0.1], [0.05, 0.85, 0.3], [0.15, -0.2, 1.1]])
 
@@ -71,6 +74,16 @@ def test_a_users_function_is_loaded_from_its_file(tmp_path):
     (tmp_path / "law.py").write_text("1 / 0\n")
     with pytest.raises(StudyError, match="cannot be run: division by zero"):
         material_from_table(table, tmp_path)
+
+
+def test_the_documented_function_is_a_law(tmp_path):
+    page = (ROOT / "docs" / "materials.md").read_text()
+    (program,) = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
+    (tmp_path / "my_law.py").write_text(program)
+    table = {"law": "user_material", "function": "my_law.py:energy", "mu": 0.6, "bulk": 7.0}
+    material = material_from_table(table, tmp_path)
+    material.check()
+    np.testing.assert_allclose(stress(material, F), stress(MooneyRivlin(c10=0.3, bulk=7.0), F), rtol=1e-12)
 
 
 def test_a_users_function_without_its_constant_is_one_message(tmp_path):

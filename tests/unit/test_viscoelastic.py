@@ -150,11 +150,9 @@ def test_an_elastic_tension_test_has_the_closed_form():
     np.testing.assert_allclose(TensionStress(law, stretch)(), expected, atol=1e-14)
 
 
-def test_mixed_elements_refuse_a_volume_that_relaxes():
-    mesh = mesh_of_one()
-    relaxing = NeoHookean(young=3.0, poisson=0.3, prony=Prony((0.3,), (1.0,)))
-    with pytest.raises(StudyError, match="set the Prony bulk_moduli to zeros"):
-        ViscousState(mesh, {"default": relaxing}, order=2).remainder("default", ngs.Id(3))
+def test_whether_the_volume_relaxes_is_told():
+    assert Prony((0.3,), (1.0,)).bulk_relaxes
+    assert not SERIES.bulk_relaxes
 
 
 @pytest.mark.parametrize(

@@ -100,8 +100,8 @@ class ViscousState:
     """The internal variables of the viscous materials on a mesh, at the points of its integration rules.
 
     The solver uses it thus: the density of each region is `energy(region, F)`, integrated with `rules`; after
-    each converged time step `advance` is called with the deformation gradient of the solution. `time_step`
-    may be changed at any time before a step.
+    each converged time step `advance` is called with the deformation gradient of the solution. `time_step`,
+    in seconds, may be changed before any step, or be replaced by an expression before energies are made.
 
     Parameters
     ----------
@@ -131,36 +131,13 @@ class ViscousState:
             return material.energy(F)
         shear, bulk = material.prony.step_factors(self.time_step)
         remainder, strain = material.parts(F)
-        energy = shear * remainder + self.history(region, F)
+        energy = shear * remainder + ngs.InnerProduct(self.remembered(region), green_lagrange(F))
         if material.volumetric_modulus is not None:
             energy += 0.5 * bulk * material.volumetric_modulus * strain**2
         return energy
 
-    def remainder(self, region: str, F: Any) -> Any:
-        """`energy` without its volumetric part, for mixed elements.
-
-        Raises
-        ------
-        StudyError : the volumetric part relaxes, which the pressure of a mixed element cannot follow.
-        """
-        material = self.materials[region]
-        if material.prony is None:
-            return material.remainder(F)
-        if material.prony.bulk_relaxes:
-            raise StudyError(
-                f"region {region}: in mixed elements only the shape may relax; "
-                "set the Prony bulk_moduli to zeros"
-            )
-        return material.prony.step_factors(self.time_step)[0] * material.remainder(F) + self.history(
-            region, F
-        )
-
-    def history(self, region: str, F: Any) -> Any:
-        """H : E, the work of the stresses remembered from earlier steps."""
-        return ngs.InnerProduct(self.remembered(region), green_lagrange(F))
-
     def remembered(self, region: str) -> Any:
-        """H (3x3), Pa, of a viscous region."""
+        """H (3x3), Pa: the second Piola-Kirchhoff stress that a viscous region keeps from earlier steps."""
         prony = self.materials[region].prony
         assert prony is not None
         remembered = ngs.CF(tuple([0.0] * 9), dims=(3, 3))
