@@ -105,6 +105,17 @@ def test_at_equal_ranks_the_error_equals_tensorlys() -> None:
     )
 
 
+def test_orthogonal_iteration_improves_on_hosvd_where_nothing_is_small() -> None:
+    tensor = np.random.default_rng(5).normal(size=(6, 7, 8))
+    start, ours = tucker(tensor, 0.7, sweeps=0), tucker(tensor, 0.7, sweeps=100)
+    assert ours.core.shape == start.core.shape
+    assert max(ours.core.shape) < 8
+    theirs = tensorly.tucker_to_tensor(tensorly_tucker(tensor, ours.core.shape, n_iter_max=100, tol=1e-12))
+    error = relative(ours.full() - tensor, tensor)
+    assert error < 0.995 * relative(start.full() - tensor, tensor)
+    assert error == pytest.approx(relative(theirs - tensor, tensor), rel=1e-3)
+
+
 def test_cp_is_no_worse_than_tensorlys_at_equal_rank() -> None:
     tensor = inverse_distance()
     ours = cp(tensor, 1e-12, 4, sweeps=300)

@@ -83,8 +83,8 @@ def test_pgd_is_the_optimal_separation_in_energy_and_its_dual_residual_the_error
         assert solution.residuals[-1] == pytest.approx(error, rel=0.01)
 
 
-def test_a_stiffness_as_second_parameter_and_a_cubic_spline_axis() -> None:
-    """Outer half 0.2 to 5 times as stiff; compared off the axis' nodes with direct solves."""
+def beam_with_moving_load_and_stiffness() -> tuple[SeparableProblem, np.ndarray]:
+    """The outer half 0.2 to 5 times as stiff, by its logarithm on a cubic spline axis."""
     problem, s = beam_with_moving_load()
     outer = np.arange(ELEMENTS) >= ELEMENTS // 2
     inner_half, outer_half = hermite_stiffness(RIGIDITY * ~outer), hermite_stiffness(RIGIDITY * outer)
@@ -101,6 +101,13 @@ def test_a_stiffness_as_second_parameter_and_a_cubic_spline_axis() -> None:
         (np.eye(ELEMENTS), np.ones((ELEMENTS, n_points))),
         sp.csc_array(inner_half + outer_half),
     )
+    return problem, s
+
+
+def test_a_stiffness_as_second_parameter_agrees_with_direct_solves() -> None:
+    """Compared off the nodes of the stiffness axis."""
+    problem, s = beam_with_moving_load_and_stiffness()
+    inner_half, outer_half = problem.matrices
     solution = solve_pgd(problem, quiet(max_modes=25, tolerance=0.0))
     samples = np.log([0.2, 0.37, 1.3, 2.9, 5.0])
     exact = np.stack(
@@ -112,6 +119,15 @@ def test_a_stiffness_as_second_parameter_and_a_cubic_spline_axis() -> None:
     _, slopes = solution.functions.evaluate(mu)
     up, down = (solution.functions.evaluate(mu + np.array([0.0, step]))[0] for step in (h, -h))
     np.testing.assert_allclose(slopes[1], (up - down) / (2.0 * h), rtol=1e-5, atol=1e-7)
+
+
+def test_every_enrichment_by_itself_lowers_the_residual_it_minimises() -> None:
+    """Without refits in between, which would hide a wrong step."""
+    problem, _ = beam_with_moving_load_and_stiffness()
+    options = quiet(max_modes=9, tolerance=0.0, refit_every=100, method="minimal_residual")
+    residuals = solve_pgd(problem, options).residuals
+    assert (np.diff(residuals) < 0.0).all()
+    assert residuals[-2] < 0.5 * residuals[0]
 
 
 # --- advection and diffusion: not symmetric ---
