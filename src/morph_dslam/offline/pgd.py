@@ -80,18 +80,6 @@ class PgdSolution:
     iterations: NDArray[np.int64]
     converged: bool
 
-    def truncated(self, n_modes: int) -> PgdSolution:
-        """The first ``n_modes`` products, as they stand in the whole sum."""
-        kept = tuple(f[:, :n_modes] for f in self.functions.factors)
-        functions = CPFunctions(self.functions.bases, kept, np.eye(n_modes))
-        return PgdSolution(
-            self.modes[:n_modes],
-            functions,
-            self.residuals[:n_modes],
-            self.iterations[:n_modes],
-            self.converged,
-        )
-
 
 class _AlternatingDirections:
     """The state of the sum: modes (n, m), coefficients [(n_free, m)], and L_t F_i as images (terms, n, m)."""
