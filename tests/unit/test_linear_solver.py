@@ -13,6 +13,7 @@ from morph_dslam.offline.linear_solver import (
     LinearSolver,
     default_engine,
 )
+from morph_dslam.offline.sparse_engines import ANALYSE, Pardiso
 
 ENGINES = ["pardiso", "sparsecholesky"]
 
@@ -77,6 +78,29 @@ def test_new_values_and_new_patterns(engine) -> None:
         matrix = sp.csr_matrix(dense)
         solution = solver.factorise(matrix.data, matrix.indices, matrix.indptr).solve(right)
         np.testing.assert_allclose(solution, np.linalg.solve(dense, right), rtol=1e-11, atol=1e-12)
+
+
+def test_pardiso_analyses_a_pattern_once(monkeypatch) -> None:
+    pytest.importorskip("pypardiso", reason="pypardiso is not installed")
+    phases = []
+    call = Pardiso._call
+    monkeypatch.setattr(
+        Pardiso, "_call", lambda self, phase, right: phases.append(phase) or call(self, phase, right)
+    )
+    free = np.ones(9, dtype=bool)
+    solver = LinearSolver(free, True, engine="pardiso")
+    for scale in (1.0, 2.0, 3.0):
+        matrix = sp.csr_matrix(scale * random_symmetric(9, 0))
+        solution = solver.factorise(matrix.data, matrix.indices, matrix.indptr).solve(np.ones(9))
+        np.testing.assert_allclose(matrix @ solution, np.ones(9), rtol=1e-12)
+    assert phases.count(ANALYSE) == 1
+    # A zero on the diagonal asks for weighted matching, and so for a new analysis.
+    broken = random_symmetric(9, 3)
+    broken[0, 0] = 0.0
+    matrix = sp.csr_matrix(np.where(broken == 0.0, 1e-300, broken))
+    matrix.data[np.abs(matrix.data) < 1e-200] = 0.0
+    solver.factorise(matrix.data, matrix.indices, matrix.indptr)
+    assert phases.count(ANALYSE) == 2
 
 
 def saddle_point(n: int, constraints: int) -> np.ndarray:

@@ -6,7 +6,7 @@ variable MORPH_LINEAR_SOLVER = pardiso | sparsecholesky overrides the choice. A 
 refinement cannot mend is done again by SuperLU, whose pivoting is safer and slower.
 
 PARDISO's settings matter: with its defaults a saddle-point matrix comes back with a relative residual of
-1e-3 and no warning. Scaling and weighted matching (iparm 11, 13) prevent that.
+1e-3 and no warning. Scaling and weighted matching (iparm 11, 13) prevent that; `sparse_engines` sets them.
 """
 
 from __future__ import annotations
