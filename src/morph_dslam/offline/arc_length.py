@@ -121,13 +121,35 @@ class ArcLength:
             self._latest = point, linearisation, self._response(linearisation, x, mu)
         return self._latest[1:]
 
-    def _correct(self, point: PathPoint, length: float) -> tuple[Array, Array, int]:
+    def _between(self, point: PathPoint, following: PathPoint, length: float) -> tuple[Array, Array]:
+        """Cubic interpolation of dofs and parameters at ``length`` along the tangent of ``point``."""
+        whole = following.length - point.length
+        t = length / whole
+        # Derivatives by the length along the first tangent, not along the path itself.
+        stretch = 1.0 / self._product(point.tangent, following.tangent)
+        rates = [np.zeros_like(point.state.mu) for _ in "12"]
+        rates[0][self.parameter], rates[1][self.parameter] = point.rate, stretch * following.rate
+        ends = (point.state.dofs, following.state.dofs), (point.state.mu, following.state.mu)
+        slopes = (point.tangent, stretch * following.tangent), rates
+        x, mu = (
+            (1.0 - t) ** 2 * ((1.0 + 2.0 * t) * a + t * whole * slope_a)
+            + t**2 * ((3.0 - 2.0 * t) * b - (1.0 - t) * whole * slope_b)
+            for (a, b), (slope_a, slope_b) in zip(ends, slopes, strict=True)
+        )
+        return x, mu
+
+    def _correct(
+        self, point: PathPoint, length: float, following: PathPoint | None = None
+    ) -> tuple[Array, Array, int]:
         """Dofs and parameters at ``length`` along the tangent of ``point``, and the corrections it took."""
         equations, options = self.equations, self.options
         origin, mu = point.state.dofs, point.state.mu.copy()
         linearisation, response = self._linearised(point)
-        x = origin + length * point.tangent
-        mu[self.parameter] += length * point.rate
+        if following is None:
+            x = origin + length * point.tangent
+            mu[self.parameter] += length * point.rate
+        else:
+            x, mu = self._between(point, following, length)
         before = size(equations, length * point.tangent)
         for count in range(1, options.max_corrections + 1):
             residual = equations.residual(x, mu)
@@ -157,17 +179,18 @@ class ArcLength:
         """The path's first point, the parameter growing from there (``sense`` = 1) or falling (-1)."""
         return self._point(start.dofs, start.mu, lambda _: sense, length=0.0)
 
-    def locate(self, point: PathPoint, length: float) -> State:
+    def locate(self, point: PathPoint, length: float, following: PathPoint | None = None) -> State:
         """The solution at ``length`` along the tangent of ``point``, without a tangent or pivots of its own.
 
-        Between two points of a path it costs corrections only, the first point's factorisation serving all.
+        Between two points of a path it costs a few corrections only, the first point's factorisation serving
+        all: they begin from the cubic interpolation if the ``following`` point is given.
 
         Raises
         ------
         SolverError
             If the corrections do not converge.
         """
-        x, mu, _ = self._correct(point, length)
+        x, mu, _ = self._correct(point, length, following)
         return State(mu, x)
 
     def step(self, point: PathPoint, length: float) -> PathPoint:

@@ -43,7 +43,9 @@ SOURCES = (
     "sparse_engines",
 )
 #: The end force needs the ends' distance far more precisely than the shape: the sheet is stiff along itself.
-PATH_OPTIONS = ArcOptions(first=2e-7, smallest=1e-10, largest=0.005, corrections=10, tolerance=1e-11)
+PATH_OPTIONS = ArcOptions(
+    first=2e-7, smallest=1e-10, largest=0.005, corrections=10, contraction=0.5, tolerance=1e-11
+)
 
 
 @dataclass(frozen=True)
@@ -243,11 +245,13 @@ def solve_positions(
     end : length of the whole path: a snapshot's coordinate is the part of it.
     """
     arc, point = _worker(sheet, folder), folder.load_point(number).point
+    following = folder.load_point(number + 1).point if folder.path_file(number + 1).is_file() else None
     for position, length in positions.items():
         file = folder.position_file(position)
         if file.is_file():
             continue
-        state = point.state if length == point.length else arc.locate(point, length - point.length)
+        on_point = length == point.length
+        state = point.state if on_point else arc.locate(point, length - point.length, following)
         file.parent.mkdir(parents=True, exist_ok=True)
         save_snapshot(file, take_snapshot(sheet, arc.equations, state, length / end), {})  # type: ignore[arg-type]
 
