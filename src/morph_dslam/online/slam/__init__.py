@@ -1,0 +1,1 @@
+"""Camera localisation in, and mapping of, the rigid scene around the object."""

@@ -1,0 +1,159 @@
+"""The pose of one camera from known points: Huber-weighted Gauss-Newton, and RANSAC where no start is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from morph_dslam.geometry import rotation_exp
+from morph_dslam.online.slam.cholesky import cholesky_solve, turned_and_shifted
+
+Array = NDArray[np.float64]
+
+#: Points nearer than this to the camera plane do not count.
+LEAST_DEPTH = 1e-6
+
+
+@njit(cache=True, nogil=True)
+def _normal_equations(pose, points, pixels, intrinsics, width):
+    """Huber cost, J'WJ (6, 6) and -J'Wr (6,) by the pose's twist from the left (rotation, translation)."""
+    matrix, right, cost = np.zeros((6, 6)), np.zeros(6), 0.0
+    rows = np.zeros((2, 6))
+    for i in range(len(points)):
+        x = pose[0, 0] * points[i, 0] + pose[0, 1] * points[i, 1] + pose[0, 2] * points[i, 2] + pose[0, 3]
+        y = pose[1, 0] * points[i, 0] + pose[1, 1] * points[i, 1] + pose[1, 2] * points[i, 2] + pose[1, 3]
+        z = pose[2, 0] * points[i, 0] + pose[2, 1] * points[i, 1] + pose[2, 2] * points[i, 2] + pose[2, 3]
+        if z < LEAST_DEPTH:
+            cost += width * 1000.0
+            continue
+        ru = intrinsics[0] * x / z + intrinsics[2] - pixels[i, 0]
+        rv = intrinsics[1] * y / z + intrinsics[3] - pixels[i, 1]
+        error = np.sqrt(ru * ru + rv * rv)
+        weight = 1.0 if error <= width else width / error
+        cost += 0.5 * error * error if error <= width else width * (error - 0.5 * width)
+        fx, fy = intrinsics[0] / z, intrinsics[1] / z
+        rows[0, 0], rows[0, 1], rows[0, 2] = -fx * x * y / z, fx * (z + x * x / z), -fx * y
+        rows[0, 3], rows[0, 4], rows[0, 5] = fx, 0.0, -fx * x / z
+        rows[1, 0], rows[1, 1], rows[1, 2] = -fy * (z + y * y / z), fy * x * y / z, fy * x
+        rows[1, 3], rows[1, 4], rows[1, 5] = 0.0, fy, -fy * y / z
+        for j in range(6):
+            right[j] -= weight * (rows[0, j] * ru + rows[1, j] * rv)
+            for k in range(6):
+                matrix[j, k] += weight * (rows[0, j] * rows[0, k] + rows[1, j] * rows[1, k])
+    return cost, matrix, right
+
+
+@njit(cache=True, nogil=True)
+def _refine(pose, points, pixels, intrinsics, width, iterations):
+    cost, matrix, right = _normal_equations(pose, points, pixels, intrinsics, width)
+    damping = 1e-6
+    for _ in range(iterations):
+        damped = matrix.copy()
+        for j in range(6):
+            damped[j, j] += damping * matrix[j, j] + 1e-9
+        step = cholesky_solve(damped, right)
+        moved = pose.copy()
+        turned_and_shifted(pose, rotation_exp(step[:3]), step[3:], moved)
+        new_cost, new_matrix, new_right = _normal_equations(moved, points, pixels, intrinsics, width)
+        if new_cost > cost:
+            damping = max(10.0 * damping, 1e-4)
+            continue
+        small = cost - new_cost < 1e-7 * cost
+        pose, cost, matrix, right = moved, new_cost, new_matrix, new_right
+        damping *= 0.1
+        if small:
+            break
+    return pose, matrix
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """A camera's pose.
+
+    Attributes
+    ----------
+    camera_from_world : (4, 4).
+    covariance : (6, 6) of the twist from the left (rotation rad, translation), for the measured pixel noise.
+    inliers : (n,) points that agree with it.
+    rms_px : root mean square error of the inliers.
+    """
+
+    camera_from_world: Array
+    covariance: Array
+    inliers: NDArray[np.bool_]
+    rms_px: float
+
+
+def reprojection_errors(camera_from_world: Array, points: Array, pixels: Array, intrinsics: Array) -> Array:
+    """Distances (n,) in pixels between projected points (n, 3) and pixels (n, 2); inf behind the camera."""
+    local = points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+    depth = np.where(local[:, 2] > LEAST_DEPTH, local[:, 2], np.nan)
+    projected = local[:, :2] / depth[:, None] * intrinsics[:2] + intrinsics[2:]
+    return np.nan_to_num(np.linalg.norm(projected - pixels, axis=1), nan=np.inf)
+
+
+def refine_pose(
+    start: Array,
+    points: Array,
+    pixels: Array,
+    intrinsics: Array,
+    huber_px: float = 1.5,
+    inlier_px: float = 3.0,
+    rounds: int = 2,
+) -> PoseEstimate:
+    """Pose (4, 4) from points (n, 3) and their pixels (n, 2), started at ``start``.
+
+    After each round the points that miss by more than ``inlier_px`` are left out of the next.
+    """
+    pose, used = np.ascontiguousarray(start, dtype=np.float64), np.ones(len(points), dtype=bool)
+    matrix = np.eye(6)
+    for _ in range(rounds):
+        if used.sum() < 4:
+            break
+        pose, matrix = _refine(
+            pose,
+            np.ascontiguousarray(points[used]),
+            np.ascontiguousarray(pixels[used]),
+            intrinsics,
+            huber_px,
+            10,
+        )
+        errors = reprojection_errors(pose, points, pixels, intrinsics)
+        used = errors < inlier_px
+    errors = reprojection_errors(pose, points, pixels, intrinsics)
+    rms = float(np.sqrt(np.mean(errors[used] ** 2))) if used.any() else float("inf")
+    # Two residuals a point: the noise of one coordinate is the rms over sqrt(2).
+    covariance = np.linalg.pinv(matrix) * max(rms, 0.1) ** 2 / 2.0 if used.any() else np.full((6, 6), np.inf)
+    return PoseEstimate(pose, covariance, used, rms)
+
+
+def find_pose(
+    points: Array, pixels: Array, intrinsics: Array, inlier_px: float = 4.0, least: int = 15
+) -> PoseEstimate | None:
+    """Pose from matches among which many are wrong (P3P in RANSAC); None if fewer than ``least`` agree."""
+    if len(points) < least:
+        return None
+    matrix = np.array(
+        [[intrinsics[0], 0.0, intrinsics[2]], [0.0, intrinsics[1], intrinsics[3]], [0.0, 0.0, 1.0]]
+    )
+    cv2.setRNGSeed(0)
+    found, turn, shift, rows = cv2.solvePnPRansac(
+        points,
+        pixels,
+        matrix,
+        None,  # type: ignore[arg-type]
+        iterationsCount=300,
+        reprojectionError=inlier_px,
+        confidence=0.999,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    if not found or rows is None or len(rows) < least:
+        return None
+    start = np.eye(4)
+    start[:3, :3], start[:3, 3] = rotation_exp(turn.ravel()), shift.ravel()
+    estimate = refine_pose(start, points, pixels, intrinsics, inlier_px=inlier_px)
+    return estimate if estimate.inliers.sum() >= least else None
