@@ -192,12 +192,16 @@ def _damped_step(
     raise SolverError(f"Newton's method stalls at {mu}: no part of its update brings the solution nearer")
 
 
-def sensitivities(equations: Equations, state: State) -> Array:
+def sensitivities(equations: Equations, state: State, linearisation: Linearisation | None = None) -> Array:
     """Derivatives (d, n) of the solution by the parameters, by implicit differentiation.
 
     One factorisation and one back-substitution a parameter: K dx = -(dr/dmu + K dx_prescribed).
+
+    Parameters
+    ----------
+    linearisation : at the state; made here if not given.
     """
-    linearisation = equations.linearise(state.dofs, state.mu)
+    linearisation = linearisation or equations.linearise(state.dofs, state.mu)
     moved = equations.prescribed_slopes(state.mu)
     right = equations.residual_slopes(state.dofs, state.mu) + linearisation.apply(moved)
     return moved - linearisation.solve(right)

@@ -8,8 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError
+from morph_dslam.offline.chord_iteration import solve_with_kept_tangent
 from morph_dslam.offline.load_ramp import loaded_state
-from morph_dslam.offline.newton import PathError, State, advance, sensitivities, solve
+from morph_dslam.offline.newton import (
+    Linearisation,
+    PathError,
+    State,
+    advance,
+    sensitivities,
+    solve,
+)
 from morph_dslam.offline.problem import Snapshot
 from morph_dslam.offline.solid import SolidProblem
 
@@ -39,6 +47,7 @@ class SolidSweep:
 
     def __init__(self, problem: SolidProblem) -> None:
         self.problem = problem
+        self._tangent: tuple[Array, Linearisation] | None = None
 
     def first_state(self) -> SolidState:
         """Equilibrium at the parameters' defaults, all loads grown together."""
@@ -53,16 +62,35 @@ class SolidSweep:
         return SolidState(arrays["mu"], arrays["dofs"], arrays["slopes"], None if pivots < 0 else pivots)
 
     def advance(self, start: SolidState, target: Array) -> SolidState:
-        """Solve at ``target``: at once from the prediction of the sensitivities, or in increments."""
-        predicted = State(target, start.dofs + (target - start.mu) @ start.slopes)
+        """Solve at ``target``: from the prediction of the sensitivities, or else in increments."""
+        predicted = start.dofs + (target - start.mu) @ start.slopes
+        state = self._by_chords(start, predicted, target)
         try:
-            state = solve(self.problem, target, predicted)
+            state = state or solve(self.problem, target, State(target, predicted))
         except SolverError:
             state = follow(self.problem, State(start.mu, start.dofs), target)
         return self._with_slopes(state)
 
+    def _by_chords(self, start: SolidState, predicted: Array, target: Array) -> State | None:
+        """Solve with one tangent: that at ``start`` if it is still at hand, or else at the prediction."""
+        state = None
+        if self._tangent is not None and np.array_equal(self._tangent[0], start.mu):
+            state = solve_with_kept_tangent(self.problem, target, predicted, self._tangent[1])
+        if state is None:
+            self._tangent = None
+            try:
+                tangent = self.problem.linearise(predicted, target)
+                state = solve_with_kept_tangent(self.problem, target, predicted, tangent)
+            except SolverError:
+                state = None
+        return state
+
     def _with_slopes(self, state: State) -> SolidState:
-        return SolidState(state.mu, state.dofs, sensitivities(self.problem, state), state.negative_pivots)
+        self._tangent = None
+        tangent = self.problem.linearise(state.dofs, state.mu)
+        slopes = sensitivities(self.problem, state, tangent)
+        self._tangent = state.mu, tangent
+        return SolidState(state.mu, state.dofs, slopes, tangent.negative_pivots)
 
     def take_snapshot(self, state: SolidState) -> Snapshot:
         """Displacement, Cauchy stress and Green-Lagrange strain at nodes, their slopes, and reactions."""

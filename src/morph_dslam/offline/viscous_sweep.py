@@ -1,8 +1,8 @@
 """A viscoelastic solid as the sweep sees it: every sample is followed through time from the start.
 
 All parameters but the time keep their values from the beginning on: the body is loaded in an instant, and
-then time runs. What it remembers depends on the whole path, so derivatives by the parameters at a fixed memory
-would be wrong ones; snapshots carry none, and the functions of the parameters are fitted to values.
+then time runs. What it remembers depends on the whole path, so derivatives by the parameters at a fixed
+memory would be wrong ones; snapshots carry none, and the functions of the parameters are fitted to values.
 """
 
 from __future__ import annotations

@@ -1,0 +1,68 @@
+"""The chord method on a scalar equation whose convergence is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from morph_dslam.offline.chord_iteration import solve_with_kept_tangent
+
+
+@dataclass
+class Slope:
+    """A tangent of one unknown."""
+
+    value: float
+    residual: np.ndarray
+    negative_pivots = 0
+
+    def solve(self, right):
+        return right / self.value
+
+    def apply(self, vectors):
+        return vectors * self.value
+
+
+class Cubic:
+    """x^3 + x = mu."""
+
+    n_dofs, free, scale = 1, np.array([True]), 1.0
+
+    def __init__(self):
+        self.residuals = 0
+
+    def prescribed(self, mu):
+        return np.zeros(1)
+
+    def prescribed_slopes(self, mu):
+        return np.zeros((1, 1))
+
+    def residual(self, x, mu):
+        self.residuals += 1
+        return x**3 + x - mu
+
+    def residual_slopes(self, x, mu):
+        return -np.ones((1, 1))
+
+    def linearise(self, x, mu):
+        return Slope(float(3.0 * x[0] ** 2 + 1.0), self.residual(x, mu))
+
+
+def test_a_near_tangent_leads_to_the_root():
+    """From x = 1 with its slope 4 to the root of x^3 + x = 2.2, by numpy's polynomial roots."""
+    equations = Cubic()
+    state = solve_with_kept_tangent(equations, np.array([2.2]), np.array([1.05]), Slope(4.0, np.zeros(1)))
+    assert state is not None
+    (root,) = [r.real for r in np.roots([1.0, 0.0, 1.0, -2.2]) if abs(r.imag) < 1e-12]
+    assert state.dofs[0] == pytest.approx(root, abs=1e-9)
+    assert equations.residuals == state.iterations <= 10
+
+
+@pytest.mark.parametrize("slope", [1.0, -4.0, 40.0])
+def test_a_tangent_that_is_too_far_off_is_given_up_early(slope):
+    equations = Cubic()
+    tangent = Slope(slope, np.zeros(1))
+    assert solve_with_kept_tangent(equations, np.array([2.2]), np.array([0.5]), tangent) is None
+    assert equations.residuals <= 4
