@@ -31,8 +31,8 @@ REAL_SYMMETRIC_INDEFINITE, REAL_UNSYMMETRIC = -2, 11
 ANALYSE, FACTORISE, SOLVE = 11, 22, 33
 PERTURBED_PIVOTS, NEGATIVE_EIGENVALUES = 14, 23
 
-#: Without PARDISO, at most so many negative eigenvalues are counted.
-MOST_COUNTED = 6
+#: Without PARDISO, negative eigenvalues are counted among so many nearest to zero.
+LOOKED_AT = 6
 
 
 class Pardiso:
@@ -119,21 +119,26 @@ class SparseCholesky:
 
     @property
     def negative_pivots(self) -> int | None:
-        """Counted by Lanczos' method on the inverse, since NGSolve keeps its pivots to itself.
+        """An estimate by Lanczos' method on the inverse, since NGSolve keeps its pivots to itself.
 
-        The negative eigenvalues nearest to zero are the inverse's lowest. None if all that are looked for are
-        negative: there may be more.
+        The eigenvalues nearest to zero are looked at: a structure that loses its stability shows it there.
+        None if all of them are negative, for then there may be more, or if they are not found.
         """
-        if self._size <= 4 * MOST_COUNTED:
+        if self._size <= 4 * LOOKED_AT:
             inverse = self.solve(np.eye(self._size))
             return int(np.count_nonzero(np.linalg.eigvalsh((inverse + inverse.T) / 2.0) < 0.0))
         operator = sla.LinearOperator(
             (self._size, self._size), matvec=lambda x: self.solve(x.reshape(-1, 1)).ravel(), dtype=float
         )
         start = np.random.default_rng(0).standard_normal(self._size)
-        lowest = sla.eigsh(operator, MOST_COUNTED, which="SA", v0=start, tol=1e-3, return_eigenvectors=False)
-        negative = int(np.count_nonzero(lowest < 0.0))
-        return None if negative == MOST_COUNTED else negative
+        try:
+            nearest = sla.eigsh(
+                operator, LOOKED_AT, which="LM", v0=start, tol=1e-3, return_eigenvectors=False
+            )
+        except sla.ArpackNoConvergence:
+            return None
+        negative = int(np.count_nonzero(nearest < 0.0))
+        return None if negative == LOOKED_AT else negative
 
     def release(self) -> None:
         self._inverse = None
