@@ -19,6 +19,7 @@ from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from tqdm import tqdm
 
 from morph_dslam.cli import run_and_report_errors
@@ -188,7 +189,9 @@ def draw_shapes(file: Path, sheet: BuckledSheet, folder: BucklingFolder, count: 
     colours = colormaps["coolwarm"]((stress + limit) / (2.0 * limit))
     x, y, z = (1e3 * placed[..., axis] for axis in range(3))
     space.plot_surface(x, y, z, facecolors=colours, rstride=1, cstride=1, shade=False)  # type: ignore[attr-defined]
-    space.set(xlabel="x / mm", ylabel="y / mm", zlabel="z / mm", aspect="equal")
+    space.set(xlabel="x / mm", ylabel="y / mm", zlabel="height / mm", aspect="equal")
+    for axis in (space.xaxis, space.yaxis, space.zaxis):  # type: ignore[attr-defined]
+        axis.set_major_locator(MaxNLocator(4))
     bar = figure.colorbar(ScalarMappable(Normalize(-limit, limit), "coolwarm"), ax=space, shrink=0.7)
     bar.set_label("stress along the sheet, upper face / MPa")
     figure.savefig(file, dpi=DPI)

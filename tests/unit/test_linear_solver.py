@@ -26,11 +26,11 @@ def engine(request) -> str:
 
 
 def random_symmetric(n: int, negative: int, seed: int = 0) -> np.ndarray:
-    """Dense symmetric matrix with that many negative eigenvalues, all between 1 and 2 in size."""
+    """Dense symmetric matrix with so many negative eigenvalues, all between 0.1 and 2 in size."""
     rng = np.random.default_rng(seed)
     vectors, _ = np.linalg.qr(rng.standard_normal((n, n)))
-    values = rng.uniform(1.0, 2.0, n)
-    values[:negative] *= -1.0
+    # As in a structure that loses its stability, the negative ones are the nearest to zero.
+    values = np.concatenate([rng.uniform(-0.4, -0.1, negative), rng.uniform(1.0, 2.0, n - negative)])
     return vectors @ np.diag(values) @ vectors.T
 
 
