@@ -189,9 +189,11 @@ def draw_shapes(file: Path, sheet: BuckledSheet, folder: BucklingFolder, count: 
     colours = colormaps["coolwarm"]((stress + limit) / (2.0 * limit))
     x, y, z = (1e3 * placed[..., axis] for axis in range(3))
     space.plot_surface(x, y, z, facecolors=colours, rstride=1, cstride=1, shade=False)  # type: ignore[attr-defined]
-    space.set(xlabel="x / mm", ylabel="y / mm", zlabel="height / mm", aspect="equal")
+    space.set(xlabel="x / mm", ylabel="y / mm", zlabel="height / mm")
+    space.set_box_aspect([np.ptp(placed[..., axis]) for axis in range(3)], zoom=0.85)  # type: ignore[attr-defined]
     for axis in (space.xaxis, space.yaxis, space.zaxis):  # type: ignore[attr-defined]
         axis.set_major_locator(MaxNLocator(4))
+    space.zaxis.labelpad = 8  # type: ignore[attr-defined]
     bar = figure.colorbar(ScalarMappable(Normalize(-limit, limit), "coolwarm"), ax=space, shrink=0.7)
     bar.set_label("stress along the sheet, upper face / MPa")
     figure.savefig(file, dpi=DPI)
