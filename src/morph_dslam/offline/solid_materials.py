@@ -63,10 +63,10 @@ class MaterialRegion:
         if pressure is None and self.remembered is None:
             return self.material.energy(F)
         (shear, bulk), modulus = self.factors, self.material.volumetric_modulus
-        remainder = shear * self.material.remainder(F)
-        if modulus is None:
+        remainder, g = self.material.parts(F)
+        remainder = shear * remainder
+        if modulus is None or g is None:
             return remainder
-        g = self.material.volumetric(F)
         if pressure is None:
             return remainder + 0.5 * bulk * modulus * g**2
         return remainder + pressure * g - pressure * pressure / (2.0 * modulus)
