@@ -62,28 +62,20 @@ class SolidSweep:
         return SolidState(arrays["mu"], arrays["dofs"], arrays["slopes"], None if pivots < 0 else pivots)
 
     def advance(self, start: SolidState, target: Array) -> SolidState:
-        """Solve at ``target``: from the prediction of the sensitivities, or else in increments."""
+        """Solve at ``target``: from the prediction of the sensitivities, or else in increments.
+
+        If the tangent at ``start`` is still at hand, as in a sweep along one parameter, it serves first.
+        """
         predicted = start.dofs + (target - start.mu) @ start.slopes
-        state = self._by_chords(start, predicted, target)
+        at_hand = self._tangent is not None and np.array_equal(self._tangent[0], start.mu)
+        tangent = self._tangent[1] if self._tangent and at_hand else None
+        self._tangent = None
         try:
+            state = solve_with_kept_tangent(self.problem, target, predicted, tangent)
             state = state or solve(self.problem, target, State(target, predicted))
         except SolverError:
             state = follow(self.problem, State(start.mu, start.dofs), target)
         return self._with_slopes(state)
-
-    def _by_chords(self, start: SolidState, predicted: Array, target: Array) -> State | None:
-        """Solve with one tangent: that at ``start`` if it is still at hand, or else at the prediction."""
-        state = None
-        if self._tangent is not None and np.array_equal(self._tangent[0], start.mu):
-            state = solve_with_kept_tangent(self.problem, target, predicted, self._tangent[1])
-        if state is None:
-            self._tangent = None
-            try:
-                tangent = self.problem.linearise(predicted, target)
-                state = solve_with_kept_tangent(self.problem, target, predicted, tangent)
-            except SolverError:
-                state = None
-        return state
 
     def _with_slopes(self, state: State) -> SolidState:
         self._tangent = None
