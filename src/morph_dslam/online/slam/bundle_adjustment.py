@@ -4,8 +4,8 @@ Levenberg-Marquardt on the Huber cost of reprojection errors. Points are elimina
 (Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, section 6), so that the linear system has six
 unknowns for each free camera. Where a camera measures depth (stereo, RGB-D), the column of the point in a
 right image at a known baseline is a third residual (Mur-Artal and Tardós, ORB-SLAM2, 2017).
-The compiled part holds no interpreter lock: a mapper can adjust while a tracker runs. Its plain twin is scipy's
-least squares, with which the tests compare it.
+The compiled part holds no interpreter lock: a mapper can adjust while a tracker runs. Its plain twin is
+scipy's least squares, with which the tests compare it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.geometry import rotation_exp
-from morph_dslam.online.slam.cholesky import cholesky_solve, inverse_3x3, turned_and_shifted
+from morph_dslam.online.slam.small_algebra import cholesky_solve, inverse_3x3, orthonormal, turned_and_shifted
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -290,4 +290,5 @@ def adjust(
     poses, points, cost, done = _adjust(
         poses, points, slot, camera_idx, point_idx, start, pixels, camera, huber_px, iterations, tolerance
     )
+    poses[~fixed] = orthonormal(poses[~fixed])
     return Adjustment(poses, points, float(before), float(cost), int(done))

@@ -1,4 +1,4 @@
-"""The pose of one camera from known points: Huber-weighted Gauss-Newton, and RANSAC where no start is known."""
+"""The pose of one camera from known points: Huber-weighted Gauss-Newton, and RANSAC without a start."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.geometry import rotation_exp
-from morph_dslam.online.slam.cholesky import cholesky_solve, turned_and_shifted
+from morph_dslam.online.slam.small_algebra import cholesky_solve, orthonormal, turned_and_shifted
 
 Array = NDArray[np.float64]
 
@@ -122,6 +122,7 @@ def refine_pose(
             huber_px,
             10,
         )
+        pose = orthonormal(pose)
         errors = reprojection_errors(pose, points, pixels, intrinsics)
         used = errors < inlier_px
     errors = reprojection_errors(pose, points, pixels, intrinsics)

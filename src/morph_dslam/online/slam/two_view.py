@@ -1,9 +1,9 @@
 """Structure from two views: essential matrix or homography, whichever explains the motion, and triangulation.
 
-The choice follows ORB-SLAM (Mur-Artal et al. 2015, IV-B): where a homography explains the matches about as well
-as an essential matrix does, the scene is plane or the camera has only turned, and the motion is taken from the
-homography's decomposition (Malis and Vargas 2007). A plane leaves two solutions; both are returned, and a third
-view decides.
+The choice follows ORB-SLAM (Mur-Artal et al. 2015, IV-B): where a homography explains the matches about as
+well as an essential matrix does, the scene is plane or the camera has only turned, and the motion is taken
+from the homography's decomposition (Malis and Vargas 2007). A plane leaves two solutions; both are returned,
+and a third view decides.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Small symmetric positive definite systems in compiled loops.
+"""Small linear algebra in compiled loops: symmetric positive definite systems, and steps of a pose.
 
-numba's `np.linalg` takes many seconds to compile; these few lines take one, and for the sizes of a local bundle
-adjustment (some dozens of unknowns) run as fast.
+numba's `np.linalg` takes many seconds to compile; these few lines take one, and for the sizes of a local
+bundle adjustment (some dozens of unknowns) run as fast.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def inverse_3x3(matrix, out):
 
 @njit(cache=True, nogil=True)
 def turned_and_shifted(pose, rotation, shift, out):
-    """``rotation`` (3, 3) applied from the left to ``pose`` (4, 4), then ``shift`` (3,), into ``out`` (4, 4)."""
+    """``rotation`` (3, 3) times the rows of ``pose`` (4, 4), plus ``shift`` (3,), into ``out`` (4, 4)."""
     for i in range(3):
         for j in range(4):
             value = 0.0
@@ -64,3 +64,14 @@ def turned_and_shifted(pose, rotation, shift, out):
                 value += rotation[i, k] * pose[k, j]
             out[i, j] = value
         out[i, 3] += shift[i]
+
+
+def orthonormal(poses):
+    """Rigid transforms (..., 4, 4) with the rotation nearest to what rounding has made of it.
+
+    A prediction that multiplies poses by transposed ones would double what is off in every frame.
+    """
+    u, _, vt = np.linalg.svd(poses[..., :3, :3])
+    result = poses.copy()
+    result[..., :3, :3] = u @ vt
+    return result

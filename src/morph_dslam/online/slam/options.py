@@ -1,0 +1,59 @@
+"""Settings of camera tracking and mapping, with the values that the tests and the benchmark run with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from morph_dslam.online.flow import FlowOptions
+
+
+@dataclass(frozen=True)
+class SlamOptions:
+    """Settings; pixels are those of the undistorted image.
+
+    Attributes
+    ----------
+    flow : Lucas-Kanade. patch_half : half width of patches that must agree; least_correlation : how well.
+    inlier_px : points that miss by more do not belong to the rigid scene.
+    least_inliers : a pose from fewer points counts as lost.
+    start_corners : corners followed from the first view; least_start_points : the fewest a map begins with.
+    start_parallax_deg : median angle between the first two views' rays.
+    start_rms_px, start_share : error, and share of the points that must fit, in three views.
+    start_clearness : how much larger a rejected hypothesis' squared error must be than the accepted one's.
+    map_corners : points and candidates that a keyframe is filled up to.
+    corner_distance_px : new corners keep this far from followed points.
+    triangulation_deg : angle between rays from which a candidate becomes a map point.
+    keyframe_share : a keyframe is due when fewer than this share of the last one's points are left.
+    keyframe_motion_px : or when points have moved this far since it (median).
+    keyframe_baseline : or when the camera has moved this part of the median depth.
+    least_frames_between : keyframes are at least this many frames apart.
+    window, fixed_window : keyframes that local bundle adjustment moves, and those that hold it.
+    search_points, search_keyframes : lost points looked for in a frame, from at most so many keyframes.
+    search_radius_px : how far from its predicted pixel a lost point may be found.
+    restart_after : frames after which a young map that stays lost is given up.
+    """
+
+    flow: FlowOptions = field(default_factory=FlowOptions)
+    patch_half: int = 6
+    least_correlation: float = 0.75
+    inlier_px: float = 3.0
+    least_inliers: int = 20
+    start_corners: int = 500
+    least_start_points: int = 80
+    start_parallax_deg: float = 1.2
+    start_rms_px: float = 1.0
+    start_share: float = 0.75
+    start_clearness: float = 1.5
+    map_corners: int = 450
+    corner_distance_px: int = 9
+    triangulation_deg: float = 1.2
+    keyframe_share: float = 0.75
+    keyframe_motion_px: float = 30.0
+    keyframe_baseline: float = 0.06
+    least_frames_between: int = 3
+    window: int = 8
+    fixed_window: int = 6
+    search_points: int = 80
+    search_keyframes: int = 3
+    search_radius_px: float = 5.0
+    restart_after: int = 90

@@ -1,0 +1,156 @@
+"""The map of the rigid scene: points, keyframes, and which keyframe saw which point where.
+
+A point begins as a candidate: a corner that is followed without its depth being known. Once rays from two
+keyframes meet at a sufficient angle it becomes a map point. Numbers of points never change; removed ones
+keep theirs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+CANDIDATE, GOOD, REMOVED = 0, 1, 2
+
+
+@dataclass
+class Keyframe:
+    """A view that the map keeps.
+
+    Attributes
+    ----------
+    index, timestamp : of its frame. flat : (h, w) its flattened image.
+    camera_from_world : (4, 4). point_ids : (k,) points seen, ascending. pixels : (k, 2) where.
+    """
+
+    index: int
+    timestamp: float
+    flat: NDArray[np.uint8]
+    camera_from_world: Array
+    point_ids: Indices
+    pixels: Array
+
+    def keep(self, rows: NDArray[np.bool_]) -> None:
+        """Forget the observations that are not chosen."""
+        self.point_ids, self.pixels = self.point_ids[rows], self.pixels[rows]
+
+    def rows_of(self, ids: Indices) -> tuple[Indices, NDArray[np.bool_]]:
+        """Rows of points (n,), and which of them (n,) were seen; the rows of the others mean nothing."""
+        if not len(self.point_ids):
+            return np.zeros(len(ids), dtype=np.int64), np.zeros(len(ids), dtype=bool)
+        rows = np.minimum(np.searchsorted(self.point_ids, ids), len(self.point_ids) - 1)
+        return rows, self.point_ids[rows] == ids
+
+
+@dataclass(frozen=True)
+class Followed:
+    """Points in a frame.
+
+    Attributes
+    ----------
+    ids : (n,) their numbers. pixels : (n, 2).
+    """
+
+    ids: Indices
+    pixels: Array
+
+    def __getitem__(self, rows: NDArray) -> Followed:
+        return Followed(self.ids[rows], self.pixels[rows])
+
+    def joined(self, other: Followed) -> Followed:
+        return Followed(np.concatenate([self.ids, other.ids]), np.concatenate([self.pixels, other.pixels]))
+
+
+class RigidMap:
+    """Points and keyframes.
+
+    Attributes
+    ----------
+    keyframes : in the order in which they came.
+    positions : (n, 3) in the world; provisional for candidates.
+    state : (n,) CANDIDATE, GOOD or REMOVED.
+    first_keyframe, first_pixels : (n,), (n, 2) where a point was first seen.
+    template_keyframe, template_pixels : (n,), (n, 2) the view whose patch stands for the point.
+    n_expected, n_found : (n,) frames in which it should have been seen, and in which it was.
+    """
+
+    def __init__(self) -> None:
+        self.keyframes: list[Keyframe] = []
+        self.positions = np.empty((0, 3))
+        self.state = np.empty(0, dtype=np.int8)
+        self.first_keyframe, self.first_pixels = np.empty(0, dtype=np.int64), np.empty((0, 2))
+        self.template_keyframe, self.template_pixels = np.empty(0, dtype=np.int64), np.empty((0, 2))
+        self.n_expected, self.n_found = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+
+    @property
+    def good(self) -> Indices:
+        """Numbers of the map points."""
+        return np.flatnonzero(self.state == GOOD)
+
+    def add_points(self, positions: Array, pixels: Array, keyframe: int, state: int) -> Indices:
+        """New points (n, 3), first seen at ``pixels`` (n, 2) of a keyframe; returns their numbers (n,)."""
+        n, before = len(positions), len(self.positions)
+        views = np.full(n, keyframe, dtype=np.int64)
+        self.positions = np.concatenate([self.positions, positions])
+        self.state = np.concatenate([self.state, np.full(n, state, dtype=np.int8)])
+        self.first_keyframe = np.concatenate([self.first_keyframe, views])
+        self.first_pixels = np.concatenate([self.first_pixels, pixels])
+        self.template_keyframe = np.concatenate([self.template_keyframe, views])
+        self.template_pixels = np.concatenate([self.template_pixels, pixels])
+        self.n_expected = np.concatenate([self.n_expected, np.zeros(n, dtype=np.int64)])
+        self.n_found = np.concatenate([self.n_found, np.zeros(n, dtype=np.int64)])
+        return np.arange(before, before + n)
+
+    def add_keyframe(self, keyframe: Keyframe) -> int:
+        """Append a view, which becomes the template of the points it sees; returns its number."""
+        order = np.argsort(keyframe.point_ids)
+        keyframe.point_ids, keyframe.pixels = keyframe.point_ids[order], keyframe.pixels[order]
+        self.keyframes.append(keyframe)
+        number = len(self.keyframes) - 1
+        self.template_keyframe[keyframe.point_ids] = number
+        self.template_pixels[keyframe.point_ids] = keyframe.pixels
+        return number
+
+    def extend_keyframe(self, number: int, ids: Indices, pixels: Array) -> None:
+        """Add observations of points newer than all that the keyframe has."""
+        keyframe = self.keyframes[number]
+        keyframe.point_ids = np.concatenate([keyframe.point_ids, ids])
+        keyframe.pixels = np.concatenate([keyframe.pixels, pixels])
+
+    def remove(self, ids: Indices) -> None:
+        """Take points out, with their observations."""
+        self.state[ids] = REMOVED
+        gone = np.zeros(len(self.state), dtype=bool)
+        gone[ids] = True
+        for keyframe in self.keyframes:
+            rows = gone[keyframe.point_ids]
+            if rows.any():
+                keyframe.keep(~rows)
+
+    def merge(self, kept: int, dropped: int) -> None:
+        """Make two points that are one: ``kept`` takes the observations of ``dropped``."""
+        for keyframe in self.keyframes:
+            rows, seen = keyframe.rows_of(np.array([kept, dropped]))
+            if seen[1] and not seen[0]:
+                keyframe.point_ids[rows[1]] = kept
+                order = np.argsort(keyframe.point_ids)
+                keyframe.point_ids, keyframe.pixels = keyframe.point_ids[order], keyframe.pixels[order]
+        self.remove(np.array([dropped]))
+
+    def shared_points(self, ids: Indices) -> Indices:
+        """How many of these points each keyframe (k,) saw: covisibility."""
+        wanted = np.zeros(len(self.state), dtype=bool)
+        wanted[ids] = True
+        return np.array([int(wanted[keyframe.point_ids].sum()) for keyframe in self.keyframes])
+
+    def n_observations(self) -> Indices:
+        """Keyframes (n,) that saw each point."""
+        counts = np.zeros(len(self.state), dtype=np.int64)
+        for keyframe in self.keyframes:
+            counts[keyframe.point_ids] += 1
+        return counts

@@ -1,0 +1,181 @@
+"""Camera tracking and mapping, one frame after the other.
+
+`Slam.process_frame` is the method: wait for a start, follow the map, keep a view where the map needs it, find the
+camera again when it is lost. The map has no scale of its own: the median depth of its first view is 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.online.flow import flatten
+from morph_dslam.online.slam.initialisation import Initialiser, MapStart
+from morph_dslam.online.slam.mapping import Mapper, pose_in_keyframe
+from morph_dslam.online.slam.options import SlamOptions
+from morph_dslam.online.slam.pose import PoseEstimate
+from morph_dslam.online.slam.relocalisation import Relocaliser
+from morph_dslam.online.slam.rigid_map import CANDIDATE, Followed, RigidMap
+from morph_dslam.online.slam.tracking import Tracked, Tracker
+from morph_dslam.online.timing import StageClock
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+STAGES = ("prepare", "start", "track", "map", "relocalise")
+NOWHERE = Followed(np.empty(0, dtype=np.int64), np.empty((0, 2)))
+
+
+@dataclass(frozen=True)
+class SlamFrame:
+    """What one frame gave.
+
+    Attributes
+    ----------
+    status : "waiting" for a start, "tracked", "relocalised", or "lost". reason : why there is no pose.
+    pose : from the map points, None without one.
+    points : map points that agree with it, and their pixels. candidates : (c, 2) pixels of corners without depth.
+    disagreeing : points that look like their map point but do not obey the rigid scene.
+    keyframe : number of the keyframe that ``from_keyframe`` (4, 4), the camera in that keyframe's frame, is in.
+    is_keyframe : whether the map kept this view. timings_ms : by stage. total_ms : the whole frame.
+    """
+
+    index: int
+    timestamp: float
+    status: str
+    reason: str
+    pose: PoseEstimate | None = None
+    points: Followed = NOWHERE
+    candidates: Array = field(default_factory=lambda: np.empty((0, 2)))
+    disagreeing: Followed = NOWHERE
+    keyframe: int = -1
+    from_keyframe: Array | None = None
+    is_keyframe: bool = False
+    timings_ms: dict[str, float] = field(default_factory=dict)
+    total_ms: float = 0.0
+
+
+class Slam:
+    """Tracks a moving camera in a rigid scene that it maps as it goes.
+
+    Parameters
+    ----------
+    camera : of all frames.
+
+    Attributes
+    ----------
+    map : what is known of the scene; replaced when a young map is given up (``n_restarts`` counts these).
+    """
+
+    def __init__(self, camera: PinholeCamera, options: SlamOptions | None = None) -> None:
+        self.camera = camera
+        self.options = options or SlamOptions()
+        self._maps = camera.undistortion_maps()
+        self.n_restarts = -1
+        self._restart()
+
+    def _restart(self) -> None:
+        self.n_restarts += 1
+        self.map, k, options = RigidMap(), self.camera.intrinsics, self.options
+        self._initialiser = Initialiser(k, options)
+        self._tracker = Tracker(self.map, k, options)
+        self._mapper = Mapper(self.map, k, options)
+        self._relocaliser = Relocaliser(self.map, k, options)
+        self._n_lost = 0
+
+    def process_frame(self, image: NDArray[np.uint8], index: int, timestamp: float) -> SlamFrame:
+        """Take in the next frame (h, w, 3) or (h, w), as recorded.
+
+        Raises
+        ------
+        CameraError
+            If it has not the camera's size.
+        """
+        clock = StageClock(STAGES)
+        with clock.stage("prepare"):
+            flat = self._prepare(image, index)
+        if not self.map.keyframes:
+            result = self._start(flat, index, timestamp, clock)
+        elif self._n_lost:
+            result = self._relocalise(flat, index, timestamp, clock)
+        else:
+            result = self._track(flat, index, timestamp, clock)
+        self._n_lost = self._n_lost + 1 if result["status"] == "lost" else 0
+        if self._n_lost > self.options.restart_after and len(self.map.keyframes) < self.options.window:
+            self._restart()
+        return SlamFrame(index, timestamp, **result, timings_ms=clock.milliseconds, total_ms=clock.total)
+
+    def refine_map(self) -> None:
+        """Adjust all keyframes and points together, once the sequence is over."""
+        if len(self.map.keyframes) > 2:
+            self._mapper.adjust_all()
+
+    def camera_from_world(self, frame: SlamFrame) -> Array | None:
+        """The camera's pose (4, 4) by what the map knows now; None where the frame has none."""
+        if frame.from_keyframe is None:
+            return None
+        return frame.from_keyframe @ self.map.keyframes[frame.keyframe].camera_from_world
+
+    def _prepare(self, image: NDArray[np.uint8], index: int) -> Image:
+        self.camera.check_image(image, f"frame {index}")
+        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        if self._maps is not None:
+            grey = cv2.remap(grey, *self._maps, cv2.INTER_LINEAR)
+        return flatten(np.asarray(grey, dtype=np.uint8), self.options.flow.flatten_window)
+
+    def _start(self, flat: Image, index: int, timestamp: float, clock: StageClock) -> dict:
+        with clock.stage("start"):
+            start = self._initialiser.process(flat, index, timestamp)
+            if not isinstance(start, MapStart):
+                return {"status": "waiting", "reason": start, "candidates": self._initialiser.followed}
+            points = self._mapper.begin(start)
+            self._tracker.place(self.map.keyframes[-1].camera_from_world, points)
+            tracked = self._tracker.track(flat)
+        if not isinstance(tracked, Tracked):
+            self.map.keyframes.clear()
+            self._restart()
+            return {"status": "waiting", "reason": f"the first map did not hold: {tracked}"}
+        return self._result("tracked", tracked, is_keyframe=True)
+
+    def _track(self, flat: Image, index: int, timestamp: float, clock: StageClock) -> dict:
+        with clock.stage("track"):
+            tracked = self._tracker.track(flat)
+        if not isinstance(tracked, Tracked):
+            found = self._relocalise(flat, index, timestamp, clock)
+            return found if found["status"] != "lost" else {"status": "lost", "reason": tracked}
+        with clock.stage("map"):
+            keeps = self._mapper.wants_keyframe(tracked, index)
+            if keeps:
+                self._tracker.points = self._mapper.insert(tracked, flat, index, timestamp)
+                self._tracker.correct(self.map.keyframes[-1].camera_from_world)
+        return self._result("tracked", tracked, keeps)
+
+    def _relocalise(self, flat: Image, index: int, timestamp: float, clock: StageClock) -> dict:
+        with clock.stage("relocalise"):
+            found = self._relocaliser.find(flat, self._tracker)
+            if isinstance(found, str):
+                return {"status": "lost", "reason": found}
+            pose, points = found
+            self._tracker.place(pose.camera_from_world, points)
+        tracked = Tracked(pose, points, int(pose.inliers.sum()), NOWHERE)
+        return self._result("relocalised", tracked, is_keyframe=False)
+
+    def _result(self, status: str, tracked: Tracked, is_keyframe: bool) -> dict:
+        number = len(self.map.keyframes) - 1
+        camera_from_world = self._tracker.camera_from_world
+        candidate = self.map.state[tracked.points.ids] == CANDIDATE
+        return {
+            "status": status,
+            "reason": "",
+            "pose": tracked.pose,
+            "points": tracked.points[~candidate],
+            "candidates": tracked.points.pixels[candidate],
+            "disagreeing": tracked.disagreeing,
+            "keyframe": number,
+            "from_keyframe": pose_in_keyframe(camera_from_world, self.map.keyframes[number]),
+            "is_keyframe": is_keyframe,
+        }

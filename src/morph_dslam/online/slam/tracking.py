@@ -1,0 +1,189 @@
+"""Following the map from frame to frame: where its points are now, and from them the camera's pose.
+
+Each point is followed from the keyframe that last saw it, not from the previous frame, so that errors do not add up
+between keyframes; the previous frame only says where to begin. Points lost from sight are looked for again where
+the pose says they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.online.flow import FlowOptions, follow, patch_correlation
+from morph_dslam.online.slam.options import SlamOptions
+from morph_dslam.online.slam.pose import PoseEstimate, refine_pose, reprojection_errors
+from morph_dslam.online.slam.projection import inside, inverse, project
+from morph_dslam.online.slam.rigid_map import CANDIDATE, GOOD, Followed, Indices, RigidMap
+from morph_dslam.online.slam.two_view import camera_centre
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Image = NDArray[np.uint8]
+
+#: Points are looked for from a keyframe only if they are seen from there at about this angle, and distance ratio.
+MOST_VIEW_ANGLE_DEG = 35.0
+MOST_SCALE_CHANGE = 1.6
+#: A point not found in this share of the frames in which it was looked for is looked for after all others.
+DOUBTFUL_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A frame's pose and points.
+
+    Attributes
+    ----------
+    pose : from the map points; its ``inliers`` belong to the rows of ``points`` that are map points.
+    points : inliers and candidates. disagreeing : points that look like their map point but are not where a
+        rigid scene would have them.
+    """
+
+    pose: PoseEstimate
+    points: Followed
+    n_inliers: int
+    disagreeing: Followed
+
+
+class Tracker:
+    """Follows the points of a map.
+
+    Attributes
+    ----------
+    camera_from_world : (4, 4) the newest pose. points : what is followed.
+    """
+
+    def __init__(self, rigid_map: RigidMap, intrinsics: Array, options: SlamOptions) -> None:
+        self._map = rigid_map
+        self._intrinsics = intrinsics
+        self._options = options
+        self._motion = np.eye(4)
+        self.camera_from_world = np.eye(4)
+        self.points = Followed(np.empty(0, dtype=np.int64), np.empty((0, 2)))
+
+    def place(self, camera_from_world: Array, points: Followed) -> None:
+        """Go on from a pose found by other means, as if the camera had stood still."""
+        self.camera_from_world, self.points, self._motion = camera_from_world, points, np.eye(4)
+
+    def correct(self, camera_from_world: Array) -> None:
+        """Take over the newest pose from bundle adjustment."""
+        self.camera_from_world = camera_from_world
+
+    def track(self, flat: Image) -> Tracked | str:
+        """Pose and points of the next frame, or why it is lost; then the newest pose stays what it was."""
+        reason = ""
+        deeper = FlowOptions(self._options.flow.window, self._options.flow.levels + 1)
+        # The prediction assumes that the motion goes on; if it has changed abruptly, the camera may stand still.
+        for predicted, flow in (
+            (self._motion @ self.camera_from_world, self._options.flow),
+            (self.camera_from_world, deeper),
+        ):
+            found = self._follow(flat, predicted, flow)
+            result = self._estimate(flat, predicted, found)
+            if isinstance(result, Tracked):
+                self._motion = result.pose.camera_from_world @ inverse(self.camera_from_world)
+                self.camera_from_world = result.pose.camera_from_world
+                self.points = result.points
+                return result
+            reason = reason or result
+        return reason
+
+    def _follow(self, flat: Image, predicted: Array, flow: FlowOptions) -> Followed:
+        """The followed points that are found again, begun where the predicted motion takes them."""
+        ids, pixels = self.points.ids, self.points.pixels
+        positions = self._map.positions[ids]
+        before, _ = project(self.camera_from_world, positions, self._intrinsics)
+        after, _ = project(predicted, positions, self._intrinsics)
+        guesses = pixels + np.nan_to_num(after - before)
+        return self.find(flat, Followed(ids, guesses), flow)
+
+    def find(self, flat: Image, guesses: Followed, flow: FlowOptions) -> Followed:
+        """Points found near their guessed pixels, from the patches of their keyframes."""
+        ids = guesses.ids
+        views, templates = self._map.template_keyframe[ids], self._map.template_pixels[ids]
+        found, good = guesses.pixels.copy(), np.zeros(len(ids), dtype=bool)
+        for view in np.unique(views):
+            rows = np.flatnonzero((views == view) & inside(guesses.pixels, flat.shape, 0.0))
+            source = self._map.keyframes[view].flat
+            pixels, ok = follow(source, flat, templates[rows], guesses.pixels[rows], flow)
+            likeness = patch_correlation(source, flat, templates[rows], pixels, self._options.patch_half)
+            found[rows], good[rows] = pixels, ok & (likeness > self._options.least_correlation)
+        return Followed(ids, found)[good]
+
+    def _estimate(self, flat: Image, predicted: Array, found: Followed) -> Tracked | str:
+        """Pose from what was followed, then with the lost points that are found again."""
+        options = self._options
+        pose, reason = self._pose(predicted, found)
+        if pose is None:
+            return reason
+        searched = self._search(flat, pose.camera_from_world, found.ids)
+        if len(searched.ids):
+            found = found.joined(searched)
+            pose, reason = self._pose(pose.camera_from_world, found)
+            if pose is None:
+                return reason
+        known = self._map.state[found.ids] == GOOD
+        fits = np.zeros(len(found.ids), dtype=bool)
+        fits[known] = pose.inliers
+        followed = np.isin(self.points.ids[self._map.state[self.points.ids] == GOOD], found.ids)
+        self._map.n_expected[self.points.ids[self._map.state[self.points.ids] == GOOD][~followed]] += 1
+        self._map.n_expected[found.ids[known]] += 1
+        self._map.n_found[found.ids[fits]] += 1
+        keep = fits | (self._map.state[found.ids] == CANDIDATE)
+        keep &= inside(found.pixels, flat.shape, options.patch_half + 2)
+        return Tracked(pose, found[keep], int(fits.sum()), found[known & ~fits])
+
+    def _pose(self, start: Array, found: Followed) -> tuple[PoseEstimate | None, str]:
+        options = self._options
+        known = found[self._map.state[found.ids] == GOOD]
+        if len(known.ids) < options.least_inliers:
+            return None, f"only {len(known.ids)} map points were found in this frame"
+        pose = refine_pose(
+            start, self._map.positions[known.ids], known.pixels, self._intrinsics, inlier_px=options.inlier_px
+        )
+        n = int(pose.inliers.sum())
+        if n < max(options.least_inliers, 0.3 * len(known.ids)):
+            return None, f"only {n} of {len(known.ids)} map points agree on a pose"
+        return pose, ""
+
+    def _search(self, flat: Image, pose: Array, followed: Indices) -> Followed:
+        """Map points that are not followed but in view, found where the pose says."""
+        options = self._options
+        lost = self._map.state == GOOD
+        lost[followed] = False
+        ids = np.flatnonzero(lost)
+        pixels, depths = project(pose, self._map.positions[ids], self._intrinsics)
+        seen = inside(pixels, flat.shape, options.flow.window) & self._alike(ids, pose, depths)
+        wanted = Followed(ids, pixels)[seen]
+        wanted = wanted[self._chosen(wanted.ids)]
+        if not len(wanted.ids):
+            return wanted
+        found = self.find(flat, wanted, FlowOptions(options.flow.window, 1))
+        errors = reprojection_errors(pose, self._map.positions[found.ids], found.pixels, self._intrinsics)
+        self._map.n_expected[np.setdiff1d(wanted.ids, found.ids)] += 1
+        return found[errors < options.search_radius_px]
+
+    def _alike(self, ids: Indices, pose: Array, depths: Array) -> Mask:
+        """Whether points look from here about as from their keyframe."""
+        views = self._map.template_keyframe[ids]
+        poses = np.array([keyframe.camera_from_world for keyframe in self._map.keyframes])
+        centres = -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])[views]
+        points = self._map.positions[ids]
+        there, here = centres - points, camera_centre(pose) - points
+        far_there, far_here = np.linalg.norm(there, axis=1), np.linalg.norm(here, axis=1)
+        cosine = np.einsum("nx,nx->n", there, here) / np.maximum(far_there * far_here, 1e-12)
+        ratio = far_here / np.maximum(far_there, 1e-12)
+        near = (ratio < MOST_SCALE_CHANGE) & (ratio > 1.0 / MOST_SCALE_CHANGE)
+        return near & (cosine > np.cos(np.radians(MOST_VIEW_ANGLE_DEG))) & (depths > 0.0)
+
+    def _chosen(self, ids: Indices) -> Indices:
+        """Rows of the points to look for: those of the keyframes that saw most, the reliable ones first."""
+        views = self._map.template_keyframe[ids]
+        numbers, counts = np.unique(views, return_counts=True)
+        best = numbers[np.argsort(-counts, kind="stable")[: self._options.search_keyframes]]
+        rows = np.flatnonzero(np.isin(views, best))
+        expected, found = self._map.n_expected[ids[rows]], self._map.n_found[ids[rows]]
+        doubtful = (expected >= 8) & (found < DOUBTFUL_SHARE * expected)
+        return rows[np.argsort(doubtful, kind="stable")[: self._options.search_points]]
