@@ -61,7 +61,7 @@ def test_a_near_tangent_leads_to_the_root():
     assert equations.residuals == state.iterations <= 10
 
 
-@pytest.mark.parametrize("slope", [9.0, 12.0])
+@pytest.mark.parametrize("slope", [2.5, 8.0])
 def test_a_tangent_that_is_too_far_off_is_made_anew(slope):
     equations = Cubic()
     state = solve_with_kept_tangent(equations, np.array([2.2]), np.array([0.9]), Slope(slope, np.zeros(1)))
