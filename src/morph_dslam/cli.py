@@ -1,4 +1,4 @@
-"""The command line: `morph build | info | track | evaluate | simulate | calibrate`.
+"""The command line: `morph build | info | export | track | evaluate | simulate | calibrate`.
 
 Each command imports what it needs when it runs, so that `morph --help` answers at once.
 """
@@ -8,10 +8,12 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from morph_dslam import __version__
 from morph_dslam.errors import EvaluationError, MorphError
+from morph_dslam.view_commands import add_view_commands
 
 USER_ERROR = 2
 INTERRUPTED = 130
@@ -125,6 +127,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"morph-dslam {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _add_offline_commands(commands)
+    add_view_commands(partial(_add, commands))
     _add_online_commands(commands)
     _add_camera_commands(commands)
     return parser

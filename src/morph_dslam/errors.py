@@ -48,3 +48,7 @@ class TrackingError(MorphError):
 
 class TrajectoryError(MorphError):
     """A camera trajectory is missing or malformed."""
+
+
+class ExportError(MorphError):
+    """An export asks for states outside the model's box, or cannot be written."""

@@ -1,0 +1,195 @@
+"""Exports read back by other programs' readers: the states, the mesh, and every field in closed form."""
+
+import csv
+
+import meshio
+import numpy as np
+import pygltflib
+import pytest
+
+from morph_dslam import cli
+from morph_dslam.errors import ExportError
+from morph_dslam.export.export import StateChoice, export
+from morph_dslam.export.gltf import FRAMES_PER_SECOND
+from morph_dslam.model import save_model
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.stretched_block import SHEAR_MODULUS, SIZE, YOUNG_MODULUS, stretched_block_model
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("models")
+    save_model(folder / "block.morph", stretched_block_model())
+    save_model(folder / "sheet.morph", bent_sheet_model(9, 7))
+    return folder
+
+
+def assert_block_state(points, cells, data, stretch, slide_mm):
+    """Everything an export of the block holds, from its closed form."""
+    model, slope = stretched_block_model(), 1e-3 * slide_mm / SIZE[2]
+    np.testing.assert_allclose(points, model.nodes)
+    np.testing.assert_array_equal(cells, model.cells["hex8"])
+    x, _, z = points.T
+    motion = np.zeros((len(points), 3))
+    motion[:, 0] = stretch * x + slope * z
+    stress, strain = np.zeros((2, 3, 3))
+    stress[0, 0], stress[0, 2], stress[2, 0] = YOUNG_MODULUS * stretch, *[SHEAR_MODULUS * slope] * 2
+    strain[0, 0], strain[0, 2], strain[2, 0] = stretch, slope / 2, slope / 2
+    np.testing.assert_allclose(data["displacement"], motion, atol=1e-9)
+    np.testing.assert_allclose(data["stress"], np.tile(stress.ravel(), (len(points), 1)), atol=0.1)
+    np.testing.assert_allclose(data["strain"], np.tile(strain.ravel(), (len(points), 1)), atol=1e-8)
+    equivalent = np.hypot(YOUNG_MODULUS * stretch, 3**0.5 * SHEAR_MODULUS * slope)
+    np.testing.assert_allclose(data["von_mises"].ravel(), equivalent, rtol=1e-6)
+
+
+def table(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+GRID = ["--vary", "stretch=-0.1:0.2:2", "--vary", "slide=-5:10:3"]
+STATES = [(s, d) for s in (-0.1, 0.2) for d in (-5.0, 2.5, 10.0)]
+
+
+def run_export(folder, out, *options):
+    assert cli.main(["export", str(folder / "block.morph"), "-o", str(out), *options]) == 0
+
+
+def test_a_vtu_series_over_a_grid(folder, tmp_path):
+    run_export(folder, tmp_path / "out", "--format", "vtu", *GRID)
+    rows = table(tmp_path / "out" / "states.csv")
+    values = [(float(row["stretch [1]"]), float(row["slide [mm]"])) for row in rows]
+    np.testing.assert_allclose(values, STATES, rtol=1e-8)
+    for row, state in zip(rows, STATES, strict=True):
+        mesh = meshio.read(tmp_path / "out" / row["file"])
+        assert_block_state(mesh.points, mesh.cells_dict["hexahedron"], mesh.point_data, *state)
+        assert f'file="{row["file"]}"' in (tmp_path / "out" / "block.pvd").read_text()
+
+
+def test_an_xdmf_series_over_a_grid(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # meshio by itself would write the HDF5 file here
+    run_export(folder, tmp_path / "out", *GRID)
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"block.xdmf", "block.h5", "states.csv"}
+    with meshio.xdmf.TimeSeriesReader(tmp_path / "out" / "block.xdmf") as series:
+        points, cells = series.read_points_cells()
+        assert series.num_steps == len(STATES)
+        for i, state in enumerate(STATES):
+            step, data, _ = series.read_data(i)
+            assert step == i
+            assert_block_state(points, cells[0].data, data, *state)
+
+
+def test_stress_on_both_faces_of_a_sheet(folder, tmp_path):
+    choice = StateChoice(vary=["arch=40:40:1"])
+    export(folder / "sheet.morph", tmp_path, "vtu", choice)
+    mesh = meshio.read(tmp_path / "sheet_0000.vtu")
+    top, bottom = (
+        np.column_stack([mesh.point_data[f"stress_{face}_{c}"] for c in ("11", "22", "12")])
+        for face in ("top", "bottom")
+    )
+    # An arch of height a over length L: w,xx = -8 a / L², bending stress E z / (1 - nu²) at z = 0.05 mm.
+    bending = 3e9 * 0.05e-3 / (1 - 0.3**2) * 8 * 0.040 / 0.420**2
+    np.testing.assert_allclose(top, np.tile([bending, 0.3 * bending, 0.0], (len(top), 1)), rtol=1e-5)
+    np.testing.assert_allclose(bottom, -top, rtol=1e-6)
+    equivalent = bending * np.sqrt(1 - 0.3 + 0.3**2)
+    np.testing.assert_allclose(mesh.point_data["von_mises_top"], equivalent, rtol=1e-5)
+    np.testing.assert_array_equal(mesh.cells_dict["triangle"], bent_sheet_model(9, 7).triangles)
+
+
+def gltf_array(document, index):
+    """An accessor's numbers, and whether its stated bounds are theirs."""
+    accessor = document.accessors[index]
+    view = document.bufferViews[accessor.bufferView]
+    blob = document.binary_blob()[view.byteOffset : view.byteOffset + view.byteLength]
+    values = np.frombuffer(blob, dtype={5126: "<f4", 5125: "<u4"}[accessor.componentType])
+    values = values.reshape(accessor.count, {"SCALAR": 1, "VEC3": 3}[accessor.type])
+    np.testing.assert_array_equal(values.min(axis=0), np.float32(accessor.min))
+    np.testing.assert_array_equal(values.max(axis=0), np.float32(accessor.max))
+    return values
+
+
+def test_a_gltf_animation_is_the_sheet_in_motion(folder, tmp_path):
+    """Rest positions and weighted morph targets, as a viewer adds them, against the model's closed form."""
+    model = bent_sheet_model(9, 7)
+    choice = StateChoice(vary=["arch=-60:60:5"], at=["skew=0.3", "twist=10"])
+    document = pygltflib.GLTF2().load(export(folder / "sheet.morph", tmp_path, "gltf", choice))
+    (primitive,) = document.meshes[0].primitives
+    rest = gltf_array(document, primitive.attributes.POSITION)
+    targets = [gltf_array(document, target["POSITION"]) for target in primitive.targets]
+    triangles = gltf_array(document, primitive.indices).reshape(-1, 3)
+    np.testing.assert_allclose(rest[triangles], model.nodes[model.triangles], atol=1e-7)
+    (channel,), (sampler,) = document.animations[0].channels, document.animations[0].samplers
+    assert (channel.target.node, channel.target.path) == (0, "weights")
+    times = gltf_array(document, sampler.input).ravel()
+    weights = gltf_array(document, sampler.output).reshape(len(times), len(targets))
+    np.testing.assert_allclose(times * FRAMES_PER_SECOND, np.arange(5), atol=1e-6)
+    np.testing.assert_array_equal(np.float32(document.meshes[0].weights), weights[0])
+    for arch, weight in zip(np.linspace(-0.06, 0.06, 5), weights, strict=True):
+        moved = rest + np.tensordot(weight, np.array(targets), axes=1)
+        expected = model.positions(np.array([arch, 0.3, np.radians(10)]))
+        np.testing.assert_allclose(moved[triangles], expected[model.triangles], atol=1e-7)
+
+
+def test_a_gltf_of_one_state_stands_still(folder, tmp_path):
+    choice = StateChoice(vary=["stretch=0.2:0.2:1"])
+    document = pygltflib.GLTF2().load(export(folder / "block.morph", tmp_path, "gltf", choice))
+    assert document.animations == []
+    assert document.meshes[0].weights == pytest.approx([0.2, 0.0])
+
+
+def test_without_ranges_each_parameter_tours_its_range(folder):
+    model = stretched_block_model()
+    states = StateChoice(at=["slide=2"]).states(model)
+    np.testing.assert_allclose(states[[0, -1]], [[0.0, 0.002]] * 2)
+    moving = np.abs(np.diff(states, axis=0)) > 1e-12
+    assert (moving.sum(axis=1) == 1).all()
+    for k in range(2):
+        assert {model.lower[k], model.upper[k]} <= set(states[:, k])
+
+
+def test_a_path_from_a_table_of_states_and_from_a_tracked_run(tmp_path):
+    model = stretched_block_model()
+    states = tmp_path / "states.csv"
+    states.write_text("file,slide [mm],stretch [1]\na,1,0.1\nb,2.5,-0.2\n")
+    np.testing.assert_allclose(StateChoice(path=states).states(model), [[0.1, 0.001], [-0.2, 0.0025]])
+    frames = tmp_path / "frames.csv"
+    frames.write_text("frame,slide_mm,slide_std_mm\n0,1,0.1\n1,,\n2,10.000001,0.1\n")
+    found = StateChoice(path=frames, at=["stretch=0.1"]).states(model)
+    np.testing.assert_allclose(found, [[0.1, 0.001], [0.1, 0.01]], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("choice", "message"),
+    [
+        ({"vary": ["bend=0:1:3"]}, "no parameter 'bend'; it has stretch, slide"),
+        ({"vary": ["slide=0:11:3"]}, "--vary slide=0:11:3: 11 is outside the range of slide, -10 to 10 mm"),
+        ({"vary": ["slide=0:10"]}, "--vary slide=0:10 is not a parameter and its values, such as"),
+        ({"vary": ["slide=0:nan:3"]}, "nan is outside the range"),
+        ({"vary": ["slide=0:1:0"]}, "is not a parameter and its values"),
+        ({"vary": ["slide=0:1:2", "slide=0:1:2"]}, "'slide' has a range already"),
+        ({"vary": ["slide=0:1:1000000000"]}, "10000 is the most"),
+        ({"vary": ["slide=0:1:101", "stretch=0:0.1:101"]}, "make 10201 states"),
+        ({"at": ["slide"]}, "--at slide is not a parameter and its value"),
+        ({"at": ["slide=x"]}, "--at slide=x is not a parameter and its value"),
+        ({"vary": ["slide=0:1:2"], "path": "p.csv"}, "give one of them"),
+        ({"path": "absent.csv"}, r"cannot read the path .*absent\.csv"),
+        ({"path": ("a,b\n1,2\n",)}, r"no column of a parameter; name the columns 'stretch \[1\]', 'slide"),
+        ({"path": ("slide_mm\n1\nmany\n",)}, r"line 3: 'many' is not a value of slide"),
+        ({"path": ("slide_mm\n1\n12\n",)}, r"line 3: 12 is outside the range of slide"),
+        ({"path": ("slide_mm,frame\n,1\n",)}, "holds 0 states"),
+    ],
+)
+def test_states_that_cannot_be_are_refused(choice, message, tmp_path):
+    path = choice.get("path")
+    if isinstance(path, tuple):
+        (tmp_path / "path.csv").write_text(path[0])
+        path = "path.csv"
+    choice = StateChoice(**{**choice, "path": tmp_path / path if path else None})
+    with pytest.raises(ExportError, match=message):
+        choice.states(stretched_block_model())
+
+
+def test_a_folder_that_cannot_be_written_is_refused(folder, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert cli.main(["export", str(folder / "block.morph"), "-o", str(tmp_path / "file" / "out")]) == 2
+    assert "morph: cannot write to" in capsys.readouterr().err
