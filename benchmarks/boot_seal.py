@@ -75,11 +75,11 @@ def follow_path() -> dict:
     """Solve the path with this project."""
     from morph_dslam.model import Parameter
     from morph_dslam.offline.materials.isotropic import NeoHookean
-    from morph_dslam.offline.meshes import CellBlock, Mesh
-    from morph_dslam.offline.newton import State, solve
-    from morph_dslam.offline.parameters import ParameterSymbols
-    from morph_dslam.offline.solid import SolidProblem
-    from morph_dslam.offline.supports import PrescribedDisplacement, RigidRotation, fixed
+    from morph_dslam.offline.mechanics.parameters import ParameterSymbols
+    from morph_dslam.offline.mechanics.solid import SolidProblem
+    from morph_dslam.offline.mechanics.supports import PrescribedDisplacement, RigidRotation, fixed
+    from morph_dslam.offline.meshing.meshes import CellBlock, Mesh
+    from morph_dslam.offline.solvers.newton import State, solve
 
     nodes, hexes, sets = bellows()
     symbols = ParameterSymbols((Parameter("lever", "angle", "deg", 0.0, float(ANGLES[-1]), 0.0),))

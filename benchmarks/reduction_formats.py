@@ -27,9 +27,9 @@ from morph_dslam.model.basis_functions import (
 )
 from morph_dslam.model.tensor_field import TensorField
 from morph_dslam.model.tensor_functions import TensorFunctions, TuckerFunctions
-from morph_dslam.offline.pod import Pod, compute_pod
-from morph_dslam.offline.sparse_pgd import SparsePgdOptions, fit_sparse_pgd
-from morph_dslam.offline.tensor_formats import (
+from morph_dslam.offline.reduction.pod import Pod, compute_pod
+from morph_dslam.offline.reduction.sparse_pgd import SparsePgdOptions, fit_sparse_pgd
+from morph_dslam.offline.reduction.tensor_formats import (
     cp,
     cp_functions,
     tensor_train,

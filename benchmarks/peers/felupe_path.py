@@ -15,7 +15,7 @@ import felupe
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from morph_dslam.offline.linear_solver import LinearSolver
+from morph_dslam.offline.solvers.linear_solver import LinearSolver
 
 MAX_ITERATIONS = 20
 

@@ -23,14 +23,14 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.offline.build import build
 from morph_dslam.offline.problem import Snapshot
 from morph_dslam.offline.snapshots import load_snapshot, snapshot_key
-from morph_dslam.offline.solid_study import SolidStudy
-from morph_dslam.offline.study import make_study
+from morph_dslam.offline.studies.solid_study import SolidStudy
+from morph_dslam.offline.studies.study import make_study
 from morph_dslam.render.model_view import draw_states
 
 HERE = Path(__file__).resolve().parent
 OUTPUT = HERE / "output"
 #: The lever's axis passes through this point of the object frame, metres, along y.
-PIVOT = np.array([0.0, 0.0, 0.044])
+PIVOT = np.array([0.0, 0.0, 0.0417])
 
 
 def read_study(divisions: list[int] | None, cells: str | None) -> SolidStudy:

@@ -11,7 +11,7 @@ from ngsolve.meshes import MakeStructured2DMesh
 from numpy.typing import NDArray
 
 from morph_dslam.model.basis_functions import cubic_spline_basis
-from morph_dslam.offline.separable_problem import (
+from morph_dslam.offline.reduction.separable_problem import (
     SeparableProblem,
     collocation_axis,
     galerkin_axis,

@@ -21,9 +21,9 @@ from figures import draw_errors, draw_modes
 from numpy.typing import NDArray
 
 from morph_dslam.cli import run_and_report_errors
-from morph_dslam.offline.pgd import PgdOptions, PgdSolution, solve_pgd
-from morph_dslam.offline.separable_problem import factorise
-from morph_dslam.offline.tensor_formats import khatri_rao
+from morph_dslam.offline.reduction.pgd import PgdOptions, PgdSolution, solve_pgd
+from morph_dslam.offline.reduction.separable_problem import factorise
+from morph_dslam.offline.reduction.tensor_formats import khatri_rao
 
 Array = NDArray[np.float64]
 

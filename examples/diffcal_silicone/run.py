@@ -28,13 +28,13 @@ from scipy.optimize import minimize_scalar
 from morph_dslam.cli import run_and_report_errors
 from morph_dslam.evaluation.surface_distance import distances_to_surface
 from morph_dslam.model import Parameter
-from morph_dslam.offline.loads import Gravity
 from morph_dslam.offline.materials.isotropic import NeoHookean
-from morph_dslam.offline.meshes import CellBlock, Mesh
-from morph_dslam.offline.newton import State, advance
-from morph_dslam.offline.parameters import ParameterSymbols
-from morph_dslam.offline.solid import SolidOptions, SolidProblem
-from morph_dslam.offline.supports import fixed
+from morph_dslam.offline.mechanics.loads import Gravity
+from morph_dslam.offline.mechanics.parameters import ParameterSymbols
+from morph_dslam.offline.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.offline.mechanics.supports import fixed
+from morph_dslam.offline.meshing.meshes import CellBlock, Mesh
+from morph_dslam.offline.solvers.newton import State, advance
 from morph_dslam.render.overlay import draw_overlay
 
 Array = NDArray[np.float64]

@@ -24,8 +24,7 @@ from tqdm import tqdm
 
 from morph_dslam.cli import run_and_report_errors
 from morph_dslam.errors import SolverError
-from morph_dslam.offline.arc_length import PathPoint, missed_bifurcations
-from morph_dslam.offline.sheet_buckling import (
+from morph_dslam.offline.mechanics.sheet_buckling import (
     BuckledSheet,
     BucklingFolder,
     PathRecord,
@@ -34,8 +33,9 @@ from morph_dslam.offline.sheet_buckling import (
     solve_positions,
     southwell_load,
 )
-from morph_dslam.offline.shell import OrthotropicSheet
+from morph_dslam.offline.mechanics.shell import OrthotropicSheet
 from morph_dslam.offline.snapshots import load_snapshot
+from morph_dslam.offline.solvers.arc_length import PathPoint, missed_bifurcations
 from morph_dslam.offline.sweep import default_executor
 
 HERE = Path(__file__).resolve().parent

@@ -12,11 +12,11 @@ import pytest
 from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.model import load_model
 from morph_dslam.offline.build import build
-from morph_dslam.offline.continuation import advance
-from morph_dslam.offline.gripped_sheet import GrippedSheet
+from morph_dslam.offline.mechanics.gripped_sheet import GrippedSheet
 from morph_dslam.offline.problem import bounds
 from morph_dslam.offline.snapshots import load_snapshot
-from morph_dslam.offline.study import load_study
+from morph_dslam.offline.solvers.continuation import advance
+from morph_dslam.offline.studies.study import load_study
 from morph_dslam.offline.sweep import neighbour_tree, sample_box
 
 STUDY = """

@@ -10,7 +10,7 @@ import pytest
 
 from morph_dslam import cli
 from morph_dslam.model import load_model
-from morph_dslam.offline.mesh_generators import block
+from morph_dslam.offline.meshing.mesh_generators import block
 
 STUDY = """
 name = "cantilever, solved elsewhere"

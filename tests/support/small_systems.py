@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import scipy.sparse as sp
 
-from morph_dslam.offline.linear_solver import AssembledLinearisation, LinearSolver
+from morph_dslam.offline.solvers.linear_solver import AssembledLinearisation, LinearSolver
 
 Function = Callable[[np.ndarray, np.ndarray], np.ndarray]
 

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from morph_dslam.model import Parameter
 from morph_dslam.offline.materials.isotropic import NeoHookean
-from morph_dslam.offline.mesh_generators import block
-from morph_dslam.offline.meshes import CellBlock, Mesh
-from morph_dslam.offline.newton import State, advance
-from morph_dslam.offline.parameters import ParameterSymbols
-from morph_dslam.offline.solid import SolidProblem
-from morph_dslam.offline.supports import AffineMotion
+from morph_dslam.offline.mechanics.parameters import ParameterSymbols
+from morph_dslam.offline.mechanics.solid import SolidProblem
+from morph_dslam.offline.mechanics.supports import AffineMotion
+from morph_dslam.offline.meshing.mesh_generators import block
+from morph_dslam.offline.meshing.meshes import CellBlock, Mesh
+from morph_dslam.offline.solvers.newton import State, advance
 
 Array = NDArray[np.float64]
 

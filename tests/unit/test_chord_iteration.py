@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from morph_dslam.offline.chord_iteration import solve_with_kept_tangent
+from morph_dslam.offline.solvers.chord_iteration import solve_with_kept_tangent
 
 
 @dataclass

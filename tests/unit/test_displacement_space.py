@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.displacement_space import DisplacementSpace
-from morph_dslam.offline.loads import DeadTraction
 from morph_dslam.offline.materials.isotropic import NeoHookean
-from morph_dslam.offline.mesh_generators import block, tube
-from morph_dslam.offline.mesh_geometry import cell_volumes
-from morph_dslam.offline.meshes import CellBlock, Mesh
-from morph_dslam.offline.newton import solve
-from morph_dslam.offline.ngsolve_mesh import NgsolveMesh, reference_points
-from morph_dslam.offline.point_location import locate
-from morph_dslam.offline.solid import SolidOptions, SolidProblem
-from morph_dslam.offline.supports import fixed
+from morph_dslam.offline.mechanics.displacement_space import DisplacementSpace
+from morph_dslam.offline.mechanics.loads import DeadTraction
+from morph_dslam.offline.mechanics.ngsolve_mesh import NgsolveMesh, reference_points
+from morph_dslam.offline.mechanics.point_location import locate
+from morph_dslam.offline.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.offline.mechanics.supports import fixed
+from morph_dslam.offline.meshing.mesh_generators import block, tube
+from morph_dslam.offline.meshing.mesh_geometry import cell_volumes
+from morph_dslam.offline.meshing.meshes import CellBlock, Mesh
+from morph_dslam.offline.solvers.newton import solve
 from tests.support.solids import SOLID_CELLS, distorted
 
 

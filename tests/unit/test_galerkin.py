@@ -5,9 +5,9 @@ import pytest
 from scipy.optimize import root
 from scipy.sparse import csr_matrix
 
-from morph_dslam.offline.galerkin import GalerkinEquations, galerkin_modes, newton_correction
-from morph_dslam.offline.linear_solver import AssembledLinearisation, LinearSolver
-from morph_dslam.offline.newton import State, advance, sensitivities, solve
+from morph_dslam.offline.reduction.galerkin import GalerkinEquations, galerkin_modes, newton_correction
+from morph_dslam.offline.solvers.linear_solver import AssembledLinearisation, LinearSolver
+from morph_dslam.offline.solvers.newton import State, advance, sensitivities, solve
 
 SPRINGS = 30
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.offline.gripped_sheet import mesh_lines
-from morph_dslam.offline.grips import ARC_SLOPE, Grips
+from morph_dslam.offline.mechanics.gripped_sheet import mesh_lines
+from morph_dslam.offline.mechanics.grips import ARC_SLOPE, Grips
 
 GRIPS = Grips(length=0.42, depth=0.012, height=0.034, centre_left=0.05, centre_right=0.06)
 

@@ -7,13 +7,13 @@ import pytest
 import scipy.sparse as sp
 
 from morph_dslam.errors import SolverError
-from morph_dslam.offline.linear_solver import (
+from morph_dslam.offline.solvers.linear_solver import (
     ENVIRONMENT_VARIABLE,
     AssembledLinearisation,
     LinearSolver,
     default_engine,
 )
-from morph_dslam.offline.sparse_engines import ANALYSE, Pardiso
+from morph_dslam.offline.solvers.sparse_engines import ANALYSE, Pardiso
 
 ENGINES = ["pardiso", "sparsecholesky"]
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.mesh_checks import check_mesh
-from morph_dslam.offline.mesh_generators import block, sheet
-from morph_dslam.offline.meshes import CellBlock, Mesh
+from morph_dslam.offline.meshing.mesh_checks import check_mesh
+from morph_dslam.offline.meshing.mesh_generators import block, sheet
+from morph_dslam.offline.meshing.meshes import CellBlock, Mesh
 
 
 def cube(name="hex8", size=0.1):

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.mesh_checks import check_mesh
-from morph_dslam.offline.mesh_files import load_mesh
-from morph_dslam.offline.mesh_generators import block
-from morph_dslam.offline.mesh_geometry import cell_volumes, surface_area
+from morph_dslam.offline.meshing.mesh_checks import check_mesh
+from morph_dslam.offline.meshing.mesh_files import load_mesh
+from morph_dslam.offline.meshing.mesh_generators import block
+from morph_dslam.offline.meshing.mesh_geometry import cell_volumes, surface_area
 from tests.support.real_data import real_data
 
 ABAQUS = {

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.mesh_checks import check_mesh
-from morph_dslam.offline.mesh_generators import Collar, block, revolution, sheet, tube
-from morph_dslam.offline.mesh_geometry import cell_volumes, centroid, surface_area
-from morph_dslam.offline.structured_grid import SOLIDS
+from morph_dslam.offline.meshing.mesh_checks import check_mesh
+from morph_dslam.offline.meshing.mesh_generators import Collar, block, revolution, sheet, tube
+from morph_dslam.offline.meshing.mesh_geometry import cell_volumes, centroid, surface_area
+from morph_dslam.offline.meshing.structured_grid import SOLIDS
 
 #: A boot of a gear lever: cuff, four round folds, neck; radius and height in millimetres.
 BOOT = [

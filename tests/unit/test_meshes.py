@@ -6,14 +6,19 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.face_lookup import find_faces
-from morph_dslam.offline.mesh_checks import check_mesh
-from morph_dslam.offline.mesh_conversion import FIRST_ORDER, SECOND_ORDER, to_first_order, to_second_order
-from morph_dslam.offline.mesh_generators import block, sheet, tube
-from morph_dslam.offline.mesh_geometry import cell_volumes
-from morph_dslam.offline.mesh_repair import reoriented, without_collapsed_cells
-from morph_dslam.offline.meshes import CellBlock, Mesh
-from morph_dslam.offline.structured_grid import SOLIDS
+from morph_dslam.offline.meshing.face_lookup import find_faces
+from morph_dslam.offline.meshing.mesh_checks import check_mesh
+from morph_dslam.offline.meshing.mesh_conversion import (
+    FIRST_ORDER,
+    SECOND_ORDER,
+    to_first_order,
+    to_second_order,
+)
+from morph_dslam.offline.meshing.mesh_generators import block, sheet, tube
+from morph_dslam.offline.meshing.mesh_geometry import cell_volumes
+from morph_dslam.offline.meshing.mesh_repair import reoriented, without_collapsed_cells
+from morph_dslam.offline.meshing.meshes import CellBlock, Mesh
+from morph_dslam.offline.meshing.structured_grid import SOLIDS
 
 
 def enclosed_volume(mesh):

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import brentq
 
 from morph_dslam.errors import SolverError
-from morph_dslam.offline.newton import PathError, State, advance, sensitivities, solve
+from morph_dslam.offline.solvers.newton import PathError, State, advance, sensitivities, solve
 from tests.support.small_systems import SmallSystem, spring_column, von_mises_truss
 
 HEIGHT = 0.3

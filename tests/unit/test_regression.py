@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morph_dslam.offline.pod import compute_pod
-from morph_dslam.offline.regression import fit_functions
+from morph_dslam.offline.reduction.pod import compute_pod
+from morph_dslam.offline.reduction.regression import fit_functions
 
 LOWER, UPPER = np.array([-2.0, 0.5, 10.0]), np.array([1.0, 1.5, 40.0])
 

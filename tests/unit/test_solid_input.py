@@ -9,15 +9,20 @@ import pytest
 
 from morph_dslam.errors import StudyError
 from morph_dslam.model import Parameter
-from morph_dslam.offline.kinematics import ShapeField
-from morph_dslam.offline.loads import DeadTraction, FollowerPressure, MovingPatch, PointLoad
 from morph_dslam.offline.materials.isotropic import NeoHookean
-from morph_dslam.offline.mesh_generators import block, sheet
-from morph_dslam.offline.newton import PathError
-from morph_dslam.offline.parameters import ParameterSymbols
-from morph_dslam.offline.solid import SolidOptions, SolidProblem
-from morph_dslam.offline.solid_materials import NearlyIncompressibleWarning
-from morph_dslam.offline.supports import ElasticFoundation, PrescribedDisplacement, RigidRotation, fixed
+from morph_dslam.offline.mechanics.kinematics import ShapeField
+from morph_dslam.offline.mechanics.loads import DeadTraction, FollowerPressure, MovingPatch, PointLoad
+from morph_dslam.offline.mechanics.parameters import ParameterSymbols
+from morph_dslam.offline.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.offline.mechanics.solid_materials import NearlyIncompressibleWarning
+from morph_dslam.offline.mechanics.supports import (
+    ElasticFoundation,
+    PrescribedDisplacement,
+    RigidRotation,
+    fixed,
+)
+from morph_dslam.offline.meshing.mesh_generators import block, sheet
+from morph_dslam.offline.solvers.newton import PathError
 from tests.support.solids import RUBBER, load_parameter, solved
 
 MESH = block((1.0, 1.0, 1.0), (2, 1, 1), "hex8")

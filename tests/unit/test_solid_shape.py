@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.kinematics import ShapeField
-from morph_dslam.offline.loads import BodyForce, DeadTraction, FollowerPressure, MovingPatch
-from morph_dslam.offline.mesh_generators import block, tube
-from morph_dslam.offline.mesh_geometry import cell_volumes
-from morph_dslam.offline.morphing import radius_field, thickness_field
-from morph_dslam.offline.solid import SolidOptions, SolidProblem
-from morph_dslam.offline.supports import ElasticFoundation, RigidRotation, fixed
+from morph_dslam.offline.mechanics.kinematics import ShapeField
+from morph_dslam.offline.mechanics.loads import BodyForce, DeadTraction, FollowerPressure, MovingPatch
+from morph_dslam.offline.mechanics.morphing import radius_field, thickness_field
+from morph_dslam.offline.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.offline.mechanics.supports import ElasticFoundation, RigidRotation, fixed
+from morph_dslam.offline.meshing.mesh_generators import block, tube
+from morph_dslam.offline.meshing.mesh_geometry import cell_volumes
 from tests.support.solids import RUBBER, load_parameter, solved
 
 

@@ -14,7 +14,7 @@ from morph_dslam.model.basis_functions import (
     kriging_basis,
     p_spline_basis,
 )
-from morph_dslam.offline.sparse_pgd import (
+from morph_dslam.offline.reduction.sparse_pgd import (
     SamplingWarning,
     SparsePgd,
     SparsePgdOptions,

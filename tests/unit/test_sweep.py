@@ -10,7 +10,7 @@ import pytest
 
 from morph_dslam.errors import StudyError
 from morph_dslam.offline import sweep
-from morph_dslam.offline.sheet_study import SheetStudy
+from morph_dslam.offline.studies.sheet_study import SheetStudy
 
 STUDY = SheetStudy.model_validate(
     {

@@ -10,7 +10,7 @@ from tensorly.decomposition import tensor_train as tensorly_train
 from tensorly.decomposition import tucker as tensorly_tucker
 
 from morph_dslam.model.basis_functions import chebyshev_basis, cubic_spline_basis
-from morph_dslam.offline.tensor_formats import (
+from morph_dslam.offline.reduction.tensor_formats import (
     cp,
     cp_functions,
     khatri_rao,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import SolverError
-from morph_dslam.offline.continuation import advance
-from morph_dslam.offline.gripped_sheet import GrippedSheet
-from morph_dslam.offline.grips import Grips
-from morph_dslam.offline.shell import OrthotropicSheet
+from morph_dslam.offline.mechanics.gripped_sheet import GrippedSheet
+from morph_dslam.offline.mechanics.grips import Grips
+from morph_dslam.offline.mechanics.shell import OrthotropicSheet
+from morph_dslam.offline.solvers.continuation import advance
 
 LENGTH, WIDTH, DEPTH = 0.42, 0.297, 0.01
 YOUNG, THICKNESS = 5e9, 5e-4

@@ -12,7 +12,7 @@ import scipy.sparse.linalg as sla
 from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
 
-from morph_dslam.offline.shell import KoiterSheet, OrthotropicSheet, rectangle_mesh
+from morph_dslam.offline.mechanics.shell import KoiterSheet, OrthotropicSheet, rectangle_mesh
 from tests.support.real_data import real_data
 
 

@@ -9,14 +9,14 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from morph_dslam.model.basis_functions import chebyshev_basis, cubic_spline_basis, hat_basis
-from morph_dslam.offline.pgd import PgdOptions, PgdSolution, solve_pgd
-from morph_dslam.offline.separable_problem import (
+from morph_dslam.offline.reduction.pgd import PgdOptions, PgdSolution, solve_pgd
+from morph_dslam.offline.reduction.separable_problem import (
     ParameterAxis,
     SeparableProblem,
     collocation_axis,
     galerkin_axis,
 )
-from morph_dslam.offline.tensor_formats import khatri_rao
+from morph_dslam.offline.reduction.tensor_formats import khatri_rao
 
 
 def quiet(**options) -> PgdOptions:

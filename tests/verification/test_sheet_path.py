@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import SolverError
-from morph_dslam.offline.arc_length import ArcLength, ArcOptions, missed_bifurcations
-from morph_dslam.offline.newton import NewtonOptions, State, advance, sensitivities
-from morph_dslam.offline.sheet_buckling import (
+from morph_dslam.offline.mechanics.sheet_buckling import (
     BuckledSheet,
     BucklingFolder,
     follow_path,
@@ -17,9 +15,11 @@ from morph_dslam.offline.sheet_buckling import (
     solve_positions,
     southwell_load,
 )
-from morph_dslam.offline.sheet_equations import SheetEquations
-from morph_dslam.offline.shell import KoiterSheet, OrthotropicSheet, rectangle_mesh
+from morph_dslam.offline.mechanics.sheet_equations import SheetEquations
+from morph_dslam.offline.mechanics.shell import KoiterSheet, OrthotropicSheet, rectangle_mesh
 from morph_dslam.offline.snapshots import load_snapshot
+from morph_dslam.offline.solvers.arc_length import ArcLength, ArcOptions, missed_bifurcations
+from morph_dslam.offline.solvers.newton import NewtonOptions, State, advance, sensitivities
 
 #: For differences of solutions.
 PRECISE = NewtonOptions(tolerance=1e-12)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morph_dslam.offline.loads import DeadTraction
 from morph_dslam.offline.materials.isotropic import NeoHookean
-from morph_dslam.offline.mesh_generators import block
-from morph_dslam.offline.solid import SolidOptions, SolidProblem
-from morph_dslam.offline.supports import PrescribedDisplacement
+from morph_dslam.offline.mechanics.loads import DeadTraction
+from morph_dslam.offline.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.offline.mechanics.supports import PrescribedDisplacement
+from morph_dslam.offline.meshing.mesh_generators import block
 from tests.support.solids import FACES, RUBBER, AffineSupport, distorted, load_parameter, solved
 
 ROLLERS = (

@@ -7,9 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from morph_dslam.offline.kinematics import ShapeField
-from morph_dslam.offline.linear_solver import default_engine
-from morph_dslam.offline.loads import (
+from morph_dslam.offline.materials.anisotropic import HolzapfelGasserOgden
+from morph_dslam.offline.materials.directions import turned_direction
+from morph_dslam.offline.materials.isotropic import NeoHookean
+from morph_dslam.offline.mechanics.kinematics import ShapeField
+from morph_dslam.offline.mechanics.loads import (
     BodyForce,
     DeadTraction,
     FollowerPressure,
@@ -18,14 +20,17 @@ from morph_dslam.offline.loads import (
     MovingPatch,
     PointLoad,
 )
-from morph_dslam.offline.materials.anisotropic import HolzapfelGasserOgden
-from morph_dslam.offline.materials.directions import turned_direction
-from morph_dslam.offline.materials.isotropic import NeoHookean
-from morph_dslam.offline.mesh_generators import block
-from morph_dslam.offline.newton import NewtonOptions, advance, sensitivities, solve
-from morph_dslam.offline.parameters import ParameterSymbols
-from morph_dslam.offline.solid import SolidOptions, SolidProblem
-from morph_dslam.offline.supports import ElasticFoundation, PrescribedDisplacement, RigidRotation, fixed
+from morph_dslam.offline.mechanics.parameters import ParameterSymbols
+from morph_dslam.offline.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.offline.mechanics.supports import (
+    ElasticFoundation,
+    PrescribedDisplacement,
+    RigidRotation,
+    fixed,
+)
+from morph_dslam.offline.meshing.mesh_generators import block
+from morph_dslam.offline.solvers.linear_solver import default_engine
+from morph_dslam.offline.solvers.newton import NewtonOptions, advance, sensitivities, solve
 from tests.support.solids import RUBBER, distorted, load_parameter
 
 EXACT = NewtonOptions(tolerance=1e-13)

@@ -6,13 +6,13 @@ import ngsolve as ngs
 import numpy as np
 import pytest
 
-from morph_dslam.offline.cell_types import cell_type as type_of
-from morph_dslam.offline.loads import BodyForce, DeadTraction
 from morph_dslam.offline.materials.isotropic import NeoHookean
-from morph_dslam.offline.mesh_generators import block
-from morph_dslam.offline.newton import solve
-from morph_dslam.offline.solid import SolidOptions, SolidProblem
-from morph_dslam.offline.supports import PrescribedDisplacement, fixed
+from morph_dslam.offline.mechanics.loads import BodyForce, DeadTraction
+from morph_dslam.offline.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.offline.mechanics.supports import PrescribedDisplacement, fixed
+from morph_dslam.offline.meshing.cell_types import cell_type as type_of
+from morph_dslam.offline.meshing.mesh_generators import block
+from morph_dslam.offline.solvers.newton import solve
 from tests.support.solids import (
     FACES,
     RUBBER,

@@ -8,10 +8,10 @@ import pytest
 from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.offline.materials.isotropic import NeoHookean
 from morph_dslam.offline.materials.viscoelastic import Prony
-from morph_dslam.offline.mesh_generators import block
-from morph_dslam.offline.newton import advance
-from morph_dslam.offline.solid import SolidProblem
-from morph_dslam.offline.supports import PrescribedDisplacement, fixed
+from morph_dslam.offline.mechanics.solid import SolidProblem
+from morph_dslam.offline.mechanics.supports import PrescribedDisplacement, fixed
+from morph_dslam.offline.meshing.mesh_generators import block
+from morph_dslam.offline.solvers.newton import advance
 from tests.support.solids import distorted, load_parameter
 
 #: g_inf = 0.4, g_1 = 0.6, tau = 2 s.

@@ -18,10 +18,10 @@ from morph_dslam.model import Parameter, ReducedModel, save_model
 from morph_dslam.offline.certificate import certify, compression_percent
 from morph_dslam.offline.external import ExternalStudy
 from morph_dslam.offline.problem import ModelMesh, ParametricStudy, Snapshot, bounds
-from morph_dslam.offline.reduction import reduce
+from morph_dslam.offline.reduction.reduce import reduce
 from morph_dslam.offline.snapshots import load_snapshot
-from morph_dslam.offline.study import Study, load_study
-from morph_dslam.offline.study_sections import ReductionSection
+from morph_dslam.offline.studies.study import Study, load_study
+from morph_dslam.offline.studies.study_sections import ReductionSection
 from morph_dslam.offline.sweep import (
     SweepResult,
     default_executor,

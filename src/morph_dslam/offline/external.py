@@ -18,10 +18,10 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from morph_dslam.errors import StudyError
 from morph_dslam.model import Parameter
-from morph_dslam.offline.meshes import CellBlock, Mesh
-from morph_dslam.offline.model_meshes import model_mesh_of
+from morph_dslam.offline.meshing.meshes import CellBlock, Mesh
+from morph_dslam.offline.meshing.model_meshes import model_mesh_of
 from morph_dslam.offline.problem import ModelMesh, Snapshot
-from morph_dslam.offline.study_sections import ReductionSection, Section
+from morph_dslam.offline.studies.study_sections import ReductionSection, Section
 from morph_dslam.units import quantity_of, to_si
 
 Array = NDArray[np.float64]

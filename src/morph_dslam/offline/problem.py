@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.model import Parameter
-from morph_dslam.offline.study_sections import ReductionSection, SamplingSection, WorkSection
+from morph_dslam.offline.studies.study_sections import ReductionSection, SamplingSection, WorkSection
 
 Array = NDArray[np.float64]
 

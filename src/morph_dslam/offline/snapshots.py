@@ -25,7 +25,7 @@ def source_fingerprint(modules: tuple[str, ...]) -> str:
 
     Parameters
     ----------
-    modules : of this package, "shell" say; a package's name stands for all its modules.
+    modules : of this package, "mechanics/shell" say; a package's name stands for all its modules.
     """
     folder = Path(__file__).parent
     digest = hashlib.sha256()

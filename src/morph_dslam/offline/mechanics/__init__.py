@@ -1,0 +1,1 @@
+"""Solids and shells on NGSolve: spaces, energies, supports, loads, and recovery of fields."""

@@ -1,0 +1,152 @@
+"""Which displacement dofs the supports hold, at which values, and whether they hold the body at all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import StudyError
+from morph_dslam.offline.mechanics.displacement_space import DisplacementSpace
+from morph_dslam.offline.mechanics.kinematics import Shape
+from morph_dslam.offline.mechanics.morphing import surface_normals
+from morph_dslam.offline.mechanics.parameters import ParameterSymbols
+from morph_dslam.offline.mechanics.supports import ElasticFoundation, PrescribedMotion
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+#: A rigid motion whose held part is below this is free.
+FREE_MOTION = 1e-6
+
+
+class Constraints:
+    """Prescribed motions of a solid in terms of its displacement dofs (3 n_scalar, those of x first).
+
+    Attributes
+    ----------
+    held : (3 n_scalar,) whether a support holds the dof.
+    """
+
+    def __init__(
+        self,
+        space: DisplacementSpace,
+        shape: Shape,
+        supports: Sequence[PrescribedMotion | ElasticFoundation],
+        symbols: ParameterSymbols,
+    ) -> None:
+        self._space, self._shape, self._symbols, self._mesh = space, shape, symbols, space.geometry.mesh
+        self._foundations = [s for s in supports if isinstance(s, ElasticFoundation)]
+        self._motions: list[PrescribedMotion] = [s for s in supports if not isinstance(s, ElasticFoundation)]
+        # Coefficients of the constant 1: one at vertices, zero for bubbles.
+        self._constant = np.zeros(space.n_scalar)
+        self._constant[: space.geometry.ngs.nv] = 1.0
+        held = np.zeros((3, space.n_scalar), dtype=bool)
+        self._parts: list[tuple[PrescribedMotion, int, Indices]] = []
+        for motion in self._motions:
+            dofs = space.dofs_on(self._mesh.set_nodes(motion.on))
+            for component in np.flatnonzero(motion.components):
+                new = dofs[~held[component, dofs]]
+                held[component, new] = True
+                self._parts.append((motion, int(component), new))
+        self.held: NDArray[np.bool_] = held.ravel()
+
+    def dofs_of(self, name: str) -> Indices:
+        """Scalar dofs that belong to a node set or surface. Raises StudyError if there is none."""
+        return self._space.dofs_on(self._mesh.set_nodes(name))
+
+    def values(self) -> Array:
+        """(3 n_scalar,) prescribed values at the present parameters; 0 where nothing is held."""
+        result = np.zeros((3, self._space.n_scalar))
+        coordinates = self._shape.coordinates(self._symbols)
+        for motion, component, dofs in self._parts:
+            affine = motion.motion(self._symbols, *self._centroid(motion))
+            rigid = coordinates[dofs] @ affine.matrix[component]
+            result[component, dofs] = rigid + self._constant[dofs] * affine.shift[component]
+        return result.ravel()
+
+    def slopes(self) -> Array:
+        """(d, 3 n_scalar) derivatives of `values` by the parameters."""
+        result = np.zeros((len(self._symbols), 3, self._space.n_scalar))
+        coordinates = self._shape.coordinates(self._symbols)
+        coordinate_slopes = self._shape.coordinate_slopes(self._symbols)
+        for motion, component, dofs in self._parts:
+            affine = motion.motion(self._symbols, *self._centroid(motion))
+            result[:, component, dofs] = (
+                affine.matrix_slopes[:, component] @ coordinates[dofs].T
+                + coordinate_slopes[:, dofs] @ affine.matrix[component]
+                + affine.shift_slopes[:, component, None] * self._constant[dofs]
+            )
+        return result.reshape(len(self._symbols), -1)
+
+    def _centroid(self, motion: PrescribedMotion) -> tuple[Array, Array]:
+        """Mean (3,) of the nodes of the set that a motion is centred on, and its derivatives (d, 3)."""
+        if motion.centred_on is None:
+            return np.zeros(3), np.zeros((len(self._symbols), 3))
+        return self.centroid(motion.centred_on)
+
+    def centroid(self, name: str) -> tuple[Array, Array]:
+        """Mean (3,) of the undeformed nodes of a set, m, and its derivatives (d, 3)."""
+        rows = self._space.node_values[self._mesh.set_nodes(name)]
+        weights = np.asarray(rows.mean(axis=0)).ravel()
+        slopes = self._shape.coordinate_slopes(self._symbols)
+        return weights @ self._shape.coordinates(self._symbols), np.einsum("n,dnc->dc", weights, slopes)
+
+    def resultant(
+        self, name: str, forces: Array, displacement: Array, about: Array | None
+    ) -> tuple[Array, Array]:
+        """Force (3,) and moment (3,) of a set's part of dof ``forces`` (3, n_scalar), N.
+
+        The moment is taken at the deformed positions, ``about`` a point (3,), m, or the set's centroid.
+        """
+        if about is None:
+            about = self.centroid(name)[0]
+        dofs = self.dofs_of(name)
+        constant, f = self._constant[dofs], forces[:, dofs]
+        arms = (self._shape.coordinates(self._symbols)[dofs] + displacement[:, dofs].T).T
+        arms = arms - np.outer(about, constant)
+        return f @ constant, np.cross(arms.T, f.T).sum(axis=0)
+
+    def check_rigid_motions(self) -> None:
+        """Refuse supports that leave the body free to move as a whole (StudyError)."""
+        modes = self._rigid_modes()
+        rows = [modes[self.held.reshape(3, -1)]]
+        for foundation in self._foundations:
+            nodes = self._mesh.surface_nodes(foundation.on)
+            at_nodes = np.stack([self._space.node_values[nodes] @ mode for mode in modes], axis=1)
+            if foundation.normal_only:
+                normals = surface_normals(self._mesh, foundation.on)[nodes]
+                rows.append(np.einsum("kc,kcm->km", normals, at_nodes))
+            else:
+                rows.append(at_nodes.reshape(-1, 6))
+        held = np.concatenate(rows)
+        _, sizes, vectors = np.linalg.svd(held.T @ held)
+        free = vectors[sizes < FREE_MOTION**2 * max(len(held), 1)]
+        if len(free):
+            raise StudyError(
+                f"the supports leave the body free to {_describe(free)}: fix a set, or give it a foundation"
+            )
+
+    def _rigid_modes(self) -> Array:
+        """(3, n_scalar, 6) coefficients of unit translations and of rotations scaled to unit size."""
+        centred = self._space.coordinates - np.outer(self._constant, self._mesh.nodes.mean(axis=0))
+        centred /= np.abs(centred).max()
+        modes = np.zeros((3, self._space.n_scalar, 6))
+        for axis in range(3):
+            modes[axis, :, axis] = self._constant
+            i, j = (axis + 1) % 3, (axis + 2) % 3
+            modes[j, :, 3 + axis] = centred[:, i]
+            modes[i, :, 3 + axis] = -centred[:, j]
+        return modes
+
+
+def _describe(free: Array) -> str:
+    """Words for rigid motions (k, 6)."""
+    share = np.linalg.norm(free, axis=0)
+    moves = [axis for axis, part in zip("xyz", share[:3], strict=True) if part > 0.3]
+    turns = [axis for axis, part in zip("xyz", share[3:], strict=True) if part > 0.3]
+    words = [
+        f"{verb} {', '.join(axes)}" for verb, axes in (("move along", moves), ("turn about", turns)) if axes
+    ]
+    return " and to ".join(words)

@@ -1,0 +1,157 @@
+"""Which material each cell has, and in which form its energy is written."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import ngsolve as ngs
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import StudyError
+from morph_dslam.offline.materials.base import Material, green_lagrange
+from morph_dslam.offline.mechanics.displacement_space import DisplacementSpace
+from morph_dslam.offline.mechanics.pressure_space import PressureSpace, check_mixed
+from morph_dslam.offline.meshing.meshes import Mesh
+
+Array = NDArray[np.float64]
+
+#: Poisson's ratio from which plain displacement elements lock noticeably.
+NEARLY_INCOMPRESSIBLE = 0.49
+
+
+class NearlyIncompressibleWarning(UserWarning):
+    """A nearly incompressible material in elements that lock."""
+
+
+@dataclass(frozen=True)
+class MaterialRegion:
+    """A material, where it is, and its pressure.
+
+    Attributes
+    ----------
+    pressures : None in the displacement form.
+    pressure_unit : Pa; makes pressure unknowns about as large as displacements in metres.
+    flag : what results must be doubted for; empty if nothing.
+    factors : of remainder and volumetric part, in a step of a viscous material.
+    remembered : second Piola-Kirchhoff stress (3x3), Pa, that a viscous material remembers, at the points of
+        its quadrature rules; see `solid_history`.
+    """
+
+    material: Material
+    region: ngs.Region
+    pressures: PressureSpace | None = None
+    pressure_unit: float = 0.0
+    flag: str = ""
+    factors: tuple[Any, Any] = (1.0, 1.0)
+    remembered: Any | None = None
+
+    def pressure(self, unknowns: list[Any]) -> Any | None:
+        """Pressure (Pa, positive in tension) of the functions of its space; None in the displacement form."""
+        return None if self.pressures is None else self.pressure_unit * self.pressures.combine(unknowns)
+
+    def energy(self, F: Any, pressure: Any | None) -> Any:
+        """Strain energy density, Pa; in the mixed form, the density whose stationary value it is."""
+        energy = self.elastic_energy(F, pressure)
+        return energy if self.remembered is None else energy + self.remembered_energy(F)
+
+    def elastic_energy(self, F: Any, pressure: Any | None) -> Any:
+        """`energy` without what the material remembers."""
+        if pressure is None and self.remembered is None:
+            return self.material.energy(F)
+        (shear, bulk), modulus = self.factors, self.material.volumetric_modulus
+        remainder, g = self.material.parts(F)
+        remainder = shear * remainder
+        if modulus is None or g is None:
+            return remainder
+        if pressure is None:
+            return remainder + 0.5 * bulk * modulus * g**2
+        return remainder + pressure * g - pressure * pressure / (2.0 * modulus)
+
+    def remembered_energy(self, F: Any) -> Any:
+        """Work of the remembered stress."""
+        return ngs.InnerProduct(self.remembered, green_lagrange(F))
+
+
+def owners_of_cells(mesh: Mesh, materials: Mapping[str, Material]) -> NDArray[np.int64]:
+    """Position (n_cells,) in ``materials`` of each cell's; "all" takes the cells that no other set names.
+
+    Raises
+    ------
+    StudyError
+        If a set is unknown, or a cell has no material or two.
+    """
+    owners = np.full(mesh.n_cells, -1, dtype=np.int64)
+    names = list(materials)
+    for name in sorted(names, key=lambda name: name == "all"):
+        cells = mesh.cells(name)
+        taken = cells[owners[cells] >= 0]
+        if name == "all":
+            cells = cells[owners[cells] < 0]
+        elif len(taken):
+            other = names[owners[taken[0]]]
+            raise StudyError(f"{len(taken)} cells are in both '{other}' and '{name}', each with a material")
+        owners[cells] = names.index(name)
+    if (owners < 0).any():
+        raise StudyError(
+            f"{int((owners < 0).sum())} of {len(owners)} cells have no material; "
+            "give one to their cell set, or one to 'all'"
+        )
+    return owners
+
+
+def place_materials(
+    space: DisplacementSpace,
+    owners: NDArray[np.int64],
+    materials: Mapping[str, Material],
+    directions: Mapping[str, Array],
+    mixed: bool,
+) -> list[MaterialRegion]:
+    """A region for each material that has cells, in the order of ``materials``.
+
+    Parameters
+    ----------
+    owners : of `owners_of_cells`.
+    directions : fibre fields by name, one direction for each cell (n_cells, 3).
+    mixed : use the mixed form for materials that have a volumetric part.
+
+    Raises
+    ------
+    StudyError
+        If a material is unstable or lacks its fibres, or the cells have no mixed form.
+    """
+    geometry = space.geometry
+    fields = {name: geometry.cell_field(field) for name, field in directions.items()}
+    regions = geometry.partition(owners)
+    result = []
+    for number, (name, material) in enumerate(materials.items()):
+        if number in regions:
+            material = material.with_fibres(fields) if material.fibres else material
+            result.append(_material_region(space, name, material, regions[number], mixed))
+    return result
+
+
+def _material_region(
+    space: DisplacementSpace, name: str, material: Material, region: ngs.Region, mixed: bool
+) -> MaterialRegion:
+    try:
+        material.check()
+    except StudyError as error:
+        raise StudyError(f"material of '{name}': {error}") from error
+    if mixed and material.volumetric_modulus is not None:
+        mesh = space.geometry.mesh
+        check_mixed(mesh, space.order)
+        unit = material.small_strain_stiffness()[3, 3] / float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
+        return MaterialRegion(material, region, PressureSpace(space, region), unit)
+    poisson = material.equivalent_poisson
+    if poisson < NEARLY_INCOMPRESSIBLE:
+        return MaterialRegion(material, region)
+    flag = (
+        f"the material of '{name}' is nearly incompressible (Poisson's ratio {poisson:.4f}) "
+        "in displacement elements, which lock; use mixed elements"
+    )
+    warnings.warn(flag, NearlyIncompressibleWarning, stacklevel=4)
+    return MaterialRegion(material, region, flag=flag)

@@ -1,0 +1,1 @@
+"""Meshes of cells with named sets: their types, generators, files and checks."""

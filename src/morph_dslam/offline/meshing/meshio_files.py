@@ -1,0 +1,200 @@
+"""Gmsh, VTK and VTU files through meshio, with their physical groups and integer data as sets."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import StudyError
+from morph_dslam.offline.meshing.cell_types import cell_type
+from morph_dslam.offline.meshing.face_lookup import find_faces
+from morph_dslam.offline.meshing.meshes import CellBlock, Mesh
+
+Indices = NDArray[np.int64]
+
+#: Our cell types by meshio's names; its node order is VTK's, save that linear prisms are as Abaqus's.
+_CELLS = {
+    "tetra": "tet4", "tetra10": "tet10", "triangle": "tri3", "quad": "quad4",
+    "wedge": "prism6", "wedge18": "prism18",
+    "hexahedron": "hex8", "hexahedron20": "hex20", "hexahedron27": "hex27",
+}  # fmt: skip
+#: Dimension of the cells that may only bound others.
+_BOUNDING = {"vertex": 0, "line": 1, "line3": 1, "triangle6": 2, "quad8": 2, "quad9": 2}
+#: Integer data with more values than this number things rather than group them.
+_MOST_GROUPS = 256
+
+
+def read_with_meshio(path: Path) -> Mesh:
+    """Read a .msh, .vtk or .vtu file; nodes in file units.
+
+    Cells of the highest dimension make the mesh. Gmsh's physical groups of that dimension become cell sets;
+    those of faces of solids become surfaces, and all lower ones node sets. In VTK files integer cell data
+    named d with value v becomes the cell set "d_v", and integer point data the node set "d_v".
+
+    Raises
+    ------
+    StudyError
+        If the file cannot be read, is cut short, or holds cells that are not known.
+    """
+    content = _read(path)
+    dimension = max((_dimension(block.type, path) for block in content.cells), default=0)
+    if dimension < 2 or all(block.type not in _CELLS for block in content.cells):
+        raise StudyError(
+            f"{path} holds no solid or sheet cells; mesh the volume (or the sheet) and save that"
+        )
+    top = [i for i, block in enumerate(content.cells) if _dimension(block.type, path) == dimension]
+    unknown = sorted({content.cells[i].type for i in top} - set(_CELLS))
+    if unknown:
+        raise StudyError(
+            f"{path} holds {', '.join(unknown)} cells, which are not known; use {', '.join(_CELLS)}"
+        )
+    blocks = [CellBlock(_CELLS[content.cells[i].type], content.cells[i].data.astype(np.int64)) for i in top]
+    nodes = np.zeros((len(content.points), 3))
+    nodes[:, : content.points.shape[1]] = content.points
+    mesh = Mesh(nodes, tuple(blocks))
+    for block in blocks:
+        if block.connectivity.size and not 0 <= block.connectivity.min() <= block.connectivity.max() < len(
+            nodes
+        ):
+            raise StudyError(
+                f"{path} has cells that refer to nodes which it does not hold ({len(nodes)} are there)"
+            )
+    return _with_groups(mesh, content, top, dimension, path)
+
+
+def _read(path: Path) -> Any:
+    readers = {".msh": meshio.gmsh.read, ".vtk": meshio.vtk.read, ".vtu": meshio.vtu.read}
+    try:
+        if path.suffix.lower() == ".msh":
+            _check_sections_closed(path)
+        with redirect_stdout(StringIO()), redirect_stderr(StringIO()) as warnings:
+            content = readers[path.suffix.lower()](str(path))
+    except OSError as error:
+        raise StudyError(f"cannot read the mesh {path}: {error.strerror or error}") from error
+    except StudyError:
+        raise
+    except ValueError as error:
+        if "gmsh:physical" in str(error):  # meshio counts the groups wrongly where an entity has none
+            raise StudyError(
+                f"{path} holds cells of no physical group beside cells of some; put every entity that is "
+                "saved into a group, or save the groups alone (Mesh.SaveAll = 0)"
+            ) from error
+        raise _damaged(path, error) from error
+    except KeyError as error:  # a cell type without a place in meshio's tables, or a damaged file
+        if "wedge15" in error.args:
+            raise StudyError(f"{path} holds prisms of 15 nodes; save it as .inp, or with 18 nodes") from error
+        raise _damaged(path, error) from error
+    except Exception as error:  # a damaged file ends meshio's readers in errors of every kind
+        raise _damaged(path, error) from error
+    if (
+        "cannot handle" in warnings.getvalue()
+    ):  # meshio leaves out cells that it does not know, such as voxels
+        raise StudyError(f"{path} holds cells that are not known; use {', '.join(_CELLS)}")
+    return content
+
+
+def _damaged(path: Path, error: Exception) -> StudyError:
+    return StudyError(
+        f"{path} is damaged, cut short, or no {path.suffix} file ({type(error).__name__}: {error})"
+    )
+
+
+def _check_sections_closed(path: Path) -> None:
+    """Meshio only warns where a Gmsh file ends inside a section."""
+    content = path.read_bytes()
+    for name in re.findall(
+        rb"^\$(MeshFormat|PhysicalNames|Entities|Nodes|Elements)\s*$", content, re.MULTILINE
+    ):
+        if not re.search(rb"^\$End" + name + rb"\s*$", content, re.MULTILINE):
+            line = content[: content.index(b"$" + name)].count(b"\n") + 1
+            raise StudyError(
+                f"{path}, line {line}: the section ${name.decode()} is not closed; the file is cut short"
+            )
+
+
+def _dimension(name: str, path: Path) -> int:
+    if name in _CELLS:
+        return cell_type(_CELLS[name]).dimension
+    if name in _BOUNDING:
+        return _BOUNDING[name]
+    raise StudyError(f"{path} holds {name} cells, which are not known; use {', '.join(_CELLS)}")
+
+
+def _groups(content: Any) -> Iterator[tuple[str, list[Indices]]]:
+    """Names of groups, and for each block of the file the positions of the group's cells in it."""
+    physical = content.cell_data.get("gmsh:physical")
+    by_name = {name: part for name, part in content.cell_sets.items() if not name.startswith("gmsh:")}
+    if by_name:
+        for name, parts in by_name.items():
+            yield name, [np.asarray([] if part is None else part, dtype=np.int64) for part in parts]
+    elif physical is not None:
+        dimensions = {name: int(entry[1]) for name, entry in content.field_data.items()}
+        for name, entry in content.field_data.items():
+            yield (
+                name,
+                [
+                    np.flatnonzero((tags == entry[0]) & (_any_dimension(block.type) == dimensions[name]))
+                    for block, tags in zip(content.cells, physical, strict=True)
+                ],
+            )
+    for name, parts in content.cell_data.items():
+        if name.startswith("gmsh:") or not all(np.issubdtype(part.dtype, np.integer) for part in parts):
+            continue
+        values = np.unique(np.concatenate(parts))
+        for value in values if len(values) <= _MOST_GROUPS else ():
+            yield f"{name}_{value}", [np.flatnonzero(part == value) for part in parts]
+
+
+def _any_dimension(name: str) -> int:
+    return cell_type(_CELLS[name]).dimension if name in _CELLS else _BOUNDING[name]
+
+
+def _with_groups(mesh: Mesh, content: Any, top: list[int], dimension: int, path: Path) -> Mesh:
+    starts = dict(zip(top, mesh.block_starts()[:-1], strict=True))
+    node_sets: dict[str, Indices] = {}
+    cell_sets: dict[str, Indices] = {}
+    surfaces: dict[str, Indices] = {}
+    for name, parts in _groups(content):
+        rows = [(i, part) for i, part in enumerate(parts) if len(part)]
+        cells = [starts[i] + part for i, part in rows if i in starts]
+        if cells:
+            cell_sets[name] = np.concatenate(cells)
+            continue
+        bounding = [content.cells[i].data[part] for i, part in rows]
+        if not bounding:
+            continue
+        node_sets[name] = np.unique(np.concatenate([part.ravel() for part in bounding])).astype(np.int64)
+        if dimension == 3 and all(_any_dimension(content.cells[i].type) == 2 for i, _ in rows):
+            surfaces[name] = _faces(mesh, content, rows, name, path)
+    node_sets |= dict(_point_groups(content))
+    return Mesh(mesh.nodes, mesh.blocks, node_sets, cell_sets, surfaces).without_unused_nodes()
+
+
+def _faces(mesh: Mesh, content: Any, rows: list[tuple[int, Indices]], name: str, path: Path) -> Indices:
+    parts = []
+    for i, part in rows:
+        corners = 3 if content.cells[i].type.startswith("triangle") else 4
+        parts.append(find_faces(mesh, content.cells[i].data[part][:, :corners]))
+    faces = np.concatenate(parts)
+    if (faces < 0).any():
+        raise StudyError(
+            f"{path}: {(faces[:, 0] < 0).sum()} faces of group '{name}' are faces of no solid cell"
+        )
+    return faces
+
+
+def _point_groups(content: Any) -> Iterator[tuple[str, Indices]]:
+    for name, values in content.point_data.items():
+        if name.startswith("gmsh:") or values.ndim != 1 or not np.issubdtype(values.dtype, np.integer):
+            continue
+        kinds = np.unique(values)
+        for value in kinds if len(kinds) <= _MOST_GROUPS else ():
+            yield f"{name}_{value}", np.flatnonzero(values == value)

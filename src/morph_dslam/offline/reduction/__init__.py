@@ -1,0 +1,1 @@
+"""From snapshots or operators to separated representations: POD, regression, Galerkin, PGD."""

@@ -1,0 +1,1 @@
+"""Solution of discretised equilibrium: linear solver, Newton, load stepping, arc length, buckling."""

@@ -1,0 +1,293 @@
+"""Sparse direct solution of K_ff x = b with the inertia of K_ff, every solve's residual checked.
+
+PARDISO (Intel MKL, through the optional package pypardiso) where it is installed: its ordering and symbolic
+factorisation are kept as long as the pattern stays. NGSolve's `sparsecholesky` otherwise. The environment
+variable MORPH_LINEAR_SOLVER = pardiso | sparsecholesky overrides the choice. A solve whose residual iterative
+refinement cannot mend is done again by SuperLU, whose pivoting is safer and slower.
+
+PARDISO's settings matter: with its defaults a saddle-point matrix comes back with a relative residual of
+1e-3 and no warning. Scaling and weighted matching (iparm 11, 13) prevent that; `sparse_engines` sets them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any, Protocol
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from morph_dslam.errors import SolverError
+from morph_dslam.offline.solvers.sparse_engines import Pardiso, SparseCholesky, SuperLU
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.integer]
+#: scipy.sparse.csr_matrix, which has no usable type stubs.
+Matrix = Any
+
+#: A solve is good when its residual is below this part of the right-hand side ...
+RESIDUAL_TOLERANCE = 1e-9
+#: ... or below this part of |A| |x| + |b|, which double precision cannot improve (Rigal and Gaches, 1967).
+BACKWARD_ERROR = 1e-14
+REFINEMENTS = 4
+
+ENVIRONMENT_VARIABLE = "MORPH_LINEAR_SOLVER"
+
+
+class Engine(Protocol):
+    """One library's factorisation of a square matrix; `factorise` replaces the one before."""
+
+    def factorise(self, matrix: Matrix) -> None: ...
+    def solve(self, right: Array) -> Array: ...
+    @property
+    def negative_pivots(self) -> int | None: ...
+    def release(self) -> None: ...
+
+
+def default_engine() -> str:
+    """Name of the engine in use: the environment's choice, or PARDISO where it is installed.
+
+    Raises
+    ------
+    SolverError
+        If the environment asks for an engine that is unknown or not installed.
+    """
+    installed = find_spec("pypardiso") is not None
+    chosen = os.environ.get(ENVIRONMENT_VARIABLE, "pardiso" if installed else "sparsecholesky")
+    if chosen not in ("pardiso", "sparsecholesky"):
+        raise SolverError(f"{ENVIRONMENT_VARIABLE}={chosen} is unknown: use pardiso or sparsecholesky")
+    if chosen == "pardiso" and not installed:
+        raise SolverError(
+            f"{ENVIRONMENT_VARIABLE}=pardiso needs pypardiso: pip install 'morph-dslam[pardiso]'"
+        )
+    return chosen
+
+
+@dataclass(frozen=True)
+class _FreeBlock:
+    """Pattern of K_ff in CSR form, and where its entries lie in the data of K.
+
+    Attributes
+    ----------
+    order : index into K's data with one zero appended (the diagonals that K does not store).
+    triangular : whether only the upper triangle is kept.
+    """
+
+    indptr: Integers
+    indices: Integers
+    order: Integers
+    triangular: bool
+
+    @staticmethod
+    def of(indices: Integers, indptr: Integers, free: NDArray[np.bool_], symmetric: bool) -> _FreeBlock:
+        # NGSolve's row pointers are unsigned.
+        rows = np.repeat(np.arange(len(free)), np.diff(np.asarray(indptr, dtype=np.int64)))
+        columns = np.asarray(indices, dtype=np.int64)
+        if symmetric and not np.any(columns > rows):
+            rows, columns = columns, rows  # only the lower triangle is stored: its transpose is the upper one
+        kept = free[rows] & free[columns]
+        if symmetric:
+            kept &= columns >= rows
+        order = np.flatnonzero(kept)
+        number, size = np.cumsum(free) - 1, int(np.count_nonzero(free))
+        rows, columns = number[rows[kept]], number[columns[kept]]
+        # PARDISO wants every diagonal entry of a symmetric matrix stored, zero or not.
+        missing = np.setdiff1d(np.arange(size), rows[rows == columns])
+        rows, columns = np.concatenate([rows, missing]), np.concatenate([columns, missing])
+        order = np.concatenate([order, np.full(len(missing), len(indices))])
+        sorting = np.lexsort((columns, rows))
+        starts = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=size))])
+        return _FreeBlock(
+            starts.astype(np.int32), columns[sorting].astype(np.int32), order[sorting], symmetric
+        )
+
+    def extract(self, data: Array) -> Matrix:
+        size = len(self.indptr) - 1
+        values = np.append(data, 0.0)[self.order]
+        return sp.csr_matrix((values, self.indices, self.indptr), shape=(size, size))
+
+
+def multiply(matrix: Matrix, vectors: Array, triangular: bool) -> Array:
+    """Matrix times ``vectors`` (n,) or (n, k), of a symmetric matrix stored as one triangle if so told."""
+    product = matrix @ vectors
+    if triangular:
+        diagonal = matrix.diagonal()
+        product += matrix.T @ vectors - (diagonal * vectors.T).T
+    return product
+
+
+class Factorisation:
+    """K_ff = L D L^T or L U of one matrix; good until its `LinearSolver` factorises the next."""
+
+    def __init__(self, solver: LinearSolver, matrix: Matrix, triangular: bool) -> None:
+        self._solver, self._matrix, self._triangular = solver, matrix, triangular
+        self._norm = np.max(multiply(abs(matrix), np.ones(matrix.shape[0]), triangular), initial=0.0)
+
+    @property
+    def current(self) -> bool:
+        """Whether this is still the solver's latest factorisation; an older one must not be used."""
+        return self._solver.latest is self
+
+    @property
+    def negative_pivots(self) -> int | None:
+        """Number of negative eigenvalues of K_ff (Sylvester's law of inertia); None if it cannot be told."""
+        return self._solver.engine.negative_pivots if self._matrix.shape[0] else 0
+
+    def solve(self, right: Array) -> Array:
+        """K_ff^-1 right_f.
+
+        Parameters
+        ----------
+        right : (n,) or (k, n) over all dofs; what it holds at prescribed dofs does not matter.
+
+        Returns
+        -------
+        The same shape, zero at prescribed dofs.
+
+        Raises
+        ------
+        SolverError
+            If neither the engine nor SuperLU gives a small residual: the matrix is singular.
+        """
+        free = self._solver.free
+        solution = np.zeros(right.shape)
+        if self._matrix.shape[0]:
+            columns = np.atleast_2d(right)[:, free].T.copy()
+            solution[..., free] = self._solve_checked(columns).T.reshape(*right.shape[:-1], -1)
+        return solution
+
+    def _solve_checked(self, right: Array) -> Array:
+        if not np.all(np.isfinite(right)):
+            raise SolverError("the right-hand side of a linear solve is not finite")
+        for engine in self._solver.engines_to_try(self._matrix):
+            solution = np.zeros_like(right)
+            residual = right
+            for _ in range(1 + REFINEMENTS):
+                solution = solution + engine.solve(residual)
+                if not np.all(np.isfinite(solution)):
+                    break
+                residual = right - multiply(self._matrix, solution, self._triangular)
+                if self._good(residual, solution, right):
+                    return solution
+        raise SolverError(
+            "the tangent matrix is singular: the body may lack supports, or be at a limit point"
+        )
+
+    def _good(self, residual: Array, solution: Array, right: Array) -> bool:
+        remaining = np.abs(residual).max(axis=0)
+        size = np.abs(right).max(axis=0)
+        rounding = BACKWARD_ERROR * (self._norm * np.abs(solution).max(axis=0) + size)
+        return bool(np.all(remaining <= np.maximum(RESIDUAL_TOLERANCE * size, rounding)))
+
+
+class LinearSolver:
+    """Factorises matrices that share their free dofs, one at a time.
+
+    Parameters
+    ----------
+    free : (n,) dofs that are solved for.
+    symmetric : whether the matrices are (then one triangle of them is enough).
+    threads : of PARDISO; None leaves MKL's own choice.
+    engine : "pardiso" or "sparsecholesky"; None for `default_engine`. Unsymmetric matrices go to SuperLU
+        where PARDISO is not used, since `sparsecholesky` reads one triangle only.
+    """
+
+    def __init__(
+        self,
+        free: NDArray[np.bool_],
+        symmetric: bool,
+        threads: int | None = None,
+        engine: str | None = None,
+    ) -> None:
+        self.free, self.symmetric = np.asarray(free, dtype=bool), symmetric
+        if (engine or default_engine()) == "pardiso":
+            self.engine: Engine = Pardiso(symmetric, threads)
+        else:
+            self.engine = SparseCholesky() if symmetric else SuperLU(triangular=False)
+        self._block: _FreeBlock | None = None
+        self._pattern: tuple[Integers, Integers] | None = None
+        self._substitute: SuperLU | None = None
+        self.latest: Factorisation | None = None
+
+    def factorise(self, data: Array, indices: Integers, indptr: Integers) -> Factorisation:
+        """Factorise the free block of K, given in CSR form with sorted indices.
+
+        A symmetric K may come whole or as its lower or upper triangle.
+
+        Raises
+        ------
+        SolverError
+            If an entry is not finite.
+        """
+        if not np.all(np.isfinite(data)):
+            raise SolverError("the tangent matrix is not finite: the deformation is too large or inside out")
+        block = self._block_of(indices, indptr)
+        matrix = block.extract(data)
+        self._substitute = None
+        if matrix.shape[0]:
+            self.engine.factorise(matrix)
+        self.latest = Factorisation(self, matrix, block.triangular)
+        return self.latest
+
+    def _block_of(self, indices: Integers, indptr: Integers) -> _FreeBlock:
+        """The free block's pattern, worked out again only when K's pattern has changed."""
+        known = self._pattern
+        if (
+            self._block is None
+            or known is None
+            or not (np.array_equal(known[0], indices) and np.array_equal(known[1], indptr))
+        ):
+            self._block = _FreeBlock.of(indices, indptr, self.free, self.symmetric)
+            self._pattern = np.array(indices), np.array(indptr)
+        return self._block
+
+    def engines_to_try(self, matrix: Matrix) -> Iterator[Engine]:
+        """The engine, then (lazily, once for each matrix) SuperLU in its place."""
+        yield self.engine
+        if self._substitute is None:
+            self._substitute = SuperLU(triangular=self.symmetric)
+            self._substitute.factorise(matrix)
+        yield self._substitute
+
+    def release(self) -> None:
+        """Give the factorisation's memory back; the next `factorise` begins anew."""
+        self.engine.release()
+        self.latest = self._substitute = None
+
+
+class AssembledLinearisation:
+    """Residual and tangent in CSR form; factorised when first solved with, and again if need be.
+
+    Parameters
+    ----------
+    residual : (n,) internal minus external forces at all dofs.
+    matrix : K over all dofs, whole or, if symmetric, one triangle; its data must not change afterwards.
+    solver : shared by the linearisations of one problem, so that PARDISO's analysis is kept.
+    """
+
+    def __init__(self, residual: Array, matrix: Matrix, solver: LinearSolver) -> None:
+        self.residual, self._matrix, self._solver = residual, matrix, solver
+        self._factorisation: Factorisation | None = None
+        self._triangular = solver.symmetric and (sp.triu(matrix, 1).nnz == 0 or sp.tril(matrix, -1).nnz == 0)
+
+    def _factorised(self) -> Factorisation:
+        if self._factorisation is None or not self._factorisation.current:
+            matrix = self._matrix
+            self._factorisation = self._solver.factorise(matrix.data, matrix.indices, matrix.indptr)
+        return self._factorisation
+
+    @property
+    def negative_pivots(self) -> int | None:
+        return self._factorised().negative_pivots
+
+    def solve(self, right: Array) -> Array:
+        """K_ff^-1 right_f for (n,) or (k, n), zero at prescribed dofs."""
+        return self._factorised().solve(right)
+
+    def apply(self, vectors: Array) -> Array:
+        """K times (n,) or (k, n), at all dofs."""
+        return multiply(self._matrix, vectors.T, self._triangular).T

@@ -1,0 +1,287 @@
+"""Newton's method for discretised equilibrium, from one parameter point to the next.
+
+Any discretisation that offers `Equations` is solved: solids, shells, or three bars in a test. The first
+iteration moves the prescribed dofs together with all others along the tangent (the linearised predictor), so
+that supports may move by far more than an element's size. Damping follows Deuflhard's natural monotonicity
+test (Newton Methods for Nonlinear Problems, 2004, section 3.3): the simplified correction, which reuses the
+factorisation, must shrink. It does not depend on the scaling of the equations, which a test of the residual
+does: stretching and bending residuals of a thin sheet differ by (length / thickness)^2. The simplified
+correction also ends the iteration without the extra factorisation that would only confirm convergence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import SolverError
+from morph_dslam.offline.solvers.continuation import step_towards
+
+Array = NDArray[np.float64]
+
+
+class Linearisation(Protocol):
+    """Residual and tangent at one point; `linear_solver.AssembledLinearisation` is the usual one."""
+
+    residual: Array
+    """(n,) internal minus external forces at all dofs: reactions at prescribed ones."""
+
+    @property
+    def negative_pivots(self) -> int | None:
+        """Negative eigenvalues of the free block of K; None if the solver cannot tell."""
+        ...
+
+    def solve(self, right: Array) -> Array:
+        """K_ff^-1 right_f for (n,) or (k, n), zero at prescribed dofs."""
+        ...
+
+    def apply(self, vectors: Array) -> Array:
+        """K times (n,) or (k, n), at all dofs."""
+        ...
+
+
+class Equations(Protocol):
+    """Discretised equilibrium r(x, mu) = 0 at free dofs, with x given at prescribed ones.
+
+    ``scale`` () or (n,) is what counts as a large change of each dof: the body's length for a displacement,
+    infinity for a dof that follows from the others (a multiplier), whose change is not measured.
+    """
+
+    @property
+    def n_dofs(self) -> int: ...
+
+    @property
+    def free(self) -> NDArray[np.bool_]: ...
+
+    @property
+    def scale(self) -> Array | float: ...
+
+    def prescribed(self, mu: Array) -> Array:
+        """(n,) values at prescribed dofs, 0 at free ones."""
+        ...
+
+    def prescribed_slopes(self, mu: Array) -> Array:
+        """(d, n) derivatives of `prescribed` by mu."""
+        ...
+
+    def residual(self, x: Array, mu: Array) -> Array:
+        """(n,) internal minus external forces at all dofs."""
+        ...
+
+    def linearise(self, x: Array, mu: Array) -> Linearisation: ...
+
+    def residual_slopes(self, x: Array, mu: Array) -> Array:
+        """(d, n) derivatives of the residual by mu at fixed x."""
+        ...
+
+
+@runtime_checkable
+class History(Protocol):
+    """Equations whose response depends on the path (internal variables): told of each accepted solution."""
+
+    def advance_history(self, x: Array, mu: Array) -> None: ...
+
+
+@dataclass(frozen=True)
+class State:
+    """A converged solution.
+
+    Attributes
+    ----------
+    mu : (d,) parameters.
+    dofs : (n,) solution.
+    negative_pivots : of the last factorised tangent; None if the solver cannot tell.
+    iterations : factorisations it took.
+    """
+
+    mu: Array
+    dofs: Array
+    negative_pivots: int | None = None
+    iterations: int = 0
+
+
+@dataclass(frozen=True)
+class NewtonOptions:
+    """When Newton's method has converged and when it is given up; sizes are in units of `Equations.scale`.
+
+    Attributes
+    ----------
+    tolerance : size of the last correction.
+    max_iterations : factorisations.
+    diverged : size of an update that is certainly wrong.
+    smallest_damping : a step damped further has stalled.
+    """
+
+    tolerance: float = 1e-8
+    max_iterations: int = 20
+    diverged: float = 10.0
+    smallest_damping: float = 1.0 / 64.0
+
+
+DEFAULT = NewtonOptions()
+
+
+def size(equations: Equations, update: Array) -> float:
+    """Largest entry of ``update`` (n,) in units of `Equations.scale`."""
+    return float(np.max(np.abs(update / equations.scale)))
+
+
+def correction(linearisation: Linearisation, residual: Array, gap: Array) -> Array:
+    """Newton's update: moves prescribed dofs by ``gap`` (n,) and brings the free residual to zero."""
+    if gap.any():
+        residual = residual + linearisation.apply(gap)
+    return gap - linearisation.solve(residual)
+
+
+def solve(equations: Equations, mu: Array, start: State, options: NewtonOptions = DEFAULT) -> State:
+    """Equilibrium at ``mu`` (d,) by Newton's method from ``start``.
+
+    Raises
+    ------
+    SolverError
+        If it stalls, diverges, or meets values that are not finite; smaller increments may help.
+    """
+    mu = np.array(mu, dtype=float)
+    x, target = start.dofs.copy(), equations.prescribed(mu)
+    for iteration in range(1, options.max_iterations + 1):
+        linearisation = equations.linearise(x, mu)
+        gap = np.where(equations.free, 0.0, target - x)
+        update = correction(linearisation, linearisation.residual, gap)
+        _check_update(equations, update, options, mu)
+        x, rest = _damped_step(equations, mu, x, update, gap, linearisation, options)
+        if rest is not None:
+            return State(mu, x + rest, linearisation.negative_pivots, iteration)
+    raise SolverError(f"Newton's method has not converged in {options.max_iterations} iterations at {mu}")
+
+
+def _check_update(equations: Equations, update: Array, options: NewtonOptions, mu: Array) -> None:
+    largest = size(equations, update)
+    if not largest < options.diverged:
+        raise SolverError(
+            f"Newton's method diverges at {mu}: an update of {largest:.1e} times the body's size"
+        )
+
+
+def _damped_step(
+    equations: Equations,
+    mu: Array,
+    x: Array,
+    update: Array,
+    gap: Array,
+    linearisation: Linearisation,
+    options: NewtonOptions,
+) -> tuple[Array, Array | None]:
+    """The accepted point along ``update``, and the last correction there if that ends the iteration."""
+    length, damping = size(equations, update), 1.0
+    while damping >= options.smallest_damping:
+        trial = x + damping * update
+        residual = equations.residual(trial, mu)
+        if np.all(np.isfinite(residual)):
+            rest = correction(linearisation, residual, (1.0 - damping) * gap)
+            remaining = size(equations, rest)
+            # An update at the level of rounding need not shrink any further.
+            if damping == 1.0 and min(remaining, length) <= options.tolerance:
+                return trial, rest
+            if remaining <= (1.0 - damping / 4.0) * length:
+                return trial, None
+        damping /= 2.0
+    raise SolverError(f"Newton's method stalls at {mu}: no part of its update brings the solution nearer")
+
+
+def sensitivities(equations: Equations, state: State, linearisation: Linearisation | None = None) -> Array:
+    """Derivatives (d, n) of the solution by the parameters, by implicit differentiation.
+
+    One factorisation and one back-substitution a parameter: K dx = -(dr/dmu + K dx_prescribed).
+
+    Parameters
+    ----------
+    linearisation : at the state; made here if not given.
+    """
+    linearisation = linearisation or equations.linearise(state.dofs, state.mu)
+    moved = equations.prescribed_slopes(state.mu)
+    right = equations.residual_slopes(state.dofs, state.mu) + linearisation.apply(moved)
+    return moved - linearisation.solve(right)
+
+
+@dataclass(frozen=True)
+class StabilityChange:
+    """Negative pivots that change between neighbouring states: the path has met a bifurcation between them.
+
+    Attributes
+    ----------
+    before, after : parameters (d,) of the two states.
+    pivots : negative pivots at the two states.
+    """
+
+    before: Array
+    after: Array
+    pivots: tuple[int, int]
+
+    def __str__(self) -> str:
+        return (
+            f"negative pivots change from {self.pivots[0]} to {self.pivots[1]} between {self.before} and "
+            f"{self.after}: a bifurcation was passed; start from a buckling mode as imperfection to follow it"
+        )
+
+
+@dataclass(frozen=True)
+class Path:
+    """States along a path in order, the start included, and the bifurcations passed without branching off."""
+
+    states: tuple[State, ...]
+    missed_bifurcations: tuple[StabilityChange, ...] = ()
+
+
+class PathError(SolverError):
+    """The path could not be followed to its end; ``path`` keeps what was solved."""
+
+    def __init__(self, message: str, path: Path) -> None:
+        super().__init__(message)
+        self.path = path
+
+
+def stability_change(before: State, after: State, expected: int = 0) -> StabilityChange | None:
+    """Compare the negative pivots of neighbours, of which limit points explain ``expected`` changes."""
+    if before.negative_pivots is None or after.negative_pivots is None:
+        return None
+    if abs(after.negative_pivots - before.negative_pivots) == expected:
+        return None
+    return StabilityChange(before.mu, after.mu, (before.negative_pivots, after.negative_pivots))
+
+
+def advance(equations: Equations, start: State, target: Array, options: NewtonOptions = DEFAULT) -> Path:
+    """Solve at ``target`` (d,) along the straight line from ``start``, in increments as large as converge.
+
+    Raises
+    ------
+    PathError
+        Naming the last parameters that converged; it carries the states up to there.
+    """
+    origin, goal = start.mu, np.asarray(target, dtype=float)
+    states: list[State] = [start]
+
+    def attempt(fraction: float, nearby: State) -> State:
+        state = solve(equations, origin + fraction * (goal - origin), nearby, options)
+        if isinstance(equations, History):
+            equations.advance_history(state.dofs, state.mu)
+        states.append(state)
+        return state
+
+    try:
+        step_towards(attempt, start)
+    except SolverError as error:
+        raise PathError(
+            f"{error}; the last parameters that converged are {states[-1].mu}. A load that the body cannot "
+            "carry (a limit point) needs arc length, or an imposed displacement in its place",
+            _path(states),
+        ) from error
+    return _path(states)
+
+
+def _path(states: list[State]) -> Path:
+    changes = (stability_change(before, after) for before, after in pairwise(states))
+    return Path(tuple(states), tuple(change for change in changes if change))

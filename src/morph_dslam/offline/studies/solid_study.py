@@ -1,0 +1,247 @@
+"""The study of a solid: mesh, materials, supports, loads, and the parameters that any of them may name."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator, model_validator
+
+from morph_dslam.errors import StudyError
+from morph_dslam.model import Parameter
+from morph_dslam.offline.mechanics.parameters import ParameterSymbols
+from morph_dslam.offline.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.offline.meshing.mesh_checks import check_mesh
+from morph_dslam.offline.meshing.meshes import Mesh
+from morph_dslam.offline.meshing.model_meshes import model_mesh_of
+from morph_dslam.offline.problem import ModelMesh, Snapshot
+from morph_dslam.offline.snapshots import source_fingerprint
+from morph_dslam.offline.studies.affine import read_affine
+from morph_dslam.offline.studies.load_sections import (
+    BodyForceLoad,
+    GravityLoad,
+    LoadSection,
+    Reader,
+    SupportSection,
+    Value,
+)
+from morph_dslam.offline.studies.material_section import MaterialSection
+from morph_dslam.offline.studies.mesh_section import MeshSection, make_mesh, mesh_fingerprint
+from morph_dslam.offline.studies.parameter_section import ParameterSection, TimeSection
+from morph_dslam.offline.studies.solid_sweep import SolidSweep
+from morph_dslam.offline.studies.study_sections import ReductionSection, SamplingSection, Section, WorkSection
+from morph_dslam.offline.studies.viscous_sweep import ViscousSweep
+
+Array = NDArray[np.float64]
+
+#: Code on which the solution of a solid depends.
+_SOLVER = (
+    "materials",
+    "meshing/cell_types",
+    "mechanics/ngsolve_mesh",
+    "mechanics/displacement_space",
+    "mechanics/pressure_space",
+    "mechanics/kinematics",
+    "mechanics/constraints",
+    "mechanics/parameters",
+    "mechanics/loads",
+    "mechanics/nodal_forces",
+    "mechanics/supports",
+    "mechanics/solid",
+    "mechanics/solid_assembly",
+    "mechanics/solid_materials",
+    "mechanics/solid_history",
+    "mechanics/recovery",
+    "studies/solid_sweep",
+    "studies/viscous_sweep",
+)
+
+
+class SolidSolverSection(WorkSection):
+    """Elements and how the machine is used.
+
+    ``order`` is that of the displacements, the cells' own if absent; ``formulation`` "mixed" gives nearly
+    incompressible materials pressures of their own. One worker with all cores as threads needs the least
+    memory; for small meshes more workers with one thread each are faster.
+    """
+
+    workers: int | None = Field(default=1, ge=1)
+    order: Literal[1, 2] | None = None
+    formulation: Literal["displacement", "mixed"] = "displacement"
+
+
+class SolidStudy(Section):
+    """A hyperelastic solid under supports and loads that depend on parameters."""
+
+    name: str
+    mesh: MeshSection
+    materials: dict[str, MaterialSection] = Field(min_length=1)
+    supports: tuple[SupportSection, ...] = ()
+    loads: tuple[LoadSection, ...] = ()
+    parameters: dict[str, ParameterSection] = Field(min_length=1)
+    time: TimeSection | None = None
+    solver: SolidSolverSection = SolidSolverSection()
+    sampling: SamplingSection = SamplingSection()
+    reduction: ReductionSection = ReductionSection()
+
+    @field_validator("parameters")
+    @classmethod
+    def _names(cls, parameters: dict[str, ParameterSection]) -> dict[str, ParameterSection]:
+        for name in parameters:
+            if not name.isidentifier():
+                raise ValueError(f"'{name}' is no name for a parameter: use letters, digits and underscores")
+        return parameters
+
+    @model_validator(mode="after")
+    def _check_values(self) -> SolidStudy:
+        """Read every value once, so that a mistake is found before anything is solved."""
+        parameters = self.model_parameters()
+
+        def read(value: Value, quantity: str | None) -> float:
+            return read_affine(value, quantity, parameters)(np.array([p.default for p in parameters]))
+
+        for where, section in self._parts():
+            try:
+                section.make(read)
+            except StudyError as error:
+                raise ValueError(f"{where}: {error}") from error
+        self._check_time(parameters)
+        if len({material.on for material in self.materials.values()}) < len(self.materials):
+            raise ValueError("two materials are on the same cell set: give each its own")
+        return self
+
+    def _check_time(self, parameters: tuple[Parameter, ...]) -> None:
+        """Viscous materials need a clock that starts at the lower end of its range."""
+        viscous = [name for name, material in self.materials.items() if "prony" in material.constants]
+        if self.time is None:
+            if viscous:
+                raise ValueError(
+                    f"materials.{viscous[0]} is viscoelastic: say in [time] which parameter is the time"
+                )
+            return
+        clock = next((p for p in parameters if p.name == self.time.parameter), None)
+        if clock is None or clock.quantity != "time":
+            raise ValueError(f"time.parameter: '{self.time.parameter}' is no parameter that measures time")
+        if not viscous:
+            raise ValueError("[time] is for viscoelastic materials, and none has a prony series")
+        if clock.default != clock.lower:
+            raise ValueError(f"parameters.{clock.name}: time starts at the lower end; leave out the default")
+
+    def _parts(self) -> list[tuple[str, Any]]:
+        """Materials, supports and loads with what messages call them."""
+        parts: list[tuple[str, Any]] = [
+            (f"materials.{name}", section) for name, section in self.materials.items()
+        ]
+        for kind, sections in (("support", self.supports), ("load", self.loads)):
+            parts += [(f"{kind} {number}", section) for number, section in enumerate(sections, start=1)]
+        return parts
+
+    def __hash__(self) -> int:
+        return hash(self.model_dump_json())
+
+    # -- what the sweep asks (`morph_dslam.offline.problem.ParametricStudy`) ---------------------------
+
+    @property
+    def work(self) -> WorkSection:
+        """Workers and threads."""
+        return self.solver
+
+    @property
+    def advice(self) -> str:
+        """What to change when the solid cannot be solved."""
+        return (
+            "Narrow the ranges of the parameters, refine the mesh, or prescribe a displacement in place of a "
+            "load past its limit point"
+        )
+
+    def model_parameters(self) -> tuple[Parameter, ...]:
+        """The parameters in the order of the file."""
+        return tuple(section.parameter(name) for name, section in self.parameters.items())
+
+    def solid_mesh(self) -> Mesh:
+        """The mesh, checked together with the sets that the study names.
+
+        Raises
+        ------
+        StudyError
+            If it cannot be made, is not fit to be solved on, or lacks a set.
+        """
+        mesh = make_mesh(self.mesh)  # type: ignore[arg-type]
+        held = [part.on for part in self.supports]
+        regions = [material.on for material in self.materials.values()]
+        for load in self.loads:
+            if isinstance(load, BodyForceLoad):
+                regions.append(load.on)
+            elif not isinstance(load, GravityLoad):
+                held.append(load.on)
+        check_mesh(mesh, held, regions)
+        return mesh
+
+    def fingerprint(self) -> str:
+        """Hash of mesh, materials, supports, loads, parameters' names and elements, and of the code."""
+        content: dict[str, Any] = self.model_dump(mode="json", include={"materials", "supports", "loads"})
+        content["functions"] = [material.source for material in self.materials.values()]
+        content["elements"] = self.solver.order, self.solver.formulation
+        content["parameters"] = list(self.parameters)
+        content["root"] = self.root().tolist() if self.time else None
+        content["time"] = self.time.model_dump() if self.time else None
+        content["mesh"] = mesh_fingerprint(self.solid_mesh())
+        content["code"] = source_fingerprint(_SOLVER)
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    def root(self) -> Array:
+        """The parameters' defaults."""
+        return np.array([parameter.default for parameter in self.model_parameters()])
+
+    def scale(self) -> Array:
+        """The sizes of the ranges."""
+        return np.array([parameter.upper - parameter.lower for parameter in self.model_parameters()])
+
+    def admissible(self, samples: Array) -> Array:
+        """All samples are."""
+        return samples
+
+    def canonical(self, samples: Array) -> Array:
+        """A solid has no mirror images."""
+        return samples
+
+    def images(self, snapshot: Snapshot) -> list[Snapshot]:
+        """The snapshot alone."""
+        return [snapshot]
+
+    def problem(self) -> SolidProblem:
+        """The discretised solid."""
+        parameters = self.model_parameters()
+        symbols = ParameterSymbols(parameters)
+        values = [symbols[parameter.name] for parameter in parameters]
+
+        def read(value: Value, quantity: str | None) -> Any:
+            return read_affine(value, quantity, parameters).expression(values)
+
+        reader: Reader = read
+        return SolidProblem(
+            self.solid_mesh(),
+            {section.on: section.make(reader) for section in self.materials.values()},
+            [section.make(reader) for section in self.supports],
+            [section.make(reader) for section in self.loads],
+            symbols,
+            SolidOptions(
+                order=self.solver.order,
+                mixed=self.solver.formulation == "mixed",
+                threads=self.solver.threads,
+            ),
+            time=symbols[self.time.parameter] if self.time else None,
+        )
+
+    def sweep_problem(self) -> SolidSweep | ViscousSweep:
+        """What the sweep solves with."""
+        if self.time is None:
+            return SolidSweep(self.problem())
+        return ViscousSweep(self.problem(), list(self.parameters).index(self.time.parameter), self.time.step)
+
+    def model_mesh(self) -> ModelMesh:
+        """The nodes of the mesh, its outer surface, its cells, and the volume of each node."""
+        return model_mesh_of(self.solid_mesh())
