@@ -1,4 +1,4 @@
-"""The command line: `morph build | info | export | track | evaluate | simulate | calibrate`.
+"""The command line: `morph build | info | export | explore | track | slam | evaluate | simulate | calibrate`.
 
 Each command imports what it needs when it runs, so that `morph --help` answers at once.
 """
@@ -77,6 +77,30 @@ def _track(arguments: argparse.Namespace) -> None:
     print(f"wrote {arguments.output}")
     print(
         f"tracked={summary['n_tracked']}/{summary['n_frames']} "
+        f"median_ms={summary['median_ms']:.2f} p95_ms={summary['p95_ms']:.2f}"
+    )
+
+
+def _slam(arguments: argparse.Namespace) -> None:
+    from morph_dslam.online.slam.run import SlamRunOptions, run_slam
+
+    first, last = arguments.range
+    summary = run_slam(
+        SlamRunOptions(
+            source=arguments.source,
+            camera=arguments.camera,
+            output=arguments.output,
+            first=first,
+            last=last,
+            video=not arguments.no_video,
+            overwrite=arguments.overwrite,
+        )
+    )
+    for flag in summary["flags"]:
+        print(f"note: {flag}")
+    print(f"wrote {arguments.output}")
+    print(
+        f"start={summary['start_frame']} tracked={summary['n_tracked']}/{summary['n_after_start']} "
         f"median_ms={summary['median_ms']:.2f} p95_ms={summary['p95_ms']:.2f}"
     )
 
@@ -225,6 +249,21 @@ def _add_online_commands(commands: argparse._SubParsersAction) -> None:
 
 
 def _add_camera_commands(commands: argparse._SubParsersAction) -> None:
+    slam = _add(
+        commands,
+        "slam",
+        _slam,
+        "the frames tracked so far and their map are kept in the run folder",
+        "find the path of a camera through a rigid scene, and a map of the scene",
+    )
+    slam.add_argument("source", type=Path, help="recording (docs/sources.md)")
+    slam.add_argument("--camera", type=Path, required=True, help="camera file: size, intrinsics, distortion")
+    slam.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="run folder to write")
+    slam.add_argument(
+        "--range", type=frame_range, default=(None, None), metavar="FIRST-LAST", help="frames to track"
+    )
+    slam.add_argument("--overwrite", action="store_true", help="replace a run that is in the run folder")
+    slam.add_argument("--no-video", action="store_true", help="do not draw the video with tracked points")
     calibrate = _add(
         commands,
         "calibrate",

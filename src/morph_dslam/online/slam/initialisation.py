@@ -44,7 +44,7 @@ class View:
 
 @dataclass(frozen=True)
 class Structure:
-    """Three views explained: poses (3, 4, 4), points (n, 3), which of them fit, and the mean squared error."""
+    """Three views explained: poses (3, 4, 4), points (n, 3), which of them fit, and the errors."""
 
     poses: Array
     points: Array
@@ -157,7 +157,8 @@ class Initialiser:
 
     def _verify(self, view: View) -> MapStart | str:
         """Accept the hypothesis that a third view singles out."""
-        assert self._first is not None and self._second is not None
+        assert self._first is not None
+        assert self._second is not None
         alive = self._alive[self._rows]
         rows = self._rows[alive]
         between = turn_residual_px(self._second.pixels[rows], view.pixels[rows], self._intrinsics)
@@ -184,7 +185,9 @@ class Initialiser:
         self._rows = np.empty(0, dtype=np.int64)
         self._open_views = 0
 
-    def _structure(self, hypothesis: TwoViewHypothesis, points: Array, pixels: list[Array]) -> Structure | None:
+    def _structure(
+        self, hypothesis: TwoViewHypothesis, points: Array, pixels: list[Array]
+    ) -> Structure | None:
         """A hypothesis adjusted to three views; None if the third camera cannot be placed."""
         known = np.isfinite(points[:, 0])
         if known.sum() < self._options.least_start_points:
@@ -206,7 +209,7 @@ class Initialiser:
             errors[view, known] = reprojection_errors(
                 adjusted.camera_from_world[view], adjusted.points, pixels[view][known], self._intrinsics
             )
-        fits = (errors < 2.0).all(axis=0)
+        fits = np.asarray((errors < 2.0).all(axis=0))
         mean_squared = float(np.mean(np.minimum(errors**2, MOST_SQUARED)))
         rms = float(np.sqrt(np.mean(errors[:, fits] ** 2))) if fits.any() else np.inf
         all_points = np.full_like(points, np.nan)

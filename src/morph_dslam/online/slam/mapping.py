@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 #: Observations that miss by more after adjustment are taken out, pixels.
-MOST_ERROR_PX = 2.5
+MOST_ERROR_PX = 4.0
 #: Points of one place: this near in the image, pixels, and their depths alike to this part.
 SAME_PIXEL, SAME_DEPTH = 2.0, 0.1
 #: Map points that are found in a smaller share of the frames that should show them are taken out.
@@ -37,7 +37,7 @@ class Mapper:
         self._n_at_keyframe = 0
 
     def begin(self, start: MapStart) -> Followed:
-        """Fill the empty map from three views, median depth 1 in the first; returns what the last one sees."""
+        """Fill the empty map from three views, median depth 1 in the first; returns what the last sees."""
         scale = 1.0 / float(np.median(start.points[:, 2]))
         ids = self._map.add_points(scale * start.points, start.views[0].pixels, 0, GOOD)
         for view, pose in zip(start.views, start.poses, strict=True):
@@ -53,6 +53,10 @@ class Mapper:
         """Whether the map should keep this view."""
         options, last = self._options, self._map.keyframes[-1]
         if frame_index - last.index < options.least_frames_between:
+            return False
+        if tracked.n_inliers < max(options.urgent_share * self._n_at_keyframe, 4 * options.least_inliers):
+            return True
+        if tracked.image_motion_px > options.quiet_px:
             return False
         if tracked.n_inliers < options.keyframe_share * self._n_at_keyframe:
             return True
@@ -100,8 +104,8 @@ class Mapper:
         if missing < 10:
             return
         mask = np.full(keyframe.flat.shape, 255, dtype=np.uint8)
-        columns, rows = np.rint(keyframe.pixels).astype(int).T
-        mask[rows.clip(0, mask.shape[0] - 1), columns.clip(0, mask.shape[1] - 1)] = 0
+        taken = np.rint(keyframe.pixels).astype(int).clip(0, np.array(mask.shape[::-1]) - 1)
+        mask[taken[:, 1], taken[:, 0]] = 0
         reach = 2 * options.corner_distance_px + 1
         mask = np.asarray(cv2.erode(mask, np.ones((reach, reach), np.uint8)), dtype=np.uint8)
         border = options.flow.window
@@ -115,7 +119,7 @@ class Mapper:
         self._map.extend_keyframe(number, ids, corners)
 
     def _triangulate(self, number: int) -> None:
-        """Turn candidates whose rays have opened into map points; drop those that fit no point, or were lost."""
+        """Turn candidates whose rays have opened into map points; drop those that fit none, or were lost."""
         keyframe, rigid_map = self._map.keyframes[number], self._map
         waiting = np.flatnonzero(rigid_map.state == CANDIDATE)
         rows, seen = keyframe.rows_of(waiting)
@@ -160,13 +164,16 @@ class Mapper:
         _, depths = project(keyframe.camera_from_world, rigid_map.positions, self._intrinsics)
         for pair in pairs:
             older, newer = min(pair), max(pair)
-            states = rigid_map.state[older], rigid_map.state[newer]
-            if GOOD not in states or CANDIDATE not in states:
-                if states != (GOOD, GOOD) or abs(depths[older] / depths[newer] - 1.0) > SAME_DEPTH:
-                    continue
+            if rigid_map.state[older] == GOOD and rigid_map.state[newer] == CANDIDATE:
+                rigid_map.remove(np.array([newer]))
+            elif rigid_map.state[older] == CANDIDATE and rigid_map.state[newer] == GOOD:
+                rigid_map.remove(np.array([older]))
+            elif (
+                rigid_map.state[older] == GOOD
+                and rigid_map.state[newer] == GOOD
+                and abs(depths[older] / depths[newer] - 1.0) < SAME_DEPTH
+            ):
                 rigid_map.merge(int(older), int(newer))
-            else:
-                rigid_map.remove(np.array([older if states[0] == CANDIDATE else newer]))
 
     def _adjust_locally(self) -> None:
         """Bundle adjustment of the newest keyframes that see the same points, held by others that do."""

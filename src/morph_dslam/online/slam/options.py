@@ -26,6 +26,9 @@ class SlamOptions:
     keyframe_share : a keyframe is due when fewer than this share of the last one's points are left.
     keyframe_motion_px : or when points have moved this far since it (median).
     keyframe_baseline : or when the camera has moved this part of the median depth.
+    quiet_px : where keyframes can wait, they wait for frames in which the image moves less than this: fast
+        motion blurs, and most cameras read their rows one after the other, which bends what they see.
+    urgent_share : they cannot wait when fewer than this share of the last one's points are left.
     least_frames_between : keyframes are at least this many frames apart.
     window, fixed_window : keyframes that local bundle adjustment moves, and those that hold it.
     search_points, search_keyframes : lost points looked for in a frame, from at most so many keyframes.
@@ -35,8 +38,8 @@ class SlamOptions:
 
     flow: FlowOptions = field(default_factory=FlowOptions)
     patch_half: int = 6
-    least_correlation: float = 0.75
-    inlier_px: float = 3.0
+    least_correlation: float = 0.6
+    inlier_px: float = 4.0
     least_inliers: int = 20
     start_corners: int = 500
     least_start_points: int = 80
@@ -50,6 +53,8 @@ class SlamOptions:
     keyframe_share: float = 0.75
     keyframe_motion_px: float = 30.0
     keyframe_baseline: float = 0.06
+    quiet_px: float = 4.0
+    urgent_share: float = 0.45
     least_frames_between: int = 3
     window: int = 8
     fixed_window: int = 6

@@ -128,7 +128,9 @@ def refine_pose(
     errors = reprojection_errors(pose, points, pixels, intrinsics)
     rms = float(np.sqrt(np.mean(errors[used] ** 2))) if used.any() else float("inf")
     # Two residuals a point: the noise of one coordinate is the rms over sqrt(2).
-    covariance = np.linalg.pinv(matrix) * max(rms, 0.1) ** 2 / 2.0 if used.any() else np.full((6, 6), np.inf)
+    if not used.any():
+        return PoseEstimate(pose, np.full((6, 6), np.inf), used, rms)
+    covariance = np.asarray(np.linalg.pinv(matrix) * max(rms, 0.1) ** 2 / 2.0, dtype=float)
     return PoseEstimate(pose, covariance, used, rms)
 
 

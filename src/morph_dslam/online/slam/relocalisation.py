@@ -1,8 +1,9 @@
 """Finding the camera again after it was lost: which keyframes look alike, and where their points are now.
 
-Keyframes are ranked by how much their thumbnails resemble the image (as PTAM does, Klein and Murray 2008). ORB
-descriptors, turned upright by each patch's intensity centroid (Rublee et al. 2011), are computed at the map points
-of a keyframe and at the corners of the image, both at several scales, since neither came from ORB's detector.
+Keyframes are ranked by how much their thumbnails resemble the image (as in PTAM, Klein and Murray 2008). ORB
+descriptors, turned upright by each patch's intensity centroid (Rublee et al. 2011), are computed at the map
+points of a keyframe and at the corners of the image, both at several scales, since neither came from ORB's
+detector.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Camera tracking and mapping, one frame after the other.
 
-`Slam.process_frame` is the method: wait for a start, follow the map, keep a view where the map needs it, find the
-camera again when it is lost. The map has no scale of its own: the median depth of its first view is 1.
+`Slam.process_frame` is the method: wait for a start, follow the map, keep a view where the map needs it, find
+the camera again when it is lost. The map has no scale of its own: the median depth of its first view is 1.
 """
 
 from __future__ import annotations
@@ -38,9 +38,10 @@ class SlamFrame:
     ----------
     status : "waiting" for a start, "tracked", "relocalised", or "lost". reason : why there is no pose.
     pose : from the map points, None without one.
-    points : map points that agree with it, and their pixels. candidates : (c, 2) pixels of corners without depth.
+    points : map points that agree with it, and their pixels.
+    candidates : (c, 2) pixels of corners without depth.
     disagreeing : points that look like their map point but do not obey the rigid scene.
-    keyframe : number of the keyframe that ``from_keyframe`` (4, 4), the camera in that keyframe's frame, is in.
+    keyframe : number of the keyframe in whose frame ``from_keyframe`` (4, 4) has the camera.
     is_keyframe : whether the map kept this view. timings_ms : by stage. total_ms : the whole frame.
     """
 

@@ -1,8 +1,8 @@
 """Following the map from frame to frame: where its points are now, and from them the camera's pose.
 
-Each point is followed from the keyframe that last saw it, not from the previous frame, so that errors do not add up
-between keyframes; the previous frame only says where to begin. Points lost from sight are looked for again where
-the pose says they are.
+Each point is followed from the keyframe that last saw it, not from the previous frame, so that errors do not
+add up between keyframes; the previous frame only says where to begin. Points lost from sight are looked for
+again where the pose says they are.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 
-#: Points are looked for from a keyframe only if they are seen from there at about this angle, and distance ratio.
+#: Points are looked for from a keyframe only if they are seen from there at about this angle and distance.
 MOST_VIEW_ANGLE_DEG = 35.0
 MOST_SCALE_CHANGE = 1.6
 #: A point not found in this share of the frames in which it was looked for is looked for after all others.
@@ -39,12 +39,14 @@ class Tracked:
     pose : from the map points; its ``inliers`` belong to the rows of ``points`` that are map points.
     points : inliers and candidates. disagreeing : points that look like their map point but are not where a
         rigid scene would have them.
+    image_motion_px : how far the points moved since the previous frame, median.
     """
 
     pose: PoseEstimate
     points: Followed
     n_inliers: int
     disagreeing: Followed
+    image_motion_px: float = 0.0
 
 
 class Tracker:
@@ -75,7 +77,7 @@ class Tracker:
         """Pose and points of the next frame, or why it is lost; then the newest pose stays what it was."""
         reason = ""
         deeper = FlowOptions(self._options.flow.window, self._options.flow.levels + 1)
-        # The prediction assumes that the motion goes on; if it has changed abruptly, the camera may stand still.
+        # The prediction is that the motion goes on; if it has changed abruptly, that the camera stands still.
         for predicted, flow in (
             (self._motion @ self.camera_from_world, self._options.flow),
             (self.camera_from_world, deeper),
@@ -133,7 +135,9 @@ class Tracker:
         self._map.n_found[found.ids[fits]] += 1
         keep = fits | (self._map.state[found.ids] == CANDIDATE)
         keep &= inside(found.pixels, flat.shape, options.patch_half + 2)
-        return Tracked(pose, found[keep], int(fits.sum()), found[known & ~fits])
+        before, _ = project(self.camera_from_world, self._map.positions[found.ids[fits]], self._intrinsics)
+        moved = np.linalg.norm(found.pixels[fits] - np.nan_to_num(before), axis=1)
+        return Tracked(pose, found[keep], int(fits.sum()), found[known & ~fits], float(np.median(moved)))
 
     def _pose(self, start: Array, found: Followed) -> tuple[PoseEstimate | None, str]:
         options = self._options

@@ -70,7 +70,7 @@ def check_points(
     points: Array, poses: list[Array], pixels: list[Array], intrinsics: Array, max_px: float
 ) -> NDArray[np.bool_]:
     """Which points (n, 3) lie in front of every camera and project within ``max_px`` of their pixels."""
-    good = np.isfinite(points).all(axis=1)
+    good = np.asarray(np.isfinite(points).all(axis=1))
     for pose, seen in zip(poses, pixels, strict=True):
         local = points @ pose[:3, :3].T + pose[:3, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -103,7 +103,7 @@ def _transfer_errors(homography: Array, first: Array, second: Array) -> tuple[Ar
         return mapped[:, :2] / mapped[:, 2:]
 
     forward = ((map_by(homography, first) - second) ** 2).sum(axis=1)
-    backward = ((map_by(np.linalg.inv(homography), second) - first) ** 2).sum(axis=1)
+    backward = ((map_by(np.asarray(np.linalg.inv(homography), dtype=float), second) - first) ** 2).sum(axis=1)
     return backward, forward
 
 
@@ -115,11 +115,13 @@ def two_view_hypotheses(
         [[intrinsics[0], 0.0, intrinsics[2]], [0.0, intrinsics[1], intrinsics[3]], [0.0, 0.0, 1.0]]
     )
     cv2.setRNGSeed(0)
-    options = {"threshold": 1.5 * noise_px, "prob": 0.9999}
-    essential, _ = cv2.findEssentialMat(first, second, matrix, method=cv2.USAC_MAGSAC, **options)
+    essential, _ = cv2.findEssentialMat(
+        first, second, matrix, method=cv2.USAC_MAGSAC, threshold=1.5 * noise_px, prob=0.9999
+    )
     homography, _ = cv2.findHomography(first, second, cv2.USAC_MAGSAC, 2.0 * noise_px, None, 2000, 0.9999)
     if essential is None or homography is None or essential.shape != (3, 3):
         return []
+    essential, homography = np.asarray(essential, dtype=float), np.asarray(homography, dtype=float)
     variance = noise_px**2
     by_lines = sum(
         _score(e / variance, CHI2_ONE) for e in _epipolar_errors(essential, first, second, intrinsics)
@@ -131,7 +133,12 @@ def two_view_hypotheses(
     else:
         one, other, shift = cv2.decomposeEssentialMat(essential)
         motions = [(r, sign * shift.ravel()) for r in (one, other) for sign in (1.0, -1.0)]
-    hypotheses = [_hypothesis(r, s, first, second, intrinsics, noise_px) for r, s in motions]
+    hypotheses = [
+        _hypothesis(
+            np.asarray(r, dtype=float), np.asarray(s, dtype=float), first, second, intrinsics, noise_px
+        )
+        for r, s in motions
+    ]
     hypotheses.sort(key=lambda hypothesis: -int(hypothesis.good.sum()))
     return hypotheses
 

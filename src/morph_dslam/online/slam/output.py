@@ -1,0 +1,180 @@
+"""What a run of camera tracking leaves behind (docs/slam.md)."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections import Counter
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from morph_dslam.io.point_cloud import save_ply
+from morph_dslam.io.trajectory import Trajectory, save_trajectory
+from morph_dslam.online.slam.projection import inverse
+from morph_dslam.online.slam.slam import STAGES, Slam, SlamFrame
+
+Array = NDArray[np.float64]
+
+DPI = 110
+PATH_COLOUR, POINT_COLOUR = "#b4530a", "#8fb3d9"
+#: Blue, green, red of what the video shows.
+INLIER, CANDIDATE, DISAGREEING = (80, 200, 60), (200, 150, 40), (40, 40, 230)
+
+
+def trajectory_of(slam: Slam, frames: list[SlamFrame]) -> Trajectory:
+    """The camera's path through all frames that have a pose, by the final map."""
+    timed = [(frame.timestamp, slam.camera_from_world(frame)) for frame in frames]
+    found = [(time, inverse(pose)) for time, pose in timed if pose is not None]
+    times, poses = [time for time, _ in found], [pose for _, pose in found]
+    return Trajectory(np.array(times), np.array(poses).reshape(-1, 4, 4))
+
+
+def write_run(folder: Path, slam: Slam, frames: list[SlamFrame], extra: dict[str, Any]) -> dict[str, Any]:
+    """Write all files but the video; returns the content of ``summary.json``."""
+    trajectory = trajectory_of(slam, frames)
+    points = slam.map.positions[slam.map.good]
+    save_trajectory(folder / "trajectory.txt", trajectory)
+    save_ply(folder / "map.ply", points)
+    _write_csv(folder / "frames.csv", slam, frames)
+    plots = folder / "plots"
+    plots.mkdir(exist_ok=True)
+    _plot_trajectory(plots / "trajectory.png", trajectory, points)
+    _plot_frames(plots / "frames.png", frames)
+    summary = summarise(slam, frames) | extra
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2, default=str) + "\n")
+    return summary
+
+
+def summarise(slam: Slam, frames: list[SlamFrame]) -> dict[str, Any]:
+    """Counts, errors and times. ``start_frame`` is None where no map was begun."""
+    found = [frame for frame in frames if frame.pose is not None]
+    after = [frame for frame in frames if found and frame.index >= found[0].index]
+    times = np.array([frame.total_ms for frame in after] or [0.0])
+    stages = {s: float(np.median([f.timings_ms[s] for f in after] or [0.0])) for s in STAGES}
+    errors = [frame.pose.rms_px for frame in found if frame.pose is not None]
+    lost = [frame for frame in after if frame.status == "lost"]
+    flags = [f"{len(lost)} frames after the start were lost: frames.csv says why"] if lost else []
+    if not found:
+        flags.append(f"no map was begun: {frames[-1].reason}")
+    return {
+        "n_frames": len(frames),
+        "start_frame": found[0].index if found else None,
+        "n_after_start": len(after),
+        "n_tracked": len(found),
+        "status": dict(Counter(frame.status for frame in frames)),
+        "n_restarts": slam.n_restarts,
+        "n_keyframes": len(slam.map.keyframes),
+        "n_map_points": len(slam.map.good),
+        "median_rms_px": float(np.median(errors)) if errors else None,
+        "median_ms": float(np.median(times)),
+        "p95_ms": float(np.percentile(times, 95)),
+        "stage_median_ms": stages,
+        "scale": "the median depth of the map's first view is 1",
+        "settings": asdict(slam.options),
+        "flags": flags,
+    }
+
+
+def _write_csv(path: Path, slam: Slam, frames: list[SlamFrame]) -> None:
+    header = ["frame", "timestamp_s", "status", "reason", *"xyz", "qx", "qy", "qz", "qw"]
+    header += ["position_std", "rotation_std_deg", "rms_px", "n_points", "n_candidates", "n_disagreeing"]
+    header += ["is_keyframe", *(f"{stage}_ms" for stage in STAGES), "total_ms"]
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        for frame in frames:
+            row: list[Any] = [frame.index, f"{frame.timestamp:.6f}", frame.status, frame.reason]
+            row += [""] * 10 if frame.pose is None else _pose_columns(slam, frame)
+            row += [len(frame.points.ids), len(frame.candidates), len(frame.disagreeing.ids)]
+            row += [int(frame.is_keyframe), *(f"{frame.timings_ms[s]:.3f}" for s in STAGES)]
+            writer.writerow([*row, f"{frame.total_ms:.3f}"])
+
+
+def _pose_columns(slam: Slam, frame: SlamFrame) -> list[str]:
+    camera_from_world = slam.camera_from_world(frame)
+    assert camera_from_world is not None
+    assert frame.pose is not None
+    pose, variances = inverse(camera_from_world), np.diag(frame.pose.covariance)
+    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
+    deviations = [np.sqrt(variances[3:].sum()), np.degrees(np.sqrt(variances[:3].sum()))]
+    return [
+        *(f"{value:.6f}" for value in (*pose[:3, 3], *quaternion)),
+        *(f"{value:.3g}" for value in deviations),
+        f"{frame.pose.rms_px:.4f}",
+    ]
+
+
+def _plot_trajectory(path: Path, trajectory: Trajectory, points: Array) -> None:
+    """The path and the map from above and from the side, as the first view stands."""
+    figure = Figure(figsize=(10.0, 4.6), layout="constrained")
+    if len(points):
+        # A few distant points would shrink everything else.
+        low, high = np.percentile(points, [2, 98], axis=0)
+        points = points[((points >= low) & (points <= high)).all(axis=1)]
+    for axes, vertical, name in zip(
+        figure.subplots(1, 2), (2, 1), ("from above", "from the front"), strict=True
+    ):
+        axes.plot(
+            points[:, 0], points[:, vertical], ".", color=POINT_COLOUR, markersize=2, label="map points"
+        )
+        path_points = trajectory.positions
+        axes.plot(
+            path_points[:, 0], path_points[:, vertical], color=PATH_COLOUR, linewidth=1.4, label="camera"
+        )
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_xlabel("x [map unit]")
+        axes.set_ylabel(f"{'xyz'[vertical]} [map unit]")
+        axes.set_title(name, fontsize=10)
+        if vertical == 1:
+            axes.invert_yaxis()
+    figure.axes[0].legend(fontsize=8, frameon=False)
+    figure.savefig(path, dpi=DPI)
+
+
+def _plot_frames(path: Path, frames: list[SlamFrame]) -> None:
+    """Points, errors and times of every frame."""
+    figure = Figure(figsize=(9.0, 6.0), layout="constrained")
+    counts, errors, times = figure.subplots(3, 1, sharex=True)
+    numbers = [frame.index for frame in frames]
+    counts.plot(numbers, [len(f.points.ids) for f in frames], color=PATH_COLOUR, label="map points")
+    counts.plot(
+        numbers, [len(f.candidates) for f in frames], color=POINT_COLOUR, label="corners without depth"
+    )
+    counts.set_ylabel("points followed")
+    counts.legend(fontsize=8, frameon=False)
+    errors.plot(numbers, [f.pose.rms_px if f.pose else np.nan for f in frames], color=PATH_COLOUR)
+    errors.set_ylabel("RMS error [px]")
+    times.plot(numbers, [f.total_ms for f in frames], color=POINT_COLOUR, linewidth=0.9)
+    keyframes = [f for f in frames if f.is_keyframe]
+    times.plot([f.index for f in keyframes], [f.total_ms for f in keyframes], ".", color=PATH_COLOUR)
+    times.set_ylabel("time [ms], keyframes dotted")
+    times.set_xlabel("frame")
+    for axes in (counts, errors, times):
+        axes.set_ylim(bottom=0.0)
+        for frame in frames:
+            if frame.pose is None:
+                axes.axvspan(frame.index - 0.5, frame.index + 0.5, color="#d9534f", alpha=0.15, linewidth=0)
+    figure.savefig(path, dpi=DPI)
+
+
+def draw_frame(image: NDArray[np.uint8], frame: SlamFrame) -> NDArray[np.uint8]:
+    """The undistorted image (h, w, 3) with map points green, corners blue, what disagrees red."""
+    drawn = image.copy()
+    for pixels, colour in (
+        (frame.candidates, CANDIDATE),
+        (frame.points.pixels, INLIER),
+        (frame.disagreeing.pixels, DISAGREEING),
+    ):
+        for x, y in np.rint(pixels).astype(int).tolist():
+            cv2.circle(drawn, (x, y), 2, colour, -1, cv2.LINE_AA)
+    text = f"{frame.index}  {frame.status}  {frame.reason}"
+    cv2.putText(drawn, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 3, cv2.LINE_AA)
+    cv2.putText(drawn, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
+    return drawn

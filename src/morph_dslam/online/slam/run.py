@@ -1,0 +1,118 @@
+"""`morph slam`: track the camera through a recording, map the scene, write the run folder."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import TrackingError
+from morph_dslam.io.calibration import load_camera
+from morph_dslam.io.video import VideoWriter
+from morph_dslam.online.flow import patch_correlation
+from morph_dslam.online.slam.bundle_adjustment import Observations, adjust
+from morph_dslam.online.slam.options import SlamOptions
+from morph_dslam.online.slam.output import draw_frame, write_run
+from morph_dslam.online.slam.pose import refine_pose
+from morph_dslam.online.slam.slam import Slam, SlamFrame
+from morph_dslam.sources import FrameSource, open_source
+
+
+@dataclass(frozen=True)
+class SlamRunOptions:
+    """What to track and where the results go.
+
+    Attributes
+    ----------
+    source : recording. camera : camera file. output : the run folder.
+    first, last : frame numbers, both included; all by default.
+    video : draw the video with the points followed. overwrite : replace a run that is there already.
+    """
+
+    source: Path
+    camera: Path
+    output: Path
+    first: int | None = None
+    last: int | None = None
+    video: bool = True
+    overwrite: bool = False
+    slam: SlamOptions = field(default_factory=SlamOptions)
+
+
+def run_slam(options: SlamRunOptions) -> dict[str, Any]:
+    """Track the camera through a recording and write the run folder.
+
+    An interrupt, or a recording that ends early, keeps what was done: the run folder is completed with the
+    frames so far and the exception goes on.
+
+    Returns
+    -------
+    The content of ``summary.json``.
+
+    Raises
+    ------
+    MorphError
+        If an input cannot be used (CameraError, SourceError) or the run folder holds a run (TrackingError).
+    """
+    camera = load_camera(options.camera)
+    source = open_source(options.source, options.first, options.last)
+    _prepare_folder(options)
+    warm_up()
+    slam, frames = Slam(camera, options.slam), []
+    try:
+        _process(slam, source, camera, options, frames)
+    finally:
+        summary = _finish(slam, frames, options) if frames else {}
+    return summary
+
+
+def _process(
+    slam: Slam, source: FrameSource, camera: PinholeCamera, options: SlamRunOptions, frames: list[SlamFrame]
+) -> None:
+    """Process all frames into ``frames``."""
+    maps = camera.undistortion_maps()
+    size = (camera.width, camera.height)
+    video = VideoWriter(options.output / "tracked.mp4", source.fps, size) if options.video else nullcontext()
+    with video as writer:
+        for frame in tqdm(source, total=len(source), desc="tracking", unit="frame"):
+            frames.append(slam.process_frame(frame.image, frame.index, frame.timestamp))
+            if writer is not None:
+                image = frame.image if maps is None else cv2.remap(frame.image, *maps, cv2.INTER_LINEAR)
+                writer.write(draw_frame(np.asarray(image, dtype=np.uint8), frames[-1]))
+
+
+def _finish(slam: Slam, frames: list[SlamFrame], options: SlamRunOptions) -> dict[str, Any]:
+    slam.refine_map()
+    inputs = {"source": str(options.source), "camera": str(options.camera)}
+    return write_run(options.output, slam, frames, {"inputs": inputs})
+
+
+def _prepare_folder(options: SlamRunOptions) -> None:
+    if (options.output / "trajectory.txt").exists() and not options.overwrite:
+        raise TrackingError(
+            f"{options.output} holds a run already: choose another folder, or allow it to be overwritten"
+        )
+    try:
+        options.output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TrackingError(f"cannot make the run folder {options.output}: {error.strerror}") from error
+
+
+def warm_up() -> None:
+    """Compile the inner loops, so that no frame has to wait for it."""
+    print("preparing: compiling the inner loops (half a minute the first time) ...", file=sys.stderr)
+    rng = np.random.default_rng(0)
+    points, intrinsics = rng.uniform([-1, -1, 3], [1, 1, 4], size=(20, 3)), np.array([100.0, 100.0, 0.0, 0.0])
+    pixels = points[:, :2] / points[:, 2:] * 100.0
+    refine_pose(np.eye(4), points, pixels, intrinsics)
+    seen = Observations(np.repeat([0, 1], 20), np.tile(np.arange(20), 2), np.concatenate([pixels, pixels]))
+    adjust(np.stack([np.eye(4)] * 2), points, seen, intrinsics, np.array([True, False]), iterations=1)
+    image, centre = rng.integers(0, 255, (32, 32)).astype(np.uint8), np.array([[16.0, 16.0]])
+    patch_correlation(image, image, centre, centre, 5)

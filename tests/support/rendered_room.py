@@ -1,0 +1,100 @@
+"""Rendered films of a textured room with boxes, a plane, or nothing, with exact camera poses."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.render.rasteriser import rasterise
+from morph_dslam.render.texture import render_textured
+from tests.support.rendered_sequence import printed_texture
+
+CAMERA = PinholeCamera(640, 480, 525.0, 525.0, 319.5, 239.5)
+#: Texture pixels a metre: about one for each pixel of the image at the usual distance of 2.5 m.
+DENSITY = 210.0
+
+
+def _rectangle(corner, right, down, texture_corner, cells=12):
+    """Nodes, triangles and texture coordinates of a rectangle, cut so that clipping loses little."""
+    corner, right, down = (np.asarray(x, dtype=float) for x in (corner, right, down))
+    a, b = (axis.ravel() for axis in np.meshgrid(np.linspace(0, 1, cells + 1), np.linspace(0, 1, cells + 1)))
+    nodes = corner + a[:, None] * right + b[:, None] * down
+    size = DENSITY * np.array([np.linalg.norm(right), np.linalg.norm(down)])
+    index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
+    p, q, r, s = (x.ravel() for x in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    triangles = np.concatenate([np.column_stack([p, q, r]), np.column_stack([p, r, s])])
+    return nodes, triangles, np.column_stack([a, b]) * size + texture_corner
+
+
+def _box(centre, size, rng):
+    """The front, the sides, the top and the bottom of a box."""
+    x, y, z = np.asarray(size) / 2.0
+    c = np.asarray(centre)
+    faces = [
+        (c + [-x, -y, -z], [2 * x, 0, 0], [0, 2 * y, 0]),
+        (c + [-x, -y, z], [0, 0, -2 * z], [0, 2 * y, 0]),
+        (c + [x, -y, -z], [0, 0, 2 * z], [0, 2 * y, 0]),
+        (c + [-x, -y, z], [2 * x, 0, 0], [0, 0, -2 * z]),
+        (c + [-x, y, -z], [2 * x, 0, 0], [0, 0, 2 * z]),
+    ]
+    return [_rectangle(*face, rng.uniform(0, 600, 2), cells=4) for face in faces]
+
+
+def room(rng):
+    """Walls 4 m apart, the far one at 4 m, a floor, and boxes before them; y points down, z away."""
+    parts = [
+        _rectangle([-2, -1.5, 4], [4, 0, 0], [0, 2.8, 0], [0, 0]),
+        _rectangle([-2, -1.5, 0], [0, 0, 4], [0, 2.8, 0], [300, 500]),
+        _rectangle([2, -1.5, 4], [0, 0, -4], [0, 2.8, 0], [500, 200]),
+        _rectangle([-2, 1.3, 4], [4, 0, 0], [0, 0, -4], [100, 600]),
+    ]
+    for centre in ([-0.9, 0.8, 2.6], [0.6, 0.6, 3.0], [1.2, -0.5, 2.4], [-0.3, -0.6, 3.2]):
+        parts += _box(centre, rng.uniform(0.4, 0.8, 3), rng)
+    return parts
+
+
+def wall(_rng):
+    """One plane, turned a little."""
+    return [_rectangle([-3.0, -2.5, 2.2], [6.0, 0, 0.9], [0, 5.0, 0.2], [0, 0])]
+
+
+class RoomFilm:
+    """Renders a scene, by default the `room`, from given places."""
+
+    def __init__(self, seed=0, scene=room, camera=CAMERA):
+        self.rng, self.camera = np.random.default_rng(seed), camera
+        parts = scene(self.rng)
+        offsets = np.cumsum([0, *(len(nodes) for nodes, _, _ in parts)])
+        self.nodes = np.concatenate([nodes for nodes, _, _ in parts])
+        self.triangles = np.concatenate([t + o for (_, t, _), o in zip(parts, offsets, strict=False)])
+        self.coordinates = np.concatenate([coordinates for _, _, coordinates in parts])
+        tile = printed_texture(900, 900, seed)
+        self.texture = np.tile(tile, (2, 2))
+
+    def frame(self, world_from_camera, noise=2.0, light=1.0):
+        """Grey image (h, w) uint8."""
+        camera = self.camera
+        local = (self.nodes - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
+        buffers = rasterise(camera.project(local), local[:, 2], self.triangles, camera.height, camera.width)
+        image = light * render_textured(buffers, self.triangles, self.coordinates, self.texture).astype(float)
+        image += noise * self.rng.standard_normal(image.shape)
+        return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def pose(position, rotation_vector=(0.0, 0.0, 0.0)):
+    """world_from_camera (4, 4)."""
+    result = np.eye(4)
+    result[:3, :3] = Rotation.from_rotvec(rotation_vector).as_matrix()
+    result[:3, 3] = position
+    return result
+
+
+def hand_held(n, seed=0, reach=0.5):
+    """Poses (n, 4, 4) of a camera that sways and turns smoothly; ``reach`` metres to either side."""
+    rng = np.random.default_rng(seed)
+    time, phase = np.linspace(0.0, 1.0, n), rng.uniform(0.0, 0.6, 6)
+    waves = np.sin(2.0 * np.pi * np.outer(time, [0.9, 0.7, 0.5, 0.6, 0.8, 0.5]) + phase) - np.sin(phase)
+    positions = waves[:, :3] * [reach, 0.4 * reach, 0.5 * reach]
+    turns = waves[:, 3:] * [0.06, 0.22, 0.05]
+    return np.array([pose(p, t) for p, t in zip(positions, turns, strict=True)])
