@@ -52,3 +52,7 @@ class TrajectoryError(MorphError):
 
 class ExportError(MorphError):
     """An export asks for states outside the model's box, or cannot be written."""
+
+
+class ExploreError(MorphError):
+    """A model cannot be shown at the port that was asked for."""

@@ -1,4 +1,4 @@
-"""Commands that show a model elsewhere: `morph export` to other programs."""
+"""Commands that show a model elsewhere: `morph export` to other programs, `morph explore` in the browser."""
 
 from __future__ import annotations
 
@@ -15,8 +15,14 @@ def _export(arguments: argparse.Namespace) -> None:
     print(f"wrote {target} and {arguments.output / 'states.csv'}")
 
 
+def _explore(arguments: argparse.Namespace) -> None:
+    from morph_dslam.explore.server import explore
+
+    explore(arguments.model, arguments.port, arguments.open)
+
+
 def add_view_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
-    """Add the commands; ``add(name, action, kept, text)`` makes the parser of one."""
+    """Add both commands; ``add(name, action, kept, text)`` makes the parser of one."""
     export = add(
         "export",
         _export,
@@ -43,3 +49,14 @@ def add_view_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         metavar="NAME=VALUE",
         help="value of a parameter that is not varied (default: its default)",
     )
+    explore = add(
+        "explore",
+        _explore,
+        "nothing was written",
+        "show a model in the browser, deformed and coloured by stress, with a slider for each parameter",
+    )
+    explore.add_argument("model", type=Path, help="model file")
+    explore.add_argument(
+        "--port", type=int, default=8765, metavar="N", help="on this computer; 0: any (default: %(default)s)"
+    )
+    explore.add_argument("--open", action="store_true", help="open the browser at once")
