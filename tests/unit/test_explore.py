@@ -2,6 +2,10 @@
 
 import http.client
 import json
+import re
+import signal
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -155,3 +159,22 @@ def test_a_port_that_is_taken(serve, tmp_path, capsys):
         for taken in (port, "70000"):
             assert cli.main(["explore", str(tmp_path / "block.morph"), "--port", taken]) == 2
             assert f"morph: port {taken} cannot be taken" in capsys.readouterr().err
+
+
+def test_the_command_serves_until_it_is_interrupted(tmp_path):
+    save_model(tmp_path / "block.morph", stretched_block_model())
+    program = (
+        "import signal, sys; from morph_dslam.cli import main\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have switched it off\n"
+        "sys.exit(main(sys.argv[1:]))"
+    )
+    command = [sys.executable, "-c", program, "explore", str(tmp_path / "block.morph"), "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        (port,) = re.findall(r"http://127\.0\.0\.1:(\d+)/", process.stdout.readline())
+        connection = http.client.HTTPConnection(HOST, int(port), timeout=20)
+        connection.request("GET", "/model.json")
+        assert json.loads(connection.getresponse().read())["name"] == "stretched block"
+        connection.close()
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=20)
+    assert (process.returncode, errors) == (0, "")

@@ -63,7 +63,7 @@ export class SolidView {
     this.camera = new THREE.PerspectiveCamera(FIELD_OF_VIEW, 1, distance / 100, distance * 100);
     this.camera.up.set(0, 0, 1);
     this.camera.position.copy(center).addScaledVector(VIEWED_FROM, distance);
-    const light = new THREE.DirectionalLight(0xffffff, 0.5 * Math.PI);
+    const light = new THREE.DirectionalLight(0xffffff, 0.4 * Math.PI);
     light.position.set(-0.3, 0.5, 1); // over the viewer's left shoulder
     this.camera.add(light, light.target);
     this.scene.add(this.camera);
