@@ -29,15 +29,15 @@ def _rectangle(corner, right, down, texture_corner, cells=12):
 
 def _box(centre, size, rng):
     """The front, the sides, the top and the bottom of a box."""
-    x, y, z = np.asarray(size) / 2.0
-    c = np.asarray(centre)
-    faces = [
-        (c + [-x, -y, -z], [2 * x, 0, 0], [0, 2 * y, 0]),
-        (c + [-x, -y, z], [0, 0, -2 * z], [0, 2 * y, 0]),
-        (c + [x, -y, -z], [0, 0, 2 * z], [0, 2 * y, 0]),
-        (c + [-x, -y, z], [2 * x, 0, 0], [0, 0, -2 * z]),
-        (c + [-x, y, -z], [2 * x, 0, 0], [0, 0, 2 * z]),
-    ]
+    corners = {  # of the face: left, top and depth in halves of the size, then its sides
+        "front": ((-1, -1, -1), (2, 0, 0), (0, 2, 0)),
+        "left": ((-1, -1, 1), (0, 0, -2), (0, 2, 0)),
+        "right": ((1, -1, -1), (0, 0, 2), (0, 2, 0)),
+        "top": ((-1, -1, 1), (2, 0, 0), (0, 0, -2)),
+        "bottom": ((-1, 1, -1), (2, 0, 0), (0, 0, 2)),
+    }
+    half = np.asarray(size) / 2.0
+    faces = [(centre + half * a, half * b, half * c) for a, b, c in corners.values()]
     return [_rectangle(*face, rng.uniform(0, 600, 2), cells=4) for face in faces]
 
 

@@ -53,8 +53,8 @@ class SlamOptions:
     keyframe_share: float = 0.75
     keyframe_motion_px: float = 30.0
     keyframe_baseline: float = 0.06
-    quiet_px: float = 4.0
-    urgent_share: float = 0.45
+    quiet_px: float = 5.0
+    urgent_share: float = 0.6
     least_frames_between: int = 3
     window: int = 8
     fixed_window: int = 6

@@ -107,13 +107,16 @@ def refine_pose(
 ) -> PoseEstimate:
     """Pose (4, 4) from points (n, 3) and their pixels (n, 2), started at ``start``.
 
-    After each round the points that miss by more than ``inlier_px`` are left out of the next.
+    After each round the points that miss by more than ``inlier_px`` are left out of the next. Without four
+    points that fit there is no inlier and the covariance is infinite.
     """
     pose, used = np.ascontiguousarray(start, dtype=np.float64), np.ones(len(points), dtype=bool)
     matrix = np.eye(6)
     for _ in range(rounds):
         if used.sum() < 4:
-            break
+            return PoseEstimate(
+                pose, np.full((6, 6), np.inf), np.zeros(len(points), dtype=bool), float("inf")
+            )
         pose, matrix = _refine(
             pose,
             np.ascontiguousarray(points[used]),
@@ -126,10 +129,10 @@ def refine_pose(
         errors = reprojection_errors(pose, points, pixels, intrinsics)
         used = errors < inlier_px
     errors = reprojection_errors(pose, points, pixels, intrinsics)
-    rms = float(np.sqrt(np.mean(errors[used] ** 2))) if used.any() else float("inf")
-    # Two residuals a point: the noise of one coordinate is the rms over sqrt(2).
     if not used.any():
-        return PoseEstimate(pose, np.full((6, 6), np.inf), used, rms)
+        return PoseEstimate(pose, np.full((6, 6), np.inf), used, float("inf"))
+    rms = float(np.sqrt(np.mean(errors[used] ** 2)))
+    # Two residuals a point: the noise of one coordinate is the rms over sqrt(2).
     covariance = np.asarray(np.linalg.pinv(matrix) * max(rms, 0.1) ** 2 / 2.0, dtype=float)
     return PoseEstimate(pose, covariance, used, rms)
 

@@ -17,9 +17,9 @@ from morph_dslam.online.flow import flatten
 from morph_dslam.online.slam.initialisation import Initialiser, MapStart
 from morph_dslam.online.slam.mapping import Mapper, pose_in_keyframe
 from morph_dslam.online.slam.options import SlamOptions
-from morph_dslam.online.slam.pose import PoseEstimate
+from morph_dslam.online.slam.pose import PoseEstimate, refine_pose
 from morph_dslam.online.slam.relocalisation import Relocaliser
-from morph_dslam.online.slam.rigid_map import CANDIDATE, Followed, RigidMap
+from morph_dslam.online.slam.rigid_map import CANDIDATE, GOOD, Followed, RigidMap
 from morph_dslam.online.slam.tracking import Tracked, Tracker
 from morph_dslam.online.timing import StageClock
 
@@ -116,10 +116,22 @@ class Slam:
             self._mapper.adjust_all()
 
     def camera_from_world(self, frame: SlamFrame) -> Array | None:
-        """The camera's pose (4, 4) by what the map knows now; None where the frame has none."""
+        """The camera's pose (4, 4) by what the map knows now; None where the frame has none.
+
+        The map may have been adjusted since: the pose is found again from what is left of the frame's points.
+        """
         if frame.from_keyframe is None:
             return None
-        return frame.from_keyframe @ self.map.keyframes[frame.keyframe].camera_from_world
+        start = frame.from_keyframe @ self.map.keyframes[frame.keyframe].camera_from_world
+        points = frame.points[self.map.state[frame.points.ids] == GOOD]
+        if len(points.ids) < self.options.least_inliers:
+            return start
+        known = self.map.positions[points.ids]
+        estimate = refine_pose(
+            start, known, points.pixels, self.camera.intrinsics, inlier_px=self.options.inlier_px
+        )
+        enough = estimate.inliers.sum() >= self.options.least_inliers
+        return estimate.camera_from_world if enough else start
 
     def _prepare(self, image: NDArray[np.uint8], index: int) -> Image:
         self.camera.check_image(image, f"frame {index}")

@@ -1,0 +1,160 @@
+"""Camera tracking and mapping on rendered films with exact camera poses."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from morph_dslam.cli import main
+from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
+from morph_dslam.online.slam.output import trajectory_of
+from morph_dslam.online.slam.slam import Slam
+from morph_dslam.similarity import fit_similarity
+from tests.support.rendered_room import CAMERA, RoomFilm, hand_held, pose, wall
+
+N_FRAMES = 80
+
+
+def follow(images):
+    slam = Slam(CAMERA)
+    return slam, [slam.process_frame(image, index, index / 30.0) for index, image in enumerate(images)]
+
+
+def errors_after_alignment(slam, frames, truth):
+    """Distances of the camera centres after Sim(3), and the length of the true path."""
+    estimate = trajectory_of(slam, frames).positions
+    expected = np.array([truth[f.index][:3, 3] for f in frames if f.pose is not None])
+    aligned = fit_similarity(estimate, expected).apply(estimate)
+    length = np.linalg.norm(np.diff(expected, axis=0), axis=1).sum()
+    return np.linalg.norm(aligned - expected, axis=1), length
+
+
+@pytest.fixture(scope="module")
+def room_film():
+    film, truth = RoomFilm(seed=1), hand_held(N_FRAMES, seed=1)
+    return [film.frame(place) for place in truth], truth
+
+
+@pytest.fixture(scope="module")
+def room_run(room_film):
+    return follow(room_film[0])
+
+
+def test_the_path_through_a_room_is_found(room_run, room_film):
+    slam, frames = room_run
+    slam.refine_map()
+    status = [frame.status for frame in frames]
+    start = status.index("tracked")
+    assert start <= 30
+    assert set(status[:start]) == {"waiting"}
+    assert set(status[start:]) == {"tracked"}
+    errors, length = errors_after_alignment(slam, frames, room_film[1])
+    assert np.median(errors) < 0.005 * length
+    assert errors.max() < 0.01 * length
+
+
+def test_the_map_lies_on_the_walls(room_run, room_film):
+    slam, frames = room_run
+    estimate = trajectory_of(slam, frames).positions
+    truth = np.array([room_film[1][f.index][:3, 3] for f in frames if f.pose is not None])
+    points = fit_similarity(estimate, truth).apply(slam.map.positions[slam.map.good])
+    assert len(points) > 300
+    # The room's walls are at x = -2 and 2, z = 4, the floor at y = 1.3; nothing is behind them.
+    outside = np.maximum.reduce([np.abs(points[:, 0]) - 2.0, points[:, 2] - 4.0, points[:, 1] - 1.3])
+    assert np.quantile(outside, 0.98) < 0.05
+    assert (np.abs(outside) < 0.03).mean() > 0.4
+
+
+def test_reported_deviations_are_of_the_size_of_the_errors(room_run):
+    _, frames = room_run
+    found = [frame for frame in frames if frame.pose is not None]
+    assert all(0.05 < frame.pose.rms_px < 1.5 for frame in found)
+    assert all(np.isfinite(frame.pose.covariance).all() for frame in found)
+
+
+def test_the_same_film_gives_the_same_result(room_run, room_film):
+    _, again = follow(room_film[0][:40])
+    for one, other in zip(room_run[1], again, strict=False):
+        assert one.status == other.status
+        assert np.array_equal(one.points.ids, other.points.ids)
+        if one.pose is not None:
+            assert np.array_equal(one.pose.camera_from_world, other.pose.camera_from_world)
+
+
+def test_a_plane_gives_the_right_path():
+    film, truth = RoomFilm(seed=2, scene=wall), hand_held(45, seed=2)
+    slam, frames = follow([film.frame(place) for place in truth])
+    errors, length = errors_after_alignment(slam, frames, truth)
+    assert len(errors) > 20
+    assert np.median(errors) < 0.005 * length
+
+
+def test_a_camera_that_only_turns_waits_and_says_why():
+    film = RoomFilm(seed=3)
+    turns = [
+        pose((0.0, 0.0, 0.0), (0.05 * np.sin(i / 4.0), 0.01 * i, 0.02 * np.cos(i / 5.0))) for i in range(25)
+    ]
+    _, frames = follow([film.frame(place) for place in turns])
+    assert {frame.status for frame in frames} == {"waiting"}
+    assert "not enough parallax" in frames[-1].reason
+
+
+def test_the_camera_is_found_again_after_a_blackout(room_film):
+    images, truth = room_film
+    dark = [np.full_like(images[0], 3)] * 15
+    slam, frames = follow([*images[:50], *dark, *images[30:50]])
+    assert {frame.status for frame in frames[50:65]} == {"lost"}
+    assert all(frame.reason for frame in frames[50:65])
+    again = [frame.status for frame in frames[65:]]
+    assert again[0] == "relocalised"
+    assert set(again[1:]) == {"tracked"}
+    errors, length = errors_after_alignment(slam, frames, [*truth[:50], *truth[:15], *truth[30:50]])
+    assert np.median(errors) < 0.005 * length
+
+
+@pytest.mark.parametrize("kind", ["black", "noise", "repeated"])
+def test_films_that_show_no_motion_start_nothing(kind, room_film):
+    rng = np.random.default_rng(0)
+    images = {
+        "black": [np.zeros((480, 640), np.uint8)] * 8,
+        "noise": [rng.integers(0, 256, (480, 640)).astype(np.uint8) for _ in range(8)],
+        "repeated": [room_film[0][0]] * 8,
+    }[kind]
+    slam, frames = follow(images)
+    assert {frame.status for frame in frames} == {"waiting"}
+    assert all(frame.reason for frame in frames)
+    assert not slam.map.keyframes
+
+
+def write_film(folder, film):
+    images, truth = film
+    folder.mkdir()
+    for index, image in enumerate(images[:40]):
+        cv2.imwrite(str(folder / f"{index:04d}.png"), image)
+    camera = f"width: 640\nheight: 480\nfx: {CAMERA.fx}\nfy: {CAMERA.fy}\ncx: {CAMERA.cx}\ncy: {CAMERA.cy}\n"
+    (folder.parent / "camera.yaml").write_text(camera)
+    save_trajectory(folder.parent / "truth.txt", Trajectory(np.arange(40) / 30.0, np.array(truth[:40])))
+
+
+def test_the_command_writes_a_run_that_evaluate_reads(tmp_path, room_film, capsys):
+    write_film(tmp_path / "film", room_film)
+    run = tmp_path / "run"
+    command = ["slam", str(tmp_path / "film"), "--camera", str(tmp_path / "camera.yaml"), "-o", str(run)]
+    assert main(command) == 0
+    assert "tracked=" in capsys.readouterr().out
+    written = {str(path.relative_to(run)) for path in run.rglob("*.*")}
+    assert written == {
+        *("trajectory.txt", "map.ply", "frames.csv", "summary.json", "tracked.mp4"),
+        *("plots/trajectory.png", "plots/frames.png"),
+    }
+    summary = json.loads((run / "summary.json").read_text())
+    assert summary["n_frames"] == 40
+    assert summary["n_tracked"] == len(load_trajectory(run / "trajectory.txt"))
+    assert len((run / "frames.csv").read_text().splitlines()) == 41
+    assert main(["evaluate", str(run), "--trajectory", str(tmp_path / "truth.txt")]) == 0
+    figures = json.loads((run / "trajectory_evaluation.json").read_text())
+    assert figures["sim3"]["absolute_mm"]["rmse"] < 5.0
+    # A second run does not replace the first unless it is told to.
+    assert main(command) == 2
+    assert "holds a run already" in capsys.readouterr().err
