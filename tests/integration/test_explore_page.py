@@ -28,7 +28,7 @@ def show(page):
     def start(model):
         server = make_server(model, 0)
         servers.append(server)
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+        threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
         page.send("Page.navigate", url=f"http://127.0.0.1:{server.server_address[1]}/")
         page.wait_for(f"document.title === '{model.name}' && document.getElementById('largest').value")
         return page

@@ -4,6 +4,8 @@ import http.client
 import json
 import re
 import signal
+import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -26,7 +28,7 @@ def serve():
     def start(model):
         server = make_server(model, 0)
         servers.append(server)
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+        threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
 
         def get(path, host=None, method="GET"):
             connection = http.client.HTTPConnection(*server.server_address, timeout=20)
@@ -37,6 +39,7 @@ def serve():
             connection.close()
             return found
 
+        get.port = server.server_address[1]
         return get
 
     yield start
@@ -178,3 +181,13 @@ def test_the_command_serves_until_it_is_interrupted(tmp_path):
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=20)
     assert (process.returncode, errors) == (0, "")
+
+
+def test_a_page_that_is_closed_at_once_is_no_error(serve, capfd):
+    get = serve(stretched_block_model())
+    for _ in range(20):
+        with socket.create_connection((HOST, get.port)) as closed:
+            closed.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # reset, not end
+            closed.sendall(b"GET /three/three.core.min.js HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    assert get("/model.json")[0] == 200
+    assert capfd.readouterr().err == ""

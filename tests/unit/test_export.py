@@ -1,6 +1,7 @@
 """Exports read back by other programs' readers: the states, the mesh, and every field in closed form."""
 
 import csv
+from dataclasses import replace
 
 import meshio
 import numpy as np
@@ -12,6 +13,7 @@ from morph_dslam.errors import ExportError
 from morph_dslam.export.export import StateChoice, export
 from morph_dslam.export.gltf import FRAMES_PER_SECOND
 from morph_dslam.model import save_model
+from morph_dslam.offline.meshing.mesh_generators import block
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.stretched_block import SHEAR_MODULUS, SIZE, YOUNG_MODULUS, stretched_block_model
 
@@ -77,6 +79,42 @@ def test_an_xdmf_series_over_a_grid(folder, tmp_path, monkeypatch):
             step, data, _ = series.read_data(i)
             assert step == i
             assert_block_state(points, cells[0].data, data, *state)
+
+
+@pytest.mark.parametrize(
+    ("cell_type", "name", "size"),
+    [
+        ("tet4", "tetra", 4), ("tet10", "tetra10", 10),
+        ("hex8", "hexahedron", 8), ("hex20", "hexahedron20", 20), ("hex27", "hexahedron27", 27),
+        ("prism6", "wedge", 6), ("prism15", "wedge", 6), ("prism18", "wedge18", 18),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("file_format", ["vtu", "xdmf"])
+def test_every_type_of_cell(cell_type, name, size, file_format, tmp_path):
+    """meshio has no prisms of 15 nodes: their corners are written."""
+    mesh = block(SIZE, (2, 1, 1), cell_type)
+    model = stretched_block_model()
+    modes = np.zeros((2, len(mesh.nodes), 3))
+    model = replace(
+        model,
+        nodes=mesh.nodes,
+        triangles=mesh.surface_triangles(),
+        displacement=replace(model.displacement, modes=modes),
+        stresses={},
+        strain=None,
+        cells={cell_type: mesh.blocks[0].connectivity},
+    )
+    save_model(tmp_path / "block.morph", model)
+    target = export(tmp_path / "block.morph", tmp_path, file_format, StateChoice(vary=["slide=0:1:2"]))
+    if file_format == "vtu":
+        read = meshio.read(tmp_path / "block_0001.vtu")
+        cells, data = read.cells_dict[name], read.point_data
+    else:
+        with meshio.xdmf.TimeSeriesReader(target) as series:
+            (cells,) = (part.data for part in series.read_points_cells()[1] if part.type == name)
+            _, data, _ = series.read_data(1)
+    np.testing.assert_array_equal(cells, mesh.blocks[0].connectivity[:, :size])
+    assert set(data) == {"displacement"}
 
 
 def test_stress_on_both_faces_of_a_sheet(folder, tmp_path):

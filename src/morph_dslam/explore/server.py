@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import webbrowser
 from functools import partial
 from http import HTTPStatus
@@ -127,6 +128,15 @@ class _Handler(BaseHTTPRequestHandler):
         """Nothing: a slider asks many times a second."""
 
 
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, request, client_address) -> None:
+        """Say nothing of a page that was closed before its answer came."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
+
+
 def make_server(model: ReducedModel, port: int) -> ThreadingHTTPServer:
     """A server for one model on this computer's own address; ``port`` 0 takes any free one.
 
@@ -136,13 +146,11 @@ def make_server(model: ReducedModel, port: int) -> ThreadingHTTPServer:
         If the port cannot be taken.
     """
     try:
-        server = ThreadingHTTPServer((HOST, port), partial(_Handler, Answers(model)))
+        return _Server((HOST, port), partial(_Handler, Answers(model)))
     except (OSError, OverflowError) as error:
         raise ExploreError(
             f"port {port} cannot be taken ({error}); choose another with --port; --port 0 takes any free one"
         ) from error
-    server.daemon_threads = True
-    return server
 
 
 def explore(model_path: Path, port: int, open_browser: bool) -> None:

@@ -23,11 +23,11 @@ from morph_dslam.model.reduced_model import von_mises
 
 Array = NDArray[np.float64]
 
-#: meshio's names of the cell types, whose order of nodes is VTK's in both.
+#: meshio's name and number of nodes of each cell type; meshio has no prisms of 15 nodes: their corners stand.
 _MESHIO_CELLS = {
-    "hex8": "hexahedron", "hex20": "hexahedron20", "hex27": "hexahedron27",
-    "tet4": "tetra", "tet10": "tetra10",
-    "prism6": "wedge", "prism15": "wedge15", "prism18": "wedge18",
+    "hex8": ("hexahedron", 8), "hex20": ("hexahedron20", 20), "hex27": ("hexahedron27", 27),
+    "tet4": ("tetra", 4), "tet10": ("tetra10", 10),
+    "prism6": ("wedge", 6), "prism15": ("wedge", 6), "prism18": ("wedge18", 18),
 }  # fmt: skip
 #: Where the nine components of a symmetric tensor stand among xx, yy, zz, yz, xz, xy.
 _FULL_TENSOR = [0, 5, 4, 5, 1, 3, 4, 3, 2]
@@ -54,10 +54,14 @@ def point_fields(model: ReducedModel, mu: Array) -> dict[str, ArrayLike]:
     return {name: values.astype(np.float32) for name, values in fields.items()}
 
 
-def _cells(model: ReducedModel) -> dict[str, ArrayLike]:
+def _cells(model: ReducedModel) -> list[tuple[str, ArrayLike] | meshio.CellBlock]:
     if not model.cells:
-        return {"triangle": model.triangles.astype(np.int32)}
-    return {_MESHIO_CELLS[name]: cells.astype(np.int32) for name, cells in model.cells.items()}
+        return [("triangle", model.triangles.astype(np.int32))]
+    result: list[tuple[str, ArrayLike] | meshio.CellBlock] = []
+    for cell_type, cells in model.cells.items():
+        name, size = _MESHIO_CELLS[cell_type]
+        result.append((name, cells[:, :size].astype(np.int32)))
+    return result
 
 
 def write_vtu_series(folder: Path, stem: str, model: ReducedModel, states: Array) -> Path:
