@@ -8,6 +8,7 @@ import pytest
 
 from morph_dslam.cli import main
 from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
+from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.slam.output import trajectory_of
 from morph_dslam.online.slam.slam import Slam
 from morph_dslam.similarity import fit_similarity
@@ -158,3 +159,36 @@ def test_the_command_writes_a_run_that_evaluate_reads(tmp_path, room_film, capsy
     # A second run does not replace the first unless it is told to.
     assert main(command) == 2
     assert "holds a run already" in capsys.readouterr().err
+
+
+def test_an_interrupted_run_keeps_what_was_mapped(tmp_path, room_film, monkeypatch):
+    write_film(tmp_path / "film", room_film)
+    process = Slam.process_frame
+
+    def interrupted(slam, image, index, timestamp):
+        if index == 25:
+            raise KeyboardInterrupt
+        return process(slam, image, index, timestamp)
+
+    monkeypatch.setattr(Slam, "process_frame", interrupted)
+    run = tmp_path / "run"
+    camera = str(tmp_path / "camera.yaml")
+    assert main(["slam", str(tmp_path / "film"), "--camera", camera, "-o", str(run), "--no-video"]) == 130
+    assert json.loads((run / "summary.json").read_text())["n_frames"] == 25
+    assert len(load_trajectory(run / "trajectory.txt")) > 5
+    assert not (run / "tracked.mp4").exists()
+
+
+def test_a_young_map_that_stays_lost_is_given_up_with_its_poses(room_film):
+    images, truth = room_film
+    elsewhere, places = RoomFilm(seed=9), hand_held(40, seed=9)
+    slam = Slam(CAMERA, SlamOptions(restart_after=5))
+    film = [*images[:16], *(elsewhere.frame(place) for place in places)]
+    frames = [slam.process_frame(image, index, index / 30.0) for index, image in enumerate(film)]
+    assert slam.n_restarts == 1
+    errors, length = errors_after_alignment(
+        slam, [f for f in frames if slam.is_placed(f)], [*truth[:16], *places]
+    )
+    assert len(trajectory_of(slam, frames)) == len(errors)
+    assert all(frame.index > 20 for frame in frames if slam.is_placed(frame))
+    assert np.median(errors) < 0.005 * length

@@ -45,7 +45,7 @@ class SlamOptions:
     least_start_points: int = 80
     start_parallax_deg: float = 1.2
     start_rms_px: float = 1.0
-    start_share: float = 0.75
+    start_share: float = 0.9
     start_clearness: float = 1.5
     map_corners: int = 450
     corner_distance_px: int = 9

@@ -54,13 +54,15 @@ def write_run(folder: Path, slam: Slam, frames: list[SlamFrame], extra: dict[str
 
 def summarise(slam: Slam, frames: list[SlamFrame]) -> dict[str, Any]:
     """Counts, errors and times. ``start_frame`` is None where no map was begun."""
-    found = [frame for frame in frames if frame.pose is not None]
+    found = [frame for frame in frames if slam.is_placed(frame)]
     after = [frame for frame in frames if found and frame.index >= found[0].index]
     times = np.array([frame.total_ms for frame in after] or [0.0])
     stages = {s: float(np.median([f.timings_ms[s] for f in after] or [0.0])) for s in STAGES}
     errors = [frame.pose.rms_px for frame in found if frame.pose is not None]
     lost = [frame for frame in after if frame.status == "lost"]
     flags = [f"{len(lost)} frames after the start were lost: frames.csv says why"] if lost else []
+    if slam.n_restarts:
+        flags.append(f"{slam.n_restarts} young maps were lost for too long and given up, with their poses")
     if not found:
         flags.append(f"no map was begun: {frames[-1].reason}")
     return {
@@ -91,7 +93,7 @@ def _write_csv(path: Path, slam: Slam, frames: list[SlamFrame]) -> None:
         writer.writerow(header)
         for frame in frames:
             row: list[Any] = [frame.index, f"{frame.timestamp:.6f}", frame.status, frame.reason]
-            row += [""] * 10 if frame.pose is None else _pose_columns(slam, frame)
+            row += _pose_columns(slam, frame) if slam.is_placed(frame) else [""] * 10
             row += [len(frame.points.ids), len(frame.candidates), len(frame.disagreeing.ids)]
             row += [int(frame.is_keyframe), *(f"{frame.timings_ms[s]:.3f}" for s in STAGES)]
             writer.writerow([*row, f"{frame.total_ms:.3f}"])

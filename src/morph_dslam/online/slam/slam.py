@@ -42,6 +42,7 @@ class SlamFrame:
     candidates : (c, 2) pixels of corners without depth.
     disagreeing : points that look like their map point but do not obey the rigid scene.
     keyframe : number of the keyframe in whose frame ``from_keyframe`` (4, 4) has the camera.
+    map_number : how many maps had been given up before the one that the pose is in.
     is_keyframe : whether the map kept this view. timings_ms : by stage. total_ms : the whole frame.
     """
 
@@ -55,6 +56,7 @@ class SlamFrame:
     disagreeing: Followed = NOWHERE
     keyframe: int = -1
     from_keyframe: Array | None = None
+    map_number: int = 0
     is_keyframe: bool = False
     timings_ms: dict[str, float] = field(default_factory=dict)
     total_ms: float = 0.0
@@ -115,12 +117,16 @@ class Slam:
         if len(self.map.keyframes) > 2:
             self._mapper.adjust_all()
 
+    def is_placed(self, frame: SlamFrame) -> bool:
+        """Whether a frame has a pose in the map that there is now."""
+        return frame.from_keyframe is not None and frame.map_number == self.n_restarts
+
     def camera_from_world(self, frame: SlamFrame) -> Array | None:
         """The camera's pose (4, 4) by what the map knows now; None where the frame has none.
 
         The map may have been adjusted since: the pose is found again from what is left of the frame's points.
         """
-        if frame.from_keyframe is None:
+        if frame.from_keyframe is None or not self.is_placed(frame):
             return None
         start = frame.from_keyframe @ self.map.keyframes[frame.keyframe].camera_from_world
         points = frame.points[self.map.state[frame.points.ids] == GOOD]
@@ -190,5 +196,6 @@ class Slam:
             "disagreeing": tracked.disagreeing,
             "keyframe": number,
             "from_keyframe": pose_in_keyframe(camera_from_world, self.map.keyframes[number]),
+            "map_number": self.n_restarts,
             "is_keyframe": is_keyframe,
         }
