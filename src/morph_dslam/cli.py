@@ -12,25 +12,13 @@ from functools import partial
 from pathlib import Path
 
 from morph_dslam import __version__
+from morph_dslam.camera_commands import add_camera_commands
+from morph_dslam.command_arguments import frame_range
 from morph_dslam.errors import EvaluationError, MorphError
 from morph_dslam.view_commands import add_view_commands
 
 USER_ERROR = 2
 INTERRUPTED = 130
-
-
-def frame_range(text: str) -> tuple[int | None, int | None]:
-    """Frame numbers "first-last", both included; "9-", "-100" and "9" are ranges too."""
-    first, dash, last = text.partition("-")
-    try:
-        numbers = (int(first) if first else None, int(last) if last else None)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a range of frames such as 9-100") from None
-    if not dash:
-        numbers = (numbers[0], numbers[0])
-    if text in ("", "-") or (None not in numbers and numbers[0] > numbers[1]):  # type: ignore[operator]
-        raise argparse.ArgumentTypeError(f"'{text}' is not a range of frames such as 9-100")
-    return numbers
 
 
 def _build(arguments: argparse.Namespace) -> None:
@@ -81,30 +69,6 @@ def _track(arguments: argparse.Namespace) -> None:
     )
 
 
-def _slam(arguments: argparse.Namespace) -> None:
-    from morph_dslam.online.slam.run import SlamRunOptions, run_slam
-
-    first, last = arguments.range
-    summary = run_slam(
-        SlamRunOptions(
-            source=arguments.source,
-            camera=arguments.camera,
-            output=arguments.output,
-            first=first,
-            last=last,
-            video=not arguments.no_video,
-            overwrite=arguments.overwrite,
-        )
-    )
-    for flag in summary["flags"]:
-        print(f"note: {flag}")
-    print(f"wrote {arguments.output}")
-    print(
-        f"start={summary['start_frame']} tracked={summary['n_tracked']}/{summary['n_after_start']} "
-        f"median_ms={summary['median_ms']:.2f} p95_ms={summary['p95_ms']:.2f}"
-    )
-
-
 def _evaluate(arguments: argparse.Namespace) -> None:
     if arguments.trajectory is not None:
         from morph_dslam.evaluation.trajectory_report import evaluate_trajectory, trajectory_line
@@ -131,19 +95,6 @@ def _simulate(arguments: argparse.Namespace) -> None:
     simulate(arguments.scene, arguments.output)
 
 
-def _calibrate(arguments: argparse.Namespace) -> None:
-    from morph_dslam.calibration.board import parse_board
-    from morph_dslam.calibration.calibrate import calibrate, picture_path
-
-    board = parse_board(arguments.board, arguments.square)
-    calibration = calibrate(arguments.source, board, arguments.output, arguments.lens)
-    print(calibration.table())
-    for remark in calibration.remarks():
-        print(f"note: {remark}")
-    print(f"wrote {arguments.output} and {picture_path(arguments.output)}")
-    print(calibration.line())
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="morph", description="Track a deformable solid in video with a physics-based reduced model."
@@ -153,7 +104,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_offline_commands(commands)
     add_view_commands(partial(_add, commands))
     _add_online_commands(commands)
-    _add_camera_commands(commands)
+    add_camera_commands(partial(_add, commands))
     return parser
 
 
@@ -245,49 +196,6 @@ def _add_online_commands(commands: argparse._SubParsersAction) -> None:
         type=int,
         metavar="N",
         help="with --points: frame whose pixels bind the truth points to the mesh",
-    )
-
-
-def _add_camera_commands(commands: argparse._SubParsersAction) -> None:
-    slam = _add(
-        commands,
-        "slam",
-        _slam,
-        "the frames tracked so far and their map are kept in the run folder",
-        "find the path of a camera through a rigid scene, and a map of the scene",
-    )
-    slam.add_argument("source", type=Path, help="recording (docs/sources.md)")
-    slam.add_argument("--camera", type=Path, required=True, help="camera file: size, intrinsics, distortion")
-    slam.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="run folder to write")
-    slam.add_argument(
-        "--range", type=frame_range, default=(None, None), metavar="FIRST-LAST", help="frames to track"
-    )
-    slam.add_argument("--overwrite", action="store_true", help="replace a run that is in the run folder")
-    slam.add_argument("--no-video", action="store_true", help="do not draw the video with tracked points")
-    calibrate = _add(
-        commands,
-        "calibrate",
-        _calibrate,
-        "nothing was written",
-        "find a camera's intrinsics and distortion from pictures of a checkerboard",
-    )
-    calibrate.add_argument(
-        "source", type=Path, nargs="+", help="images, a folder of images, or a video (docs/cameras.md)"
-    )
-    calibrate.add_argument(
-        "--board", required=True, metavar="9x6", help="inner corners, where four squares meet, each way"
-    )
-    calibrate.add_argument(
-        "--square", required=True, metavar="'25 mm'", help="side of one square, with its unit"
-    )
-    calibrate.add_argument(
-        "--lens",
-        choices=("radial-tangential", "fisheye"),
-        default="radial-tangential",
-        help="lens model: fisheye for views of more than about 120 degrees",
-    )
-    calibrate.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="CAMERA", help="camera file to write (.yaml)"
     )
 
 

@@ -1,0 +1,88 @@
+"""Commands about a camera alone: where it moved (`morph slam`), what it is (`morph calibrate`)."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+from morph_dslam.command_arguments import frame_range
+
+
+def _slam(arguments: argparse.Namespace) -> None:
+    from morph_dslam.online.slam.run import SlamRunOptions, run_slam
+
+    first, last = arguments.range
+    summary = run_slam(
+        SlamRunOptions(
+            source=arguments.source,
+            camera=arguments.camera,
+            output=arguments.output,
+            first=first,
+            last=last,
+            video=not arguments.no_video,
+            overwrite=arguments.overwrite,
+        )
+    )
+    for flag in summary["flags"]:
+        print(f"note: {flag}")
+    print(f"wrote {arguments.output}")
+    print(
+        f"start={summary['start_frame']} tracked={summary['n_tracked']}/{summary['n_after_start']} "
+        f"median_ms={summary['median_ms']:.2f} p95_ms={summary['p95_ms']:.2f}"
+    )
+
+
+def _calibrate(arguments: argparse.Namespace) -> None:
+    from morph_dslam.calibration.board import parse_board
+    from morph_dslam.calibration.calibrate import calibrate, picture_path
+
+    board = parse_board(arguments.board, arguments.square)
+    calibration = calibrate(arguments.source, board, arguments.output, arguments.lens)
+    print(calibration.table())
+    for remark in calibration.remarks():
+        print(f"note: {remark}")
+    print(f"wrote {arguments.output} and {picture_path(arguments.output)}")
+    print(calibration.line())
+
+
+def add_camera_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
+    """Add both commands; ``add(name, action, kept, text)`` makes the parser of one."""
+    slam = add(
+        "slam",
+        _slam,
+        "the frames tracked so far and their map are kept in the run folder",
+        "find the path of a camera through a rigid scene, and a map of the scene",
+    )
+    slam.add_argument("source", type=Path, help="recording (docs/sources.md)")
+    slam.add_argument("--camera", type=Path, required=True, help="camera file: size, intrinsics, distortion")
+    slam.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="run folder to write")
+    slam.add_argument(
+        "--range", type=frame_range, default=(None, None), metavar="FIRST-LAST", help="frames to track"
+    )
+    slam.add_argument("--overwrite", action="store_true", help="replace a run that is in the run folder")
+    slam.add_argument("--no-video", action="store_true", help="do not draw the video with tracked points")
+    calibrate = add(
+        "calibrate",
+        _calibrate,
+        "nothing was written",
+        "find a camera's intrinsics and distortion from pictures of a checkerboard",
+    )
+    calibrate.add_argument(
+        "source", type=Path, nargs="+", help="images, a folder of images, or a video (docs/cameras.md)"
+    )
+    calibrate.add_argument(
+        "--board", required=True, metavar="9x6", help="inner corners, where four squares meet, each way"
+    )
+    calibrate.add_argument(
+        "--square", required=True, metavar="'25 mm'", help="side of one square, with its unit"
+    )
+    calibrate.add_argument(
+        "--lens",
+        choices=("radial-tangential", "fisheye"),
+        default="radial-tangential",
+        help="lens model: fisheye for views of more than about 120 degrees",
+    )
+    calibrate.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="CAMERA", help="camera file to write (.yaml)"
+    )

@@ -1,0 +1,19 @@
+"""Kinds of values that several commands take."""
+
+from __future__ import annotations
+
+import argparse
+
+
+def frame_range(text: str) -> tuple[int | None, int | None]:
+    """Frame numbers "first-last", both included; "9-", "-100" and "9" are ranges too."""
+    first, dash, last = text.partition("-")
+    try:
+        numbers = (int(first) if first else None, int(last) if last else None)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a range of frames such as 9-100") from None
+    if not dash:
+        numbers = (numbers[0], numbers[0])
+    if text in ("", "-") or (None not in numbers and numbers[0] > numbers[1]):  # type: ignore[operator]
+        raise argparse.ArgumentTypeError(f"'{text}' is not a range of frames such as 9-100")
+    return numbers
