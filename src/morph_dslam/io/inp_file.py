@@ -54,12 +54,17 @@ class Elements:
 
 @dataclass(frozen=True)
 class Section:
-    """A *SOLID SECTION or *SHELL SECTION: which material an element set has; thickness in file units."""
+    """A *SOLID SECTION or *SHELL SECTION: which material an element set has.
+
+    ``thickness`` is in file units, None for solids; ``orientation`` names the material's axes if they are
+    turned.
+    """
 
     element_set: str
     material: str
     thickness: float | None
     line: Line
+    orientation: str = ""
 
 
 @dataclass(frozen=True)
@@ -198,7 +203,8 @@ def _read_section(card: Card) -> Section:
         if not card.data:
             raise card.line.error("*SHELL SECTION lacks the thickness on the line below it")
         thickness = card.data[0].real(0)
-    return Section(card.required("ELSET"), card.required("MATERIAL"), thickness, card.line)
+    orientation = card.parameters.get("ORIENTATION", "")
+    return Section(card.required("ELSET"), card.required("MATERIAL"), thickness, card.line, orientation)
 
 
 def _refuse_what_moves_nodes(cards: list[Card]) -> None:

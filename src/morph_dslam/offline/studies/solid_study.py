@@ -12,14 +12,16 @@ from pydantic import Field, field_validator, model_validator
 
 from morph_dslam.errors import StudyError
 from morph_dslam.model import Parameter
+from morph_dslam.offline.materials.base import Material
 from morph_dslam.offline.mechanics.parameters import ParameterSymbols
 from morph_dslam.offline.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.offline.meshing.mesh_checks import check_mesh
 from morph_dslam.offline.meshing.meshes import Mesh
 from morph_dslam.offline.meshing.model_meshes import model_mesh_of
-from morph_dslam.offline.problem import ModelMesh, Snapshot
+from morph_dslam.offline.problem import ModelMesh, Snapshot, SweepProblem
 from morph_dslam.offline.snapshots import source_fingerprint
 from morph_dslam.offline.studies.affine import read_affine
+from morph_dslam.offline.studies.file_materials import file_materials, require_materials
 from morph_dslam.offline.studies.load_sections import (
     BodyForceLoad,
     GravityLoad,
@@ -30,7 +32,9 @@ from morph_dslam.offline.studies.load_sections import (
 )
 from morph_dslam.offline.studies.material_section import MaterialSection
 from morph_dslam.offline.studies.mesh_section import MeshSection, make_mesh, mesh_fingerprint
+from morph_dslam.offline.studies.morphed_sweep import MorphedSweep
 from morph_dslam.offline.studies.parameter_section import ParameterSection, TimeSection
+from morph_dslam.offline.studies.shape_section import ShapeSection, shape_fields
 from morph_dslam.offline.studies.solid_sweep import SolidSweep
 from morph_dslam.offline.studies.study_sections import ReductionSection, SamplingSection, Section, WorkSection
 from morph_dslam.offline.studies.viscous_sweep import ViscousSweep
@@ -58,6 +62,8 @@ _SOLVER = (
     "studies/solid_sweep",
     "studies/viscous_sweep",
 )
+#: Code on which it depends too where the shape varies.
+_SHAPE = ("mechanics/morphing", "studies/shape_section", "studies/morphed_sweep")
 
 
 class SolidSolverSection(WorkSection):
@@ -74,13 +80,17 @@ class SolidSolverSection(WorkSection):
 
 
 class SolidStudy(Section):
-    """A hyperelastic solid under supports and loads that depend on parameters."""
+    """A hyperelastic solid under supports and loads that depend on parameters.
+
+    Cells that ``materials`` leaves out have those of the mesh file's sections.
+    """
 
     name: str
     mesh: MeshSection
-    materials: dict[str, MaterialSection] = Field(min_length=1)
+    materials: dict[str, MaterialSection] = Field(default_factory=dict)
     supports: tuple[SupportSection, ...] = ()
     loads: tuple[LoadSection, ...] = ()
+    shape: tuple[ShapeSection, ...] = ()
     parameters: dict[str, ParameterSection] = Field(min_length=1)
     time: TimeSection | None = None
     solver: SolidSolverSection = SolidSolverSection()
@@ -108,18 +118,32 @@ class SolidStudy(Section):
                 section.make(read)
             except StudyError as error:
                 raise ValueError(f"{where}: {error}") from error
-        self._check_time(parameters)
         if len({material.on for material in self.materials.values()}) < len(self.materials):
             raise ValueError("two materials are on the same cell set: give each its own")
+        try:
+            from_file = self._file_materials()
+            require_materials(self.mesh, {**self.materials, **from_file})
+        except StudyError as error:
+            raise ValueError(str(error)) from error
+        self._check_time(parameters, [name for name, material in from_file.items() if material.prony])
         return self
 
-    def _check_time(self, parameters: tuple[Parameter, ...]) -> None:
-        """Viscous materials need a clock that starts at the lower end of its range."""
-        viscous = [name for name, material in self.materials.items() if "prony" in material.constants]
+    def _file_materials(self) -> dict[str, Material]:
+        """Materials of the mesh file by cell set."""
+        return file_materials(self.mesh, [material.on for material in self.materials.values()])
+
+    def _check_time(self, parameters: tuple[Parameter, ...], viscous: list[str]) -> None:
+        """Viscous materials need a clock that starts at the lower end of its range.
+
+        ``viscous`` are cell sets of the mesh file that have such a material.
+        """
+        viscous = [
+            name for name, material in self.materials.items() if "prony" in material.constants
+        ] + viscous
         if self.time is None:
             if viscous:
                 raise ValueError(
-                    f"materials.{viscous[0]} is viscoelastic: say in [time] which parameter is the time"
+                    f"the material {viscous[0]} is viscoelastic: say in [time] which parameter is the time"
                 )
             return
         clock = next((p for p in parameters if p.name == self.time.parameter), None)
@@ -131,11 +155,11 @@ class SolidStudy(Section):
             raise ValueError(f"parameters.{clock.name}: time starts at the lower end; leave out the default")
 
     def _parts(self) -> list[tuple[str, Any]]:
-        """Materials, supports and loads with what messages call them."""
+        """Materials, supports, loads and shapes with what messages call them."""
         parts: list[tuple[str, Any]] = [
             (f"materials.{name}", section) for name, section in self.materials.items()
         ]
-        for kind, sections in (("support", self.supports), ("load", self.loads)):
+        for kind, sections in (("support", self.supports), ("load", self.loads), ("shape", self.shape)):
             parts += [(f"{kind} {number}", section) for number, section in enumerate(sections, start=1)]
         return parts
 
@@ -181,7 +205,7 @@ class SolidStudy(Section):
         return mesh
 
     def fingerprint(self) -> str:
-        """Hash of mesh, materials, supports, loads, parameters' names and elements, and of the code."""
+        """Hash of mesh, shape, materials, supports, loads, parameters' names, elements and the code."""
         content: dict[str, Any] = self.model_dump(mode="json", include={"materials", "supports", "loads"})
         content["functions"] = [material.source for material in self.materials.values()]
         content["elements"] = self.solver.order, self.solver.formulation
@@ -189,7 +213,9 @@ class SolidStudy(Section):
         content["root"] = self.root().tolist() if self.time else None
         content["time"] = self.time.model_dump() if self.time else None
         content["mesh"] = mesh_fingerprint(self.solid_mesh())
-        content["code"] = source_fingerprint(_SOLVER)
+        content["code"] = source_fingerprint(_SOLVER + _SHAPE if self.shape else _SOLVER)
+        content |= {"shape": self.model_dump(mode="json")["shape"]} if self.shape else {}
+        content |= {f"material of {name}": repr(law) for name, law in self._file_materials().items()}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def root(self) -> Array:
@@ -214,7 +240,7 @@ class SolidStudy(Section):
 
     def problem(self) -> SolidProblem:
         """The discretised solid."""
-        parameters = self.model_parameters()
+        parameters, mesh = self.model_parameters(), self.solid_mesh()
         symbols = ParameterSymbols(parameters)
         values = [symbols[parameter.name] for parameter in parameters]
 
@@ -223,8 +249,9 @@ class SolidStudy(Section):
 
         reader: Reader = read
         return SolidProblem(
-            self.solid_mesh(),
-            {section.on: section.make(reader) for section in self.materials.values()},
+            mesh,
+            {section.on: section.make(reader) for section in self.materials.values()}
+            | self._file_materials(),
             [section.make(reader) for section in self.supports],
             [section.make(reader) for section in self.loads],
             symbols,
@@ -233,14 +260,18 @@ class SolidStudy(Section):
                 mixed=self.solver.formulation == "mixed",
                 threads=self.solver.threads,
             ),
+            shape_fields(self.shape, mesh, symbols),
             time=symbols[self.time.parameter] if self.time else None,
         )
 
-    def sweep_problem(self) -> SolidSweep | ViscousSweep:
+    def sweep_problem(self) -> SweepProblem:
         """What the sweep solves with."""
+        problem = self.problem()
         if self.time is None:
-            return SolidSweep(self.problem())
-        return ViscousSweep(self.problem(), list(self.parameters).index(self.time.parameter), self.time.step)
+            sweep = SolidSweep(problem)
+        else:
+            sweep = ViscousSweep(problem, list(self.parameters).index(self.time.parameter), self.time.step)
+        return MorphedSweep(sweep, problem) if self.shape else sweep
 
     def model_mesh(self) -> ModelMesh:
         """The nodes of the mesh, its outer surface, its cells, and the volume of each node."""
