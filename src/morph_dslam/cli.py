@@ -23,8 +23,11 @@ INTERRUPTED = 130
 
 def _build(arguments: argparse.Namespace) -> None:
     from morph_dslam.offline.build import build
+    from morph_dslam.offline.stability import stability_warnings
 
-    build(arguments.study, arguments.output, workers=arguments.workers)
+    model = build(arguments.study, arguments.output, workers=arguments.workers)
+    for line in stability_warnings(model.certificate):
+        print(f"warning: {line}")
 
 
 def _info(arguments: argparse.Namespace) -> None:

@@ -19,13 +19,15 @@ from morph_dslam.offline.certificate import certify, compression_percent
 from morph_dslam.offline.external import ExternalStudy
 from morph_dslam.offline.problem import ModelMesh, ParametricStudy, Snapshot, bounds
 from morph_dslam.offline.reduction.reduce import reduce
-from morph_dslam.offline.snapshots import load_snapshot
+from morph_dslam.offline.snapshots import load_outputs, load_snapshot
+from morph_dslam.offline.stability import stability_report
 from morph_dslam.offline.studies.study import Study, load_study
 from morph_dslam.offline.studies.study_sections import ReductionSection
 from morph_dslam.offline.sweep import (
     SweepResult,
     default_executor,
     held_out_samples,
+    neighbour_tree,
     run_sweep,
     training_samples,
 )
@@ -41,6 +43,7 @@ class Solutions:
     ----------
     seen : to make the model from; mirror images of one solution form a group. unseen : to measure its error.
     failed : coordinates and reason of each sample that could not be solved.
+    stability : see `stability_report`; None for solutions of another program.
     """
 
     mesh: ModelMesh
@@ -48,6 +51,7 @@ class Solutions:
     seen: list[list[Snapshot]]
     unseen: list[Snapshot]
     failed: list[dict[str, Any]] = field(default_factory=list)
+    stability: dict[str, Any] | None = None
 
 
 def build(
@@ -104,7 +108,19 @@ def _solve(study: ParametricStudy, folder: Path, workers: int | None, executor: 
             {"coordinates": samples[index].tolist(), "reason": reason}
             for index, reason in sorted(result.failed.items())
         ],
+        _stability(study, study.canonical(samples), result),
     )
+
+
+def _stability(study: ParametricStudy, samples: Array, result: SweepResult) -> dict[str, Any]:
+    """Stability of the solutions at ``samples`` (n, d), canonical, along the tree that joins them."""
+    outputs = {index: load_outputs(path) for index, path in result.solved.items()}
+    pivots = {
+        index: int(values["negative_pivots"]) if "negative_pivots" in values else None
+        for index, values in outputs.items()
+    }
+    _, parents = neighbour_tree(samples, study.scale(), study.root(), failed=result.failed)
+    return stability_report(study.model_parameters(), samples, pivots, parents)
 
 
 def _read(study: ExternalStudy) -> Solutions:
@@ -147,6 +163,8 @@ def _certified(solutions: Solutions, options: ReductionSection, name: str) -> Re
     certificate = certify(model, unseen)
     certificate["compression_percent"] = compression_percent(model, len(seen) + len(unseen))
     certificate["samples"] = {"training": len(seen), "held_out": len(unseen), "failed": solutions.failed}
+    if solutions.stability is not None:
+        certificate["stability"] = solutions.stability
     model.certificate.update(certificate)
     return model
 

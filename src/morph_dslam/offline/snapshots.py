@@ -67,6 +67,12 @@ def load_snapshot(path: Path) -> Snapshot:
         )
 
 
+def load_outputs(path: Path) -> dict[str, Array]:
+    """The results of a snapshot that are no fields, by name."""
+    with np.load(path) as file:
+        return _under(file, "output")
+
+
 def load_state(path: Path) -> dict[str, Array]:
     """The arrays of the solver's state of a snapshot, to start a neighbour from."""
     with np.load(path) as file:

@@ -1,0 +1,91 @@
+"""A column pushed past its buckling load without an imperfection: the build says what it has passed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from morph_dslam import cli, load_model
+from morph_dslam.model import Parameter
+from morph_dslam.offline.stability import stability_report, stability_warnings
+
+COLUMN = """
+name = "column"
+[mesh]
+generator = "block"
+size = ["10 mm", "20 mm", "150 mm"]
+divisions = [1, 1, 12]
+[materials.rubber]
+law = "neo_hookean"
+young = "3 MPa"
+poisson = 0.0
+[[supports]]
+kind = "fixed"
+on = "z_min"
+[[supports]]
+kind = "displacement"
+on = "z_max"
+x = "0 mm"
+y = "0 mm"
+z = "-150 mm * shortening"
+[parameters.shortening]
+range = [0.0, 0.025]
+[solver]
+threads = 1
+[sampling]
+scheme = "even"
+training = 11
+held_out = 4
+"""
+#: Shortening at which a clamped column buckles: 4 pi^2 I / (A L^2), Euler.
+EULER = 4.0 * np.pi**2 * 10.0**2 / (12.0 * 150.0**2)
+
+
+def test_a_bifurcation_that_was_passed_is_reported(tmp_path, capsys) -> None:
+    (tmp_path / "study.toml").write_text(COLUMN)
+    assert cli.main(["build", str(tmp_path / "study.toml"), "-o", str(tmp_path / "column.morph")]) == 0
+    printed = capsys.readouterr().out
+    report = load_model(tmp_path / "column.morph").certificate["stability"]
+    (passed,) = report["passed"]
+    (before,), (after,) = passed["coordinates"]
+    assert before < EULER < after
+    assert passed["negative_pivots"] == [0, 1]
+    beyond = [sample["coordinates"][0] for sample in report["unstable_samples"]]
+    assert min(beyond) == after
+    assert report["stable"] + report["unstable"] == 15
+    assert report["unstable"] == len(beyond) > 3
+    assert f"warning: {len(beyond)} of 15 solutions are unstable" in printed
+    assert "warning: negative pivots change from 0 to 1 between shortening = 0.01" in printed
+    assert cli.main(["info", str(tmp_path / "column.morph")]) == 0
+    assert f"{len(beyond)} of 15 solutions are unstable; bifurcations" in capsys.readouterr().out
+
+
+SHIFT = Parameter("shift", "length", "mm", 0.0, 1.0, 0.0)
+SAMPLES = np.array([[0.001], [0.002], [0.003], [0.004]])
+
+
+def test_neighbours_are_those_of_the_sweep_tree() -> None:
+    """Two branches from the first sample; one of them ends beyond a critical point."""
+    report = stability_report([SHIFT], SAMPLES, {0: 0, 1: 0, 2: 2, 3: None}, [-1, 0, 0, 2])
+    assert report["passed"] == [
+        {
+            "between": ["shift = 1 mm", "shift = 3 mm"],
+            "coordinates": [[0.001], [0.003]],
+            "negative_pivots": [0, 2],
+        }
+    ]
+    assert (report["stable"], report["unstable"], report["unknown"]) == (2, 1, 1)
+    assert stability_warnings({"stability": report}) == [
+        "1 of 4 solutions are unstable; bifurcations may have been passed at 1 places; of 1 it is not known",
+        "negative pivots change from 0 to 2 between shift = 1 mm and shift = 3 mm",
+    ]
+
+
+def test_what_the_solver_cannot_tell_is_said() -> None:
+    unknown = stability_report([SHIFT], SAMPLES, dict.fromkeys(range(4)), [-1, 0, 1, 2])
+    assert stability_warnings({"stability": unknown}) == [
+        "the solver cannot tell whether the solutions are stable"
+    ]
+    stable = stability_report([SHIFT], SAMPLES, dict.fromkeys(range(4), 0), [-1, 0, 1, 2])
+    assert stable["statement"] == "all 4 solutions are stable"
+    assert stability_warnings({"stability": stable}) == []
+    assert stability_warnings({}) == []
