@@ -294,22 +294,3 @@ def test_python_states_the_same_study(built):
     mu = np.array([0.1, 0.002])
     kept = load_model(built / "block.morph").positions(mu)
     assert model.positions(mu) == pytest.approx(kept, abs=1e-8)
-
-
-def test_a_viscous_bar_relaxes_as_its_prony_series_says(tmp_path):
-    """g = 0.6, tau = 2 s: the stress at constant stretch falls to 0.763918 at 1 s and 0.481201 at 4 s."""
-    text = BLOCK[: BLOCK.index("[[supports]]")]
-    text += 'prony = { relative_moduli = [0.6], times = ["2 s"] }\n'
-    for face, axis in (("x_min", "x"), ("y_min", "y"), ("z_min", "z")):
-        text += f'[[supports]]\nkind = "displacement"\non = "{face}"\n{axis} = "0 mm"\n'
-    text += '[[supports]]\nkind = "displacement"\non = "z_max"\nz = "12 mm"\n'
-    text += '[parameters.held]\nrange = ["0 s", "5 s"]\n[time]\nparameter = "held"\nstep = "0.2 s"\n'
-    text += '[solver]\nthreads = 1\n[sampling]\nscheme = "even"\ntraining = 21\nheld_out = 4\n'
-    text += "[reduction]\nmax_degree = 8\ntolerance = 1e-7\n"
-    (tmp_path / "study.toml").write_text(text.replace("[3, 3, 6]", "[1, 1, 1]"))
-    assert cli.main(["build", str(tmp_path / "study.toml"), "-o", str(tmp_path / "bar.morph")]) == 0
-    model = load_model(tmp_path / "bar.morph")
-    start, one, four = (model.von_mises(np.array([t]), "solid") for t in (0.0, 1.0, 4.0))
-    assert one / start == pytest.approx(np.full(8, 0.763918), abs=2e-5)
-    assert four / start == pytest.approx(np.full(8, 0.481201), abs=2e-5)
-    assert "sensitivity" not in model.certificate

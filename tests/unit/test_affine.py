@@ -34,6 +34,10 @@ MU = np.array([2000.0, 0.25, 0.5])
         ("2.5e-1 N/mm3", "stiffness per area", 2.5e8),
         ("7 g/cm3", None, 7000.0),
         ("load + 1 kPa", None, 3000.0),
+        ("3 mm * load / 4 kPa + 1 mm", "length", 0.0025),
+        ("-2 * tilt / 0.5 rad", "ratio", -2.0),
+        ("load / 1 kPa - share", "ratio", 1.75),
+        ("load / 4 Pa", None, 500.0),
     ],
 )
 def test_values(text, quantity, value):
@@ -57,6 +61,12 @@ def test_expression_is_the_same_function_of_other_variables():
         ("weight", "stress", r"names 'weight', which is no parameter; the parameters are load, share, tilt"),
         ("tilt", "stress", r"the parameter tilt is of angle, and stress is wanted"),
         ("3 kPa * load", "stress", r"only a parameter without unit can be multiplied by 3 kPa"),
+        ("3 kPa * load", "stress", r'make it one with "load / 1 kPa"'),
+        ("3 mm * load / 2 s", "length", r"'s' is not a unit of pressure"),
+        ("3 mm / 2 mm", "length", r"only a parameter can be divided"),
+        ("load / 0 kPa", "ratio", r"not by zero"),
+        ("load / 2", "ratio", r"is not a number with a unit, nor a sum"),
+        ("tilt / 2 deg", "angle", r"the parameter tilt is of ratio, and angle is wanted"),
         ("load * load", "stress", r"is not a number with a unit, nor a sum"),
         ("3 MPa 4", "stress", r"is not a number with a unit, nor a sum"),
         ("", "stress", r"an empty text"),

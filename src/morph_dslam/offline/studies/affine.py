@@ -1,7 +1,8 @@
 """Quantities that depend on the parameters: linear expressions as study files write them.
 
 "3 MPa" is a number, "pressure" the parameter of that name, "0.5 * pressure + 2 kPa" and "10 N * share" (of a
-parameter without unit) are sums of both.
+parameter without unit) are sums of both. A parameter over a quantity of its own kind is a ratio, as in
+"5 kPa * held / 2 s".
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _WORD = r"[A-Za-z_][\w./]*"
 _TERM = re.compile(
     rf"(?:(?P<number>{_NUMBER})(?:\s+(?P<unit>{_WORD}))?(?:\s*\*\s*(?P<factor>{_WORD}))?|(?P<name>{_WORD}))"
+    rf"(?:\s*/\s*(?P<divisor>{_NUMBER})\s+(?P<divisor_unit>{_WORD}))?"
 )
 
 
@@ -94,7 +96,7 @@ def _own_quantity(text: str, known: Mapping[str, int], parameters: Sequence[Para
     if term["unit"] is not None:
         return quantity_of(term["unit"])
     name = term["factor"] or term["name"]
-    return parameters[known[name]].quantity if name in known else "ratio"
+    return parameters[known[name]].quantity if name in known and term["divisor"] is None else "ratio"
 
 
 def _terms(text: str) -> list[tuple[float, re.Match]]:
@@ -123,22 +125,34 @@ def _read_term(
     name = term["factor"] or term["name"]
     if name is not None and name not in known:
         raise StudyError(f"'{text}' names '{name}', which is no parameter; {_listed(known)}")
+    measured = "ratio" if name is None else parameters[known[name]].quantity
+    share = 1.0
+    if term["divisor"] is not None:
+        share, measured = _share(term, text, measured, name), "ratio"
     if unit is not None:
-        value = to_si(float(number), unit, quantity)
-        if name is not None and parameters[known[name]].quantity != "ratio":
-            raise StudyError(f"'{text}': only a parameter without unit can be multiplied by {number} {unit}")
+        value = to_si(float(number), unit, quantity) * share
+        if name is not None and measured != "ratio":
+            raise StudyError(
+                f"'{text}': only a parameter without unit can be multiplied by {number} {unit}; make it one "
+                f'with "{name} / 1 {parameters[known[name]].unit}"'
+            )
         return value, name
-    value = 1.0 if number is None else float(number)
+    value = share if number is None else float(number) * share
     if name is None:
         if quantity != "ratio":
             raise StudyError(f"'{text}' lacks a unit of {quantity}: {', '.join(FACTORS[quantity])}")
         return value, None
-    if FACTORS[parameters[known[name]].quantity] is not FACTORS[quantity]:
-        raise StudyError(
-            f"'{text}': the parameter {name} is of {parameters[known[name]].quantity}, "
-            f"and {quantity} is wanted here"
-        )
+    if FACTORS[measured] is not FACTORS[quantity]:
+        raise StudyError(f"'{text}': the parameter {name} is of {measured}, and {quantity} is wanted here")
     return value, name
+
+
+def _share(term: re.Match, text: str, measured: str, name: str | None) -> float:
+    """One over the quantity that a parameter, which measures the same, is divided by."""
+    divisor = float(term["divisor"])
+    if name is None or not divisor:
+        raise StudyError(f"'{text}': only a parameter can be divided, and not by zero")
+    return 1.0 / to_si(divisor, term["divisor_unit"], measured)
 
 
 def _listed(names: Mapping[str, int]) -> str:
