@@ -152,7 +152,7 @@ def find_pose(
         pixels,
         matrix,
         None,  # type: ignore[arg-type]
-        iterationsCount=300,
+        iterationsCount=1000,
         reprojectionError=inlier_px,
         confidence=0.999,
         flags=cv2.SOLVEPNP_AP3P,

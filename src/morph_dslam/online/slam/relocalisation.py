@@ -32,6 +32,11 @@ THUMBNAIL = (40, 30)
 N_CORNERS = 700
 #: Keyframes tried in one frame: the two that look most alike, and one more in turn.
 N_ALIKE = 2
+#: Matches that agree on a rough pose, within so many pixels.
+ROUGH_INLIERS, ROUGH_PX = 12, 6.0
+#: A pose is believed if this share of the keyframe's points in view fit it, with an error of at most so many
+#: times the usual one: repeated texture fits badly somewhere else.
+LEAST_SHARE, MOST_ERROR_RATIO = 0.35, 2.0
 
 
 def thumbnail(flat: Image) -> Array:
@@ -114,8 +119,13 @@ class Relocaliser:
         rows, described = describe(keyframe.flat, keyframe.pixels[known], MAP_OCTAVES)
         # Scales of one point compete with each other, so the second best says nothing: RANSAC sorts it out.
         first, second = match_descriptors(described, descriptors, ratio=1.0)
-        matched = ids[rows[first]]
-        rough = find_pose(self._map.positions[matched], pixels[second], self._intrinsics, 6.0, least=12)
+        rough = find_pose(
+            self._map.positions[ids[rows[first]]],
+            pixels[second],
+            self._intrinsics,
+            ROUGH_PX,
+            least=ROUGH_INLIERS,
+        )
         return None if rough is None else self._confirmed(number, flat, rough, tracker)
 
     def _confirmed(
@@ -135,7 +145,7 @@ class Relocaliser:
             self._intrinsics,
             inlier_px=self._options.inlier_px,
         )
-        n = int(pose.inliers.sum())
-        if n < max(self._options.least_inliers, 0.5 * len(found.ids)):
+        enough = max(self._options.least_inliers, 0.5 * len(found.ids), LEAST_SHARE * int(seen.sum()))
+        if pose.inliers.sum() < enough or pose.rms_px > MOST_ERROR_RATIO * tracker.usual_rms_px:
             return None
         return pose, found[pose.inliers]

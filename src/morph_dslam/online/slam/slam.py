@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 STAGES = ("prepare", "start", "track", "map", "relocalise")
+#: Frames that a relocalised pose has to be tracked for before the map grows again.
+HELD_FRAMES = 3
 NOWHERE = Followed(np.empty(0, dtype=np.int64), np.empty((0, 2)))
 
 
@@ -88,7 +90,7 @@ class Slam:
         self._tracker = Tracker(self.map, k, options)
         self._mapper = Mapper(self.map, k, options)
         self._relocaliser = Relocaliser(self.map, k, options)
-        self._n_lost = 0
+        self._n_lost, self._n_held = 0, 0
 
     def process_frame(self, image: NDArray[np.uint8], index: int, timestamp: float) -> SlamFrame:
         """Take in the next frame (h, w, 3) or (h, w), as recorded.
@@ -167,7 +169,9 @@ class Slam:
             found = self._relocalise(flat, index, timestamp, clock)
             return found if found["status"] != "lost" else {"status": "lost", "reason": tracked}
         with clock.stage("map"):
-            keeps = self._mapper.wants_keyframe(tracked, index)
+            # A pose found again has to hold for some frames before the map is built on it.
+            self._n_held += 1
+            keeps = self._n_held > HELD_FRAMES and self._mapper.wants_keyframe(tracked, index)
             if keeps:
                 self._tracker.points = self._mapper.insert(tracked, flat, index, timestamp)
                 self._tracker.correct(self.map.keyframes[-1].camera_from_world)
@@ -179,6 +183,7 @@ class Slam:
             if isinstance(found, str):
                 return {"status": "lost", "reason": found}
             pose, points = found
+            self._n_held = 0
             self._tracker.place(pose.camera_from_world, points)
         tracked = Tracked(pose, points, int(pose.inliers.sum()), NOWHERE)
         return self._result("relocalised", tracked, is_keyframe=False)

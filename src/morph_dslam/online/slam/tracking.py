@@ -28,6 +28,8 @@ MOST_VIEW_ANGLE_DEG = 35.0
 MOST_SCALE_CHANGE = 1.6
 #: A point not found in this share of the frames in which it was looked for is looked for after all others.
 DOUBTFUL_SHARE = 0.25
+#: Weight of the newest frame in the usual error.
+USUAL_RATE = 0.1
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,7 @@ class Tracker:
     Attributes
     ----------
     camera_from_world : (4, 4) the newest pose. points : what is followed.
+    usual_rms_px : running mean of the poses' errors.
     """
 
     def __init__(self, rigid_map: RigidMap, intrinsics: Array, options: SlamOptions) -> None:
@@ -62,6 +65,7 @@ class Tracker:
         self._intrinsics = intrinsics
         self._options = options
         self._motion = np.eye(4)
+        self.usual_rms_px = options.inlier_px
         self.camera_from_world = np.eye(4)
         self.points = Followed(np.empty(0, dtype=np.int64), np.empty((0, 2)))
 
@@ -88,6 +92,7 @@ class Tracker:
                 self._motion = result.pose.camera_from_world @ inverse(self.camera_from_world)
                 self.camera_from_world = result.pose.camera_from_world
                 self.points = result.points
+                self.usual_rms_px += USUAL_RATE * (result.pose.rms_px - self.usual_rms_px)
                 return result
             reason = reason or result
         return reason
