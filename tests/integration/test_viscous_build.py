@@ -1,4 +1,4 @@
-"""Viscoelastic bars from their study files to their models, against closed forms of linear viscoelasticity."""
+"""Viscoelastic bars from study file to model, against closed forms of linear viscoelasticity."""
 
 from __future__ import annotations
 

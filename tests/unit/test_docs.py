@@ -24,6 +24,21 @@ def test_the_model_file_can_be_read_with_the_documented_program(tmp_path):
     np.testing.assert_allclose(positions, load_model(path).positions(mu), atol=1e-12)
 
 
+def test_the_programs_for_solids_pull_a_block_as_far_as_its_law_says(tmp_path, monkeypatch):
+    """E = 3 MPa, nu = 0, nominal stress 0.3 MPa = mu (s - 1/s): the stretch s is 1.104988."""
+    monkeypatch.chdir(tmp_path)
+    text = (DOCS / "solid-study.md").read_text()
+    study, problem = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    names = {}
+    exec(study, names)
+    top = names["model"].nodes[:, 2] > 0.0599
+    np.testing.assert_allclose(names["positions"][top, 2], 0.06 * 1.104988, rtol=1e-5)
+    assert names["model"].certificate["stability"]["statement"] == "all 13 solutions are stable"
+    exec(problem, names)
+    np.testing.assert_allclose(names["fields"]["displacement"][top, 2], 0.06 * 0.104988, rtol=1e-5)
+    np.testing.assert_allclose(names["force"], [0.0, 0.0, -0.3e6 * 0.02**2], atol=1e-6)
+
+
 def test_links_between_documents_lead_somewhere():
     for page in [*DOCS.glob("*.md"), DOCS.parent / "README.md", DOCS.parent / "CONTRIBUTING.md"]:
         for target in re.findall(r"\]\(([\w./-]+\.\w+)\)", page.read_text()):
