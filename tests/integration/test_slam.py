@@ -192,3 +192,23 @@ def test_a_young_map_that_stays_lost_is_given_up_with_its_poses(room_film):
     assert len(trajectory_of(slam, frames)) == len(errors)
     assert all(frame.index > 20 for frame in frames if slam.is_placed(frame))
     assert np.median(errors) < 0.005 * length
+
+
+def test_a_frozen_map_stays_and_the_camera_is_still_found(room_film):
+    images, truth = room_film
+    slam = Slam(CAMERA)
+    film = [*images[:50], *images[49:20:-1]]
+    places = [*truth[:50], *truth[49:20:-1]]
+    frames = []
+    for index, image in enumerate(film):
+        if index == 50:
+            slam.freeze()
+            before = slam.map.positions.copy(), len(slam.map.keyframes)
+        frames.append(slam.process_frame(image, index, index / 30.0))
+    slam.refine_map()
+    assert np.array_equal(slam.map.positions, before[0])
+    assert len(slam.map.keyframes) == before[1]
+    assert {frame.status for frame in frames[50:]} == {"tracked"}
+    assert all(not len(frame.candidates) for frame in frames[50:])
+    errors, length = errors_after_alignment(slam, frames, places)
+    assert np.median(errors[-29:]) < 0.005 * length

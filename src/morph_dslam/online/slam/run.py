@@ -33,6 +33,7 @@ class SlamRunOptions:
     ----------
     source : recording. camera : camera file. output : the run folder.
     first, last : frame numbers, both included; all by default.
+    freeze_at : frame number from which the map is kept as it is; never by default.
     video : draw the video with the points followed. overwrite : replace a run that is there already.
     """
 
@@ -41,6 +42,7 @@ class SlamRunOptions:
     output: Path
     first: int | None = None
     last: int | None = None
+    freeze_at: int | None = None
     video: bool = True
     overwrite: bool = False
     slam: SlamOptions = field(default_factory=SlamOptions)
@@ -82,6 +84,8 @@ def _process(
     video = VideoWriter(options.output / "tracked.mp4", source.fps, size) if options.video else nullcontext()
     with video as writer:
         for frame in tqdm(source, total=len(source), desc="tracking", unit="frame"):
+            if options.freeze_at is not None and frame.index >= options.freeze_at and not slam.is_frozen:
+                slam.freeze()
             frames.append(slam.process_frame(frame.image, frame.index, frame.timestamp))
             if writer is not None:
                 image = frame.image if maps is None else cv2.remap(frame.image, *maps, cv2.INTER_LINEAR)

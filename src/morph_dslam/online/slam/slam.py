@@ -74,12 +74,14 @@ class Slam:
     Attributes
     ----------
     map : what is known of the scene; replaced when a young map is given up (``n_restarts`` counts these).
+    is_frozen : whether the map is kept as it is.
     """
 
     def __init__(self, camera: PinholeCamera, options: SlamOptions | None = None) -> None:
         self.camera = camera
         self.options = options or SlamOptions()
         self._maps = camera.undistortion_maps()
+        self.is_frozen = False
         self.n_restarts = -1
         self._restart()
 
@@ -110,13 +112,20 @@ class Slam:
         else:
             result = self._track(flat, index, timestamp, clock)
         self._n_lost = self._n_lost + 1 if result["status"] == "lost" else 0
-        if self._n_lost > self.options.restart_after and len(self.map.keyframes) < self.options.window:
+        is_young = len(self.map.keyframes) < self.options.window and not self.is_frozen
+        if is_young and self._n_lost > self.options.restart_after:
             self._restart()
         return SlamFrame(index, timestamp, **result, timings_ms=clock.milliseconds, total_ms=clock.total)
 
+    def freeze(self) -> None:
+        """Keep the map as it is from now on and only find the camera in it; before a start, do nothing."""
+        if self.map.keyframes:
+            self.is_frozen = True
+            self._tracker.drop_candidates()
+
     def refine_map(self) -> None:
-        """Adjust all keyframes and points together, once the sequence is over."""
-        if len(self.map.keyframes) > 2:
+        """Adjust all keyframes and points together, once the sequence is over; a frozen map stays."""
+        if len(self.map.keyframes) > 2 and not self.is_frozen:
             self._mapper.adjust_all()
 
     def is_placed(self, frame: SlamFrame) -> bool:
@@ -171,7 +180,11 @@ class Slam:
         with clock.stage("map"):
             # A pose found again has to hold for some frames before the map is built on it.
             self._n_held += 1
-            keeps = self._n_held > HELD_FRAMES and self._mapper.wants_keyframe(tracked, index)
+            keeps = (
+                not self.is_frozen
+                and self._n_held > HELD_FRAMES
+                and self._mapper.wants_keyframe(tracked, index)
+            )
             if keeps:
                 self._tracker.points = self._mapper.insert(tracked, flat, index, timestamp)
                 self._tracker.correct(self.map.keyframes[-1].camera_from_world)

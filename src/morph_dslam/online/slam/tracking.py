@@ -77,6 +77,10 @@ class Tracker:
         """Take over the newest pose from bundle adjustment."""
         self.camera_from_world = camera_from_world
 
+    def drop_candidates(self) -> None:
+        """Follow map points only."""
+        self.points = self.points[self._map.state[self.points.ids] == GOOD]
+
     def track(self, flat: Image) -> Tracked | str:
         """Pose and points of the next frame, or why it is lost; then the newest pose stays what it was."""
         reason = ""
