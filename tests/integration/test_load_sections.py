@@ -1,0 +1,148 @@
+"""Every kind of load, support and parameter as a study states it: what it does to a stiff block is known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from morph_dslam import make_study
+from morph_dslam.offline.problem import Snapshot
+from morph_dslam.offline.studies.solid_study import SolidStudy
+
+STIFF = {"law": "neo_hookean", "young": "3 GPa", "poisson": 0.3, "density": "2 g/cm3"}
+FIXED = {"kind": "fixed", "on": "z_min"}
+PARAMETERS = {
+    "pull": {"range": ["0 kPa", "20 kPa"]},
+    "share": {"range": [0.0, 1.0]},
+    "place": {"range": ["-10 mm", "10 mm"]},
+    "tilt": {"range": ["0 deg", "90 deg"]},
+    "young": {"range": ["1 MPa", "5 MPa"], "default": "3 MPa"},
+}
+#: Parameters of every test: 10 kPa, 0.5, 4 mm, 30 degrees, 2 MPa.
+MU = np.array([1e4, 0.5, 0.004, np.pi / 6.0, 2e6])
+AREA, HEIGHT = 0.04**2, 0.02
+
+
+def snapshot(mu: np.ndarray = MU, **sections: Any) -> Snapshot:
+    """The solution at ``mu`` of a block of 40 x 40 x 20 mm, fixed below."""
+    content: dict[str, Any] = {
+        "name": "block",
+        "mesh": {"generator": "block", "size": ["40 mm", "40 mm", "20 mm"], "divisions": [4, 4, 1]},
+        "materials": {"stiff": STIFF},
+        "supports": [FIXED],
+        "parameters": PARAMETERS,
+        "solver": {"threads": 1},
+    }
+    study = make_study(content | sections)
+    assert isinstance(study, SolidStudy)
+    sweep = study.sweep_problem()
+    return sweep.take_snapshot(sweep.advance(sweep.first_state(), mu))
+
+
+PATCH = {"on": "z_max", "centre": ["20 mm + place", "20 mm", "20 mm"], "width": "5 mm"}
+MIDDLE = np.array([0.02, 0.02, HEIGHT])
+PULLED, HELD = 1e4 * AREA, np.array([0.02, 0.02, HEIGHT / 2])
+#: A load, its resultant (N), a point on its line of action (m), and the tolerance.
+LOADS: dict[str, tuple[dict[str, Any], tuple[float, float, float], np.ndarray, float]] = {
+    "traction": (
+        {"on": "z_max", "traction": ["pull", "0 Pa", "-pull"]},
+        (PULLED, 0.0, -PULLED),
+        MIDDLE,
+        1e-4,
+    ),
+    "pressure": ({"on": "z_max", "pressure": "2 * pull"}, (0.0, 0.0, -2.0 * PULLED), MIDDLE, 1e-4),
+    "body_force": (
+        {"force": ["0 N/m3", "2000 N/m3 * share", "0 N/m3"]},
+        (0.0, 1000.0 * AREA * HEIGHT, 0.0),
+        HELD,
+        1e-4,
+    ),
+    "gravity": ({}, (0.0, 0.0, -9.80665 * 2000.0 * AREA * HEIGHT), HELD, 1e-6),
+    "point": (
+        {"on": "z_max", "force": ["0 N", "5 N * pull / 20 kPa", "0 N"]},
+        (0.0, 2.5, 0.0),
+        MIDDLE,
+        1e-3,
+    ),
+    "moving_patch": (
+        {**PATCH, "force": ["0 N", "0 N", "-8 N * share"]},
+        (0.0, 0.0, -4.0),
+        MIDDLE + np.array([0.004, 0.0, 0.0]),
+        5e-3,
+    ),
+    "moving_line": (
+        {**PATCH, "direction": [0, 1, 0], "force": ["0 N/m", "0 N/m", "-0.1 N/mm"]},
+        (0.0, 0.0, -4.0),
+        MIDDLE + np.array([0.004, 0.0, 0.0]),
+        5e-3,
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", sorted(LOADS))
+def test_supports_answer_a_load(kind: str) -> None:
+    keys, total, at, tolerance = LOADS[kind]
+    force = np.array(total)
+    outputs = snapshot(loads=[{"kind": kind, **keys}]).outputs
+    size = float(np.linalg.norm(force))
+    np.testing.assert_allclose(outputs["force_z_min"], -force, atol=tolerance * size)
+    moment = np.cross(at, force)
+    np.testing.assert_allclose(outputs["moment_z_min"], -moment, atol=tolerance * size * 0.04)
+
+
+def test_a_block_sinks_into_its_foundation() -> None:
+    """Sinking = pressure over stiffness."""
+    springs = {"kind": "foundation", "on": "z_min", "stiffness": "4 N/mm3 * share"}
+    load = {"kind": "traction", "on": "z_max", "traction": ["0 Pa", "0 Pa", "-pull"]}
+    parameters = PARAMETERS | {"share": {"range": [0.1, 1.0], "default": 1.0}}
+    found = snapshot(supports=[springs], loads=[load], parameters=parameters)
+    base = found.fields["displacement"][:, 2].max()
+    assert base == pytest.approx(-1e4 / 2e9, rel=2e-2)
+
+
+def test_a_set_moves_as_it_is_told() -> None:
+    """Turned by the tilt about y through a given point and shifted by the place."""
+    top = {
+        "kind": "rotation",
+        "on": "z_max",
+        "axis": [0, 2, 0],
+        "angle": "0.1 * tilt",
+        "centre": ["0 mm", "0 mm", "20 mm"],
+        "translation": ["place", "0 mm", "1 mm"],
+    }
+    displacement = snapshot(supports=[FIXED, top]).fields["displacement"]
+    angle = 0.1 * np.pi / 6.0
+    far = np.array([0.04 * np.cos(angle) - 0.04 + 0.004, 0.0, -0.04 * np.sin(angle) + 0.001])
+    distance = np.linalg.norm(displacement - far, axis=1)
+    assert distance.min() < 1e-12
+    shifted = {"kind": "displacement", "on": "z_max", "x": "place", "z": "-0.5 * place"}
+    displacement = snapshot(supports=[FIXED, shifted]).fields["displacement"]
+    assert np.linalg.norm(displacement[:, [0, 2]] - [0.004, -0.002], axis=1).min() < 1e-12
+
+
+@pytest.mark.parametrize("index", [2, 3, 4], ids=["load position", "fibre angle", "material constant"])
+def test_derivatives_by_a_parameter_agree_with_differences(index: int) -> None:
+    fibred = {
+        "law": "transversely_isotropic",
+        "young_fibre": "5 * young",
+        "young_cross": "young",
+        "poisson_fibre": 0.3,
+        "poisson_cross": 0.3,
+        "shear_fibre": "1 MPa",
+        "fibre": {"angle": "tilt", "from": [1, 0, 0], "towards": [0, 1, 0]},
+    }
+    loads = [
+        {"kind": "moving_patch", **PATCH, "force": ["3 N", "1 N", "-8 N"]},
+        {"kind": "traction", "on": "x_max", "traction": ["pull", "0 Pa", "0 Pa"]},
+    ]
+    step = 1e-4 * np.array([1.0, 1.0, 0.01, 1.0, 1e6]) * np.eye(5)[index]
+    at, before, after = (
+        snapshot(mu, materials={"m": fibred}, loads=loads) for mu in (MU, MU - step, MU + step)
+    )
+    for name in ("displacement", "stress_solid", "strain"):
+        slope = (after.fields[name] - before.fields[name]) / (2.0 * step[index])
+        assert np.abs(slope).max() > 0.0
+        found = at.sensitivities[name][index]
+        np.testing.assert_allclose(found, slope, atol=1e-4 * np.abs(slope).max())
