@@ -20,6 +20,7 @@ def _slam(arguments: argparse.Namespace) -> None:
             output=arguments.output,
             first=first,
             last=last,
+            map_file=arguments.map,
             freeze_at=arguments.freeze_at,
             video=not arguments.no_video,
             overwrite=arguments.overwrite,
@@ -60,6 +61,9 @@ def add_camera_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
     slam.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="run folder to write")
     slam.add_argument(
         "--range", type=frame_range, default=(None, None), metavar="FIRST-LAST", help="frames to track"
+    )
+    slam.add_argument(
+        "--map", type=Path, metavar="MAP", help="map.h5 of an earlier run, to find the camera in"
     )
     slam.add_argument(
         "--freeze-at", type=int, metavar="N", help="from this frame on keep the map and only find the camera"

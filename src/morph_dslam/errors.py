@@ -46,6 +46,10 @@ class TrackingError(MorphError):
     """A tracking run cannot be written where it was asked for."""
 
 
+class MapError(MorphError):
+    """A map of the rigid scene is missing, damaged, of another version, or of another camera."""
+
+
 class TrajectoryError(MorphError):
     """A camera trajectory is missing or malformed."""
 

@@ -1,15 +1,19 @@
 """Camera tracking and mapping on rendered films with exact camera poses."""
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
 from morph_dslam.cli import main
+from morph_dslam.errors import MapError
 from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
+from morph_dslam.online.slam.map_file import load_map, save_map
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.slam.output import trajectory_of
+from morph_dslam.online.slam.rigid_map import RigidMap
 from morph_dslam.online.slam.slam import Slam
 from morph_dslam.similarity import fit_similarity
 from tests.support.rendered_room import CAMERA, RoomFilm, hand_held, pose, wall
@@ -146,7 +150,7 @@ def test_the_command_writes_a_run_that_evaluate_reads(tmp_path, room_film, capsy
     assert "tracked=" in capsys.readouterr().out
     written = {str(path.relative_to(run)) for path in run.rglob("*.*")}
     assert written == {
-        *("trajectory.txt", "map.ply", "frames.csv", "summary.json", "tracked.mp4"),
+        *("trajectory.txt", "map.ply", "map.h5", "frames.csv", "summary.json", "tracked.mp4"),
         *("plots/trajectory.png", "plots/frames.png"),
     }
     summary = json.loads((run / "summary.json").read_text())
@@ -212,3 +216,35 @@ def test_a_frozen_map_stays_and_the_camera_is_still_found(room_film):
     assert all(not len(frame.candidates) for frame in frames[50:])
     errors, length = errors_after_alignment(slam, frames, places)
     assert np.median(errors[-29:]) < 0.005 * length
+
+
+def test_the_camera_is_found_in_a_saved_map(tmp_path, room_run, room_film):
+    mapped, _ = room_run
+    images, truth = room_film
+    save_map(tmp_path / "map.h5", mapped.map, CAMERA)
+    slam = Slam(CAMERA, rigid_map=load_map(tmp_path / "map.h5", CAMERA))
+    order = list(range(70, 40, -1))
+    frames = [slam.process_frame(images[i], n, n / 30.0) for n, i in enumerate(order)]
+    assert [frame.status for frame in frames[:2]] == ["relocalised", "tracked"]
+    assert {frame.status for frame in frames[1:]} == {"tracked"}
+    assert len(slam.map.keyframes) == len(mapped.map.keyframes)
+    errors, length = errors_after_alignment(slam, frames, [truth[i] for i in order])
+    assert np.median(errors) < 0.005 * length
+
+
+def test_a_map_that_cannot_be_used_is_refused(tmp_path, room_run):
+    path = tmp_path / "map.h5"
+    with pytest.raises(MapError, match="there is no map"):
+        load_map(path, CAMERA)
+    save_map(path, RigidMap(), CAMERA)
+    with pytest.raises(MapError, match="empty"):
+        load_map(path, CAMERA)
+    save_map(path, room_run[0].map, CAMERA)
+    with pytest.raises(MapError, match="use the camera file it was made with"):
+        load_map(path, replace(CAMERA, fx=600.0))
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(MapError, match="damaged"):
+        load_map(path, CAMERA)
+    path.write_text("no map")
+    with pytest.raises(MapError, match="no map of"):
+        load_map(path, CAMERA)

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.io.point_cloud import save_ply
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
+from morph_dslam.online.slam.map_file import save_map
 from morph_dslam.online.slam.projection import inverse
 from morph_dslam.online.slam.slam import STAGES, Slam, SlamFrame
 
@@ -42,6 +43,7 @@ def write_run(folder: Path, slam: Slam, frames: list[SlamFrame], extra: dict[str
     points = slam.map.positions[slam.map.good]
     save_trajectory(folder / "trajectory.txt", trajectory)
     save_ply(folder / "map.ply", points)
+    save_map(folder / "map.h5", slam.map, slam.camera)
     _write_csv(folder / "frames.csv", slam, frames)
     plots = folder / "plots"
     plots.mkdir(exist_ok=True)

@@ -146,6 +146,6 @@ class Relocaliser:
             inlier_px=self._options.inlier_px,
         )
         enough = max(self._options.least_inliers, 0.5 * len(found.ids), LEAST_SHARE * int(seen.sum()))
-        if pose.inliers.sum() < enough or pose.rms_px > MOST_ERROR_RATIO * tracker.usual_rms_px:
+        if pose.inliers.sum() < enough or pose.rms_px > MOST_ERROR_RATIO * self._map.usual_rms_px:
             return None
         return pose, found[pose.inliers]

@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 CANDIDATE, GOOD, REMOVED = 0, 1, 2
+#: Error that poses are taken to have before there is any.
+FIRST_RMS_PX = 4.0
 
 
 @dataclass
@@ -77,10 +79,12 @@ class RigidMap:
     first_keyframe, first_pixels : (n,), (n, 2) where a point was first seen.
     template_keyframe, template_pixels : (n,), (n, 2) the view whose patch stands for the point.
     n_expected, n_found : (n,) frames in which it should have been seen, and in which it was.
+    usual_rms_px : running mean of the errors of the poses found in it.
     """
 
     def __init__(self) -> None:
         self.keyframes: list[Keyframe] = []
+        self.usual_rms_px = FIRST_RMS_PX
         self.positions = np.empty((0, 3))
         self.state = np.empty(0, dtype=np.int8)
         self.first_keyframe, self.first_pixels = np.empty(0, dtype=np.int64), np.empty((0, 2))

@@ -18,6 +18,7 @@ from morph_dslam.io.calibration import load_camera
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.online.flow import patch_correlation
 from morph_dslam.online.slam.bundle_adjustment import Observations, adjust
+from morph_dslam.online.slam.map_file import load_map
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.slam.output import draw_frame, write_run
 from morph_dslam.online.slam.pose import refine_pose
@@ -33,6 +34,7 @@ class SlamRunOptions:
     ----------
     source : recording. camera : camera file. output : the run folder.
     first, last : frame numbers, both included; all by default.
+    map_file : a map of an earlier run with the same camera, kept as it is; a new map by default.
     freeze_at : frame number from which the map is kept as it is; never by default.
     video : draw the video with the points followed. overwrite : replace a run that is there already.
     """
@@ -42,6 +44,7 @@ class SlamRunOptions:
     output: Path
     first: int | None = None
     last: int | None = None
+    map_file: Path | None = None
     freeze_at: int | None = None
     video: bool = True
     overwrite: bool = False
@@ -61,13 +64,15 @@ def run_slam(options: SlamRunOptions) -> dict[str, Any]:
     Raises
     ------
     MorphError
-        If an input cannot be used (CameraError, SourceError) or the run folder holds a run (TrackingError).
+        If an input cannot be used (CameraError, SourceError, MapError) or the run folder holds a run
+        (TrackingError).
     """
     camera = load_camera(options.camera)
     source = open_source(options.source, options.first, options.last)
     _prepare_folder(options)
     warm_up()
-    slam, frames = Slam(camera, options.slam), []
+    rigid_map = load_map(options.map_file, camera) if options.map_file is not None else None
+    slam, frames = Slam(camera, options.slam, rigid_map), []
     try:
         _process(slam, source, camera, options, frames)
     finally:

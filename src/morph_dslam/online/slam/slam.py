@@ -70,6 +70,8 @@ class Slam:
     Parameters
     ----------
     camera : of all frames.
+    rigid_map : a map from an earlier run with the same camera (`map_file`), which is kept frozen; the first
+        frames are lost until the camera is found in it.
 
     Attributes
     ----------
@@ -77,22 +79,28 @@ class Slam:
     is_frozen : whether the map is kept as it is.
     """
 
-    def __init__(self, camera: PinholeCamera, options: SlamOptions | None = None) -> None:
+    def __init__(
+        self, camera: PinholeCamera, options: SlamOptions | None = None, rigid_map: RigidMap | None = None
+    ) -> None:
         self.camera = camera
         self.options = options or SlamOptions()
         self._maps = camera.undistortion_maps()
-        self.is_frozen = False
-        self.n_restarts = -1
-        self._restart()
+        self.is_frozen = rigid_map is not None
+        self.n_restarts = 0
+        self._begin(rigid_map or RigidMap())
 
     def _restart(self) -> None:
         self.n_restarts += 1
-        self.map, k, options = RigidMap(), self.camera.intrinsics, self.options
+        self._begin(RigidMap())
+
+    def _begin(self, rigid_map: RigidMap) -> None:
+        self.map, k, options = rigid_map, self.camera.intrinsics, self.options
         self._initialiser = Initialiser(k, options)
         self._tracker = Tracker(self.map, k, options)
         self._mapper = Mapper(self.map, k, options)
         self._relocaliser = Relocaliser(self.map, k, options)
-        self._n_lost, self._n_held = 0, 0
+        # In a map from elsewhere the camera is lost until it is found.
+        self._n_lost, self._n_held = int(bool(rigid_map.keyframes)), 0
 
     def process_frame(self, image: NDArray[np.uint8], index: int, timestamp: float) -> SlamFrame:
         """Take in the next frame (h, w, 3) or (h, w), as recorded.

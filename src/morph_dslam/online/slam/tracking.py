@@ -57,7 +57,6 @@ class Tracker:
     Attributes
     ----------
     camera_from_world : (4, 4) the newest pose. points : what is followed.
-    usual_rms_px : running mean of the poses' errors.
     """
 
     def __init__(self, rigid_map: RigidMap, intrinsics: Array, options: SlamOptions) -> None:
@@ -65,7 +64,6 @@ class Tracker:
         self._intrinsics = intrinsics
         self._options = options
         self._motion = np.eye(4)
-        self.usual_rms_px = options.inlier_px
         self.camera_from_world = np.eye(4)
         self.points = Followed(np.empty(0, dtype=np.int64), np.empty((0, 2)))
 
@@ -96,7 +94,7 @@ class Tracker:
                 self._motion = result.pose.camera_from_world @ inverse(self.camera_from_world)
                 self.camera_from_world = result.pose.camera_from_world
                 self.points = result.points
-                self.usual_rms_px += USUAL_RATE * (result.pose.rms_px - self.usual_rms_px)
+                self._map.usual_rms_px += USUAL_RATE * (result.pose.rms_px - self._map.usual_rms_px)
                 return result
             reason = reason or result
         return reason
@@ -138,9 +136,8 @@ class Tracker:
         known = self._map.state[found.ids] == GOOD
         fits = np.zeros(len(found.ids), dtype=bool)
         fits[known] = pose.inliers
-        followed = np.isin(self.points.ids[self._map.state[self.points.ids] == GOOD], found.ids)
-        self._map.n_expected[self.points.ids[self._map.state[self.points.ids] == GOOD][~followed]] += 1
-        self._map.n_expected[found.ids[known]] += 1
+        wanted = self.points.ids[self._map.state[self.points.ids] == GOOD]
+        self._map.n_expected[np.union1d(wanted, found.ids[known])] += 1
         self._map.n_found[found.ids[fits]] += 1
         keep = fits | (self._map.state[found.ids] == CANDIDATE)
         keep &= inside(found.pixels, flat.shape, options.patch_half + 2)
