@@ -75,7 +75,7 @@ def test_neighbours_are_those_of_the_sweep_tree() -> None:
     ]
     assert (report["stable"], report["unstable"], report["unknown"]) == (2, 1, 1)
     assert stability_warnings({"stability": report}) == [
-        "1 of 4 solutions are unstable; bifurcations may have been passed at 1 places; of 1 it is not known",
+        "1 of 4 solutions are unstable; bifurcations may have been passed in one place; of 1 it is not known",
         "negative pivots change from 0 to 2 between shift = 1 mm and shift = 3 mm",
     ]
 

@@ -42,7 +42,7 @@ def stability_report(
         for index, count in counts.items()
         if counts.get(parents[index], count) != count
     ]
-    report = {
+    return {
         "statement": _statement(len(pivots), len(counts), len(unstable), len(passed)),
         "stable": len(counts) - len(unstable),
         "unstable": len(unstable),
@@ -59,7 +59,6 @@ def stability_report(
             for pair in passed
         ],
     }
-    return report
 
 
 def stability_warnings(certificate: dict[str, Any]) -> list[str]:
@@ -81,11 +80,10 @@ def _statement(solved: int, known: int, unstable: int, passed: int) -> str:
         return "the solver cannot tell whether the solutions are stable"
     told = f"; of {solved - known} it is not known" if known < solved else ""
     if not unstable:
-        return (
-            f"all {known} solutions are stable{told}" if not told else f"{known} solutions are stable{told}"
-        )
-    places = f"; bifurcations may have been passed at {passed} places" if passed else ""
-    return f"{unstable} of {solved} solutions are unstable{places}{told}"
+        return f"{known} solutions are stable{told}" if told else f"all {known} solutions are stable"
+    places = f"in {passed} places" if passed > 1 else "in one place"
+    branches = f"; bifurcations may have been passed {places}" if passed else ""
+    return f"{unstable} of {solved} solutions are unstable{branches}{told}"
 
 
 def _point(parameters: Sequence[Parameter], coordinates: Array) -> str:
