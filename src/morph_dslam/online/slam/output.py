@@ -159,7 +159,8 @@ def _plot_frames(path: Path, frames: list[SlamFrame]) -> None:
     times.plot(numbers, [f.total_ms for f in frames], color=POINT_COLOUR, linewidth=0.9)
     keyframes = [f for f in frames if f.is_keyframe]
     times.plot([f.index for f in keyframes], [f.total_ms for f in keyframes], ".", color=PATH_COLOUR)
-    times.set_ylabel("time [ms], keyframes dotted")
+    times.set_ylabel("time [ms]")
+    times.legend(["frame", "keyframe"], fontsize=8, frameon=False)
     times.set_xlabel("frame")
     for axes in (counts, errors, times):
         axes.set_ylim(bottom=0.0)
