@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 from collections.abc import Collection, Iterator
@@ -129,6 +130,7 @@ class SerialExecutor(Executor):
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Give back the memory of the problem."""
         _worker_problem.cache_clear()
+        gc.collect()  # a problem and its linear solver refer to each other
 
 
 @contextmanager

@@ -122,6 +122,7 @@ class SolidProblem:
         scale = np.full(self.n_dofs, np.inf)
         scale[:n_displacements] = self.length
         self.scale: Array | float = scale
+        self._latest: tuple[Array, Array, Array] | None = None
         points = [load for load in loads if isinstance(load, PointLoad)]
         self._nodal_forces = NodalForces(self.displacements, points, self.symbols)
 
@@ -219,11 +220,19 @@ class SolidProblem:
 
     def residual(self, x: Array, mu: Array) -> Array:
         self._set(mu)
-        return self.assembly.residual(x) - self._padded(self._nodal_forces.values())
+        residual = self.assembly.residual(x) - self._padded(self._nodal_forces.values())
+        self._latest = x.copy(), np.array(mu), residual
+        return residual.copy()
 
     def linearise(self, x: Array, mu: Array) -> Linearisation:
+        # Newton's method has mostly just asked for the residual at the same point.
+        known = self._latest
+        if known is None or not (np.array_equal(known[0], x) and np.array_equal(known[1], mu)):
+            self.residual(x, mu)
+            known = self._latest
+        assert known is not None
         self._set(mu)
-        return self.assembly.linearise(x, mu, self._padded(self._nodal_forces.values()), self.solver)
+        return self.assembly.linearise(x, mu, known[2], self.solver)
 
     def residual_slopes(self, x: Array, mu: Array) -> Array:
         self._set(mu)
@@ -234,6 +243,7 @@ class SolidProblem:
         if self.history:
             self._set(mu)
             self.history.advance(self.recovery.deformation_gradient(x))
+            self._latest = None
 
     def _set(self, mu: Array) -> None:
         self.symbols.set(mu)

@@ -129,9 +129,8 @@ class Assembly:
             result[index] = self._apply(form, x)
         return result
 
-    def linearise(self, x: Array, mu: Array, forces: Array, solver: LinearSolver) -> Linearisation:
-        """Residual, less nodal ``forces`` (n,), and tangent at ``x``; ``mu`` is set already."""
-        residual = self.residual(x) - forces
+    def linearise(self, x: Array, mu: Array, residual: Array, solver: LinearSolver) -> Linearisation:
+        """Tangent at ``x``, with the ``residual`` (n,) there; ``mu`` is set already."""
         multipliers = int(np.count_nonzero(solver.free[self._n_displacements :]))
         linearisation = _MixedLinearisation(residual, self.tangent(x), solver, multipliers)
         if not self.condensed:

@@ -210,6 +210,7 @@ class LinearSolver:
             self.engine = SparseCholesky() if symmetric else SuperLU(triangular=False)
         self._block: _FreeBlock | None = None
         self._pattern: tuple[Integers, Integers] | None = None
+        self._triangle: tuple[Integers, bool] | None = None
         self._substitute: SuperLU | None = None
         self.latest: Factorisation | None = None
 
@@ -245,6 +246,13 @@ class LinearSolver:
             self._pattern = np.array(indices), np.array(indptr)
         return self._block
 
+    def is_triangle(self, matrix: Matrix) -> bool:
+        """Whether only one triangle of ``matrix`` is stored; looked at once for each array of columns."""
+        if self._triangle is None or not np.may_share_memory(self._triangle[0], matrix.indices):
+            one_sided = sp.triu(matrix, 1).nnz == 0 or sp.tril(matrix, -1).nnz == 0
+            self._triangle = matrix.indices, one_sided
+        return self._triangle[1]
+
     def engines_to_try(self, matrix: Matrix) -> Iterator[Engine]:
         """The engine, then (lazily, once for each matrix) SuperLU in its place."""
         yield self.engine
@@ -272,7 +280,7 @@ class AssembledLinearisation:
     def __init__(self, residual: Array, matrix: Matrix, solver: LinearSolver) -> None:
         self.residual, self._matrix, self._solver = residual, matrix, solver
         self._factorisation: Factorisation | None = None
-        self._triangular = solver.symmetric and (sp.triu(matrix, 1).nnz == 0 or sp.tril(matrix, -1).nnz == 0)
+        self._triangular = solver.symmetric and solver.is_triangle(matrix)
 
     def _factorised(self) -> Factorisation:
         if self._factorisation is None or not self._factorisation.current:

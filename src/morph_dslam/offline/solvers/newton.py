@@ -114,15 +114,19 @@ class NewtonOptions:
     max_iterations : factorisations.
     diverged : size of an update that is certainly wrong.
     smallest_damping : a step damped further has stalled.
+    most_chords : a tangent is kept where so many more corrections with it should do, judged by the last two.
     """
 
     tolerance: float = 1e-8
     max_iterations: int = 20
     diverged: float = 10.0
     smallest_damping: float = 1.0 / 64.0
+    most_chords: int = 4
 
 
 DEFAULT = NewtonOptions()
+#: Repeated corrections with one tangent end at this part of the tolerance.
+CHORD_TARGET = 0.01
 
 
 def size(equations: Equations, update: Array) -> float:
@@ -152,9 +156,12 @@ def solve(equations: Equations, mu: Array, start: State, options: NewtonOptions 
         gap = np.where(equations.free, 0.0, target - x)
         update = correction(linearisation, linearisation.residual, gap)
         _check_update(equations, update, options, mu)
-        x, rest = _damped_step(equations, mu, x, update, gap, linearisation, options)
-        if rest is not None:
-            return State(mu, x + rest, linearisation.negative_pivots, iteration)
+        trial = _damped_step(equations, mu, x, update, gap, linearisation, options)
+        if trial.whole:
+            trial = _follow_chords(equations, mu, trial, linearisation, options)
+            if min(trial.remaining, trial.length) <= options.tolerance:
+                return State(mu, trial.x + trial.rest, linearisation.negative_pivots, iteration)
+        x = trial.x
     raise SolverError(f"Newton's method has not converged in {options.max_iterations} iterations at {mu}")
 
 
@@ -166,6 +173,23 @@ def _check_update(equations: Equations, update: Array, options: NewtonOptions, m
         )
 
 
+@dataclass(frozen=True)
+class _Trial:
+    """A point ``x`` (n,) reached by an update of size ``length``, and what the same tangent asks for there.
+
+    Attributes
+    ----------
+    rest : (n,) the simplified correction, and ``remaining`` its size.
+    whole : whether the update was not damped.
+    """
+
+    x: Array
+    length: float
+    rest: Array
+    remaining: float
+    whole: bool = True
+
+
 def _damped_step(
     equations: Equations,
     mu: Array,
@@ -174,22 +198,46 @@ def _damped_step(
     gap: Array,
     linearisation: Linearisation,
     options: NewtonOptions,
-) -> tuple[Array, Array | None]:
-    """The accepted point along ``update``, and the last correction there if that ends the iteration."""
+) -> _Trial:
+    """The point along ``update`` that is accepted."""
     length, damping = size(equations, update), 1.0
     while damping >= options.smallest_damping:
-        trial = x + damping * update
-        residual = equations.residual(trial, mu)
+        point = x + damping * update
+        residual = equations.residual(point, mu)
         if np.all(np.isfinite(residual)):
             rest = correction(linearisation, residual, (1.0 - damping) * gap)
             remaining = size(equations, rest)
             # An update at the level of rounding need not shrink any further.
-            if damping == 1.0 and min(remaining, length) <= options.tolerance:
-                return trial, rest
-            if remaining <= (1.0 - damping / 4.0) * length:
-                return trial, None
+            if remaining <= (1.0 - damping / 4.0) * length or (
+                damping == 1.0 and length <= options.tolerance
+            ):
+                return _Trial(point, length, rest, remaining, damping == 1.0)
         damping /= 2.0
     raise SolverError(f"Newton's method stalls at {mu}: no part of its update brings the solution nearer")
+
+
+def _follow_chords(
+    equations: Equations, mu: Array, trial: _Trial, linearisation: Linearisation, options: NewtonOptions
+) -> _Trial:
+    """Repeat the simplified correction where few repetitions will do: each saves a factorisation.
+
+    They converge linearly, so that they must go further than Newton's method for the same error.
+    """
+    no_gap, target = np.zeros_like(trial.x), CHORD_TARGET * options.tolerance
+    while options.tolerance < trial.length and target < trial.remaining < trial.length:
+        contraction = np.log(trial.remaining / trial.length)
+        if np.log(target / trial.remaining) < options.most_chords * contraction:
+            break
+        point = trial.x + trial.rest
+        residual = equations.residual(point, mu)
+        if not np.all(np.isfinite(residual)):
+            break
+        rest = correction(linearisation, residual, no_gap)
+        remaining = size(equations, rest)
+        if not remaining < trial.remaining:
+            break
+        trial = _Trial(point, trial.remaining, rest, remaining)
+    return trial
 
 
 def sensitivities(equations: Equations, state: State, linearisation: Linearisation | None = None) -> Array:
