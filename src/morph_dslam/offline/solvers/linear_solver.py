@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.util import find_spec
 from typing import Any, Protocol
 
@@ -125,7 +126,12 @@ class Factorisation:
 
     def __init__(self, solver: LinearSolver, matrix: Matrix, triangular: bool) -> None:
         self._solver, self._matrix, self._triangular = solver, matrix, triangular
-        self._norm = np.max(multiply(abs(matrix), np.ones(matrix.shape[0]), triangular), initial=0.0)
+
+    @cached_property
+    def _norm(self) -> float:
+        """Largest sum of a row's magnitudes; worked out only for solves that are not plainly good."""
+        ones = np.ones(self._matrix.shape[0])
+        return float(np.max(multiply(abs(self._matrix), ones, self._triangular), initial=0.0))
 
     @property
     def current(self) -> bool:
@@ -180,6 +186,8 @@ class Factorisation:
     def _good(self, residual: Array, solution: Array, right: Array) -> bool:
         remaining = np.abs(residual).max(axis=0)
         size = np.abs(right).max(axis=0)
+        if np.all(remaining <= RESIDUAL_TOLERANCE * size):
+            return True
         rounding = BACKWARD_ERROR * (self._norm * np.abs(solution).max(axis=0) + size)
         return bool(np.all(remaining <= np.maximum(RESIDUAL_TOLERANCE * size, rounding)))
 

@@ -226,7 +226,8 @@ def _follow_chords(
     no_gap, target = np.zeros_like(trial.x), CHORD_TARGET * options.tolerance
     while options.tolerance < trial.length and target < trial.remaining < trial.length:
         contraction = np.log(trial.remaining / trial.length)
-        if np.log(target / trial.remaining) < options.most_chords * contraction:
+        goal = options.tolerance if trial.remaining > options.tolerance else target
+        if np.log(goal / trial.remaining) < options.most_chords * contraction:
             break
         point = trial.x + trial.rest
         residual = equations.residual(point, mu)
