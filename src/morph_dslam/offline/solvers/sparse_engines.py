@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 Matrix = Any
 sla: Any = scipy.sparse.linalg
 
-#: PARDISO's settings, numbered from 1 as in its manual: own settings; METIS ordering; refinement only where pivots
-#: were perturbed (`linear_solver` refines where a residual asks for it);
+#: PARDISO's settings, numbered from 1 as in its manual: own settings; METIS ordering; refinement only where
+#: pivots were perturbed (`linear_solver` refines where a residual asks for it);
 #: perturbation of zero pivots 1e-8; Bunch-Kaufman pivoting.
 PARDISO_SETTINGS = {1: 1, 2: 2, 8: 0, 10: 8, 21: 1}
 #: Scaling and weighted matching. Saddle points need them; where all diagonals are positive they cost a fifth
