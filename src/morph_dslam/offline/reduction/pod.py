@@ -1,10 +1,12 @@
-"""Proper orthogonal decomposition by the method of snapshots (Sirovich, Q. Appl. Math. 45, 1987)."""
+"""Proper orthogonal decomposition of snapshots, by a thin singular value decomposition."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -32,8 +34,7 @@ class Pod:
 def compute_pod(snapshots: Array, weights: Array, tolerance: float, max_modes: int) -> Pod:
     """Leading modes of ``snapshots`` (n_snapshots, n).
 
-    From the eigenvectors of the snapshots' Gram matrix, which takes no more memory than they do. Singular
-    values below 1e-7 of the largest are lost in rounding; snapshots are kept in single precision anyway.
+    A QR factorisation in place comes first, so that little more memory is needed than the snapshots take.
 
     Parameters
     ----------
@@ -42,13 +43,10 @@ def compute_pod(snapshots: Array, weights: Array, tolerance: float, max_modes: i
     max_modes : at most this many.
     """
     root = np.sqrt(weights)
-    scaled = snapshots * root
-    eigenvalues, vectors = np.linalg.eigh(scaled @ scaled.T)
-    singular_values = np.sqrt(np.maximum(eigenvalues[::-1], 0.0))[: snapshots.shape[1]]
+    factors: Any = scipy.linalg.qr((snapshots * root).T, mode="economic", overwrite_a=True)
+    basis, triangle = factors
+    _, singular_values, right = np.linalg.svd(triangle.T, full_matrices=False)
     energy = np.cumsum(singular_values[::-1] ** 2)[::-1]
     left_out = np.sqrt(np.append(energy[1:], 0.0) / energy[0])
     count = min(int(np.argmax(left_out <= tolerance)) + 1, max_modes)
-    # Products of rounded eigenvectors are orthogonal only roughly where singular values are small.
-    modes, triangle = np.linalg.qr((vectors[:, ::-1][:, :count].T @ scaled).T)
-    modes = modes.T * np.sign(np.diag(triangle))[:, None]
-    return Pod(modes / root, singular_values, weights)
+    return Pod(right[:count] @ basis.T / root, singular_values, weights)
