@@ -18,7 +18,7 @@ from morph_dslam.model import Parameter, ReducedModel, save_model
 from morph_dslam.offline.certificate import certify, compression_percent
 from morph_dslam.offline.external import ExternalStudy
 from morph_dslam.offline.problem import ModelMesh, ParametricStudy, Snapshot, bounds
-from morph_dslam.offline.reduction.reduce import reduce
+from morph_dslam.offline.reduction.method import METHODS, ReductionTask
 from morph_dslam.offline.snapshots import load_outputs, load_snapshot
 from morph_dslam.offline.stability import stability_report
 from morph_dslam.offline.studies.study import Study, load_study
@@ -159,7 +159,7 @@ def _certified(solutions: Solutions, options: ReductionSection, name: str) -> Re
     seen, unseen = solutions.seen, solutions.unseen
     if len(unseen) < 4:
         raise StudyError(f"only {len(unseen)} held-out samples converged: too few to certify the model")
-    model = reduce(solutions.mesh, solutions.parameters, seen, options, name)
+    model = METHODS["pod"](ReductionTask(solutions.mesh, solutions.parameters, seen, options, name))
     certificate = certify(model, unseen)
     certificate["compression_percent"] = compression_percent(model, len(seen) + len(unseen))
     certificate["samples"] = {"training": len(seen), "held_out": len(unseen), "failed": solutions.failed}

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.model import Parameter, ReducedModel, SeparatedField
-from morph_dslam.offline.problem import ModelMesh, Snapshot
+from morph_dslam.model import ReducedModel, SeparatedField
+from morph_dslam.offline.problem import Snapshot
 from morph_dslam.offline.reduction.pod import Pod, compute_pod
 from morph_dslam.offline.reduction.regression import fit_functions
+from morph_dslam.offline.reduction.task import ReductionTask
 from morph_dslam.offline.studies.study_sections import ReductionSection
 
 Array = NDArray[np.float64]
@@ -16,32 +17,25 @@ Array = NDArray[np.float64]
 STRESS = "stress_"
 
 
-def reduce(
-    mesh: ModelMesh,
-    parameters: tuple[Parameter, ...],
-    groups: list[list[Snapshot]],
-    options: ReductionSection,
-    name: str = "",
-) -> ReducedModel:
+def reduce(task: ReductionTask) -> ReducedModel:
     """A reduced model of every field that the snapshots hold.
 
-    Parameters
-    ----------
-    parameters : with the box that the functions are fitted in.
-    groups : snapshots; those of one group (mirror images) are left out together in cross-validation.
+    Snapshots of one group (mirror images) are left out together in cross-validation.
     """
+    mesh, groups = task.mesh, task.groups
     snapshots = [snapshot for group in groups for snapshot in group]
     fold = np.concatenate([np.full(len(group), index) for index, group in enumerate(groups)])
     fields, summaries = {}, {}
-    box = np.array([[parameter.lower, parameter.upper] for parameter in parameters])
     for key in snapshots[0].fields:
-        fields[key], summaries[key] = _reduce_field(mesh.weights, box, snapshots, key, fold, options)
+        fields[key], summaries[key] = _reduce_field(
+            mesh.weights, task.box, snapshots, key, fold, task.options
+        )
     return ReducedModel(
-        name=name,
+        name=task.name,
         nodes=mesh.nodes,
         triangles=mesh.triangles,
         cells=mesh.cells,
-        parameters=parameters,
+        parameters=task.parameters,
         displacement=fields["displacement"],
         stresses={key.removeprefix(STRESS): field for key, field in fields.items() if key.startswith(STRESS)},
         strain=fields.get("strain"),

@@ -52,9 +52,28 @@ class SamplingSection(Section):
     seed: int = 0
 
 
-class ReductionSection(Section):
-    """Modes kept (relative energy left out, and at most) and the highest polynomial degree tried."""
+#: Names of the methods of reduction, of formats of several parameters, and of functions of one.
+MethodName = Literal["galerkin", "pod", "reduced_basis", "sparse_pgd", "pgd"]
+FormatName = Literal["tucker", "tensor_train", "cp", "polynomial"]
+BasisName = Literal["chebyshev", "cubic_spline", "p_spline", "kriging", "fourier", "hat"]
 
+
+class ReductionSection(Section):
+    """How solutions are reduced.
+
+    ``method`` finds the functions of the parameters, ``format`` is how those of several parameters are kept
+    and ``basis`` what those of a single one are made of; the study and the method choose where one is absent.
+    ``inner_product`` is that in which modes are orthogonal: "mass" counts nodes by their volume, "energy" by
+    the stiffness. ``components`` "separate" gives every component of a field modes of its own. Modes are kept
+    until the relative norm left out is below ``tolerance``, and at most ``max_modes``; ``max_degree`` is the
+    highest polynomial degree tried in the parameters.
+    """
+
+    method: MethodName | None = None
+    format: FormatName | None = None
+    basis: BasisName | None = None
+    inner_product: Literal["mass", "energy"] = "mass"
+    components: Literal["together", "separate"] = "together"
     tolerance: float = Field(default=5e-4, gt=0, lt=1)
     max_modes: int = Field(default=24, ge=1)
     max_degree: int = Field(default=8, ge=1, le=40)

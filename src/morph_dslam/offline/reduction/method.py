@@ -1,0 +1,19 @@
+"""The methods of reduction by their names in study files.
+
+A method is a function from a `ReductionTask` to a `ReducedModel` with all fields that the snapshots hold.
+What it says of itself goes under "reduction" into the model's certificate; the build adds held-out errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from morph_dslam.model import ReducedModel
+from morph_dslam.offline.reduction.reduce import reduce
+from morph_dslam.offline.reduction.task import ReductionTask
+
+__all__ = ["METHODS", "ReductionTask"]
+
+METHODS: dict[str, Callable[[ReductionTask], ReducedModel]] = {
+    "pod": reduce,
+}
