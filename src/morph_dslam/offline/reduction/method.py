@@ -10,10 +10,12 @@ from collections.abc import Callable
 
 from morph_dslam.model import ReducedModel
 from morph_dslam.offline.reduction.reduce import reduce
+from morph_dslam.offline.reduction.sparse_pgd_method import reduce_by_sparse_pgd
 from morph_dslam.offline.reduction.task import ReductionTask
 
 __all__ = ["METHODS", "ReductionTask"]
 
 METHODS: dict[str, Callable[[ReductionTask], ReducedModel]] = {
     "pod": reduce,
+    "sparse_pgd": reduce_by_sparse_pgd,
 }

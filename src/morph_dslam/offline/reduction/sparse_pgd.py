@@ -185,9 +185,15 @@ class _Fit:
 
 
 def fit_sparse_pgd(
-    samples: Array, values: Array, bases: tuple[Basis, ...], options: SparsePgdOptions | None = None
+    samples: Array,
+    values: Array,
+    bases: tuple[Basis, ...],
+    options: SparsePgdOptions | None = None,
+    labels: NDArray[np.int64] | None = None,
 ) -> SparsePgd:
     """Fit fields ``values`` (N, n) at ``samples`` (N, d) by a sum of products of functions in ``bases``.
+
+    Samples of one label in ``labels`` (N,), mirror images say, are kept aside together; all differ if absent.
 
     Warns
     -----
@@ -199,9 +205,11 @@ def fit_sparse_pgd(
     data = pod.project(values)
     tables = [b.evaluate(samples[:, k]) for k, b in enumerate(bases)]
     penalties = [b.penalty() for b in bases]
-    order = np.random.default_rng(0).permutation(len(samples))
-    n_aside = max(1, round(options.validation_fraction * len(samples)))
-    aside, used = order[:n_aside], order[n_aside:]
+    labels = np.arange(len(samples)) if labels is None else labels
+    order = np.random.default_rng(0).permutation(np.unique(labels))
+    n_aside = max(1, round(options.validation_fraction * len(order)))
+    kept_aside = np.isin(labels, order[:n_aside])
+    aside, used = np.flatnonzero(kept_aside), np.flatnonzero(~kept_aside)
     fit = _Fit([t[used] for t in tables], penalties, data[used])
     errors: dict[int, float] = {}
     best: tuple[Array, list[Array]] = (fit.mixing, fit.coefficients)

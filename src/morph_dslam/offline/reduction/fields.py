@@ -1,0 +1,46 @@
+"""The fields that snapshots hold, and the reduced model that separated fields make."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.model import ReducedModel, SeparatedField
+from morph_dslam.offline.problem import Snapshot
+from morph_dslam.offline.reduction.task import ReductionTask
+
+Array = NDArray[np.float64]
+
+STRESS = "stress_"
+
+
+def field_names(snapshots: Sequence[Snapshot]) -> list[str]:
+    """The names of all fields, as the model file has them."""
+    return list(snapshots[0].fields)
+
+
+def field_values(snapshots: Sequence[Snapshot], name: str) -> Array:
+    """The values (n_snapshots, n_points, n_components) of one field in all snapshots."""
+    return np.array([snapshot.fields[name] for snapshot in snapshots], dtype=np.float64)
+
+
+def model_of(
+    task: ReductionTask, fields: Mapping[str, SeparatedField], summary: dict[str, Any]
+) -> ReducedModel:
+    """The reduced model of separated fields by name, with what the method says of itself."""
+    return ReducedModel(
+        name=task.name,
+        nodes=task.mesh.nodes,
+        triangles=task.mesh.triangles,
+        cells=task.mesh.cells,
+        parameters=task.parameters,
+        displacement=fields["displacement"],
+        stresses={
+            name.removeprefix(STRESS): field for name, field in fields.items() if name.startswith(STRESS)
+        },
+        strain=fields.get("strain"),
+        certificate={"reduction": summary},
+    )
