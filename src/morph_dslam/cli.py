@@ -78,9 +78,16 @@ def _evaluate(arguments: argparse.Namespace) -> None:
 
         print(trajectory_line(evaluate_trajectory(arguments.run, arguments.trajectory)))
         return
-    from morph_dslam.evaluation.evaluate import evaluate
-    from morph_dslam.evaluation.statements import remarks, result_line
+    from morph_dslam.evaluation.evaluate import evaluate, evaluate_depth
+    from morph_dslam.evaluation.statements import depth_line, remarks, result_line
 
+    if arguments.depth is not None:
+        found = evaluate_depth(
+            arguments.run, arguments.depth, arguments.base_frame, arguments.depth_per_metre
+        )
+        print(f"wrote {arguments.run / 'depth_evaluation.json'} and depth_evaluation.png")
+        print(depth_line(found))
+        return
     if arguments.bind_frame is None:
         raise EvaluationError(
             "--points needs --bind-frame N, the frame whose pixels bind the points to the mesh"
@@ -186,13 +193,25 @@ def _add_online_commands(commands: argparse._SubParsersAction) -> None:
         "evaluate",
         _evaluate,
         "the run is unchanged",
-        "compare a run with measured points, without alignment, or its camera path with the true one",
+        "compare a run with measured points or depth images, or its camera path with the true one",
     )
     evaluate.add_argument("run", type=Path, help="run folder, or a trajectory file")
     truth = evaluate.add_mutually_exclusive_group(required=True)
     truth.add_argument("--points", type=Path, metavar="TRUTH", help="truth file (.npz)")
     truth.add_argument(
         "--trajectory", type=Path, metavar="TRUTH", help="true camera path (TUM, KITTI, COLMAP or 7-Scenes)"
+    )
+    truth.add_argument(
+        "--depth",
+        type=Path,
+        metavar="DEPTH",
+        help="depth.h5 of a simulation, a recording with depth, or a folder of 16-bit images",
+    )
+    evaluate.add_argument(
+        "--base-frame", type=int, metavar="N", help="with --depth: a frame in which nothing is deformed"
+    )
+    evaluate.add_argument(
+        "--depth-per-metre", type=float, metavar="V", help="with a folder of depth images: values a metre"
     )
     evaluate.add_argument(
         "--bind-frame",

@@ -8,8 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from morph_dslam.evaluation.depth_error import depth_error, summarise_depth
 from morph_dslam.evaluation.material_error import material_error, summarise
-from morph_dslam.evaluation.plots import plot_error_map, plot_errors_by_frame
+from morph_dslam.evaluation.plots import (
+    plot_depth_error_map,
+    plot_depth_errors_by_frame,
+    plot_error_map,
+    plot_errors_by_frame,
+)
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.evaluation.run_report import write_run_report
 from morph_dslam.evaluation.truth import load_truth
@@ -45,4 +51,37 @@ def evaluate(folder: Path, truth_path: Path, bind_frame: int) -> dict[str, Any]:
     plot_errors_by_frame(folder / "evaluation.png", error)
     plot_error_map(folder / "error_map.png", error, run.model)
     write_run_report(run, figures)
+    return figures
+
+
+def evaluate_depth(
+    folder: Path, depth: Path, base_frame: int | None = None, values_per_metre: float | None = None
+) -> dict[str, Any]:
+    """Compare a run's surfaces with depth images; writes ``depth_evaluation.json`` and pictures into it.
+
+    Parameters
+    ----------
+    folder : a run folder. depth, values_per_metre : see `read_depths`.
+    base_frame : a frame in which the object is not deformed, whose error stands beside the others'.
+
+    Returns
+    -------
+    The content of ``depth_evaluation.json``.
+
+    Raises
+    ------
+    EvaluationError
+        If the run or the depth images cannot be read or do not fit together.
+    """
+    run = load_run(folder)
+    error = depth_error(run, depth, base_frame, values_per_metre)
+    figures = {
+        **summarise_depth(error),
+        "depth": str(depth),
+        "n_frames": len(run.frames),
+        "n_frames_tracked": int(run.tracked.sum()),
+    }
+    (folder / "depth_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
+    plot_depth_errors_by_frame(folder / "depth_evaluation.png", error)
+    plot_depth_error_map(folder / "depth_error_map.png", error, run.model)
     return figures

@@ -1,4 +1,4 @@
-"""Pictures of the material error."""
+"""Pictures of the material error and of the surface error."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from morph_dslam.evaluation.depth_error import DepthError
 from morph_dslam.evaluation.material_error import MaterialError
 from morph_dslam.model import ReducedModel
 
@@ -47,20 +48,51 @@ def _draw_bands(axes: Axes, frames: NDArray[np.int64], distances: list[NDArray])
 
 
 def plot_errors_by_frame(path: Path, error: MaterialError) -> None:
-    """The spread of the error over the points of each truth frame; boxes for few frames, bands for many."""
+    """The spread of the material error over the points of each truth frame."""
     measured = np.isfinite(error.distances).any(axis=1)
     distances = [1e3 * row[np.isfinite(row)] for row in error.distances[measured]]
+    title = f"bound in frame {error.binding.frame}"
+    _plot_by_frame(path, error.frames[measured], distances, distances, "material error [mm]", title)
+
+
+def plot_depth_errors_by_frame(path: Path, error: DepthError) -> None:
+    """The spread of the surface error over the sensor's points of each frame, beside that of the sensor."""
+    distances = [1e3 * row for row in error.distances]
+    base = error.base
+    title = "no base frame"
+    if base is not None and len(base):
+        title = (
+            f"sensor and registration in frame {error.base_frame}: mean {1e3 * base.mean():.2f} mm (dotted)"
+        )
+    shown = None if base is None or not len(base) else 1e3 * float(base.mean())
+    label = "distance to the estimated surface [mm]"
+    _plot_by_frame(path, error.frames, distances, [1e3 * error.compared], label, title, shown)
+
+
+def _plot_by_frame(
+    path: Path,
+    frames: NDArray[np.int64],
+    distances: list[NDArray],
+    counted: list[NDArray],
+    label: str,
+    title: str,
+    base: float | None = None,
+) -> None:
+    """Boxes for few frames, bands for many; the mean of ``counted`` dashed, ``base`` dotted."""
     figure = Figure(figsize=(9.0, 4.2), layout="constrained")
     axes = figure.add_subplot()
     draw = _draw_boxes if len(distances) <= MOST_BOXES else _draw_bands
-    draw(axes, error.frames[measured], distances)
-    axes.axhline(1e3 * error.mean, color=MEAN, linewidth=0.8, linestyle="--")
+    draw(axes, frames, distances)
+    values = np.concatenate(counted)
+    axes.axhline(values.mean(), color=MEAN, linewidth=0.8, linestyle="--")
+    if base is not None:
+        axes.axhline(base, color=MEAN, linewidth=1.0, linestyle=":")
     axes.set_xlabel("frame")
-    axes.set_ylabel("material error [mm]")
+    axes.set_ylabel(label)
     axes.set_ylim(bottom=0.0)
     axes.set_title(
-        f"mean {1e3 * error.mean:.2f} mm (dashed), median {1e3 * error.median:.2f} mm, "
-        f"95th percentile {1e3 * error.p95:.2f} mm; bound in frame {error.binding.frame}",
+        f"mean {values.mean():.2f} mm (dashed), median {np.median(values):.2f} mm, "
+        f"95th percentile {np.percentile(values, 95):.2f} mm; {title}",
         fontsize=10,
     )
     figure.savefig(path, dpi=DPI)
@@ -77,19 +109,33 @@ def outline_edges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def plot_error_map(path: Path, error: MaterialError, model: ReducedModel) -> None:
     """Mean error of each material point where it lies on the undeformed object."""
+    measured = np.isfinite(error.distances).any(axis=0)
+    mean = np.nanmean(error.distances[:, measured], axis=0)
+    rest = model.rest_positions(error.binding.points)[measured]
+    _plot_map(path, rest, mean, model, "mean material error [mm]")
+
+
+def plot_depth_error_map(path: Path, error: DepthError, model: ReducedModel) -> None:
+    """Mean distance of the sensor's points around each mesh node, on the undeformed object."""
+    means = error.node_means(len(model.nodes))
+    seen = np.isfinite(means)
+    _plot_map(path, model.nodes[seen], means[seen], model, "mean distance to the surface [mm]")
+
+
+def _plot_map(path: Path, rest: NDArray, mean: NDArray, model: ReducedModel, label: str) -> None:
+    """Points (p, 3) of the undeformed object coloured by their means (p,); both in metres."""
     # The two longest directions of the object span the picture.
     first, second = sorted(np.argsort(np.ptp(model.nodes, axis=0))[-2:])
-    measured = np.isfinite(error.distances).any(axis=0)
-    mean = 1e3 * np.nanmean(error.distances[:, measured], axis=0)
-    rest = 1e3 * model.rest_positions(error.binding.points)[measured]
     figure = Figure(figsize=(7.5, 5.2), layout="constrained")
     axes = figure.add_subplot()
     segments = 1e3 * model.nodes[outline_edges(model.triangles)][:, :, [first, second]]
     axes.add_collection(LineCollection(list(segments), colors="#57606a", linewidths=1.0))
-    dots = axes.scatter(rest[:, first], rest[:, second], c=mean, s=26, cmap="viridis", vmin=0.0)
+    dots = axes.scatter(
+        1e3 * rest[:, first], 1e3 * rest[:, second], c=1e3 * mean, s=26, cmap="viridis", vmin=0.0
+    )
     axes.set_aspect("equal")
     axes.autoscale()
     axes.set_xlabel(f"{'xyz'[first]} on the undeformed object [mm]")
     axes.set_ylabel(f"{'xyz'[second]} [mm]")
-    figure.colorbar(dots, shrink=0.75, label="mean material error [mm]")
+    figure.colorbar(dots, shrink=0.75, label=label)
     figure.savefig(path, dpi=DPI)

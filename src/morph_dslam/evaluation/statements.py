@@ -36,3 +36,14 @@ def result_line(figures: Mapping[str, Any]) -> str:
         f"tracked={figures['n_frames_tracked']}/{figures['n_frames']} "
         f"median_ms={figures['median_ms']:.2f} p95_ms={figures['p95_ms']:.2f}"
     )
+
+
+def depth_line(figures: Mapping[str, Any]) -> str:
+    """The last line of an evaluation against depth images."""
+    base = figures["base"]
+    beside = f" base_mean_mm={base['mean_mm']:.3f}" if base and base["n_points"] else ""
+    return (
+        f"surface_mean_mm={figures['mean_mm']:.3f} surface_median_mm={figures['median_mm']:.3f} "
+        f"surface_p95_mm={figures['p95_mm']:.3f}{beside} left_out_percent={figures['left_out_percent']:.1f} "
+        f"frames={len(figures['frames_compared'])}/{figures['n_frames']}"
+    )

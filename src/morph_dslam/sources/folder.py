@@ -13,7 +13,7 @@ from morph_dslam.sources.recorded import ImageRecord, RecordedFrames
 ASSUMED_FPS = 30.0
 
 
-def _numbered_images(folder: Path) -> dict[int, Path]:
+def numbered_images(folder: Path) -> dict[int, Path]:
     """The images of a folder by the last number in their names, in its order."""
     images: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
@@ -39,6 +39,6 @@ def _numbered_images(folder: Path) -> dict[int, Path]:
 def image_folder(folder: Path, first: int | None = None, last: int | None = None) -> RecordedFrames:
     """A folder of images as a source; gaps in the numbering are kept as they are."""
     records = [
-        ImageRecord(number, number / ASSUMED_FPS, path) for number, path in _numbered_images(folder).items()
+        ImageRecord(number, number / ASSUMED_FPS, path) for number, path in numbered_images(folder).items()
     ]
     return RecordedFrames(folder, records, first=first, last=last, fps=ASSUMED_FPS)

@@ -1,0 +1,107 @@
+"""The surface error: sensor points at known distances from a surface, and what is left out."""
+
+import json
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from morph_dslam.cli import main
+from morph_dslam.evaluation.depth_error import RIM_PX, depth_error
+from morph_dslam.evaluation.run_folder import load_run
+from morph_dslam.render.rasteriser import rasterise_numpy
+from tests.support.run_folders import CAMERA, write_run
+
+
+def surface_depth(run, row):
+    """Exact depth (h, w) of the estimated surface, 0 beside it, drawn by the plain rasteriser."""
+    nodes = run.camera_points(row)
+    drawn = rasterise_numpy(CAMERA.project(nodes), nodes[:, 2], run.model.triangles, 480, 640).depth
+    return np.where(np.isfinite(drawn), drawn, 0.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A run whose sensor sees the surface 3 mm nearer than it is in frame 11, and exactly in frame 10."""
+    folder = tmp_path_factory.mktemp("depth") / "run"
+    write_run(folder, ["tracked", "tracked", "lost", "tracked", "tracked", "tracked"])
+    run = load_run(folder)
+    depth = np.zeros((12, 480, 640), dtype=np.float32)
+    depth[10], depth[11] = surface_depth(run, 0), surface_depth(run, 1)
+    depth[11][depth[11] > 0.0] -= 0.003
+    depth[11][200:260, 280:340] = 0.4  # a hand in front, 0.2 m nearer
+    with h5py.File(folder.parent / "depth.h5", "w") as file:
+        file["depth_m"] = depth
+    return folder
+
+
+def test_distances_are_those_of_the_sensor_and_what_is_in_front_is_left_out(folder):
+    error = depth_error(load_run(folder), folder.parent / "depth.h5", base_frame=10)
+    assert error.frames.tolist() == [10, 11]
+    assert error.base is not None
+    assert error.base.max() < 1e-5
+    # 3 mm along the axis are more along an oblique ray, and less across a surface that is turned away
+    longest_ray = np.linalg.norm([320.0 / 528.0, 240.0 / 528.0, 1.0])
+    assert error.compared.max() <= 0.003 * longest_ray
+    assert np.median(error.compared) == pytest.approx(0.003, rel=0.05)
+    covered = surface_depth(load_run(folder), 1) > 0.0
+    inside = cv2.erode(
+        covered.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * RIM_PX + 1,) * 2)
+    )
+    assert error.left_out[1] == pytest.approx(60 * 60 / np.count_nonzero(inside), rel=0.1)
+    assert error.left_out[0] == 0.0
+
+
+def test_means_at_nodes_are_of_the_points_around_them(folder):
+    run = load_run(folder)
+    error = depth_error(run, folder.parent / "depth.h5")
+    means = error.node_means(len(run.model.nodes))
+    seen = np.isfinite(means)
+    assert seen.mean() > 0.8
+    assert np.median(means[seen]) == pytest.approx(0.0015, rel=0.05)  # half of the points have no error
+
+
+def test_the_command_prints_the_base_beside_the_error(folder, capsys):
+    assert (
+        main(["evaluate", str(folder), "--depth", str(folder.parent / "depth.h5"), "--base-frame", "10"]) == 0
+    )
+    line = capsys.readouterr().out.splitlines()[-1]
+    values = dict(part.split("=") for part in line.split())
+    assert float(values["surface_median_mm"]) == pytest.approx(3.0, rel=0.05)
+    assert float(values["base_mean_mm"]) < 0.01
+    assert values["frames"] == "2/6"
+    figures = json.loads((folder / "depth_evaluation.json").read_text())
+    assert set(figures["per_frame"]) == {"10", "11"}
+    for name in ("depth_evaluation.png", "depth_error_map.png"):
+        assert (folder / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_folder_of_images_is_read_in_its_unit(folder, tmp_path):
+    depth = surface_depth(load_run(folder), 1)
+    cv2.imwrite(str(tmp_path / "depth-11.png"), np.rint(4000.0 * depth).astype(np.uint16))
+    error = depth_error(load_run(folder), tmp_path, values_per_metre=4000.0)
+    assert error.frames.tolist() == [11]
+    assert error.compared.max() <= 0.125e-3 + 1e-6  # half of the sensor's step
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["missing.h5"], "no depth images at"),
+        (["depth.h5", "--base-frame", "12"], "base frame 12 was not tracked or has no depth"),
+        (["small"], "is no recording with depth"),
+        (["small", "--depth-per-metre", "1000"], "register the depth"),
+        (["small", "--depth-per-metre", "0"], "cannot have 0 values a metre"),
+        (["broken.h5"], "simulate again"),
+    ],
+)
+def test_what_cannot_be_compared_is_one_message(folder, capsys, arguments, message):
+    parent = folder.parent
+    (parent / "small").mkdir(exist_ok=True)
+    cv2.imwrite(str(parent / "small" / "11.png"), np.full((24, 32), 600, np.uint16))
+    (parent / "broken.h5").write_bytes((parent / "depth.h5").read_bytes()[:3000])
+    assert main(["evaluate", str(folder), "--depth", str(parent / arguments[0]), *arguments[1:]]) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
