@@ -83,11 +83,10 @@ def main() -> None:
     def jacobian(step):
         """With the left Jacobian of the rotation, because scipy's step is measured from the start."""
         state = moved(start, step)
-        rotation, translation = state.camera_from_object.rotation, state.camera_from_object.translation
+        pose, rows = state.camera_from_object, functions.rows(state.parameters)
         result = project_with_jacobian(
-            state.parameters, rotation, translation, points.rest, points.field.modes, functions.lower,
-            functions.upper, functions.multi_indices, functions.coefficients, CAMERA.intrinsics,
-        )[1].reshape(-1, 10)  # fmt: skip
+            rows, pose.rotation, pose.translation, points.rest, points.field.modes, CAMERA.intrinsics
+        )[1].reshape(-1, 10)
         result[:, 4:7] = result[:, 4:7] @ left_jacobian(step[4:7])
         return result
 

@@ -25,7 +25,7 @@ from morph_dslam.model.basis_functions import (
     kriging_basis,
     p_spline_basis,
 )
-from morph_dslam.model.tensor_field import TensorField
+from morph_dslam.model.separated import SeparatedField
 from morph_dslam.model.tensor_functions import TensorFunctions, TuckerFunctions
 from morph_dslam.offline.reduction.pod import Pod, compute_pod
 from morph_dslam.offline.reduction.sparse_pgd import SparsePgdOptions, fit_sparse_pgd
@@ -109,7 +109,7 @@ def slopes(mu: Array, step: float = 1e-4) -> Array:
 def microseconds(functions: TensorFunctions) -> float:
     """Median time of value and all sensitivities at 500 points with three components."""
     rng = np.random.default_rng(0)
-    field = TensorField(rng.normal(size=(functions.n_functions, 500, 3)), functions)
+    field = SeparatedField(rng.normal(size=(functions.n_functions, 500, 3)), functions)
     mu, times = np.array([0.1, 0.2, 0.3]), []
     for _ in range(2000):
         start = time.perf_counter()

@@ -6,8 +6,6 @@ from scipy.special import eval_chebyt
 
 from morph_dslam.model.functions import (
     ParameterFunctions,
-    evaluate_functions,
-    evaluate_functions_numpy,
     total_degree_indices,
 )
 
@@ -24,14 +22,9 @@ def random_functions(dimension, degree, n_functions=7, seed=0):
 def test_compiled_functions_equal_their_numpy_twin(dimension, degree):
     functions = random_functions(dimension, degree)
     rng = np.random.default_rng(1)
-    arguments = (functions.lower, functions.upper, functions.multi_indices, functions.coefficients)
     for mu in rng.uniform(functions.lower - 0.1, functions.upper + 0.1, (20, dimension)):
-        np.testing.assert_allclose(
-            evaluate_functions(mu, *arguments),
-            evaluate_functions_numpy(mu, *arguments),
-            rtol=1e-10,
-            atol=1e-10,
-        )
+        for compiled, plain in zip(functions.evaluate(mu), functions.evaluate_numpy(mu), strict=True):
+            np.testing.assert_allclose(compiled, plain, rtol=1e-10, atol=1e-10)
 
 
 def test_values_are_sums_of_products_of_chebyshev_polynomials():
@@ -52,6 +45,30 @@ def test_gradient_by_central_differences():
                 2 * step
             )
             np.testing.assert_allclose(gradient[k], difference, rtol=1e-5, atol=1e-5)
+
+
+def test_polynomials_go_on_as_tangents_outside_the_box():
+    """Value at the nearer end plus slope times distance, for each parameter in turn and for both together."""
+    functions = random_functions(2, 6)
+    ends, width = functions.upper, functions.upper - functions.lower
+    value, gradient = functions.evaluate(ends)
+    for k in range(2):
+        beyond = ends + 0.3 * width * np.eye(2)[k]
+        expected = value + 0.3 * width[k] * gradient[k]
+        np.testing.assert_allclose(functions.evaluate(beyond)[0], expected, rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(functions.evaluate(beyond)[1][k], gradient[k], rtol=1e-10, atol=1e-10)
+        assert functions.inside(beyond).tolist() == [k != 0, k != 1]
+    corner = ends + 0.3 * width
+    cross = functions.partial(ends, (1, 1))
+    expected = value + 0.3 * width @ gradient + 0.09 * width.prod() * cross
+    np.testing.assert_allclose(functions.evaluate(corner)[0], expected, rtol=1e-10, atol=1e-10)
+
+
+def test_mixed_functions_are_the_linear_combinations_of_the_old():
+    functions, mixing = random_functions(2, 3), np.random.default_rng(3).normal(size=(7, 4))
+    mu = functions.lower + 0.3
+    for new, old in zip(functions.mixed(mixing).evaluate(mu), functions.evaluate(mu), strict=True):
+        np.testing.assert_allclose(new, old @ mixing, rtol=1e-12)
 
 
 def test_total_degree_indices_are_all_and_ordered():

@@ -13,7 +13,7 @@ from morph_dslam.model.basis_functions import (
     kriging_basis,
     p_spline_basis,
 )
-from morph_dslam.model.tensor_field import TensorField
+from morph_dslam.model.separated import SeparatedField
 from morph_dslam.model.tensor_functions import (
     CPFunctions,
     TensorFunctions,
@@ -135,6 +135,14 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
         TensorTrainFunctions(bases, tuple(rng.normal(size=(2, b.size, 2)) for b in bases))
 
 
+@every_form
+def test_mixed_functions_are_the_linear_combinations_of_the_old(form: str) -> None:
+    functions, mixing = make(form, 3), np.random.default_rng(3).normal(size=(N_FUNCTIONS, 4))
+    mu = POINTS[3][0]
+    for new, old in zip(functions.mixed(mixing).evaluate(mu), functions.evaluate(mu), strict=True):
+        np.testing.assert_allclose(new, old @ mixing, rtol=1e-10, atol=1e-12)
+
+
 def test_leaving_the_box_is_flagged_for_each_parameter() -> None:
     functions = make("cp", 4)
     assert functions.inside([0.5, 9.0, 0.5, 0.0]).tolist() == [True, True, True, True]  # an angle has no end
@@ -144,7 +152,7 @@ def test_leaving_the_box_is_flagged_for_each_parameter() -> None:
 @every_form
 def test_fields_combine_the_modes_and_restrict_to_points(form: str) -> None:
     rng = np.random.default_rng(9)
-    field = TensorField(rng.normal(size=(N_FUNCTIONS, 11, 3)), make(form, 3))
+    field = SeparatedField(rng.normal(size=(N_FUNCTIONS, 11, 3)), make(form, 3))
     mu = np.array(POINTS[3][0])
     value, sensitivities = field.value_and_sensitivities(mu)
     plain, plain_sensitivities = field.value_and_sensitivities_numpy(mu)

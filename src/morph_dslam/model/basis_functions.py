@@ -55,10 +55,16 @@ class Basis:
         if not self.lower < self.upper:
             raise ValueError(f"the range of a basis must grow, not go from {self.lower} to {self.upper}")
 
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """The ends of the range; infinite for the periodic basis, which has no outside."""
+        return (-np.inf, np.inf) if self.kind == "fourier" else (self.lower, self.upper)
+
     def inside(self, x: ArrayLike) -> NDArray[np.bool_]:
         """Where ``x`` lies in the range (always for the periodic basis)."""
         x = np.asarray(x, dtype=float)
-        return (x >= self.lower) & (x <= self.upper) | (self.kind == "fourier")
+        lower, upper = self.bounds
+        return (x >= lower) & (x <= upper)
 
     def table(self, x: ArrayLike) -> Array:
         """Values and two derivatives (n, 3, size) at points ``x`` (n,), compiled."""

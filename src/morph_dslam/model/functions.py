@@ -1,35 +1,110 @@
-"""Smooth functions of the parameters: sums of products of Chebyshev polynomials, with their derivatives.
+"""Functions of the parameters: what every format offers, and the smooth polynomials of a total degree.
 
-Each function is H_i(mu) = sum_t c[t, i] prod_k T_{m[t, k]}(xi_k), where xi_k in [-1, 1] is mu_k scaled to
-its range. Products of one-dimensional functions are what makes the representation separated (the paper's
-equation for the parametric solution); polynomials make it smooth to every order.
+A field is modes in space times functions H_i(mu) of the parameters (the paper's equation for the parametric
+solution). The formats differ in how H_i is made of one-dimensional functions: `ParameterFunctions` here,
+`CPFunctions`, `TuckerFunctions` and `TensorTrainFunctions` in `tensor_functions`.
+
+No format extrapolates: beyond its range each one-dimensional function goes on as its tangent (C1), and
+`Functions.inside` says which parameters are in their range.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numba import njit
-from numpy.polynomial import chebyshev
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from morph_dslam.model.basis_functions import chebyshev_basis, evaluate_numpy
+from morph_dslam.model.basis_kernels import CHEBYSHEV, fill_basis
 
 Array = NDArray[np.float64]
 
 
+class Functions(ABC):
+    """``n_functions`` functions H_i of ``dimension`` = d parameters, in any format."""
+
+    @property
+    @abstractmethod
+    def n_functions(self) -> int:
+        """Number of functions H_i."""
+
+    @property
+    @abstractmethod
+    def n_floats(self) -> int:
+        """Numbers stored, for the compression factor."""
+
+    @property
+    @abstractmethod
+    def bounds(self) -> tuple[Array, Array]:
+        """Ends of the ranges (d,), (d,) in SI units; infinite for a periodic parameter, which has none."""
+
+    @abstractmethod
+    def _compiled(self, mu: Array) -> Array:
+        """`rows` without the check."""
+
+    @abstractmethod
+    def partial(self, mu: ArrayLike, orders: tuple[int, ...]) -> Array:
+        """The mixed derivative (n_functions,) of ``orders`` (0, 1 or 2 for each parameter) at ``mu`` (d,)."""
+
+    @abstractmethod
+    def mixed(self, matrix: Array) -> Self:
+        """The functions sum_i ``matrix[i, j]`` H_i for a matrix (n_functions, n), in the same format."""
+
+    @property
+    def dimension(self) -> int:
+        """Number of parameters d."""
+        return len(self.bounds[0])
+
+    def rows(self, mu: ArrayLike) -> Array:
+        """Values, then the derivative by each parameter (1 + d, n_functions) at ``mu`` (d,), compiled.
+
+        Raises
+        ------
+        ValueError
+            If ``mu`` has another shape: compiled code would read beyond the arrays.
+        """
+        mu = np.ascontiguousarray(mu, dtype=np.float64)
+        if mu.shape != (self.dimension,):
+            raise ValueError(f"{self.dimension} parameters are needed, not an array of shape {mu.shape}")
+        return self._compiled(mu)
+
+    def evaluate(self, mu: ArrayLike) -> tuple[Array, Array]:
+        """Values (n_functions,) and gradient (d, n_functions) at ``mu`` (d,)."""
+        rows = self.rows(mu)
+        return rows[0], rows[1:]
+
+    def evaluate_numpy(self, mu: ArrayLike) -> tuple[Array, Array]:
+        """The plain twin of `evaluate`."""
+        unit = np.eye(self.dimension, dtype=int)
+        slopes = [self.partial(mu, tuple(row)) for row in unit]
+        return self.partial(mu, (0,) * self.dimension), np.stack(slopes)
+
+    def inside(self, mu: ArrayLike) -> NDArray[np.bool_]:
+        """Which parameters (d,) lie in their range: where one does not, the answer is extrapolated."""
+        mu = np.asarray(mu, dtype=np.float64)
+        lower, upper = self.bounds
+        return (mu >= lower) & (mu <= upper)
+
+    def nearest_inside(self, mu: ArrayLike) -> Array:
+        """``mu`` (d,) with every parameter brought to the nearer end of its range if it lies outside."""
+        lower, upper = self.bounds
+        return np.minimum(np.maximum(np.asarray(mu, dtype=np.float64), lower), upper)
+
+
 @njit(cache=True, nogil=True)
-def evaluate_functions(mu, lower, upper, multi_indices, coefficients):
-    """Values and gradient of all functions at one point, compiled.
+def evaluate_polynomials(mu, lower, upper, multi_indices, coefficients):
+    """Values and gradient (1 + d, n) of sums of products of Chebyshev polynomials, compiled.
 
     Parameters
     ----------
     mu, lower, upper : (d,) parameters and their range.
     multi_indices : (n_terms, d) int, polynomial degree of each factor.
-    coefficients : (n_terms, n_functions).
-
-    Returns
-    -------
-    (1 + d, n_functions): the values, then the derivative with respect to each parameter.
+    coefficients : (n_terms, n).
     """
     n_terms, d = multi_indices.shape
     n_functions = coefficients.shape[1]
@@ -37,49 +112,28 @@ def evaluate_functions(mu, lower, upper, multi_indices, coefficients):
     for t in range(n_terms):
         for k in range(d):
             degree = max(degree, multi_indices[t, k])
-    table = np.empty((d, degree + 1))
-    slope = np.empty((d, degree + 1))
+    table, knots = np.empty((d, 3, degree + 1)), np.empty(0)
     for k in range(d):
-        scale = 2.0 / (upper[k] - lower[k])
-        xi = (mu[k] - lower[k]) * scale - 1.0
-        table[k, 0], slope[k, 0] = 1.0, 0.0
-        if degree > 0:
-            table[k, 1], slope[k, 1] = xi, scale
-        for j in range(2, degree + 1):
-            table[k, j] = 2.0 * xi * table[k, j - 1] - table[k, j - 2]
-            slope[k, j] = 2.0 * scale * table[k, j - 1] + 2.0 * xi * slope[k, j - 1] - slope[k, j - 2]
+        fill_basis(CHEBYSHEV, 0, degree + 1, lower[k], upper[k], knots, mu[k], table[k])
     result = np.zeros((1 + d, n_functions))
     factors = np.empty(1 + d)
     for t in range(n_terms):
         factors[:] = 1.0
         for k in range(d):
-            value = table[k, multi_indices[t, k]]
+            value = table[k, 0, multi_indices[t, k]]
             for row in range(1 + d):
-                factors[row] *= slope[k, multi_indices[t, k]] if row == k + 1 else value
+                factors[row] *= table[k, 1, multi_indices[t, k]] if row == k + 1 else value
         for row in range(1 + d):
             for i in range(n_functions):
                 result[row, i] += factors[row] * coefficients[t, i]
     return result
 
 
-def evaluate_functions_numpy(mu, lower, upper, multi_indices, coefficients):
-    """The plain twin of `evaluate_functions`, by numpy's Chebyshev series."""
-    d = len(mu)
-    scale = 2.0 / (upper - lower)
-    xi = (mu - lower) * scale - 1.0
-    values, slopes = [], []
-    for k in range(d):
-        unit = np.eye(multi_indices[:, k].max() + 1)
-        values.append(chebyshev.chebval(xi[k], unit)[multi_indices[:, k]])
-        slopes.append(scale[k] * chebyshev.chebval(xi[k], chebyshev.chebder(unit))[multi_indices[:, k]])
-    rows = [np.prod(values, axis=0)]
-    rows += [np.prod([slopes[j] if j == k else values[j] for j in range(d)], axis=0) for k in range(d)]
-    return np.stack(rows) @ coefficients
-
-
 @dataclass(frozen=True)
-class ParameterFunctions:
-    """``n_functions`` smooth functions on a box of ``d`` parameters.
+class ParameterFunctions(Functions):
+    """Polynomials of several parameters: H_i(mu) = sum_t c[t, i] prod_k T_{m[t, k]}(xi_k).
+
+    T are Chebyshev polynomials and xi_k in [-1, 1] is mu_k scaled to its range.
 
     Attributes
     ----------
@@ -93,12 +147,39 @@ class ParameterFunctions:
     multi_indices: NDArray[np.int64]
     coefficients: Array
 
-    def evaluate(self, mu: Array) -> tuple[Array, Array]:
-        """Values (n_functions,) and gradient (d, n_functions) at ``mu`` (d,)."""
-        result = evaluate_functions(
-            np.asarray(mu, dtype=float), self.lower, self.upper, self.multi_indices, self.coefficients
+    @property
+    def n_functions(self) -> int:
+        return self.coefficients.shape[1]
+
+    @property
+    def n_floats(self) -> int:
+        """Coefficients, and the degrees: each is one byte of a number's four."""
+        return self.coefficients.size + -(-self.multi_indices.size // 4)
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        return self.lower, self.upper
+
+    def _compiled(self, mu: Array) -> Array:
+        return evaluate_polynomials(mu, self.lower, self.upper, self.multi_indices, self.coefficients)
+
+    def partial(self, mu: ArrayLike, orders: tuple[int, ...]) -> Array:
+        terms = np.ones(len(self.coefficients))
+        for x, basis, degrees, order in zip(
+            np.asarray(mu), self._bases, self.multi_indices.T, orders, strict=True
+        ):
+            terms = terms * evaluate_numpy(basis, x, order)[0, degrees]
+        return terms @ self.coefficients
+
+    @cached_property
+    def _bases(self):
+        return tuple(
+            chebyshev_basis(low, high, int(degree))
+            for low, high, degree in zip(self.lower, self.upper, self.multi_indices.max(axis=0), strict=True)
         )
-        return result[0], result[1:]
+
+    def mixed(self, matrix: Array) -> Self:
+        return replace(self, coefficients=self.coefficients @ matrix)
 
 
 def total_degree_indices(dimension: int, degree: int) -> NDArray[np.int64]:

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from morph_dslam.model.separated import SeparatedField
+from morph_dslam.model.separated import Outside, SeparatedField
 from morph_dslam.units import from_si
 
 Array = NDArray[np.float64]
@@ -81,6 +81,8 @@ class ReducedModel:
         (xx, yy, zz, yz, xz, xy) in the object frame; pascals. Empty where none was computed.
     cells : volume cells (k, c) by type ("hex8", "tet10"), nodes in VTK's order; empty for sheets.
     strain : Green-Lagrange strain of a solid, 6 components as of the stress (tensor shears), or None.
+    reactions : what supports exert, fields of one point: "force_SET" in newtons and "moment_SET" about the
+        centre of the set in newton metres, 3 components in the object frame.
     certificate : held-out errors and how they were measured, plain JSON.
     provenance : versions, study text, mesh hash, plain JSON.
     """
@@ -93,6 +95,7 @@ class ReducedModel:
     stresses: dict[str, SeparatedField] = field(default_factory=dict)
     cells: dict[str, NDArray[np.int64]] = field(default_factory=dict)
     strain: SeparatedField | None = None
+    reactions: dict[str, SeparatedField] = field(default_factory=dict)
     certificate: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
 
@@ -111,25 +114,30 @@ class ReducedModel:
         """Parameters of the state assumed before anything is seen (d,), SI."""
         return np.array([p.default for p in self.parameters])
 
-    def positions(self, mu: Array) -> Array:
+    def inside(self, mu: ArrayLike) -> NDArray[np.bool_]:
+        """Which parameters (d,) of ``mu`` (d,) lie in their range; elsewhere see `separated.Outside`."""
+        return self.displacement.inside(mu)
+
+    def positions(self, mu: ArrayLike, outside: Outside = "bounded") -> Array:
         """Deformed node positions (n, 3) in the object frame, metres."""
-        return self.nodes + self.displacement.value(mu)
+        return self.nodes + self.displacement.value(mu, outside)
 
     @property
     def fields(self) -> dict[str, SeparatedField]:
         """Every field under its name in the model file: "displacement", "stress_top", "strain" and so on."""
         result = {"displacement": self.displacement}
         result |= {f"stress_{place}": field for place, field in self.stresses.items()}
-        return result if self.strain is None else result | {"strain": self.strain}
+        result |= {} if self.strain is None else {"strain": self.strain}
+        return result | {f"reaction_{name}": field for name, field in self.reactions.items()}
 
-    def von_mises(self, mu: Array, place: str) -> Array:
+    def von_mises(self, mu: ArrayLike, place: str, outside: Outside = "bounded") -> Array:
         """Von Mises stress (n,) in pascals at ``place``, a key of `stresses`.
 
         On the faces of sheets, plane stress: sqrt(s11² - s11 s22 + s22² + 3 s12²); there the second
         Piola-Kirchhoff stress stands for the Cauchy stress turned back with the sheet; they differ by the
         order of the strain, below one per cent in paper.
         """
-        return von_mises(self.stresses[place].value(mu))
+        return von_mises(self.stresses[place].value(mu, outside))
 
     def rest_positions(self, points: SurfacePoints) -> Array:
         """Undeformed positions (p, 3) of surface points, metres."""

@@ -2,14 +2,42 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
 
-from morph_dslam.model.functions import ParameterFunctions
+from morph_dslam.model.functions import Functions
 
 Array = NDArray[np.float64]
+
+#: What a field is outside the box of its parameters. "bounded": that of the nearest state in the box;
+#: "linear": continued from there by its tangents (C1, linear in each parameter), see `SeparatedField.inside`.
+Outside = Literal["bounded", "linear"]
+
+
+@njit(cache=True, nogil=True)
+def combine_modes(rows, modes):
+    """``rows`` (r, m) times ``modes`` (m, n); four modes at a pass, which spares traffic to the result."""
+    n_rows, m = rows.shape
+    n = modes.shape[1]
+    result = np.zeros((n_rows, n))
+    whole = m - m % 4
+    for i in range(0, whole, 4):
+        for row in range(n_rows):
+            a, b, c, d = rows[row, i], rows[row, i + 1], rows[row, i + 2], rows[row, i + 3]
+            for p in range(n):
+                result[row, p] += (
+                    a * modes[i, p] + b * modes[i + 1, p] + c * modes[i + 2, p] + d * modes[i + 3, p]
+                )
+    for i in range(whole, m):
+        for row in range(n_rows):
+            a = rows[row, i]
+            for p in range(n):
+                result[row, p] += a * modes[i, p]
+    return result
 
 
 @dataclass(frozen=True)
@@ -19,32 +47,63 @@ class SeparatedField:
     Attributes
     ----------
     modes : (n_modes, n_points, n_components), the functions F_i at the points, in the field's SI unit.
-    functions : the n_modes functions H_i.
+    functions : the n_modes functions H_i, in any format.
     """
 
     modes: Array
-    functions: ParameterFunctions
+    functions: Functions
 
     @property
     def n_modes(self) -> int:
         return self.modes.shape[0]
 
-    def value(self, mu: Array) -> Array:
-        """The field (n_points, n_components) at parameters ``mu`` (d,)."""
-        values, _ = self.functions.evaluate(mu)
-        return np.tensordot(values, self.modes, axes=1)
+    @property
+    def n_floats(self) -> int:
+        """Numbers stored, for the compression factor."""
+        return self.modes.size + self.functions.n_floats
 
-    def value_and_sensitivities(self, mu: Array) -> tuple[Array, Array]:
-        """The field (n_points, n_components) and its derivatives (d, n_points, n_components)."""
-        values, gradient = self.functions.evaluate(mu)
+    def inside(self, mu: ArrayLike) -> NDArray[np.bool_]:
+        """Which parameters (d,) of ``mu`` (d,) lie in their range; always so for a periodic one."""
+        return self.functions.inside(mu)
+
+    def _state(self, mu: ArrayLike, outside: Outside) -> ArrayLike:
+        if outside == "linear":
+            return mu
+        if outside == "bounded":
+            return self.functions.nearest_inside(mu)
+        raise ValueError(f"outside the box a field is 'bounded' or 'linear', not '{outside}'")
+
+    def value(self, mu: ArrayLike, outside: Outside = "bounded") -> Array:
+        """The field (n_points, n_components) at parameters ``mu`` (d,)."""
+        rows = self.functions.rows(self._state(mu, outside))
+        return combine_modes(rows[:1], self.modes.reshape(self.n_modes, -1)).reshape(self.modes.shape[1:])
+
+    def value_and_sensitivities(self, mu: ArrayLike, outside: Outside = "bounded") -> tuple[Array, Array]:
+        """The field (n_points, n_components) and its derivatives (d, n_points, n_components).
+
+        Outside the box a bounded field gives the value and the derivatives of the nearest state in it.
+        """
+        rows = self.functions.rows(self._state(mu, outside))
+        result = combine_modes(rows, self.modes.reshape(self.n_modes, -1))
+        result = result.reshape(len(rows), *self.modes.shape[1:])
+        return result[0], result[1:]
+
+    def value_and_sensitivities_numpy(
+        self, mu: ArrayLike, outside: Outside = "bounded"
+    ) -> tuple[Array, Array]:
+        """The plain twin of `value_and_sensitivities`."""
+        values, gradient = self.functions.evaluate_numpy(self._state(mu, outside))
         return np.tensordot(values, self.modes, axes=1), np.tensordot(gradient, self.modes, axes=1)
+
+    def with_modes(self, modes: Array) -> SeparatedField:
+        """The same functions with other modes (n_modes, any points, any components)."""
+        return SeparatedField(np.ascontiguousarray(modes), self.functions)
 
     def restrict(self, corners: NDArray[np.integer], weights: Array) -> SeparatedField:
         """The same field at p points interpolated from mesh nodes.
 
         Parameters
         ----------
-        corners : (p, 3) node indices. weights : (p, 3) interpolation weights.
+        corners : (p, c) node indices. weights : (p, c) interpolation weights.
         """
-        modes = np.einsum("pc,mpcx->mpx", weights, self.modes[:, corners])
-        return replace(self, modes=np.ascontiguousarray(modes))
+        return self.with_modes(np.einsum("pc,mpcx->mpx", weights, self.modes[:, corners]))

@@ -12,14 +12,16 @@ second in each parameter) by plain numpy, and is the twin that the compiled pass
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from abc import abstractmethod
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from morph_dslam.model.basis_functions import Basis, evaluate_numpy
+from morph_dslam.model.functions import Functions
 from morph_dslam.model.tensor_kernels import (
     PackedBases,
     evaluate_cp,
@@ -32,24 +34,10 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class TensorFunctions(ABC):
+class TensorFunctions(Functions):
     """``n_functions`` functions of ``d`` parameters; the common part of the three formats."""
 
     bases: tuple[Basis, ...]
-
-    @property
-    @abstractmethod
-    def n_functions(self) -> int:
-        """Number of functions H_i."""
-
-    @property
-    @abstractmethod
-    def n_floats(self) -> int:
-        """Numbers stored, for the compression factor."""
-
-    @abstractmethod
-    def _compiled(self, mu: Array) -> Array:
-        """`rows` without the check."""
 
     @abstractmethod
     def _contract(self, vectors: list[Array]) -> Array:
@@ -59,42 +47,19 @@ class TensorFunctions(ABC):
     def _packed(self) -> PackedBases:
         return pack_bases(self.bases)
 
-    def rows(self, mu: ArrayLike) -> Array:
-        """Values, then the derivative by each parameter (1 + d, n_functions) at ``mu`` (d,), compiled."""
-        mu = np.asarray(mu, dtype=np.float64)
-        if mu.shape != (len(self.bases),):  # compiled code would read beyond the arrays
-            raise ValueError(f"{len(self.bases)} parameters are needed, not an array of shape {mu.shape}")
-        return self._compiled(mu)
+    @cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        lower, upper = np.array([b.bounds for b in self.bases]).T
+        return np.ascontiguousarray(lower), np.ascontiguousarray(upper)
 
     def _check_sizes(self, arrays: tuple[Array, ...], axis: int) -> None:
         sizes, found = [b.size for b in self.bases], [a.shape[axis] for a in arrays]
         if sizes != found:
             raise ValueError(f"the bases have {sizes} functions, the coefficients {found}")
 
-    def evaluate(self, mu: ArrayLike) -> tuple[Array, Array]:
-        """Values (n_functions,) and gradient (d, n_functions) at ``mu`` (d,).
-
-        Outside the box each parameter's functions go on as their tangents; see `inside`.
-        """
-        rows = self.rows(mu)
-        return rows[0], rows[1:]
-
     def partial(self, mu: ArrayLike, orders: tuple[int, ...]) -> Array:
-        """The mixed derivative (n_functions,) of ``orders`` (0, 1 or 2 for each parameter) at ``mu`` (d,)."""
         mu = np.asarray(mu, dtype=float)
         return self._contract([evaluate_numpy(b, mu[k], orders[k])[0] for k, b in enumerate(self.bases)])
-
-    def evaluate_numpy(self, mu: ArrayLike) -> tuple[Array, Array]:
-        """The plain twin of `evaluate`."""
-        d = len(self.bases)
-        unit = np.eye(d, dtype=int)
-        slopes = [self.partial(mu, tuple(unit[k])) for k in range(d)]
-        return self.partial(mu, (0,) * d), np.stack(slopes)
-
-    def inside(self, mu: ArrayLike) -> NDArray[np.bool_]:
-        """Which parameters (d,) lie in their range: where one does not, the answer is extrapolated."""
-        mu = np.asarray(mu, dtype=float)
-        return np.array([bool(b.inside(mu[k])) for k, b in enumerate(self.bases)])
 
 
 @dataclass(frozen=True)
@@ -134,6 +99,9 @@ class CPFunctions(TensorFunctions):
     def _contract(self, vectors: list[Array]) -> Array:
         terms = np.prod([v @ f for v, f in zip(vectors, self.factors, strict=True)], axis=0)
         return terms @ self.mixing
+
+    def mixed(self, matrix: Array) -> Self:
+        return replace(self, mixing=self.mixing @ matrix)
 
 
 @dataclass(frozen=True)
@@ -177,6 +145,9 @@ class TuckerFunctions(TensorFunctions):
             result = result @ (v @ factor)
         return result
 
+    def mixed(self, matrix: Array) -> Self:
+        return replace(self, core=np.ascontiguousarray(np.tensordot(matrix.T, self.core, axes=1)))
+
 
 @dataclass(frozen=True)
 class TensorTrainFunctions(TensorFunctions):
@@ -216,3 +187,7 @@ class TensorTrainFunctions(TensorFunctions):
         for v, core in zip(vectors[::-1], self.cores[::-1], strict=True):
             result = np.einsum("j,ijq,q->i", v, core, result)
         return result
+
+    def mixed(self, matrix: Array) -> Self:
+        first = np.ascontiguousarray(np.tensordot(matrix.T, self.cores[0], axes=1))
+        return replace(self, cores=(first, *self.cores[1:]))

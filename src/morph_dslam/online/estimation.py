@@ -65,9 +65,9 @@ class BoundPoints:
             np.concatenate([self.surface.triangles, other.surface.triangles]),
             np.concatenate([self.surface.weights, other.surface.weights]),
         )
-        modes = np.ascontiguousarray(np.concatenate([self.field.modes, other.field.modes], axis=1))
+        modes = np.concatenate([self.field.modes, other.field.modes], axis=1)
         rest = np.concatenate([self.rest, other.rest])
-        return BoundPoints(surface, rest, replace(self.field, modes=modes))
+        return BoundPoints(surface, rest, self.field.with_modes(modes))
 
     def in_camera(self, state: State) -> Array:
         """Positions (p, 3) in the camera frame, metres."""
@@ -177,12 +177,11 @@ class Estimator:
         self, points: BoundPoints, pixels: Array, weights: Array, state: State, normals: Array | None = None
     ):
         """Cost, Hessian, gradient and residuals at a state; see `reprojection.linearise`."""
-        functions = points.field.functions
+        pose = state.camera_from_object
         normals = np.zeros_like(pixels) if normals is None else normals
         return self._linearise(
-            state.parameters, state.camera_from_object.rotation, state.camera_from_object.translation,
-            points.rest, points.field.modes, functions.lower, functions.upper, functions.multi_indices,
-            functions.coefficients, self.camera.intrinsics, pixels, weights, normals, self.options.huber_px,
+            points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
+            points.field.modes, self.camera.intrinsics, pixels, weights, normals, self.options.huber_px,
         )  # fmt: skip
 
     def estimate(

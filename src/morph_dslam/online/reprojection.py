@@ -10,28 +10,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from morph_dslam.model.functions import evaluate_functions, evaluate_functions_numpy
+from morph_dslam.model.separated import combine_modes
 
 #: Points nearer to the camera plane than this, in metres, or behind it cannot be seen.
 MINIMUM_DEPTH = 1e-3
 #: Cost of a point that the state places behind the camera; large, so that such a step is refused.
 UNSEEN_COST = 1e9
-
-
-@njit(cache=True, nogil=True)
-def combine_modes(functions, modes):
-    """Displacement and sensitivities (1 + d, p, 3) from function rows (1 + d, m) and modes (m, p, 3)."""
-    rows, n_modes = functions.shape
-    n_points = modes.shape[1]
-    size = 3 * n_points
-    flat_modes = modes.reshape(n_modes, size)
-    fields = np.zeros((rows, size))
-    for row in range(rows):
-        for i in range(n_modes):
-            factor = functions[row, i]
-            for q in range(size):
-                fields[row, q] += factor * flat_modes[i, q]
-    return fields.reshape(rows, n_points, 3)
 
 
 @njit(cache=True, nogil=True)
@@ -56,17 +40,14 @@ def _point_jacobian(jacobian, fields, j, rotation, turned, inverse_depth, x, y, 
 
 
 @njit(cache=True, nogil=True)
-def linearise(
-    parameters, rotation, translation, rest, modes, lower, upper, multi_indices, coefficients,
-    intrinsics, pixels, weights, normals, huber,
-):  # fmt: skip
+def linearise(functions, rotation, translation, rest, modes, intrinsics, pixels, weights, normals, huber):
     """Huber cost of the reprojection error, its gradient and Gauss-Newton Hessian, compiled.
 
     Parameters
     ----------
-    parameters, rotation, translation : the state: (d,) SI, (3, 3) and (3,) of camera_from_object, metres.
+    functions : (1 + d, m) values and derivatives of the parameter functions at the state, `Functions.rows`.
+    rotation, translation : (3, 3) and (3,) of camera_from_object, metres.
     rest, modes : (p, 3) undeformed points and (m, p, 3) displacement modes at them, metres.
-    lower, upper, multi_indices, coefficients : the parameter functions, see `evaluate_functions`.
     intrinsics : (4,) fx, fy, cx, cy in pixels.
     pixels, weights : (p, 2) measurements in pixels and (p,) weights; points of weight 0 do not count.
     normals : (p, 2) unit vectors; a point with one counts only along it (a point of an outline, which may
@@ -80,9 +61,9 @@ def linearise(
     residuals : (p, 2) projected minus measured, along the normal where there is one, pixels; NaN behind
         the camera.
     """
-    functions = evaluate_functions(parameters, lower, upper, multi_indices, coefficients)
-    fields = combine_modes(functions, modes)
-    n_points, d = rest.shape[0], parameters.shape[0]
+    n_points, d = rest.shape[0], functions.shape[0] - 1
+    flat_modes = modes.reshape(modes.shape[0], 3 * n_points)
+    fields = combine_modes(functions, flat_modes).reshape(1 + d, n_points, 3)
     size = d + 6
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
     residuals, jacobian, turned = np.empty((n_points, 2)), np.zeros((2, size)), np.empty(3)
@@ -128,18 +109,15 @@ def linearise(
     return cost, hessian, gradient, residuals
 
 
-def project_with_jacobian(
-    parameters, rotation, translation, rest, modes, lower, upper, multi_indices, coefficients, intrinsics
-):
+def project_with_jacobian(functions, rotation, translation, rest, modes, intrinsics):
     """Pixels (p, 2) and their Jacobian (p, 2, d + 6), in plain numpy; NaN behind the camera."""
-    functions = evaluate_functions_numpy(parameters, lower, upper, multi_indices, coefficients)
     fields = np.tensordot(functions, modes, axes=1)
     turned = (rest + fields[0]) @ rotation.T
     x, y, z = (turned + translation).T
     z = np.where(z < MINIMUM_DEPTH, np.nan, z)
     fx, fy, cx, cy = intrinsics
     pixels = np.column_stack([fx * x / z + cx, fy * y / z + cy])
-    d = len(parameters)
+    d = len(functions) - 1
     of_position = np.zeros((len(rest), 2, 3))
     of_position[:, 0, 0], of_position[:, 0, 2] = fx / z, -fx * x / z**2
     of_position[:, 1, 1], of_position[:, 1, 2] = fy / z, -fy * y / z**2
@@ -151,13 +129,10 @@ def project_with_jacobian(
 
 
 def linearise_numpy(
-    parameters, rotation, translation, rest, modes, lower, upper, multi_indices, coefficients,
-    intrinsics, pixels, weights, normals, huber,
-):  # fmt: skip
+    functions, rotation, translation, rest, modes, intrinsics, pixels, weights, normals, huber
+):
     """The plain twin of `linearise`."""
-    projected, jacobian = project_with_jacobian(
-        parameters, rotation, translation, rest, modes, lower, upper, multi_indices, coefficients, intrinsics
-    )
+    projected, jacobian = project_with_jacobian(functions, rotation, translation, rest, modes, intrinsics)
     residuals = projected - pixels
     directed = (normals != 0.0).any(axis=1)
     onto = np.where(directed[:, None, None], normals[:, :, None] * normals[:, None, :], np.eye(2))
