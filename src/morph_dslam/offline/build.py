@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -16,21 +14,18 @@ from numpy.typing import NDArray
 from morph_dslam.errors import StudyError
 from morph_dslam.model import Parameter, ReducedModel, save_model
 from morph_dslam.offline.certificate import certify, compression_percent
+from morph_dslam.offline.executors import default_executor
 from morph_dslam.offline.external import ExternalStudy
+from morph_dslam.offline.neighbour_tree import neighbour_tree
 from morph_dslam.offline.problem import ModelMesh, ParametricStudy, Snapshot, bounds
+from morph_dslam.offline.provenance import provenance
 from morph_dslam.offline.reduction.method import METHODS, ReductionTask
+from morph_dslam.offline.sampling import held_out_samples, training_samples
 from morph_dslam.offline.snapshots import load_outputs, load_snapshot
 from morph_dslam.offline.stability import stability_report
 from morph_dslam.offline.studies.study import Study, load_study
 from morph_dslam.offline.studies.study_sections import ReductionSection
-from morph_dslam.offline.sweep import (
-    SweepResult,
-    default_executor,
-    held_out_samples,
-    neighbour_tree,
-    run_sweep,
-    training_samples,
-)
+from morph_dslam.offline.sweep import SweepResult, run_sweep
 
 Array = NDArray[np.float64]
 
@@ -84,7 +79,7 @@ def build(
     else:
         solutions = _solve(study, output.with_name(output.name + ".snapshots"), workers, executor)
     model = _certified(solutions, study.reduction, study.name)
-    model.provenance.update(_provenance(text or study.model_dump_json(), model))
+    model.provenance.update(provenance(text or study.model_dump_json(), study, model))
     save_model(output, model)
     return model
 
@@ -167,13 +162,3 @@ def _certified(solutions: Solutions, options: ReductionSection, name: str) -> Re
         certificate["stability"] = solutions.stability
     model.certificate.update(certificate)
     return model
-
-
-def _provenance(study_text: str, model: ReducedModel) -> dict:
-    mesh = hashlib.sha256(model.nodes.tobytes() + model.triangles.tobytes()).hexdigest()
-    packages = ("morph-dslam", "ngsolve", "numpy", "scipy")
-    return {
-        "study": study_text,
-        "mesh_sha256": mesh,
-        "versions": {package: version(package) for package in packages},
-    }

@@ -1,0 +1,47 @@
+"""Where a model comes from: the mesh by its hash, the programs by their versions."""
+
+import hashlib
+import json
+import platform
+from dataclasses import replace
+from importlib.metadata import version
+
+import numpy as np
+
+from morph_dslam import make_study
+from morph_dslam.offline.provenance import mesh_hash, provenance
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.stretched_block import stretched_block_model
+
+
+def test_the_mesh_hash_is_that_of_its_arrays():
+    model = bent_sheet_model(3, 3)
+    expected = hashlib.sha256(model.nodes.astype("<f8").tobytes() + model.triangles.astype("<i8").tobytes())
+    assert mesh_hash(model) == expected.hexdigest()
+
+
+def test_any_other_mesh_has_another_hash():
+    model = stretched_block_model()
+    moved, turned = model.nodes.copy(), {"hex8": model.cells["hex8"][::-1].copy()}
+    moved[3, 1] = np.nextafter(moved[3, 1], 1.0)
+    others = [replace(model, nodes=moved), replace(model, cells=turned), replace(model, cells={})]
+    assert len({mesh_hash(each) for each in [model, *others]}) == 4
+
+
+SOLID = {
+    "name": "block",
+    "mesh": {"generator": "block", "size": ["1 mm", "1 mm", "1 mm"], "divisions": [1, 1, 1]},
+    "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.0}},
+    "supports": [{"kind": "fixed", "on": "z_min"}],
+    "parameters": {"pull": {"range": ["0 kPa", "600 kPa"]}},
+}
+
+
+def test_versions_and_linear_solver(monkeypatch):
+    monkeypatch.setenv("MORPH_LINEAR_SOLVER", "sparsecholesky")
+    facts = provenance("name = 'x'", make_study(SOLID), bent_sheet_model(3, 3))
+    assert facts["study"] == "name = 'x'"
+    assert facts["linear_solver"] == "sparsecholesky"
+    assert facts["versions"]["numpy"] == version("numpy")
+    assert facts["versions"]["python"] == platform.python_version()
+    json.dumps(facts)
