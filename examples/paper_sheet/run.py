@@ -2,8 +2,8 @@
 
 An A3 sheet (31 x 43 nodes are 10 mm apart), fibres along it, clamped at its short ends, which are brought
 together until its middle stands 169 mm above the plane: just short of as high as a sheet of this length can
-arch. The positions are snapshots for the reduction, kept in the output folder; a run that was stopped goes on
-where it was. Pictures of the path are drawn beside them.
+arch. The positions are kept in the output folder; a run that was stopped goes on where it was. They are then
+reduced to a model file and to the paper's form u(X, Y, path). Pictures are drawn beside them.
 """
 
 from __future__ import annotations
@@ -20,10 +20,12 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from reduction import Grid, write_reduction
 from tqdm import tqdm
 
 from morph_dslam.cli import run_and_report_errors
 from morph_dslam.errors import SolverError
+from morph_dslam.offline.executors import default_executor
 from morph_dslam.offline.mechanics.sheet_buckling import (
     BuckledSheet,
     BucklingFolder,
@@ -36,7 +38,6 @@ from morph_dslam.offline.mechanics.sheet_buckling import (
 from morph_dslam.offline.mechanics.shell import OrthotropicSheet
 from morph_dslam.offline.snapshots import load_snapshot
 from morph_dslam.offline.solvers.arc_length import PathPoint, missed_bifurcations
-from morph_dslam.offline.sweep import default_executor
 
 HERE = Path(__file__).resolve().parent
 OUTPUT = HERE / "output"
@@ -78,6 +79,8 @@ def run(arguments: argparse.Namespace) -> None:
         f"positions={len(table)} largest_mm={1e3 * table[:, 1].max():.2f} pcr_path_N={from_path:.5f} "
         f"pcr_eigen_N={eigenvalue:.5f} seconds={time.perf_counter() - began:.0f}"
     )
+    snapshots = [load_snapshot(folder.position_file(number)) for number in range(arguments.positions)]
+    print(write_reduction(snapshots, Grid((sheet.length, sheet.width), sheet.cells), arguments.output))
 
 
 def trace(sheet: BuckledSheet, folder: BucklingFolder) -> list[PathRecord]:
