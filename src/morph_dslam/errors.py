@@ -18,6 +18,10 @@ class SolverError(MorphError):
     """A mechanical problem could not be solved where the study asked for it."""
 
 
+class WorkerError(MorphError):
+    """The processes or the cluster that a sweep runs on cannot be reached, do not fit, or were lost."""
+
+
 class ModelFileError(MorphError):
     """A model file is missing, damaged, or of a version that this release cannot read."""
 

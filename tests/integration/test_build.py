@@ -13,11 +13,12 @@ from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.model import load_model
 from morph_dslam.offline.build import build
 from morph_dslam.offline.mechanics.gripped_sheet import GrippedSheet
+from morph_dslam.offline.neighbour_tree import neighbour_tree
 from morph_dslam.offline.problem import bounds
+from morph_dslam.offline.sampling import sample_box
 from morph_dslam.offline.snapshots import load_snapshot
 from morph_dslam.offline.solvers.continuation import advance
 from morph_dslam.offline.studies.study import load_study
-from morph_dslam.offline.sweep import neighbour_tree, sample_box
 
 STUDY = """
 name = "tiny sheet"

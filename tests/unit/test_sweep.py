@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from concurrent.futures import Executor, Future
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
 from morph_dslam.offline import sweep
+from morph_dslam.offline.problem import Snapshot
+from morph_dslam.offline.sample_task import SampleResult
+from morph_dslam.offline.snapshots import encode_snapshot
 from morph_dslam.offline.studies.sheet_study import SheetStudy
 
 STUDY = SheetStudy.model_validate(
@@ -46,16 +48,14 @@ def stand_in(monkeypatch, solvable):
     """Replace the solver by ``solvable(coordinates, start coordinates or None)``; records every attempt."""
     attempts: list[tuple[float, float | None]] = []
 
-    def solve(study, coordinates, start, result):
-        origin = float(np.load(start)["bulge"]) if start else None
+    def solve(study, fingerprint, coordinates, start):
+        origin = None if start is None else float(start["bulge"])
         attempts.append((round(float(coordinates[0]), 6), origin))
         if not solvable(coordinates[0], origin):
-            return "no equilibrium"
-        with Path(result).open("wb") as file:
-            np.savez(file, bulge=coordinates[0])
-        return None
+            return SampleResult(None, "no equilibrium")
+        return SampleResult(encode_snapshot(Snapshot(coordinates, {}), {"bulge": coordinates[0]}))
 
-    monkeypatch.setattr(sweep, "_solve_sample", solve)
+    monkeypatch.setattr(sweep, "solve_sample", solve)
     return attempts
 
 

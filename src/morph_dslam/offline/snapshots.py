@@ -1,13 +1,17 @@
 """Snapshots on disk: one file for each solved sample, named by what it depends on.
 
 The name is a hash of the study's fingerprint and the coordinates, so a build that was stopped goes on where
-it was, and a changed study solves again only what the change touches.
+it was, and a changed study solves again only what the change touches. A file is a zip archive of arrays
+(numpy's .npz), which has a CRC-32 of each.
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 import os
+import zipfile
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
@@ -17,6 +21,9 @@ from numpy.typing import NDArray
 from morph_dslam.offline.problem import ParametricStudy, Snapshot
 
 Array = NDArray[np.float64]
+
+#: Ending of a file that is being written; one left behind is a build's that was killed.
+PARTIAL = ".partial"
 
 
 @cache
@@ -39,24 +46,50 @@ def source_fingerprint(modules: tuple[str, ...]) -> str:
 
 def snapshot_key(study: ParametricStudy, coordinates: Array) -> str:
     """Name of a sample: hash of the study's fingerprint and the coordinates (d,)."""
-    text = study.fingerprint() + np.round(coordinates, 12).tobytes().hex()
-    return hashlib.sha256(text.encode()).hexdigest()[:24]
+    return snapshot_keys(study.fingerprint(), [coordinates])[0]
+
+
+def snapshot_keys(fingerprint: str, samples: Iterable[Array]) -> list[str]:
+    """Names of many samples (n, d) of a study with this fingerprint."""
+    texts = [fingerprint + np.round(sample, 12).tobytes().hex() for sample in samples]
+    return [hashlib.sha256(text.encode()).hexdigest()[:24] for text in texts]
 
 
 def save_snapshot(path: Path, snapshot: Snapshot, state: dict[str, Array]) -> None:
-    """Write a snapshot and the arrays of the solver's state; the file appears only when it is complete.
+    """Write a snapshot and the arrays of the solver's state; the file appears only when it is complete."""
+    write_atomically(path, encode_snapshot(snapshot, state))
 
-    Fields are kept in single precision, the state in full.
-    """
-    partial = path.with_suffix(f".{os.getpid()}.partial")
+
+def encode_snapshot(snapshot: Snapshot, state: dict[str, Array]) -> bytes:
+    """Content of a snapshot's file. Fields are kept in single precision, the state in full."""
     arrays: dict[str, NDArray] = {"coordinates": snapshot.coordinates}
     arrays |= {f"field/{name}": values.astype(np.float32) for name, values in snapshot.fields.items()}
     arrays |= {f"slope/{name}": values.astype(np.float32) for name, values in snapshot.sensitivities.items()}
     arrays |= {f"output/{name}": np.asarray(values) for name, values in snapshot.outputs.items()}
     arrays |= {f"state/{name}": values for name, values in state.items()}
+    content = io.BytesIO()
+    np.savez(content, **arrays)  # type: ignore[arg-type]
+    return content.getvalue()
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file that is either there in full or not at all, whenever the program is killed."""
+    partial = path.with_suffix(f".{os.getpid()}{PARTIAL}")
     with partial.open("wb") as file:
-        np.savez(file, **arrays)  # type: ignore[arg-type]
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())  # the name must not reach the disk before the content
     os.replace(partial, path)
+
+
+def damage(path: Path) -> str | None:
+    """What is wrong with a snapshot's file, found by reading all of it; None if it is sound."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            wrong = archive.testzip()
+    except (zipfile.BadZipFile, EOFError, OSError, ValueError, NotImplementedError, RuntimeError) as error:
+        return str(error)
+    return f"the checksum of {wrong} does not match" if wrong else None
 
 
 def load_snapshot(path: Path) -> Snapshot:

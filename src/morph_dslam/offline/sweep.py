@@ -1,25 +1,30 @@
-"""The sweep: every sample solved once, each from its nearest solved neighbour, on any Executor."""
+"""The sweep: every sample solved once, each from its nearest solved neighbour, on any Executor.
+
+Which sample starts from which depends on the samples alone, never on the number of workers, their timing, or
+what an earlier build had solved when it was stopped: the numbers are the same every time.
+"""
 
 from __future__ import annotations
 
-import gc
-import multiprocessing
-import os
-from collections.abc import Collection, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager
+import fcntl
+import sys
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 from tqdm import tqdm
 
-from morph_dslam.errors import SolverError, StudyError
-from morph_dslam.offline.problem import ParametricStudy, SweepProblem, bounds
-from morph_dslam.offline.snapshots import load_state, save_snapshot, snapshot_key
+from morph_dslam.errors import StudyError
+from morph_dslam.offline.executors import slots
+from morph_dslam.offline.failed_attempts import FailedAttempts
+from morph_dslam.offline.neighbour_tree import neighbour_tree
+from morph_dslam.offline.problem import ParametricStudy
+from morph_dslam.offline.sample_task import SampleResult, solve_sample
+from morph_dslam.offline.snapshots import PARTIAL, damage, load_state, snapshot_keys, write_atomically
 
 Array = NDArray[np.float64]
 
@@ -35,157 +40,162 @@ class SweepResult:
     failed: dict[int, str] = field(default_factory=dict)
 
 
-def training_samples(study: ParametricStudy) -> Array:
-    """The samples (n, d) that the model is made from."""
-    sampling = study.sampling
-    if sampling.scheme == "sobol":
-        return sample_box(study, sampling.training, sampling.seed, towards_edges=0.5)
-    box = bounds(study)
-    if len(box) != 1:
-        raise StudyError(
-            f'sampling.scheme = "even" is for one parameter, and this study has {len(box)}: use "sobol"'
-        )
-    return study.admissible(np.linspace(box[0, 0], box[0, 1], sampling.training)[:, None])
-
-
-def held_out_samples(study: ParametricStudy) -> Array:
-    """The samples (n, d) that only measure the error: uniform, as the certificate's statement assumes."""
-    return sample_box(study, study.sampling.held_out, study.sampling.seed + 1, towards_edges=0.0)
-
-
-def sample_box(study: ParametricStudy, count: int, seed: int, towards_edges: float) -> Array:
-    """Scrambled Sobol samples (count, d) of the box.
-
-    ``towards_edges`` in [0, 1] moves them from uniform to the Chebyshev density, at which polynomial
-    regression is best conditioned.
-    """
-    box = bounds(study)
-    sobol = qmc.Sobol(len(box), rng=seed)
-    unit = 2.0 * sobol.random_base2(int(np.ceil(np.log2(count))))[:count] - 1.0
-    xi = (1.0 - towards_edges) * unit + towards_edges * np.sin(np.pi / 2.0 * unit)
-    return study.admissible(box.mean(axis=1) + xi * np.diff(box, axis=1).ravel() / 2.0)
-
-
-def neighbour_tree(
-    samples: Array, scale: Array, root: Array, solved: Collection[int] = (), failed: Collection[int] = ()
-) -> tuple[list[int], list[int]]:
-    """Prim's order of the samples that are not solved yet, and the neighbour that each starts from.
-
-    Parameters
-    ----------
-    solved, failed : samples that may be started from already, and samples that nothing is to start from.
-
-    Returns
-    -------
-    order : the unsolved samples. parent : for every sample, another one or -1 for the root state.
-    """
-    points = samples / scale
-    distance = np.linalg.norm(points - root / scale, axis=1)
-    parent = np.full(len(points), -1)
-    waiting = np.ones(len(points), dtype=bool)
-    order: list[int] = []
-    for step in range(len(points)):
-        known = sorted(solved)
-        nearest = known[step] if step < len(known) else int(np.argmin(np.where(waiting, distance, np.inf)))
-        if step >= len(known):
-            order.append(nearest)
-        waiting[nearest] = False
-        if nearest in failed:
-            continue
-        to_new = np.linalg.norm(points - points[nearest], axis=1)
-        closer = waiting & (to_new < distance)
-        distance[closer], parent[closer] = to_new[closer], nearest
-    return order, parent.tolist()
-
-
-@lru_cache(maxsize=1)
-def _worker_problem(study: ParametricStudy) -> SweepProblem:
-    """The problem of a worker process, built once."""
-    import ngsolve
-
-    ngsolve.SetNumThreads(study.work.threads or os.cpu_count() or 1)
-    return study.sweep_problem()
-
-
-def _solve_sample(study: ParametricStudy, coordinates: Array, start: Path | None, result: Path) -> str | None:
-    """Solve one sample and write its snapshot; returns why it could not be solved, or None."""
-    problem = _worker_problem(study)
-    try:
-        state = problem.unpack(load_state(start)) if start else problem.first_state()
-        state = problem.advance(state, coordinates)
-    except SolverError as error:
-        return str(error)
-    save_snapshot(result, problem.take_snapshot(state), problem.pack(state))
-    return None
-
-
-class SerialExecutor(Executor):
-    """Runs each task here, when it is submitted: no second process, so the least memory."""
-
-    def submit(self, fn, /, *args, **kwargs) -> Future:
-        future: Future = Future()
-        future.set_result(fn(*args, **kwargs))
-        return future
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Give back the memory of the problem."""
-        _worker_problem.cache_clear()
-        gc.collect()  # a problem and its linear solver refer to each other
-
-
-@contextmanager
-def default_executor(workers: int | None) -> Iterator[Executor]:
-    """Worker processes, one a core unless ``workers`` says otherwise; cancelled cleanly on interruption.
-
-    A single worker is this process itself.
-    """
-    if workers == 1:
-        with SerialExecutor() as executor:
-            yield executor
-        return
-    context = multiprocessing.get_context("spawn")
-    executor = ProcessPoolExecutor(workers or os.cpu_count(), mp_context=context)
-    try:
-        yield executor
-    except BaseException:
-        executor.shutdown(wait=False, cancel_futures=True)
-        for process in multiprocessing.active_children():
-            process.terminate()
-        raise
-    executor.shutdown()
-
-
 def run_sweep(study: ParametricStudy, samples: Array, folder: Path, executor: Executor) -> SweepResult:
     """Solve all ``samples`` (n, d), canonical, keeping each as soon as it is solved.
 
-    Samples found in ``folder`` are not solved again. Each starts from its nearest neighbour in a tree; what
+    Samples found in ``folder`` are not solved again, so that a caller can come back with more of them; a
+    damaged file is named and its sample solved anew. Each starts from its nearest neighbour in a tree; what
     lies behind a sample that did not converge is tried in the next pass from other neighbours, and so is the
-    sample itself, once. Which sample starts from which does not depend on the workers' timing.
+    sample itself, once.
 
     Raises
     ------
     StudyError
-        If not even half of the samples converge.
+        If not even half of the samples converge, or another build is at work in ``folder``.
+    WorkerError
+        If the executor's workers are lost or do not fit.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{snapshot_key(study, sample)}.npz" for sample in samples]
-    result = SweepResult()
-    tried: dict[int, list[int]] = {}
-    with tqdm(total=len(samples), desc="solving", unit="sample", smoothing=0.05) as progress:
-        while len(result.solved) < len(samples):
-            order, parent = neighbour_tree(samples, study.scale(), study.root(), result.solved, result.failed)
-            children: dict[int, list[int]] = {}
-            for sample in order:
-                starts = tried.get(sample, [])
-                if parent[sample] not in starts and len(starts) < MOST_ATTEMPTS:
-                    children.setdefault(parent[sample], []).append(sample)
-            if not children.keys() & {-1, *result.solved}:
-                break
-            _run_pass(study, samples, paths, children, executor, result, tried, progress)
-    for sample in set(range(len(samples))) - set(result.solved) - set(result.failed):
-        result.failed[sample] = "not reached: no neighbour of it could be solved"
+    fingerprint = study.fingerprint()
+    keys = snapshot_keys(fingerprint, samples)
+    paths = [folder / f"{key}.npz" for key in keys]
+    damaged = {path: reason for path in paths if path.is_file() and (reason := damage(path))}
+    found = {number for number, path in enumerate(paths) if path.is_file() and path not in damaged}
+    with (
+        _alone(folder) if len(found) < len(samples) else nullcontext(),
+        tqdm(
+            total=len(samples), initial=len(found), desc="solving", unit="sample", smoothing=0.05
+        ) as progress,
+    ):
+        for path, reason in damaged.items():
+            progress.write(f"{path} is damaged ({reason}): that sample is solved again", sys.stderr)
+        attempts = FailedAttempts(folder, keys)
+        sweep = _Sweep(study, fingerprint, samples, paths, found, attempts, executor, progress)
+        result = sweep.run()
     _check_reach(study, samples, result, folder)
     return result
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """No other sweep writes to this folder; what one that was killed left unfinished is removed."""
+    with (folder / ".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise StudyError(
+                f"another build is solving in {folder}: wait for it, or give this one another output"
+            ) from error
+        for partial in folder.glob(f"*{PARTIAL}"):
+            partial.unlink()
+        yield
+
+
+class _Sweep:
+    """One call of `run_sweep`.
+
+    Parameters
+    ----------
+    paths : of the samples' files. found : samples whose files are there already.
+    attempts : those that failed, in this sweep and in earlier ones.
+    """
+
+    def __init__(
+        self,
+        study: ParametricStudy,
+        fingerprint: str,
+        samples: Array,
+        paths: list[Path],
+        found: set[int],
+        attempts: FailedAttempts,
+        executor: Executor,
+        progress: tqdm,
+    ) -> None:
+        self.study, self.fingerprint, self.samples = study, fingerprint, samples
+        self.paths, self.found, self.attempts = paths, found, attempts
+        self.executor, self.progress = executor, progress
+        self.result = SweepResult()
+        self.tried: dict[int, list[int]] = {}
+
+    def run(self) -> SweepResult:
+        """Pass after pass, until all samples are solved or tried often enough."""
+        result, count = self.result, len(self.samples)
+        while len(result.solved) < count:
+            children = self._tree()
+            if not children.keys() & {-1, *result.solved}:
+                break
+            self._walk(children)
+        for sample in set(range(count)) - set(result.solved) - set(result.failed):
+            result.failed[sample] = "not reached: no neighbour of it could be solved"
+        return result
+
+    def _tree(self) -> dict[int, list[int]]:
+        """By sample (-1 for the root), the samples that are to start from it next."""
+        order, parent = neighbour_tree(
+            self.samples, self.study.scale(), self.study.root(), self.result.solved, self.result.failed
+        )
+        children: dict[int, list[int]] = {}
+        for sample in order:
+            starts = self.tried.get(sample, [])
+            if parent[sample] not in starts and len(starts) < MOST_ATTEMPTS:
+                children.setdefault(parent[sample], []).append(sample)
+        return children
+
+    def _walk(self, children: dict[int, list[int]]) -> None:
+        """Walk a tree of samples from the solved ones outwards; branches behind a failure are left."""
+        # The last one in is the next one out: a worker then mostly goes on from what it has just solved.
+        waiting = _attempts_from(children, [-1, *sorted(self.result.solved)])
+        running: dict[Future[SampleResult], tuple[int, int]] = {}
+        try:
+            while waiting or running:
+                while waiting and len(running) < slots(self.executor):
+                    origin, sample = waiting.pop()
+                    self.tried.setdefault(sample, []).append(origin)
+                    if sample in self.found:
+                        self.result.solved[sample] = self.paths[sample]
+                        waiting += _attempts_from(children, [sample])
+                    elif reason := self.attempts.reason(origin, sample):
+                        self._note_failure(sample, reason)
+                    else:
+                        running[self._submit(origin, sample)] = origin, sample
+                for future in wait(running, return_when=FIRST_COMPLETED).done if running else ():
+                    origin, sample = running.pop(future)
+                    if self._keep(origin, sample, future.result()):
+                        waiting += _attempts_from(children, [sample])
+        except BaseException:
+            self._keep_finished(running)
+            raise
+
+    def _submit(self, origin: int, sample: int) -> Future[SampleResult]:
+        start = load_state(self.paths[origin]) if origin >= 0 else None
+        return self.executor.submit(solve_sample, self.study, self.fingerprint, self.samples[sample], start)
+
+    def _keep(self, origin: int, sample: int, outcome: SampleResult) -> bool:
+        """Write what a worker sent; whether that is a solution."""
+        if outcome.snapshot is None:
+            self.attempts.record(origin, sample, outcome.reason)
+            self._note_failure(sample, outcome.reason)
+            return False
+        write_atomically(self.paths[sample], outcome.snapshot)
+        self.result.solved[sample] = self.paths[sample]
+        self.result.failed.pop(sample, None)
+        self.progress.update()
+        return True
+
+    def _note_failure(self, sample: int, reason: str) -> None:
+        self.result.failed[sample] = reason
+        self.progress.set_postfix(failed=len(self.result.failed))
+
+    def _keep_finished(self, running: dict[Future[SampleResult], tuple[int, int]]) -> None:
+        """On an interruption, keep what has come back already."""
+        for future, (origin, sample) in running.items():
+            if future.done() and not future.cancelled() and future.exception() is None:
+                self._keep(origin, sample, future.result())
+
+
+def _attempts_from(children: dict[int, list[int]], origins: list[int]) -> list[tuple[int, int]]:
+    """Pairs of a start and a sample, the last of which is to be tried first."""
+    return [(origin, sample) for origin in reversed(origins) for sample in reversed(children.get(origin, []))]
 
 
 def _check_reach(study: ParametricStudy, samples: Array, result: SweepResult, folder: Path) -> None:
@@ -206,44 +216,3 @@ def _check_reach(study: ParametricStudy, samples: Array, result: SweepResult, fo
                 f"{parameter.unit}: {result.failed[beyond[0]]}. The solutions up to there are kept in "
                 f"{folder}; with that range the same command goes on from them. {study.advice}"
             )
-
-
-def _run_pass(
-    study: ParametricStudy,
-    samples: Array,
-    paths: list[Path],
-    children: dict[int, list[int]],
-    executor: Executor,
-    result: SweepResult,
-    tried: dict[int, list[int]],
-    progress: tqdm,
-) -> None:
-    """Walk a tree of samples from the solved ones outwards; branches behind a failure are left."""
-    running: dict[Future, int] = {}
-
-    def start(parent: int) -> None:
-        for sample in children.get(parent, []):
-            tried.setdefault(sample, []).append(parent)
-            if paths[sample].is_file():
-                future: Future = Future()
-                future.set_result(None)
-            else:
-                origin = paths[parent] if parent >= 0 else None
-                future = executor.submit(_solve_sample, study, samples[sample], origin, paths[sample])
-            running[future] = sample
-
-    for origin in [-1, *sorted(result.solved)]:
-        start(origin)
-    while running:
-        done, _ = wait(running, return_when=FIRST_COMPLETED)
-        for future in done:
-            sample = running.pop(future)
-            reason = future.result()
-            if reason is None:
-                result.solved[sample] = paths[sample]
-                result.failed.pop(sample, None)
-                progress.update()
-                start(sample)
-            else:
-                result.failed[sample] = reason
-        progress.set_postfix(failed=len(result.failed))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
 from morph_dslam.errors import StudyError
 from morph_dslam.units import to_si
@@ -42,14 +42,41 @@ class Section(BaseModel):
 class SamplingSection(Section):
     """Numbers of training and held-out solves, where they lie, and the seed of their positions.
 
-    ``scheme`` places the training samples: "sobol" scatters them, denser towards the edges of the box; "even"
-    spaces them evenly with both ends included, for a single parameter. Held-out samples are always scattered.
+    ``scheme`` places the training samples: "sobol" scatters ``training`` of them, denser towards the edges of
+    the box; "even" spaces them evenly with both ends included, for a single parameter; "grid" takes all
+    points of a full grid with ``points`` for each parameter, or one number for all; "adaptive" solves
+    ``first`` scattered ones and then adds where the model's error is estimated to be largest, up to
+    ``training``. Held-out samples are always scattered.
     """
 
     training: int = Field(default=256, ge=8)
     held_out: int = Field(default=59, ge=4)
-    scheme: Literal["sobol", "even"] = "sobol"
+    scheme: Literal["sobol", "even", "grid", "adaptive"] = "sobol"
+    points: int | tuple[int, ...] | None = None
+    first: int = Field(default=16, ge=4)
     seed: int = 0
+
+    @field_validator("points")
+    @classmethod
+    def _check_points(cls, points: int | tuple[int, ...] | None) -> int | tuple[int, ...] | None:
+        if any(count < 2 for count in ((points,) if isinstance(points, int) else points or ())):
+            raise ValueError("a grid needs at least 2 points along each parameter")
+        return points
+
+    @model_validator(mode="after")
+    def _check_scheme(self) -> SamplingSection:
+        given = self.model_fields_set
+        if self.scheme == "grid" and self.points is None:
+            raise ValueError('scheme = "grid" needs points: their number along each parameter, [9, 5] say')
+        if self.scheme == "grid" and "training" in given:
+            raise ValueError('with scheme = "grid" the points are the training samples: leave out training')
+        if self.scheme != "grid" and "points" in given:
+            raise ValueError('points are those of scheme = "grid": leave them out, or choose that scheme')
+        if self.scheme != "adaptive" and "first" in given:
+            raise ValueError('first is for scheme = "adaptive": leave it out, or choose that scheme')
+        if self.scheme == "adaptive" and self.first > self.training:
+            raise ValueError("first must be at most training: adaptive sampling starts with it and adds")
+        return self
 
 
 #: Names of the methods of reduction, of formats of several parameters, and of functions of one.

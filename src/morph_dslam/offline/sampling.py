@@ -1,0 +1,108 @@
+"""Where a study is solved: samples of the parameter box, every scheme of them deterministic.
+
+Scrambled Sobol samples are nested: the first of a longer sequence are the shorter one, so a study that asks
+for more samples keeps those it has (Sobol 1967; scrambling after Owen 1998).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+from morph_dslam.errors import StudyError
+from morph_dslam.offline.problem import ParametricStudy, bounds
+
+Array = NDArray[np.float64]
+
+#: How far training samples are moved from uniform to the Chebyshev density (`sample_box`).
+TRAINING_TOWARDS_EDGES = 0.5
+#: More points than these on a full grid are taken for a mistake: other schemes need far fewer.
+MOST_GRID_POINTS = 100_000
+
+
+def training_samples(study: ParametricStudy) -> Array:
+    """The samples (n, d) that the model is made from; with "adaptive", those that are solved first.
+
+    Raises
+    ------
+    StudyError
+        If the scheme does not suit the number of parameters.
+    """
+    sampling = study.sampling
+    if sampling.scheme == "even":
+        return study.admissible(_even(study, sampling.training))
+    if sampling.scheme == "grid":
+        return study.admissible(_grid(study))
+    count = sampling.first if sampling.scheme == "adaptive" else sampling.training
+    return sample_box(study, count, sampling.seed, TRAINING_TOWARDS_EDGES)
+
+
+def candidate_samples(study: ParametricStudy, count: int) -> Array:
+    """Samples (count, d) among which adaptive sampling chooses: those that follow the training samples.
+
+    A longer list begins with the shorter one, and no candidate is a training or a held-out sample.
+    """
+    sampling = study.sampling
+    following = sample_box(study, sampling.first + count, sampling.seed, TRAINING_TOWARDS_EDGES)
+    return following[sampling.first :]
+
+
+def held_out_samples(study: ParametricStudy) -> Array:
+    """The samples (n, d) that only measure the error: uniform, as the certificate's statement assumes."""
+    return sample_box(study, study.sampling.held_out, study.sampling.seed + 1, towards_edges=0.0)
+
+
+def sample_box(study: ParametricStudy, count: int, seed: int, towards_edges: float) -> Array:
+    """Scrambled Sobol samples (count, d) of the box; of two counts, the smaller gives the first samples.
+
+    ``towards_edges`` in [0, 1] moves them from uniform to the Chebyshev density, at which polynomial
+    regression is best conditioned.
+    """
+    box = bounds(study)
+    sobol = qmc.Sobol(len(box), rng=seed)
+    unit = 2.0 * sobol.random_base2(int(np.ceil(np.log2(count))))[:count] - 1.0
+    xi = (1.0 - towards_edges) * unit + towards_edges * np.sin(np.pi / 2.0 * unit)
+    return study.admissible(box.mean(axis=1) + xi * np.diff(box, axis=1).ravel() / 2.0)
+
+
+def _even(study: ParametricStudy, count: int) -> Array:
+    """Evenly spaced samples (count, 1), both ends included."""
+    box = bounds(study)
+    if len(box) != 1:
+        raise StudyError(
+            f'sampling.scheme = "even" is for one parameter, and this study has {len(box)}: '
+            'use "grid" or "sobol"'
+        )
+    return np.linspace(box[0, 0], box[0, 1], count)[:, None]
+
+
+def _grid(study: ParametricStudy) -> Array:
+    """The full grid (n, d), evenly spaced along each parameter, the last parameter running fastest."""
+    axes = grid_axes(study)
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+
+
+def grid_axes(study: ParametricStudy) -> list[Array]:
+    """Values of each parameter on the full grid, both ends included.
+
+    Raises
+    ------
+    StudyError
+        If ``sampling.points`` does not suit the number of parameters, or makes too many points.
+    """
+    box, points = bounds(study), study.sampling.points
+    counts = (points,) * len(box) if isinstance(points, int) else tuple(points or ())
+    if len(counts) != len(box):
+        names = ", ".join(parameter.name for parameter in study.model_parameters())
+        raise StudyError(
+            f"sampling.points has {len(counts)} numbers, and this study has {len(box)} parameters "
+            f"({names}): give one number of points for each, in this order"
+        )
+    total = int(np.prod([float(count) for count in counts]))
+    if total > MOST_GRID_POINTS:
+        raise StudyError(
+            f"the full grid of sampling.points has {total} points, more than {MOST_GRID_POINTS}: "
+            'take fewer, or scheme = "sobol"'
+        )
+    return [np.linspace(*ends, count) for ends, count in zip(box, counts, strict=True)]
