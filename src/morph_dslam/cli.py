@@ -36,11 +36,10 @@ def _info(arguments: argparse.Namespace) -> None:
 
     model = load_model(arguments.model)
     print(f"{model.name}: a reduced model of {arguments.model.stat().st_size / 1e6:.2f} MB")
-    for heading, facts in summarise_model(model).items():
+    for heading, table in summarise_model(model).items():
         print(f"\n{heading}")
-        width = max(len(name) for name in facts)
-        for name, value in facts.items():
-            print(f"  {name:<{width}}  {value}")
+        for line in table.text():
+            print(f"  {line}")
 
 
 def _track(arguments: argparse.Namespace) -> None:

@@ -1,46 +1,42 @@
-"""What a model file holds, in words: `morph info` prints it and the reports show it."""
+"""What a model file holds, in tables: `morph info` prints them and the reports show them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from morph_dslam.evaluation.error_tables import error_table, sensitivity_table
+from morph_dslam.evaluation.field_names import field_title
+from morph_dslam.evaluation.report import Table
 from morph_dslam.model import Parameter, ReducedModel
+from morph_dslam.model.functions import ParameterFunctions
+from morph_dslam.model.tensor_functions import CPFunctions, TensorTrainFunctions, TuckerFunctions
 
 #: Endings of certificate keys and the unit they stand for.
 _UNITS = {"_mm": "mm", "_percent": "%", "_MPa": "MPa", "_seconds": "s", "_ms": "ms", "_deg": "°"}
-#: Provenance longer than this (a study's text) is for programs, not for a summary.
+#: Texts longer than this (a study's) are for programs, not for a summary.
 _LONGEST_TEXT = 120
-
-#: Fields of the model file in words.
-_FIELDS = {
-    "stress_top": "stress, top face",
-    "stress_bottom": "stress, bottom face",
-    "stress_solid": "Cauchy stress",
+_FORMATS = {
+    ParameterFunctions: "polynomials",
+    CPFunctions: "CP",
+    TuckerFunctions: "Tucker",
+    TensorTrainFunctions: "tensor train",
 }
+#: Long lists of the reduction, which the build's report draws.
+_DRAWN = ("singular_values", "cross_validation")
 
 Facts = dict[str, str]
 
 
-def _range(parameter: Parameter) -> str:
-    lower, upper, default = (
-        f"{parameter.display(value):.4g}" for value in (parameter.lower, parameter.upper, parameter.default)
+def describe_point(parameters: Sequence[Parameter], coordinates: ArrayLike) -> str:
+    """Coordinates (d,), SI, as "lever = 12 deg, load = 3 N"."""
+    return ", ".join(
+        f"{parameter.name} = {parameter.display(float(value)):.4g} {parameter.unit}".removesuffix(" 1")
+        for parameter, value in zip(parameters, np.asarray(coordinates), strict=True)
     )
-    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
-    note = f"; {parameter.description}" if parameter.description else ""
-    return f"{lower} to {upper}{unit}, default {default}{note}"
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, list):
-        if any(isinstance(item, Mapping) for item in value):
-            return f"{len(value)} entries"
-        return ", ".join(_value(item) for item in value) or "none"
-    return str(value)
 
 
 def flatten(content: Mapping[str, Any], prefix: str = "") -> Facts:
@@ -61,20 +57,122 @@ def flatten(content: Mapping[str, Any], prefix: str = "") -> Facts:
     return facts
 
 
-def summarise_model(model: ReducedModel) -> dict[str, Facts]:
-    """Facts of a model by heading, in the order in which they are read; empty headings are left out."""
-    extent = 1e3 * np.ptp(model.nodes, axis=0)
+def summarise_model(model: ReducedModel) -> dict[str, Table]:
+    """Tables of a model by heading, in the order in which they are read; empty ones are left out.
+
+    Certificates of older files, which say less, are shown as far as they go.
+    """
+    certificate = model.certificate
     summary = {
-        "mesh": {
-            "nodes": str(len(model.nodes)),
-            "triangles": str(len(model.triangles)),
-            **{f"{name} cells": str(len(cells)) for name, cells in model.cells.items()},
-            "extent": " x ".join(f"{length:.4g}" for length in extent) + " mm",
-            "units in the file": "metres, pascals, radians",
-        },
-        "parameters": {parameter.name: _range(parameter) for parameter in model.parameters},
-        "modes": {_FIELDS.get(name, name): str(field.n_modes) for name, field in model.fields.items()},
-        "certificate": flatten(model.certificate),
-        "provenance": flatten(model.provenance),
+        "mesh": Table.of(_mesh(model)),
+        "parameters": Table.of({parameter.name: _range(parameter) for parameter in model.parameters}),
+        "fields": _fields(model),
+        "errors on held-out solves": error_table(certificate),
+        "errors of the displacement's sensitivities": sensitivity_table(certificate),
+        "held-out solves": Table.of(held_out_facts(model)),
+        "memory and samples": Table.of(_memory(certificate)),
+        "error estimator": Table.of(flatten(certificate.get("estimator", {}))),
+        "reduction": Table.of(_reduction(certificate)),
+        "stability": Table.of(_stability(certificate)),
+        "made with": Table.of(flatten(_versions_last(model.provenance))),
     }
-    return {heading: facts for heading, facts in summary.items() if facts}
+    return {heading: table for heading, table in summary.items() if table.rows}
+
+
+def held_out_facts(model: ReducedModel) -> Facts:
+    """How far the errors can be relied upon, and where the worst of them is."""
+    errors = model.certificate.get("displacement", {})
+    facts = {}
+    if "n_held_out" in errors:
+        facts["number"] = str(errors["n_held_out"])
+    if "confidence" in errors:
+        facts["confidence"] = errors["confidence"]
+    if "worst_sample" in errors:
+        worst = f"mean error {_value(errors['worst_sample_mean_mm'])} mm"
+        facts["worst"] = f"{describe_point(model.parameters, errors['worst_sample'])}: {worst}"
+    return facts
+
+
+def parameter_table(parameters: Sequence[Parameter]) -> Table:
+    """Ranges and defaults in the unit of each parameter."""
+    rows = []
+    for parameter in parameters:
+        values = (parameter.lower, parameter.upper, parameter.default)
+        numbers = [f"{parameter.display(value):.4g}" for value in values]
+        rows.append([parameter.name, *numbers, _unit(parameter) or "–", parameter.description])
+    return Table(rows, ("parameter", "from", "to", "default", "unit", "meaning"))
+
+
+def _unit(parameter: Parameter) -> str:
+    return "" if parameter.unit == "1" else parameter.unit
+
+
+def _range(parameter: Parameter) -> str:
+    lower, upper, default = (
+        f"{parameter.display(value):.4g}" for value in (parameter.lower, parameter.upper, parameter.default)
+    )
+    note = f"; {parameter.description}" if parameter.description else ""
+    return f"{lower} to {upper} {_unit(parameter)}".rstrip() + f", default {default}{note}"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list):
+        if any(isinstance(item, Mapping) for item in value):
+            return f"{len(value)} entries"
+        return ", ".join(_value(item) for item in value) or "none"
+    return str(value)
+
+
+def _mesh(model: ReducedModel) -> Facts:
+    extent = 1e3 * np.ptp(model.nodes, axis=0)
+    return {
+        "nodes": str(len(model.nodes)),
+        "triangles": str(len(model.triangles)),
+        **{f"{name} cells": str(len(cells)) for name, cells in model.cells.items()},
+        "extent": " x ".join(f"{length:.4g}" for length in extent) + " mm",
+        "units in the file": "metres, pascals, radians",
+    }
+
+
+def _fields(model: ReducedModel) -> Table:
+    rows = [
+        [
+            field_title(name),
+            str(field.n_modes),
+            _FORMATS.get(type(field.functions), "other"),
+            str(field.n_floats),
+        ]
+        for name, field in model.fields.items()
+    ]
+    return Table(rows, ("field", "modes", "format", "numbers stored"))
+
+
+def _memory(certificate: Mapping[str, Any]) -> Facts:
+    facts = {}
+    if "compression_percent" in certificate:
+        facts["compression of the displacement"] = f"{certificate['compression_percent']:.2f} %"
+    samples = certificate.get("samples", {})
+    return facts | {f"{name.replace('_', ' ')} samples": _value(value) for name, value in samples.items()}
+
+
+def _reduction(certificate: Mapping[str, Any]) -> Facts:
+    content = certificate.get("reduction", {})
+    return flatten({key: value for key, value in content.items() if key not in _DRAWN})
+
+
+def _stability(certificate: Mapping[str, Any]) -> Facts:
+    report = certificate.get("stability", {})
+    facts = flatten(
+        {key: report[key] for key in ("statement", "stable", "unstable", "unknown") if key in report}
+    )
+    places = [" and ".join(place["between"]) for place in report.get("passed", [])]
+    return facts | {f"change of stability {n}": f"between {place}" for n, place in enumerate(places, start=1)}
+
+
+def _versions_last(provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """The provenance without nesting, versions by their packages' names."""
+    return {key: value for key, value in provenance.items() if key != "versions"} | dict(
+        provenance.get("versions", {})
+    )

@@ -61,6 +61,15 @@ class Table:
         """Two columns, a name and its value."""
         return cls(list(figures.items()))
 
+    def text(self) -> list[str]:
+        """The table in lines, columns aligned on their left."""
+        rows = [self.header, *self.rows] if self.header else self.rows
+        widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+        return [
+            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+            for row in rows
+        ]
+
     def html(self) -> str:
         lines = [_row(self.header, "th")] if self.header else []
         lines += [_row(row, "td") for row in self.rows]

@@ -105,7 +105,7 @@ def write_run_report(run: Run, figures: Mapping[str, Any]) -> Path:
         _video_section(run),
         _lost_section(run),
         tracking,
-        *(Section(f"Model: {name}", [Table.of(facts)]) for name, facts in summarise_model(run.model).items()),
+        *(Section(f"Model: {name}", [table]) for name, table in summarise_model(run.model).items()),
         settings,
     ]
     path = run.folder / "report.html"

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.evaluation.model_summary import describe_point
 from morph_dslam.model import Parameter
 
 Array = NDArray[np.float64]
@@ -52,7 +53,7 @@ def stability_report(
         ],
         "passed": [
             {
-                "between": [_point(parameters, samples[index]) for index in pair],
+                "between": [describe_point(parameters, samples[index]) for index in pair],
                 "coordinates": [samples[index].tolist() for index in pair],
                 "negative_pivots": [counts[index] for index in pair],
             }
@@ -84,10 +85,3 @@ def _statement(solved: int, known: int, unstable: int, passed: int) -> str:
     places = f"in {passed} places" if passed > 1 else "in one place"
     branches = f"; bifurcations may have been passed {places}" if passed else ""
     return f"{unstable} of {solved} solutions are unstable{branches}{told}"
-
-
-def _point(parameters: Sequence[Parameter], coordinates: Array) -> str:
-    return ", ".join(
-        f"{parameter.name} = {parameter.display(value):.4g} {parameter.unit}".removesuffix(" 1")
-        for parameter, value in zip(parameters, coordinates, strict=True)
-    )
