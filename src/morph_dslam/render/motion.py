@@ -12,10 +12,20 @@ from morph_dslam.errors import SceneError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.render.key_frames import interpolate_key_frames
-from morph_dslam.render.scene_file import Occluder, ParameterKeyFrame, PoseKeyFrame, Scene
+from morph_dslam.render.model_view import looking_at
+from morph_dslam.render.scene_file import (
+    CameraKeyFrame,
+    Occluder,
+    ParameterKeyFrame,
+    PoseKeyFrame,
+    Scene,
+    Vector,
+)
 from morph_dslam.units import to_si
 
 Array = NDArray[np.float64]
+
+_AT_ORIGIN = PoseKeyFrame(frame=0, position_mm=(0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -26,11 +36,13 @@ class Motion:
     ----------
     parameters : (T, d) SI.
     camera_from_object : T poses of the object in the camera frame, metres.
+    camera_from_world : T poses of the world, or None where only the object's pose is prescribed.
     occluder_centres : (T, 2) pixels, or None without an occluder.
     """
 
     parameters: Array
     camera_from_object: list[RigidTransform]
+    camera_from_world: list[RigidTransform] | None
     occluder_centres: Array | None
 
 
@@ -83,12 +95,36 @@ def _parameter_tracks(model: ReducedModel, keys: list[ParameterKeyFrame], frames
     return np.column_stack([_parameter_track(parameter, keys, frames) for parameter in model.parameters])
 
 
-def _pose_track(keys: list[PoseKeyFrame], frames: NDArray) -> list[RigidTransform]:
+def _pose_track(keys: list[PoseKeyFrame], frames: NDArray, upright: Vector) -> list[RigidTransform]:
     numbers = [key.frame for key in keys]
     position = interpolate_key_frames(numbers, np.array([key.position_mm for key in keys]) * 1e-3, frames)
-    angles = interpolate_key_frames(numbers, np.array([key.rotation_deg for key in keys]), frames)
+    angles = interpolate_key_frames(numbers, np.array([key.rotation_deg or upright for key in keys]), frames)
     rotation = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
     return [RigidTransform(r, p) for r, p in zip(rotation, position, strict=True)]
+
+
+def _camera_track(keys: list[CameraKeyFrame], frames: NDArray) -> list[RigidTransform]:
+    """Poses camera_from_world of a camera that looks at its target with the world's z axis up.
+
+    Raises
+    ------
+    SceneError
+        If it looks straight up or down, or stands in its target.
+    """
+    numbers = [key.frame for key in keys]
+    positions = interpolate_key_frames(numbers, np.array([key.position_mm for key in keys]) * 1e-3, frames)
+    targets = interpolate_key_frames(numbers, np.array([key.target_mm for key in keys]) * 1e-3, frames)
+    poses = []
+    for frame, position, target in zip(frames, positions, targets, strict=True):
+        ahead = target - position
+        distance = float(np.linalg.norm(ahead))
+        if np.hypot(*ahead[:2]) <= 1e-3 * distance:
+            raise SceneError(
+                f"camera_path: in frame {frame} the camera looks straight up or down, or stands in its "
+                "target, so that nothing is upright: move it aside"
+            )
+        poses.append(looking_at(target, ahead, distance))
+    return poses
 
 
 def _occluder_track(occluder: Occluder | None, frames: NDArray) -> Array | None:
@@ -107,8 +143,15 @@ def plan_motion(scene: Scene, model: ReducedModel) -> Motion:
         If a parameter is unknown to the model, or leaves its range at or between key frames.
     """
     frames = np.arange(scene.frames)
+    if scene.camera_path:
+        in_world = _pose_track(scene.pose or [_AT_ORIGIN], frames, (0.0, 0.0, 0.0))
+        camera_from_world = _camera_track(scene.camera_path, frames)
+        poses = [camera @ placed for camera, placed in zip(camera_from_world, in_world, strict=True)]
+    else:
+        camera_from_world, poses = None, _pose_track(scene.pose, frames, (180.0, 0.0, 0.0))
     return Motion(
         parameters=_parameter_tracks(model, scene.parameters, frames),
-        camera_from_object=_pose_track(scene.pose, frames),
+        camera_from_object=poses,
+        camera_from_world=camera_from_world,
         occluder_centres=_occluder_track(scene.occluder, frames),
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,6 +50,27 @@ def find_photograph(name: str, folder: Path) -> Path:
             "or an image file"
         )
     return files[name]
+
+
+def resize_to_fill(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """The largest centred part of an image with these proportions, resized.
+
+    A finer image would alias, so it is averaged down; a coarser one is smoothed up.
+    """
+    cropped = crop_to_aspect(image, width / height)
+    shrinks = cropped.shape[1] > width
+    resized = cv2.resize(
+        cropped, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
+    )
+    return np.asarray(resized, dtype=np.uint8)
+
+
+def crop_to_aspect(image: NDArray[np.uint8], aspect: float) -> NDArray[np.uint8]:
+    """The largest centred part of an image with this width-to-height ratio."""
+    height, width = image.shape[:2]
+    kept_width, kept_height = min(width, round(height * aspect)), min(height, round(width / aspect))
+    left, top = (width - kept_width) // 2, (height - kept_height) // 2
+    return image[top : top + kept_height, left : left + kept_width]
 
 
 def load_photograph(name: str, folder: Path) -> NDArray[np.uint8]:

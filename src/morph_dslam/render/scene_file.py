@@ -18,6 +18,7 @@ Colour = tuple[
 ]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 FrameNumber = Annotated[int, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
 class _Section(BaseModel):
@@ -48,7 +49,7 @@ class Background(_Section):
 
 
 class Light(_Section):
-    """A distant light in ``direction`` (towards it, in the camera frame), and ambient light (0-1)."""
+    """A distant light in ``direction`` (towards it, in the frame of the poses), and ambient light (0-1)."""
 
     direction: Vector = (-0.4, -0.6, -1.0)
     ambient: float = Field(default=0.45, ge=0.0, le=1.0)
@@ -76,15 +77,67 @@ class ParameterKeyFrame(BaseModel):
 
 
 class PoseKeyFrame(_Section):
-    """Where the object is in the camera frame (x right, y down, z ahead).
+    """Where the object is: in the camera frame (x right, y down, z ahead), or in the world if there is a
+    ``camera_path``.
 
-    The object turns about the camera's x axis first, then y, then z (degrees); (180, 0, 0) shows the top face
-    upright.
+    The object turns about that frame's x axis first, then y, then z (degrees). Left out, the object is shown
+    with its top face upright, (180, 0, 0), or stands in the world as in its own frame.
     """
 
     frame: FrameNumber
     position_mm: Vector
-    rotation_deg: Vector = (180.0, 0.0, 0.0)
+    rotation_deg: Vector | None = None
+
+
+class CameraKeyFrame(_Section):
+    """Where the camera is in the world, and the point that it looks at; the world's z axis points up."""
+
+    frame: FrameNumber
+    position_mm: Vector
+    target_mm: Vector
+
+
+class Rectangle(_Section):
+    """A textured rectangle: its centre and its whole edges to the right and down, world."""
+
+    texture: str
+    centre_mm: Vector
+    right_mm: Vector
+    down_mm: Vector
+
+
+class Box(_Section):
+    """A textured box that stands upright, turned about the vertical."""
+
+    texture: str
+    centre_mm: Vector
+    size_mm: tuple[Positive, Positive, Positive]
+    turn_deg: FiniteFloat = 0.0
+
+
+class Environment(_Section):
+    """What stands still around the object; textures are cut to the proportions of each face."""
+
+    rectangles: list[Rectangle] = []
+    boxes: list[Box] = []
+
+    @model_validator(mode="after")
+    def _has_something(self) -> Environment:
+        if not self.rectangles and not self.boxes:
+            raise ValueError("give it rectangles or boxes")
+        return self
+
+
+class DepthSensor(_Section):
+    """A depth camera in the place of the colour camera.
+
+    ``noise_mm_at_1m`` is the standard deviation at 1 m and grows with the square of the distance. Within
+    ``rim_px`` of a jump in depth, and beyond ``range_mm``, there is no depth.
+    """
+
+    noise_mm_at_1m: float = Field(default=1.4, ge=0.0, allow_inf_nan=False)
+    rim_px: int = Field(default=2, ge=0, le=20)
+    range_mm: float = Field(default=5000.0, gt=0.0, le=13000.0)
 
 
 class OccluderKeyFrame(_Section):
@@ -115,12 +168,23 @@ class Scene(_Section):
     light: Light = Light()
     sensor: Sensor = Sensor()
     parameters: list[ParameterKeyFrame] = []
-    pose: list[PoseKeyFrame] = Field(min_length=1)
+    pose: list[PoseKeyFrame] = []
+    camera_path: list[CameraKeyFrame] = []
+    environment: Environment | None = None
+    depth_sensor: DepthSensor | None = None
     occluder: Occluder | None = None
 
     @model_validator(mode="after")
+    def _something_is_placed(self) -> Scene:
+        if not self.pose and not self.camera_path:
+            raise ValueError("the key 'pose' is missing, or 'camera_path' where the camera moves")
+        if self.environment and not self.camera_path:
+            raise ValueError("an environment stands in the world: say with camera_path where the camera is")
+        return self
+
+    @model_validator(mode="after")
     def _key_frames_are_ordered(self) -> Scene:
-        lists = {"parameters": self.parameters, "pose": self.pose}
+        lists = {"parameters": self.parameters, "pose": self.pose, "camera_path": self.camera_path}
         if self.occluder:
             lists["occluder.path"] = self.occluder.path
         for name, keys in lists.items():

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
+from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
-from morph_dslam.render.photographs import load_photograph
+from morph_dslam.render.environment import StaticScene
+from morph_dslam.render.photographs import crop_to_aspect, load_photograph, resize_to_fill
 from morph_dslam.render.rasteriser import Buffers, rasterise
 from morph_dslam.render.scene_file import Background, Scene, Sensor, Surface
 from morph_dslam.render.shading import lambert, vertex_normals
@@ -36,18 +38,8 @@ def supersampled(camera: PinholeCamera, factor: int) -> PinholeCamera:
     )
 
 
-def crop_to_aspect(image: Image, aspect: float) -> Image:
-    """The largest centred part of an image with this width-to-height ratio."""
-    height, width = image.shape[:2]
-    kept_width, kept_height = min(width, round(height * aspect)), min(height, round(width / aspect))
-    left, top = (width - kept_width) // 2, (height - kept_height) // 2
-    return image[top : top + kept_height, left : left + kept_width]
-
-
 def print_texture(surface: Surface, folder: Path, size: Array, pixels_per_metre: float) -> Image:
     """The sheet's print, with its border, at the resolution at which the camera sees it.
-
-    A finer texture would alias, so it is averaged down; a coarser one is smoothed up.
 
     Parameters
     ----------
@@ -57,11 +49,8 @@ def print_texture(surface: Surface, folder: Path, size: Array, pixels_per_metre:
     width, height = np.maximum(np.rint(size * pixels_per_metre).astype(int), 2)
     border = min(round(surface.border_mm * 1e-3 * pixels_per_metre), (min(width, height) - 1) // 2)
     inner = (int(width - 2 * border), int(height - 2 * border))
-    cropped = crop_to_aspect(photograph, inner[0] / inner[1])
-    shrinks = cropped.shape[1] > inner[0]
-    resized = cv2.resize(cropped, inner, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
     texture = np.full((height, width, 3), 244, dtype=np.uint8)
-    texture[border : border + inner[1], border : border + inner[0]] = resized
+    texture[border : border + inner[1], border : border + inner[0]] = resize_to_fill(photograph, *inner)
     return texture
 
 
@@ -132,6 +121,7 @@ class SceneRenderer:
     scene : its description. model : the object. camera : without lens distortion.
     folder : what paths in the scene are relative to.
     nearest_depth : metres; the print is made as fine as it can be seen from there.
+    surroundings : what stands around the object, for `supersampled` pictures, or None.
 
     Raises
     ------
@@ -140,9 +130,15 @@ class SceneRenderer:
     """
 
     def __init__(
-        self, scene: Scene, model: ReducedModel, camera: PinholeCamera, folder: Path, nearest_depth: float
+        self,
+        scene: Scene,
+        model: ReducedModel,
+        camera: PinholeCamera,
+        folder: Path,
+        nearest_depth: float,
+        surroundings: StaticScene | None = None,
     ) -> None:
-        self._scene = scene
+        self._scene, self._surroundings = scene, surroundings
         self._triangles = model.triangles
         self._factor = scene.supersampling
         self._camera = supersampled(camera, self._factor)
@@ -161,10 +157,14 @@ class SceneRenderer:
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         return self._sides * np.einsum("mx,mx->m", normals, corners[:, 0]) < 0.0
 
-    def _paint_surface(self, image: Image, buffers: Buffers, points: Array) -> None:
+    def _paint_surface(
+        self, image: Image, buffers: Buffers, points: Array, camera_from_world: RigidTransform | None
+    ) -> None:
         light, back = self._scene.light, self._scene.surface.back_colour[::-1]
-        normals = vertex_normals(points, self._triangles)
-        brightness = lambert(normals, np.array(light.direction), light.ambient)
+        to_light = np.array(light.direction)
+        if camera_from_world is not None:
+            to_light = camera_from_world.rotation @ to_light
+        brightness = lambert(vertex_normals(points, self._triangles), to_light, light.ambient)
         covered = buffers.covered
         surface = self._surface
         printed = render_textured(buffers, surface.triangles, surface.coordinates, self._texture)[covered]
@@ -173,19 +173,31 @@ class SceneRenderer:
         lit = colour * interpolate(buffers, self._triangles, brightness.astype(np.float32))[:, None]
         image[covered] = (lit + np.float32(0.5)).astype(np.uint8)
 
-    def render(self, points: Array, frame: int, occluder_centre: Array | None) -> Image:
+    def render(
+        self,
+        points: Array,
+        frame: int,
+        occluder_centre: Array | None,
+        camera_from_world: RigidTransform | None = None,
+    ) -> Image:
         """The picture (h, w, 3) uint8, blue, green, red.
 
         Parameters
         ----------
         points : (n, 3) nodes in the camera frame, metres. frame : its number, which seeds the noise.
         occluder_centre : (2,) pixels, or None without an occluder.
+        camera_from_world : where the camera is, in a scene that has a world.
         """
         camera, factor = self._camera, self._factor
         pixels = camera.project(points)
         buffers = rasterise(pixels, points[:, 2], self._triangles, camera.height, camera.width)
         image = np.array(self._background, dtype=np.uint8)
-        self._paint_surface(image, buffers, points)
+        if self._surroundings is not None and camera_from_world is not None:
+            behind = self._surroundings.buffers(camera_from_world)
+            self._surroundings.paint(image, behind)
+            hidden = behind.depth < buffers.depth
+            buffers = replace(buffers, triangle_ids=np.where(hidden, np.int32(-1), buffers.triangle_ids))
+        self._paint_surface(image, buffers, points, camera_from_world)
         occluder = self._scene.occluder
         if occluder is not None and occluder_centre is not None:
             centre = (occluder_centre + 0.5) * factor - 0.5

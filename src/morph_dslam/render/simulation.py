@@ -1,7 +1,8 @@
 """Simulated sequences: a video of a model in motion, with everything about it known.
 
-The folder written holds `frames/`, `camera.yaml`, `landmarks.csv`, `truth.npz` and `depth.h5`; the truth is
-computed from the model, never read off the images.
+The folder written holds `frames/`, `camera.yaml`, `landmarks.csv`, `truth.npz` and `depth.h5`; where the
+camera moves also `groundtruth.txt`, and with a depth sensor `depth/` and the lists of a TUM RGB-D recording.
+The truth is computed from the model, never read off the images.
 """
 
 from __future__ import annotations
@@ -20,11 +21,14 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import SceneError
 from morph_dslam.io.calibration import load_camera, parse_camera, save_camera
 from morph_dslam.io.landmarks import Landmarks, save_landmarks
+from morph_dslam.io.trajectory import Trajectory, save_trajectory
 from morph_dslam.model import ReducedModel, SurfacePoints, load_model
+from morph_dslam.render.depth_sensor import sensor_depth
+from morph_dslam.render.environment import StaticScene
 from morph_dslam.render.motion import Motion, plan_motion
 from morph_dslam.render.rasteriser import rasterise, visible_points
 from morph_dslam.render.scene_file import Scene, load_scene_file
-from morph_dslam.render.scene_renderer import SceneRenderer, in_disc, pixel_axes
+from morph_dslam.render.scene_renderer import SceneRenderer, in_disc, pixel_axes, supersampled
 from morph_dslam.render.sheet_points import is_sheet, landmark_nodes, regular_points
 from morph_dslam.render.solid_points import scattered_points, spread_nodes
 
@@ -46,6 +50,7 @@ class _World:
     model: ReducedModel
     camera: PinholeCamera
     motion: Motion
+    surroundings: StaticScene | None
 
     def node_positions(self, frame: int) -> Array:
         """Nodes (n, 3) in the camera frame, metres."""
@@ -64,6 +69,12 @@ class _World:
             pixels, points[:, 2], self.model.triangles, self.camera.height, self.camera.width
         ).depth
 
+    def surroundings_depth(self, frame: int) -> NDArray[np.float32]:
+        """Depth (h, w) in metres of what stands around the object, infinity where nothing does."""
+        if self.surroundings is None or self.motion.camera_from_world is None:
+            return np.full((self.camera.height, self.camera.width), np.inf, dtype=np.float32)
+        return self.surroundings.buffers(self.motion.camera_from_world[frame], self.camera).depth
+
     def occluded(self, frame: int, columns: NDArray, rows: NDArray) -> NDArray[np.bool_]:
         """Which pixels the occluder covers; ``columns`` and ``rows`` broadcast against each other."""
         centres, occluder = self.motion.occluder_centres, self.scene.occluder
@@ -72,7 +83,10 @@ class _World:
         return in_disc(columns, rows, centres[frame], occluder.radius_px)
 
     def visible(self, frame: int, points: Array, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Which surface points (p, 3), camera frame, are in the image with nothing in front of them."""
+        """Which surface points (p, 3), camera frame, are in the image with nothing in front of them.
+
+        ``depth`` (h, w) is that of the object and its surroundings.
+        """
         pixels = self.camera.project(points)
         seen = visible_points(pixels, points[:, 2], depth, HIDDEN_BY)
         return seen & ~self.occluded(frame, pixels[:, 0], pixels[:, 1])
@@ -93,7 +107,11 @@ def _load_world(scene_path: Path) -> _World:
         motion = plan_motion(scene, model)
     except SceneError as error:
         raise SceneError(f"{scene_path}: {error}") from error
-    world = _World(scene, folder, model, camera, motion)
+    try:
+        surroundings = _surroundings(scene, folder, camera, motion)
+    except SceneError as error:
+        raise SceneError(f"{scene_path}: {error}") from error
+    world = _World(scene, folder, model, camera, motion, surroundings)
     for frame in range(scene.frames):
         points = world.node_positions(frame)
         if points[:, 2].min() <= 0.0:
@@ -104,23 +122,34 @@ def _load_world(scene_path: Path) -> _World:
     return world
 
 
+def _surroundings(scene: Scene, folder: Path, camera: PinholeCamera, motion: Motion) -> StaticScene | None:
+    if scene.environment is None or motion.camera_from_world is None:
+        return None
+    positions = np.array([pose.inverse.translation for pose in motion.camera_from_world])
+    finer, light = supersampled(camera, scene.supersampling), scene.light
+    return StaticScene(scene.environment, folder, finer, positions, np.array(light.direction), light.ambient)
+
+
 def _prepare_folder(output: Path) -> None:
     """Make the folders, and clear frames of an earlier simulation, which would mix with the new ones."""
-    frames = output / "frames"
-    try:
-        frames.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SceneError(f"cannot write the sequence to {output}: {error.strerror}") from error
-    for path in frames.iterdir():
-        if re.fullmatch(r"\d{6}\.(png|jpg)", path.name):
-            path.unlink()
+    for folder in (output / "frames", output / "depth"):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise SceneError(f"cannot write the sequence to {output}: {error.strerror}") from error
+        for path in folder.iterdir():
+            if re.fullmatch(r"\d{6}\.(png|jpg)", path.name):
+                path.unlink()
+    for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):
+        (output / name).unlink(missing_ok=True)
 
 
 def _write_landmarks(path: Path, world: _World) -> None:
     """Write landmarks that frame 0 shows: mesh nodes and their pixels."""
     nodes = landmark_nodes(world.model) if is_sheet(world.model) else spread_nodes(world.model)
     positions = world.node_positions(0)
-    nodes = nodes[world.visible(0, positions[nodes], world.depth_image(positions))]
+    depth = np.minimum(world.depth_image(positions), world.surroundings_depth(0))
+    nodes = nodes[world.visible(0, positions[nodes], depth)]
     if len(nodes) < MIN_LANDMARKS:
         raise SceneError(
             f"frame 0 shows {len(nodes)} landmarks of the object, and a tracker needs {MIN_LANDMARKS}: "
@@ -181,19 +210,44 @@ def _render_frames(
 ) -> NDArray[np.bool_]:
     """Write all images and depths; says which truth points (T, p) are visible."""
     scene, camera, centres = world.scene, world.camera, world.motion.occluder_centres
+    cameras = world.motion.camera_from_world
     columns, rows = pixel_axes(camera.height, camera.width)
     visible = np.zeros(truth.shape[:2], dtype=bool)
     with h5py.File(output / "depth.h5", "w") as file:
         depths = _create_depth(file, world)
         for frame in tqdm(range(scene.frames), desc="rendering", unit="frame", disable=not progress):
             nodes = world.node_positions(frame)
-            image = renderer.render(nodes, frame, None if centres is None else centres[frame])
+            image = renderer.render(
+                nodes,
+                frame,
+                None if centres is None else centres[frame],
+                None if cameras is None else cameras[frame],
+            )
             _write_image(output / "frames" / f"{frame:06}.{scene.image_format}", image)
-            depth = world.depth_image(nodes)
-            visible[frame] = world.visible(frame, truth[frame], depth)
-            hidden = np.isinf(depth) | world.occluded(frame, columns, rows)
+            depth, behind = world.depth_image(nodes), world.surroundings_depth(frame)
+            both, occluded = np.minimum(depth, behind), world.occluded(frame, columns, rows)
+            visible[frame] = world.visible(frame, truth[frame], both)
+            hidden = np.isinf(depth) | (behind < depth) | occluded
             depths[frame] = np.where(hidden, np.float32(0.0), depth)
+            if scene.depth_sensor is not None:
+                seen = np.where(occluded, np.float32(np.inf), both)
+                measured = sensor_depth(seen, scene.depth_sensor, (scene.seed, frame))
+                cv2.imwrite(str(output / "depth" / f"{frame:06}.png"), measured)
     return visible
+
+
+def _write_lists(output: Path, world: _World) -> None:
+    """Write the camera's true path, and the lists that make a recording with depth of the folder."""
+    times = np.arange(world.scene.frames) / world.scene.fps
+    if world.motion.camera_from_world is not None:
+        poses = np.array([pose.inverse.matrix for pose in world.motion.camera_from_world])
+        save_trajectory(output / "groundtruth.txt", Trajectory(times, poses))
+    if world.scene.depth_sensor is None:
+        (output / "depth").rmdir()
+        return
+    for name, folder, suffix in (("rgb", "frames", world.scene.image_format), ("depth", "depth", "png")):
+        lines = [f"{time:.6f} {folder}/{frame:06}.{suffix}" for frame, time in enumerate(times)]
+        (output / f"{name}.txt").write_text("\n".join(lines) + "\n")
 
 
 def simulate(scene_path: Path, output: Path, progress: bool = True) -> None:
@@ -212,7 +266,9 @@ def simulate(scene_path: Path, output: Path, progress: bool = True) -> None:
         If the camera or the model that it names cannot be read.
     """
     world = _load_world(Path(scene_path))
-    renderer = SceneRenderer(world.scene, world.model, world.camera, world.folder, world.nearest_depth())
+    renderer = SceneRenderer(
+        world.scene, world.model, world.camera, world.folder, world.nearest_depth(), world.surroundings
+    )
     output = Path(output)
     _prepare_folder(output)
     save_camera(output / "camera.yaml", world.camera)
@@ -221,3 +277,4 @@ def simulate(scene_path: Path, output: Path, progress: bool = True) -> None:
     truth = _truth_positions(world, spread(world.model, N_TRUTH_POINTS))
     visible = _render_frames(world, renderer, output, truth, progress)
     _write_truth(output / "truth.npz", world, truth, visible)
+    _write_lists(output, world)
