@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.offline.problem import Snapshot
+from morph_dslam.offline.reactions import REACTION
 from morph_dslam.offline.reduction.task import ReductionTask
 
 Array = NDArray[np.float64]
@@ -38,9 +39,13 @@ def model_of(
         cells=task.mesh.cells,
         parameters=task.parameters,
         displacement=fields["displacement"],
-        stresses={
-            name.removeprefix(STRESS): field for name, field in fields.items() if name.startswith(STRESS)
-        },
+        stresses=_without_prefix(fields, STRESS),
         strain=fields.get("strain"),
+        reactions=_without_prefix(fields, REACTION),
         certificate={"reduction": summary},
     )
+
+
+def _without_prefix(fields: Mapping[str, SeparatedField], prefix: str) -> dict[str, SeparatedField]:
+    """The fields whose names start with ``prefix``, under the rest of their names."""
+    return {name.removeprefix(prefix): field for name, field in fields.items() if name.startswith(prefix)}
