@@ -22,6 +22,7 @@ def _slam(arguments: argparse.Namespace) -> None:
             last=last,
             map_file=arguments.map,
             freeze_at=arguments.freeze_at,
+            use_depth=not arguments.no_depth,
             video=not arguments.no_video,
             overwrite=arguments.overwrite,
         )
@@ -57,7 +58,12 @@ def add_camera_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         "find the path of a camera through a rigid scene, and a map of the scene",
     )
     slam.add_argument("source", type=Path, help="recording (docs/sources.md)")
-    slam.add_argument("--camera", type=Path, required=True, help="camera file: size, intrinsics, distortion")
+    slam.add_argument(
+        "--camera",
+        type=Path,
+        required=True,
+        help="camera file: size, intrinsics, distortion; a Kalibr camchain or EuRoC folder for a stereo pair",
+    )
     slam.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="run folder to write")
     slam.add_argument(
         "--range", type=frame_range, default=(None, None), metavar="FIRST-LAST", help="frames to track"
@@ -67,6 +73,9 @@ def add_camera_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
     )
     slam.add_argument(
         "--freeze-at", type=int, metavar="N", help="from this frame on keep the map and only find the camera"
+    )
+    slam.add_argument(
+        "--no-depth", action="store_true", help="leave the depth images of the recording aside"
     )
     slam.add_argument("--overwrite", action="store_true", help="replace a run that is in the run folder")
     slam.add_argument("--no-video", action="store_true", help="do not draw the video with tracked points")

@@ -169,10 +169,10 @@ def test_an_interrupted_run_keeps_what_was_mapped(tmp_path, room_film, monkeypat
     write_film(tmp_path / "film", room_film)
     process = Slam.process_frame
 
-    def interrupted(slam, image, index, timestamp):
+    def interrupted(slam, image, index, *rest):
         if index == 25:
             raise KeyboardInterrupt
-        return process(slam, image, index, timestamp)
+        return process(slam, image, index, *rest)
 
     monkeypatch.setattr(Slam, "process_frame", interrupted)
     run = tmp_path / "run"
@@ -222,7 +222,8 @@ def test_the_camera_is_found_in_a_saved_map(tmp_path, room_run, room_film):
     mapped, _ = room_run
     images, truth = room_film
     save_map(tmp_path / "map.h5", mapped.map, CAMERA)
-    slam = Slam(CAMERA, rigid_map=load_map(tmp_path / "map.h5", CAMERA))
+    slam = Slam(CAMERA)
+    slam.use_map(load_map(tmp_path / "map.h5", CAMERA))
     order = list(range(70, 40, -1))
     frames = [slam.process_frame(images[i], n, n / 30.0) for n, i in enumerate(order)]
     assert [frame.status for frame in frames[:2]] == ["relocalised", "tracked"]

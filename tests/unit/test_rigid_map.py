@@ -7,7 +7,7 @@ import numpy as np
 from morph_dslam.io.point_cloud import save_ply
 from morph_dslam.online.features import match_descriptors
 from morph_dslam.online.slam.relocalisation import describe, orientations, thumbnail
-from morph_dslam.online.slam.rigid_map import CANDIDATE, GOOD, REMOVED, Keyframe, RigidMap
+from morph_dslam.online.slam.rigid_map import CANDIDATE, GOOD, REMOVED, Followed, Keyframe, RigidMap
 from tests.support.rendered_sequence import printed_texture
 
 
@@ -52,7 +52,7 @@ def test_merged_points_keep_all_views_and_removed_ones_none():
 def test_new_corners_join_the_keyframe_that_found_them():
     rigid_map = small_map()
     ids = rigid_map.add_points(np.zeros((2, 3)), np.ones((2, 2)), 1, CANDIDATE)
-    rigid_map.extend_keyframe(1, ids, np.ones((2, 2)))
+    rigid_map.extend_keyframe(1, Followed(ids, np.ones((2, 2))))
     assert rigid_map.keyframes[1].point_ids.tolist() == [1, 3, 4, 5]
     assert rigid_map.good.tolist() == [0, 1, 2, 3]
 

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import CameraError
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.io.calibration import parse_camera
+from morph_dslam.io.calibration import load_camera, parse_camera
 from morph_dslam.io.camera_formats import from_kalibr, numbers
 from morph_dslam.io.opencv_yaml import read_opencv_yaml
 from morph_dslam.stereo import StereoCamera
@@ -31,6 +32,26 @@ def load_stereo(path: Path) -> StereoCamera:
     """
     path = Path(path)
     return _from_euroc(path) if path.is_dir() else _from_kalibr(path)
+
+
+def load_camera_or_pair(path: Path) -> PinholeCamera | StereoCamera:
+    """Read what `load_stereo` reads as a pair, anything else as `load_camera` does.
+
+    A camchain of which one camera is chosen, `camchain.yaml#cam0`, is that camera alone.
+
+    Raises
+    ------
+    CameraError
+        As both do.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return _from_euroc(path)
+    if path.is_file() and path.suffix in (".yaml", ".yml"):
+        content = read_opencv_yaml(path)
+        if isinstance(content, dict) and all(isinstance(content.get(c), dict) for c in ("cam0", "cam1")):
+            return _from_kalibr(path)
+    return load_camera(path)
 
 
 def _from_kalibr(path: Path) -> StereoCamera:

@@ -19,10 +19,17 @@ END_MARKERS = {".png": b"IEND", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 
 @dataclass(frozen=True)
 class DepthScale:
-    """How a recording stores depth: ``values_per_metre``, and the values that mean it was not measured."""
+    """How a recording stores depth.
+
+    Attributes
+    ----------
+    values_per_metre : of the stored whole numbers. unknown : values that mean it was not measured.
+    registered : whether depth pixels belong to the colour pixels of the same row and column.
+    """
 
     values_per_metre: float
     unknown: tuple[int, ...] = (0,)
+    registered: bool = True
 
 
 def read_image(path: Path, what: str) -> NDArray[np.uint8]:

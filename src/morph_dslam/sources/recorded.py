@@ -62,6 +62,12 @@ class RecordedFrames:
         self._records = [record for record in records if low <= record.index <= high]
         self._depth_scale = depth_scale
 
+    @property
+    def has_registered_depth(self) -> bool:
+        """Whether frames come with depth that belongs to their pixels."""
+        scale = self._depth_scale
+        return scale is not None and scale.registered and any(r.depth is not None for r in self._records)
+
     def __len__(self) -> int:
         return len(self._records)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from morph_dslam.sources.images import DepthScale
 from morph_dslam.sources.recorded import ImageRecord, RecordedFrames
 
-DEPTH = DepthScale(values_per_metre=1000.0, unknown=(0, 65535))
+DEPTH = DepthScale(values_per_metre=1000.0, unknown=(0, 65535), registered=False)
 
 #: The recordings carry no timestamps.
 FPS = 30.0

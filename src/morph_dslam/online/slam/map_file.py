@@ -11,7 +11,7 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import MapError
 from morph_dslam.online.slam.rigid_map import Keyframe, RigidMap
 
-FORMAT, VERSION = "morph-dslam map", 1
+FORMAT, VERSION = "morph-dslam map", 2
 
 #: Arrays of a map with one row a point.
 POINT_ARRAYS = (
@@ -24,13 +24,14 @@ POINT_ARRAYS = (
     "n_expected",
     "n_found",
 )
-KEYFRAME_ARRAYS = ("flat", "camera_from_world", "point_ids", "pixels")
+KEYFRAME_ARRAYS = ("flat", "camera_from_world", "point_ids", "pixels", "right")
 
 
 def save_map(path: Path, rigid_map: RigidMap, camera: PinholeCamera) -> None:
     """Write points, keyframes with their flattened images, and the camera that they are of, as HDF5."""
     with h5py.File(path, "w") as file:
         file.attrs.update({"format": FORMAT, "version": VERSION, "usual_rms_px": rigid_map.usual_rms_px})
+        file.attrs["baseline_px"] = rigid_map.baseline_px
         file.attrs.update({"intrinsics": camera.intrinsics, "size": (camera.width, camera.height)})
         for name in POINT_ARRAYS:
             file[f"points/{name}"] = getattr(rigid_map, name)
@@ -73,7 +74,7 @@ def _read(path: Path, file: h5py.File, camera: PinholeCamera) -> RigidMap:
     keyframes = file.get("keyframes")
     if not isinstance(keyframes, h5py.Group):
         raise MapError(f"{path} is empty: the run that wrote it never began a map")
-    rigid_map = RigidMap()
+    rigid_map = RigidMap(float(np.asarray(file.attrs["baseline_px"])))
     rigid_map.usual_rms_px = float(np.asarray(file.attrs["usual_rms_px"]))
     for name in POINT_ARRAYS:
         setattr(rigid_map, name, np.asarray(file[f"points/{name}"]))

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from morph_dslam.online.features import spread_corners
 from morph_dslam.online.slam.bundle_adjustment import Observations, adjust
+from morph_dslam.online.slam.depth import FrameDepth, depth_of
+from morph_dslam.online.slam.frame_images import FrameView
 from morph_dslam.online.slam.initialisation import MapStart
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.slam.pose import reprojection_errors
@@ -17,7 +19,6 @@ from morph_dslam.online.slam.tracking import Tracked
 from morph_dslam.online.slam.two_view import camera_centre, check_points, triangulate
 
 Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 #: Observations that miss by more after adjustment are taken out, pixels.
 MOST_ERROR_PX = 4.0
@@ -49,6 +50,16 @@ class Mapper:
         self._adjust_locally()
         return self._finish(2)
 
+    def begin_metric(self, view: FrameView) -> Followed | str:
+        """Fill the empty map from one view whose corners' depths are measured, or say why it cannot be."""
+        empty = np.empty(0, dtype=np.int64)
+        self._map.add_keyframe(
+            Keyframe(view.index, view.timestamp, view.flat, np.eye(4), empty, np.empty((0, 2)))
+        )
+        points = self._finish(0, view.depth)
+        n, least = self._n_at_keyframe, self._options.least_start_points
+        return points if n >= least else f"only {n} corners with depth, {least} are needed"
+
     def wants_keyframe(self, tracked: Tracked, frame_index: int) -> bool:
         """Whether the map should keep this view."""
         options, last = self._options, self._map.keyframes[-1]
@@ -70,27 +81,45 @@ class Mapper:
         )
         return bool(np.median(motion) > options.keyframe_motion_px or baseline > options.keyframe_baseline)
 
-    def insert(self, tracked: Tracked, flat: Image, index: int, timestamp: float) -> Followed:
+    def insert(self, tracked: Tracked, view: FrameView) -> Followed:
         """Keep a view; returns the points to follow from it."""
-        points = tracked.points
-        keyframe = Keyframe(index, timestamp, flat, tracked.pose.camera_from_world, points.ids, points.pixels)
-        number = self._map.add_keyframe(keyframe)
+        points, pose = tracked.points, tracked.pose.camera_from_world
+        number = self._map.add_keyframe(
+            Keyframe(view.index, view.timestamp, view.flat, pose, points.ids, points.pixels, points.right)
+        )
+        self._place_by_depth(number, view.depth)
         self._triangulate(number)
         self._fuse(number)
         self._adjust_locally()
         self._cull()
-        return self._finish(number)
+        return self._finish(number, view.depth)
 
     def adjust_all(self, iterations: int = 20) -> None:
         """Bundle adjustment of the whole map."""
         everything = np.arange(len(self._map.keyframes))
         self._adjust(everything, np.empty(0, dtype=np.int64), iterations)
 
-    def _finish(self, number: int) -> Followed:
+    def _finish(self, number: int, depth: FrameDepth | None = None) -> Followed:
         self._add_candidates(number)
+        self._place_by_depth(number, depth)
         keyframe = self._map.keyframes[number]
         self._n_at_keyframe = int((self._map.state[keyframe.point_ids] == GOOD).sum())
         return Followed(keyframe.point_ids.copy(), keyframe.pixels.copy())
+
+    def _place_by_depth(self, number: int, depth: FrameDepth | None) -> None:
+        """Make map points of the candidates of a view that are near enough for their depth to be measured."""
+        rigid_map, keyframe = self._map, self._map.keyframes[number]
+        if depth is None or not rigid_map.is_metric:
+            return
+        rows = np.flatnonzero(rigid_map.state[keyframe.point_ids] == CANDIDATE)
+        right = depth.right_columns(keyframe.pixels[rows])
+        near = keyframe.pixels[rows, 0] - right >= self._options.least_disparity_px
+        rows, right = rows[near], right[near]
+        keyframe.right[rows] = right
+        ids, pixels = keyframe.point_ids[rows], keyframe.pixels[rows]
+        depths = depth_of(pixels, right, rigid_map.baseline_px)
+        rigid_map.positions[ids] = world_points(keyframe.camera_from_world, pixels, depths, self._intrinsics)
+        rigid_map.state[ids] = GOOD
 
     def _median_depth(self, pose: Array, ids: Indices) -> float:
         known = ids[self._map.state[ids] == GOOD]
@@ -116,7 +145,7 @@ class Mapper:
         ids = self._map.add_points(
             world_points(pose, corners, depth, self._intrinsics), corners, number, CANDIDATE
         )
-        self._map.extend_keyframe(number, ids, corners)
+        self._map.extend_keyframe(number, Followed(ids, corners))
 
     def _triangulate(self, number: int) -> None:
         """Turn candidates whose rays have opened into map points; drop those that fit none, or were lost."""
@@ -209,6 +238,7 @@ class Mapper:
                 [local[rigid_map.keyframes[k].point_ids[r]] for k, r in zip(numbers, chosen, strict=True)]
             ),
             np.concatenate([rigid_map.keyframes[k].pixels[r] for k, r in zip(numbers, chosen, strict=True)]),
+            np.concatenate([rigid_map.keyframes[k].right[r] for k, r in zip(numbers, chosen, strict=True)]),
         )
         poses = np.array([rigid_map.keyframes[k].camera_from_world for k in numbers])
         result = adjust(
@@ -217,6 +247,7 @@ class Mapper:
             observations,
             self._intrinsics,
             held,
+            rigid_map.baseline_px,
             huber_px=1.5,
             iterations=iterations,
             tolerance=1e-4,
@@ -236,8 +267,20 @@ class Mapper:
                 keyframe.camera_from_world, rigid_map.positions[ids], keyframe.pixels, self._intrinsics
             )
             keyframe.keep((errors < MOST_ERROR_PX) | (rigid_map.state[ids] != GOOD))
+            self._drop_wrong_depths(keyframe)
         seen = rigid_map.n_observations()
         rigid_map.remove(np.flatnonzero((rigid_map.state == GOOD) & (seen < 2)))
+
+    def _drop_wrong_depths(self, keyframe: Keyframe) -> None:
+        """Forget the columns in the right image that contradict the map."""
+        if not self._map.is_metric:
+            return
+        points = self._map.positions[keyframe.point_ids]
+        pixels, depths = project(keyframe.camera_from_world, points, self._intrinsics)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            misses = np.abs(pixels[:, 0] - self._map.baseline_px / depths - keyframe.right)
+            wrong = (misses > MOST_ERROR_PX) & (self._map.state[keyframe.point_ids] == GOOD)
+        keyframe.right[wrong] = np.nan
 
     def _cull(self) -> None:
         """Take out map points that are hardly ever found where they should be."""

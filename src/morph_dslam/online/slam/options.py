@@ -20,6 +20,9 @@ class SlamOptions:
     start_parallax_deg : median angle between the first two views' rays.
     start_rms_px, start_share : error, and share of the points that must fit, in three views.
     start_clearness : how much larger a rejected hypothesis' squared error must be than the accepted one's.
+    most_disparity_px : of stereo pairs; nearer points have no depth from one frame.
+    least_disparity_px : from this disparity on the depth of a point in one frame makes it a map point; in
+        depth images the baseline counts as 8 cm.
     map_corners : points and candidates that a keyframe is filled up to.
     corner_distance_px : new corners keep this far from followed points.
     triangulation_deg : angle between rays from which a candidate becomes a map point.
@@ -47,6 +50,8 @@ class SlamOptions:
     start_rms_px: float = 1.0
     start_share: float = 0.9
     start_clearness: float = 1.5
+    most_disparity_px: int = 128
+    least_disparity_px: float = 10.0
     map_corners: int = 450
     corner_distance_px: int = 9
     triangulation_deg: float = 1.2

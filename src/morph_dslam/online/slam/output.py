@@ -81,7 +81,7 @@ def summarise(slam: Slam, frames: list[SlamFrame]) -> dict[str, Any]:
         "median_ms": float(np.median(times)),
         "p95_ms": float(np.percentile(times, 95)),
         "stage_median_ms": stages,
-        "scale": "the median depth of the map's first view is 1",
+        "scale": "metres" if slam.map.is_metric else "the median depth of the map's first view is 1",
         "settings": asdict(slam.options),
         "flags": flags,
     }

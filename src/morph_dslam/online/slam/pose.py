@@ -1,4 +1,7 @@
-"""The pose of one camera from known points: Huber-weighted Gauss-Newton, and RANSAC without a start."""
+"""The pose of one camera from known points: Huber-weighted Gauss-Newton, and RANSAC without a start.
+
+Where depth was measured, the point's column in a right image is a third residual, as in `bundle_adjustment`.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +22,10 @@ LEAST_DEPTH = 1e-6
 
 
 @njit(cache=True, nogil=True)
-def _normal_equations(pose, points, pixels, intrinsics, width):
+def _normal_equations(pose, points, pixels, camera, width):
     """Huber cost, J'WJ (6, 6) and -J'Wr (6,) by the pose's twist from the left (rotation, translation)."""
     matrix, right, cost = np.zeros((6, 6)), np.zeros(6), 0.0
-    rows = np.zeros((2, 6))
+    rows = np.zeros((3, 6))
     for i in range(len(points)):
         x = pose[0, 0] * points[i, 0] + pose[0, 1] * points[i, 1] + pose[0, 2] * points[i, 2] + pose[0, 3]
         y = pose[1, 0] * points[i, 0] + pose[1, 1] * points[i, 1] + pose[1, 2] * points[i, 2] + pose[1, 3]
@@ -30,12 +33,17 @@ def _normal_equations(pose, points, pixels, intrinsics, width):
         if z < LEAST_DEPTH:
             cost += width * 1000.0
             continue
-        ru = intrinsics[0] * x / z + intrinsics[2] - pixels[i, 0]
-        rv = intrinsics[1] * y / z + intrinsics[3] - pixels[i, 1]
-        error = np.sqrt(ru * ru + rv * rv)
+        ru = camera[0] * x / z + camera[2] - pixels[i, 0]
+        rv = camera[1] * y / z + camera[3] - pixels[i, 1]
+        square = ru * ru + rv * rv
+        has_depth, rd = not np.isnan(pixels[i, 2]), 0.0
+        if has_depth:
+            rd = ru + pixels[i, 0] - camera[4] / z - pixels[i, 2]
+            square += rd * rd
+        error = np.sqrt(square)
         weight = 1.0 if error <= width else width / error
         cost += 0.5 * error * error if error <= width else width * (error - 0.5 * width)
-        fx, fy = intrinsics[0] / z, intrinsics[1] / z
+        fx, fy = camera[0] / z, camera[1] / z
         rows[0, 0], rows[0, 1], rows[0, 2] = -fx * x * y / z, fx * (z + x * x / z), -fx * y
         rows[0, 3], rows[0, 4], rows[0, 5] = fx, 0.0, -fx * x / z
         rows[1, 0], rows[1, 1], rows[1, 2] = -fy * (z + y * y / z), fy * x * y / z, fy * x
@@ -44,12 +52,25 @@ def _normal_equations(pose, points, pixels, intrinsics, width):
             right[j] -= weight * (rows[0, j] * ru + rows[1, j] * rv)
             for k in range(6):
                 matrix[j, k] += weight * (rows[0, j] * rows[0, k] + rows[1, j] * rows[1, k])
+        if not has_depth:
+            continue
+        # The column in the right image moves as the one in the left, and with the disparity.
+        by_depth = camera[4] / (z * z)
+        for j in range(6):
+            rows[2, j] = rows[0, j]
+        rows[2, 0] += by_depth * y
+        rows[2, 1] -= by_depth * x
+        rows[2, 5] += by_depth
+        for j in range(6):
+            right[j] -= weight * rows[2, j] * rd
+            for k in range(6):
+                matrix[j, k] += weight * rows[2, j] * rows[2, k]
     return cost, matrix, right
 
 
 @njit(cache=True, nogil=True)
-def _refine(pose, points, pixels, intrinsics, width, iterations):
-    cost, matrix, right = _normal_equations(pose, points, pixels, intrinsics, width)
+def _refine(pose, points, pixels, camera, width, iterations):
+    cost, matrix, right = _normal_equations(pose, points, pixels, camera, width)
     damping = 1e-6
     for _ in range(iterations):
         damped = matrix.copy()
@@ -58,7 +79,7 @@ def _refine(pose, points, pixels, intrinsics, width, iterations):
         step = cholesky_solve(damped, right)
         moved = pose.copy()
         turned_and_shifted(pose, rotation_exp(step[:3]), step[3:], moved)
-        new_cost, new_matrix, new_right = _normal_equations(moved, points, pixels, intrinsics, width)
+        new_cost, new_matrix, new_right = _normal_equations(moved, points, pixels, camera, width)
         if new_cost > cost:
             damping = max(10.0 * damping, 1e-4)
             continue
@@ -104,14 +125,19 @@ def refine_pose(
     huber_px: float = 1.5,
     inlier_px: float = 3.0,
     rounds: int = 2,
+    right: Array | None = None,
+    baseline_px: float = 0.0,
 ) -> PoseEstimate:
     """Pose (4, 4) from points (n, 3) and their pixels (n, 2), started at ``start``.
 
-    After each round the points that miss by more than ``inlier_px`` are left out of the next. Without four
-    points that fit there is no inlier and the covariance is infinite.
+    ``right`` (n,) are columns in a right image at ``baseline_px``, NaN where depth was not measured. After
+    each round the points that miss by more than ``inlier_px`` are left out of the next. Without four points
+    that fit there is no inlier and the covariance is infinite.
     """
     pose, used = np.ascontiguousarray(start, dtype=np.float64), np.ones(len(points), dtype=bool)
     matrix = np.eye(6)
+    columns = np.full(len(points), np.nan) if right is None else right
+    rows, camera = np.column_stack([pixels, columns]), np.append(intrinsics, baseline_px)
     for _ in range(rounds):
         if used.sum() < 4:
             return PoseEstimate(
@@ -120,8 +146,8 @@ def refine_pose(
         pose, matrix = _refine(
             pose,
             np.ascontiguousarray(points[used]),
-            np.ascontiguousarray(pixels[used]),
-            intrinsics,
+            np.ascontiguousarray(rows[used]),
+            camera,
             huber_px,
             10,
         )

@@ -28,6 +28,7 @@ class Keyframe:
     ----------
     index, timestamp : of its frame. flat : (h, w) its flattened image.
     camera_from_world : (4, 4). point_ids : (k,) points seen, ascending. pixels : (k, 2) where.
+    right : (k,) their columns in a right image (`Followed`); all unmeasured by default.
     """
 
     index: int
@@ -36,10 +37,20 @@ class Keyframe:
     camera_from_world: Array
     point_ids: Indices
     pixels: Array
+    right: Array = None  # type: ignore[assignment]
 
-    def keep(self, rows: NDArray[np.bool_]) -> None:
-        """Forget the observations that are not chosen."""
-        self.point_ids, self.pixels = self.point_ids[rows], self.pixels[rows]
+    def __post_init__(self) -> None:
+        if self.right is None:
+            self.right = np.full(len(self.point_ids), np.nan)
+
+    @property
+    def seen(self) -> Followed:
+        """The points and where they are."""
+        return Followed(self.point_ids, self.pixels, self.right)
+
+    def keep(self, rows: NDArray) -> None:
+        """Keep the chosen observations only, in the chosen order."""
+        self.point_ids, self.pixels, self.right = self.point_ids[rows], self.pixels[rows], self.right[rows]
 
     def rows_of(self, ids: Indices) -> tuple[Indices, NDArray[np.bool_]]:
         """Rows of points (n,), and which of them (n,) were seen; the rows of the others mean nothing."""
@@ -49,23 +60,30 @@ class Keyframe:
         return rows, self.point_ids[rows] == ids
 
 
-@dataclass(frozen=True)
 class Followed:
     """Points in a frame.
 
     Attributes
     ----------
     ids : (n,) their numbers. pixels : (n, 2).
+    right : (n,) their columns in a right image at the map's baseline, NaN where depth was not measured.
     """
 
-    ids: Indices
-    pixels: Array
+    __slots__ = ("ids", "pixels", "right")
+
+    def __init__(self, ids: Indices, pixels: Array, right: Array | None = None) -> None:
+        self.ids, self.pixels = ids, pixels
+        self.right = np.full(len(ids), np.nan) if right is None else right
 
     def __getitem__(self, rows: NDArray) -> Followed:
-        return Followed(self.ids[rows], self.pixels[rows])
+        return Followed(self.ids[rows], self.pixels[rows], self.right[rows])
 
     def joined(self, other: Followed) -> Followed:
-        return Followed(np.concatenate([self.ids, other.ids]), np.concatenate([self.pixels, other.pixels]))
+        return Followed(
+            np.concatenate([self.ids, other.ids]),
+            np.concatenate([self.pixels, other.pixels]),
+            np.concatenate([self.right, other.right]),
+        )
 
 
 class RigidMap:
@@ -80,9 +98,12 @@ class RigidMap:
     template_keyframe, template_pixels : (n,), (n, 2) the view whose patch stands for the point.
     n_expected, n_found : (n,) frames in which it should have been seen, and in which it was.
     usual_rms_px : running mean of the errors of the poses found in it.
+    baseline_px : focal length times the baseline that right columns refer to, px m; 0 where no depth is
+        measured, and lengths are in map units instead of metres.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, baseline_px: float = 0.0) -> None:
+        self.baseline_px = baseline_px
         self.keyframes: list[Keyframe] = []
         self.usual_rms_px = FIRST_RMS_PX
         self.positions = np.empty((0, 3))
@@ -90,6 +111,11 @@ class RigidMap:
         self.first_keyframe, self.first_pixels = np.empty(0, dtype=np.int64), np.empty((0, 2))
         self.template_keyframe, self.template_pixels = np.empty(0, dtype=np.int64), np.empty((0, 2))
         self.n_expected, self.n_found = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether lengths are metres."""
+        return self.baseline_px > 0.0
 
     @property
     def good(self) -> Indices:
@@ -112,19 +138,18 @@ class RigidMap:
 
     def add_keyframe(self, keyframe: Keyframe) -> int:
         """Append a view, which becomes the template of the points it sees; returns its number."""
-        order = np.argsort(keyframe.point_ids)
-        keyframe.point_ids, keyframe.pixels = keyframe.point_ids[order], keyframe.pixels[order]
+        keyframe.keep(np.argsort(keyframe.point_ids))
         self.keyframes.append(keyframe)
         number = len(self.keyframes) - 1
         self.template_keyframe[keyframe.point_ids] = number
         self.template_pixels[keyframe.point_ids] = keyframe.pixels
         return number
 
-    def extend_keyframe(self, number: int, ids: Indices, pixels: Array) -> None:
+    def extend_keyframe(self, number: int, new: Followed) -> None:
         """Add observations of points newer than all that the keyframe has."""
         keyframe = self.keyframes[number]
-        keyframe.point_ids = np.concatenate([keyframe.point_ids, ids])
-        keyframe.pixels = np.concatenate([keyframe.pixels, pixels])
+        seen = keyframe.seen.joined(new)
+        keyframe.point_ids, keyframe.pixels, keyframe.right = seen.ids, seen.pixels, seen.right
 
     def remove(self, ids: Indices) -> None:
         """Take points out, with their observations."""
@@ -142,8 +167,7 @@ class RigidMap:
             rows, seen = keyframe.rows_of(np.array([kept, dropped]))
             if seen[1] and not seen[0]:
                 keyframe.point_ids[rows[1]] = kept
-                order = np.argsort(keyframe.point_ids)
-                keyframe.point_ids, keyframe.pixels = keyframe.point_ids[order], keyframe.pixels[order]
+                keyframe.keep(np.argsort(keyframe.point_ids))
         self.remove(np.array([dropped]))
 
     def shared_points(self, ids: Indices) -> Indices:
@@ -153,8 +177,8 @@ class RigidMap:
         return np.array([int(wanted[keyframe.point_ids].sum()) for keyframe in self.keyframes])
 
     def n_observations(self) -> Indices:
-        """Keyframes (n,) that saw each point."""
+        """Keyframes (n,) that saw each point; one that measured its depth places it and counts twice."""
         counts = np.zeros(len(self.state), dtype=np.int64)
         for keyframe in self.keyframes:
-            counts[keyframe.point_ids] += 1
+            counts[keyframe.point_ids] += 1 + np.isfinite(keyframe.right)
         return counts

@@ -8,13 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from tqdm import tqdm
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import TrackingError
-from morph_dslam.io.calibration import load_camera
+from morph_dslam.io.stereo_calibration import load_camera_or_pair
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.online.flow import patch_correlation
 from morph_dslam.online.slam.bundle_adjustment import Observations, adjust
@@ -24,6 +23,7 @@ from morph_dslam.online.slam.output import draw_frame, write_run
 from morph_dslam.online.slam.pose import refine_pose
 from morph_dslam.online.slam.slam import Slam, SlamFrame
 from morph_dslam.sources import FrameSource, open_source
+from morph_dslam.sources.recorded import RecordedFrames
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,8 @@ class SlamRunOptions:
 
     Attributes
     ----------
-    source : recording. camera : camera file. output : the run folder.
+    source : recording. camera : camera file, or that of a stereo pair. output : the run folder.
+    use_depth : use the depth images of a recording that has them for its colour pixels.
     first, last : frame numbers, both included; all by default.
     map_file : a map of an earlier run with the same camera, kept as it is; a new map by default.
     freeze_at : frame number from which the map is kept as it is; never by default.
@@ -46,6 +47,7 @@ class SlamRunOptions:
     last: int | None = None
     map_file: Path | None = None
     freeze_at: int | None = None
+    use_depth: bool = True
     video: bool = True
     overwrite: bool = False
     slam: SlamOptions = field(default_factory=SlamOptions)
@@ -67,34 +69,39 @@ def run_slam(options: SlamRunOptions) -> dict[str, Any]:
         If an input cannot be used (CameraError, SourceError, MapError) or the run folder holds a run
         (TrackingError).
     """
-    camera = load_camera(options.camera)
+    camera = load_camera_or_pair(options.camera)
     source = open_source(options.source, options.first, options.last)
+    with_depth = (
+        options.use_depth
+        and isinstance(camera, PinholeCamera)
+        and isinstance(source, RecordedFrames)
+        and source.has_registered_depth
+    )
     _prepare_folder(options)
     warm_up()
-    rigid_map = load_map(options.map_file, camera) if options.map_file is not None else None
-    slam, frames = Slam(camera, options.slam, rigid_map), []
+    slam, frames = Slam(camera, options.slam, with_depth=with_depth), []
+    if options.map_file is not None:
+        slam.use_map(load_map(options.map_file, slam.camera))
     try:
-        _process(slam, source, camera, options, frames)
+        _process(slam, source, options, frames)
     finally:
         summary = _finish(slam, frames, options) if frames else {}
     return summary
 
 
-def _process(
-    slam: Slam, source: FrameSource, camera: PinholeCamera, options: SlamRunOptions, frames: list[SlamFrame]
-) -> None:
+def _process(slam: Slam, source: FrameSource, options: SlamRunOptions, frames: list[SlamFrame]) -> None:
     """Process all frames into ``frames``."""
-    maps = camera.undistortion_maps()
-    size = (camera.width, camera.height)
+    size = (slam.camera.width, slam.camera.height)
     video = VideoWriter(options.output / "tracked.mp4", source.fps, size) if options.video else nullcontext()
     with video as writer:
         for frame in tqdm(source, total=len(source), desc="tracking", unit="frame"):
             if options.freeze_at is not None and frame.index >= options.freeze_at and not slam.is_frozen:
                 slam.freeze()
-            frames.append(slam.process_frame(frame.image, frame.index, frame.timestamp))
+            frames.append(
+                slam.process_frame(frame.image, frame.index, frame.timestamp, frame.depth, frame.right)
+            )
             if writer is not None:
-                image = frame.image if maps is None else cv2.remap(frame.image, *maps, cv2.INTER_LINEAR)
-                writer.write(draw_frame(np.asarray(image, dtype=np.uint8), frames[-1]))
+                writer.write(draw_frame(slam.undistort(frame.image), frames[-1]))
 
 
 def _finish(slam: Slam, frames: list[SlamFrame], options: SlamRunOptions) -> dict[str, Any]:

@@ -1,19 +1,20 @@
 """Camera tracking and mapping, one frame after the other.
 
 `Slam.process_frame` is the method: wait for a start, follow the map, keep a view where the map needs it, find
-the camera again when it is lost. The map has no scale of its own: the median depth of its first view is 1.
+the camera again when it is lost. From one camera alone the map has no scale of its own: the median depth of
+its first view is 1. With depth images, or a stereo pair, it is metric and begins with the first view.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.online.flow import flatten
+from morph_dslam.errors import MapError
+from morph_dslam.online.slam.frame_images import FrameImages, FrameView
 from morph_dslam.online.slam.initialisation import Initialiser, MapStart
 from morph_dslam.online.slam.mapping import Mapper, pose_in_keyframe
 from morph_dslam.online.slam.options import SlamOptions
@@ -22,9 +23,9 @@ from morph_dslam.online.slam.relocalisation import Relocaliser
 from morph_dslam.online.slam.rigid_map import CANDIDATE, GOOD, Followed, RigidMap
 from morph_dslam.online.slam.tracking import Tracked, Tracker
 from morph_dslam.online.timing import StageClock
+from morph_dslam.stereo import StereoCamera
 
 Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 STAGES = ("prepare", "start", "track", "map", "relocalise")
 #: Frames that a relocalised pose has to be tracked for before the map grows again.
@@ -69,29 +70,59 @@ class Slam:
 
     Parameters
     ----------
-    camera : of all frames.
-    rigid_map : a map from an earlier run with the same camera (`map_file`), which is kept frozen; the first
-        frames are lost until the camera is found in it.
+    camera : of all frames; a stereo pair, whose rectified left camera is then what the map and the poses
+        are of.
+    with_depth : whether frames come with depth images that belong to them pixel by pixel.
 
     Attributes
     ----------
+    camera : the camera of the undistorted images.
     map : what is known of the scene; replaced when a young map is given up (``n_restarts`` counts these).
     is_frozen : whether the map is kept as it is.
     """
 
     def __init__(
-        self, camera: PinholeCamera, options: SlamOptions | None = None, rigid_map: RigidMap | None = None
+        self,
+        camera: PinholeCamera | StereoCamera,
+        options: SlamOptions | None = None,
+        with_depth: bool = False,
     ) -> None:
-        self.camera = camera
         self.options = options or SlamOptions()
-        self._maps = camera.undistortion_maps()
-        self.is_frozen = rigid_map is not None
+        self._images = FrameImages(camera, self.options, with_depth)
+        self.camera = self._images.camera
+        self.is_frozen = False
         self.n_restarts = 0
-        self._begin(rigid_map or RigidMap())
+        self._begin(RigidMap(self._images.baseline_px))
+
+    def use_map(self, rigid_map: RigidMap, extend: bool = False) -> None:
+        """Go on in a map from an earlier run with the same camera (`map_file`).
+
+        Frames are lost until the camera is found in it. It is kept as it is, or grows with ``extend``.
+
+        Raises
+        ------
+        MapError
+            If the map is to grow, but its depth comes from another kind of camera.
+        """
+        if rigid_map.baseline_px != self._images.baseline_px:
+            if extend:
+                raise MapError(
+                    "a map can only be extended by the kind of camera that made it: its depth comes from "
+                    f"{_origin_of(rigid_map.baseline_px)}, "
+                    f"this camera's from {_origin_of(self._images.baseline_px)}"
+                )
+            # The map's own depths are enough to find the camera in it.
+            self._images.baseline_px = 0.0
+        self.is_frozen = not extend
+        self._begin(rigid_map)
+
+    def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """An image (h, w[, 3]) as ``camera`` would have seen it; stereo: the left one, rectified."""
+        return self._images.undistort(image)
 
     def _restart(self) -> None:
         self.n_restarts += 1
-        self._begin(RigidMap())
+        self._begin(RigidMap(self._images.baseline_px))
 
     def _begin(self, rigid_map: RigidMap) -> None:
         self.map, k, options = rigid_map, self.camera.intrinsics, self.options
@@ -102,23 +133,35 @@ class Slam:
         # In a map from elsewhere the camera is lost until it is found.
         self._n_lost, self._n_held = int(bool(rigid_map.keyframes)), 0
 
-    def process_frame(self, image: NDArray[np.uint8], index: int, timestamp: float) -> SlamFrame:
-        """Take in the next frame (h, w, 3) or (h, w), as recorded.
+    def process_frame(
+        self,
+        image: NDArray[np.uint8],
+        index: int,
+        timestamp: float,
+        depth: NDArray[np.float32] | None = None,
+        right: NDArray[np.uint8] | None = None,
+    ) -> SlamFrame:
+        """Take in the next frame, as recorded.
+
+        Parameters
+        ----------
+        image : (h, w, 3) or (h, w). depth : (h, w) metres, NaN where not measured; right : (h, w[, 3]) the
+            right image of a stereo pair. A frame may lack them.
 
         Raises
         ------
         CameraError
-            If it has not the camera's size.
+            If an image has not the camera's size.
         """
         clock = StageClock(STAGES)
         with clock.stage("prepare"):
-            flat = self._prepare(image, index)
+            view = self._images.prepare(image, index, timestamp, depth, right)
         if not self.map.keyframes:
-            result = self._start(flat, index, timestamp, clock)
+            result = self._start(view, clock)
         elif self._n_lost:
-            result = self._relocalise(flat, index, timestamp, clock)
+            result = self._relocalise(view, clock)
         else:
-            result = self._track(flat, index, timestamp, clock)
+            result = self._track(view, clock)
         self._n_lost = self._n_lost + 1 if result["status"] == "lost" else 0
         is_young = len(self.map.keyframes) < self.options.window and not self.is_frozen
         if is_young and self._n_lost > self.options.restart_after:
@@ -153,37 +196,46 @@ class Slam:
             return start
         known = self.map.positions[points.ids]
         estimate = refine_pose(
-            start, known, points.pixels, self.camera.intrinsics, inlier_px=self.options.inlier_px
+            start,
+            known,
+            points.pixels,
+            self.camera.intrinsics,
+            inlier_px=self.options.inlier_px,
+            right=points.right,
+            baseline_px=self.map.baseline_px,
         )
         enough = estimate.inliers.sum() >= self.options.least_inliers
         return estimate.camera_from_world if enough else start
 
-    def _prepare(self, image: NDArray[np.uint8], index: int) -> Image:
-        self.camera.check_image(image, f"frame {index}")
-        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        if self._maps is not None:
-            grey = cv2.remap(grey, *self._maps, cv2.INTER_LINEAR)
-        return flatten(np.asarray(grey, dtype=np.uint8), self.options.flow.flatten_window)
-
-    def _start(self, flat: Image, index: int, timestamp: float, clock: StageClock) -> dict:
+    def _start(self, view: FrameView, clock: StageClock) -> dict:
         with clock.stage("start"):
-            start = self._initialiser.process(flat, index, timestamp)
-            if not isinstance(start, MapStart):
-                return {"status": "waiting", "reason": start, "candidates": self._initialiser.followed}
-            points = self._mapper.begin(start)
+            points = self._start_metric(view) if self.map.is_metric else self._start_moving(view)
+            if not isinstance(points, Followed):
+                return {"status": "waiting", "reason": points, "candidates": self._initialiser.followed}
             self._tracker.place(self.map.keyframes[-1].camera_from_world, points)
-            tracked = self._tracker.track(flat)
+            tracked = self._tracker.track(view.flat, view.depth)
         if not isinstance(tracked, Tracked):
-            self.map.keyframes.clear()
             self._restart()
             return {"status": "waiting", "reason": f"the first map did not hold: {tracked}"}
         return self._result("tracked", tracked, is_keyframe=True)
 
-    def _track(self, flat: Image, index: int, timestamp: float, clock: StageClock) -> dict:
+    def _start_moving(self, view: FrameView) -> Followed | str:
+        start = self._initialiser.process(view.flat, view.index, view.timestamp)
+        return self._mapper.begin(start) if isinstance(start, MapStart) else start
+
+    def _start_metric(self, view: FrameView) -> Followed | str:
+        if view.depth is None:
+            return "this frame has no depth"
+        points = self._mapper.begin_metric(view)
+        if isinstance(points, str):
+            self._begin(RigidMap(self._images.baseline_px))
+        return points
+
+    def _track(self, view: FrameView, clock: StageClock) -> dict:
         with clock.stage("track"):
-            tracked = self._tracker.track(flat)
+            tracked = self._tracker.track(view.flat, view.depth)
         if not isinstance(tracked, Tracked):
-            found = self._relocalise(flat, index, timestamp, clock)
+            found = self._relocalise(view, clock)
             return found if found["status"] != "lost" else {"status": "lost", "reason": tracked}
         with clock.stage("map"):
             # A pose found again has to hold for some frames before the map is built on it.
@@ -191,16 +243,16 @@ class Slam:
             keeps = (
                 not self.is_frozen
                 and self._n_held > HELD_FRAMES
-                and self._mapper.wants_keyframe(tracked, index)
+                and self._mapper.wants_keyframe(tracked, view.index)
             )
             if keeps:
-                self._tracker.points = self._mapper.insert(tracked, flat, index, timestamp)
+                self._tracker.points = self._mapper.insert(tracked, view)
                 self._tracker.correct(self.map.keyframes[-1].camera_from_world)
         return self._result("tracked", tracked, keeps)
 
-    def _relocalise(self, flat: Image, index: int, timestamp: float, clock: StageClock) -> dict:
+    def _relocalise(self, view: FrameView, clock: StageClock) -> dict:
         with clock.stage("relocalise"):
-            found = self._relocaliser.find(flat, self._tracker)
+            found = self._relocaliser.find(view.flat, self._tracker)
             if isinstance(found, str):
                 return {"status": "lost", "reason": found}
             pose, points = found
@@ -225,3 +277,7 @@ class Slam:
             "map_number": self.n_restarts,
             "is_keyframe": is_keyframe,
         }
+
+
+def _origin_of(baseline_px: float) -> str:
+    return f"a baseline of {baseline_px:.1f} px m" if baseline_px else "the motion of one camera alone"

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.online.flow import FlowOptions, follow, patch_correlation
+from morph_dslam.online.slam.depth import FrameDepth
 from morph_dslam.online.slam.options import SlamOptions
-from morph_dslam.online.slam.pose import PoseEstimate, refine_pose, reprojection_errors
+from morph_dslam.online.slam.pose import LEAST_DEPTH, PoseEstimate, refine_pose, reprojection_errors
 from morph_dslam.online.slam.projection import inside, inverse, project
 from morph_dslam.online.slam.rigid_map import CANDIDATE, GOOD, Followed, Indices, RigidMap
 from morph_dslam.online.slam.two_view import camera_centre
@@ -79,7 +80,7 @@ class Tracker:
         """Follow map points only."""
         self.points = self.points[self._map.state[self.points.ids] == GOOD]
 
-    def track(self, flat: Image) -> Tracked | str:
+    def track(self, flat: Image, depth: FrameDepth | None = None) -> Tracked | str:
         """Pose and points of the next frame, or why it is lost; then the newest pose stays what it was."""
         reason = ""
         deeper = FlowOptions(self._options.flow.window, self._options.flow.levels + 1)
@@ -89,7 +90,7 @@ class Tracker:
             (self.camera_from_world, deeper),
         ):
             found = self._follow(flat, predicted, flow)
-            result = self._estimate(flat, predicted, found)
+            result = self._estimate(flat, depth, predicted, found)
             if isinstance(result, Tracked):
                 self._motion = result.pose.camera_from_world @ inverse(self.camera_from_world)
                 self.camera_from_world = result.pose.camera_from_world
@@ -121,15 +122,29 @@ class Tracker:
             found[rows], good[rows] = pixels, ok & (likeness > self._options.least_correlation)
         return Followed(ids, found)[good]
 
-    def _estimate(self, flat: Image, predicted: Array, found: Followed) -> Tracked | str:
+    def measured(self, found: Followed, pose: Array, depth: FrameDepth | None) -> Followed:
+        """Map points with their columns in the right image, where those are near what the pose expects."""
+        baseline_px, known = self._map.baseline_px, np.flatnonzero(self._map.state[found.ids] == GOOD)
+        if depth is None or not baseline_px:
+            return found
+        expected, depths = project(pose, self._map.positions[found.ids[known]], self._intrinsics)
+        columns = expected[:, 0] - baseline_px / np.maximum(depths, LEAST_DEPTH)
+        right = np.full(len(found.ids), np.nan)
+        right[known] = depth.right_columns(found.pixels[known], columns)
+        return Followed(found.ids, found.pixels, right)
+
+    def _estimate(
+        self, flat: Image, depth: FrameDepth | None, predicted: Array, found: Followed
+    ) -> Tracked | str:
         """Pose from what was followed, then with the lost points that are found again."""
         options = self._options
+        found = self.measured(found, predicted, depth)
         pose, reason = self._pose(predicted, found)
         if pose is None:
             return reason
         searched = self._search(flat, pose.camera_from_world, found.ids)
         if len(searched.ids):
-            found = found.joined(searched)
+            found = found.joined(self.measured(searched, pose.camera_from_world, depth))
             pose, reason = self._pose(pose.camera_from_world, found)
             if pose is None:
                 return reason
@@ -151,7 +166,13 @@ class Tracker:
         if len(known.ids) < options.least_inliers:
             return None, f"only {len(known.ids)} map points were found in this frame"
         pose = refine_pose(
-            start, self._map.positions[known.ids], known.pixels, self._intrinsics, inlier_px=options.inlier_px
+            start,
+            self._map.positions[known.ids],
+            known.pixels,
+            self._intrinsics,
+            inlier_px=options.inlier_px,
+            right=known.right,
+            baseline_px=self._map.baseline_px,
         )
         n = int(pose.inliers.sum())
         if n < max(options.least_inliers, 0.3 * len(known.ids)):
