@@ -1,0 +1,74 @@
+"""Solved samples of a study for the benchmarks of reduction: kept ones are read, the others solved first."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from morph_dslam.model import ReducedModel
+from morph_dslam.offline.certificate import certify
+from morph_dslam.offline.executors import default_executor
+from morph_dslam.offline.problem import Snapshot
+from morph_dslam.offline.reduction.method import METHODS, ReductionTask
+from morph_dslam.offline.sampling import held_out_samples, training_samples
+from morph_dslam.offline.snapshots import load_snapshot
+from morph_dslam.offline.studies.solid_study import SolidStudy
+from morph_dslam.offline.sweep import run_sweep
+
+
+@dataclass(frozen=True)
+class SolvedStudy:
+    """Solutions of a study, those that models are made from and those that measure their errors.
+
+    Attributes
+    ----------
+    seconds : that the solves took; close to none where they were kept.
+    """
+
+    study: SolidStudy
+    seen: list[Snapshot]
+    unseen: list[Snapshot]
+    seconds: float
+
+    def task(self, **options: object) -> ReductionTask:
+        """What a method of reduction is given, with some of the study's [reduction] changed."""
+        section = type(self.study.reduction)
+        changed = section.model_validate(self.study.reduction.model_dump(exclude_unset=True) | options)
+        return ReductionTask(
+            self.study.model_mesh(),
+            self.study.model_parameters(),
+            [[snapshot] for snapshot in self.seen],
+            changed,
+            self.study.name,
+            self.study.sweep_problem,
+        )
+
+    def reduce(self, method: str, **options: object) -> ReducedModel:
+        """A model by one method, certified by the held-out solutions."""
+        model = METHODS[method](self.task(method=method, **options))
+        model.certificate.update(certify(model, self.unseen))
+        return model
+
+    def displacements(self) -> SolvedStudy:
+        """The same with displacements alone and without derivatives: what the paper's method is given."""
+        seen, unseen = (
+            [Snapshot(s.coordinates, {"displacement": s.fields["displacement"]}) for s in part]
+            for part in (self.seen, self.unseen)
+        )
+        return SolvedStudy(self.study, seen, unseen, self.seconds)
+
+
+def solve_study(study: SolidStudy, folder: Path, workers: int | None = None) -> SolvedStudy:
+    """Solve all samples of a study that ``folder`` does not hold yet."""
+    training = training_samples(study)
+    samples = np.vstack([training, held_out_samples(study)])
+    began = time.perf_counter()
+    with default_executor(workers or study.work.workers) as executor:
+        result = run_sweep(study, study.canonical(samples), folder, executor)
+    seconds = time.perf_counter() - began
+    snapshots = {index: load_snapshot(path) for index, path in sorted(result.solved.items())}
+    seen = [snapshot for index, snapshot in snapshots.items() if index < len(training)]
+    return SolvedStudy(study, seen, list(snapshots.values())[len(seen) :], seconds)
