@@ -63,7 +63,8 @@ def test_the_map_lies_on_the_walls_in_metres(metric_run):
     points = slam.map.positions[slam.map.good]
     assert len(points) > 400
     outside = np.maximum.reduce([np.abs(points[:, 0]) - 2.0, points[:, 2] - 4.0, points[:, 1] - 1.3])
-    assert np.quantile(outside, 0.98) < 0.06
+    # At 4 m a fifth of a pixel of disparity is 8 cm.
+    assert np.quantile(outside, 0.98) < 0.1
     assert (np.abs(outside) < 0.03).mean() > 0.4
 
 
