@@ -9,13 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from morph_dslam.model import ReducedModel
-from morph_dslam.offline.reduction.reduce import reduce
+from morph_dslam.offline.reduction.galerkin_method import reduce_by_galerkin
+from morph_dslam.offline.reduction.pod_method import reduce_by_pod
 from morph_dslam.offline.reduction.sparse_pgd_method import reduce_by_sparse_pgd
 from morph_dslam.offline.reduction.task import ReductionTask
 
 __all__ = ["METHODS", "ReductionTask"]
 
 METHODS: dict[str, Callable[[ReductionTask], ReducedModel]] = {
-    "pod": reduce,
+    "galerkin": reduce_by_galerkin,
+    "pod": reduce_by_pod,
     "sparse_pgd": reduce_by_sparse_pgd,
 }

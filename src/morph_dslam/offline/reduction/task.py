@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ class ReductionTask:
     options : the study's [reduction].
     name : the study's name.
     problem : makes what the study is solved with; None for solutions of another program.
+    files : where the solutions are kept with the solver's states, one for each group; as of ``problem``.
     """
 
     mesh: ModelMesh
@@ -35,6 +37,7 @@ class ReductionTask:
     options: ReductionSection
     name: str = ""
     problem: Callable[[], SweepProblem] | None = None
+    files: tuple[Path, ...] = ()
 
     @property
     def box(self) -> Array:

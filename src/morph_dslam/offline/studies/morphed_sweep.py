@@ -22,7 +22,7 @@ class MorphedSweep:
     """Adds the change of shape to another sweep's snapshots (`morph_dslam.offline.problem.SweepProblem`)."""
 
     def __init__(self, sweep: SweepProblem, problem: SolidProblem) -> None:
-        self._sweep, self._problem = sweep, problem
+        self._sweep, self.problem = sweep, problem
 
     def first_state(self) -> Any:
         return self._sweep.first_state()
@@ -39,12 +39,12 @@ class MorphedSweep:
     def take_snapshot(self, state: Any) -> Snapshot:
         """The sweep's snapshot with displacements from the mesh's nodes."""
         snapshot = self._sweep.take_snapshot(state)
-        shape, symbols = self._problem.shape, self._problem.symbols
-        at_nodes = self._problem.displacements.node_values
+        shape, symbols = self.problem.shape, self.problem.symbols
+        at_nodes = self.problem.displacements.node_values
         symbols.set(snapshot.coordinates)
         fields, slopes = dict(snapshot.fields), dict(snapshot.sensitivities)
         fields["displacement"] = (
-            fields["displacement"] + at_nodes @ shape.coordinates(symbols) - self._problem.mesh.nodes
+            fields["displacement"] + at_nodes @ shape.coordinates(symbols) - self.problem.mesh.nodes
         )
         if "displacement" in slopes:
             changes = [at_nodes @ change for change in shape.coordinate_slopes(symbols)]

@@ -1,0 +1,182 @@
+"""The method "galerkin": few full solutions, many reduced ones, functions of the parameters through these.
+
+The equations are projected on the modes of the training solutions (`galerkin`), solved wherever the functions
+need it (`reduced_solver`), and each field is recovered there as it is from full solutions. Up to four
+parameters the samples form a full grid (`grid_functions`); beyond, a sparse expansion is fitted to scattered
+ones (`scattered_functions`). Last, every field keeps the modes that the tolerance asks for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import StudyError
+from morph_dslam.model import ReducedModel, SeparatedField
+from morph_dslam.model.basis_functions import chebyshev_basis
+from morph_dslam.model.functions import Functions
+from morph_dslam.offline.mechanics.solid import SolidProblem
+from morph_dslam.offline.reduction.bases import parameter_bases
+from morph_dslam.offline.reduction.fields import field_names, model_of
+from morph_dslam.offline.reduction.grid_functions import (
+    functions_on_grid,
+    interpolation_nodes,
+    sizes_along_lines,
+    values_on_grid,
+)
+from morph_dslam.offline.reduction.reduced_solver import FullSolutions, ReducedSolver
+from morph_dslam.offline.reduction.sampled_fields import SampledFields, field_modes
+from morph_dslam.offline.reduction.scattered_functions import (
+    ScatteredValues,
+    expansion_train,
+    fit_expansion,
+    polynomial_functions,
+)
+from morph_dslam.offline.reduction.task import ReductionTask
+
+Array = NDArray[np.float64]
+
+#: A full grid is sampled up to so many parameters.
+MOST_GRID_PARAMETERS = 4
+#: Part of the tolerance that interpolation and the separated form may each use.
+SHARE = 0.5
+
+
+def reduce_by_galerkin(task: ReductionTask) -> ReducedModel:
+    """A reduced model of every field from densely sampled Galerkin solutions.
+
+    Raises
+    ------
+    StudyError
+        If the study is not that of a hyperelastic solid.
+    """
+    problem = solid_equations(task)
+    snapshots = [snapshot for group in task.groups for snapshot in group]
+    box, tolerance = task.box, task.options.tolerance
+    solver = ReducedSolver(problem, FullSolutions.read(task.files), box, tolerance)
+    spread = np.diff(box, axis=1)[:, 0]
+    modes = {
+        name: field_modes(snapshots, name, task.mesh.weights, spread, tolerance)
+        for name in field_names(snapshots)
+    }
+    sampled = SampledFields(solver, problem, modes)
+    dense = _on_grid(task, sampled) if _grid_is_used(task) else _scattered(task, sampled)
+    fields, summaries = {}, {}
+    for name, part in sampled.parts.items():
+        rotation, singular_values = _leading(dense.coefficients[part], tolerance, task.options.max_modes)
+        functions = dense.functions(rotation.T, part, task, SHARE * tolerance)
+        fields[name] = SeparatedField(np.tensordot(rotation.T, modes[name].modes, axes=1), functions)
+        summaries[name] = {
+            "modes": rotation.shape[1],
+            "singular_values": singular_values[:60].tolist(),
+            "left_out_by_the_snapshots_modes": modes[name].left_out,
+        }
+    summary = {
+        "method": "galerkin",
+        "galerkin_modes": solver.galerkin.n_dofs,
+        "reduced_solves": dense.count,
+        **dense.summary,
+        **summaries["displacement"],
+    }
+    return model_of(task, fields, summary)
+
+
+def solid_equations(task: ReductionTask) -> SolidProblem:
+    """The full equations of the task.
+
+    Raises
+    ------
+    StudyError
+        If they are not those of a solid without memory.
+    """
+    problem = getattr(task.problem(), "problem", None) if task.problem else None
+    if not isinstance(problem, SolidProblem) or problem.history is not None:
+        raise StudyError(
+            'reduction.method = "galerkin" needs the equations of a solid without memory: use "pod"'
+        )
+    return problem
+
+
+def _grid_is_used(task: ReductionTask) -> bool:
+    return len(task.parameters) <= MOST_GRID_PARAMETERS and task.options.format != "polynomial"
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Coefficients (n, n_1, ..., n_d) of all fields on a grid; see `_Expansion`."""
+
+    bases: tuple[Any, ...]
+    coefficients: Array
+    summary: dict[str, Any]
+
+    @property
+    def count(self) -> int:
+        return int(np.prod(self.coefficients.shape[1:]))
+
+    def functions(self, rotation: Array, part: slice, task: ReductionTask, tolerance: float) -> Functions:
+        """Functions (one for each row of ``rotation``) of one field's part of the coefficients."""
+        tensor = np.tensordot(rotation, self.coefficients[part], axes=1)
+        return functions_on_grid(tensor, self.bases, task.options.format or "tucker", tolerance)
+
+
+@dataclass(frozen=True)
+class _Expansion:
+    """Coefficients (n, n_terms) of all fields in a sparse Chebyshev expansion."""
+
+    indices: NDArray[np.int64]
+    coefficients: Array
+    count: int
+    summary: dict[str, Any]
+
+    def functions(self, rotation: Array, part: slice, task: ReductionTask, tolerance: float) -> Functions:
+        """Functions (one for each row of ``rotation``) of one field's part of the coefficients."""
+        found = (rotation @ self.coefficients[part]).T
+        if task.options.format == "polynomial":
+            return polynomial_functions(task.box, self.indices, found)
+        degrees = self.indices.max(axis=0)
+        bases = tuple(
+            chebyshev_basis(lower, upper, int(degree))
+            for (lower, upper), degree in zip(task.box, degrees, strict=True)
+        )
+        return expansion_train(self.indices, found, bases, tolerance)
+
+
+def _on_grid(task: ReductionTask, sampled: SampledFields) -> _Grid:
+    """All fields on the grid that lines through the box ask for."""
+    basis = task.options.basis or "chebyshev"
+    sizes = sizes_along_lines(sampled.displacement, task.parameters, basis, SHARE * task.options.tolerance)
+    bases = parameter_bases(basis, task.parameters, sizes)
+    values = values_on_grid(sampled, tuple(interpolation_nodes(basis) for basis in bases))
+    return _Grid(
+        bases, values, {"format": task.options.format or "tucker", "basis": basis, "grid": list(sizes)}
+    )
+
+
+def _scattered(task: ReductionTask, sampled: SampledFields) -> _Expansion:
+    """All fields at scattered samples, fitted by a sparse expansion."""
+    tolerance = SHARE * task.options.tolerance
+    sizes = sizes_along_lines(sampled.displacement, task.parameters, "chebyshev", tolerance)
+    degrees = [size - 1 for size in sizes]
+    scattered = ScatteredValues(sampled, task.box)
+    leading = sampled.parts["displacement"]
+    indices, coefficients, error = fit_expansion(scattered, task.box, degrees, tolerance, leading)
+    summary = {
+        "format": task.options.format or "tensor_train",
+        "basis": "chebyshev",
+        "degrees": indices.max(axis=0).tolist(),
+        "terms": len(indices),
+        "expansion_error": error,
+    }
+    return _Expansion(indices, coefficients.T, len(scattered.samples), summary)
+
+
+def _leading(coefficients: Array, tolerance: float, max_modes: int) -> tuple[Array, Array]:
+    """Leading left singular vectors (k, m) of coefficients (k, ...) and all singular values."""
+    flat = coefficients.reshape(len(coefficients), -1)
+    left, values, _ = np.linalg.svd(flat, full_matrices=False)
+    left_out = np.sqrt(np.cumsum(values[::-1] ** 2))[::-1]
+    count = max(1, int(np.sum(left_out > tolerance * left_out[0])))
+    return left[:, : min(count, max_modes)], values

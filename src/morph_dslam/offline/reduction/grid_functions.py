@@ -1,0 +1,128 @@
+"""Functions of the parameters through values on a full grid, whose size along each parameter lines decide.
+
+Along lines through the middle and towards the corners of the box the sought functions are sampled finely;
+each parameter gets as many nodes as interpolation along its lines needs. The values on the grid of these
+nodes are then decomposed (`tensor_formats`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from morph_dslam.model import Parameter
+from morph_dslam.model.basis_functions import Basis
+from morph_dslam.model.tensor_functions import TensorFunctions
+from morph_dslam.offline.reduction.bases import parameter_basis
+from morph_dslam.offline.reduction.tensor_formats import (
+    cp,
+    cp_functions,
+    tensor_train,
+    tensor_train_functions,
+    tucker,
+    tucker_functions,
+)
+from morph_dslam.offline.studies.study_sections import BasisName, FormatName
+
+Array = NDArray[np.float64]
+
+#: Nodes along the lines that decide the size of a grid, and how far from the middle lines run.
+FINEST, OFF_CENTRE = 17, 0.7
+LEAST = 4
+#: Most terms of a CP form.
+MOST_TERMS = 60
+
+
+def interpolation_nodes(basis: Basis) -> Array:
+    """As many points as the basis has functions, at which it interpolates stably.
+
+    Chebyshev polynomials have their extrema, which include both ends; all others even spacing, Fourier
+    functions without the upper end.
+    """
+    if basis.size == 1:
+        return np.array([(basis.lower + basis.upper) / 2.0])
+    if basis.kind == "chebyshev":
+        unit = -np.cos(np.pi * np.arange(basis.size) / (basis.size - 1))
+        return (basis.lower + basis.upper) / 2.0 + unit * (basis.upper - basis.lower) / 2.0
+    return np.linspace(basis.lower, basis.upper, basis.size, endpoint=basis.kind != "fourier")
+
+
+def sizes_along_lines(
+    evaluate: Callable[[Array], Array],
+    parameters: tuple[Parameter, ...],
+    basis: BasisName,
+    tolerance: float,
+) -> tuple[int, ...]:
+    """For each parameter the least number of functions that interpolates ``evaluate`` to the tolerance.
+
+    Parameters
+    ----------
+    evaluate : values (n,) at parameters (d,).
+    tolerance : largest error (Euclidean) on the lines over the largest value met on any.
+    """
+    lower = np.array([parameter.lower for parameter in parameters])
+    upper = np.array([parameter.upper for parameter in parameters])
+    middle, half = (lower + upper) / 2.0, (upper - lower) / 2.0
+    finest = [parameter_basis("chebyshev", parameter, FINEST) for parameter in parameters]
+    signs = np.array([(-1.0) ** k for k in range(len(parameters))])
+    starts = [middle, middle + OFF_CENTRE * half, middle - OFF_CENTRE * signs * half]
+    lines: list[list[Array]] = []
+    jobs = len(parameters) * FINEST * (len(starts) if len(parameters) > 1 else 1)
+    with tqdm(total=jobs, desc="choosing the grid", unit="sample") as progress:
+        for k, fine in enumerate(finest):
+            lines.append([])
+            for start in starts if len(parameters) > 1 else starts[:1]:
+                points = np.repeat(start[None], FINEST, axis=0)
+                points[:, k] = interpolation_nodes(fine)
+                lines[-1].append(np.array([_counted(evaluate, point, progress) for point in points]))
+    largest = max(float(np.linalg.norm(values, axis=1).max()) for line in lines for values in line)
+    return tuple(
+        _size_for(values, fine, basis, parameter, tolerance * largest)
+        for values, fine, parameter in zip(lines, finest, parameters, strict=True)
+    )
+
+
+def _counted(evaluate: Callable[[Array], Array], point: Array, progress: tqdm) -> Array:
+    values = evaluate(point)
+    progress.update()
+    return values
+
+
+def _size_for(lines: list[Array], fine: Basis, name: BasisName, parameter: Parameter, allowed: float) -> int:
+    """The least size of a basis whose interpolants of the fine ones are off by ``allowed`` at most."""
+    between = np.linspace(fine.lower, fine.upper, 4 * FINEST)
+    coefficients = [fine.interpolate(interpolation_nodes(fine), values) for values in lines]
+    truth = np.array([fine.evaluate(between) @ c for c in coefficients])
+    largest = FINEST if name == "chebyshev" else 4 * FINEST
+    for size in range(LEAST, largest):
+        basis = parameter_basis(name, parameter, size)
+        nodes = interpolation_nodes(basis)
+        through = np.linalg.pinv(basis.evaluate(nodes))
+        found = np.array(
+            [basis.evaluate(between) @ (through @ (fine.evaluate(nodes) @ c)) for c in coefficients]
+        )
+        if np.linalg.norm(found - truth, axis=2).max() <= allowed:
+            return basis.size
+    return largest
+
+
+def values_on_grid(evaluate: Callable[[Array], Array], nodes: tuple[Array, ...]) -> Array:
+    """``evaluate`` (n,) at all points of a grid: (n, n_1, ..., n_d)."""
+    points = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, len(nodes))
+    values = [evaluate(point) for point in tqdm(points, desc="sampling the reduced solver", unit="sample")]
+    return np.moveaxis(np.array(values).reshape(*[len(n) for n in nodes], -1), -1, 0)
+
+
+def functions_on_grid(
+    tensor: Array, bases: tuple[Basis, ...], form: FormatName, tolerance: float
+) -> TensorFunctions:
+    """Functions in a separated form through values (n_functions, n_1, ..., n_d) at the bases' nodes."""
+    nodes = tuple(interpolation_nodes(basis) for basis in bases)
+    if form == "tensor_train":
+        return tensor_train_functions(tensor_train(tensor, tolerance), nodes, bases)
+    if form == "cp":
+        return cp_functions(cp(tensor, tolerance, MOST_TERMS), nodes, bases)
+    return tucker_functions(tucker(tensor, tolerance), nodes, bases)

@@ -1,0 +1,174 @@
+"""Galerkin solutions at any parameters, predicted from full solutions and corrected by quasi-Newton steps.
+
+A prediction is polynomial regression of the full solutions and their sensitivities. Corrections start with
+the projected tangent of the nearest full solution and update its inverse by Broyden's method (Kelley,
+Iterative Methods for Linear and Nonlinear Equations, 1995, chapter 7), so that each costs one residual in
+place of a tangent. Where they do not converge, Newton's method follows the path from the nearest full
+solution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.offline.reduction.galerkin import GalerkinEquations, galerkin_modes, newton_correction
+from morph_dslam.offline.reduction.regression import fit_functions
+from morph_dslam.offline.snapshots import load_state
+from morph_dslam.offline.solvers.newton import Equations, State, advance
+
+Array = NDArray[np.float64]
+
+#: Modes are kept until so little of the states is left out, as a part of the tolerance of the reduction ...
+MODE_TOLERANCE = 0.02
+#: ... and the last correction is so small a part of it.
+SOLVER_TOLERANCE = 1e-2
+#: Most modes that equilibrium is projected on; more cost little, for assembly takes nearly all of the time.
+MOST_MODES = 60
+MOST_CORRECTIONS = 15
+#: A correction larger than this part of the largest solution is not trusted.
+TOO_LARGE = 2.0
+
+
+@dataclass(frozen=True)
+class FullSolutions:
+    """Solutions of the full equations.
+
+    Attributes
+    ----------
+    samples : (n, d) parameters. states : (n, n_dofs). slopes : (n, d, n_dofs) of the states by parameters.
+    """
+
+    samples: Array
+    states: Array
+    slopes: Array
+
+    @staticmethod
+    def read(files: Sequence[Path]) -> FullSolutions:
+        """Those kept with snapshots by a sweep of solids."""
+        states = [load_state(file) for file in files]
+        return FullSolutions(
+            *(np.array([state[key] for state in states]) for key in ("mu", "dofs", "slopes"))
+        )
+
+
+class ReducedSolver:
+    """Solves equations projected on the modes of some of their solutions.
+
+    Parameters
+    ----------
+    equations : the full ones.
+    solutions : of them, with their sensitivities.
+    box : (d, 2) ends of the parameters.
+    tolerance : relative error that the reduction may have.
+    max_degree : highest polynomial degree of the prediction.
+
+    Attributes
+    ----------
+    galerkin : the projected equations.
+    measured : dofs whose errors count; others, pressures say, follow from them.
+    largest : Euclidean norm of the largest solution over the dofs measured.
+    """
+
+    def __init__(
+        self,
+        equations: Equations,
+        solutions: FullSolutions,
+        box: Array,
+        tolerance: float,
+        max_degree: int = 8,
+    ) -> None:
+        self.equations, self._solutions, self._box = equations, solutions, box
+        self.measured = np.broadcast_to(np.isfinite(equations.scale), equations.n_dofs)
+        self.largest = float(np.linalg.norm(solutions.states[:, self.measured], axis=1).max())
+        spread = np.diff(box, axis=1)
+        vectors = np.concatenate([solutions.states, *(solutions.slopes * spread).swapaxes(0, 1)])
+        self._weights = balancing_weights(vectors, self.measured)
+        modes = galerkin_modes(equations, vectors, MODE_TOLERANCE * tolerance, MOST_MODES, self._weights)
+        self.galerkin = GalerkinEquations(equations, modes)
+        known = (solutions.states * self._weights) @ modes.T
+        slopes = (solutions.slopes * self._weights) @ modes.T
+        self._known = known
+        self._size = float(np.linalg.norm(known, axis=1).max())
+        self._allowed = SOLVER_TOLERANCE * tolerance * self._size
+        self._prediction, _ = fit_functions(
+            solutions.samples, known, slopes, box[:, 0], box[:, 1], max_degree, np.arange(len(known))
+        )
+        self._inverses: dict[int, Array] = {}
+        self.n_followed = 0
+
+    def solve(self, mu: Array) -> Array:
+        """Coefficients (k,) of the modes at ``mu`` (d,).
+
+        Raises
+        ------
+        SolverError
+            If no equilibrium is found from the nearest full solution either.
+        """
+        distance = np.linalg.norm((self._solutions.samples - mu) / np.diff(self._box, axis=1).T, axis=1)
+        nearest = int(np.argmin(distance))
+        predicted, _ = self._prediction.evaluate(mu)
+        found = self._corrected(predicted, mu, self._inverse(nearest))
+        if found is not None:
+            return found
+        self.n_followed += 1
+        start = State(self._solutions.samples[nearest], self._known[nearest])
+        return advance(self.galerkin, start, mu).states[-1].dofs
+
+    def lift(self, y: Array, mu: Array) -> Array:
+        """Full state (n_dofs,) of coefficients ``y``."""
+        return self.galerkin.lift(y, mu)
+
+    def estimate(self, y: Array, mu: Array) -> float:
+        """Estimated error of a reduced solution over the largest solution: the full Newton correction."""
+        correction = newton_correction(self.equations, self.lift(y, mu), mu)
+        return float(np.linalg.norm(correction[self.measured])) / self.largest
+
+    def _inverse(self, sample: int) -> Array:
+        """Inverse (k, k) of the projected tangent at a full solution, kept once made."""
+        if sample not in self._inverses:
+            tangent = self.galerkin.linearise(self._known[sample], self._solutions.samples[sample])
+            self._inverses[sample] = tangent.solve(np.eye(len(self._known[sample]))).T
+        return self._inverses[sample]
+
+    def _corrected(self, y: Array, mu: Array, inverse: Array) -> Array | None:
+        """The solution by Broyden's method from ``y`` (k,); None where it does not converge."""
+        prescribed = self.equations.prescribed(mu)
+        modes = self.galerkin.modes
+
+        def residual(y: Array) -> Array:
+            return modes @ self.equations.residual(prescribed + y @ modes, mu)
+
+        inverse = inverse.copy()
+        r = residual(y)
+        for _ in range(MOST_CORRECTIONS):
+            step = -inverse @ r
+            length = float(np.linalg.norm(step))
+            if not length < TOO_LARGE * self._size:
+                return None
+            y = y + step
+            if length <= self._allowed:
+                return y
+            r = residual(y)
+            if not np.all(np.isfinite(r)):
+                return None
+            # after a full step B s = -r_old, so that the rank-one update needs the new residual only
+            asked = inverse @ r
+            inverse -= np.outer(asked, step @ inverse) / (step @ (step + asked))
+        return None
+
+
+def balancing_weights(vectors: Array, measured: NDArray[np.bool_]) -> Array:
+    """Weights (n,) of dofs that give those not measured, pressures say, as much energy as the others.
+
+    Without them the modes of a mixed formulation would be those of its pressures, whose numbers are larger.
+    """
+    weights = np.ones(len(measured))
+    other = float(np.sum(vectors[:, ~measured] ** 2))
+    if other > 0.0:
+        weights[~measured] = float(np.sum(vectors[:, measured] ** 2)) / other
+    return weights
