@@ -105,4 +105,4 @@ def grid_axes(study: ParametricStudy) -> list[Array]:
             f"the full grid of sampling.points has {total} points, more than {MOST_GRID_POINTS}: "
             'take fewer, or scheme = "sobol"'
         )
-    return [np.linspace(*ends, count) for ends, count in zip(box, counts, strict=True)]
+    return [np.linspace(low, high, count) for (low, high), count in zip(box, counts, strict=True)]

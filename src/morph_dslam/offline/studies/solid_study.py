@@ -34,8 +34,8 @@ from morph_dslam.offline.studies.material_section import MaterialSection
 from morph_dslam.offline.studies.mesh_section import MeshSection, make_mesh, mesh_fingerprint
 from morph_dslam.offline.studies.morphed_sweep import MorphedSweep
 from morph_dslam.offline.studies.parameter_section import ParameterSection, TimeSection
+from morph_dslam.offline.studies.repeatable_sweep import RepeatableSweep
 from morph_dslam.offline.studies.shape_section import ShapeSection, shape_fields
-from morph_dslam.offline.studies.solid_sweep import SolidSweep
 from morph_dslam.offline.studies.study_sections import ReductionSection, SamplingSection, Section, WorkSection
 from morph_dslam.offline.studies.viscous_sweep import ViscousSweep
 
@@ -268,7 +268,7 @@ class SolidStudy(Section):
         """What the sweep solves with."""
         problem = self.problem()
         if self.time is None:
-            sweep = SolidSweep(problem)
+            sweep = RepeatableSweep(problem)
         else:
             sweep = ViscousSweep(problem, list(self.parameters).index(self.time.parameter), self.time.step)
         return MorphedSweep(sweep, problem) if self.shape else sweep
