@@ -5,8 +5,8 @@ on. They are not in the height of the middle, which stops growing at the end, no
 whose root the height is at the start.
 
 Two forms are made. In the model file, which tracking reads, modes in space are multiplied by functions of the
-position. In the paper's form, u(X, Y, mu), the coordinates of the sheet are separated too. Every second
-position makes both, the others measure the errors.
+position. In the paper's form, u(X, Y, mu), the coordinates of the sheet are separated too. Few positions,
+equally far apart, make both; all others measure the errors.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ Array = NDArray[np.float64]
 PATH = Parameter(
     "path", "ratio", "1", 0.0, 1.0, 0.0, "part of the path from the flat sheet to its full height"
 )
-OPTIONS = ReductionSection(method="pod", tolerance=5e-5, max_modes=12, max_degree=20)
+OPTIONS = ReductionSection(method="pod", basis="cubic_spline", tolerance=5e-5)
+#: The model file is made from about so many positions: as many splines interpolate between them.
+NODES = 41
 #: Cubic splines of the position, and the most products, in the paper's form; X and Y have one spline a node.
 SPLINES = 24
 PRODUCTS = 20
@@ -138,7 +140,7 @@ def _separated_errors(
 
 
 def write_reduction(snapshots: Sequence[Snapshot], grid: Grid, output: Path) -> str:
-    """Make both forms from every second position, keep model and picture in ``output``, print the errors.
+    """Make both forms, keep the model file and a picture in ``output``, and print a table of errors.
 
     Returns
     -------
@@ -147,15 +149,18 @@ def write_reduction(snapshots: Sequence[Snapshot], grid: Grid, output: Path) -> 
     """
     print(f"{'':9s} {'modes in space x path':>34s} {'products of X, Y and path':>37s}")
     print(TABLE_HEAD)
-    for every in (1, len(snapshots) // 20):
+    for every in (1, 2):
         print(_table_row(reduce_positions(snapshots, every, grid)))
-    reduced = reduce_positions(snapshots, 2, grid)
+    every = max(2, round((len(snapshots) - 1) / (NODES - 1)))
+    reduced = reduce_positions(snapshots, every, grid)
     print(_table_row(reduced))
     save_model(output / "paper_sheet.morph", reduced.model)
-    draw_reduction(output / "reduction.png", reduced, snapshots[1::2], grid)
+    unseen = [snapshot for i, snapshot in enumerate(snapshots) if i % every]
+    draw_reduction(output / "reduction.png", reduced, unseen, grid)
     certificate, figures = reduced.model.certificate, reduced.errors
     stress = max(certificate[f"stress_{face}"]["von_mises"]["relative_l2"] for face in ("top", "bottom"))
     return (
+        f"seen={certificate['samples']['training']} held_out={certificate['samples']['held_out']} "
         f"modes={reduced.model.displacement.n_modes} "
         f"normalised_error={certificate['displacement']['relative_l2']:.2e} von_mises_error={stress:.2e} "
         f"compression_percent={certificate['compression_percent']:.2f} "
