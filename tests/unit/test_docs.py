@@ -3,25 +3,47 @@
 import re
 from pathlib import Path
 
+import h5py
 import numpy as np
+import pytest
 
 from morph_dslam.model import load_model, save_model
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.function_formats import FORMATS
+from tests.support.small_models import block_model
 
 DOCS = Path(__file__).parents[2] / "docs"
 
 
-def test_the_model_file_can_be_read_with_the_documented_program(tmp_path):
+@pytest.fixture(scope="module")
+def reader():
+    """The program that reads model files without the library, as the documentation gives it."""
     (program,) = re.findall(r"```python\n(.*?)```", (DOCS / "model-file.md").read_text(), flags=re.DOTALL)
     assert "morph_dslam" not in program
     names = {}
     exec(program, names)
+    return names
+
+
+def test_the_model_file_can_be_read_with_the_documented_program(tmp_path, reader):
     path, mu = tmp_path / "sheet.morph", np.array([0.025, -0.3, 0.2])
     model = bent_sheet_model(9, 7)
     save_model(path, model)
-    positions = names["deformed_positions"](path, mu)
+    positions = reader["deformed_positions"](path, mu)
     np.testing.assert_allclose(positions, model.positions(mu), atol=1e-8)
     np.testing.assert_allclose(positions, load_model(path).positions(mu), atol=1e-12)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("mu", [[-1.0, 0.0, 0.0], [0.3, 0.7, 1.9], [1.0, 1.0, 2.0]])
+def test_every_format_can_be_read_with_the_documented_program(tmp_path, reader, form, mu):
+    save_model(tmp_path / "block.morph", block_model(form))
+    model = load_model(tmp_path / "block.morph")
+    with h5py.File(tmp_path / "block.morph") as file:
+        for name in ("displacement", "stress_solid", "strain"):
+            value = model.fields[name].value(mu)
+            found = reader["field"](file, name, mu)
+            np.testing.assert_allclose(found, value, atol=1e-9 * np.abs(value).max())
 
 
 def test_the_programs_for_solids_pull_a_block_as_far_as_its_law_says(tmp_path, monkeypatch):

@@ -54,6 +54,31 @@ class Basis:
             raise ValueError(f"a basis is one of {', '.join(KINDS)}, not '{self.kind}'")
         if not self.lower < self.upper:
             raise ValueError(f"the range of a basis must grow, not go from {self.lower} to {self.upper}")
+        self._check_knots()
+
+    def _check_knots(self) -> None:
+        """Compiled code reads the arrays unchecked."""
+        n = {"spline": self.size + self.degree + 1, "kriging": self.size + 1}.get(self.kind, 0)
+        if self.size < 1 or (self.kind == "fourier" and self.size % 2 == 0):
+            raise ValueError(f"a {self.kind} basis cannot have {self.size} functions")
+        if self.kind == "spline" and not (1 <= self.degree <= 3 and self.size > self.degree):
+            raise ValueError(f"{self.size} splines cannot be of degree {self.degree}")
+        if self.knots.shape != (n,) or not np.isfinite(self.knots).all():
+            raise ValueError(f"{self.size} functions of a {self.kind} basis need {n} finite knots")
+        if self.kind == "spline" and not self._knots_grow():
+            raise ValueError("the knots of a spline must grow from its lower to its upper end")
+        if self.kind == "kriging" and self.knots[0] <= 0.0:
+            raise ValueError(f"a correlation length must be positive, not {self.knots[0]}")
+
+    def _knots_grow(self) -> bool:
+        """Each function has a support, and the spans inside the range cover it."""
+        p, t = self.degree, self.knots
+        ordered = (
+            (np.diff(t) >= 0.0).all()
+            and (t[p + 1 :] > t[: -p - 1]).all()
+            and (np.diff(t[p : self.size + 1]) > 0.0).all()
+        )
+        return bool(ordered and t[p] == self.lower and t[self.size] == self.upper)
 
     @property
     def bounds(self) -> tuple[float, float]:

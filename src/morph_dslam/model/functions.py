@@ -147,6 +147,16 @@ class ParameterFunctions(Functions):
     multi_indices: NDArray[np.int64]
     coefficients: Array
 
+    def __post_init__(self) -> None:
+        shapes = [np.shape(a) for a in (self.lower, self.upper, self.multi_indices, self.coefficients)]
+        (d,), (terms, _) = shapes[0], shapes[3]
+        if shapes[:3] != [(d,), (d,), (terms, d)] or terms < 1:
+            raise ValueError(f"ranges, degrees and coefficients of shapes {shapes} do not fit together")
+        if not (np.asarray(self.lower) < self.upper).all():
+            raise ValueError(f"the ranges must grow, not go from {self.lower} to {self.upper}")
+        if np.min(self.multi_indices) < 0:
+            raise ValueError("a polynomial cannot be of negative degree")
+
     @property
     def n_functions(self) -> int:
         return self.coefficients.shape[1]

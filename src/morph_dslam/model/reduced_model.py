@@ -82,7 +82,7 @@ class ReducedModel:
     cells : volume cells (k, c) by type ("hex8", "tet10"), nodes in VTK's order; empty for sheets.
     strain : Green-Lagrange strain of a solid, 6 components as of the stress (tensor shears), or None.
     reactions : what supports exert, fields of one point: "force_SET" in newtons and "moment_SET" about the
-        centre of the set in newton metres, 3 components in the object frame.
+        origin in newton metres, 3 components in the object frame.
     certificate : held-out errors and how they were measured, plain JSON.
     provenance : versions, study text, mesh hash, plain JSON.
     """

@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from morph_dslam.model.compact_modes import CompactModes
 from morph_dslam.model.functions import Functions
 
 Array = NDArray[np.float64]
@@ -48,10 +49,17 @@ class SeparatedField:
     ----------
     modes : (n_modes, n_points, n_components), the functions F_i at the points, in the field's SI unit.
     functions : the n_modes functions H_i, in any format.
+    compact : the same modes in the form that the file keeps, or None where it keeps them as they are.
     """
 
     modes: Array
     functions: Functions
+    compact: CompactModes | None = None
+
+    @classmethod
+    def from_compact(cls, compact: CompactModes, functions: Functions) -> SeparatedField:
+        """A field whose modes are kept in a compact form."""
+        return cls(compact.expand(), functions, compact)
 
     @property
     def n_modes(self) -> int:
@@ -60,7 +68,8 @@ class SeparatedField:
     @property
     def n_floats(self) -> int:
         """Numbers stored, for the compression factor."""
-        return self.modes.size + self.functions.n_floats
+        modes = self.modes.size if self.compact is None else self.compact.n_floats
+        return modes + self.functions.n_floats
 
     def inside(self, mu: ArrayLike) -> NDArray[np.bool_]:
         """Which parameters (d,) of ``mu`` (d,) lie in their range; always so for a periodic one."""

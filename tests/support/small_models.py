@@ -1,0 +1,89 @@
+"""Small models in every format of the model file, and a writer of version 2 files as earlier releases had."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict
+
+import h5py
+import numpy as np
+
+from morph_dslam.model import Parameter, ReducedModel, SeparatedField
+from morph_dslam.model.basis_functions import Basis
+from morph_dslam.model.compact_modes import GridModes
+from morph_dslam.model.stacked_functions import stack_components
+from tests.support.function_formats import SMOOTH, make_functions
+
+PARAMETERS = (
+    Parameter("stretch", "ratio", "1", -1.0, 1.0, 0.0, "strain along x"),
+    Parameter("pressure", "pressure", "MPa", 0.0, 1.0, 0.0, "on the top"),
+    Parameter("shift", "length", "mm", 0.0, 2.0, 0.0, "motion of the top"),
+)
+N = 3  # nodes along each edge
+
+
+def block_model(form: str, bases: tuple[Basis, ...] = SMOOTH) -> ReducedModel:
+    """A cube of 8 hex8 cells with random fields of every kind, its displacement in the format ``form``.
+
+    "by_component" and "grid" name the modes' form; their functions are Tucker's.
+    """
+    rng = np.random.default_rng(2)
+    index = np.arange(N**3).reshape(N, N, N)
+    nodes = np.stack(np.meshgrid(*[np.linspace(0.0, 0.1, N)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    starts = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]  # the corners of a cell, in VTK's order
+    starts += [(a, b, 1) for a, b, _ in starts]
+    corners = [index[a : N - 1 + a, b : N - 1 + b, c : N - 1 + c].ravel() for a, b, c in starts]
+    top = index[:, :, -1]
+    a, b, c, d = (part.ravel() for part in (top[:-1, :-1], top[1:, :-1], top[1:, 1:], top[:-1, 1:]))
+    tucker = make_functions("tucker", 6, bases)
+    if form == "by_component":
+        parts = [("cp", 1), ("tucker", 2), ("tensor_train", 3)]
+        displacement = stack_components(
+            [
+                SeparatedField(rng.normal(size=(n, N**3, 1)), make_functions(part, n, bases))
+                for part, n in parts
+            ]
+        )
+    elif form == "grid":
+        axes = tuple(rng.normal(size=(6, N)) for _ in range(3))
+        displacement = SeparatedField.from_compact(GridModes(axes, rng.normal(size=(6, 3))), tucker)
+    else:
+        displacement = SeparatedField(rng.normal(size=(6, N**3, 3)), make_functions(form, 6, bases))
+    return ReducedModel(
+        name="block",
+        nodes=nodes,
+        triangles=np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])]),
+        parameters=PARAMETERS,
+        displacement=displacement,
+        stresses={"solid": SeparatedField(1e6 * rng.normal(size=(6, N**3, 6)), tucker)},
+        cells={"hex8": np.column_stack(corners)},
+        strain=SeparatedField(rng.normal(size=(6, N**3, 6)), tucker),
+        reactions={"force_clamped/end": SeparatedField(rng.normal(size=(6, 1, 3)), tucker)},
+        certificate={"displacement": {"mean_mm": 0.01}},
+        provenance={"study": "a block"},
+    )
+
+
+def save_version_2(path, model) -> None:
+    """Write a model with polynomials as releases up to version 2 of the file did."""
+    with h5py.File(path, "w") as file:
+        file.attrs["format"], file.attrs["version"] = "morph-dslam reduced model", 2
+        file.attrs["name"] = model.name
+        file.attrs["parameters"] = json.dumps([asdict(parameter) for parameter in model.parameters])
+        file.attrs["certificate"] = json.dumps(model.certificate)
+        file.attrs["provenance"] = json.dumps(model.provenance)
+        file["nodes"], file["triangles"] = model.nodes, model.triangles.astype(np.int32)
+        for name, field in model.fields.items():
+            file[f"fields/{name}/modes"] = field.modes.astype(np.float32)
+            file[f"fields/{name}/multi_indices"] = field.functions.multi_indices.astype(np.uint8)
+            file[f"fields/{name}/coefficients"] = field.functions.coefficients
+        names = []
+        file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+        digest = hashlib.sha256()
+        for name in sorted(names):
+            digest.update(f"{name}{file[name].shape}{file[name].dtype.str}".encode())
+            digest.update(file[name][()].tobytes())
+        for name in ("name", "parameters", "certificate", "provenance"):
+            digest.update(file.attrs[name].encode())
+        file.attrs["content_sha256"] = digest.hexdigest()
