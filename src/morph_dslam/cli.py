@@ -6,8 +6,11 @@ Each command imports what it needs when it runs, so that `morph --help` answers 
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -25,7 +28,14 @@ def _build(arguments: argparse.Namespace) -> None:
     from morph_dslam.offline.build import build
     from morph_dslam.offline.stability import stability_warnings
 
-    model = build(arguments.study, arguments.output, workers=arguments.workers)
+    if arguments.scheduler is None:
+        cluster = nullcontext()
+    else:
+        from morph_dslam.offline.cluster import cluster_executor
+
+        cluster = cluster_executor(arguments.scheduler)
+    with cluster as executor:
+        model = build(arguments.study, arguments.output, arguments.workers, executor)
     for line in stability_warnings(model.certificate):
         print(f"warning: {line}")
 
@@ -135,7 +145,13 @@ def _add_offline_commands(commands: argparse._SubParsersAction) -> None:
     build.add_argument(
         "-o", "--output", type=Path, required=True, metavar="MODEL", help="model file to write"
     )
-    build.add_argument("--workers", type=int, metavar="N", help="processes to solve in (default: one a core)")
+    where = build.add_mutually_exclusive_group()
+    where.add_argument("--workers", type=int, metavar="N", help="processes to solve in (default: one a core)")
+    where.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="solve on a Dask cluster, tcp://host:8786 say (docs/clusters.md)",
+    )
     info = _add(commands, "info", _info, "nothing was written", "say what a model file holds")
     info.add_argument("model", type=Path, help="model file")
     simulate = _add(
@@ -220,12 +236,26 @@ def _add_online_commands(commands: argparse._SubParsersAction) -> None:
     )
 
 
+@contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """SIGTERM, as batch systems send it, ends a command as Ctrl-C does: workers stop, results are kept."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def run_and_report_errors(
     action: Callable[[argparse.Namespace], None], arguments: argparse.Namespace, kept: str
 ) -> int:
     """Run an action; returns the exit status: 0, 2 for a mistake the user can mend, 130 if interrupted."""
     try:
-        action(arguments)
+        with _terminated_as_interrupted():
+            action(arguments)
     except MorphError as error:
         print(f"morph: {error}", file=sys.stderr)
         return USER_ERROR
