@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 from morph_dslam.model import ReducedModel
 from morph_dslam.offline.reduction.galerkin_method import reduce_by_galerkin
+from morph_dslam.offline.reduction.pgd_method import reduce_by_pgd
 from morph_dslam.offline.reduction.pod_method import reduce_by_pod
 from morph_dslam.offline.reduction.sparse_pgd_method import reduce_by_sparse_pgd
 from morph_dslam.offline.reduction.task import ReductionTask
@@ -19,5 +20,6 @@ __all__ = ["METHODS", "ReductionTask"]
 METHODS: dict[str, Callable[[ReductionTask], ReducedModel]] = {
     "galerkin": reduce_by_galerkin,
     "pod": reduce_by_pod,
+    "pgd": reduce_by_pgd,
     "sparse_pgd": reduce_by_sparse_pgd,
 }
