@@ -82,7 +82,12 @@ def built(tmp_path_factory):
 
 def test_held_out_errors_are_small(built):
     certificate = load_model(built / "block.morph").certificate
-    assert certificate["samples"] == {"training": 24, "held_out": 8, "failed": []}
+    samples = certificate["samples"]
+    assert samples["training"] <= 24
+    assert (samples["held_out"], samples["failed"]) == (8, [])
+    assert samples["rounds"][-1]["largest_estimate"] <= 5e-4 / 2
+    assert certificate["reduction"]["method"] == "galerkin"
+    assert certificate["estimator"]["effectivity_min"] == pytest.approx(1.0, abs=0.02)
     assert certificate["displacement"]["mean_relative_to_largest"] < 1e-3
     assert certificate["sensitivity"]["bend"]["relative_l2"] < 1e-2
     assert certificate["stress_solid"]["relative_l2"] < 1e-2

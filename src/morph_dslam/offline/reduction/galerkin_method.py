@@ -14,11 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.errors import StudyError
 from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.model.basis_functions import chebyshev_basis
 from morph_dslam.model.functions import Functions
-from morph_dslam.offline.mechanics.solid import SolidProblem
 from morph_dslam.offline.reduction.bases import parameter_bases
 from morph_dslam.offline.reduction.fields import field_names, model_of
 from morph_dslam.offline.reduction.grid_functions import (
@@ -27,7 +25,7 @@ from morph_dslam.offline.reduction.grid_functions import (
     sizes_along_lines,
     values_on_grid,
 )
-from morph_dslam.offline.reduction.reduced_solver import FullSolutions, ReducedSolver
+from morph_dslam.offline.reduction.reduced_solver import FullSolutions, ReducedSolver, solid_equations
 from morph_dslam.offline.reduction.sampled_fields import SampledFields, field_modes
 from morph_dslam.offline.reduction.scattered_functions import (
     ScatteredValues,
@@ -53,7 +51,7 @@ def reduce_by_galerkin(task: ReductionTask) -> ReducedModel:
     StudyError
         If the study is not that of a hyperelastic solid.
     """
-    problem = solid_equations(task)
+    problem = solid_equations(task.problem() if task.problem else None)
     snapshots = [snapshot for group in task.groups for snapshot in group]
     box, tolerance = task.box, task.options.tolerance
     solver = ReducedSolver(problem, FullSolutions.read(task.files), box, tolerance)
@@ -82,22 +80,6 @@ def reduce_by_galerkin(task: ReductionTask) -> ReducedModel:
         **summaries["displacement"],
     }
     return model_of(task, fields, summary)
-
-
-def solid_equations(task: ReductionTask) -> SolidProblem:
-    """The full equations of the task.
-
-    Raises
-    ------
-    StudyError
-        If they are not those of a solid without memory.
-    """
-    problem = getattr(task.problem(), "problem", None) if task.problem else None
-    if not isinstance(problem, SolidProblem) or problem.history is not None:
-        raise StudyError(
-            'reduction.method = "galerkin" needs the equations of a solid without memory: use "pod"'
-        )
-    return problem
 
 
 def _grid_is_used(task: ReductionTask) -> bool:

@@ -16,6 +16,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.errors import StudyError
+from morph_dslam.offline.mechanics.solid import SolidProblem
+from morph_dslam.offline.problem import SweepProblem
 from morph_dslam.offline.reduction.galerkin import GalerkinEquations, galerkin_modes, newton_correction
 from morph_dslam.offline.reduction.regression import fit_functions
 from morph_dslam.offline.snapshots import load_state
@@ -54,6 +57,23 @@ class FullSolutions:
         return FullSolutions(
             *(np.array([state[key] for state in states]) for key in ("mu", "dofs", "slopes"))
         )
+
+
+def solid_equations(sweep: SweepProblem | None) -> SolidProblem:
+    """The full equations that a sweep solves.
+
+    Raises
+    ------
+    StudyError
+        If they are not those of a solid without memory.
+    """
+    problem = getattr(sweep, "problem", None)
+    if not isinstance(problem, SolidProblem) or problem.history is not None:
+        raise StudyError(
+            "a Galerkin projection needs the equations of a solid without memory: use "
+            'reduction.method = "pod", or an elastic material'
+        )
+    return problem
 
 
 class ReducedSolver:

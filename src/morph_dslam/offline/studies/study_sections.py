@@ -46,12 +46,12 @@ class SamplingSection(Section):
     the box; "even" spaces them evenly with both ends included, for a single parameter; "grid" takes all
     points of a full grid with ``points`` for each parameter, or one number for all; "adaptive" solves
     ``first`` scattered ones and then adds where the model's error is estimated to be largest, up to
-    ``training``. Held-out samples are always scattered.
+    ``training``. The method of reduction chooses where it is absent. Held-out samples are always scattered.
     """
 
     training: int = Field(default=256, ge=8)
     held_out: int = Field(default=59, ge=4)
-    scheme: Literal["sobol", "even", "grid", "adaptive"] = "sobol"
+    scheme: Literal["sobol", "even", "grid", "adaptive"] | None = None
     points: int | tuple[int, ...] | None = None
     first: int = Field(default=16, ge=4)
     seed: int = 0
@@ -72,7 +72,7 @@ class SamplingSection(Section):
             raise ValueError('with scheme = "grid" the points are the training samples: leave out training')
         if self.scheme != "grid" and "points" in given:
             raise ValueError('points are those of scheme = "grid": leave them out, or choose that scheme')
-        if self.scheme != "adaptive" and "first" in given:
+        if self.scheme not in (None, "adaptive") and "first" in given:
             raise ValueError('first is for scheme = "adaptive": leave it out, or choose that scheme')
         if self.scheme == "adaptive" and self.first > self.training:
             raise ValueError("first must be at most training: adaptive sampling starts with it and adds")
