@@ -26,12 +26,14 @@ class SolvedStudy:
     Attributes
     ----------
     seconds : that the solves took; close to none where they were kept.
+    files : of the solutions seen.
     """
 
     study: SolidStudy
     seen: list[Snapshot]
     unseen: list[Snapshot]
     seconds: float
+    files: tuple[Path, ...]
 
     def task(self, **options: object) -> ReductionTask:
         """What a method of reduction is given, with some of the study's [reduction] changed."""
@@ -44,6 +46,7 @@ class SolvedStudy:
             changed,
             self.study.name,
             self.study.sweep_problem,
+            self.files,
         )
 
     def reduce(self, method: str, **options: object) -> ReducedModel:
@@ -58,7 +61,7 @@ class SolvedStudy:
             [Snapshot(s.coordinates, {"displacement": s.fields["displacement"]}) for s in part]
             for part in (self.seen, self.unseen)
         )
-        return SolvedStudy(self.study, seen, unseen, self.seconds)
+        return SolvedStudy(self.study, seen, unseen, self.seconds, self.files)
 
 
 def solve_study(study: SolidStudy, folder: Path, workers: int | None = None) -> SolvedStudy:
@@ -69,6 +72,7 @@ def solve_study(study: SolidStudy, folder: Path, workers: int | None = None) -> 
     with default_executor(workers or study.work.workers) as executor:
         result = run_sweep(study, study.canonical(samples), folder, executor)
     seconds = time.perf_counter() - began
-    snapshots = {index: load_snapshot(path) for index, path in sorted(result.solved.items())}
-    seen = [snapshot for index, snapshot in snapshots.items() if index < len(training)]
-    return SolvedStudy(study, seen, list(snapshots.values())[len(seen) :], seconds)
+    solved = sorted(result.solved.items())
+    files = tuple(path for index, path in solved if index < len(training))
+    snapshots = [load_snapshot(path) for _, path in solved]
+    return SolvedStudy(study, snapshots[: len(files)], snapshots[len(files) :], seconds, files)
