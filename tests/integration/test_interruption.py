@@ -1,0 +1,105 @@
+"""Builds that are stopped or killed, each a process of its own, then finished: the same file, to the byte."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morph_dslam.cli import INTERRUPTED, main
+from morph_dslam.offline.snapshots import PARTIAL
+from tests.support.block_study import write_study
+
+N_SAMPLES = 30
+
+
+def start(study: Path, output: Path) -> subprocess.Popen:
+    """A build on two worker processes, in a process group of its own."""
+    command = [
+        sys.executable,
+        "-m",
+        "morph_dslam.cli",
+        "build",
+        str(study),
+        "-o",
+        str(output),
+        "--workers",
+        "2",
+    ]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+
+
+def solved(output: Path) -> list[Path]:
+    return list(output.with_name(output.name + ".snapshots").glob("*.npz"))
+
+
+def wait_until(ready, seconds: float = 120.0) -> None:
+    until = time.monotonic() + seconds
+    while not ready():
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+def nothing_left(group: int) -> bool:
+    """Whether all processes of a group have ended."""
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory) -> bytes:
+    """The model file of a build that nothing disturbed, in one process."""
+    folder = tmp_path_factory.mktemp("alone")
+    assert main(["build", str(write_study(folder)), "-o", str(folder / "block.morph")]) == 0
+    return (folder / "block.morph").read_bytes()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_build_keeps_what_it_solved_and_says_so(number, alone: bytes, tmp_path: Path) -> None:
+    """Ctrl-C reaches the whole group, SIGTERM of a batch system the main process alone."""
+    study, output = write_study(tmp_path), tmp_path / "block.morph"
+    process = start(study, output)
+    wait_until(lambda: len(solved(output)) >= 3 or process.poll() is not None)
+    (os.killpg if number == signal.SIGINT else os.kill)(process.pid, number)
+    message = process.communicate(timeout=60)[1]
+    assert process.returncode == INTERRUPTED
+    assert "Traceback" not in message
+    said = message.splitlines()[-1]
+    assert said == (
+        "morph: interrupted; the solutions found so far are kept, and the same command goes on from there"
+    )
+    wait_until(lambda: nothing_left(process.pid))
+    assert 3 <= len(solved(output)) < N_SAMPLES
+    assert main(["build", str(study), "-o", str(output)]) == 0
+    assert output.read_bytes() == alone
+
+
+@pytest.mark.slow
+def test_killed_ten_times_at_random_moments(alone: bytes, tmp_path: Path) -> None:
+    """SIGKILL of the whole group or of the main process alone, whose workers must then end by themselves."""
+    study, output = write_study(tmp_path), tmp_path / "block.morph"
+    rng = np.random.default_rng(5)
+    for count in np.sort(rng.integers(0, N_SAMPLES + 1, 10)):
+        process = start(study, output)
+        wait_until(
+            lambda process=process, count=count: len(solved(output)) >= count or process.poll() is not None
+        )
+        time.sleep(rng.uniform(0.0, 2.0 if count in (0, N_SAMPLES) else 0.02))
+        (os.killpg if rng.random() < 0.5 else os.kill)(process.pid, signal.SIGKILL)
+        process.communicate()
+        wait_until(lambda process=process: nothing_left(process.pid), 10.0)
+    process = start(study, output)
+    assert process.communicate()[1].count("damaged") == 0
+    assert process.returncode == 0
+    assert output.read_bytes() == alone
+    assert len(solved(output)) == N_SAMPLES
+    assert not list(tmp_path.rglob(f"*{PARTIAL}"))
