@@ -26,8 +26,11 @@ INTERRUPTED = 130
 
 def _build(arguments: argparse.Namespace) -> None:
     from morph_dslam.offline.build import build
+    from morph_dslam.offline.report.build_report import report_path, write_build_report
+    from morph_dslam.offline.report.reference_curve import read_reference_curve
     from morph_dslam.offline.stability import stability_warnings
 
+    reference = None if arguments.reference_curve is None else read_reference_curve(arguments.reference_curve)
     if arguments.scheduler is None:
         cluster = nullcontext()
     else:
@@ -36,6 +39,9 @@ def _build(arguments: argparse.Namespace) -> None:
         cluster = cluster_executor(arguments.scheduler)
     with cluster as executor:
         model = build(arguments.study, arguments.output, arguments.workers, executor)
+    report = report_path(arguments.output)
+    write_build_report(report, model, reference)
+    print(f"wrote {arguments.output} and {report}")
     for line in stability_warnings(model.certificate):
         print(f"warning: {line}")
 
@@ -151,6 +157,12 @@ def _add_offline_commands(commands: argparse._SubParsersAction) -> None:
         "--scheduler",
         metavar="ADDRESS",
         help="solve on a Dask cluster, tcp://host:8786 say (docs/clusters.md)",
+    )
+    build.add_argument(
+        "--reference-curve",
+        type=Path,
+        metavar="CSV",
+        help="errors of somebody else by number of modes, drawn in the report (docs/certificate.md)",
     )
     info = _add(commands, "info", _info, "nothing was written", "say what a model file holds")
     info.add_argument("model", type=Path, help="model file")

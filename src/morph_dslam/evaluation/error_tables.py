@@ -9,8 +9,9 @@ from morph_dslam.evaluation.field_names import field_title
 from morph_dslam.evaluation.report import Table
 
 #: Endings of a certificate's keys and the unit in which their values are.
-_UNITS = {"_mm": " mm", "_MPa": " MPa", "_Nmm": " N mm", "_N": " N", "": ""}
-_HEADER = ("field", "mean", "largest", "worst solve's mean", "largest value", "mean / largest", "relative L2")
+_UNITS = {"_mm": "mm", "_MPa": "MPa", "_Nmm": "N mm", "_N": "N"}
+_ABSOLUTE = ("mean", "max", "worst_sample_mean", "largest")
+_HEADER = ("field", "mean", "largest", "worst mean", "largest value", "unit", "mean / largest", "relative L2")
 _SENSITIVITY_HEADER = ("parameter", "mean / largest", "relative L2")
 _UNKNOWN = "–"
 
@@ -40,17 +41,14 @@ def sensitivity_table(certificate: Mapping[str, Any]) -> Table:
 
 
 def _row(title: str, errors: Mapping[str, Any]) -> list[str]:
-    absolute = [_absolute(errors, name) for name in ("mean", "max", "worst_sample_mean", "largest")]
-    return [title, *absolute, *_relative(errors)]
-
-
-def _absolute(errors: Mapping[str, Any], name: str) -> str:
-    for ending, unit in _UNITS.items():
-        if name + ending in errors:
-            return f"{errors[name + ending]:.3g}{unit}"
-    return _UNKNOWN
+    ending = next((ending for ending in _UNITS if f"mean{ending}" in errors), "")
+    absolute = [_number(errors.get(name + ending), ".3g") for name in _ABSOLUTE]
+    return [title, *absolute, _UNITS.get(ending, _UNKNOWN), *_relative(errors)]
 
 
 def _relative(errors: Mapping[str, Any]) -> list[str]:
-    values = [errors.get(name) for name in ("mean_relative_to_largest", "relative_l2")]
-    return [_UNKNOWN if value is None else f"{value:.2e}" for value in values]
+    return [_number(errors.get(name), ".2e") for name in ("mean_relative_to_largest", "relative_l2")]
+
+
+def _number(value: float | None, form: str) -> str:
+    return _UNKNOWN if value is None else f"{value:{form}}"

@@ -69,7 +69,7 @@ def summarise_model(model: ReducedModel) -> dict[str, Table]:
         "fields": _fields(model),
         "errors on held-out solves": error_table(certificate),
         "errors of the displacement's sensitivities": sensitivity_table(certificate),
-        "held-out solves": Table.of(held_out_facts(model)),
+        "confidence": Table.of(held_out_facts(model)),
         "memory and samples": Table.of(_memory(certificate)),
         "error estimator": Table.of(flatten(certificate.get("estimator", {}))),
         "reduction": Table.of(_reduction(certificate)),
@@ -84,12 +84,12 @@ def held_out_facts(model: ReducedModel) -> Facts:
     errors = model.certificate.get("displacement", {})
     facts = {}
     if "n_held_out" in errors:
-        facts["number"] = str(errors["n_held_out"])
+        facts["held-out solves"] = str(errors["n_held_out"])
     if "confidence" in errors:
         facts["confidence"] = errors["confidence"]
     if "worst_sample" in errors:
         worst = f"mean error {_value(errors['worst_sample_mean_mm'])} mm"
-        facts["worst"] = f"{describe_point(model.parameters, errors['worst_sample'])}: {worst}"
+        facts["worst solve"] = f"{describe_point(model.parameters, errors['worst_sample'])}: {worst}"
     return facts
 
 
@@ -120,7 +120,7 @@ def _value(value: Any) -> str:
         return f"{value:.4g}"
     if isinstance(value, list):
         if any(isinstance(item, Mapping) for item in value):
-            return f"{len(value)} entries"
+            return f"{len(value)} entries" if len(value) > 1 else "1 entry"
         return ", ".join(_value(item) for item in value) or "none"
     return str(value)
 

@@ -21,9 +21,16 @@ body { margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.6rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; border-bottom: 1px solid #d0d7de; }
 table { border-collapse: collapse; margin: 1rem 0; }
 td, th { padding: .25rem .9rem .25rem 0; text-align: left; }
-td { font-variant-numeric: tabular-nums; } tr { border-bottom: 1px solid #eaeef2; }
+td { font-variant-numeric: tabular-nums; } th { white-space: nowrap; }
+tr { border-bottom: 1px solid #eaeef2; }
 figure { margin: 1rem 0; } img { max-width: 100%; } figcaption { color: #57606a; font-size: .9rem; }
 .warning { background: #fff8c5; border-left: 4px solid #d4a72c; padding: .5rem 1rem; }
+.figures { display: grid; grid-template-columns: repeat(auto-fit, minmax(12rem, 1fr)); gap: .8rem; }
+.figures div { border: 1px solid #d0d7de; border-radius: 6px; padding: .6rem .9rem; }
+.figures b { display: block; font-size: 1.3rem; font-weight: 600; } .figures span { color: #57606a; }
+.wide { overflow-x: auto; } .wide table { margin: .3rem 0 .6rem; }
+summary { cursor: pointer; color: #57606a; }
+pre { background: #f6f8fa; padding: .8rem 1rem; font-size: .85rem; overflow-x: auto; }
 </style>
 </head>
 <body>
@@ -33,7 +40,7 @@ $body
 </html>
 """)
 
-_MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg"}
+_MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".svg": "image/svg+xml"}
 
 
 @dataclass(frozen=True)
@@ -73,12 +80,37 @@ class Table:
     def html(self) -> str:
         lines = [_row(self.header, "th")] if self.header else []
         lines += [_row(row, "td") for row in self.rows]
-        return "<table>\n" + "\n".join(lines) + "\n</table>"
+        return '<div class="wide"><table>\n' + "\n".join(lines) + "\n</table></div>"
+
+
+@dataclass(frozen=True)
+class KeyFigures:
+    """The few figures that are looked for first, each a name and its value."""
+
+    figures: Mapping[str, str]
+
+    def html(self) -> str:
+        cards = [
+            f"<div><b>{escape(value)}</b><span>{escape(name)}</span></div>"
+            for name, value in self.figures.items()
+        ]
+        return '<div class="figures">\n' + "\n".join(cards) + "\n</div>"
+
+
+@dataclass(frozen=True)
+class Listing:
+    """A text as it stands, folded away under ``title``."""
+
+    title: str
+    text: str
+
+    def html(self) -> str:
+        return f"<details><summary>{escape(self.title)}</summary><pre>{escape(self.text)}</pre></details>"
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An encoded image, ``suffix`` .png or .jpg, shown inside the page."""
+    """An encoded image, ``suffix`` .png, .jpg or .svg, shown inside the page."""
 
     data: bytes
     suffix: str
@@ -105,12 +137,15 @@ class Link:
         return f'<p><a href="{escape(self.target)}">{escape(self.text)}</a></p>'
 
 
+Block = Text | Table | KeyFigures | Listing | Picture | Link
+
+
 @dataclass(frozen=True)
 class Section:
     """A heading and what stands under it."""
 
     heading: str
-    blocks: Sequence[Text | Table | Picture | Link]
+    blocks: Sequence[Block]
 
     def html(self) -> str:
         return "\n".join([f"<h2>{escape(self.heading)}</h2>", *(block.html() for block in self.blocks)])

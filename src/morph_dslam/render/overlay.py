@@ -64,6 +64,44 @@ def _blend_panel(image: NDArray[np.uint8], panel: NDArray[np.uint8], top: int, l
     place[:] = cv2.addWeighted(place, 0.12, panel[: place.shape[0], : place.shape[1]], 0.88, 0.0)
 
 
+def _widened(value_range: tuple[float, float]) -> tuple[float, float]:
+    """The range, or a little more where it is a single value."""
+    low, high = value_range
+    return low, high if high > low else low + 1e-9 + abs(low) * 1e-6
+
+
+def paint_surface(
+    image: NDArray[np.uint8],
+    pixels: Array,
+    depths: Array,
+    triangles: NDArray,
+    node_values: Array,
+    value_range: tuple[float, float],
+    colour_map: str = "turbo",
+    alpha: float = 1.0,
+    brightness: Array | None = None,
+) -> NDArray[np.bool_]:
+    """Paint a surface coloured by a field into ``image``, which is changed; arguments as of `draw_overlay`.
+
+    Returns
+    -------
+    (h, w) where the surface is seen.
+    """
+    low, high = _widened(value_range)
+    buffers = rasterise(pixels, depths, triangles, *image.shape[:2])
+    blend_surface(
+        image,
+        buffers.triangle_ids,
+        buffers.weights,
+        np.ascontiguousarray(triangles, dtype=np.int64),
+        (np.asarray(node_values, dtype=np.float64) - low) * (255.0 / (high - low)),
+        np.ones(len(pixels)) if brightness is None else np.asarray(brightness, dtype=np.float64),
+        colour_table(colour_map),
+        float(alpha),
+    )
+    return buffers.covered
+
+
 def draw_overlay(
     image: NDArray[np.uint8],
     pixels: Array,
@@ -100,20 +138,11 @@ def draw_overlay(
     result = image.copy()
     height, width = image.shape[:2]
     scale = 0.42 * max(height / 480.0, 0.6)
-    low, high = value_range
-    high = high if high > low else low + 1e-9 + abs(low) * 1e-6
-    buffers = rasterise(pixels, depths, triangles, height, width)
-    blend_surface(
-        result,
-        buffers.triangle_ids,
-        buffers.weights,
-        np.ascontiguousarray(triangles, dtype=np.int64),
-        (np.asarray(node_values, dtype=np.float64) - low) * (255.0 / (high - low)),
-        np.ones(len(pixels)) if brightness is None else np.asarray(brightness, dtype=np.float64),
-        colour_table(colour_map),
-        float(alpha),
+    low, high = _widened(value_range)
+    covered = paint_surface(
+        result, pixels, depths, triangles, node_values, value_range, colour_map, alpha, brightness
     )
-    _draw_outline(result, buffers.covered)
+    _draw_outline(result, covered)
     margin = round(0.02 * height)
     bar = colour_bar(round(0.6 * height), float(low), float(high), label, colour_map, scale)
     _blend_panel(result, bar, margin, width - margin - bar.shape[1])
