@@ -1,6 +1,8 @@
 """Adaptive sampling: full solves where a Galerkin model of those so far is estimated to err most.
 
-The estimate is the full Newton correction at the reduced solution, one factorisation for each candidate.
+The estimate is the full Newton correction at the reduced solution, one factorisation for each candidate that
+could be among the worst. Method "galerkin" adds several samples in a round, which are solved side by side;
+"reduced_basis" adds one, as the weak greedy algorithm has it: fewer solves, one after the other.
 Candidates come from the same Sobol sequence as the first samples, so that the choice depends on the study
 alone: a build that was stopped makes it again and finds on disk what it had solved.
 """
@@ -17,6 +19,7 @@ from tqdm import tqdm
 
 from morph_dslam.errors import SolverError
 from morph_dslam.offline.problem import ParametricStudy, SweepProblem, bounds
+from morph_dslam.offline.reduction.greedy import worst_candidates
 from morph_dslam.offline.reduction.reduced_solver import FullSolutions, ReducedSolver, solid_equations
 from morph_dslam.offline.sampling import candidate_samples, training_samples
 from morph_dslam.offline.sweep import SweepResult
@@ -45,35 +48,45 @@ def sample_adaptively(
         If the study has no Galerkin model, or too few samples converge.
     """
     equations = solid_equations(problem)
-    samples, chosen = training_samples(study), np.zeros(0, dtype=np.int64)
+    samples = training_samples(study)
     pool = min(CANDIDATES * len(bounds(study)), MOST_CANDIDATES)
+    estimates = np.full(pool, np.inf)
     rounds: list[dict[str, Any]] = []
     while True:
         result = sweep(samples)
         solutions = FullSolutions.read([path for _, path in sorted(result.solved.items())])
         solver = ReducedSolver(equations, solutions, bounds(study), study.reduction.tolerance)
-        candidates = candidate_samples(study, pool + len(chosen))
-        free = np.setdiff1d(np.arange(len(candidates)), chosen)
-        estimates = _estimates(solver, candidates[free])
-        rounds.append({"solves": len(samples), "largest_estimate": float(estimates.max())})
+        candidates = candidate_samples(study, len(estimates))
         room = study.sampling.training - len(samples)
-        if estimates.max() <= SHARE * study.reduction.tolerance or room <= 0:
+        count = min(_samples_of_a_round(study, len(samples)), max(room, 1))
+        worst, estimates = _worst(solver, candidates, estimates, count)
+        largest = float(estimates[worst[0]])
+        rounds.append({"solves": len(samples), "largest_estimate": largest})
+        if largest <= SHARE * study.reduction.tolerance or room <= 0:
             return samples, rounds
-        count = min(max(LEAST, int(GROWTH * len(samples))), room)
-        worst = free[np.argsort(-estimates, kind="stable")[:count]]
-        chosen = np.concatenate([chosen, worst])
+        estimates[worst] = -np.inf
+        estimates = np.append(estimates, np.full(len(worst), np.inf))
         samples = np.vstack([samples, candidates[worst]])
 
 
-def _estimates(solver: ReducedSolver, candidates: Array) -> Array:
-    """Estimated errors (n,) at candidates (n, d); infinite where there is no reduced solution."""
-    found = np.full(len(candidates), np.inf)
-    for number, mu in enumerate(tqdm(candidates, desc="estimating errors", unit="sample", leave=False)):
+def _samples_of_a_round(study: ParametricStudy, known: int) -> int:
+    return 1 if study.reduction.method == "reduced_basis" else max(LEAST, int(GROWTH * known))
+
+
+def _worst(
+    solver: ReducedSolver, candidates: Array, earlier: Array, count: int
+) -> tuple[NDArray[np.int64], Array]:
+    """`worst_candidates` among ``candidates`` (n, d); infinite where there is no reduced solution."""
+
+    def estimate(index: int) -> float:
+        progress.update()
         try:
-            found[number] = solver.estimate(solver.solve(mu), mu)
+            return solver.estimate(solver.solve(candidates[index]), candidates[index])
         except SolverError:
-            continue
-    return found
+            return np.inf
+
+    with tqdm(desc="estimating errors", unit="sample", leave=False) as progress:
+        return worst_candidates(estimate, earlier, count)
 
 
 def estimator_check(solver: ReducedSolver, files: Sequence[Path]) -> dict[str, Any]:

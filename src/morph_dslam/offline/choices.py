@@ -10,6 +10,8 @@ from morph_dslam.offline.studies.study_sections import MethodName, Section
 
 #: Methods that sample adaptively unless the study has another scheme.
 ADAPTIVE = ("galerkin", "reduced_basis")
+#: Solves that greedy sampling starts with, beside one for each parameter.
+FEWEST = 4
 
 
 def usable_methods(study: Study) -> tuple[tuple[MethodName, ...], str]:
@@ -30,7 +32,8 @@ def with_choices(study: Study) -> Study:
     """The study with method and sampling scheme said.
 
     Solids with several parameters are reduced by "galerkin", everything else by "pod"; Galerkin models are
-    sampled adaptively, up to ``sampling.training`` solves, unless the study has another scheme.
+    sampled adaptively, up to ``sampling.training`` solves, unless the study has another scheme. The greedy
+    sampling of "reduced_basis" starts with as few solves as can be, since each choice knows all before it.
 
     Raises
     ------
@@ -51,6 +54,9 @@ def with_choices(study: Study) -> Study:
                 f'sampling.scheme = "adaptive" needs an estimate of the error, which method "{method}" '
                 'lacks: use scheme = "sobol"' + (', or method = "galerkin"' if "galerkin" in methods else "")
             )
-        first = min(sampling.first, sampling.training)
+        first = sampling.first
+        if method == "reduced_basis" and "first" not in sampling.model_fields_set:
+            first = len(study.model_parameters()) + FEWEST
+        first = min(first, sampling.training)
         update["sampling"] = sampling.model_copy(update={"scheme": scheme, "first": first})
     return study.model_copy(update=update)

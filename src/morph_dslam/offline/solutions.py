@@ -23,6 +23,9 @@ from morph_dslam.offline.sweep import SweepResult
 
 Array = NDArray[np.float64]
 
+#: Methods that make a model from the equations alone: only held-out samples are solved for them.
+WITHOUT_SOLUTIONS = ("pgd",)
+
 
 @dataclass(frozen=True)
 class Solutions:
@@ -60,7 +63,9 @@ def solve(
     problem : makes what the study is solved with. sweep : solves samples (n, d), or finds them on disk.
     """
     rounds: list[dict[str, Any]] = []
-    if study.sampling.scheme == "adaptive":
+    if study.reduction.method in WITHOUT_SOLUTIONS:
+        training = np.zeros((0, len(study.model_parameters())))
+    elif study.sampling.scheme == "adaptive":
         training, rounds = sample_adaptively(study, problem(), sweep)
     else:
         training = training_samples(study)
@@ -69,7 +74,8 @@ def solve(
     mesh = study.model_mesh()
     seen = _gather(study, samples, result, range(len(training)))
     unseen = _gather(study, samples, result, range(len(training), len(samples)))
-    names = reaction_names([group[0] for group in seen], float(np.linalg.norm(np.ptp(mesh.nodes, axis=0))))
+    known = [group[0] for group in seen or unseen]
+    names = reaction_names(known, float(np.linalg.norm(np.ptp(mesh.nodes, axis=0))))
     return Solutions(
         mesh,
         study.model_parameters(),

@@ -73,7 +73,7 @@ def reduce_by_galerkin(task: ReductionTask) -> ReducedModel:
             "left_out_by_the_snapshots_modes": modes[name].left_out,
         }
     summary = {
-        "method": "galerkin",
+        "method": task.options.method or "galerkin",
         "galerkin_modes": solver.galerkin.n_dofs,
         "reduced_solves": dense.count,
         **dense.summary,

@@ -2,6 +2,7 @@
 
 A method is a function from a `ReductionTask` to a `ReducedModel` with all fields that the snapshots hold.
 What it says of itself goes under "reduction" into the model's certificate; the build adds held-out errors.
+Methods "galerkin" and "reduced_basis" differ in how the build samples for them (`adaptive_sampling`).
 """
 
 from __future__ import annotations
@@ -21,5 +22,6 @@ METHODS: dict[str, Callable[[ReductionTask], ReducedModel]] = {
     "galerkin": reduce_by_galerkin,
     "pod": reduce_by_pod,
     "pgd": reduce_by_pgd,
+    "reduced_basis": reduce_by_galerkin,
     "sparse_pgd": reduce_by_sparse_pgd,
 }
