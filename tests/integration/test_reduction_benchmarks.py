@@ -46,6 +46,7 @@ def test_a_coarse_boot_seal_is_as_near_with_twelve_modes_as_is_asked_of_the_fine
     assert picture.std() > 10.0  # something is drawn
 
 
+@pytest.mark.slow
 def test_one_parameter_of_the_bar_needs_eight_solves(tmp_path: Path) -> None:
     found = figures(
         "reduction_growth",
