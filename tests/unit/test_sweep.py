@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor, Future, wait
 
 import numpy as np
 import pytest
@@ -99,3 +99,126 @@ def test_solved_samples_are_not_solved_again(monkeypatch, tmp_path):
     result = sweep.run_sweep(STUDY, samples, tmp_path, AtOnce())
     assert attempts == []
     assert len(result.solved) == 3
+
+
+def test_damaged_files_are_named_and_solved_again(monkeypatch, tmp_path, capsys):
+    samples = row([0.008, 0.012, 0.016])
+    stand_in(monkeypatch, lambda bulge, origin: True)
+    first = sweep.run_sweep(STUDY, samples, tmp_path, AtOnce())
+    contents = [first.solved[sample].read_bytes() for sample in range(3)]
+    first.solved[1].write_bytes(contents[1][:-20])
+    attempts = stand_in(monkeypatch, lambda bulge, origin: True)
+    capsys.readouterr()
+    again = sweep.run_sweep(STUDY, samples, tmp_path, AtOnce())
+    assert f"{first.solved[1]} is damaged (" in capsys.readouterr().err
+    assert attempts == [(0.012, 0.008)]
+    assert [again.solved[sample].read_bytes() for sample in range(3)] == contents
+
+
+def test_failed_attempts_are_not_repeated_by_the_next_build(monkeypatch, tmp_path):
+    samples = row([0.008, 0.012, 0.016, 0.02])
+    stand_in(monkeypatch, lambda bulge, origin: abs(bulge - 0.012) > 1e-9)
+    first = sweep.run_sweep(STUDY, samples, tmp_path, AtOnce())
+    attempts = stand_in(monkeypatch, lambda bulge, origin: True)
+    again = sweep.run_sweep(STUDY, samples, tmp_path, AtOnce())
+    assert attempts == []
+    assert again == first
+    assert again.failed == {1: "no equilibrium"}
+
+
+def test_more_samples_keep_those_solved_and_fill_in_between(monkeypatch, tmp_path):
+    """A caller adds samples: only they are solved, each from its nearest neighbour, old or new."""
+    stand_in(monkeypatch, lambda bulge, origin: True)
+    sweep.run_sweep(STUDY, row([0.008, 0.016]), tmp_path, AtOnce())
+    attempts = stand_in(monkeypatch, lambda bulge, origin: True)
+    result = sweep.run_sweep(STUDY, row([0.008, 0.016, 0.013, 0.014]), tmp_path, AtOnce())
+    assert attempts == [(0.013, 0.008), (0.014, 0.013)] or attempts == [(0.014, 0.016), (0.013, 0.014)]
+    assert sorted(result.solved) == [0, 1, 2, 3]
+
+
+def test_an_interruption_keeps_what_has_come_back(monkeypatch, tmp_path):
+    """Ctrl-C while three samples are on their way, one of which has just been solved."""
+    stand_in(monkeypatch, lambda bulge, origin: True)
+
+    def wait_forever(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    class Waiting(Executor):
+        slots = 3
+
+        def __init__(self):
+            self.pending = []
+
+        def submit(self, fn, /, *args, **kwargs):
+            future: Future = Future()
+            if not self.pending:
+                future.set_result(fn(*args, **kwargs))
+            self.pending.append(future)
+            return future
+
+    monkeypatch.setattr(sweep, "wait", wait_forever)
+    with pytest.raises(KeyboardInterrupt):
+        sweep.run_sweep(STUDY, row([0.004, 0.0061, 0.0062]), tmp_path, Waiting())
+    assert len(list(tmp_path.glob("*.npz"))) == 1
+
+
+def test_two_builds_in_one_folder_are_refused(monkeypatch, tmp_path):
+    samples = row([0.008, 0.012])
+    inner: list[str] = []
+
+    def solve_meanwhile(bulge, origin):
+        with pytest.raises(StudyError, match=r"another build is solving in") as caught:
+            sweep.run_sweep(STUDY, samples, tmp_path, AtOnce())
+        inner.append(str(caught.value))
+        return True
+
+    stand_in(monkeypatch, solve_meanwhile)
+    assert len(sweep.run_sweep(STUDY, samples, tmp_path, AtOnce()).solved) == 2
+    assert len(inner) == 2
+
+
+def test_no_more_is_on_its_way_than_the_executor_takes(monkeypatch, tmp_path):
+    """Starts are held in memory only for samples that are submitted."""
+    stand_in(monkeypatch, lambda bulge, origin: True)
+
+    class Counting(Executor):
+        slots, running, most = 4, 0, 0
+
+        def submit(self, fn, /, *args, **kwargs):
+            self.running += 1
+            self.most = max(self.most, self.running)
+            future: Future = Future()
+            future.set_result(fn(*args, **kwargs))
+            return future
+
+    executor = Counting()
+
+    def wait_for_all(running, return_when):
+        executor.running -= len(running)
+        return wait(running)
+
+    monkeypatch.setattr(sweep, "wait", wait_for_all)
+    star = STUDY.root() + np.outer(np.linspace(1.0, 1.01, 40), [0.0, 0.0, 1e-2, 0.0])
+    star[1::2, 2] *= -1.0
+    star[2::4, 3] = 1e-3
+    result = sweep.run_sweep(STUDY, star, tmp_path, executor)
+    assert len(result.solved) == 40
+    assert 1 <= executor.most <= 4
+
+
+def test_progress_counts_what_is_solved_now_for_the_time_left(monkeypatch, tmp_path, capsys):
+    """Samples found on disk are there from the start and say nothing of the rate."""
+    samples = row(np.linspace(0.006, 0.02, 12))
+    stand_in(monkeypatch, lambda bulge, origin: True)
+    sweep.run_sweep(STUDY, samples[:8], tmp_path, AtOnce())
+    seen: list[tuple[int, int]] = []
+    make = sweep.tqdm
+
+    def recorded(*args, **kwargs):
+        seen.append((kwargs["initial"], kwargs["total"]))
+        return make(*args, **kwargs)
+
+    monkeypatch.setattr(sweep, "tqdm", recorded)
+    sweep.run_sweep(STUDY, samples, tmp_path, AtOnce())
+    assert seen == [(8, 12)]
+    assert "12/12" in capsys.readouterr().err

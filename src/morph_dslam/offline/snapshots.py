@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 
 #: Ending of a file that is being written; one left behind is a build's that was killed.
 PARTIAL = ".partial"
+#: Bytes in a zip archive before a member's name, and at most so many between the name and the data.
+ZIP_HEADER, ZIP_EXTRA = 30, 20
 
 
 @cache
@@ -86,10 +88,21 @@ def damage(path: Path) -> str | None:
     """What is wrong with a snapshot's file, found by reading all of it; None if it is sound."""
     try:
         with zipfile.ZipFile(path) as archive:
+            if _hides_members(archive):
+                return "its table of contents is wrong"
             wrong = archive.testzip()
     except (zipfile.BadZipFile, EOFError, OSError, ValueError, NotImplementedError, RuntimeError) as error:
         return str(error)
     return f"the checksum of {wrong} does not match" if wrong else None
+
+
+def _hides_members(archive: zipfile.ZipFile) -> bool:
+    """Whether bytes before the table of contents belong to no member that it lists."""
+    members = sorted(archive.infolist(), key=lambda member: member.header_offset)
+    starts = [0, *(member.header_offset for member in members), archive.start_dir]
+    taken = [0, *(ZIP_HEADER + len(member.filename) + member.compress_size for member in members)]
+    between = np.diff(starts) - taken
+    return bool(np.any(between < 0) or np.any(between > ZIP_EXTRA))
 
 
 def load_snapshot(path: Path) -> Snapshot:

@@ -1,0 +1,91 @@
+"""Sampling schemes against what they promise: nesting, full grids, and messages for what does not fit."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+
+from morph_dslam.errors import StudyError
+from morph_dslam.offline.problem import bounds
+from morph_dslam.offline.sampling import candidate_samples, held_out_samples, training_samples
+from morph_dslam.offline.studies.solid_study import SolidStudy
+from morph_dslam.offline.studies.study import make_study
+
+
+def study(sampling: dict[str, Any], parameters: int = 3) -> SolidStudy:
+    names = ("pull", "push", "lift")[:parameters]
+    ranges = (("0 kPa", "600 kPa"), ("-30 kPa", "30 kPa"), ("10 kPa", "20 kPa"))
+    made = make_study(
+        {
+            "name": "block",
+            "mesh": {"generator": "block", "size": ["2 mm", "2 mm", "6 mm"], "divisions": [1, 1, 1]},
+            "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.3}},
+            "supports": [{"kind": "fixed", "on": "z_min"}],
+            "parameters": {name: {"range": ends} for name, ends in zip(names, ranges, strict=False)},
+            "sampling": sampling,
+        }
+    )
+    assert isinstance(made, SolidStudy)
+    return made
+
+
+@pytest.mark.parametrize("fewer", [8, 11, 64, 100])
+def test_more_sobol_samples_contain_the_fewer(fewer: int) -> None:
+    few = training_samples(study({"scheme": "sobol", "training": fewer, "seed": 3}))
+    many = training_samples(study({"scheme": "sobol", "training": 257, "seed": 3}))
+    assert few.shape == (fewer, 3)
+    np.testing.assert_array_equal(many[:fewer], few)
+    assert len(np.unique(many, axis=0)) == 257
+
+
+def test_more_held_out_samples_contain_the_fewer_and_are_uniform() -> None:
+    few, many = (held_out_samples(study({"held_out": count})) for count in (59, 4096))
+    np.testing.assert_array_equal(many[:59], few)
+    lower, upper = bounds(study({})).T
+    unit = (many - lower) / (upper - lower)
+    # Of a Sobol net every half, quarter and eighth of an axis holds its share, to the sample.
+    for axis in unit.T:
+        np.testing.assert_array_equal(np.histogram(axis, bins=8, range=(0.0, 1.0))[0], 512)
+
+
+def test_adaptive_sampling_starts_with_the_first_and_chooses_among_those_that_follow() -> None:
+    adaptive = study({"scheme": "adaptive", "training": 64, "first": 10})
+    scattered = training_samples(study({"scheme": "sobol", "training": 64}))
+    np.testing.assert_array_equal(training_samples(adaptive), scattered[:10])
+    np.testing.assert_array_equal(candidate_samples(adaptive, 30), scattered[10:40])
+    np.testing.assert_array_equal(candidate_samples(adaptive, 54), scattered[10:])
+
+
+def test_a_grid_has_all_combinations_with_both_ends() -> None:
+    samples = training_samples(study({"scheme": "grid", "points": [4, 3, 2]}))
+    axes = [[0.0, 2e5, 4e5, 6e5], [-3e4, 0.0, 3e4], [1e4, 2e4]]
+    np.testing.assert_allclose(samples, list(itertools.product(*axes)), rtol=1e-12, atol=1e-9)
+    same = training_samples(study({"scheme": "grid", "points": 3}))
+    assert same.shape == (27, 3)
+
+
+def test_even_samples_are_evenly_spaced() -> None:
+    samples = training_samples(study({"scheme": "even", "training": 13}, parameters=1))
+    np.testing.assert_allclose(samples, 5e4 * np.arange(13.0)[:, None])
+
+
+@pytest.mark.parametrize(
+    ("sampling", "message"),
+    [
+        ({"scheme": "even"}, r"for one parameter, and this study has 3"),
+        ({"scheme": "grid", "points": [4, 3]}, r"points has 2 numbers, .* 3 parameters \(pull, push, lift\)"),
+        ({"scheme": "grid", "points": 50}, r"125000 points, more than 100000"),
+        ({"scheme": "grid"}, r"sampling: scheme = \"grid\" needs points"),
+        ({"scheme": "grid", "points": 1}, r"at least 2 points along each"),
+        ({"scheme": "grid", "points": 3, "training": 9}, r"leave out training"),
+        ({"scheme": "sobol", "points": 3}, r"points are those of scheme = \"grid\""),
+        ({"scheme": "sobol", "first": 8}, r"first is for scheme = \"adaptive\""),
+        ({"scheme": "adaptive", "first": 20, "training": 10}, r"first must be at most training"),
+    ],
+)
+def test_schemes_that_do_not_fit_are_refused(sampling: dict[str, Any], message: str) -> None:
+    with pytest.raises(StudyError, match=message):
+        training_samples(study(sampling))
