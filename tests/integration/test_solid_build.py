@@ -93,6 +93,14 @@ def test_held_out_errors_are_small(built):
     assert certificate["stress_solid"]["relative_l2"] < 1e-2
     assert certificate["stress_solid"]["von_mises"]["relative_l2"] < 1e-2
     assert certificate["strain"]["relative_l2"] < 1e-2
+    assert certificate["reaction_moment_z_max"]["relative_l2"] < 1e-2
+
+
+def test_a_report_stands_beside_the_model(built):
+    page = (built / "block.report.html").read_text()
+    assert "could not be made" not in page
+    assert "<td>moment on z_max</td>" in page
+    assert page.count("data:image/") == 6
 
 
 def test_the_model_moves_its_end_as_a_rigid_body(built):
@@ -197,6 +205,14 @@ def test_uniaxial_stretch_reaches_the_closed_form_through_the_whole_chain(tmp_pa
     assert model.strain is not None
     green = [(0.830679**2 - 1) / 2, (0.830679**2 - 1) / 2, (1.5**2 - 1) / 2, 0, 0, 0]
     assert model.strain.value(mu) == pytest.approx(np.tile(green, (len(model.nodes), 1)), abs=1e-4)
+    # The nominal stress on 40 x 40 mm; faces that only slide along their neighbours are free of force.
+    force = 1.075843e6 * 0.04**2
+    assert model.reactions["force_z_max"].value(mu)[0] == pytest.approx([0.0, 0.0, force], abs=1e-4 * force)
+    assert set(model.reactions) == {
+        f"{kind}_{end}" for kind in ("force", "moment") for end in ("z_min", "z_max")
+    }
+    assert model.certificate["reaction_force_z_max"]["largest_N"] > force
+    assert model.certificate["reaction_force_z_max"]["relative_l2"] < 1e-4
 
 
 MISTAKES = {

@@ -13,6 +13,7 @@ from morph_dslam.evaluation.field_names import field_title
 from morph_dslam.evaluation.report import Table
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.model.functions import ParameterFunctions
+from morph_dslam.model.stacked_functions import StackedFunctions
 from morph_dslam.model.tensor_functions import CPFunctions, TensorTrainFunctions, TuckerFunctions
 
 #: Endings of certificate keys and the unit they stand for.
@@ -24,6 +25,7 @@ _FORMATS = {
     CPFunctions: "CP",
     TuckerFunctions: "Tucker",
     TensorTrainFunctions: "tensor train",
+    StackedFunctions: "by component",
 }
 #: Long lists of the reduction, which the build's report draws.
 _DRAWN = ("singular_values", "cross_validation")
@@ -141,7 +143,7 @@ def _fields(model: ReducedModel) -> Table:
         [
             field_title(name),
             str(field.n_modes),
-            _FORMATS.get(type(field.functions), "other"),
+            _FORMATS[type(field.functions)],
             str(field.n_floats),
         ]
         for name, field in model.fields.items()

@@ -116,7 +116,7 @@ def _key_figures(model: ReducedModel) -> KeyFigures:
     return KeyFigures(
         figures
         | {
-            "modes of the displacement": str(model.displacement.n_modes),
+            "displacement modes": str(model.displacement.n_modes),
             "compression": f"{certificate['compression_percent']:.2f} %",
             "held-out solves": str(errors["n_held_out"]),
         }

@@ -83,4 +83,3 @@ def _name_axis(axes: Axes, which: str, parameter: Parameter) -> None:
     margin = 0.03 * np.array([-1.0, 1.0]) * np.ptp(ends)
     label = f"{parameter.name} [{parameter.unit}]".removesuffix(" [1]")
     axes.set(**{f"{which}label": label, f"{which}lim": tuple(ends + margin)})
-    axes.locator_params(axis="both" if axes.get_yscale() == "linear" else "x", nbins=5)

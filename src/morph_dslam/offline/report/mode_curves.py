@@ -74,7 +74,6 @@ def plot_parameter_functions(model: ReducedModel) -> Picture:
             label = f"mode {mode + 1}, {lengths[mode]:.2g} mm"
             panel.plot(values, relative, color=CYCLE[mode], linewidth=1.4, label=label)
         panel.set_xlabel(f"{parameter.name} [{parameter.unit}]".removesuffix(" [1]"))
-        panel.locator_params(axis="x", nbins=5)
     axes[0].set_ylabel("function / largest")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(

@@ -8,6 +8,7 @@ from typing import Any
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from morph_dslam.evaluation.report import Picture
 
@@ -39,6 +40,8 @@ def panels(n_panels: int, height: float, **options) -> tuple[Figure, list[Axes]]
         axes = figure.subplots(rows, columns, squeeze=False, **options).ravel().tolist()
     for unused in axes[n_panels:]:
         unused.remove()
+    for used in axes[:n_panels]:
+        used.xaxis.set_major_locator(MaxNLocator(12 // columns + 1, steps=[1, 2, 2.5, 5, 10]))
     return figure, axes[:n_panels]
 
 
