@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 from morph_dslam.offline.mechanics.solid import SolidProblem
 from morph_dslam.offline.problem import Snapshot
 from morph_dslam.offline.reactions import with_reactions
-from morph_dslam.offline.reduction.pod import compute_pod
+from morph_dslam.offline.reduction.pod import compute_pod, weighted
 from morph_dslam.offline.reduction.reduced_solver import ReducedSolver
 from morph_dslam.offline.studies.solid_sweep import snapshot_fields, support_reactions
 
 Array = NDArray[np.float64]
 
+#: Error allowed in all fields but the displacement, as a multiple of the tolerance.
+OTHER_FIELDS = 10.0
 #: Modes of a field are kept until so little is left out, as a part of the tolerance, and at most so many.
 MODE_TOLERANCE, MOST_MODES = 0.1, 80
 
@@ -49,9 +51,14 @@ class FieldModes:
     Parameters
     ----------
     values : (n, n_points, n_components) vectors that the modes span. weights : (n_points,).
+    n_values : how many of them, the first ones, are values of the field and no sensitivities.
+
+    Attributes
+    ----------
+    largest : norm of the largest value.
     """
 
-    def __init__(self, values: Array, weights: Array, tolerance: float) -> None:
+    def __init__(self, values: Array, weights: Array, tolerance: float, n_values: int) -> None:
         shape = values.shape[1:]
         pod = compute_pod(
             values.reshape(len(values), -1),
@@ -61,13 +68,16 @@ class FieldModes:
         )
         self._pod = pod
         self.modes = pod.modes.reshape(-1, *shape)
+        self.largest = float(
+            np.linalg.norm(pod.project(values.reshape(len(values), -1)[:n_values]), axis=1).max()
+        )
         self._square, self._missed = 0.0, 0.0
 
     def coefficients(self, values: Array) -> Array:
         """Coefficients (k,) of a field (n_points, n_components); what is left out is added to the tally."""
         flat = values.ravel()
         found = self._pod.project(flat)
-        square = float(flat @ (self._pod.weights * flat))
+        square = float(flat @ weighted(flat, self._pod.weights))
         self._square += square
         self._missed += max(square - float(found @ found), 0.0)
         return found
@@ -90,7 +100,8 @@ def field_modes(
             for slope, length in zip(snapshot.sensitivities[name], spread, strict=True)
         ]
     points = values[0].shape[0]
-    return FieldModes(np.array(values), weights if len(weights) == points else np.ones(points), tolerance)
+    weights = weights if len(weights) == points else np.ones(points)
+    return FieldModes(np.array(values), weights, tolerance, len(snapshots))
 
 
 class SampledFields:
@@ -98,25 +109,36 @@ class SampledFields:
 
     Parameters
     ----------
-    modes : of each field by name; the displacement is the first. names of reactions begin with "reaction_".
+    modes : of each field by name; names of reactions begin with "reaction_".
+    tolerance : error allowed in the displacement, relative to its largest value.
+
+    Attributes
+    ----------
+    parts : where the coefficients of each field are.
     """
 
-    def __init__(self, solver: ReducedSolver, problem: SolidProblem, modes: dict[str, FieldModes]) -> None:
+    def __init__(
+        self, solver: ReducedSolver, problem: SolidProblem, modes: dict[str, FieldModes], tolerance: float
+    ) -> None:
         self._solver, self._problem, self.modes = solver, problem, modes
         self._reactions = [name.removeprefix("reaction_") for name in modes if name.startswith("reaction_")]
+        self._allowed = tolerance * np.concatenate(
+            [
+                np.full(len(m.modes), m.largest * (1.0 if name == "displacement" else OTHER_FIELDS))
+                for name, m in modes.items()
+            ]
+        )
         ends = np.cumsum([0, *(len(field.modes) for field in modes.values())])
         self.parts = {name: slice(a, b) for name, a, b in zip(modes, ends[:-1], ends[1:], strict=True)}
 
     def __call__(self, mu: Array) -> Array:
         """Coefficients of all fields (n,) at ``mu`` (d,)."""
-        snapshot = solid_snapshot(self._problem, self._dofs(mu), mu, self._reactions)
+        dofs = self._solver.lift(self._solver.solve(mu), mu)
+        snapshot = solid_snapshot(self._problem, dofs, mu, self._reactions)
         return np.concatenate(
             [field.coefficients(snapshot.fields[name]) for name, field in self.modes.items()]
         )
 
-    def displacement(self, mu: Array) -> Array:
-        """Coefficients of the displacement alone: much cheaper."""
-        return self.modes["displacement"].coefficients(solid_displacement(self._problem, self._dofs(mu), mu))
-
-    def _dofs(self, mu: Array) -> Array:
-        return self._solver.lift(self._solver.solve(mu), mu)
+    def in_allowed_units(self, mu: Array) -> Array:
+        """The same in units of the error allowed in each field."""
+        return self(mu) / self._allowed
