@@ -5,7 +5,7 @@ under a dead load P in [0, 8] at s in [0.4, 1], its outer half kappa in [0.3, 3]
 The grid formats see 25 x 21 x 17 solves, sparse PGD 500 scattered ones; errors are relative, in L2, over 300
 samples of the inner 95 % of the box, for the field and for its three sensitivities by the scaled parameters.
 The last column is the time of the value and all sensitivities at 500 points with three components, on one
-thread. Run: python benchmarks/reduction_formats.py
+thread; the last line gives it for 30 modes in each format. Run: python benchmarks/reduction_formats.py
 """
 
 from __future__ import annotations
@@ -26,7 +26,12 @@ from morph_dslam.model.basis_functions import (
     p_spline_basis,
 )
 from morph_dslam.model.separated import SeparatedField
-from morph_dslam.model.tensor_functions import TensorFunctions, TuckerFunctions
+from morph_dslam.model.tensor_functions import (
+    CPFunctions,
+    TensorFunctions,
+    TensorTrainFunctions,
+    TuckerFunctions,
+)
 from morph_dslam.offline.reduction.pod import Pod, compute_pod
 from morph_dslam.offline.reduction.sparse_pgd import SparsePgdOptions, fit_sparse_pgd
 from morph_dslam.offline.reduction.tensor_formats import (
@@ -180,10 +185,26 @@ def scattered_formats(report: Report) -> None:
         report.line(f"sparse PGD {fit.n_products}, {name}", fit.pod, fit.functions, len(mu))
 
 
+def time_thirty_modes() -> str:
+    """One line: times of 30 modes in each format, of sizes that errors of about 1e-4 ask for."""
+    rng = np.random.default_rng(0)
+    bases = tuple(cubic_spline_basis(np.linspace(-1.0, 1.0, n)) for n in GRID)
+    factors = {rank: tuple(rng.normal(size=(n, rank)) for n in GRID) for rank in (8, 30)}
+    ranks = (30, 16, 8, 1)
+    cores = tuple(rng.normal(size=(a, n, b)) for a, n, b in zip(ranks, GRID, ranks[1:], strict=False))
+    functions: dict[str, TensorFunctions] = {
+        "cp": CPFunctions(bases, factors[30], np.eye(30)),
+        "tucker": TuckerFunctions(bases, factors[8], rng.normal(size=(30, 8, 8, 8))),
+        "tensor_train": TensorTrainFunctions(bases, cores),
+    }
+    return "modes=30 " + " ".join(f"{name}_us={microseconds(f):.0f}" for name, f in functions.items())
+
+
 def main() -> None:
     report = Report()
     grid_formats(report)
     scattered_formats(report)
+    print(time_thirty_modes())
 
 
 if __name__ == "__main__":
