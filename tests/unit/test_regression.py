@@ -57,6 +57,30 @@ def test_smooth_functions_converge_with_the_degree() -> None:
         )
 
 
+def test_a_parameter_that_needs_it_gets_a_higher_degree_than_the_others() -> None:
+    """1 / (1 + 9 s^2) is smooth but hard for polynomials; the other parameters enter with degree 1."""
+
+    def narrow(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        s = (2.0 * x[:, 0] - LOWER[0] - UPPER[0]) / (UPPER[0] - LOWER[0])
+        peak = 1.0 / (1.0 + 9.0 * s**2)
+        slope = -18.0 * s * peak**2 * 2.0 / (UPPER[0] - LOWER[0])
+        values = peak * x[:, 1] + 0.1 * x[:, 2]
+        return values[:, None], np.stack([slope * x[:, 1], peak, np.full(len(x), 0.1)], axis=1)[..., None]
+
+    x, new = samples(200, 8), samples(50, 9)
+    fits = [fit_functions(x, *narrow(x), LOWER, UPPER, 8, np.arange(200), raise_single=r)[0] for r in (0, 1)]
+    assert fits[0].multi_indices.max(axis=0).max() <= 8
+    degrees = fits[1].multi_indices.max(axis=0)
+    assert degrees[0] >= 12
+    assert degrees[1:].max() <= 8
+    _, expected = narrow(new)
+    missed = [
+        np.linalg.norm([fit.evaluate(mu)[1] - slope for mu, slope in zip(new, expected, strict=True)])
+        for fit in fits
+    ]
+    assert missed[1] < 0.3 * missed[0]
+
+
 def test_too_high_a_degree_is_not_chosen_for_noisy_values() -> None:
     """Cross-validation must notice that noise is not worth fitting."""
     rng = np.random.default_rng(4)

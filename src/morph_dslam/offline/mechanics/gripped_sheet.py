@@ -1,7 +1,7 @@
 """Equilibrium of a sheet held by two rigid grips, at given coordinates, with all sensitivities.
 
-Unknowns are the shell's dofs and the three free motions of the grips (approach and the two turns in the
-plane). The equations are equilibrium of the sheet, the prescribed bulge, and zero moment against the turns.
+Unknowns are the shell's dofs and the two free motions of the grips (approach, and their turn in the
+plane). The equations are equilibrium of the sheet, the prescribed bulge, and zero moment against the turn.
 Prescribing the bulge instead of the approach follows the path through the flat state and past any largest
 approach (as in arc-length methods), and puts no lateral force on the sheet: the bulge equation replaces that
 of the axial force, it does not add a load.
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError
-from morph_dslam.offline.mechanics.grips import FREE_MOTIONS, Grips
+from morph_dslam.offline.mechanics.grips import FREE_MOTIONS, MOTION, Grips
 from morph_dslam.offline.mechanics.shell import KoiterSheet, OrthotropicSheet, rectangle_mesh
 
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ DIVERGED = 2.0
 
 @dataclass(frozen=True)
 class EquilibriumState:
-    """A converged state: coordinates (4,), grip motion (6,) and the shell's dofs."""
+    """A converged state: coordinates (4,), grip motion (5,) and the shell's dofs."""
 
     coordinates: Array
     motion: Array
@@ -135,7 +135,7 @@ class GrippedSheet:
     def _respond(self, motion: Array, target: Array) -> _Response:
         """Assemble and factorise at the current state; solve for the residual and for each grip motion.
 
-        The border holds three equations over the free motions: the bulge, and zero moments of the turns.
+        The border holds an equation for each free motion: the bulge, and zero moment of the turn.
         """
         shell = self.shell
         form, state = shell.form, shell.state.vec
@@ -149,7 +149,7 @@ class GrippedSheet:
         velocity = self._held_velocity(motion)
         gap = self._held_values(motion) - shell.state_vector()[self._held_dofs]
         fields, reactions = [], []
-        for column in range(7):
+        for column in range(1 + len(MOTION)):
             work[:] = 0.0
             work.FV().NumPy()[self._held_dofs] = gap if column == 0 else velocity[:, column - 1]
             load = state.CreateVector()
@@ -171,24 +171,20 @@ class GrippedSheet:
     def _border(
         self, motion: Array, target: Array, fields: list[Array], reactions: list[Array], velocity: Array
     ) -> tuple[Array, Array]:
-        """Rows of the border equations: derivative (3, 6) by the motions, and residual (3,)."""
+        """Rows of the border equations: derivative (2, 5) by the motions, and residual (2,)."""
         row = self._bulge_row
-        border, residual = np.zeros((3, 6)), np.zeros(3)
+        border, residual = np.zeros((2, 5)), np.zeros(2)
         residual[0] = row @ (self.shell.state_vector() + fields[0]) - target[0]
         border[0] = [row @ field for field in fields[1:]]
-        step = 1e-5
-        for equation, turn in enumerate(FREE_MOTIONS[1:], start=1):
-            residual[equation] = velocity[:, turn] @ reactions[0]
-            border[equation] = [velocity[:, turn] @ reaction for reaction in reactions[1:]]
-            for other in range(6):
-                change = np.zeros(6)
-                change[other] = step
-                # The direction in which the turn moves the grip changes with the other motions.
-                bent = (
-                    self._held_velocity(motion + change)[:, turn]
-                    - self._held_velocity(motion - change)[:, turn]
-                )
-                border[equation, other] += bent @ reactions[0] / (2.0 * step)
+        turn, step = FREE_MOTIONS[1], 1e-5
+        residual[1] = velocity[:, turn] @ reactions[0]
+        border[1] = [velocity[:, turn] @ reaction for reaction in reactions[1:]]
+        for other in range(5):
+            change = np.zeros(5)
+            change[other] = step
+            # The direction in which the turn moves the grip changes with the other motions.
+            forward, backward = self._held_velocity(motion + change), self._held_velocity(motion - change)
+            border[1, other] += (forward - backward)[:, turn] @ reactions[0] / (2.0 * step)
         return border, residual
 
     # -- solution -------------------------------------------------------------------------------------
@@ -228,7 +224,7 @@ class GrippedSheet:
         raise SolverError(f"no equilibrium found at {_describe(coordinates)}")
 
     def sensitivities(self, state: EquilibriumState) -> tuple[Array, Array]:
-        """Derivatives of the dofs (4, n_dofs) and of the grip motion (4, 6) by the coordinates.
+        """Derivatives of the dofs (4, n_dofs) and of the grip motion (4, 5) by the coordinates.
 
         Implicit differentiation of the equilibrium equations: one factorisation, one solve each.
         """
@@ -264,7 +260,7 @@ class GrippedSheet:
         dofs /= float(self._bulge_row @ dofs)
         for reduction in (1.0, 0.5, 0.25, 0.125):
             coordinates = np.array([reduction * bulge, 1.0, 0.0, 0.0])
-            start = EquilibriumState(coordinates, np.zeros(6), coordinates[0] * dofs)
+            start = EquilibriumState(coordinates, np.zeros(5), coordinates[0] * dofs)
             try:
                 return self.solve(coordinates, start)
             except SolverError:

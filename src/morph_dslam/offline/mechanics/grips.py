@@ -1,13 +1,13 @@
 """Rigid grips on the short edges of a sheet: how they move, and the coordinates that a model uses for it.
 
 The object frame has its origin at the sheet's centre, x along the length, y up, z out of the face.
-Each grip holds a rectangle rigidly. Its motion is described by six numbers, turning about
+Each grip holds a rectangle rigidly. Their motion is described by five numbers, each grip turning about
 the middle of its inner edge:
 
     bend_left, bend_right   rotation about the vertical axis, rad; both positive: the sheet arches to +z
     twist                   relative rotation about the x axis, rad, half to each grip
     approach                how much closer the grips are, m
-    turn_left, turn_right   rotation in the sheet's plane, rad
+    turn    rotation of both in the sheet's plane, rad
 
 The four coordinates of the reduced model are
 
@@ -15,15 +15,17 @@ The four coordinates of the reduced model are
     bend    symmetric bend, as a multiple of that of a circular arc with this bulge, 1
     skew    antisymmetric bend, (bend_left - bend_right) / 2, rad
     slant   twist, as a multiple of twice the bend of that arc: in a gently bent sheet the tangent of the
-            angle by which the rulings lean, 1; levelled off at both ends (`LEVELLING`, `FLAT_TWIST`)
+            angle by which the rulings lean, 1; levelled off (`LEVELLING`)
 
 Why not the angles and the approach themselves: for given angles two shapes, bulging to either side, share the
 same approach, none exists below a smallest approach, and the two meet only in the flat state. A thin sheet
 stays developable, so it cannot twist without bending either. Over (bulge, bend, skew, slant) the family of
 shapes is one smooth graph that holds both sides. bend = 1 is bent by pure moments, about 0.78 is held like a
 hinge, 0 is clamped straight (Euler's column), above 1 pulled. In the flat state, bulge = 0, bend makes hardly
-any difference: there the images cannot tell it.
-The approach follows from the bulge; the turns in the plane are free: no moment acts there.
+any difference, nor does slant: there the images cannot tell them.
+The approach follows from the bulge, and no moment acts on the turn that both grips share in the plane. They
+do not turn against each other: a sheet that may fan out changes between cones with their tips above and below
+at the slightest cause, and no smooth function of few terms follows it there.
 """
 
 from __future__ import annotations
@@ -41,14 +43,11 @@ ARC_SLOPE = 4.0 / (4.0 * (0.25 - (1.0 / 12.0 - 1.0 / (2.0 * np.pi**2))))
 #: The twist grows in proportion to the bulge up to about this part of the free length, then levels off: what
 #: a slightly bent sheet can follow would tear a strongly bent one apart.
 LEVELLING = 0.1
-#: Below this part of the free length the bulge no longer limits the twist: a nearly flat sheet follows a
-#: small twist by stretching a little.
-FLAT_TWIST = 0.006
 
-MOTION = ("bend_left", "bend_right", "twist", "approach", "turn_left", "turn_right")
+MOTION = ("bend_left", "bend_right", "twist", "approach", "turn")
 COORDINATES = ("bulge", "bend", "skew", "slant")
-#: Motions that are unknowns of the equilibrium problem: found from the bulge and from zero moments.
-FREE_MOTIONS = (3, 4, 5)
+#: Motions that are unknowns of the equilibrium problem: found from the bulge and from zero moment.
+FREE_MOTIONS = (3, 4)
 
 
 @dataclass(frozen=True)
@@ -85,25 +84,24 @@ class Grips:
         return np.where(inside, np.cos(np.pi * x / self.free_length) ** 2, 0.0)
 
     def prescribed_motion(self, coordinates: Array) -> Array:
-        """Motion (6,) that the coordinates (4,) prescribe; the free motions are left zero."""
+        """Motion (5,) that the coordinates (4,) prescribe; the free motions are left zero."""
         bulge, bend, skew, slant = coordinates
         arc = ARC_SLOPE * bulge / self.free_length
         twist = 2.0 * slant * ARC_SLOPE * self._twist_scale(bulge)[0]
-        return np.array([bend * arc + skew, bend * arc - skew, twist, 0.0, 0.0, 0.0])
+        return np.array([bend * arc + skew, bend * arc - skew, twist, 0.0, 0.0])
 
     def _twist_scale(self, bulge: float) -> tuple[float, float]:
-        """About |bulge| over the free length, smooth at 0 and levelled off; and its derivative."""
+        """Bulge over the free length, levelled off; and its derivative."""
         x = bulge / self.free_length
-        square = (x**2 + FLAT_TWIST**2) / (1.0 + (x / LEVELLING) ** 2)
-        slope = x * (1.0 - (FLAT_TWIST / LEVELLING) ** 2) / (1.0 + (x / LEVELLING) ** 2) ** 2
-        return float(np.sqrt(square)), float(slope / np.sqrt(square) / self.free_length)
+        square = 1.0 + (x / LEVELLING) ** 2
+        return x / square**0.5, 1.0 / square**1.5 / self.free_length
 
     def prescribed_motion_gradient(self, coordinates: Array) -> Array:
-        """Derivative (6, 4) of `prescribed_motion`."""
+        """Derivative (5, 4) of `prescribed_motion`."""
         bulge, bend, _, slant = coordinates
         scale = ARC_SLOPE / self.free_length
         twist, twist_slope = self._twist_scale(bulge)
-        gradient = np.zeros((6, 4))
+        gradient = np.zeros((5, 4))
         gradient[:3, 0] = bend * scale, bend * scale, 2.0 * slant * ARC_SLOPE * twist_slope
         gradient[:2, 1] = bulge * scale
         gradient[:2, 2] = 1.0, -1.0
@@ -112,11 +110,11 @@ class Grips:
 
     def positions(self, motion: Array, left: Array, right: Array) -> Array:
         """Positions (n_left + n_right, 3) of material points (n, 3) held by the grips."""
-        bend_left, bend_right, twist, approach, turn_left, turn_right = motion
+        bend_left, bend_right, twist, approach, turn = motion
         pivot_left, pivot_right = self.pivots
         shift = np.array([approach / 2.0, 0.0, 0.0])
-        rotation_left = _about_x(-twist / 2.0) @ _about_z(turn_left) @ _about_y(-bend_left)
-        rotation_right = _about_x(twist / 2.0) @ _about_z(turn_right) @ _about_y(bend_right)
+        rotation_left = _about_x(-twist / 2.0) @ _about_z(turn) @ _about_y(-bend_left)
+        rotation_right = _about_x(twist / 2.0) @ _about_z(turn) @ _about_y(bend_right)
         return np.vstack(
             [
                 (left - pivot_left) @ rotation_left.T + pivot_left + shift,
@@ -125,14 +123,14 @@ class Grips:
         )
 
     def velocity(self, motion: Array, left: Array, right: Array) -> Array:
-        """Derivative (n_left + n_right, 3, 6) of `positions` by central differences.
+        """Derivative (n_left + n_right, 3, 5) of `positions` by central differences.
 
         The rotations are entire functions with derivatives below one: a step of 1e-5 is exact to 1e-11.
         """
         step = 1e-5
         columns = []
-        for index in range(6):
-            change = np.zeros(6)
+        for index in range(5):
+            change = np.zeros(5)
             change[index] = step
             forward = self.positions(motion + change, left, right)
             backward = self.positions(motion - change, left, right)

@@ -8,11 +8,16 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
 from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
+from morph_dslam.offline.reduction.scattered_functions import weighted_degree_indices
 
 Array = NDArray[np.float64]
 
 #: Tikhonov weight relative to the largest singular value; it only settles directions the data leave open.
 RIDGE = 1e-8
+#: Parts that the samples are split into for cross-validation.
+FOLDS = 5
+#: A parameter gets a higher degree than the others if the error falls below this part of what it was.
+WORTH_RAISING = 0.9
 
 
 def design_matrix(samples: Array, lower: Array, upper: Array, indices: NDArray[np.int64]) -> Array:
@@ -45,6 +50,37 @@ def _solve(design: Array, targets: Array, gradient_weight: float) -> Array:
     return np.asarray(np.linalg.solve(gram, matrix.T @ right), dtype=np.float64)
 
 
+class _Fit:
+    """Samples (n, d) in a box, with targets (1 or 1 + d, n, n_functions) by the scaled parameters."""
+
+    def __init__(
+        self, samples: Array, targets: Array, box: Array, folds: NDArray[np.int64], gradient_weight: float
+    ) -> None:
+        self._samples, self._targets, self._box = samples, targets, box
+        self._folds, self._gradient_weight = folds, gradient_weight
+
+    def suits(self, indices: NDArray[np.int64]) -> bool:
+        """Whether there are enough samples for so many terms when a fold is left out."""
+        equations = len(self._targets) * np.mean(self._folds != 0) * len(self._samples)
+        return len(indices) <= 0.8 * equations
+
+    def missed(self, indices: NDArray[np.int64]) -> float:
+        """Relative root-mean-square error of the values of samples that were left out."""
+        design, missed = self._design(indices), 0.0
+        for fold in range(FOLDS):
+            left = self._folds == fold
+            coefficients = _solve(design[:, ~left], self._targets[:, ~left], self._gradient_weight)
+            missed += float(np.sum((design[0, left] @ coefficients - self._targets[0, left]) ** 2))
+        return float(np.sqrt(missed / np.sum(self._targets[0] ** 2)))
+
+    def functions(self, indices: NDArray[np.int64]) -> ParameterFunctions:
+        coefficients = _solve(self._design(indices), self._targets, self._gradient_weight)
+        return ParameterFunctions(self._box[0], self._box[1], indices, coefficients)
+
+    def _design(self, indices: NDArray[np.int64]) -> Array:
+        return design_matrix(self._samples, self._box[0], self._box[1], indices)[: len(self._targets)]
+
+
 def fit_functions(
     samples: Array,
     values: Array,
@@ -54,6 +90,7 @@ def fit_functions(
     max_degree: int,
     groups: NDArray[np.int64],
     gradient_weight: float = 0.3,
+    raise_single: bool = False,
 ) -> tuple[ParameterFunctions, dict[int, float]]:
     """Polynomials of the total degree that predicts left-out samples best.
 
@@ -63,10 +100,12 @@ def fit_functions(
         where they are unknown.
     groups : (n,) label of the fold that each sample is left out with; mirror images share one.
     gradient_weight : weight of gradients (over the half range) relative to values.
+    raise_single : whether parameters may have higher degrees than the others where that predicts clearly
+        better, up to twice ``max_degree``.
 
     Returns
     -------
-    The functions and, by degree, the relative root-mean-square error of cross-validation.
+    The functions and, by total degree, the relative root-mean-square error of cross-validation.
 
     Raises
     ------
@@ -78,23 +117,30 @@ def fit_functions(
     if gradients is not None:
         targets = np.concatenate([targets, np.moveaxis(gradients * half[None, :, None], 1, 0)])
     d = samples.shape[1]
+    fit = _Fit(samples, targets, np.array([lower, upper]), groups % FOLDS, gradient_weight)
     errors: dict[int, float] = {}
-    folds = groups % 5
     for degree in range(2, max_degree + 1):
         indices = total_degree_indices(d, degree)
-        if len(indices) > 0.8 * len(targets) * np.mean(folds != 0) * len(samples):
+        if not fit.suits(indices):
             break
-        design = design_matrix(samples, lower, upper, indices)[: len(targets)]
-        missed = 0.0
-        for fold in range(5):
-            left = folds == fold
-            coefficients = _solve(design[:, ~left], targets[:, ~left], gradient_weight)
-            missed += float(np.sum((design[0, left] @ coefficients - values[left]) ** 2))
-        errors[degree] = float(np.sqrt(missed / np.sum(values**2)))
+        errors[degree] = fit.missed(indices)
     if not errors:
         raise StudyError(f"{len(samples)} training samples are too few for {d} parameters: solve more")
     best = min(errors, key=lambda degree: errors[degree])
     indices = total_degree_indices(d, best)
-    design = design_matrix(samples, lower, upper, indices)[: len(targets)]
-    coefficients = _solve(design, targets, gradient_weight)
-    return ParameterFunctions(lower, upper, indices, coefficients), errors
+    if raise_single and d > 1:
+        indices = _raised(fit, [best] * d, errors[best], 2 * max_degree)
+    return fit.functions(indices), errors
+
+
+def _raised(fit: _Fit, degrees: list[int], error: float, highest: int) -> NDArray[np.int64]:
+    """Multi-indices with the degrees of single parameters raised by half while that predicts better."""
+    best = weighted_degree_indices(degrees)
+    for k in range(len(degrees)):
+        while 3 * degrees[k] // 2 <= highest:
+            tried = [*degrees[:k], 3 * degrees[k] // 2, *degrees[k + 1 :]]
+            indices = weighted_degree_indices(tried)
+            if not fit.suits(indices) or (missed := fit.missed(indices)) > WORTH_RAISING * error:
+                break
+            best, degrees, error = indices, tried, missed
+    return best

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 FACES = ("top", "bottom")
 #: Signs that the coordinates take when the sheet is mirrored in its own plane, in x = 0 and in y = 0.
-MIRROR_Z = np.array([-1.0, 1.0, -1.0, -1.0])
+MIRROR_Z = np.array([-1.0, 1.0, -1.0, 1.0])
 MIRROR_X = np.array([1.0, 1.0, -1.0, -1.0])
 MIRROR_Y = np.array([1.0, 1.0, 1.0, -1.0])
 
@@ -77,7 +77,7 @@ def mirrored(snapshot: Snapshot) -> Snapshot:
         snapshot.coordinates * MIRROR_Z,
         image(snapshot.fields, 1.0),
         image(snapshot.sensitivities, flip),
-        {"motion": snapshot.outputs["motion"] * np.array([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])},
+        {"motion": snapshot.outputs["motion"] * np.array([-1.0, -1.0, -1.0, 1.0, 1.0])},
     )
 
 
@@ -100,12 +100,12 @@ def reversed_ends(snapshot: Snapshot, columns: int) -> Snapshot:
             for name, field in fields.items()
         }
 
-    left, right, twist, approach, turn_left, turn_right = snapshot.outputs["motion"]
+    left, right, twist, approach, turn = snapshot.outputs["motion"]
     return Snapshot(
         snapshot.coordinates * MIRROR_X,
         image(snapshot.fields, 1.0),
         image(snapshot.sensitivities, flip),
-        {"motion": np.array([right, left, -twist, approach, -turn_right, -turn_left])},
+        {"motion": np.array([right, left, -twist, approach, -turn])},
     )
 
 
@@ -132,5 +132,5 @@ def upside_down(snapshot: Snapshot, columns: int) -> Snapshot:
         snapshot.coordinates * MIRROR_Y,
         image(snapshot.fields, 1.0),
         image(snapshot.sensitivities, flip),
-        {"motion": snapshot.outputs["motion"] * np.array([1.0, 1.0, -1.0, 1.0, -1.0, -1.0])},
+        {"motion": snapshot.outputs["motion"] * np.array([1.0, 1.0, -1.0, 1.0, -1.0])},
     )
