@@ -128,12 +128,13 @@ def _fitted(
     folds = np.concatenate([np.full(len(group), index) for index, group in enumerate(task.groups)])
     coefficients = pod.project(values.reshape(len(values), -1))
     functions, errors = fit_functions(
-        samples, coefficients, slopes, box[:, 0], box[:, 1], options.max_degree, folds
+        samples, coefficients, slopes, box[:, 0], box[:, 1], options.max_degree, folds, raise_single=True
     )
     summary = {
         "format": options.format or "polynomial",
         "basis": "chebyshev",
         "degree": int(functions.multi_indices.sum(axis=1).max()),
+        "degrees": functions.multi_indices.max(axis=0).tolist(),
         "terms": len(functions.multi_indices),
         "cross_validation": {str(degree): error for degree, error in errors.items()},
     }
