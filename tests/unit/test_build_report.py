@@ -13,8 +13,6 @@ import pytest
 
 from morph_dslam.errors import StudyError
 from morph_dslam.evaluation.report import Picture
-from morph_dslam.offline.certificate import certify, compression_percent
-from morph_dslam.offline.problem import Snapshot
 from morph_dslam.offline.report import build_report
 from morph_dslam.offline.report.build_report import report_path, write_build_report
 from morph_dslam.offline.report.chosen_states import half_way_out, states_to_show
@@ -22,31 +20,13 @@ from morph_dslam.offline.report.mode_curves import plot_convergence
 from morph_dslam.offline.report.reference_curve import ReferenceCurve, read_reference_curve
 from morph_dslam.render.colour_maps import colour_table
 from morph_dslam.render.model_view import draw_shapes
-from tests.support.stretched_block import PARAMETERS, stretched_block_model
-
-FAILED = {"coordinates": [0.1, -0.004], "reason": "no equilibrium <found>"}
+from tests.support.certified_block import certified_block_model
+from tests.support.stretched_block import PARAMETERS
 
 
 @pytest.fixture(scope="module")
 def model():
-    """The stretched block, certified against solves that are 1 % larger than it says."""
-    model, rng = stretched_block_model(), np.random.default_rng(0)
-    solves = []
-    for _ in range(6):
-        mu = model.lower + (model.upper - model.lower) * rng.random(2)
-        slopes = 1.01 * model.displacement.value_and_sensitivities(mu)[1]
-        fields = {name: 1.01 * field.value(mu) for name, field in model.fields.items()}
-        solves.append(Snapshot(mu, fields, {"displacement": slopes}))
-    certificate = {
-        "reduction": {"modes": 2, "singular_values": [3.0, 1.0, 1e-9]},
-        **certify(model, solves),
-        "compression_percent": compression_percent(model, 20),
-        "samples": {"training": 14, "held_out": 6, "failed": [FAILED]},
-        "stability": {"statement": "all 20 solutions are stable", "stable": 20, "unstable": 0, "unknown": 0}
-        | {"unstable_samples": [], "passed": []},
-    }
-    provenance = {"study": "name = 'block' # <0.45>", "mesh_sha256": "ab", "versions": {"numpy": "2"}}
-    return replace(model, certificate=certificate, provenance=provenance)
+    return certified_block_model()
 
 
 @pytest.fixture(scope="module")
