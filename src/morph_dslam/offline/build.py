@@ -18,6 +18,7 @@ from morph_dslam.offline.choices import ADAPTIVE, with_choices
 from morph_dslam.offline.executors import default_executor
 from morph_dslam.offline.external import ExternalStudy
 from morph_dslam.offline.problem import ParametricStudy
+from morph_dslam.offline.progress import announce
 from morph_dslam.offline.provenance import provenance
 from morph_dslam.offline.reduction.method import METHODS, ReductionTask
 from morph_dslam.offline.reduction.reduced_solver import FullSolutions, ReducedSolver, solid_equations
@@ -97,7 +98,10 @@ def certified_model(known: Solutions, options: ReductionSection, name: str) -> R
     if len(unseen) < 4:
         raise StudyError(f"only {len(unseen)} held-out samples converged: too few to certify the model")
     task = ReductionTask(known.mesh, known.parameters, seen, options, name, known.problem, known.seen_files)
-    model = METHODS[options.method or "pod"](task)
+    method = options.method or "pod"
+    announce(f"reducing {len(seen)} solutions by method {method}" if seen else f"method {method}")
+    model = METHODS[method](task)
+    announce(f"measuring errors at {len(unseen)} held-out solutions")
     certificate = certify(model, unseen)
     certificate["compression_percent"] = compression_percent(model, len(seen) + len(unseen))
     certificate["samples"] = {"training": len(seen), "held_out": len(unseen), "failed": known.failed}

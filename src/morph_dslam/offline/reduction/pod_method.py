@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from morph_dslam.errors import StudyError
 from morph_dslam.model import ReducedModel, SeparatedField
@@ -50,7 +51,7 @@ def reduce_by_pod(task: ReductionTask) -> ReducedModel:
         grid is not None and task.options.basis in (None, *GRID_BASES) and task.options.format != "polynomial"
     )
     fields, summaries = {}, {}
-    for name in field_names(snapshots):
+    for name in tqdm(field_names(snapshots), desc="modes and functions", unit="field"):
         values = field_values(snapshots, name)
         pod = _field_pod(task, values)
         if use_grid:
