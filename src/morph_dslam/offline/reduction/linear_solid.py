@@ -9,6 +9,7 @@ parameters, are taken from the finite elements as they are, and separated (`sepa
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,9 @@ from morph_dslam.offline.materials.isotropic import LinearElastic
 from morph_dslam.offline.mechanics.loads import FollowerPressure
 from morph_dslam.offline.mechanics.solid import SolidProblem
 from morph_dslam.offline.problem import SweepProblem
-from morph_dslam.offline.reduction.separable_problem import SeparableProblem, factorise, galerkin_axis
+from morph_dslam.offline.reduction.separable_problem import SeparableProblem, galerkin_axis
 from morph_dslam.offline.reduction.separation import SeparatedVector, generic_points, separate
+from morph_dslam.offline.solvers.linear_solver import LinearSolver
 from morph_dslam.offline.studies.morphed_sweep import MorphedSweep
 from morph_dslam.offline.studies.solid_sweep import SolidSweep
 
@@ -59,8 +61,14 @@ class LinearSolid:
 
     def solve(self, mu: Array) -> Array:
         """u_f (n_free,) at ``mu`` (d,), directly."""
-        matrix = self.matrix(self.stiffness.value(mu))
-        return factorise(matrix, True).solve(self.load.value(mu))
+        data = self.stiffness.value(mu)
+        return self._solver.factorise(data, self.indices, self.indptr).solve(self.load.value(mu))
+
+    @cached_property
+    def _solver(self) -> LinearSolver:
+        return LinearSolver(
+            np.ones(len(self.free), dtype=bool), symmetric=True, threads=self.problem.options.threads
+        )
 
     def separable(self, bases: tuple[Basis, ...]) -> SeparableProblem:
         """The problem for u_f with functions of the parameters in ``bases``."""

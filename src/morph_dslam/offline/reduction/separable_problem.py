@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -22,6 +22,7 @@ from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 
 from morph_dslam.errors import SolverError
 from morph_dslam.model.basis_functions import Basis, hat_basis
+from morph_dslam.offline.solvers.linear_solver import Factorisation, LinearSolver
 
 Array = NDArray[np.float64]
 
@@ -159,12 +160,23 @@ def factorise(matrix: sp.csc_array, symmetric: bool) -> SuperLU:
 
 
 class GalerkinOperators:
-    """L_q = A_q themselves: the energy is minimised; sums must be symmetric and positive definite."""
+    """L_q = A_q themselves: the energy is minimised; sums must be symmetric and positive definite.
+
+    All sums have one pattern, so that the linear solver analyses it once.
+    """
 
     def __init__(self, problem: SeparableProblem) -> None:
         self.matrices = problem.matrices
         self.n_terms = len(problem.matrices)
-        self._single = factorise(problem.matrices[0], True) if self.n_terms == 1 else None
+        pattern: Any = sp.csr_array(reduce(lambda a, b: a + b, [abs(m) for m in problem.matrices]))
+        pattern.sort_indices()
+        self._indices, self._indptr = pattern.indices, pattern.indptr
+        self._data = np.stack([_data_in(pattern, m) for m in problem.matrices])
+        self._solver = LinearSolver(np.ones(pattern.shape[0], dtype=bool), symmetric=True)
+        self._single = self._factorise(np.ones(1)) if self.n_terms == 1 else None
+
+    def _factorise(self, weights: Array) -> Factorisation:
+        return self._solver.factorise(weights @ self._data, self._indices, self._indptr)
 
     def apply(self, term: int, vectors: Array) -> Array:
         return self.matrices[term] @ vectors
@@ -172,7 +184,18 @@ class GalerkinOperators:
     def solve(self, weights: Array, right: Array) -> Array:
         if self._single is not None:
             return self._single.solve(right) / weights[0]
-        return factorise(weighted_sum(weights, self.matrices), True).solve(right)
+        return self._factorise(weights).solve(right)
+
+
+def _data_in(pattern: Any, matrix: sp.csc_array) -> Array:
+    """The entries of a matrix in the order of a pattern (CSR, sorted) that holds them all."""
+    entries: Any = sp.coo_array(matrix)
+    size = pattern.shape[1]
+    rows = np.repeat(np.arange(pattern.shape[0], dtype=np.int64), np.diff(pattern.indptr))
+    places = np.searchsorted(rows * size + pattern.indices, entries.row.astype(np.int64) * size + entries.col)
+    data = np.zeros(pattern.nnz)
+    np.add.at(data, places, entries.data)
+    return data
 
 
 class MinimalResidualOperators:
