@@ -12,6 +12,7 @@ import yaml
 
 from morph_dslam import cli
 from morph_dslam.io.video import VideoWriter
+from morph_dslam.model.file_seal import seal
 from tests.support.real_data import ROOT
 from tests.support.scenes import write_scene
 
@@ -129,6 +130,7 @@ def newer_model(folder, tmp_path):
     shutil.copyfile(folder / "sheet.morph", tmp_path / "newer.morph")
     with h5py.File(tmp_path / "newer.morph", "r+") as file:
         file.attrs["version"] = 7
+    seal(tmp_path / "newer.morph")
     return {"model": tmp_path / "newer.morph"}
 
 
@@ -171,7 +173,7 @@ BAD_INPUTS = {
     "camera of another size": (spoiled_camera, "480x360 pixels but the camera file is for 640x480"),
     "camera missing": (lambda f, t: {"camera": t / "absent.yaml"}, "cannot read the camera file"),
     "half a model": (halved_model, "is damaged or cut short"),
-    "newer model": (newer_model, "version 7, this release reads versions 1 to 2: update morph-dslam"),
+    "newer model": (newer_model, "version 7, this release reads versions 1 to 3: update morph-dslam"),
     "landmarks missing": (lambda f, t: {"landmarks": t / "absent.csv"}, "cannot read the landmarks"),
     "landmarks off the object": (off_the_object, "landmark"),
     "landmarks at random pixels": (scattered_pixels, "landmark"),
