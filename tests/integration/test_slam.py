@@ -16,7 +16,7 @@ from morph_dslam.online.slam.output import trajectory_of
 from morph_dslam.online.slam.rigid_map import RigidMap
 from morph_dslam.online.slam.slam import Slam
 from morph_dslam.similarity import fit_similarity
-from tests.support.rendered_room import CAMERA, RoomFilm, hand_held, pose, wall
+from tests.support.rendered_room import CAMERA, RoomFilm, hand_held, pose, room, wall
 
 N_FRAMES = 80
 
@@ -116,6 +116,50 @@ def test_the_camera_is_found_again_after_a_blackout(room_film):
     assert set(again[1:]) == {"tracked"}
     errors, length = errors_after_alignment(slam, frames, [*truth[:50], *truth[:15], *truth[30:50]])
     assert np.median(errors) < 0.005 * length
+
+
+@pytest.fixture(scope="module", params=[room, wall], ids=["room", "wall"])
+def small_map(request):
+    """A frozen map made by moving a quarter of a metre, the film, and the last pose."""
+    film, truth = RoomFilm(seed=1, scene=request.param), hand_held(50, seed=1, reach=0.25)
+    slam = Slam(CAMERA)
+    frames = [slam.process_frame(film.frame(place), i, i / 30.0) for i, place in enumerate(truth)]
+    slam.refine_map()
+    slam.freeze()
+    estimate = trajectory_of(slam, frames).positions
+    expected = np.array([truth[f.index][:3, 3] for f in frames if f.pose is not None])
+    return slam, film, truth[-1], fit_similarity(estimate, expected)
+
+
+@pytest.mark.parametrize(
+    ("shift", "turn"),
+    [
+        ((0.5, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        ((-0.5, 0.0, 0.0), (0.0, 0.2, 0.0)),
+        ((0.0, 0.0, 0.6), (0.0, 0.0, 0.0)),
+        ((0.0, 0.0, -0.6), (0.0, 0.0, 0.0)),
+        ((0.1, 0.0, 0.0), (0.0, 0.0, 0.5)),
+    ],
+    ids=["right", "left and turned", "nearer", "farther", "rolled"],
+)
+def test_the_camera_is_found_from_beside_the_keyframes_and_stays_found(small_map, shift, turn):
+    slam, film, last, world_from_map = small_map
+    slam.process_frame(np.full((480, 640), 3, np.uint8), 100, 3.3)
+    place = last @ pose(shift, turn)
+    frames = [slam.process_frame(film.frame(place), 101 + i, 3.4 + i / 30.0) for i in range(3)]
+    assert [frame.status for frame in frames] == ["relocalised", "tracked", "tracked"]
+    for frame in frames:
+        centre = np.linalg.inv(frame.pose.camera_from_world)[:3, 3]
+        assert world_from_map.apply(centre) == pytest.approx(place[:3, 3], abs=0.015)
+
+
+def test_the_camera_is_found_in_no_other_room(small_map):
+    slam = small_map[0]
+    elsewhere = RoomFilm(seed=8)
+    images = [elsewhere.frame(place) for place in hand_held(12, seed=8)]
+    frames = [slam.process_frame(image, 200 + i, 7.0 + i / 30.0) for i, image in enumerate(images)]
+    assert {frame.status for frame in frames} == {"lost"}
+    assert {frame.reason for frame in frames[1:]} == {"the view resembles no keyframe"}
 
 
 @pytest.mark.parametrize("kind", ["black", "noise", "repeated"])

@@ -1,14 +1,10 @@
-"""The map's book-keeping, descriptors for relocalisation, and the point cloud file."""
+"""The map's book-keeping and the point cloud file."""
 
-import cv2
 import meshio
 import numpy as np
 
 from morph_dslam.io.point_cloud import save_ply
-from morph_dslam.online.features import match_descriptors
-from morph_dslam.online.slam.relocalisation import describe, orientations, thumbnail
 from morph_dslam.online.slam.rigid_map import CANDIDATE, GOOD, REMOVED, Followed, Keyframe, RigidMap
-from tests.support.rendered_sequence import printed_texture
 
 
 def keyframe(ids, pixels, index=0):
@@ -55,43 +51,6 @@ def test_new_corners_join_the_keyframe_that_found_them():
     rigid_map.extend_keyframe(1, Followed(ids, np.ones((2, 2))))
     assert rigid_map.keyframes[1].point_ids.tolist() == [1, 3, 4, 5]
     assert rigid_map.good.tolist() == [0, 1, 2, 3]
-
-
-def corners_of(image):
-    mask = np.zeros_like(image)
-    mask[60:-60, 60:-60] = 255
-    return cv2.goodFeaturesToTrack(image, 150, 0.01, 8, mask=mask).reshape(-1, 2).astype(float)
-
-
-def test_orientations_turn_with_the_image():
-    image = printed_texture(401, 401)
-    corners = corners_of(image)
-    turned = np.ascontiguousarray(np.rot90(image, -1))
-    moved = np.column_stack([400 - corners[:, 1], corners[:, 0]])
-    difference = (orientations(turned, moved) - orientations(image, corners)) % 360.0
-    assert np.median(np.abs(difference - 90.0)) < 1e-3
-
-
-def test_descriptors_match_across_turns_and_scales():
-    image = printed_texture(400, 400, seed=1)
-    corners = corners_of(image)
-    change = cv2.getRotationMatrix2D((200.0, 200.0), 35.0, 0.8)
-    turned = cv2.warpAffine(image, change, (400, 400), flags=cv2.INTER_AREA, borderValue=225)
-    moved = corners @ change[:, :2].T + change[:, 2]
-    rows, descriptors = describe(image, corners, (0, 1))
-    other_rows, other_descriptors = describe(turned, moved, (0,))
-    first, second = match_descriptors(descriptors, other_descriptors, ratio=1.0)
-    right = rows[first] == other_rows[second]
-    assert right.sum() > 0.4 * len(corners)
-    assert right.mean() > 0.7
-
-
-def test_thumbnails_know_their_image_again():
-    images = [printed_texture(480, 640, seed) for seed in range(4)]
-    darker = np.clip(0.7 * images[2] + 5.0, 0, 255).astype(np.uint8)
-    likeness = [thumbnail(image) @ thumbnail(darker) for image in images]
-    assert np.argmax(likeness) == 2
-    assert likeness[2] > 0.99
 
 
 def test_the_point_cloud_is_read_by_another_program(tmp_path):

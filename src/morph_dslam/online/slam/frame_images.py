@@ -23,10 +23,16 @@ VIRTUAL_BASELINE = 0.08
 
 @dataclass(frozen=True)
 class FrameView:
-    """A frame: ``flat`` (h, w) undistorted and flattened, ``depth`` None where nothing measured it."""
+    """A frame.
+
+    Attributes
+    ----------
+    grey : (h, w) undistorted. flat : (h, w) the same flattened. depth : None where nothing measured it.
+    """
 
     index: int
     timestamp: float
+    grey: Image
     flat: Image
     depth: FrameDepth | None = None
 
@@ -72,29 +78,35 @@ class FrameImages:
         CameraError
             If an image has not the camera's size.
         """
-        flat = self._flat(image, f"frame {index}", self._maps)
+        grey = self._grey(image, f"frame {index}", self._maps)
+        flat = self._flat(grey)
+        return FrameView(index, timestamp, grey, flat, self._depth(index, flat, depth, right))
+
+    def _depth(
+        self, index: int, flat: Image, depth: NDArray[np.float32] | None, right: Image | None
+    ) -> FrameDepth | None:
         if not self.baseline_px:
-            return FrameView(index, timestamp, flat)
+            return None
         if self._right_maps is not None:
             if right is None:
-                return FrameView(index, timestamp, flat)
-            right_flat = self._flat(right, f"the right image of frame {index}", self._right_maps)
-            return FrameView(index, timestamp, flat, StereoImages(flat, right_flat, self._options))
+                return None
+            right = self._grey(right, f"the right image of frame {index}", self._right_maps)
+            return StereoImages(flat, self._flat(right), self._options)
         if depth is None:
-            return FrameView(index, timestamp, flat)
+            return None
         self.camera.check_image(depth, f"the depth image of frame {index}")
         if self._maps is not None:
             # Depths on both sides of an edge must not be blended.
             depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST, borderValue=np.nan)  # type: ignore[assignment]
-        return FrameView(
-            index, timestamp, flat, DepthImage(np.asarray(depth, dtype=np.float32), self.baseline_px)
-        )
+        return DepthImage(np.asarray(depth, dtype=np.float32), self.baseline_px)
 
-    def _flat(self, image: Image, where: str, maps: tuple[NDArray, NDArray] | None) -> Image:
+    def _grey(self, image: Image, where: str, maps: tuple[NDArray, NDArray] | None) -> Image:
         self.camera.check_image(image, where)
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        undistorted = self._remapped(np.asarray(grey, dtype=np.uint8), maps)
-        return flatten(undistorted, self._options.flow.flatten_window)
+        return self._remapped(np.asarray(grey, dtype=np.uint8), maps)
+
+    def _flat(self, grey: Image) -> Image:
+        return flatten(grey, self._options.flow.flatten_window)
 
     @staticmethod
     def _remapped(image: Image, maps: tuple[NDArray, NDArray] | None) -> Image:

@@ -16,6 +16,7 @@ from morph_dslam.geometry import rotation_log
 from morph_dslam.online.features import spread_corners
 from morph_dslam.online.flow import follow, patch_correlation
 from morph_dslam.online.slam.bundle_adjustment import Observations, adjust
+from morph_dslam.online.slam.frame_images import FrameView
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.slam.pose import refine_pose, reprojection_errors
 from morph_dslam.online.slam.projection import rays
@@ -36,9 +37,7 @@ MOST_OPEN_VIEWS = 8
 class View:
     """A frame and where the corners (n, 2) of the first view are in it."""
 
-    index: int
-    timestamp: float
-    flat: NDArray[np.uint8]
+    frame: FrameView
     pixels: Array
 
 
@@ -102,26 +101,26 @@ class Initialiser:
         """Pixels (n, 2) of the corners followed in the newest frame."""
         return self._pixels[self._alive]
 
-    def process(self, flat: NDArray[np.uint8], index: int, timestamp: float) -> MapStart | str:
+    def process(self, frame: FrameView) -> MapStart | str:
         """Take in a frame; a start, or the reason why there is none yet."""
         if self._first is None:
-            return self._take_reference(flat, index, timestamp)
-        self._follow(flat)
+            return self._take_reference(frame)
+        self._follow(frame.flat)
         if self._alive.sum() < max(self._options.least_start_points, 0.4 * len(self._alive)):
-            reason = self._take_reference(flat, index, timestamp)
+            reason = self._take_reference(frame)
             return f"the first view was lost from sight; {reason}"
-        view = View(index, timestamp, flat, self._pixels.copy())
+        view = View(frame, self._pixels.copy())
         return self._verify(view) if self._second is not None else self._propose(view)
 
-    def _take_reference(self, flat: NDArray[np.uint8], index: int, timestamp: float) -> str:
-        mask = np.zeros(flat.shape, dtype=np.uint8)
+    def _take_reference(self, frame: FrameView) -> str:
+        mask = np.zeros(frame.flat.shape, dtype=np.uint8)
         border = self._options.flow.window
         mask[border:-border, border:-border] = 255
-        corners = spread_corners(flat, mask, self._options.start_corners)
+        corners = spread_corners(frame.flat, mask, self._options.start_corners)
         self.reset()
         if len(corners) < self._options.least_start_points:
             return f"too little texture: {len(corners)} corners"
-        self._first = View(index, timestamp, flat, corners)
+        self._first = View(frame, corners)
         self._pixels, self._alive = corners.copy(), np.ones(len(corners), dtype=bool)
         return "waiting for the camera to move"
 
@@ -129,10 +128,11 @@ class Initialiser:
         assert self._first is not None
         rows = np.flatnonzero(self._alive)
         start, flow = self._first.pixels[rows], self._options.flow
-        found, ok = follow(self._first.flat, flat, start, self._pixels[rows], flow)
-        back, ok_back = follow(flat, self._first.flat, found, start, flow)
+        first = self._first.frame.flat
+        found, ok = follow(first, flat, start, self._pixels[rows], flow)
+        back, ok_back = follow(flat, first, found, start, flow)
         ok &= ok_back & (np.linalg.norm(back - start, axis=1) < 1.0)
-        likeness = patch_correlation(self._first.flat, flat, start, found, self._options.patch_half)
+        likeness = patch_correlation(first, flat, start, found, self._options.patch_half)
         ok &= likeness > self._options.least_correlation
         self._alive[rows[~ok]] = False
         self._pixels[rows] = found
@@ -176,7 +176,7 @@ class Initialiser:
                 self._drop_second()
             return reason
         best = found[0]
-        chosen = tuple(View(v.index, v.timestamp, v.flat, v.pixels[rows][best.fits]) for v in views)
+        chosen = tuple(View(v.frame, v.pixels[rows][best.fits]) for v in views)
         return MapStart(chosen, best.poses, best.points[best.fits])  # type: ignore[arg-type]
 
     def _drop_second(self) -> None:

@@ -24,7 +24,15 @@ POINT_ARRAYS = (
     "n_expected",
     "n_found",
 )
-KEYFRAME_ARRAYS = ("flat", "camera_from_world", "point_ids", "pixels", "right")
+KEYFRAME_ARRAYS = (
+    "flat",
+    "camera_from_world",
+    "point_ids",
+    "pixels",
+    "right",
+    "described_ids",
+    "descriptors",
+)
 
 
 def save_map(path: Path, rigid_map: RigidMap, camera: PinholeCamera) -> None:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from morph_dslam.online.features import spread_corners
 from morph_dslam.online.slam.bundle_adjustment import Observations, adjust
 from morph_dslam.online.slam.depth import FrameDepth, depth_of
+from morph_dslam.online.slam.descriptors import OCTAVES, describe
 from morph_dslam.online.slam.frame_images import FrameView
 from morph_dslam.online.slam.initialisation import MapStart
 from morph_dslam.online.slam.options import SlamOptions
@@ -44,19 +45,17 @@ class Mapper:
         for view, pose in zip(start.views, start.poses, strict=True):
             scaled = pose.copy()
             scaled[:3, 3] *= scale
-            self._map.add_keyframe(
-                Keyframe(view.index, view.timestamp, view.flat, scaled, ids.copy(), view.pixels)
-            )
+            self._map.add_keyframe(_keyframe(view.frame, scaled, Followed(ids.copy(), view.pixels)))
         self._adjust_locally()
-        return self._finish(2)
+        for number in (0, 1):
+            self._describe(number, start.views[number].frame)
+        return self._finish(2, start.views[2].frame)
 
     def begin_metric(self, view: FrameView) -> Followed | str:
         """Fill the empty map from one view whose corners' depths are measured, or say why it cannot be."""
-        empty = np.empty(0, dtype=np.int64)
-        self._map.add_keyframe(
-            Keyframe(view.index, view.timestamp, view.flat, np.eye(4), empty, np.empty((0, 2)))
-        )
-        points = self._finish(0, view.depth)
+        nothing = Followed(np.empty(0, dtype=np.int64), np.empty((0, 2)))
+        self._map.add_keyframe(_keyframe(view, np.eye(4), nothing))
+        points = self._finish(0, view)
         n, least = self._n_at_keyframe, self._options.least_start_points
         return points if n >= least else f"only {n} corners with depth, {least} are needed"
 
@@ -83,28 +82,32 @@ class Mapper:
 
     def insert(self, tracked: Tracked, view: FrameView) -> Followed:
         """Keep a view; returns the points to follow from it."""
-        points, pose = tracked.points, tracked.pose.camera_from_world
-        number = self._map.add_keyframe(
-            Keyframe(view.index, view.timestamp, view.flat, pose, points.ids, points.pixels, points.right)
-        )
+        number = self._map.add_keyframe(_keyframe(view, tracked.pose.camera_from_world, tracked.points))
         self._place_by_depth(number, view.depth)
         self._triangulate(number)
         self._fuse(number)
         self._adjust_locally()
         self._cull()
-        return self._finish(number, view.depth)
+        return self._finish(number, view)
 
     def adjust_all(self, iterations: int = 20) -> None:
         """Bundle adjustment of the whole map."""
         everything = np.arange(len(self._map.keyframes))
         self._adjust(everything, np.empty(0, dtype=np.int64), iterations)
 
-    def _finish(self, number: int, depth: FrameDepth | None = None) -> Followed:
+    def _finish(self, number: int, view: FrameView) -> Followed:
         self._add_candidates(number)
-        self._place_by_depth(number, depth)
+        self._place_by_depth(number, view.depth)
+        self._describe(number, view)
         keyframe = self._map.keyframes[number]
         self._n_at_keyframe = int((self._map.state[keyframe.point_ids] == GOOD).sum())
         return Followed(keyframe.point_ids.copy(), keyframe.pixels.copy())
+
+    def _describe(self, number: int, view: FrameView) -> None:
+        """Describe what a view sees, so that it can be recognised."""
+        keyframe = self._map.keyframes[number]
+        rows, keyframe.descriptors = describe(view.grey, keyframe.pixels, OCTAVES)
+        keyframe.described_ids = keyframe.point_ids[rows]
 
     def _place_by_depth(self, number: int, depth: FrameDepth | None) -> None:
         """Make map points of the candidates of a view that are near enough for their depth to be measured."""
@@ -287,6 +290,10 @@ class Mapper:
         rigid_map = self._map
         rare = rigid_map.n_found < LEAST_FOUND * rigid_map.n_expected
         rigid_map.remove(np.flatnonzero((rigid_map.state == GOOD) & rare & (rigid_map.n_expected >= 20)))
+
+
+def _keyframe(view: FrameView, pose: Array, seen: Followed) -> Keyframe:
+    return Keyframe(view.index, view.timestamp, view.flat, pose, seen.ids, seen.pixels, seen.right)
 
 
 def pose_in_keyframe(camera_from_world: Array, keyframe: Keyframe) -> Array:

@@ -5,7 +5,7 @@ Where depth was measured, the point's column in a right image is a third residua
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -187,5 +187,11 @@ def find_pose(
         return None
     start = np.eye(4)
     start[:3, :3], start[:3, 3] = rotation_exp(turn.ravel()), shift.ravel()
-    estimate = refine_pose(start, points, pixels, intrinsics, inlier_px=inlier_px)
+    # The matches that RANSAC rejects are too many for a Huber weight.
+    agreeing = np.asarray(rows, dtype=np.int64).ravel()
+    start = refine_pose(start, points[agreeing], pixels[agreeing], intrinsics).camera_from_world
+    used = reprojection_errors(start, points, pixels, intrinsics) < inlier_px
+    estimate = refine_pose(start, points[used], pixels[used], intrinsics, inlier_px=inlier_px)
+    used[used] = estimate.inliers
+    estimate = replace(estimate, inliers=used)
     return estimate if estimate.inliers.sum() >= least else None

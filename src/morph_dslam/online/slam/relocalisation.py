@@ -1,82 +1,50 @@
 """Finding the camera again after it was lost: which keyframes look alike, and where their points are now.
 
-Keyframes are ranked by how much their thumbnails resemble the image (as in PTAM, Klein and Murray 2008). ORB
-descriptors, turned upright by each patch's intensity centroid (Rublee et al. 2011), are computed at the map
-points of a keyframe and at the corners of the image, both at several scales, since neither came from ORB's
-detector.
+Keyframes are ranked by `place_recognition`. The points of the likeliest one and of those that share most
+points with it are matched with the image's corners; P3P in RANSAC gives a rough pose, which is believed only
+if the points are found where it has them.
 """
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.online.features import match_descriptors, spread_corners
+from morph_dslam.online.features import spread_corners
 from morph_dslam.online.flow import FlowOptions
+from morph_dslam.online.slam.descriptors import (
+    OCTAVES,
+    Descriptors,
+    Indices,
+    describe,
+    least_distances,
+    match_points,
+)
+from morph_dslam.online.slam.frame_images import FrameView
 from morph_dslam.online.slam.options import SlamOptions
+from morph_dslam.online.slam.place_recognition import PlaceIndex
 from morph_dslam.online.slam.pose import PoseEstimate, find_pose, refine_pose
 from morph_dslam.online.slam.projection import inside, project
-from morph_dslam.online.slam.rigid_map import GOOD, Followed, Indices, RigidMap
+from morph_dslam.online.slam.rigid_map import GOOD, Followed, RigidMap
 from morph_dslam.online.slam.tracking import Tracker
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-#: ORB's patch radius in pixels, and what it needs around a keypoint at the first scale.
-PATCH_RADIUS, BORDER = 15, 32
-SCALE_STEP = 1.2
-#: Octaves described at map points, and at the image's corners.
-MAP_OCTAVES, IMAGE_OCTAVES = (0, 2, 4), (0, 2)
-THUMBNAIL = (40, 30)
-N_CORNERS = 700
-#: Keyframes tried in one frame: the two that look most alike, and one more in turn.
-N_ALIKE = 2
+#: Corners of the image that are described.
+N_CORNERS = 600
+#: Keyframes tried in one frame: the one that looks most alike, and one more in turn of those that follow.
+N_IN_TURN = 10
+#: Keyframes whose points are matched together, and the fewest points that they share.
+GROUP, LEAST_SHARED = 4, 20
+#: Matches are nearer than this many bits, and clearly nearer than the second best.
+MOST_BITS, RATIO = 80, 0.95
 #: Matches that agree on a rough pose, within so many pixels.
 ROUGH_INLIERS, ROUGH_PX = 12, 6.0
-#: A pose is believed if this share of the keyframe's points in view fit it, with an error of at most so many
-#: times the usual one: repeated texture fits badly somewhere else.
-LEAST_SHARE, MOST_ERROR_RATIO = 0.35, 2.0
-
-
-def thumbnail(flat: Image) -> Array:
-    """The image (30 * 40,) small, blurred, without its mean and of length 1."""
-    small = cv2.GaussianBlur(cv2.resize(flat, THUMBNAIL, interpolation=cv2.INTER_AREA), (0, 0), 1.5)
-    values = small.astype(float).ravel()
-    values -= values.mean()
-    return values / max(float(np.linalg.norm(values)), 1e-9)
-
-
-def orientations(flat: Image, points: Array) -> Array:
-    """Direction (n,), degrees, from each point (n, 2) to the centroid of grey of the disc around it."""
-    offsets = np.arange(-PATCH_RADIUS, PATCH_RADIUS + 1)
-    dx, dy = np.meshgrid(offsets, offsets)
-    disc = (dx**2 + dy**2 <= PATCH_RADIUS**2).ravel()
-    dx, dy = dx.ravel()[disc], dy.ravel()[disc]
-    columns, rows = np.rint(points).astype(int).T
-    grey = flat[rows[:, None] + dy, columns[:, None] + dx].astype(np.float32)
-    return np.degrees(np.arctan2(grey @ dy.astype(np.float32), grey @ dx.astype(np.float32))) % 360.0
-
-
-def describe(flat: Image, points: Array, octaves: tuple[int, ...]) -> tuple[Indices, NDArray[np.uint8]]:
-    """ORB descriptors (k, 32) of points (n, 2), at several scales, and the row (k,) of each one's point."""
-    whole = np.flatnonzero(inside(points, flat.shape, BORDER))
-    angles = orientations(flat, points[whole])
-    orb = cv2.ORB_create(nlevels=max(octaves) + 1, scaleFactor=SCALE_STEP)  # type: ignore[attr-defined]
-    rows, descriptors = [], []
-    for octave in octaves:
-        # OpenCV drops keypoints too near the border at their scale: class_id says which remain.
-        keypoints = [
-            cv2.KeyPoint(float(x), float(y), 31.0 * SCALE_STEP**octave, float(angle), 1.0, octave, int(row))
-            for row, (x, y), angle in zip(whole, points[whole], angles, strict=True)
-        ]
-        kept, described = orb.compute(flat, keypoints)
-        if described is not None:
-            rows.append(np.array([k.class_id for k in kept], dtype=np.int64))
-            descriptors.append(described)
-    if not rows:
-        return np.empty(0, dtype=np.int64), np.empty((0, 32), dtype=np.uint8)
-    return np.concatenate(rows), np.concatenate(descriptors)
+#: A pose is believed if this share of the group's points in view are found where it has them, most of these
+#: fit it, and their error is at most so many times the usual one, or this: repeated texture fits badly
+#: somewhere else, but beside all keyframes the map's own errors show.
+LEAST_SHARE, LEAST_FIT, MOST_ERROR_RATIO, MOST_ERROR_PX = 0.35, 0.7, 2.0, 1.2
 
 
 class Relocaliser:
@@ -86,66 +54,74 @@ class Relocaliser:
         self._map = rigid_map
         self._intrinsics = intrinsics
         self._options = options
-        self._thumbnails: list[Array] = []
+        self.places = PlaceIndex(rigid_map)
         self._turn = 0
 
-    def find(self, flat: Image, tracker: Tracker) -> tuple[PoseEstimate, Followed] | str:
+    def find(self, view: FrameView, tracker: Tracker) -> tuple[PoseEstimate, Followed] | str:
         """The pose and the points that support it, or why there is none."""
-        mask = np.full(flat.shape, 255, dtype=np.uint8)
-        corners = spread_corners(flat, mask, N_CORNERS)
-        if len(corners) < self._options.least_inliers:
+        flat = view.flat
+        corners = spread_corners(flat, np.full(flat.shape, 255, dtype=np.uint8), N_CORNERS)
+        rows, descriptors = describe(view.grey, corners, OCTAVES)
+        if len(rows) < self._options.least_inliers:
             return f"too little texture: {len(corners)} corners"
-        rows, descriptors = describe(flat, corners, IMAGE_OCTAVES)
-        for number in self._candidates(flat):
-            found = self._from_keyframe(number, flat, corners[rows], descriptors, tracker)
+        self.places.update()
+        for number in self._candidates(descriptors):
+            group = self._group(number)
+            rough = self._rough_pose(group, corners, rows, descriptors)
+            found = None if rough is None else self._confirmed(group, flat, rough, tracker)
             if found is not None:
                 return found
         return "the view resembles no keyframe"
 
-    def _candidates(self, flat: Image) -> list[int]:
-        keyframes = self._map.keyframes
-        self._thumbnails += [thumbnail(keyframe.flat) for keyframe in keyframes[len(self._thumbnails) :]]
-        order = np.argsort(-np.array(self._thumbnails) @ thumbnail(flat), kind="stable").tolist()
+    def _candidates(self, descriptors: Descriptors) -> list[int]:
+        order = np.argsort(-self.places.similarities(descriptors), kind="stable").tolist()
+        rest = order[1 : 1 + N_IN_TURN]
         self._turn += 1
-        in_turn = order[N_ALIKE + self._turn % (len(order) - N_ALIKE)] if len(order) > N_ALIKE else order[0]
-        return list(dict.fromkeys([*order[:N_ALIKE], in_turn]))
+        return [order[0], *rest[self._turn % max(len(rest), 1) :][:1]]
 
-    def _from_keyframe(
-        self, number: int, flat: Image, pixels: Array, descriptors: NDArray[np.uint8], tracker: Tracker
-    ) -> tuple[PoseEstimate, Followed] | None:
-        keyframe = self._map.keyframes[number]
-        known = self._map.state[keyframe.point_ids] == GOOD
-        ids = keyframe.point_ids[known]
-        rows, described = describe(keyframe.flat, keyframe.pixels[known], MAP_OCTAVES)
-        # Scales of one point compete with each other, so the second best says nothing: RANSAC sorts it out.
-        first, second = match_descriptors(described, descriptors, ratio=1.0)
-        rough = find_pose(
-            self._map.positions[ids[rows[first]]],
-            pixels[second],
-            self._intrinsics,
-            ROUGH_PX,
-            least=ROUGH_INLIERS,
-        )
-        return None if rough is None else self._confirmed(number, flat, rough, tracker)
+    def _group(self, number: int) -> Indices:
+        """A keyframe and those that share most of its points."""
+        ids = self._map.keyframes[number].point_ids
+        shared = self._map.shared_points(ids[self._map.state[ids] == GOOD])
+        shared[number] = np.iinfo(np.int64).max
+        best = np.argsort(-shared, kind="stable")[:GROUP]
+        return best[shared[best] >= LEAST_SHARED]
+
+    def _rough_pose(
+        self, group: Indices, corners: Array, rows: Indices, descriptors: Descriptors
+    ) -> PoseEstimate | None:
+        """The pose that matches of descriptors agree on."""
+        keyframes = [self._map.keyframes[k] for k in group]
+        ids = np.concatenate([keyframe.described_ids for keyframe in keyframes])
+        described = np.concatenate([keyframe.descriptors for keyframe in keyframes])
+        good = self._map.state[ids] == GOOD
+        points, local = np.unique(ids[good], return_inverse=True)
+        distances = least_distances(descriptors, rows, described[good], local)
+        first, second = match_points(distances, RATIO, MOST_BITS)
+        positions = self._map.positions[points[second]]
+        return find_pose(positions, corners[first], self._intrinsics, ROUGH_PX, least=ROUGH_INLIERS)
 
     def _confirmed(
-        self, number: int, flat: Image, rough: PoseEstimate, tracker: Tracker
+        self, group: Indices, flat: Image, rough: PoseEstimate, tracker: Tracker
     ) -> tuple[PoseEstimate, Followed] | None:
-        """The pose from all points of the keyframe, found where the rough pose has them; None if too few."""
-        keyframe = self._map.keyframes[number]
-        ids = keyframe.point_ids[self._map.state[keyframe.point_ids] == GOOD]
-        guesses, _ = project(rough.camera_from_world, self._map.positions[ids], self._intrinsics)
+        """The pose from all points of the group, found where the rough pose has them; None if too few."""
+        pose = rough.camera_from_world
+        ids = np.unique(np.concatenate([self._map.keyframes[k].point_ids for k in group]))
+        ids = ids[self._map.state[ids] == GOOD]
+        guesses, depths = project(pose, self._map.positions[ids], self._intrinsics)
         seen = inside(guesses, flat.shape, self._options.patch_half + 2)
+        seen &= tracker.looks_alike(ids, pose, depths)
         flow = FlowOptions(self._options.flow.window, 2)
-        found = tracker.find(flat, Followed(ids[seen], guesses[seen]), flow)
-        pose = refine_pose(
-            rough.camera_from_world,
+        found = tracker.find(flat, Followed(ids[seen], guesses[seen]), pose, flow)
+        refined = refine_pose(
+            pose,
             self._map.positions[found.ids],
             found.pixels,
             self._intrinsics,
             inlier_px=self._options.inlier_px,
         )
-        enough = max(self._options.least_inliers, 0.5 * len(found.ids), LEAST_SHARE * int(seen.sum()))
-        if pose.inliers.sum() < enough or pose.rms_px > MOST_ERROR_RATIO * self._map.usual_rms_px:
+        enough = max(self._options.least_inliers, LEAST_FIT * len(found.ids), LEAST_SHARE * int(seen.sum()))
+        most = max(MOST_ERROR_RATIO * self._map.usual_rms_px, MOST_ERROR_PX)
+        if refined.inliers.sum() < enough or refined.rms_px > most:
             return None
-        return pose, found[pose.inliers]
+        return refined, found[refined.inliers]

@@ -7,7 +7,7 @@ keep theirs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,7 @@ class Keyframe:
     index, timestamp : of its frame. flat : (h, w) its flattened image.
     camera_from_world : (4, 4). point_ids : (k,) points seen, ascending. pixels : (k, 2) where.
     right : (k,) their columns in a right image (`Followed`); all unmeasured by default.
+    described_ids, descriptors : (d,), (d, 32) what points looked like, by `descriptors.describe`.
     """
 
     index: int
@@ -38,6 +39,8 @@ class Keyframe:
     point_ids: Indices
     pixels: Array
     right: Array = None  # type: ignore[assignment]
+    described_ids: Indices = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    descriptors: NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 32), dtype=np.uint8))
 
     def __post_init__(self) -> None:
         if self.right is None:

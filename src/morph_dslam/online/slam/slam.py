@@ -220,7 +220,7 @@ class Slam:
         return self._result("tracked", tracked, is_keyframe=True)
 
     def _start_moving(self, view: FrameView) -> Followed | str:
-        start = self._initialiser.process(view.flat, view.index, view.timestamp)
+        start = self._initialiser.process(view)
         return self._mapper.begin(start) if isinstance(start, MapStart) else start
 
     def _start_metric(self, view: FrameView) -> Followed | str:
@@ -252,7 +252,7 @@ class Slam:
 
     def _relocalise(self, view: FrameView, clock: StageClock) -> dict:
         with clock.stage("relocalise"):
-            found = self._relocaliser.find(view.flat, self._tracker)
+            found = self._relocaliser.find(view, self._tracker)
             if isinstance(found, str):
                 return {"status": "lost", "reason": found}
             pose, points = found

@@ -19,6 +19,7 @@ from morph_dslam.online.slam.pose import LEAST_DEPTH, PoseEstimate, refine_pose,
 from morph_dslam.online.slam.projection import inside, inverse, project
 from morph_dslam.online.slam.rigid_map import CANDIDATE, GOOD, Followed, Indices, RigidMap
 from morph_dslam.online.slam.two_view import camera_centre
+from morph_dslam.online.slam.view_warp import WarpedViews, warp_pixels
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -65,6 +66,7 @@ class Tracker:
         self._intrinsics = intrinsics
         self._options = options
         self._motion = np.eye(4)
+        self._warped = WarpedViews(intrinsics)
         self.camera_from_world = np.eye(4)
         self.points = Followed(np.empty(0, dtype=np.int64), np.empty((0, 2)))
 
@@ -107,20 +109,30 @@ class Tracker:
         before, _ = project(self.camera_from_world, positions, self._intrinsics)
         after, _ = project(predicted, positions, self._intrinsics)
         guesses = pixels + np.nan_to_num(after - before)
-        return self.find(flat, Followed(ids, guesses), flow)
+        return self.find(flat, Followed(ids, guesses), predicted, flow)
 
-    def find(self, flat: Image, guesses: Followed, flow: FlowOptions) -> Followed:
-        """Points found near their guessed pixels, from the patches of their keyframes."""
+    def find(self, flat: Image, guesses: Followed, pose: Array, flow: FlowOptions) -> Followed:
+        """Points found near their guessed pixels, by the patches of their keyframes as seen from a pose."""
         ids = guesses.ids
         views, templates = self._map.template_keyframe[ids], self._map.template_pixels[ids]
         found, good = guesses.pixels.copy(), np.zeros(len(ids), dtype=bool)
         for view in np.unique(views):
             rows = np.flatnonzero((views == view) & inside(guesses.pixels, flat.shape, 0.0))
-            source = self._map.keyframes[view].flat
-            pixels, ok = follow(source, flat, templates[rows], guesses.pixels[rows], flow)
-            likeness = patch_correlation(source, flat, templates[rows], pixels, self._options.patch_half)
+            source, starts = self._seen_from(pose, int(view), ids[rows], templates[rows])
+            pixels, ok = follow(source, flat, starts, guesses.pixels[rows], flow)
+            likeness = patch_correlation(source, flat, starts, pixels, self._options.patch_half)
             found[rows], good[rows] = pixels, ok & (likeness > self._options.least_correlation)
         return Followed(ids, found)[good]
+
+    def _seen_from(self, pose: Array, number: int, ids: Indices, pixels: Array) -> tuple[Image, Array]:
+        """A keyframe's image, warped where it looks much different from the pose, and its pixels there."""
+        keyframe = self._map.keyframes[number]
+        if not len(ids):
+            return keyframe.flat, pixels
+        _, depths = project(keyframe.camera_from_world, self._map.positions[ids], self._intrinsics)
+        depth = max(float(np.median(depths)), LEAST_DEPTH)
+        image, homography = self._warped.view(number, keyframe, pose, depth)
+        return image, pixels if homography is None else warp_pixels(homography, pixels)
 
     def measured(self, found: Followed, pose: Array, depth: FrameDepth | None) -> Followed:
         """Map points with their columns in the right image, where those are near what the pose expects."""
@@ -186,17 +198,17 @@ class Tracker:
         lost[followed] = False
         ids = np.flatnonzero(lost)
         pixels, depths = project(pose, self._map.positions[ids], self._intrinsics)
-        seen = inside(pixels, flat.shape, options.flow.window) & self._alike(ids, pose, depths)
+        seen = inside(pixels, flat.shape, options.flow.window) & self.looks_alike(ids, pose, depths)
         wanted = Followed(ids, pixels)[seen]
         wanted = wanted[self._chosen(wanted.ids)]
         if not len(wanted.ids):
             return wanted
-        found = self.find(flat, wanted, FlowOptions(options.flow.window, 1))
+        found = self.find(flat, wanted, pose, FlowOptions(options.flow.window, 1))
         errors = reprojection_errors(pose, self._map.positions[found.ids], found.pixels, self._intrinsics)
         self._map.n_expected[np.setdiff1d(wanted.ids, found.ids)] += 1
         return found[errors < options.search_radius_px]
 
-    def _alike(self, ids: Indices, pose: Array, depths: Array) -> Mask:
+    def looks_alike(self, ids: Indices, pose: Array, depths: Array) -> Mask:
         """Whether points look from here about as from their keyframe."""
         views = self._map.template_keyframe[ids]
         poses = np.array([keyframe.camera_from_world for keyframe in self._map.keyframes])

@@ -1,0 +1,118 @@
+"""ORB descriptors at given points, and matching points that have several of them.
+
+Descriptors are turned upright by each patch's intensity centroid (Rublee et al. 2011) and computed at several
+scales, since the points did not come from ORB's detector. The image is the grey one: flattening, by a window
+of fixed size, makes the same surface look different from nearer or farther.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numba import njit, types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from morph_dslam.online.slam.projection import inside
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Image = NDArray[np.uint8]
+Descriptors = NDArray[np.uint8]
+
+#: ORB's patch radius in pixels, and what it needs around a keypoint at the first scale.
+PATCH_RADIUS, BORDER = 15, 32
+SCALE_STEP = 1.2
+#: Octaves that points are described at, for changes of scale between 0.6 and 1.6.
+OCTAVES = (0, 2, 4)
+#: Bits in a descriptor.
+N_BITS = 256
+
+
+def orientations(image: Image, points: Array) -> Array:
+    """Direction (n,), degrees, from each point (n, 2) to the centroid of grey of the disc around it."""
+    offsets = np.arange(-PATCH_RADIUS, PATCH_RADIUS + 1)
+    dx, dy = np.meshgrid(offsets, offsets)
+    disc = (dx**2 + dy**2 <= PATCH_RADIUS**2).ravel()
+    dx, dy = dx.ravel()[disc], dy.ravel()[disc]
+    columns, rows = np.rint(points).astype(int).T
+    grey = image[rows[:, None] + dy, columns[:, None] + dx].astype(np.float32)
+    return np.degrees(np.arctan2(grey @ dy.astype(np.float32), grey @ dx.astype(np.float32))) % 360.0
+
+
+def describe(grey: Image, points: Array, octaves: tuple[int, ...]) -> tuple[Indices, Descriptors]:
+    """ORB descriptors (k, 32) of points (n, 2), at several scales, and the row (k,) of each one's point."""
+    whole = np.flatnonzero(inside(points, grey.shape, BORDER))
+    if not len(whole):
+        return np.empty(0, dtype=np.int64), np.empty((0, 32), dtype=np.uint8)
+    angles = orientations(grey, points[whole])
+    orb = cv2.ORB_create(nlevels=max(octaves) + 1, scaleFactor=SCALE_STEP)  # type: ignore[attr-defined]
+    # OpenCV reorders keypoints and drops those too near the border at their scale: class_id says which stay.
+    keypoints = [
+        cv2.KeyPoint(x, y, 31.0 * SCALE_STEP**octave, angle, 1.0, octave, row)
+        for octave in octaves
+        for row, (x, y), angle in zip(whole.tolist(), points[whole].tolist(), angles.tolist(), strict=True)
+    ]
+    kept, described = orb.compute(grey, keypoints)
+    if described is None:
+        return np.empty(0, dtype=np.int64), np.empty((0, 32), dtype=np.uint8)
+    return np.array([k.class_id for k in kept], dtype=np.int64), described
+
+
+@intrinsic
+def _ones(_context, word):
+    """Bits that are set in a 64-bit word."""
+
+    def generate(_context, builder, _signature, arguments):
+        return builder.ctpop(arguments[0])
+
+    return types.uint64(word), generate
+
+
+@njit(cache=True, nogil=True)
+def _least_distances(first, first_points, second, second_points, out):
+    for i in range(len(first)):
+        a, b, c, d = first[i, 0], first[i, 1], first[i, 2], first[i, 3]
+        row = out[first_points[i]]
+        for j in range(len(second)):
+            distance = (
+                _ones(a ^ second[j, 0])  # type: ignore[call-arg]
+                + _ones(b ^ second[j, 1])  # type: ignore[call-arg]
+                + _ones(c ^ second[j, 2])  # type: ignore[call-arg]
+                + _ones(d ^ second[j, 3])  # type: ignore[call-arg]
+            )
+            point = second_points[j]
+            row[point] = min(row[point], distance)
+
+
+def least_distances(
+    first: Descriptors, first_points: Indices, second: Descriptors, second_points: Indices
+) -> NDArray[np.uint16]:
+    """Least Hamming distance (a, b) between any descriptors of points 0..a-1 and of points 0..b-1.
+
+    Parameters
+    ----------
+    first, second : (i, 32), (j, 32). first_points, second_points : (i,), (j,) whose each one is.
+    """
+    shape = (int(first_points.max(initial=-1)) + 1, int(second_points.max(initial=-1)) + 1)
+    result = np.full(shape, N_BITS, dtype=np.uint16)
+    words = [np.ascontiguousarray(d).view(np.uint64) for d in (first, second)]
+    _least_distances(words[0], first_points, words[1], second_points, result)
+    return result
+
+
+def match_points(distances: NDArray[np.uint16], ratio: float, most: int) -> tuple[Indices, Indices]:
+    """Rows and columns that are nearest to each other, nearer than ``most`` bits.
+
+    Either's second best has to be further away by 1 / ``ratio``.
+    """
+    if min(distances.shape) < 2:
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    rows = np.arange(len(distances))
+    columns = distances.argmin(axis=1)
+    best = distances[rows, columns]
+    clear = (best < most) & (distances[:, columns].argmin(axis=0) == rows)
+    clear &= best < ratio * np.partition(distances, 1, axis=1)[:, 1]
+    rows, columns, best = rows[clear], columns[clear], best[clear]
+    kept = best < ratio * np.partition(distances[:, columns], 1, axis=0)[1]
+    return rows[kept], columns[kept]

@@ -1,0 +1,168 @@
+"""Descriptors, the bag of words that recognises places, and keyframes warped to be seen from elsewhere."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from morph_dslam.online.slam.descriptors import describe, least_distances, match_points, orientations
+from morph_dslam.online.slam.place_recognition import PlaceIndex, Vocabulary
+from morph_dslam.online.slam.rigid_map import Keyframe, RigidMap
+from morph_dslam.online.slam.view_warp import (
+    WarpedViews,
+    is_small,
+    local_change,
+    plane_homography,
+    warp_pixels,
+)
+from tests.support.rendered_sequence import printed_texture
+
+INTRINSICS = np.array([500.0, 510.0, 200.0, 190.0])
+
+
+def corners_of(image):
+    mask = np.zeros_like(image)
+    mask[60:-60, 60:-60] = 255
+    return cv2.goodFeaturesToTrack(image, 150, 0.01, 8, mask=mask).reshape(-1, 2).astype(float)
+
+
+def test_orientations_turn_with_the_image():
+    image = printed_texture(401, 401)
+    corners = corners_of(image)
+    turned = np.ascontiguousarray(np.rot90(image, -1))
+    moved = np.column_stack([400 - corners[:, 1], corners[:, 0]])
+    difference = (orientations(turned, moved) - orientations(image, corners)) % 360.0
+    assert np.median(np.abs(difference - 90.0)) < 1e-3
+
+
+def test_distances_are_those_of_opencv_by_point():
+    rng = np.random.default_rng(0)
+    first, second = (rng.integers(0, 256, (n, 32)).astype(np.uint8) for n in (9, 12))
+    first_points, second_points = np.repeat(np.arange(3), 3), np.tile(np.arange(6), 2)
+    expected = np.full((3, 6), 256)
+    for match in (m for row in cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(first, second, k=12) for m in row):
+        place = first_points[match.queryIdx], second_points[match.trainIdx]
+        expected[place] = min(expected[place], match.distance)
+    assert np.array_equal(least_distances(first, first_points, second, second_points), expected)
+
+
+def test_matches_are_mutual_near_and_clear():
+    distances = np.array([[10, 90, 90], [12, 95, 30], [99, 70, 68]], dtype=np.uint16)
+    # The first two both like column 0, which likes the first; the last cannot decide between two.
+    rows, columns = match_points(distances, ratio=0.95, most=80)
+    assert (rows.tolist(), columns.tolist()) == ([0], [0])
+    rows, columns = match_points(distances[:, 1:], ratio=1.0, most=80)
+    assert (rows.tolist(), columns.tolist()) == ([1], [1])
+    assert not len(match_points(distances[:, 1:], ratio=1.0, most=30)[0])
+    assert not len(match_points(distances[:, :1], ratio=1.0, most=80)[0])
+
+
+@pytest.mark.parametrize("scale", [0.7, 0.8, 1.25, 1.45])
+def test_descriptors_match_across_turns_and_scales(scale):
+    image = printed_texture(400, 400, seed=1)
+    corners = corners_of(image)
+    change = cv2.getRotationMatrix2D((200.0, 200.0), 35.0, scale)
+    turned = cv2.warpAffine(image, change, (400, 400), flags=cv2.INTER_AREA, borderValue=225)
+    moved = corners @ change[:, :2].T + change[:, 2]
+    rows, descriptors = describe(image, corners, (0, 2, 4))
+    other_rows, other = describe(turned, moved, (0, 2, 4))
+    first, second = match_points(least_distances(descriptors, rows, other, other_rows), 0.95, 80)
+    assert (first == second).mean() > 0.75
+    assert len(first) > 0.33 * len(np.unique(other_rows))
+
+
+def test_points_too_near_the_border_are_not_described():
+    rows, descriptors = describe(printed_texture(200, 200), np.array([[5.0, 100.0], [100.0, 196.0]]), (0, 2))
+    assert (rows.shape, descriptors.shape) == ((0,), (0, 32))
+
+
+def test_words_are_the_centres_of_clusters():
+    rng = np.random.default_rng(2)
+    centres = rng.integers(0, 2, (5, 256)).astype(np.uint8)
+    members = np.repeat(np.arange(5), 60)
+    bits = centres[members] ^ (rng.random((300, 256)) < 0.08)
+    descriptors = np.packbits(bits, axis=1)
+    vocabulary = Vocabulary(descriptors, n_words=20)
+    assert np.array_equal(vocabulary.words, Vocabulary(descriptors, n_words=20).words)
+    # No word serves two clusters, and words are nearer to their cluster's centre than its members are.
+    assigned = vocabulary.assign(descriptors)
+    assert all(len(np.unique(members[assigned == word])) == 1 for word in assigned)
+    words = np.unpackbits(vocabulary.words[assigned], axis=1)
+    assert (words != centres[members]).mean() < 0.02
+    assert vocabulary.histogram(descriptors).sum() == pytest.approx(1.0)
+    assert not vocabulary.histogram(descriptors[:0]).any()
+
+
+def test_an_image_resembles_the_keyframe_of_its_place():
+    images = [printed_texture(400, 400, seed) for seed in range(6)]
+    rigid_map = RigidMap()
+    for image in images:
+        points = corners_of(image)
+        keyframe = Keyframe(0, 0.0, image, np.eye(4), np.arange(len(points)), points)
+        rows, keyframe.descriptors = describe(image, points, (0, 2, 4))
+        keyframe.described_ids = rows
+        rigid_map.keyframes.append(keyframe)
+    places = PlaceIndex(rigid_map)
+    places.update()
+    for number, image in enumerate(images):
+        change = cv2.getRotationMatrix2D((200.0, 200.0), 20.0, 0.9)
+        darker = cv2.warpAffine((0.6 * image).astype(np.uint8), change, (400, 400), borderValue=110)
+        _, descriptors = describe(darker, corners_of(darker), (0, 2, 4))
+        similarities = places.similarities(descriptors)
+        assert similarities.argmax() == number
+        assert similarities[number] > 1.1 * np.delete(similarities, number).max()
+
+
+def pose_matrix(rotation_vector, translation):
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec(rotation_vector).as_matrix(), translation
+    return pose
+
+
+def project(pose, points):
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    return local[:, :2] / local[:, 2:] * INTRINSICS[:2] + INTRINSICS[2:]
+
+
+def test_the_homography_of_a_plane_moves_pixels_as_projection_does():
+    keyframe, now = (
+        pose_matrix([0.1, 0.2, 0.0], [0.3, 0.0, 0.1]),
+        pose_matrix([0, 0.1, 0.5], [0.2, -0.3, 0.4]),
+    )
+    local = np.column_stack([np.random.default_rng(3).uniform(-0.5, 0.5, (30, 2)), np.full(30, 2.5)])
+    points = (local - keyframe[:3, 3]) @ keyframe[:3, :3]
+    homography = plane_homography(keyframe, now, 2.5, INTRINSICS)
+    pixels = project(keyframe, points)
+    assert warp_pixels(homography, pixels) == pytest.approx(project(now, points), abs=1e-9)
+    step = 1e-5 * np.eye(2)
+    around = warp_pixels(homography, pixels[0] + np.vstack([step, -step]))
+    numerical = (around[:2] - around[2:]).T / 2e-5
+    assert local_change(homography, pixels[0]) == pytest.approx(numerical, abs=1e-6)
+
+
+def test_only_views_that_look_much_different_are_warped():
+    image = printed_texture(380, 400)
+    keyframe, views = (
+        Keyframe(0, 0.0, image, np.eye(4), np.arange(0), np.empty((0, 2))),
+        WarpedViews(INTRINSICS),
+    )
+    near, homography = views.view(0, keyframe, pose_matrix([0, 0, 0.1], [0.1, 0, 0]), 2.0)
+    assert near is image
+    assert homography is None
+    turned, homography = views.view(0, keyframe, pose_matrix([0, 0, 0.6], [0, 0, 0]), 2.0)
+    angle = Rotation.from_matrix(np.block([[homography[:2, :2], np.zeros((2, 1))], [0, 0, 1]])).magnitude()
+    assert angle == pytest.approx(0.6, abs=0.01)
+    assert turned is not image
+    # A little further on the same warped view still serves; much further another one is made.
+    again, same = views.view(0, keyframe, pose_matrix([0, 0, 0.65], [0, 0, 0]), 2.0)
+    assert again is turned
+    assert np.array_equal(same, homography)
+    assert views.view(0, keyframe, pose_matrix([0, 0, 1.0], [0, 0, 0]), 2.0)[0] is not turned
+
+
+@pytest.mark.parametrize(
+    ("change", "small"),
+    [(np.eye(2), True), (1.2 * np.eye(2), True), (1.3 * np.eye(2), False), (np.diag([1.0, 0.75]), False)],
+)
+def test_changes_within_reach_of_following(change, small):
+    assert is_small(change) is small
