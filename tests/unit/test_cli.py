@@ -108,7 +108,7 @@ def test_info_says_what_a_model_holds(tmp_path, capsys):
         "arch -60 to 60 mm, default 0; height of the arch",
         "twist -20 to 20 deg",
         "displacement 9",
-        "displacement 0.21 – – – mm",
+        "displacement 0.210 – – – mm",
         "held-out solves 32",
         "compression of the displacement 98.70 %",
         "morph dslam 0.1.0",

@@ -35,7 +35,12 @@ CERTIFICATE = {
     "sensitivity": {"stretch": RELATIVE, "slide": {"relative_l2": 0.5, "mean_relative_to_largest": None}},
     "estimator": {"mean_effectivity": 1.02, "min_effectivity": 0.97, "max_effectivity": 1.31},
     "compression_percent": 97.123,
-    "samples": {"training": 64, "held_out": 59, "failed": [{"coordinates": [0.0, 0.0], "reason": "no"}]},
+    "samples": {
+        "rounds": [{"solves": 32, "largest_estimate": 0.02}, {"solves": 64, "largest_estimate": 4e-4}],
+        "training": 64,
+        "held_out": 59,
+        "failed": [{"coordinates": [0.0, 0.0], "reason": "no"}],
+    },
     "stability": {
         "statement": "1 of 4 solutions are unstable",
         "stable": 3,
@@ -51,13 +56,20 @@ PROVENANCE = {"study": "name = 'x'\n" * 40, "mesh_sha256": "ab12", "versions": {
 def test_every_field_has_a_row_in_its_unit():
     rows = {row[0]: row[1:] for row in error_table(CERTIFICATE).rows}
     relative = ["2.00e-02", "1.23e-02"]
-    assert rows["displacement"] == ["1", "4", "2", "50", "mm", *relative]
-    assert rows["Cauchy stress"] == ["1", "4", "2", "50", "MPa", *relative]
+    assert rows["displacement"] == ["1.00", "4.00", "2.00", "50.0", "mm", *relative]
+    assert rows["Cauchy stress"] == ["1.00", "4.00", "2.00", "50.0", "MPa", *relative]
     assert rows["von Mises stress"][-2:] == ["2.00e-02", "–"]
-    assert rows["strain"][:5] == ["1", "4", "2", "50", "–"]
+    assert rows["strain"][:5] == ["1.00", "4.00", "2.00", "50.0", "–"]
     assert rows["force on top"][4] == "N"
     assert rows["moment on top"][4] == "N mm"
     assert len(rows) == 6
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(1287.4, "1287"), (999.4, "999"), (0.00499703, "0.00500"), (1.4657e-05, "1.47e-05")]
+)
+def test_errors_have_three_digits(value, text):
+    assert error_table({"reaction_moment_top": {"mean_Nmm": value}}).rows[0][1] == text
 
 
 def test_sensitivities_have_both_measures():
@@ -82,7 +94,7 @@ def test_the_faces_of_a_sheet_have_a_von_mises_stress_each():
 def test_certificates_of_older_files_are_shown_as_far_as_they_go():
     old = {"displacement": {"mean_mm": 0.21}, "stress_solid": 0.004, "sensitivity": {"lever": 6.8e-4}}
     assert error_table(old).rows == [
-        ["displacement", "0.21", "–", "–", "–", "mm", "–", "–"],
+        ["displacement", "0.210", "–", "–", "–", "mm", "–", "–"],
         ["Cauchy stress", "–", "–", "–", "–", "–", "–", "4.00e-03"],
     ]
     assert sensitivity_table(old).rows == [["lever", "–", "6.80e-04"]]
@@ -105,6 +117,7 @@ def test_info_prints_the_whole_certificate(tmp_path, capsys):
         "compression of the displacement 97.12 %",
         "training samples 64",
         "failed samples 1 entry",
+        "adaptive round 2 64 solves, largest estimated error 0.0004",
         "mean effectivity 1.02",
         "statement 1 of 4 solutions are unstable",
         "change of stability 1 between slide = 1 mm and slide = 2 mm",

@@ -42,7 +42,7 @@ def sensitivity_table(certificate: Mapping[str, Any]) -> Table:
 
 def _row(title: str, errors: Mapping[str, Any]) -> list[str]:
     ending = next((ending for ending in _UNITS if f"mean{ending}" in errors), "")
-    absolute = [_number(errors.get(name + ending), ".3g") for name in _ABSOLUTE]
+    absolute = [_number(errors.get(name + ending), "#.3g") for name in _ABSOLUTE]
     return [title, *absolute, _UNITS.get(ending, _UNKNOWN), *_relative(errors)]
 
 
@@ -51,4 +51,7 @@ def _relative(errors: Mapping[str, Any]) -> list[str]:
 
 
 def _number(value: float | None, form: str) -> str:
-    return _UNKNOWN if value is None else f"{value:{form}}"
+    if value is None:
+        return _UNKNOWN
+    # Thousands in full, not as a power of ten.
+    return f"{value:.0f}" if abs(value) >= 1e3 else f"{value:{form}}".removesuffix(".")

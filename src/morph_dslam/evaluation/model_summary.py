@@ -155,8 +155,14 @@ def _memory(certificate: Mapping[str, Any]) -> Facts:
     facts = {}
     if "compression_percent" in certificate:
         facts["compression of the displacement"] = f"{certificate['compression_percent']:.2f} %"
-    samples = certificate.get("samples", {})
-    return facts | {f"{name.replace('_', ' ')} samples": _value(value) for name, value in samples.items()}
+    samples = dict(certificate.get("samples", {}))
+    rounds = samples.pop("rounds", [])
+    facts |= {f"{name.replace('_', '-')} samples": _value(value) for name, value in samples.items()}
+    return facts | {
+        f"adaptive round {number}": f"{content['solves']} solves, "
+        f"largest estimated error {_value(content['largest_estimate'])}"
+        for number, content in enumerate(rounds, start=1)
+    }
 
 
 def _reduction(certificate: Mapping[str, Any]) -> Facts:

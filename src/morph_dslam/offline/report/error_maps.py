@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
+from matplotlib.colors import LogNorm, Normalize
 from numpy.typing import NDArray
 
 from morph_dslam.evaluation.report import Picture
@@ -47,7 +47,8 @@ def plot_error_maps(model: ReducedModel) -> Picture:
     places = _displayed(model.parameters, held_out["coordinates"])
     failed = _displayed(model.parameters, _failed(model))
     errors = _positive(held_out["mean_mm"])
-    worst, scale = int(errors.argmax()), LogNorm(errors.min(), max(errors.max(), 1.01 * errors.min()))
+    worst, low, high = int(errors.argmax()), errors.min(), errors.max()
+    scale = LogNorm(low, high) if high > 10.0 * low else Normalize(0.0, high)
     pairs = list(combinations(range(len(model.parameters)), 2))[:MOST_MAPS]
     figure, axes = panels(len(pairs), 2.8)
     dots = None

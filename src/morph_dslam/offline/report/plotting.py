@@ -25,15 +25,19 @@ _STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
+    "axes.axisbelow": True,
     "grid.color": "#e4e8ec",
     "grid.linewidth": 0.7,
     "svg.hashsalt": "morph-dslam",  # the same plot is the same text, every time
 }
 
 
-def panels(n_panels: int, height: float, **options) -> tuple[Figure, list[Axes]]:
-    """A figure of ``n_panels`` axes in rows of ``height`` inches; ``options`` as of subplots."""
-    columns = min(n_panels, 2 if n_panels == 4 else 3)
+def panels(n_panels: int, height: float, of_four: int = 2, **options) -> tuple[Figure, list[Axes]]:
+    """A figure of ``n_panels`` axes in rows of ``height`` inches, three in a row, or four ``of_four`` a row.
+
+    ``options`` are those of `Figure.subplots`.
+    """
+    columns = of_four if n_panels == 4 else min(n_panels, 3)
     rows = -(-n_panels // columns)
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(WIDTH, height * rows), layout="constrained")

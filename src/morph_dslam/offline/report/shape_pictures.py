@@ -83,7 +83,7 @@ def _grid(
     images = draw_shapes(
         model.triangles, shapes, values, value_range, viewing_direction(model), SIZE, colour_map
     )
-    figure, axes = panels(len(images), 2.7)
+    figure, axes = panels(len(images), 2.7, of_four=4)
     for image, caption, panel in zip(images, captions, axes, strict=True):
         panel.imshow(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
         panel.set_title(caption)
