@@ -210,7 +210,7 @@ def draw_reduction(file: Path, reduced: Reduced, unseen: Sequence[Snapshot], gri
     y_axes.set(xlabel="Y / mm", title="functions of Y")
     path_axes.set(xlabel="part of the path", title="functions of the path")
     path_axes.legend([f"product {i + 1}" for i in range(shown)], frameon=False, fontsize=8)
-    figure.savefig(file, dpi=110)
+    figure.savefig(file, dpi=100)
 
 
 def _mean_distance(functions: CPFunctions, unseen: Sequence[Snapshot], grid: Grid, products: int) -> float:
