@@ -42,7 +42,8 @@ def _build(arguments: argparse.Namespace) -> None:
     report = report_path(arguments.output)
     write_build_report(report, model, reference)
     print(f"wrote {arguments.output} and {report}")
-    for line in stability_warnings(model.certificate):
+    of_the_method = model.certificate["reduction"].get("warnings", [])
+    for line in [*stability_warnings(model.certificate), *of_the_method]:
         print(f"warning: {line}")
 
 
