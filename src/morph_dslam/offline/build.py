@@ -103,7 +103,8 @@ def certified_model(known: Solutions, options: ReductionSection, name: str) -> R
     model = METHODS[method](task)
     announce(f"measuring errors at {len(unseen)} held-out solutions")
     certificate = certify(model, unseen)
-    certificate["compression_percent"] = compression_percent(model, len(seen) + len(unseen))
+    if seen:  # a method that needs no solutions compresses none
+        certificate["compression_percent"] = compression_percent(model, len(seen) + len(unseen))
     certificate["samples"] = {"training": len(seen), "held_out": len(unseen), "failed": known.failed}
     if known.rounds:
         certificate["samples"]["rounds"] = known.rounds
