@@ -22,16 +22,13 @@ from matplotlib.figure import Figure
 
 from morph_dslam.cli import run_and_report_errors
 from morph_dslam.offline.certificate import compression_percent
+from morph_dslam.offline.report.reference_curve import read_reference_curve
 from reduction_snapshots import SolvedStudy, solve_study
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "boot_seal"
-#: The paper's figure of the mean error (mm) against the number of modes, 1 to 29, and the positions that its
-#: compression of 92.58 % with 29 modes implies.
-PAPER_MM = (
-    9.8840, 3.1217, 0.9354, 0.5369, 0.3853, 0.3456, 0.3180, 0.2973, 0.2692, 0.2553, 0.2377, 0.2358, 0.2338,
-    0.2274, 0.2274, 0.2197, 0.2086, 0.2082, 0.2060, 0.2001, 0.1925, 0.1920, 0.1919, 0.1916, 0.1910, 0.1896,
-    0.1896, 0.1892, 0.1891,
-)  # fmt: skip
+#: The paper's figure of the mean error (mm) against the number of modes.
+PAPER = read_reference_curve(EXAMPLE / "paper_errors.csv")
+#: Positions that the paper's compression of 92.58 % with 29 modes implies.
 PAPER_POSITIONS = 397
 MOST_MODES = 12
 #: Sparse PGD is fitted anew for each of these numbers of modes.
@@ -70,7 +67,7 @@ def draw(curves: dict[str, list[tuple[int, float]]], path: Path) -> None:
     """All curves in one picture."""
     figure = Figure(figsize=(7.5, 5.0), layout="constrained")
     axes = figure.subplots()
-    axes.semilogy(range(1, 30), PAPER_MM, "k--", linewidth=2, label="the paper, sparse PGD")
+    axes.semilogy(PAPER.modes, PAPER.mean_mm, "k--", linewidth=2, label=PAPER.label)
     for (name, curve), marker in zip(curves.items(), "osv", strict=True):
         axes.semilogy(*zip(*curve, strict=True), marker + "-", markersize=4, label=name)
     axes.set(xlabel="modes", ylabel="mean error of the displacement / mm", xlim=(0, 30))
@@ -81,7 +78,8 @@ def draw(curves: dict[str, list[tuple[int, float]]], path: Path) -> None:
 
 def print_curves(curves: dict[str, list[tuple[int, float]]]) -> None:
     """One line for each number of modes, errors in mm."""
-    columns = {"the paper": dict(enumerate(PAPER_MM, start=1))} | {n: dict(c) for n, c in curves.items()}
+    paper = dict(enumerate(PAPER.mean_mm.tolist(), start=1))
+    columns = {"the paper": paper} | {n: dict(c) for n, c in curves.items()}
     print("modes " + " ".join(f"{name:>24s}" for name in columns))
     for modes in sorted(set().union(*(curve for name, curve in columns.items() if name != "the paper"))):
         cells = [f"{column[modes]:24.3g}" if modes in column else f"{'':24s}" for column in columns.values()]
