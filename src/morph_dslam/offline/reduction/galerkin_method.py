@@ -60,7 +60,7 @@ def reduce_by_galerkin(task: ReductionTask) -> ReducedModel:
         name: field_modes(snapshots, name, task.mesh.weights, spread, tolerance)
         for name in field_names(snapshots)
     }
-    sampled = SampledFields(solver, problem, modes)
+    sampled = SampledFields(solver, problem, modes, SHARE * tolerance)
     dense = _on_grid(task, sampled) if _grid_is_used(task) else _scattered(task, sampled)
     fields, summaries = {}, {}
     for name, part in sampled.parts.items():
@@ -129,7 +129,8 @@ class _Expansion:
 def _on_grid(task: ReductionTask, sampled: SampledFields) -> _Grid:
     """All fields on the grid that lines through the box ask for."""
     basis = task.options.basis or "chebyshev"
-    sizes = sizes_along_lines(sampled.displacement, task.parameters, basis, SHARE * task.options.tolerance)
+    leading = sampled.parts["displacement"]
+    sizes = sizes_along_lines(sampled.in_allowed_units, task.parameters, basis, leading)
     bases = parameter_bases(basis, task.parameters, sizes)
     values = values_on_grid(sampled, tuple(interpolation_nodes(basis) for basis in bases))
     return _Grid(
@@ -139,11 +140,11 @@ def _on_grid(task: ReductionTask, sampled: SampledFields) -> _Grid:
 
 def _scattered(task: ReductionTask, sampled: SampledFields) -> _Expansion:
     """All fields at scattered samples, fitted by a sparse expansion."""
-    tolerance = SHARE * task.options.tolerance
-    sizes = sizes_along_lines(sampled.displacement, task.parameters, "chebyshev", tolerance)
+    leading = sampled.parts["displacement"]
+    sizes = sizes_along_lines(sampled.in_allowed_units, task.parameters, "chebyshev", leading)
     degrees = [size - 1 for size in sizes]
     scattered = ScatteredValues(sampled, task.box)
-    leading = sampled.parts["displacement"]
+    tolerance = SHARE * task.options.tolerance
     indices, coefficients, error = fit_expansion(scattered, task.box, degrees, tolerance, leading)
     summary = {
         "format": task.options.format or "tensor_train",

@@ -32,6 +32,8 @@ Array = NDArray[np.float64]
 #: Nodes along the lines that decide the size of a grid, and how far from the middle lines run.
 FINEST, OFF_CENTRE = 17, 0.7
 LEAST = 4
+#: Error of a derivative along a line that is good enough, relative to the largest on the parameter's lines.
+SLOPE_ERROR = 2e-2
 #: Most terms of a CP form.
 MOST_TERMS = 60
 
@@ -54,59 +56,57 @@ def sizes_along_lines(
     evaluate: Callable[[Array], Array],
     parameters: tuple[Parameter, ...],
     basis: BasisName,
-    tolerance: float,
+    leading: slice,
 ) -> tuple[int, ...]:
-    """For each parameter the least number of functions that interpolates ``evaluate`` to the tolerance.
+    """For each parameter the least number of functions that interpolates well enough along its lines.
 
     Parameters
     ----------
-    evaluate : values (n,) at parameters (d,).
-    tolerance : largest error (Euclidean) on the lines over the largest value met on any.
+    evaluate : values (n,) at parameters (d,), in units of the error allowed.
+    leading : the values whose derivatives count too (`SLOPE_ERROR`).
     """
     lower = np.array([parameter.lower for parameter in parameters])
     upper = np.array([parameter.upper for parameter in parameters])
     middle, half = (lower + upper) / 2.0, (upper - lower) / 2.0
-    finest = [parameter_basis("chebyshev", parameter, FINEST) for parameter in parameters]
     signs = np.array([(-1.0) ** k for k in range(len(parameters))])
     starts = [middle, middle + OFF_CENTRE * half, middle - OFF_CENTRE * signs * half]
-    lines: list[list[Array]] = []
-    jobs = len(parameters) * FINEST * (len(starts) if len(parameters) > 1 else 1)
-    with tqdm(total=jobs, desc="choosing the grid", unit="sample") as progress:
-        for k, fine in enumerate(finest):
-            lines.append([])
-            for start in starts if len(parameters) > 1 else starts[:1]:
+    starts = starts if len(parameters) > 1 else starts[:1]
+    sizes = []
+    with tqdm(
+        total=len(parameters) * len(starts) * FINEST, desc="choosing the grid", unit="sample"
+    ) as progress:
+        for k, parameter in enumerate(parameters):
+            fine, lines = parameter_basis("chebyshev", parameter, FINEST), []
+            for start in starts:
                 points = np.repeat(start[None], FINEST, axis=0)
                 points[:, k] = interpolation_nodes(fine)
-                lines[-1].append(np.array([_counted(evaluate, point, progress) for point in points]))
-    largest = max(float(np.linalg.norm(values, axis=1).max()) for line in lines for values in line)
-    return tuple(
-        _size_for(values, fine, basis, parameter, tolerance * largest)
-        for values, fine, parameter in zip(lines, finest, parameters, strict=True)
-    )
+                lines.append(fine.interpolate(points[:, k], np.array([evaluate(p) for p in points])))
+                progress.update(FINEST)
+            sizes.append(_size_for(np.array(lines), fine, basis, parameter, leading))
+    return tuple(sizes)
 
 
-def _counted(evaluate: Callable[[Array], Array], point: Array, progress: tqdm) -> Array:
-    values = evaluate(point)
-    progress.update()
-    return values
-
-
-def _size_for(lines: list[Array], fine: Basis, name: BasisName, parameter: Parameter, allowed: float) -> int:
-    """The least size of a basis whose interpolants of the fine ones are off by ``allowed`` at most."""
+def _size_for(lines: Array, fine: Basis, name: BasisName, parameter: Parameter, leading: slice) -> int:
+    """The least size of a basis that is good enough for lines (n_lines, FINEST, n) in the fine one."""
     between = np.linspace(fine.lower, fine.upper, 4 * FINEST)
-    coefficients = [fine.interpolate(interpolation_nodes(fine), values) for values in lines]
-    truth = np.array([fine.evaluate(between) @ c for c in coefficients])
+    truth = fine.evaluate(between) @ lines
+    slopes = fine.evaluate(between, 1) @ lines[:, :, leading]
+    # an error of one unit over the range is always good enough for a slope
+    allowed = max(SLOPE_ERROR * _largest(slopes), 1.0 / (fine.upper - fine.lower))
     largest = FINEST if name == "chebyshev" else 4 * FINEST
     for size in range(LEAST, largest):
         basis = parameter_basis(name, parameter, size)
         nodes = interpolation_nodes(basis)
-        through = np.linalg.pinv(basis.evaluate(nodes))
-        found = np.array(
-            [basis.evaluate(between) @ (through @ (fine.evaluate(nodes) @ c)) for c in coefficients]
-        )
-        if np.linalg.norm(found - truth, axis=2).max() <= allowed:
+        through = np.linalg.pinv(basis.evaluate(nodes)) @ fine.evaluate(nodes)
+        if _largest(basis.evaluate(between) @ through @ lines - truth) > 1.0:
+            continue
+        if _largest(basis.evaluate(between, 1) @ through @ lines[:, :, leading] - slopes) <= allowed:
             return basis.size
     return largest
+
+
+def _largest(vectors: Array) -> float:
+    return float(np.linalg.norm(vectors, axis=-1).max())
 
 
 def values_on_grid(evaluate: Callable[[Array], Array], nodes: tuple[Array, ...]) -> Array:

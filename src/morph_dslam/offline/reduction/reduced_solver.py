@@ -1,10 +1,10 @@
 """Galerkin solutions at any parameters, predicted from full solutions and corrected by quasi-Newton steps.
 
-A prediction is polynomial regression of the full solutions and their sensitivities. Corrections start with
-the projected tangent of the nearest full solution and update its inverse by Broyden's method (Kelley,
-Iterative Methods for Linear and Nonlinear Equations, 1995, chapter 7), so that each costs one residual in
-place of a tangent. Where they do not converge, Newton's method follows the path from the nearest full
-solution.
+A prediction is polynomial regression of the full solutions and their sensitivities, shifted by what it
+missed at the nearest solution known. Corrections start with the inverse of the projected tangent there and
+update it by Broyden's method (Kelley, Iterative Methods for Linear and Nonlinear Equations, 1995, chapter 7),
+so that each costs one residual in place of a tangent; the updated inverse is kept with the new solution.
+Where they do not converge, Newton's method does, or follows the path from the nearest full solution.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.errors import StudyError
+from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.offline.mechanics.solid import SolidProblem
 from morph_dslam.offline.problem import SweepProblem
 from morph_dslam.offline.reduction.galerkin import GalerkinEquations, galerkin_modes, newton_correction
 from morph_dslam.offline.reduction.regression import fit_functions
 from morph_dslam.offline.snapshots import load_state
-from morph_dslam.offline.solvers.newton import Equations, State, advance
+from morph_dslam.offline.solvers.newton import Equations, State, advance, solve
 
 Array = NDArray[np.float64]
 
@@ -118,8 +118,11 @@ class ReducedSolver:
         self._prediction, _ = fit_functions(
             solutions.samples, known, slopes, box[:, 0], box[:, 1], max_degree, np.arange(len(known))
         )
-        self._inverses: dict[int, Array] = {}
-        self.n_followed = 0
+        predicted = np.array([self._prediction.evaluate(mu)[0] for mu in solutions.samples])
+        # what is known so far: parameters, what the prediction missed there, inverse tangent (when needed)
+        self._samples: list[Array] = list(solutions.samples)
+        self._missed: list[Array] = list(known - predicted)
+        self._inverses: list[Array | None] = [None] * len(known)
 
     def solve(self, mu: Array) -> Array:
         """Coefficients (k,) of the modes at ``mu`` (d,).
@@ -129,15 +132,29 @@ class ReducedSolver:
         SolverError
             If no equilibrium is found from the nearest full solution either.
         """
-        distance = np.linalg.norm((self._solutions.samples - mu) / np.diff(self._box, axis=1).T, axis=1)
-        nearest = int(np.argmin(distance))
+        nearest = self._nearest(np.array(self._samples), mu)
         predicted, _ = self._prediction.evaluate(mu)
-        found = self._corrected(predicted, mu, self._inverse(nearest))
-        if found is not None:
-            return found
-        self.n_followed += 1
-        start = State(self._solutions.samples[nearest], self._known[nearest])
-        return advance(self.galerkin, start, mu).states[-1].dofs
+        start = predicted + self._missed[nearest]
+        corrected = self._corrected(start, mu, self._inverse(nearest))
+        if corrected is None:
+            found, inverse = self._solved_by_newton(start, mu), None
+        else:
+            found, inverse = corrected
+        self._samples.append(np.array(mu, dtype=float))
+        self._missed.append(found - predicted)
+        self._inverses.append(inverse)
+        return found
+
+    def _nearest(self, samples: Array, mu: Array) -> int:
+        return int(np.argmin(np.linalg.norm((samples - mu) / np.diff(self._box, axis=1).T, axis=1)))
+
+    def _solved_by_newton(self, start: Array, mu: Array) -> Array:
+        try:
+            return solve(self.galerkin, mu, State(mu, start)).dofs
+        except SolverError:
+            nearest = self._nearest(self._solutions.samples, mu)
+            state = State(self._solutions.samples[nearest], self._known[nearest])
+            return advance(self.galerkin, state, mu).states[-1].dofs
 
     def lift(self, y: Array, mu: Array) -> Array:
         """Full state (n_dofs,) of coefficients ``y``."""
@@ -148,15 +165,18 @@ class ReducedSolver:
         correction = newton_correction(self.equations, self.lift(y, mu), mu)
         return float(np.linalg.norm(correction[self.measured])) / self.largest
 
-    def _inverse(self, sample: int) -> Array:
-        """Inverse (k, k) of the projected tangent at a full solution, kept once made."""
-        if sample not in self._inverses:
-            tangent = self.galerkin.linearise(self._known[sample], self._solutions.samples[sample])
-            self._inverses[sample] = tangent.solve(np.eye(len(self._known[sample]))).T
-        return self._inverses[sample]
+    def _inverse(self, number: int) -> Array:
+        """Inverse (k, k) of the projected tangent at a solution known, kept once made."""
+        inverse = self._inverses[number]
+        if inverse is None:
+            mu = self._samples[number]
+            y = self._prediction.evaluate(mu)[0] + self._missed[number]
+            inverse = self.galerkin.linearise(y, mu).solve(np.eye(len(y))).T
+            self._inverses[number] = inverse
+        return inverse
 
-    def _corrected(self, y: Array, mu: Array, inverse: Array) -> Array | None:
-        """The solution by Broyden's method from ``y`` (k,); None where it does not converge."""
+    def _corrected(self, y: Array, mu: Array, inverse: Array) -> tuple[Array, Array] | None:
+        """The solution and inverse tangent by Broyden's method from ``y`` (k,); None if it diverges."""
         prescribed = self.equations.prescribed(mu)
         modes = self.galerkin.modes
 
@@ -172,7 +192,7 @@ class ReducedSolver:
                 return None
             y = y + step
             if length <= self._allowed:
-                return y
+                return y, inverse
             r = residual(y)
             if not np.all(np.isfinite(r)):
                 return None

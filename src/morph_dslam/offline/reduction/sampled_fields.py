@@ -21,7 +21,7 @@ from morph_dslam.offline.studies.solid_sweep import snapshot_fields, support_rea
 Array = NDArray[np.float64]
 
 #: Error allowed in all fields but the displacement, as a multiple of the tolerance.
-OTHER_FIELDS = 10.0
+OTHER_FIELDS = 40.0
 #: Modes of a field are kept until so little is left out, as a part of the tolerance, and at most so many.
 MODE_TOLERANCE, MOST_MODES = 0.1, 80
 
