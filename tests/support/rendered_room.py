@@ -59,18 +59,37 @@ def wall(_rng):
     return [_rectangle([-3.0, -2.5, 2.2], [6.0, 0, 0.9], [0, 5.0, 0.2], [0, 0])]
 
 
-class RoomFilm:
-    """Renders a scene, by default the `room`, from given places."""
+def closed_room(_rng):
+    """Four walls 4 m apart around the origin, each with a print of its own, for a round trip."""
+    return [
+        _rectangle([-2, -1.4, 2], [4, 0, 0], [0, 2.8, 0], [0, 0]),
+        _rectangle([2, -1.4, 2], [0, 0, -4], [0, 2.8, 0], [900, 0]),
+        _rectangle([2, -1.4, -2], [-4, 0, 0], [0, 2.8, 0], [0, 900]),
+        _rectangle([-2, -1.4, -2], [0, 0, 4], [0, 2.8, 0], [900, 900]),
+    ]
 
-    def __init__(self, seed=0, scene=room, camera=CAMERA):
+
+def round_trip(n, radius=0.8, turns=1.08, bob=0.1):
+    """Poses (n, 4, 4) of a camera that goes sideways first, then round a circle, and looks outwards."""
+    n_sideways = 16
+    sideways = [pose((x, 0.2 * x, radius)) for x in np.linspace(-0.35, 0.0, n_sideways, endpoint=False)]
+    angles = 2.0 * np.pi * turns * np.linspace(0.0, 1.0, n - n_sideways)
+    places = [(radius * np.sin(a), bob * np.sin(3.0 * a), radius * np.cos(a)) for a in angles]
+    return np.array([*sideways, *(pose(p, (0.0, a, 0.0)) for p, a in zip(places, angles, strict=True))])
+
+
+class RoomFilm:
+    """Renders a scene, by default the `room`, from given places; ``prints`` different ones side by side."""
+
+    def __init__(self, seed=0, scene=room, camera=CAMERA, prints=1):
         self.rng, self.camera = np.random.default_rng(seed), camera
         parts = scene(self.rng)
         offsets = np.cumsum([0, *(len(nodes) for nodes, _, _ in parts)])
         self.nodes = np.concatenate([nodes for nodes, _, _ in parts])
         self.triangles = np.concatenate([t + o for (_, t, _), o in zip(parts, offsets, strict=False)])
         self.coordinates = np.concatenate([coordinates for _, _, coordinates in parts])
-        tile = printed_texture(900, 900, seed)
-        self.texture = np.tile(tile, (2, 2))
+        tiles = [printed_texture(900, 900, seed + 100 * (i % prints)) for i in range(4)]
+        self.texture = np.block([tiles[:2], tiles[2:]])
 
     def frame(self, world_from_camera, noise=2.0, light=1.0):
         """Grey image (h, w) uint8."""

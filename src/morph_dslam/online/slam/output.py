@@ -75,6 +75,7 @@ def summarise(slam: Slam, frames: list[SlamFrame]) -> dict[str, Any]:
         "status": dict(Counter(frame.status for frame in frames)),
         "n_restarts": slam.n_restarts,
         "map_frozen": slam.is_frozen,
+        "n_loops_closed": slam.n_loops,
         "n_keyframes": len(slam.map.keyframes),
         "n_map_points": len(slam.map.good),
         "median_rms_px": float(np.median(errors)) if errors else None,

@@ -7,6 +7,8 @@ if the points are found where it has them.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -47,6 +49,20 @@ ROUGH_INLIERS, ROUGH_PX = 12, 6.0
 LEAST_SHARE, LEAST_FIT, MOST_ERROR_RATIO, MOST_ERROR_PX = 0.35, 0.7, 2.0, 1.2
 
 
+@dataclass(frozen=True)
+class _Corners:
+    """Corners (n, 2) of an image, their descriptors (k, 32), and the row (k,) of each one's corner."""
+
+    pixels: Array
+    rows: Indices
+    descriptors: Descriptors
+
+
+def _described_corners(view: FrameView) -> _Corners:
+    pixels = spread_corners(view.flat, np.full(view.flat.shape, 255, dtype=np.uint8), N_CORNERS)
+    return _Corners(pixels, *describe(view.grey, pixels, OCTAVES))
+
+
 class Relocaliser:
     """Finds the camera from the keyframes of a map."""
 
@@ -59,19 +75,27 @@ class Relocaliser:
 
     def find(self, view: FrameView, tracker: Tracker) -> tuple[PoseEstimate, Followed] | str:
         """The pose and the points that support it, or why there is none."""
-        flat = view.flat
-        corners = spread_corners(flat, np.full(flat.shape, 255, dtype=np.uint8), N_CORNERS)
-        rows, descriptors = describe(view.grey, corners, OCTAVES)
-        if len(rows) < self._options.least_inliers:
-            return f"too little texture: {len(corners)} corners"
+        corners = _described_corners(view)
+        if len(corners.rows) < self._options.least_inliers:
+            return f"too little texture: {len(corners.pixels)} corners"
         self.places.update()
-        for number in self._candidates(descriptors):
-            group = self._group(number)
-            rough = self._rough_pose(group, corners, rows, descriptors)
-            found = None if rough is None else self._confirmed(group, flat, rough, tracker)
+        for number in self._candidates(corners.descriptors):
+            found = self._locate(view, corners, self.group(number), tracker)
             if found is not None:
                 return found
         return "the view resembles no keyframe"
+
+    def locate(
+        self, view: FrameView, group: Indices, tracker: Tracker
+    ) -> tuple[PoseEstimate, Followed] | None:
+        """The pose by the points of some keyframes, and the points that support it; None if they do not."""
+        return self._locate(view, _described_corners(view), group, tracker)
+
+    def _locate(
+        self, view: FrameView, corners: _Corners, group: Indices, tracker: Tracker
+    ) -> tuple[PoseEstimate, Followed] | None:
+        rough = self._rough_pose(group, corners)
+        return None if rough is None else self._confirmed(group, view.flat, rough, tracker)
 
     def _candidates(self, descriptors: Descriptors) -> list[int]:
         order = np.argsort(-self.places.similarities(descriptors), kind="stable").tolist()
@@ -79,7 +103,7 @@ class Relocaliser:
         self._turn += 1
         return [order[0], *rest[self._turn % max(len(rest), 1) :][:1]]
 
-    def _group(self, number: int) -> Indices:
+    def group(self, number: int) -> Indices:
         """A keyframe and those that share most of its points."""
         ids = self._map.keyframes[number].point_ids
         shared = self._map.shared_points(ids[self._map.state[ids] == GOOD])
@@ -87,19 +111,17 @@ class Relocaliser:
         best = np.argsort(-shared, kind="stable")[:GROUP]
         return best[shared[best] >= LEAST_SHARED]
 
-    def _rough_pose(
-        self, group: Indices, corners: Array, rows: Indices, descriptors: Descriptors
-    ) -> PoseEstimate | None:
+    def _rough_pose(self, group: Indices, corners: _Corners) -> PoseEstimate | None:
         """The pose that matches of descriptors agree on."""
         keyframes = [self._map.keyframes[k] for k in group]
         ids = np.concatenate([keyframe.described_ids for keyframe in keyframes])
         described = np.concatenate([keyframe.descriptors for keyframe in keyframes])
         good = self._map.state[ids] == GOOD
         points, local = np.unique(ids[good], return_inverse=True)
-        distances = least_distances(descriptors, rows, described[good], local)
+        distances = least_distances(corners.descriptors, corners.rows, described[good], local)
         first, second = match_points(distances, RATIO, MOST_BITS)
         positions = self._map.positions[points[second]]
-        return find_pose(positions, corners[first], self._intrinsics, ROUGH_PX, least=ROUGH_INLIERS)
+        return find_pose(positions, corners.pixels[first], self._intrinsics, ROUGH_PX, least=ROUGH_INLIERS)
 
     def _confirmed(
         self, group: Indices, flat: Image, rough: PoseEstimate, tracker: Tracker

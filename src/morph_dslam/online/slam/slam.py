@@ -16,6 +16,7 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import MapError
 from morph_dslam.online.slam.frame_images import FrameImages, FrameView
 from morph_dslam.online.slam.initialisation import Initialiser, MapStart
+from morph_dslam.online.slam.loop_closing import LoopCloser
 from morph_dslam.online.slam.mapping import Mapper, pose_in_keyframe
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.slam.pose import PoseEstimate, refine_pose
@@ -130,6 +131,7 @@ class Slam:
         self._tracker = Tracker(self.map, k, options)
         self._mapper = Mapper(self.map, k, options)
         self._relocaliser = Relocaliser(self.map, k, options)
+        self._loops = LoopCloser(self.map, k, options, self._relocaliser, self._mapper)
         # In a map from elsewhere the camera is lost until it is found.
         self._n_lost, self._n_held = int(bool(rigid_map.keyframes)), 0
 
@@ -178,6 +180,11 @@ class Slam:
         """Adjust all keyframes and points together, once the sequence is over; a frozen map stays."""
         if len(self.map.keyframes) > 2 and not self.is_frozen:
             self._mapper.adjust_all()
+
+    @property
+    def n_loops(self) -> int:
+        """Loops closed in the map that there is now."""
+        return self._loops.n_closed
 
     def is_placed(self, frame: SlamFrame) -> bool:
         """Whether a frame has a pose in the map that there is now."""
@@ -246,7 +253,8 @@ class Slam:
                 and self._mapper.wants_keyframe(tracked, view.index)
             )
             if keeps:
-                self._tracker.points = self._mapper.insert(tracked, view)
+                points = self._mapper.insert(tracked, view)
+                self._tracker.points = self._loops.close(view, self._tracker) or points
                 self._tracker.correct(self.map.keyframes[-1].camera_from_world)
         return self._result("tracked", tracked, keeps)
 
