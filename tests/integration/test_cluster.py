@@ -17,6 +17,7 @@ from morph_dslam.errors import WorkerError
 from morph_dslam.offline import cluster
 from morph_dslam.offline.executors import default_executor
 from morph_dslam.offline.sampling import training_samples
+from morph_dslam.offline.snapshots import damage
 from morph_dslam.offline.studies.solid_study import SolidStudy
 from morph_dslam.offline.studies.study import load_study
 from morph_dslam.offline.sweep import run_sweep
@@ -38,6 +39,8 @@ class Cluster:
         self.address = json.loads(scheduler.read_text())["address"]
 
     def add_workers(self) -> None:
+        if len(self.processes) > 1:
+            return
         for name in ("one", "two"):
             self.processes.append(
                 self._start("dask_worker", self.address, "--name", name, "--nthreads", "1", "--no-nanny")
@@ -72,6 +75,22 @@ def loopback(tmp_path_factory) -> Iterator[Cluster]:
         running.stop()
 
 
+def kill_after(count: int, victim: subprocess.Popen, executor: cluster.ClusterExecutor, monkeypatch) -> list:
+    """Kill a process when so many samples have been submitted; the list of all that were."""
+    submitted: list = []
+    submit = executor.submit
+
+    def submit_and_kill(fn, /, *args, **kwargs):
+        submitted.append(args)
+        if len(submitted) == count:
+            victim.kill()
+            victim.wait()
+        return submit(fn, *args, **kwargs)
+
+    monkeypatch.setattr(executor, "submit", submit_and_kill)
+    return submitted
+
+
 def contents(result) -> list[bytes]:
     return [result.solved[sample].read_bytes() for sample in sorted(result.solved)]
 
@@ -92,23 +111,29 @@ def test_a_lost_worker_changes_nothing(loopback: Cluster, tmp_path: Path, monkey
     with default_executor(1) as executor:
         alone = run_sweep(study, samples, tmp_path / "alone", executor)
     loopback.add_workers()
-    victim = loopback.processes[1]
     with cluster.cluster_executor(loopback.address) as executor:
-        count = 0
-        submit = executor.submit
-
-        def submit_and_kill(fn, /, *args, **kwargs):
-            nonlocal count
-            count += 1
-            if count == 6:
-                victim.kill()
-                victim.wait()
-            return submit(fn, *args, **kwargs)
-
-        monkeypatch.setattr(executor, "submit", submit_and_kill)
+        submitted = kill_after(6, loopback.processes[1], executor, monkeypatch)
         spread = run_sweep(study, samples, tmp_path / "spread", executor)
-    assert count == len(samples) == len(spread.solved)
+    assert len(submitted) == len(samples) == len(spread.solved)
     assert contents(spread) == contents(alone)
+
+
+def test_a_lost_scheduler_is_one_message_and_what_was_solved_stays(
+    loopback: Cluster, tmp_path: Path, monkeypatch
+) -> None:
+    study = load_study(write_study(tmp_path))
+    assert isinstance(study, SolidStudy)
+    loopback.add_workers()
+    monkeypatch.setattr(cluster, "PATIENCE", 3.0)
+    lost = pytest.raises(
+        WorkerError, match=r"the connection to the scheduler at tcp://\S+ was lost\. What was"
+    )
+    with lost, cluster.cluster_executor(loopback.address) as executor:
+        kill_after(8, loopback.processes[0], executor, monkeypatch)
+        run_sweep(study, training_samples(study), tmp_path / "spread", executor)
+    kept = list((tmp_path / "spread").glob("*.npz"))
+    assert 0 < len(kept) < 24
+    assert not any(damage(path) for path in kept)
 
 
 def test_workers_of_another_version_are_refused(monkeypatch) -> None:

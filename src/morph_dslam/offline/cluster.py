@@ -6,6 +6,7 @@ worker that is lost is no harm: the scheduler gives its samples to others.
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import CancelledError, Executor, Future
@@ -32,7 +33,10 @@ class ClusterExecutor(Executor):
     @property
     def slots(self) -> int:
         """Twice as many as the workers' threads now; workers may come and go."""
-        threads: dict[str, int] = self._client.nthreads()  # type: ignore[assignment]
+        try:
+            threads: dict[str, int] = self._client.nthreads()  # type: ignore[assignment]
+        except OSError as error:  # a time-out too
+            raise ConnectionResetError(str(error)) from error
         return 2 * max(1, sum(threads.values()))
 
     def submit(self, fn, /, *args, **kwargs) -> Future:
@@ -62,6 +66,7 @@ def cluster_executor(address: str) -> Iterator[ClusterExecutor]:
     with (
         # A start is an argument as large as a solution, which is no mistake here.
         dask.config.set({"distributed.admin.large-graph-warning-threshold": "1TiB"}),
+        _quiet_client(),
         _connected(Client, address) as client,
     ):
         _check_workers(client, address)
@@ -73,13 +78,25 @@ def cluster_executor(address: str) -> Iterator[ClusterExecutor]:
                 f"{error}. Most likely the workers want memory: start fewer on each machine. What was solved "
                 "is kept, and the same command goes on from there"
             ) from error
-        except (CancelledError, CommClosedError) as error:
+        except (CancelledError, CommClosedError, ConnectionResetError) as error:
             raise WorkerError(
                 f"the connection to the scheduler at {address} was lost. What was solved is kept: start the "
                 "scheduler again, and the same command goes on from there"
             ) from error
         finally:
             executor.shutdown(wait=False)
+
+
+@contextmanager
+def _quiet_client() -> Iterator[None]:
+    """The client logs a traceback when it loses its scheduler, which is reported in one message here."""
+    logger = logging.getLogger("distributed.client")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 @contextmanager
