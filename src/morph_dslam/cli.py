@@ -1,4 +1,4 @@
-"""The command line: `morph build | info | export | explore | track | slam | evaluate | simulate | calibrate`.
+"""The command line: `morph build | info | export | explore | track | slam | register | evaluate | ...`.
 
 Each command imports what it needs when it runs, so that `morph --help` answers at once.
 """
@@ -18,6 +18,7 @@ from morph_dslam import __version__
 from morph_dslam.camera_commands import add_camera_commands
 from morph_dslam.command_arguments import frame_range
 from morph_dslam.errors import EvaluationError, MorphError
+from morph_dslam.registration_commands import add_registration_commands
 from morph_dslam.view_commands import add_view_commands
 
 USER_ERROR = 2
@@ -38,10 +39,16 @@ def _build(arguments: argparse.Namespace) -> None:
 
         cluster = cluster_executor(arguments.scheduler)
     with cluster as executor:
-        model = build(arguments.study, arguments.output, arguments.workers, executor)
+        model = build(
+            arguments.study, arguments.output, arguments.workers, executor, compare=arguments.compare
+        )
     report = report_path(arguments.output)
     write_build_report(report, model, reference)
     print(f"wrote {arguments.output} and {report}")
+    if arguments.compare:
+        from morph_dslam.offline.comparison import comparison_lines
+
+        print("\n".join(comparison_lines(arguments.output)))
     of_the_method = model.certificate["reduction"].get("warnings", [])
     for line in [*stability_warnings(model.certificate), *of_the_method]:
         print(f"warning: {line}")
@@ -131,6 +138,7 @@ def _parser() -> argparse.ArgumentParser:
     add_view_commands(partial(_add, commands))
     _add_online_commands(commands)
     add_camera_commands(partial(_add, commands))
+    add_registration_commands(partial(_add, commands))
     return parser
 
 
@@ -158,6 +166,11 @@ def _add_offline_commands(commands: argparse._SubParsersAction) -> None:
         "--scheduler",
         metavar="ADDRESS",
         help="solve on a Dask cluster, tcp://host:8786 say (docs/clusters.md)",
+    )
+    build.add_argument(
+        "--compare",
+        action="store_true",
+        help="reduce the same solutions by every other method too, and print how they compare",
     )
     build.add_argument(
         "--reference-curve",

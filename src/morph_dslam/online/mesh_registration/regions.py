@@ -1,0 +1,96 @@
+"""Where in a map an object may be: what stands out of its planes, in connected pieces."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+Array = NDArray[np.float64]
+
+#: A plane holds at least this part of the map; at most so many are taken out.
+PLANE_SHARE, MOST_PLANES = 0.12, 4
+#: Planes are this thick, in units of the map's usual spacing between points.
+PLANE_THICKNESS = 0.15
+#: Points of one piece are joined over so many times the usual spacing, each in turn.
+JOINED_OVER = (0.6, 0.9, 1.3, 2.0, 3.0)
+#: A piece has at least so many points.
+FEWEST_POINTS = 25
+TRIALS = 400
+
+
+def usual_spacing(points: Array) -> float:
+    """Median distance of points (n, 3) to their fourth neighbour."""
+    distances, _ = KDTree(points).query(points, k=min(5, len(points)))
+    return float(np.median(distances[:, -1]))
+
+
+def without_strays(points: Array) -> NDArray[np.bool_]:
+    """Points (n,) that have neighbours as close as is usual, up to a factor of four."""
+    distances, _ = KDTree(points).query(points, k=min(5, len(points)))
+    return distances[:, -1] <= 4.0 * np.median(distances[:, -1])
+
+
+def plane_points(points: Array, thickness: float, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Points (n,) of the plane that holds most of them, by RANSAC; none if it holds too few."""
+    best = np.zeros(len(points), dtype=bool)
+    for _ in range(TRIALS):
+        a, b, c = points[rng.choice(len(points), 3, replace=False)]
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal)
+        if length == 0.0:
+            continue
+        near = np.abs((points - a) @ (normal / length)) <= thickness
+        if near.sum() > best.sum():
+            best = near
+    if best.sum() < 3:
+        return np.zeros(len(points), dtype=bool)
+    centre = points[best].mean(axis=0)
+    normal = np.linalg.svd(points[best] - centre)[2][-1]
+    return np.abs((points - centre) @ normal) <= thickness
+
+
+def candidate_regions(points: Array, seed: int = 0) -> list[NDArray[np.int64]]:
+    """Indices of the points of each region where an object may be.
+
+    The pieces that are left when one plane after the other is taken out, joined over short and long
+    distances, the largest first; then the whole map, for objects that are planes themselves.
+
+    Parameters
+    ----------
+    points : (n, 3) of the map.
+    """
+    rng = np.random.default_rng(seed)
+    spacing = usual_spacing(points)
+    usable = np.flatnonzero(without_strays(points))
+    regions: list[NDArray[np.int64]] = []
+    left = usable
+    for _ in range(MOST_PLANES):
+        if len(left) < FEWEST_POINTS:
+            break
+        on_plane = plane_points(points[left], PLANE_THICKNESS * spacing, rng)
+        if on_plane.sum() < PLANE_SHARE * len(usable):
+            break
+        # The next plane may be a face of the object, so what is left before it counts too.
+        left = left[~on_plane]
+        for reach in JOINED_OVER:
+            for piece in _pieces(points, left, reach * spacing):
+                if not any(_alike(piece, other) for other in regions):
+                    regions.append(piece)
+    regions.sort(key=len, reverse=True)
+    return [*regions, usable] if len(usable) >= FEWEST_POINTS else regions
+
+
+def _alike(piece: NDArray[np.int64], other: NDArray[np.int64]) -> bool:
+    """Whether two pieces are the same but for a tenth of their points."""
+    return len(np.intersect1d(piece, other)) > 0.9 * max(len(piece), len(other))
+
+
+def _pieces(points: Array, indices: NDArray[np.int64], reach: float) -> list[NDArray[np.int64]]:
+    if len(indices) < FEWEST_POINTS:
+        return []
+    near = KDTree(points[indices]).sparse_distance_matrix(KDTree(points[indices]), reach)
+    _, label = connected_components(near, directed=False)
+    pieces = [indices[label == number] for number in np.unique(label)]
+    return sorted((piece for piece in pieces if len(piece) >= FEWEST_POINTS), key=len, reverse=True)

@@ -1,0 +1,200 @@
+"""Registration of a mesh to a sparse map: where the object is, how large the map's unit is, and how sure.
+
+Regions of the map that stand out of its planes are tried in turn. In each the surface starts in many
+attitudes and sizes, is laid through the points by scaled robust ICP, and every result is scored by the
+keyframes: points that it explains count for it, points that it would hide against it. The best and the best
+other one are kept, and the best is refined by comparing the keyframes' images on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import RegistrationError
+from morph_dslam.online.mesh_registration.evidence import Evidence, gather_evidence
+from morph_dslam.online.mesh_registration.regions import candidate_regions
+from morph_dslam.online.mesh_registration.scaled_icp import Fit, fit_surface
+from morph_dslam.online.mesh_registration.scene import MapPoints, View
+from morph_dslam.online.mesh_registration.surface import Axis, Surface
+from morph_dslam.online.mesh_registration.texture_alignment import TextureAlignment
+from morph_dslam.similarity import SimilarityTransform
+
+Array = NDArray[np.float64]
+
+#: Sizes at which the surface starts, over that of the region.
+START_SIZES = (0.85, 1.1, 1.45)
+#: Points used while searching, starts of a region that are followed to their end, and those then scored.
+MOST_POINTS, N_FOLLOWED, N_SCORED = 120, 30, 6
+#: Samples of the surface while searching, and keyframes asked for evidence.
+ROUGH_SAMPLES, MOST_ASKED = 3000, 10
+#: Widths of the robust weights over the surface's size: for all starts, for the better ones, to refine these.
+COARSE = np.array([0.3, 0.25, 0.2, 0.15])
+MIDDLE = np.array([0.15, 0.12, 0.1, 0.08, 0.07, 0.06, 0.05])
+FINE = np.array([0.05, 0.04, 0.04, 0.03, 0.03, 0.025, 0.025, 0.02, 0.02, 0.02])
+#: A point explained lies this near to the surface, over its size.
+TOLERANCE = 0.015
+#: A lower score is no evidence.
+FEWEST_EXPLAINED = 20
+#: Two places are one if the surfaces are this near to each other, over their size.
+SAME_PLACE = 0.05
+#: The runner-up's score over the best's above which the two cannot be told apart.
+AMBIGUOUS = 0.8
+
+
+@dataclass(frozen=True)
+class MeshRegistration:
+    """An object found in a map.
+
+    Attributes
+    ----------
+    world_from_object : metres to the map's unit.
+    covariance : (7, 7) of log scale, rotation vector and translation about the mean node, world; from the
+        images' noise alone, without the error of the map's camera path.
+    score, runner_up : of `Evidence`, for this place and for the next best.
+    n_explained : points on the surface.
+    rms_px : how far the keyframes' images of the surface agree; None if there was too little to compare.
+    axis : about which the surface can be turned without a difference, so that this angle is not known.
+    """
+
+    world_from_object: SimilarityTransform
+    covariance: Array | None
+    score: float
+    runner_up: float
+    n_explained: int
+    rms_px: float | None
+    axis: Axis | None
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether another place is nearly as good."""
+        return self.runner_up > AMBIGUOUS * self.score
+
+
+@dataclass(frozen=True)
+class _Place:
+    transform: SimilarityTransform
+    evidence: Evidence
+
+
+def register_mesh(
+    nodes: Array,
+    triangles: NDArray[np.int64],
+    points: MapPoints,
+    views: Sequence[View],
+    camera: PinholeCamera,
+    metric: bool = False,
+    progress: bool = False,
+) -> MeshRegistration:
+    """Find an undeformed object in a map.
+
+    Parameters
+    ----------
+    nodes : (n, 3) metres. triangles : (m, 3), outwards if the surface is closed.
+    points : of the map. views : its keyframes, whose ``point_ids`` are rows of ``points``.
+    camera : of the views, without distortion. metric : the map's unit is the metre.
+
+    Raises
+    ------
+    RegistrationError
+        If no place in the map explains enough points.
+    """
+    rough, surface = Surface.of_mesh(nodes, triangles, ROUGH_SAMPLES), Surface.of_mesh(nodes, triangles)
+    attitudes, asked = _attitudes(surface.axis_of_revolution), _spread(views, MOST_ASKED)
+    places: list[_Place] = []
+    for region in tqdm(
+        candidate_regions(points.positions), desc="registering", unit="region", disable=not progress
+    ):
+        for start in _searched(points[region], rough, attitudes, metric):
+            size = surface.size * start.scale
+            near = np.linalg.norm(points.positions - start.apply(surface.centre), axis=1) < size
+            place = fit_surface(points[near], surface, start, FINE * size, metric).world_from_object
+            evidence = gather_evidence(
+                place, nodes, triangles, points.positions, asked, camera, TOLERANCE * size
+            )
+            places.append(_Place(place, evidence))
+    best, runner_up = _decided(places, len(points), surface)
+    alignment = TextureAlignment(nodes, triangles, camera, views, metric).refine(best.transform)
+    return MeshRegistration(
+        best.transform if alignment is None else alignment.world_from_object,
+        None if alignment is None else alignment.covariance,
+        best.evidence.score,
+        runner_up,
+        int(best.evidence.explained.sum()),
+        None if alignment is None else alignment.rms_px,
+        surface.axis_of_revolution,
+    )
+
+
+def _spread(views: Sequence[View], most: int) -> list[View]:
+    """At most so many of the views, spread over all."""
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int))
+    return [views[index] for index in chosen]
+
+
+def _searched(
+    points: MapPoints, surface: Surface, attitudes: list[Array], metric: bool
+) -> list[SimilarityTransform]:
+    """The best distinct fits to a region, before the keyframes have been asked."""
+    some = points[np.random.default_rng(0).permutation(len(points))[:MOST_POINTS]]
+    centre = np.median(points.positions, axis=0)
+    spread = float(np.sqrt(np.mean(np.sum((points.positions - centre) ** 2, axis=1))))
+    starts = []
+    for scale in (1.0,) if metric else np.array(START_SIZES) * spread / surface.radius:
+        for rotation in attitudes:
+            start = SimilarityTransform(scale, rotation, centre - scale * rotation @ surface.centre)
+            starts.append(fit_surface(some, surface, start, COARSE * surface.size * scale, metric, False))
+    fits = []
+    for rough in _by_weight(starts)[:N_FOLLOWED]:
+        begun = rough.world_from_object
+        fits.append(fit_surface(some, surface, begun, MIDDLE * surface.size * begun.scale, metric, False))
+    chosen: list[SimilarityTransform] = []
+    for fit in _by_weight(fits):
+        place = fit.world_from_object
+        if len(chosen) < N_SCORED and all(not _same_place(place, other, surface) for other in chosen):
+            chosen.append(place)
+    return chosen
+
+
+def _by_weight(fits: list[Fit]) -> list[Fit]:
+    return sorted(fits, key=lambda fit: -float(fit.weights.sum()))
+
+
+def _attitudes(axis: Axis | None) -> list[Array]:
+    """Rotations (3, 3) spread over all: those of the icosahedron, one for each direction of an axis."""
+    rotations = list(Rotation.create_group("I").as_matrix())
+    if axis is None:
+        return rotations
+    kept: list[Array] = []
+    for rotation in rotations:
+        if all(np.linalg.norm((rotation - other) @ axis.direction) > 0.1 for other in kept):
+            kept.append(rotation)
+    return kept
+
+
+def _same_place(a: SimilarityTransform, b: SimilarityTransform, surface: Surface) -> bool:
+    """Whether two similarities lay the surface, as a set of points, in the same place."""
+    between = b.inverse @ a
+    distances, _ = surface.tree.query(between.apply(surface.points[::20]))
+    return abs(np.log(between.scale)) < 0.1 and float(distances.mean()) < SAME_PLACE * surface.size
+
+
+def _decided(places: list[_Place], n_points: int, surface: Surface) -> tuple[_Place, float]:
+    """The best place, and the score of the best other one."""
+    places = sorted(places, key=lambda place: -place.evidence.score)
+    if not places or places[0].evidence.score < FEWEST_EXPLAINED:
+        found = max((int(place.evidence.solid.sum()) for place in places), default=0)
+        raise RegistrationError(
+            f"the object was not found in the map: no place explains more than {found} of its {n_points} "
+            "points without hiding others. Film the undeformed object closer and from more sides, and check "
+            "the unit of its mesh"
+        )
+    best = places[0]
+    others = [p.evidence.score for p in places if not _same_place(p.transform, best.transform, surface)]
+    return best, max([0.0, *others])

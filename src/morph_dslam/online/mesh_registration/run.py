@@ -1,0 +1,133 @@
+"""`morph register`: from a saved map and a model to the place of the object in the map, with a picture."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import RegistrationError
+from morph_dslam.io.calibration import load_camera
+from morph_dslam.model import ReducedModel, load_model
+from morph_dslam.online.mesh_registration.register import MeshRegistration, register_mesh
+from morph_dslam.online.mesh_registration.scene import View, scene_of_map
+from morph_dslam.online.slam.map_file import load_map
+from morph_dslam.render.overlay import draw_overlay
+from morph_dslam.render.shading import lambert, vertex_normals
+
+N_PICTURES = 3
+
+
+def run_registration(map_path: Path, model_path: Path, camera_path: Path, output: Path) -> dict[str, Any]:
+    """Find a model's undeformed object in a map; writes ``registration.json`` and ``registration.jpg``.
+
+    Parameters
+    ----------
+    map_path : the map.h5 of `morph slam`. model_path : a model file. camera_path : the camera of the map.
+    output : the folder to write.
+
+    Returns
+    -------
+    The content of ``registration.json``.
+
+    Raises
+    ------
+    RegistrationError
+        If the object is not found, or the folder cannot be written.
+    MapError, ModelFileError, CameraError
+        If an input cannot be read.
+    """
+    camera, model = load_camera(camera_path), load_model(model_path)
+    rigid_map = load_map(map_path, camera)
+    points, views = scene_of_map(rigid_map)
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RegistrationError(f"cannot write the registration to {output}: {error.strerror}") from error
+    nodes = model.positions(model.default)
+    found = register_mesh(nodes, model.triangles, points, views, camera, rigid_map.is_metric, progress=True)
+    content = _content(found, nodes)
+    (output / "registration.json").write_text(json.dumps(content, indent=2) + "\n")
+    cv2.imwrite(str(output / "registration.jpg"), draw_registration(found, model, views, camera))
+    return content
+
+
+def _content(found: MeshRegistration, nodes: NDArray[np.float64]) -> dict[str, Any]:
+    similarity = found.world_from_object
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = similarity.scale * similarity.rotation, similarity.translation
+    content: dict[str, Any] = {
+        "world_from_object": matrix.tolist(),
+        "map_units_per_metre": similarity.scale,
+        "mean_node_m": nodes.mean(axis=0).tolist(),
+        "score": found.score,
+        "runner_up_score": found.runner_up,
+        "ambiguous": found.ambiguous,
+        "n_explained": found.n_explained,
+        "rms_px": found.rms_px,
+        "covariance": None if found.covariance is None else found.covariance.tolist(),
+        "axis_of_revolution": None,
+    }
+    if found.axis is not None:
+        axis = {"point_m": found.axis.point.tolist(), "direction": found.axis.direction.tolist()}
+        content["axis_of_revolution"] = axis
+    return content
+
+
+def remarks(content: dict[str, Any]) -> list[str]:
+    """What a reader of the registration must know."""
+    lines = []
+    if content["ambiguous"]:
+        lines.append(
+            "ambiguous: another place is nearly as good (see runner_up_score); look at registration.jpg, and "
+            "give landmarks if it is wrong"
+        )
+    if content["axis_of_revolution"] is not None:
+        lines.append("the object is a body of revolution: the angle about its axis cannot be seen")
+    if content["rms_px"] is None:
+        lines.append("the keyframes show too little texture on the object to refine its place")
+    return lines
+
+
+def registration_line(content: dict[str, Any]) -> str:
+    """The last line that the command prints."""
+    agreement = "none" if content["rms_px"] is None else f"{content['rms_px']:.3f}"
+    return (
+        f"map_units_per_metre={content['map_units_per_metre']:.6g} score={content['score']:.0f} "
+        f"runner_up={content['runner_up_score']:.0f} explained={content['n_explained']} rms_px={agreement} "
+        f"ambiguous={'yes' if content['ambiguous'] else 'no'}"
+    )
+
+
+def draw_registration(
+    found: MeshRegistration, model: ReducedModel, views: Sequence[View], camera: PinholeCamera
+) -> NDArray[np.uint8]:
+    """Keyframes side by side, the object drawn over the lower row, coloured by its height."""
+    nodes = model.positions(model.default)
+    world = found.world_from_object.apply(nodes)
+    height = 1e3 * (nodes[:, 2] - nodes[:, 2].min())
+    chosen = np.unique(np.linspace(0, len(views) - 1, N_PICTURES).round().astype(int))
+    columns = []
+    for index in chosen:
+        local = views[index].camera_from_world.apply(world)
+        image = cv2.cvtColor(views[index].flat, cv2.COLOR_GRAY2BGR)
+        normals = vertex_normals(local, model.triangles)
+        drawn = draw_overlay(
+            np.asarray(image, dtype=np.uint8),
+            camera.project(local),
+            local[:, 2],
+            model.triangles,
+            height,
+            (0.0, float(height.max())),
+            label="z on the object [mm]",
+            alpha=0.5,
+            brightness=lambert(normals, np.array([-0.4, -0.6, -1.0]), 0.4),
+        )
+        columns.append(np.vstack([image, drawn]))
+    return np.hstack(columns)

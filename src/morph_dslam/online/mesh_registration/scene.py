@@ -1,0 +1,63 @@
+"""A map of the rigid scene as registration takes it: points with where they were seen from, and views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.online.slam.rigid_map import GOOD, RigidMap
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MapPoints:
+    """Points (n, 3) of a map, and from where (n, 3) each was seen, world."""
+
+    positions: Array
+    viewpoints: Array
+
+    def __getitem__(self, rows: NDArray) -> MapPoints:
+        return MapPoints(self.positions[rows], self.viewpoints[rows])
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+@dataclass(frozen=True)
+class View:
+    """A keyframe.
+
+    Attributes
+    ----------
+    flat : (h, w) uint8 its flattened image, undistorted. camera_from_world : its pose.
+    point_ids : (k,) rows of the map points seen. pixels : (k, 2) where.
+    """
+
+    flat: NDArray[np.uint8]
+    camera_from_world: RigidTransform
+    point_ids: NDArray[np.int64]
+    pixels: Array
+
+
+def scene_of_map(rigid_map: RigidMap) -> tuple[MapPoints, Sequence[View]]:
+    """Points and views of a map; each point's viewpoint is the mean place of the keyframes that saw it."""
+    good = np.flatnonzero(rigid_map.state == GOOD)
+    row = np.full(len(rigid_map.state), -1)
+    row[good] = np.arange(len(good))
+    views, total, count = [], np.zeros((len(good), 3)), np.zeros(len(good))
+    for keyframe in rigid_map.keyframes:
+        pose = RigidTransform.from_matrix(keyframe.camera_from_world)
+        seen = row[keyframe.point_ids]
+        kept = seen >= 0
+        views.append(View(keyframe.flat, pose, seen[kept], keyframe.pixels[kept]))
+        total[seen[kept]] += pose.inverse.translation
+        count[seen[kept]] += 1.0
+    used = count > 0
+    everywhere = total.sum(axis=0) / max(count.sum(), 1.0)
+    viewpoints = np.where(used[:, None], total / np.maximum(count, 1.0)[:, None], everywhere)
+    return MapPoints(rigid_map.positions[good], viewpoints), views
