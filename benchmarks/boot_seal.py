@@ -15,13 +15,13 @@ import resource
 import subprocess
 import tempfile
 import time
-import venv
 from pathlib import Path
 
 import numpy as np
 
+from peer_environment import peer_python
+
 ROOT = Path(__file__).resolve().parents[1]
-ENVIRONMENT = ROOT / ".venv-bench"
 PEER = ROOT / "benchmarks" / "peers" / "felupe_path.py"
 YOUNG, POISSON = 3e6, 0.45
 #: Where the axis of the turning top passes, m.
@@ -29,18 +29,6 @@ PIVOT = np.array([0.0, 0.0, 0.045])
 ANGLES = np.radians(np.arange(4.0, 52.1, 4.0))
 #: The free residual over the reactions at which the peer's Newton iteration ends.
 TOLERANCE = 1e-8
-
-
-def peer_python() -> Path:
-    """The interpreter of the peer's environment, made if need be."""
-    python = ENVIRONMENT / "bin" / "python"
-    if not (ENVIRONMENT / "complete").is_file():
-        print(f"making {ENVIRONMENT} with felupe (once)", flush=True)
-        venv.create(ENVIRONMENT, with_pip=True, clear=True)
-        wanted = [f"{ROOT}[pardiso]", "felupe>=11"]
-        subprocess.run([python, "-m", "pip", "install", "--quiet", "--editable", *wanted], check=True)
-        (ENVIRONMENT / "complete").touch()
-    return python
 
 
 def bellows() -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
@@ -128,7 +116,7 @@ def main() -> None:
     if arguments.ours:
         arguments.ours.write_text(json.dumps(follow_path()))
         return
-    python = peer_python()
+    python = peer_python("felupe", "felupe>=11")
     with tempfile.TemporaryDirectory() as folder:
         ours = Path(folder) / "ours.json"
         subprocess.run([python, __file__, "--ours", ours], check=True)

@@ -1,0 +1,223 @@
+"""The methods of reduction beside pyMOR's and tensorly's, on one linear problem and the same solutions.
+
+benchmarks/studies/linear_bar.toml is a bar of 3 435 degrees of freedom under a moving line load, with two of
+its Young's moduli as further parameters. Each of the project's methods makes a model from its own choice of
+solutions. pyMOR gets the separated stiffness and load: POD with Galerkin projection, and its weak greedy
+algorithm with residual estimator. tensorly gets the coefficients of all solutions on a grid, as do the
+project's own CP and Tucker decompositions. Errors are relative, in L2 over the nodes of the held-out
+solutions; CPU seconds on one core count from nothing to the finished model, the solves included; a query is
+one displacement field. pyMOR (BSD) is installed in .venv-bench by the first run.
+Run: python benchmarks/reduction_peers.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"))
+
+import numpy as np
+import tensorly.decomposition as tensorly
+from numpy.typing import NDArray
+
+from morph_dslam.cli import run_and_report_errors
+from morph_dslam.model import ReducedModel, SeparatedField
+from morph_dslam.model.basis_functions import chebyshev_basis
+from morph_dslam.offline.build import certified_model, solve_or_read
+from morph_dslam.offline.choices import with_choices
+from morph_dslam.offline.problem import Snapshot
+from morph_dslam.offline.reduction.grid_functions import interpolation_nodes
+from morph_dslam.offline.reduction.linear_solid import LinearSolid, linear_solid
+from morph_dslam.offline.reduction.pod import Pod, compute_pod
+from morph_dslam.offline.reduction.separation import SeparatedVector
+from morph_dslam.offline.reduction.tensor_formats import (
+    CP,
+    Tucker,
+    cp,
+    cp_functions,
+    tucker,
+    tucker_functions,
+)
+from morph_dslam.offline.studies.solid_study import SolidStudy
+from morph_dslam.offline.studies.study import load_study
+from peer_environment import peer_python
+
+Array = NDArray[np.float64]
+
+HERE = Path(__file__).resolve().parent
+TOLERANCE = 1e-4
+#: What each of the project's methods is asked for.
+METHODS: dict[str, dict[str, Any]] = {
+    "pgd": {"max_modes": 60},
+    "galerkin": {"max_modes": 60},
+    "reduced_basis": {"max_modes": 60},
+    "pod": {"max_modes": 60, "max_degree": 12},
+    "sparse_pgd": {"max_modes": 40, "max_degree": 14},
+}
+#: Numbers of modes at which pyMOR's reduced models are compared.
+MODES = (10, 20, 30)
+GRID = (17, 12, 12)
+MOST_TERMS = 40
+
+
+class Table:
+    """Lines as they are found, and the errors for the last one."""
+
+    def __init__(self, unseen: list[Snapshot]) -> None:
+        self.samples = np.array([snapshot.coordinates for snapshot in unseen])
+        self.truth = np.array([snapshot.fields["displacement"] for snapshot in unseen], dtype=np.float64)
+        self.errors: dict[str, float] = {}
+        print(
+            f"{'method':22s} {'solves':>6s} {'modes':>5s} {'error':>8s} {'s':>7s} {'query, us':>9s}",
+            flush=True,
+        )
+
+    def add(self, name: str, solves: int, modes: int, found: Array, seconds: float, query: float) -> None:
+        missed = found.reshape(self.truth.shape) - self.truth
+        self.errors[name] = float(np.linalg.norm(missed) / np.linalg.norm(self.truth))
+        print(
+            f"{name:22s} {solves:6d} {modes:5d} {self.errors[name]:8.1e} {seconds:7.1f} {1e6 * query:9.0f}",
+            flush=True,
+        )
+
+    def add_field(self, name: str, solves: int, field: SeparatedField, seconds: float) -> None:
+        field.value(self.samples[0])  # compiles
+        began = time.process_time()
+        found = np.array([field.value(mu) for mu in self.samples])
+        query = (time.process_time() - began) / len(self.samples)
+        self.add(name, solves, field.n_modes, found, seconds, query)
+
+
+def reduced_by(study: SolidStudy, method: str) -> SolidStudy:
+    """The study with a method of reduction."""
+    options = type(study.reduction)(method=method, tolerance=TOLERANCE, **METHODS[method])
+    return with_choices(study.model_copy(update={"reduction": options}))
+
+
+def own_model(study: SolidStudy, held_out: Path, folder: Path) -> tuple[ReducedModel, float]:
+    """A model made in a folder that has the held-out solutions and no others yet, and its time."""
+    shutil.copytree(held_out, folder)
+    began = time.process_time()
+    model = certified_model(solve_or_read(study, folder, workers=1), study.reduction, study.name)
+    return model, time.process_time() - began
+
+
+def run_pymor(solid: LinearSolid, training: Array, table: Table, folder: Path) -> None:
+    """pyMOR's reduced models from the separated problem."""
+    python = peer_python("pymor", "pymor>=2025")
+    middle = solid.load.box.mean(axis=1)
+    problem, result = folder / "problem.npz", folder / "pymor.npz"
+    np.savez(
+        problem,
+        stiffness=solid.stiffness.vectors.T,
+        indices=solid.indices,
+        indptr=solid.indptr,
+        middle=solid.stiffness.value(middle),
+        loads=solid.load.vectors,
+        training_a=factors(solid.stiffness, training),
+        training_f=factors(solid.load, training),
+        unseen_a=factors(solid.stiffness, table.samples),
+        unseen_f=factors(solid.load, table.samples),
+        modes=MODES,
+    )
+    subprocess.run([python, HERE / "peers" / "pymor_reduction.py", problem, result], check=True)
+    with np.load(result) as found:
+        for name in ("pod", "greedy"):
+            for count in MODES:
+                nodal = nodal_displacements(solid, found[f"{name}_{count}"])
+                times = float(found[f"{name}_seconds"]), float(found[f"{name}_{count}_query"])
+                table.add(f"pyMOR {name} {count}", int(found[f"{name}_solves"]), count, nodal, *times)
+
+
+def factors(vector: SeparatedVector, samples: Array) -> Array:
+    """Products of the functions (n, Q) of a separated vector at samples (n, d)."""
+    return np.prod([vector.functions(k, samples[:, k]).T for k in range(samples.shape[1])], axis=0)
+
+
+def nodal_displacements(solid: LinearSolid, found: Array) -> Array:
+    """(n, n_nodes, 3) of solutions (n, n_free); no displacement is prescribed but zero."""
+    dofs = np.zeros((len(found), solid.problem.n_dofs))
+    dofs[:, solid.free] = found
+    return np.array([solid.problem.nodal_displacement(x) for x in dofs])
+
+
+def run_tensors(solid: LinearSolid, table: Table) -> None:
+    """CP and Tucker forms of the solutions on a grid, by the project and by tensorly."""
+    began = time.process_time()
+    bases = tuple(
+        chebyshev_basis(p.lower, p.upper, n - 1) for p, n in zip(solid.parameters, GRID, strict=True)
+    )
+    nodes = tuple(interpolation_nodes(basis) for basis in bases)
+    grid = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, len(bases))
+    fields = nodal_displacements(solid, np.array([solid.solve(mu) for mu in grid]))
+    flat = fields.reshape(len(grid), -1)
+    pod = compute_pod(flat, np.ones(flat.shape[1]), 0.1 * TOLERANCE, 100)
+    tensor = pod.project(flat).T.reshape(-1, *GRID)
+    solving = time.process_time() - began
+    own, own_seconds = timed(lambda: tucker(tensor, TOLERANCE))
+    other, other_seconds = timed(lambda: tensorly.tucker(tensor, rank=list(own.core.shape), init="svd"))
+    for name, form, seconds in (
+        ("Tucker", own, own_seconds),
+        ("tensorly Tucker", Tucker(np.asarray(other[0]), tuple(other[1])), other_seconds),
+    ):
+        functions = tucker_functions(form, nodes, bases)
+        table.add_field(name, len(grid), field_of(pod, functions), solving + seconds)
+    terms, own_seconds = timed(lambda: cp(tensor, TOLERANCE, MOST_TERMS))
+    rank = terms.factors[0].shape[1]
+    other, other_seconds = timed(
+        lambda: tensorly.parafac(tensor, rank=rank, init="svd", n_iter_max=2000, tol=1e-10)
+    )
+    scaled = (np.asarray(other[1][0]) * other[0], *(np.asarray(f) for f in other[1][1:]))
+    for name, form, seconds in (("CP", terms, own_seconds), ("tensorly CP", CP(scaled), other_seconds)):
+        table.add_field(
+            f"{name} {rank}", len(grid), field_of(pod, cp_functions(form, nodes, bases)), solving + seconds
+        )
+
+
+def timed(make: Callable[[], Any]) -> tuple[Any, float]:
+    began = time.process_time()
+    return make(), time.process_time() - began
+
+
+def field_of(pod: Pod, functions: Any) -> SeparatedField:
+    """The displacement with a POD's modes."""
+    return SeparatedField(pod.modes.reshape(len(pod.modes), -1, 3), functions)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    study = load_study(HERE / "studies" / "linear_bar.toml")
+    assert isinstance(study, SolidStudy)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        held_out = folder / "held_out"
+        table = Table(solve_or_read(reduced_by(study, "pgd"), held_out, workers=1).unseen)
+        for method in METHODS:
+            model, seconds = own_model(reduced_by(study, method), held_out, folder / method)
+            solves = model.certificate["samples"]["training"]
+            table.add_field(method, solves, model.displacement, seconds)
+        solid = linear_solid(study.sweep_problem())
+        box, rng = solid.load.box, np.random.default_rng(0)
+        training = box[:, 0] + rng.random((study.sampling.training, len(box))) * np.diff(box, axis=1).T
+        run_pymor(solid, training, table, folder)
+        run_tensors(solid, table)
+    print(" ".join(f"{key.replace(' ', '_')}={error:.2e}" for key, error in table.errors.items()))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    return run_and_report_errors(run, parser.parse_args(), "nothing was kept")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
