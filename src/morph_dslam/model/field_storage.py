@@ -77,7 +77,8 @@ def _write_functions(group: h5py.Group, functions: Functions) -> None:
         group.attrs["format"] = "cp"
         _write_bases(group, functions.bases)
         _write_arrays(group, "factor", functions.factors)
-        group.create_dataset("mixing", data=functions.mixing)
+        if not functions.is_unmixed:
+            group.create_dataset("mixing", data=functions.mixing)
     elif isinstance(functions, TuckerFunctions):
         group.attrs["format"] = "tucker"
         _write_bases(group, functions.bases)
@@ -159,5 +160,6 @@ def read_functions(group: h5py.Group, lower: Array, upper: Array) -> Functions:
         return TensorTrainFunctions(bases, tuple(read_array(group, f"core_{k + 1}", 3) for k in range(d)))
     factors = tuple(read_array(group, f"factor_{k + 1}", 2) for k in range(d))
     if form == "cp":
-        return CPFunctions(bases, factors, read_array(group, "mixing", 2))
+        unmixed = np.eye(factors[0].shape[1])
+        return CPFunctions(bases, factors, read_array(group, "mixing", 2) if "mixing" in group else unmixed)
     return TuckerFunctions(bases, factors, read_array(group, "core", d + 1))

@@ -55,6 +55,22 @@ class SurfacePoints:
         return SurfacePoints(self.triangles[selection], self.weights[selection])
 
 
+@dataclass(frozen=True)
+class MaterialPoints:
+    """Any points of the object, by nodes and interpolation weights; inside of volume cells for instance.
+
+    Attributes
+    ----------
+    corners : (p, c) node indices. weights : (p, c), the shape functions of those nodes at the points.
+    """
+
+    corners: NDArray[np.int64]
+    weights: Array
+
+    def __len__(self) -> int:
+        return len(self.corners)
+
+
 def von_mises(stress: Array) -> Array:
     """Von Mises stress (...) of (..., 3) plane (11, 22, 12) or (..., 6) components (normal ones first)."""
     if stress.shape[-1] == 3:
@@ -139,10 +155,16 @@ class ReducedModel:
         """
         return von_mises(self.stresses[place].value(mu, outside))
 
-    def rest_positions(self, points: SurfacePoints) -> Array:
-        """Undeformed positions (p, 3) of surface points, metres."""
-        return np.einsum("pc,pcx->px", points.weights, self.nodes[self.triangles[points.triangles]])
+    def _interpolation(self, points: SurfacePoints | MaterialPoints) -> tuple[NDArray[np.int64], Array]:
+        if isinstance(points, SurfacePoints):
+            return self.triangles[points.triangles], points.weights
+        return points.corners, points.weights
 
-    def restrict(self, points: SurfacePoints) -> SeparatedField:
-        """The displacement field at surface points only."""
-        return self.displacement.restrict(self.triangles[points.triangles], points.weights)
+    def rest_positions(self, points: SurfacePoints | MaterialPoints) -> Array:
+        """Undeformed positions (p, 3) of points, metres."""
+        corners, weights = self._interpolation(points)
+        return np.einsum("pc,pcx->px", weights, self.nodes[corners])
+
+    def restrict(self, points: SurfacePoints | MaterialPoints, name: str = "displacement") -> SeparatedField:
+        """The field called ``name`` in `fields` at these points only."""
+        return self.fields[name].restrict(*self._interpolation(points))

@@ -69,7 +69,7 @@ class CPFunctions(TensorFunctions):
     Attributes
     ----------
     factors : one (size_k, n_terms) per parameter, coefficients in its basis.
-    mixing : (n_terms, n_functions); the unit matrix where each term is one mode, as in PGD.
+    mixing : (n_terms, n_functions); the unit matrix, which files leave out, where each term is one mode.
     """
 
     factors: tuple[Array, ...]
@@ -81,7 +81,12 @@ class CPFunctions(TensorFunctions):
 
     @property
     def n_floats(self) -> int:
-        return sum(f.size for f in self.factors) + self.mixing.size
+        return sum(f.size for f in self.factors) + (0 if self.is_unmixed else self.mixing.size)
+
+    @cached_property
+    def is_unmixed(self) -> bool:
+        """Whether each term is one function, so that ``mixing`` need not be kept."""
+        return np.array_equal(self.mixing, np.eye(*self.mixing.shape))
 
     @cached_property
     def _stacked(self) -> Array:
@@ -101,7 +106,11 @@ class CPFunctions(TensorFunctions):
         return terms @ self.mixing
 
     def mixed(self, matrix: Array) -> Self:
-        return replace(self, mixing=self.mixing @ matrix)
+        mixing = self.mixing @ matrix
+        if len(self.factors) == 1:  # a sum of functions of one parameter is such a function
+            factor = np.ascontiguousarray(self.factors[0] @ mixing)
+            return replace(self, factors=(factor,), mixing=np.eye(mixing.shape[1]))
+        return replace(self, mixing=mixing)
 
 
 @dataclass(frozen=True)
