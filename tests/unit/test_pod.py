@@ -7,7 +7,10 @@ import pytest
 import scipy.linalg
 import scipy.sparse
 
+from morph_dslam.offline.problem import Snapshot
+from morph_dslam.offline.reduction.fields import FieldRows
 from morph_dslam.offline.reduction.pod import compute_pod, hierarchical_pod
+from morph_dslam.offline.snapshots import load_snapshot, save_snapshot
 
 N = 300
 
@@ -112,6 +115,28 @@ def test_blocks_are_read_one_at_a_time(tmp_path) -> None:
     assert pod.error_bound > 0.0
     missed = np.linalg.norm(snapshots - pod.project(snapshots) @ pod.modes)
     assert missed <= 1e-4 * np.linalg.norm(snapshots)
+
+
+def test_a_field_of_snapshots_on_disk_is_gathered_in_blocks(tmp_path) -> None:
+    """As few rows at a time as the memory allows, and the modes of numpy's decomposition of all."""
+    fields = decaying(96, 0.5).astype(np.float32)
+    for number, field in enumerate(fields):
+        snapshot = Snapshot(np.array([float(number)]), {"displacement": field.reshape(-1, 3)})
+        save_snapshot(tmp_path / f"{number}.npz", snapshot, {})
+    kept = [load_snapshot(tmp_path / f"{number}.npz") for number in range(len(fields))]
+    gathered: list[int] = []
+
+    class Counting(FieldRows):
+        def __getitem__(self, rows: slice) -> np.ndarray:
+            gathered.append(len(range(*rows.indices(self.shape[0]))))
+            return super().__getitem__(rows)
+
+    pod = compute_pod(Counting(kept, "displacement"), np.ones(N), 1e-3, 50, memory=3 * 8 * fields.size / 3)
+    assert max(gathered) <= 8
+    assert sum(gathered) == 96
+    _, values, right = np.linalg.svd(fields.astype(float), full_matrices=False)
+    np.testing.assert_allclose(pod.singular_values[:5], values[:5], rtol=1e-6)
+    np.testing.assert_allclose(np.abs(np.sum(pod.modes[:5] * right[:5], axis=1)), 1.0, atol=1e-6)
 
 
 def test_fields_that_are_zero_everywhere_have_one_mode() -> None:

@@ -39,6 +39,24 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_fields_are_read_when_asked_for(tmp_path: Path) -> None:
+    """A field joined to those on disk is beside them, in order; what another name has is not touched."""
+    path = tmp_path / "one.npz"
+    written = write(path)
+    read = snapshots.load_snapshot(path)
+    joined = read.fields | {"reaction": np.ones((1, 3))}
+    assert list(joined) == ["displacement", "reaction"]
+    assert len(joined) == 2
+    assert "slope/displacement" not in joined
+    with pytest.raises(KeyError):
+        read.fields["reaction"]
+    np.testing.assert_array_equal(joined["reaction"], 1.0)
+    assert list(read.fields) == ["displacement"]
+    other = Snapshot(written.coordinates, {"displacement": np.zeros((40, 3))})
+    snapshots.save_snapshot(path, other, {})
+    np.testing.assert_array_equal(joined["displacement"], 0.0)
+
+
 def test_a_write_that_is_cut_short_leaves_no_file(tmp_path: Path, monkeypatch) -> None:
     def killed(descriptor: int) -> None:
         raise OSError("no space left")

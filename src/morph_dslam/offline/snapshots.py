@@ -11,7 +11,7 @@ import hashlib
 import io
 import os
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 
@@ -106,11 +106,44 @@ def _hides_members(archive: zipfile.ZipFile) -> bool:
 
 
 def load_snapshot(path: Path) -> Snapshot:
-    """Read what `save_snapshot` wrote; fields stay in single precision, to be gathered one at a time."""
+    """What `save_snapshot` wrote; fields, in single precision, are read each time they are asked for.
+
+    So a thousand snapshots take no memory, and whoever gathers one field of them needs no more than that.
+    """
     with np.load(path) as file:
-        return Snapshot(
-            file["coordinates"], _under(file, "field"), _under(file, "slope"), _under(file, "output")
-        )
+        stored = [StoredArrays(path, file.files, prefix) for prefix in ("field", "slope")]
+        return Snapshot(file["coordinates"], *stored, _under(file, "output"))  # type: ignore[arg-type]
+
+
+class StoredArrays(Mapping[str, NDArray]):
+    """Arrays of a snapshot's file by name, and others that were joined to them with ``|``."""
+
+    def __init__(
+        self, path: Path, names: Iterable[str], prefix: str, added: Mapping[str, NDArray] | None = None
+    ) -> None:
+        self._path, self._prefix, self._all = path, prefix, list(names)
+        self._names = [name.removeprefix(prefix + "/") for name in self._all if name.startswith(prefix + "/")]
+        self._added = dict(added or {})
+
+    def __getitem__(self, name: str) -> NDArray:
+        if name in self._added:
+            return self._added[name]
+        if name not in self._names:
+            raise KeyError(name)
+        with np.load(self._path) as file:
+            return file[f"{self._prefix}/{name}"]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._added or name in self._names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(dict.fromkeys([*self._names, *self._added]))
+
+    def __len__(self) -> int:
+        return len({*self._names, *self._added})
+
+    def __or__(self, other: Mapping[str, NDArray]) -> StoredArrays:
+        return StoredArrays(self._path, self._all, self._prefix, {**self._added, **other})
 
 
 def load_outputs(path: Path) -> dict[str, Array]:

@@ -23,6 +23,22 @@ def field_names(snapshots: Sequence[Snapshot]) -> list[str]:
     return list(snapshots[0].fields)
 
 
+class FieldRows:
+    """One field of all snapshots as rows (n_snapshots, n_points * n_components), gathered when sliced.
+
+    It stands for the array where that may not fit in memory (`morph_dslam.offline.reduction.pod`).
+    """
+
+    def __init__(self, snapshots: Sequence[Snapshot], name: str) -> None:
+        self._snapshots, self._name = snapshots, name
+        self.field_shape = snapshots[0].fields[name].shape
+        self.shape = len(snapshots), int(np.prod(self.field_shape))
+
+    def __getitem__(self, rows: slice) -> Array:
+        values = [snapshot.fields[self._name].ravel() for snapshot in self._snapshots[rows]]
+        return np.array(values, dtype=np.float64)
+
+
 def field_values(snapshots: Sequence[Snapshot], name: str) -> Array:
     """The values (n_snapshots, n_points, n_components) of one field in all snapshots."""
     return np.array([snapshot.fields[name] for snapshot in snapshots], dtype=np.float64)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import scipy.linalg
@@ -53,8 +53,17 @@ def weighted(fields: Array, inner_product: InnerProduct) -> Array:
     return np.asarray(fields @ matrix)
 
 
+class Rows(Protocol):
+    """Snapshots (n_snapshots, n) that are gathered when sliced: an array, or one that is on disk."""
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+
+    def __getitem__(self, rows: slice, /) -> NDArray[Any]: ...
+
+
 def compute_pod(
-    snapshots: Array,
+    snapshots: Rows,
     weights: InnerProduct,
     tolerance: float,
     max_modes: int,
@@ -69,7 +78,7 @@ def compute_pod(
     tolerance : modes are kept until the root of the relative energy left out is below it.
     max_modes : at most this many.
     memory : bytes; if more were needed, blocks of snapshots are decomposed one after the other
-        (`hierarchical_pod`). Snapshots may then be of single precision, or an array on disk (`numpy.memmap`).
+        (`hierarchical_pod`). Snapshots may then be of single precision, or on disk (`numpy.memmap`).
 
     Raises
     ------
@@ -78,7 +87,7 @@ def compute_pod(
     """
     count, n = snapshots.shape
     if COPIES * 8 * count * n <= memory:
-        found = _decompose(np.asarray(snapshots, dtype=np.float64), weights)
+        found = _decompose(np.asarray(snapshots[:], dtype=np.float64), weights)
         kept = min(_rank(found.values, tolerance**2 * float(np.sum(found.values**2))), max_modes)
         return Pod(found.modes(kept), found.values, weights)
     # Two blocks and what is kept of others must fit.

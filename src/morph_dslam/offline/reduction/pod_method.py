@@ -20,7 +20,7 @@ from morph_dslam.model.functions import Functions, ParameterFunctions
 from morph_dslam.offline.problem import Snapshot
 from morph_dslam.offline.reduction.bases import parameter_bases
 from morph_dslam.offline.reduction.even_grid import EvenGrid
-from morph_dslam.offline.reduction.fields import field_names, field_values, model_of
+from morph_dslam.offline.reduction.fields import FieldRows, field_names, model_of
 from morph_dslam.offline.reduction.grid_functions import functions_on_grid
 from morph_dslam.offline.reduction.pod import Pod, compute_pod
 from morph_dslam.offline.reduction.regression import fit_functions
@@ -52,14 +52,16 @@ def reduce_by_pod(task: ReductionTask) -> ReducedModel:
     )
     fields, summaries = {}, {}
     for name in tqdm(field_names(snapshots), desc="modes and functions", unit="field"):
-        values = field_values(snapshots, name)
-        pod = _field_pod(task, values)
+        rows = FieldRows(snapshots, name)
+        pod = _field_pod(task, rows)
+        # One snapshot at a time: all of them together may not fit in memory.
+        coefficients = np.array([pod.project(rows[i : i + 1])[0] for i in range(len(snapshots))])
         if use_grid:
             assert grid is not None
-            functions, summary = _interpolated(task, grid, pod.project(values.reshape(len(values), -1)))
+            functions, summary = _interpolated(task, grid, coefficients)
         else:
-            functions, summary = _fitted(task, samples, pod, values, _slopes(snapshots, name, pod))
-        fields[name] = SeparatedField(pod.modes.reshape(-1, *values.shape[1:]), functions)
+            functions, summary = _fitted(task, samples, coefficients, _slopes(snapshots, name, pod))
+        fields[name] = SeparatedField(pod.modes.reshape(-1, *rows.field_shape), functions)
         summaries[name] = summary | {
             "modes": len(pod.modes),
             "singular_values": pod.singular_values[:60].tolist(),
@@ -87,14 +89,12 @@ def _check_choices(task: ReductionTask, grid: EvenGrid | None) -> None:
         )
 
 
-def _field_pod(task: ReductionTask, values: Array) -> Pod:
-    """POD of values (n_snapshots, n_points, n_components); points count by the nodes' weights."""
-    n_points, n_components = values.shape[1:]
+def _field_pod(task: ReductionTask, rows: FieldRows) -> Pod:
+    """POD of a field in all snapshots; points count by the nodes' weights."""
+    n_points, n_components = rows.field_shape
     at_nodes = n_points == len(task.mesh.weights)
     weights = np.repeat(task.mesh.weights if at_nodes else np.ones(n_points), n_components)
-    return compute_pod(
-        values.reshape(len(values), -1), weights, task.options.tolerance, task.options.max_modes
-    )
+    return compute_pod(rows, weights, task.options.tolerance, task.options.max_modes)
 
 
 def _slopes(snapshots: list[Snapshot], name: str, pod: Pod) -> Array | None:
@@ -122,12 +122,11 @@ def _interpolated(
 
 
 def _fitted(
-    task: ReductionTask, samples: Array, pod: Pod, values: Array, slopes: Array | None
+    task: ReductionTask, samples: Array, coefficients: Array, slopes: Array | None
 ) -> tuple[Functions, dict[str, Any]]:
-    """Polynomials fitted to the coefficients of a field's values at scattered samples."""
+    """Polynomials fitted to the coefficients (n_snapshots, n_modes) of a field at scattered samples."""
     options, box = task.options, task.box
     folds = np.concatenate([np.full(len(group), index) for index, group in enumerate(task.groups)])
-    coefficients = pod.project(values.reshape(len(values), -1))
     functions, errors = fit_functions(
         samples, coefficients, slopes, box[:, 0], box[:, 1], options.max_degree, folds, raise_single=True
     )
