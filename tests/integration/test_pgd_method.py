@@ -188,6 +188,10 @@ def test_other_functions_of_the_parameters_may_be_chosen(basis: str) -> None:
             {"mesh": BLOCK | {"cells": "hex27"}},
             r"takes hex20 or hex8 in place of hex27",
         ),
+        (
+            {"loads": [], "parameters": {"bed": STIFF_BED}},
+            r"nothing moves this solid",
+        ),
         ({"solver": {"threads": 1, "formulation": "mixed"}}, r"has no pressures: leave out"),
         (
             {"loads": [MOVING | {"width": "0.1 mm"}]},

@@ -104,6 +104,12 @@ def linear_solid(sweep: SweepProblem) -> LinearSolid:
     def load(mu: Array) -> Array:
         return -problem.residual(problem.prescribed(mu), mu)[free]
 
+    forces = separate(load, parameters, "the load")
+    if not forces.n_terms:
+        raise StudyError(
+            'reduction.method = "pgd": nothing moves this solid: it needs a load or a prescribed displacement '
+            "that is not zero"
+        )
     return LinearSolid(
         problem,
         parameters,
@@ -111,7 +117,7 @@ def linear_solid(sweep: SweepProblem) -> LinearSolid:
         separate(stiffness, parameters, "the stiffness"),
         pattern.indices,
         pattern.indptr,
-        separate(load, parameters, "the load"),
+        forces,
         separate(problem.prescribed, parameters, "the prescribed displacement"),
     )
 
