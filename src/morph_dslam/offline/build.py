@@ -15,6 +15,7 @@ from morph_dslam.offline import solutions
 from morph_dslam.offline.adaptive_sampling import estimator_check
 from morph_dslam.offline.certificate import certify, compression_percent
 from morph_dslam.offline.choices import ADAPTIVE, with_choices
+from morph_dslam.offline.comparison import compare_methods, write_comparison
 from morph_dslam.offline.executors import default_executor
 from morph_dslam.offline.external import ExternalStudy
 from morph_dslam.offline.problem import ParametricStudy
@@ -31,7 +32,11 @@ Array = NDArray[np.float64]
 
 
 def build(
-    study: Path | Study, output: Path, workers: int | None = None, executor: Executor | None = None
+    study: Path | Study,
+    output: Path,
+    workers: int | None = None,
+    executor: Executor | None = None,
+    compare: bool = False,
 ) -> ReducedModel:
     """Solve a study and write its model file.
 
@@ -42,6 +47,8 @@ def build(
     study : a study, its file, or the folder of a file study.toml. output : the model file.
     workers : processes, the study's own number if absent.
     executor : what to solve on in their place, a Dask cluster's say.
+    compare : whether to try every other method on the same solutions too, and write how they compare beside
+        the model (`comparison.comparison_paths`).
 
     Raises
     ------
@@ -53,7 +60,11 @@ def build(
         raise StudyError(f"the folder {output.parent} for the model file does not exist: make it first")
     chosen = with_choices(described)
     known = solve_or_read(chosen, output.with_name(output.name + ".snapshots"), workers, executor)
-    model = certified_model(known, chosen.reduction, chosen.name)
+    if compare:
+        model, rows = compare_methods(chosen, lambda options: certified_model(known, options, chosen.name))
+        write_comparison(output, rows)
+    else:
+        model = certified_model(known, chosen.reduction, chosen.name)
     model.provenance.update(provenance(text, chosen, model))
     save_model(output, model)
     return model
