@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 InnerProduct = Array | scipy.sparse.sparray | scipy.sparse.spmatrix
 
 #: Bytes that a decomposition may take before it is done in blocks.
-DEFAULT_MEMORY = 4 * 2**30
+DEFAULT_MEMORY = 4e9
 #: Arrays of the snapshots' size, in double precision, that a decomposition at once needs.
 COPIES = 3
 #: Part of the tolerance that truncation before the last decomposition may use.

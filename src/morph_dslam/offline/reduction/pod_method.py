@@ -94,7 +94,8 @@ def _field_pod(task: ReductionTask, rows: FieldRows) -> Pod:
     n_points, n_components = rows.field_shape
     at_nodes = n_points == len(task.mesh.weights)
     weights = np.repeat(task.mesh.weights if at_nodes else np.ones(n_points), n_components)
-    return compute_pod(rows, weights, task.options.tolerance, task.options.max_modes)
+    options = task.options
+    return compute_pod(rows, weights, options.tolerance, options.max_modes, 1e9 * options.memory_gb)
 
 
 def _slopes(snapshots: list[Snapshot], name: str, pod: Pod) -> Array | None:

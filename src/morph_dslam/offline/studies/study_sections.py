@@ -93,7 +93,8 @@ class ReductionSection(Section):
     ``inner_product`` is that in which modes are orthogonal: "mass" counts nodes by their volume, "energy" by
     the stiffness. ``components`` "separate" gives every component of a field modes of its own. Modes are kept
     until the relative norm left out is below ``tolerance``, and at most ``max_modes``; ``max_degree`` is the
-    highest polynomial degree tried in the parameters.
+    highest polynomial degree tried in the parameters. ``memory_gb`` is what a decomposition of snapshots may
+    take, in 1e9 bytes; more of them are decomposed in blocks.
     """
 
     method: MethodName | None = None
@@ -104,6 +105,7 @@ class ReductionSection(Section):
     tolerance: float = Field(default=5e-4, gt=0, lt=1)
     max_modes: int = Field(default=24, ge=1)
     max_degree: int = Field(default=8, ge=1, le=40)
+    memory_gb: float = Field(default=4.0, gt=0, allow_inf_nan=False)
 
 
 class WorkSection(Section):
