@@ -63,7 +63,7 @@ def alone(tmp_path_factory) -> bytes:
     return (folder / "block.morph").read_bytes()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_a_stopped_build_keeps_what_it_solved_and_says_so(number, alone: bytes, tmp_path: Path) -> None:
     """Ctrl-C reaches the whole group, SIGTERM of a batch system the main process alone."""
     study, output = write_study(tmp_path), tmp_path / "block.morph"
