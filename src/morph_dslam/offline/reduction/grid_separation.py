@@ -46,8 +46,10 @@ def separate_grid(
     if np.prod(shape) != n_points:
         raise ValueError(f"a grid of {shape} nodes is not a mesh of {n_points}")
     values = np.stack([field.functions.evaluate(mu)[0] for mu in samples])
-    triangle = np.asarray(np.linalg.qr(values, mode="r"))  # norms over samples are those of its columns
-    weighted = triangle @ field.modes.reshape(n_modes, -1)
+    _, sizes, mixes = np.linalg.svd(values, full_matrices=False)  # without the samples norms are the same
+    used = sizes > 1e-13 * sizes[0]
+    sizes, mixes = sizes[used], mixes[used]
+    weighted = sizes[:, None] * (mixes @ field.modes.reshape(n_modes, -1))
     # many modes of few dimensions, snapshots say, are first told by those few
     left, values, right = np.linalg.svd(weighted, full_matrices=False)
     kept = values > 0.01 * tolerance * values[0]
@@ -65,5 +67,5 @@ def separate_grid(
             terms.append((mixing, *(axis.T for axis in axes), components))
     mixing = np.concatenate([term[0] for term in terms], axis=1)
     *axes, components = (np.concatenate(parts) for parts in list(zip(*terms, strict=True))[1:])
-    functions = field.functions.mixed(np.linalg.pinv(triangle) @ left[:, kept] @ mixing)
+    functions = field.functions.mixed((mixes.T / sizes) @ left[:, kept] @ mixing)
     return SeparatedField.from_compact(GridModes(tuple(axes), components), functions)
