@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.model import ReducedModel, SeparatedField
+from morph_dslam.model import ReducedModel
 from morph_dslam.model.basis_functions import chebyshev_basis
 from morph_dslam.model.functions import Functions
 from morph_dslam.offline.reduction.bases import parameter_bases
@@ -25,6 +25,7 @@ from morph_dslam.offline.reduction.grid_functions import (
     sizes_along_lines,
     values_on_grid,
 )
+from morph_dslam.offline.reduction.kept_modes import keep_modes
 from morph_dslam.offline.reduction.reduced_solver import FullSolutions, ReducedSolver, solid_equations
 from morph_dslam.offline.reduction.sampled_fields import SampledFields, field_modes
 from morph_dslam.offline.reduction.scattered_functions import (
@@ -64,12 +65,12 @@ def reduce_by_galerkin(task: ReductionTask) -> ReducedModel:
     dense = _on_grid(task, sampled) if _grid_is_used(task) else _scattered(task, sampled)
     fields, summaries = {}, {}
     for name, part in sampled.parts.items():
-        rotation, singular_values = _leading(dense.coefficients[part], tolerance, task.options.max_modes)
-        functions = dense.functions(rotation.T, part, task, SHARE * tolerance)
-        fields[name] = SeparatedField(np.tensordot(rotation.T, modes[name].modes, axes=1), functions)
+        flat = dense.coefficients[part].reshape(part.stop - part.start, -1)
+        kept = keep_modes(task, name, modes[name].modes, flat)
+        fields[name] = kept.field(dense.functions(kept.rotation, part, task, SHARE * tolerance))
         summaries[name] = {
-            "modes": rotation.shape[1],
-            "singular_values": singular_values[:60].tolist(),
+            "modes": len(kept.modes),
+            "singular_values": kept.singular_values[:60].tolist(),
             "left_out_by_the_snapshots_modes": modes[name].left_out,
         }
     summary = {
@@ -154,12 +155,3 @@ def _scattered(task: ReductionTask, sampled: SampledFields) -> _Expansion:
         "expansion_error": error,
     }
     return _Expansion(indices, coefficients.T, len(scattered.samples), summary)
-
-
-def _leading(coefficients: Array, tolerance: float, max_modes: int) -> tuple[Array, Array]:
-    """Leading left singular vectors (k, m) of coefficients (k, ...) and all singular values."""
-    flat = coefficients.reshape(len(coefficients), -1)
-    left, values, _ = np.linalg.svd(flat, full_matrices=False)
-    left_out = np.sqrt(np.cumsum(values[::-1] ** 2))[::-1]
-    count = max(1, int(np.sum(left_out > tolerance * left_out[0])))
-    return left[:, : min(count, max_modes)], values

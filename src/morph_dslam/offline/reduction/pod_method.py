@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from morph_dslam.errors import StudyError
-from morph_dslam.model import ReducedModel, SeparatedField
+from morph_dslam.model import ReducedModel
 from morph_dslam.model.basis_functions import chebyshev_basis
 from morph_dslam.model.functions import Functions, ParameterFunctions
 from morph_dslam.offline.problem import Snapshot
@@ -22,6 +22,7 @@ from morph_dslam.offline.reduction.bases import parameter_bases
 from morph_dslam.offline.reduction.even_grid import EvenGrid
 from morph_dslam.offline.reduction.fields import FieldRows, field_names, model_of
 from morph_dslam.offline.reduction.grid_functions import functions_on_grid
+from morph_dslam.offline.reduction.kept_modes import KeptModes, keep_modes
 from morph_dslam.offline.reduction.pod import Pod, compute_pod
 from morph_dslam.offline.reduction.regression import fit_functions
 from morph_dslam.offline.reduction.scattered_functions import expansion_train
@@ -31,6 +32,8 @@ Array = NDArray[np.float64]
 
 #: Bases that interpolate on a grid, and error of a separated form there as a part of the tolerance.
 GRID_BASES, SHARE = ("cubic_spline", "hat"), 0.2
+#: Modes that those kept are chosen from: to this part of the tolerance, and so many times ``max_modes``.
+FINER, MORE_MODES = 0.1, 3
 
 
 def reduce_by_pod(task: ReductionTask) -> ReducedModel:
@@ -56,15 +59,17 @@ def reduce_by_pod(task: ReductionTask) -> ReducedModel:
         pod = _field_pod(task, rows)
         # One snapshot at a time: all of them together may not fit in memory.
         coefficients = np.array([pod.project(rows[i : i + 1])[0] for i in range(len(snapshots))])
+        kept = keep_modes(task, name, pod.modes.reshape(-1, *rows.field_shape), coefficients.T)
+        coefficients = coefficients @ kept.rotation.T
         if use_grid:
             assert grid is not None
             functions, summary = _interpolated(task, grid, coefficients)
         else:
-            functions, summary = _fitted(task, samples, coefficients, _slopes(snapshots, name, pod))
-        fields[name] = SeparatedField(pod.modes.reshape(-1, *rows.field_shape), functions)
+            functions, summary = _fitted(task, samples, coefficients, _slopes(snapshots, name, pod, kept))
+        fields[name] = kept.field(functions)
         summaries[name] = summary | {
-            "modes": len(pod.modes),
-            "singular_values": pod.singular_values[:60].tolist(),
+            "modes": len(kept.modes),
+            "singular_values": kept.singular_values[:60].tolist(),
         }
     return model_of(task, fields, {"method": "pod", **summaries["displacement"]})
 
@@ -90,21 +95,22 @@ def _check_choices(task: ReductionTask, grid: EvenGrid | None) -> None:
 
 
 def _field_pod(task: ReductionTask, rows: FieldRows) -> Pod:
-    """POD of a field in all snapshots; points count by the nodes' weights."""
+    """More modes of a field in all snapshots than are kept; points count by the nodes' weights."""
     n_points, n_components = rows.field_shape
     at_nodes = n_points == len(task.mesh.weights)
     weights = np.repeat(task.mesh.weights if at_nodes else np.ones(n_points), n_components)
     options = task.options
-    return compute_pod(rows, weights, options.tolerance, options.max_modes, 1e9 * options.memory_gb)
+    most = MORE_MODES * options.max_modes
+    return compute_pod(rows, weights, FINER * options.tolerance, most, 1e9 * options.memory_gb)
 
 
-def _slopes(snapshots: list[Snapshot], name: str, pod: Pod) -> Array | None:
+def _slopes(snapshots: list[Snapshot], name: str, pod: Pod, kept: KeptModes) -> Array | None:
     """Derivatives (n_snapshots, d, n_modes) of a field's coefficients; None where they are unknown."""
     if name not in snapshots[0].sensitivities:
         return None
     # One snapshot at a time: the slopes of all of them together would be the largest array of a build.
     slopes = [
-        pod.project(values.reshape(len(values), -1).astype(np.float64))
+        pod.project(values.reshape(len(values), -1).astype(np.float64)) @ kept.rotation.T
         for values in (snapshot.sensitivities[name] for snapshot in snapshots)
     ]
     return np.array(slopes)
