@@ -109,6 +109,10 @@ def test_reactions_of_the_model_balance(compared):
     ("line", "message"),
     [
         ('[reduction]\nmethod = "krylov"', "reduction.method"),
+        ('[reduction]\nbasis = "kriging"', 'leave it out, or use one of "chebyshev", "cubic_spline"'),
+        ('[reduction]\nmethod = "sparse_pgd"\nformat = "tucker"', 'use one of "cp"'),
+        ('[reduction]\nmethod = "sparse_pgd"\ncomponents = "separate"', 'use method "galerkin" or "pod"'),
+        ('[reduction]\nformat = "polynomial"\nbasis = "hat"', "leave out reduction.basis"),
         ('scheme = "adaptive"\n[reduction]\nmethod = "pod"', "needs an estimate of the error"),
     ],
 )
