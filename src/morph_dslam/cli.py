@@ -76,6 +76,7 @@ def _track(arguments: argparse.Namespace) -> None:
             model=arguments.model,
             camera=arguments.camera,
             landmarks=arguments.landmarks,
+            placement=arguments.place,
             output=arguments.output,
             first=first,
             last=last,
@@ -204,8 +205,13 @@ def _add_online_commands(commands: argparse._SubParsersAction) -> None:
     track.add_argument("frames", type=Path, metavar="FRAMES", help="video file, or folder of numbered images")
     track.add_argument("--model", type=Path, required=True, help="model file of `morph build`")
     track.add_argument("--camera", type=Path, required=True, help="camera file: size, intrinsics, distortion")
-    track.add_argument(
-        "--landmarks", type=Path, required=True, help="object points and their pixels in the reference frame"
+    start = track.add_mutually_exclusive_group(required=True)
+    start.add_argument("--landmarks", type=Path, help="object points and their pixels in the reference frame")
+    start.add_argument(
+        "--place",
+        type=Path,
+        metavar="JSON",
+        help="registration.json of `morph register` in a map of the frames",
     )
     track.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="run folder to write")
     track.add_argument(

@@ -102,13 +102,19 @@ def scanned(world_from_object, objects=ONE, noise=3e-4, seed=0, with_images=Fals
             image = render_textured(drawn, scene_triangles, np.tile(coordinates, (len(objects), 1)), texture)
             flat = np.where(drawn.covered, image, np.uint8(128)).astype(np.uint8)
         camera_from_world = _camera_from_world(pose, world_from_object)
-        views.append(View(flat, camera_from_world, np.flatnonzero(seen), pixels[seen]))
+        views.append(View(len(views), flat, camera_from_world, np.flatnonzero(seen), pixels[seen]))
         count[seen] += 1
         places[seen] += camera_from_world.inverse.translation
     kept = count >= 2
     rows = np.cumsum(kept) - 1
     views = [
-        View(v.flat, v.camera_from_world, rows[v.point_ids[kept[v.point_ids]]], v.pixels[kept[v.point_ids]])
+        View(
+            v.frame,
+            v.flat,
+            v.camera_from_world,
+            rows[v.point_ids[kept[v.point_ids]]],
+            v.pixels[kept[v.point_ids]],
+        )
         for v in views
     ]
     noisy = points + noise * rng.standard_normal(points.shape)

@@ -16,6 +16,7 @@ from morph_dslam.model.array_reading import names, read_array, read_group, read_
 from morph_dslam.model.basis_functions import Basis
 from morph_dslam.model.compact_modes import CompactModes, ComponentModes, GridModes
 from morph_dslam.model.functions import Functions, ParameterFunctions
+from morph_dslam.model.product_functions import ProductFunctions
 from morph_dslam.model.separated import SeparatedField
 from morph_dslam.model.stacked_functions import StackedFunctions
 from morph_dslam.model.tensor_functions import CPFunctions, TensorTrainFunctions, TuckerFunctions
@@ -94,6 +95,13 @@ def _write_functions(group: h5py.Group, functions: Functions) -> None:
             _write_functions(group.create_group(f"part_{k + 1}"), part)
         if functions.mixing is not None:
             group.create_dataset("mixing", data=functions.mixing)
+    elif isinstance(functions, ProductFunctions):
+        group.attrs["format"] = "product"
+        group.attrs["n_first"] = functions.first.dimension
+        _write_functions(group.create_group("part_1"), functions.first)
+        _write_functions(group.create_group("part_2"), functions.second)
+        if functions.mixing is not None:
+            group.create_dataset("mixing", data=functions.mixing)
     else:
         raise TypeError(f"there is no place in the model file for {type(functions).__name__}")
 
@@ -153,6 +161,13 @@ def read_functions(group: h5py.Group, lower: Array, upper: Array) -> Functions:
             read_functions(read_group(group, f"part_{k}"), lower, upper) for k in _numbers(group, "part")
         ]
         return StackedFunctions(tuple(parts), read_array(group, "mixing", 2) if "mixing" in group else None)
+    if form == "product":
+        split = int(read_number(group, "n_first"))
+        if not 1 <= split < d:
+            raise ValueError(f"products of functions of {split} parameters in a model of {d}")
+        first = read_functions(read_group(group, "part_1"), lower[:split], upper[:split])
+        second = read_functions(read_group(group, "part_2"), lower[split:], upper[split:])
+        return ProductFunctions(first, second, read_array(group, "mixing", 2) if "mixing" in group else None)
     if form not in ("cp", "tucker", "tensor_train"):
         raise ValueError(f"functions are kept in the unknown format '{form}'")
     bases = tuple(_read_basis(read_group(group, f"basis_{k + 1}")) for k in range(d))

@@ -19,11 +19,12 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import SourceError, TrackingError
 from morph_dslam.io.calibration import load_camera
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
-from morph_dslam.model import ReducedModel, load_model
+from morph_dslam.model import ReducedModel, load_model, save_model
 from morph_dslam.online.augmentation import write_video
 from morph_dslam.online.estimation import State
 from morph_dslam.online.outline import rim
 from morph_dslam.online.pipeline import Tracker, TrackerOptions
+from morph_dslam.online.placement import Placement, load_placement, place_by_landmarks
 from morph_dslam.online.plots import write_plots
 from morph_dslam.online.reference_refinement import (
     Keyframe,
@@ -31,9 +32,12 @@ from morph_dslam.online.reference_refinement import (
     choose_keyframes,
     refine_reference,
 )
-from morph_dslam.online.registration import Registration, RegistrationOptions, bind_landmarks, register
+from morph_dslam.online.registration import RegistrationOptions, bind_landmarks
 from morph_dslam.online.results import RunResults, write_csv, write_hdf5, write_summary
 from morph_dslam.sources import Frame, FrameSource, open_source
+
+#: Options that name input files.
+_INPUTS = ("frames", "model", "camera", "landmarks", "placement")
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,9 @@ class TrackOptions:
 
     Attributes
     ----------
-    frames : video file or folder of images. model, camera, landmarks : files.
+    frames : video file or folder of images. model, camera : files.
+    landmarks : file of landmarks in the reference frame; or placement : registration.json of
+        `morph register`, whose last keyframe is the reference frame.
     output : the run folder. first, last : frame numbers to track, both included; all by default.
     reference_frame : the frame that the landmarks belong to; the first one tracked by default.
     refine_reference : after tracking, refine the reference state over the whole sequence and track once more.
@@ -53,8 +59,9 @@ class TrackOptions:
     frames: Path
     model: Path
     camera: Path
-    landmarks: Path
     output: Path
+    landmarks: Path | None = None
+    placement: Path | None = None
     first: int | None = None
     last: int | None = None
     reference_frame: int | None = None
@@ -85,26 +92,31 @@ def track(options: TrackOptions) -> dict[str, Any]:
     """
     _check_output(options)
     model, camera = load_model(options.model), load_camera(options.camera)
-    landmarks = load_landmarks(options.landmarks)
+    landmarks = None if options.landmarks is None else load_landmarks(options.landmarks)
     if options.use_outline and not len(rim(model.triangles)):
         raise TrackingError(
             f"the surface of '{model.name}' is closed and has no rim: track it without the outline"
         )
+    if options.placement is not None:
+        placement = load_placement(options.placement, model)
+        first = placement.frame if options.first is None else options.first
+        options = replace(options, reference_frame=placement.frame, first=first)
     source = open_source(options.frames, options.first, options.last)
     reference = _reference_frame(options)
     camera.check_image(reference.image, f"frame {reference.index} of {options.frames}")
-    registration = register(model, camera, landmarks.points, landmarks.pixels, options.registration)
-    _warm_up(model, camera, reference, registration.state, options)
-    run = RunResults(model, reference.index)
+    if landmarks is not None:
+        placement = place_by_landmarks(model, camera, landmarks, options.registration)
+    _warm_up(camera, reference, placement, options)
+    run = RunResults(placement.model, reference.index)
     try:
-        keyframes = _follow(source, camera, reference, registration.state, options, run)
-        if options.refine_reference:
-            state = _refined(model, camera, landmarks, registration, keyframes, reference, options)
-            again = RunResults(model, reference.index, refined=True)
+        keyframes = _follow(source, camera, reference, placement.state, options, run)
+        if options.refine_reference and landmarks is not None:
+            state = _refined(camera, landmarks, placement, keyframes, reference, options)
+            again = RunResults(placement.model, reference.index, refined=True)
             _follow(source, camera, reference, state, options, again)
             run = again
     finally:
-        summary = _write_run(options, source, camera, run, registration) if len(run) else {}
+        summary = _write_run(options, source, camera, run, placement) if len(run) else {}
     return summary
 
 
@@ -129,19 +141,19 @@ def _follow(
 
 
 def _refined(
-    model: ReducedModel,
     camera: PinholeCamera,
     landmarks: Landmarks,
-    registration: Registration,
+    placement: Placement,
     keyframes: list[Keyframe],
     reference: Frame,
     options: TrackOptions,
 ) -> State:
     """The reference state refined over the sequence."""
     print("refining the reference state over the sequence ...", file=sys.stderr)
-    tracker = _new_tracker(model, camera, reference, registration.state, options)
+    model, state = placement.model, placement.state
+    tracker = _new_tracker(model, camera, reference, state, options)
     # How well the landmarks fit tells how carefully they were set, where they are enough to tell.
-    sigma = registration.estimate.sigma_px
+    sigma = placement.facts["sigma_px"]
     stated = options.refinement.landmark_px
     trust = replace(options.refinement, landmark_px=max(sigma, 0.1) if np.isfinite(sigma) else stated)
     return refine_reference(
@@ -149,7 +161,7 @@ def _refined(
         bind_landmarks(model, landmarks.points, options.registration),
         camera.undistort_pixels(landmarks.pixels),
         tracker.reference_pixels,
-        registration.state,
+        state,
         choose_keyframes(keyframes, options.refinement.n_keyframes),
         trust,
         tracker.outline,
@@ -157,6 +169,13 @@ def _refined(
 
 
 def _check_output(options: TrackOptions) -> None:
+    if (options.landmarks is None) == (options.placement is None):
+        raise TrackingError("say where the object is: either landmarks, or a registration in a map")
+    if options.placement is not None and (options.refine_reference or options.reference_frame is not None):
+        raise TrackingError(
+            "a registration in a map brings its own reference frame, refined already: leave out --refine and "
+            "--reference-frame"
+        )
     if (options.output / "result.h5").exists() and not options.overwrite:
         raise TrackingError(
             f"{options.output} holds a run already: choose another folder, or allow it to be overwritten"
@@ -183,12 +202,11 @@ def _new_tracker(
     return Tracker(model, camera, reference.image, state, settings, in_sequence=begins)
 
 
-def _warm_up(
-    model: ReducedModel, camera: PinholeCamera, reference: Frame, state: State, options: TrackOptions
-) -> None:
+def _warm_up(camera: PinholeCamera, reference: Frame, placement: Placement, options: TrackOptions) -> None:
     """Compile the inner loops, so that the first frame takes no longer than the others."""
     print("preparing: compiling the inner loops (half a minute the first time) ...", file=sys.stderr)
-    _new_tracker(model, camera, reference, state, options).process_frame(reference.image)
+    tracker = _new_tracker(placement.model, camera, reference, placement.state, options)
+    tracker.process_frame(reference.image)
 
 
 def _write_run(
@@ -196,26 +214,22 @@ def _write_run(
     source: FrameSource,
     camera: PinholeCamera,
     run: RunResults,
-    registration: Registration,
+    placement: Placement,
 ) -> dict[str, Any]:
     """Write all files of the run folder; the video last, because it takes longest."""
     folder = options.output
     write_hdf5(folder / "result.h5", run)
     write_csv(folder / "frames.csv", run)
-    _copy(options.model, folder / "model.morph")
+    save_model(folder / "model.morph", placement.model)
     _copy(options.camera, folder / "camera.yaml")
     extra = {
-        "registration": {
-            "residual_rms_px": registration.residual_rms_px,
-            "n_landmarks": len(registration.estimate.residuals),
-            "n_alternatives": len(registration.alternatives),
-        },
+        "registration": placement.facts,
         "reference_refined_over_the_sequence": run.refined,
         "outline_used": options.use_outline,
-        "flags": list(registration.flags),
+        "flags": list(placement.flags),
         "start_of_each_frame": "previous state; the first guess of image motion assumes constant velocity",
         "temporal_prior": "none",
-        "inputs": {name: str(getattr(options, name)) for name in ("frames", "model", "camera", "landmarks")},
+        "inputs": {name: str(getattr(options, name)) for name in _INPUTS if getattr(options, name)},
         "settings": {
             "registration": asdict(options.registration),
             "refinement": asdict(options.refinement),

@@ -52,7 +52,7 @@ def run_registration(map_path: Path, model_path: Path, camera_path: Path, output
         raise RegistrationError(f"cannot write the registration to {output}: {error.strerror}") from error
     nodes = model.positions(model.default)
     found = register_mesh(nodes, model.triangles, points, views, camera, rigid_map.is_metric, progress=True)
-    content = _content(found, nodes)
+    content = _content(found, nodes) | {"keyframes": _keyframes(found, views)}
     (output / "registration.json").write_text(json.dumps(content, indent=2) + "\n")
     cv2.imwrite(str(output / "registration.jpg"), draw_registration(found, model, views, camera))
     return content
@@ -78,6 +78,19 @@ def _content(found: MeshRegistration, nodes: NDArray[np.float64]) -> dict[str, A
         axis = {"point_m": found.axis.point.tolist(), "direction": found.axis.direction.tolist()}
         content["axis_of_revolution"] = axis
     return content
+
+
+def _keyframes(found: MeshRegistration, views: Sequence[View]) -> list[dict[str, Any]]:
+    """The object's pose in every keyframe, metres."""
+    placed = found.world_from_object
+    poses = []
+    for view in views:
+        camera = view.camera_from_world
+        matrix = np.eye(4)
+        matrix[:3, :3] = camera.rotation @ placed.rotation
+        matrix[:3, 3] = camera.apply(placed.translation) / placed.scale
+        poses.append({"frame": view.frame, "camera_from_object": matrix.tolist()})
+    return poses
 
 
 def remarks(content: dict[str, Any]) -> list[str]:

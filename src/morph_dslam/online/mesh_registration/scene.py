@@ -34,10 +34,12 @@ class View:
 
     Attributes
     ----------
+    frame : its number in the recording.
     flat : (h, w) uint8 its flattened image, undistorted. camera_from_world : its pose.
     point_ids : (k,) rows of the map points seen. pixels : (k, 2) where.
     """
 
+    frame: int
     flat: NDArray[np.uint8]
     camera_from_world: RigidTransform
     point_ids: NDArray[np.int64]
@@ -54,7 +56,7 @@ def scene_of_map(rigid_map: RigidMap) -> tuple[MapPoints, Sequence[View]]:
         pose = RigidTransform.from_matrix(keyframe.camera_from_world)
         seen = row[keyframe.point_ids]
         kept = seen >= 0
-        views.append(View(keyframe.flat, pose, seen[kept], keyframe.pixels[kept]))
+        views.append(View(keyframe.index, keyframe.flat, pose, seen[kept], keyframe.pixels[kept]))
         total[seen[kept]] += pose.inverse.translation
         count[seen[kept]] += 1.0
     used = count > 0

@@ -1,0 +1,81 @@
+"""Where tracking starts: from landmarks in a reference frame, or from a registration in a map."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import RegistrationError
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.io.landmarks import Landmarks
+from morph_dslam.model import ReducedModel
+from morph_dslam.model.turned_model import turned_model
+from morph_dslam.online.estimation import State
+from morph_dslam.online.registration import RegistrationOptions, register
+
+
+@dataclass(frozen=True)
+class Placement:
+    """An object in a reference frame.
+
+    Attributes
+    ----------
+    model : the model to track with; with the angle about its axis as a parameter where that is not known.
+    frame : number of the reference frame; None for the first one tracked.
+    state : of the object there. facts : for the summary. flags : what a reader must know.
+    """
+
+    model: ReducedModel
+    frame: int | None
+    state: State
+    facts: dict[str, Any]
+    flags: tuple[str, ...]
+
+
+def load_placement(path: Path, model: ReducedModel) -> Placement:
+    """The object as `morph register` placed it, undeformed, in the last keyframe of the map.
+
+    Raises
+    ------
+    RegistrationError
+        If the file is missing or not one of `morph register`.
+    """
+    try:
+        content = json.loads(path.read_text())
+        keyframe = max(content["keyframes"], key=lambda entry: entry["frame"])
+        pose = RigidTransform.from_matrix(np.array(keyframe["camera_from_object"], dtype=np.float64))
+        frame, axis = int(keyframe["frame"]), content["axis_of_revolution"]
+        facts = {key: content[key] for key in ("score", "runner_up_score", "rms_px", "map_units_per_metre")}
+        ambiguous = bool(content["ambiguous"])
+    except OSError as error:
+        raise RegistrationError(f"cannot read the registration {path}: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        raise RegistrationError(f"{path} is not a registration.json of `morph register` ({error})") from error
+    flags = ["registration ambiguous: another place in the map is nearly as good"] if ambiguous else []
+    if axis is not None:
+        model = turned_model(model, np.array(axis["point_m"]), np.array(axis["direction"]))
+        flags.append(
+            f"the angle about the object's axis cannot be seen before it deforms: it is the parameter "
+            f"'{model.parameters[-1].name}'"
+        )
+    return Placement(model, frame, State(model.default, pose), {"from": "map", **facts}, tuple(flags))
+
+
+def place_by_landmarks(
+    model: ReducedModel, camera: PinholeCamera, landmarks: Landmarks, options: RegistrationOptions
+) -> Placement:
+    """The object in the frame of the landmarks; raises RegistrationError as `register` does."""
+    registration = register(model, camera, landmarks.points, landmarks.pixels, options)
+    facts = {
+        "from": "landmarks",
+        "residual_rms_px": registration.residual_rms_px,
+        "sigma_px": registration.estimate.sigma_px,
+        "n_landmarks": len(registration.estimate.residuals),
+        "n_alternatives": len(registration.alternatives),
+    }
+    return Placement(model, None, registration.state, facts, registration.flags)

@@ -1,0 +1,149 @@
+"""Bodies of revolution loaded from an unknown side, and products of functions: closed forms."""
+
+import json
+
+import numpy as np
+import pytest
+
+from morph_dslam.errors import ModelFileError, RegistrationError
+from morph_dslam.model import Parameter, ReducedModel, SeparatedField, load_model, save_model
+from morph_dslam.model.basis_functions import chebyshev_basis, fourier_basis
+from morph_dslam.model.functions import ParameterFunctions
+from morph_dslam.model.product_functions import ProductFunctions
+from morph_dslam.model.tensor_functions import CPFunctions
+from morph_dslam.model.turned_model import turned_model
+from morph_dslam.offline.meshing.mesh_generators import block, tube
+from morph_dslam.online.placement import load_placement
+
+AXIS = (np.zeros(3), np.array([0.0, 0.0, 1.0]))
+
+
+def polynomial(coefficients):
+    """Functions of one parameter in [0, 2], by their Chebyshev coefficients (terms, functions)."""
+    degrees = np.arange(len(coefficients))[:, None]
+    return ParameterFunctions(
+        np.array([0.0]), np.array([2.0]), degrees, np.asarray(coefficients, dtype=float)
+    )
+
+
+def bent_tube(mesh=None):
+    """u = mu z² e_x, and a stress mu (e_x e_x + y e_x e_y): on a tube 0.1 m long, for a load along x."""
+    mesh = mesh or tube(0.02, 0.03, 0.1, (4, 1, 24), cell_type="hex8")
+    x, y, z = mesh.nodes.T
+    zero = np.zeros_like(x)
+    linear = polynomial([[1.0], [1.0]])  # mu = 1 + T_1(mu - 1)
+    stress = np.column_stack([1e6 + zero, zero, zero, zero, zero, 1e7 * y])
+    return ReducedModel(
+        "bent tube",
+        mesh.nodes,
+        mesh.surface_triangles(),
+        (Parameter("load", "ratio", "1", 0.0, 2.0, 0.0),),
+        SeparatedField(np.column_stack([z**2, zero, zero])[None], linear),
+        stresses={"solid": SeparatedField(stress[None], linear)},
+    )
+
+
+def turned_stress(nodes, load, angle):
+    """The stress of `bent_tube` turned by an angle: R S(R^T X) R^T (n, 3, 3)."""
+    c, s = np.cos(angle), np.sin(angle)
+    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    y = (nodes @ rotation)[:, 1]
+    local = np.zeros((len(nodes), 3, 3))
+    local[:, 0, 0] = 1e6
+    local[:, 0, 1] = local[:, 1, 0] = 1e7 * y
+    return load * rotation @ local @ rotation.T
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, -2.3, 2.0 * np.pi / 24 * 5])
+def test_displacement_and_stress_turn_with_the_load(angle):
+    turned = turned_model(bent_tube(), *AXIS)
+    mu, z = np.array([1.3, angle]), turned.nodes[:, 2]
+    expected = 1.3 * z[:, None] ** 2 * np.array([np.cos(angle), np.sin(angle), 0.0])
+    np.testing.assert_allclose(turned.displacement.value(mu), expected, atol=1e-12)
+    tensor = turned_stress(turned.nodes, 1.3, angle)
+    components = tensor[:, [0, 1, 2, 1, 0, 0], [0, 1, 2, 2, 2, 1]]
+    np.testing.assert_allclose(turned.stresses["solid"].value(mu), components, atol=1e-4)
+
+
+def test_sensitivity_to_the_angle_is_that_of_finite_differences():
+    field = turned_model(bent_tube(), *AXIS).displacement
+    mu, step = np.array([1.3, 0.7]), 1e-6
+    _, slopes = field.value_and_sensitivities(mu)
+    for k in range(2):
+        delta = step * np.eye(2)[k]
+        difference = (field.value(mu + delta) - field.value(mu - delta)) / (2.0 * step)
+        np.testing.assert_allclose(slopes[k], difference, atol=1e-9)
+
+
+def test_a_turned_model_is_kept_in_a_file(tmp_path):
+    turned = turned_model(bent_tube(), *AXIS)
+    save_model(tmp_path / "turned.morph", turned)
+    loaded = load_model(tmp_path / "turned.morph")
+    mu = np.array([0.6, 1.1])
+    assert [parameter.name for parameter in loaded.parameters] == ["load", "turn"]
+    np.testing.assert_allclose(loaded.positions(mu), turned.positions(mu), atol=1e-8)
+    assert loaded.displacement.n_floats == turned.displacement.n_floats
+
+
+def test_a_block_cannot_be_turned():
+    mesh = block((0.02, 0.03, 0.1), (2, 3, 4), "hex8")
+    with pytest.raises(ModelFileError, match="body of revolution"):
+        turned_model(bent_tube(mesh), *AXIS)
+
+
+def test_an_angle_that_there_is_already_is_refused():
+    with pytest.raises(ModelFileError, match="'load'"):
+        turned_model(bent_tube(), *AXIS, name="load")
+
+
+def test_products_are_those_of_their_factors():
+    """Against numpy's polynomials and cosines, mixed derivatives and mixtures too."""
+    first = polynomial([[0.5, 1.0], [1.0, 0.0], [0.0, -2.0]])
+    unit = np.eye(3)
+    second = CPFunctions((fourier_basis(0.0, 2.0 * np.pi, 1),), (unit,), unit)
+    product = ProductFunctions(first, second)
+    x, a = 0.3, 0.9
+    t = x - 1.0
+    h, dh = np.array([0.5 + t, 1.0 - 2.0 * (2 * t**2 - 1)]), np.array([1.0, -8.0 * t])
+    k, dk = np.array([1.0, np.cos(a), np.sin(a)]), np.array([0.0, -np.sin(a), np.cos(a)])
+    rows = product.rows([x, a])
+    np.testing.assert_allclose(rows[0], np.outer(h, k).ravel())
+    np.testing.assert_allclose(rows[1], np.outer(dh, k).ravel(), atol=1e-12)
+    np.testing.assert_allclose(rows[2], np.outer(h, dk).ravel())
+    np.testing.assert_allclose(product.partial([x, a], (1, 1)), np.outer(dh, dk).ravel(), atol=1e-12)
+    matrix = np.random.default_rng(0).standard_normal((6, 2))
+    np.testing.assert_allclose(product.mixed(matrix).rows([x, a]), rows @ matrix)
+    np.testing.assert_allclose(
+        product.mixed(matrix).evaluate_numpy([x, a])[1], (rows @ matrix)[1:], atol=1e-12
+    )
+    with pytest.raises(ValueError, match="mixed by a matrix"):
+        ProductFunctions(first, CPFunctions((chebyshev_basis(0.0, 1.0, 2),), (unit,), unit), np.eye(4))
+
+
+def test_a_registration_places_the_object_in_its_last_keyframe(tmp_path):
+    pose = np.eye(4)
+    pose[:3, 3] = [0.1, 0.2, 0.5]
+    content = {
+        "score": 50.0,
+        "runner_up_score": 45.0,
+        "rms_px": 0.1,
+        "map_units_per_metre": 2.0,
+        "ambiguous": True,
+        "axis_of_revolution": {"point_m": [0.0, 0.0, 0.05], "direction": [0.0, 0.0, 1.0]},
+        "keyframes": [
+            {"frame": 7, "camera_from_object": pose.tolist()},
+            {"frame": 3, "camera_from_object": np.eye(4).tolist()},
+        ],
+    }
+    path = tmp_path / "registration.json"
+    path.write_text(json.dumps(content))
+    placement = load_placement(path, bent_tube())
+    assert placement.frame == 7
+    np.testing.assert_allclose(placement.state.camera_from_object.matrix, pose)
+    assert placement.model.parameters[-1].name == "turn"
+    assert any("ambiguous" in flag for flag in placement.flags)
+    path.write_text("{}")
+    with pytest.raises(RegistrationError, match=r"not a registration\.json"):
+        load_placement(path, bent_tube())
+    with pytest.raises(RegistrationError, match="cannot read"):
+        load_placement(tmp_path / "none.json", bent_tube())
