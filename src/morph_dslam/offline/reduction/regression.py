@@ -39,15 +39,19 @@ def design_matrix(samples: Array, lower: Array, upper: Array, indices: NDArray[n
     return np.array(rows, dtype=np.float64)
 
 
-def _solve(design: Array, targets: Array, gradient_weight: float) -> Array:
-    """Least squares over values and weighted gradients: (n_terms, n_functions)."""
+def _normal_equations(design: Array, targets: Array, gradient_weight: float) -> tuple[Array, Array]:
+    """Matrix (n_terms, n_terms) and right-hand side of least squares over values and weighted gradients."""
     weights = np.ones(len(design))
     weights[1:] = gradient_weight
     matrix = (design * weights[:, None, None]).reshape(-1, design.shape[2])
     right = (targets * weights[:, None, None]).reshape(-1, targets.shape[2])
-    gram = matrix.T @ matrix
-    gram[np.diag_indices_from(gram)] += RIDGE * np.trace(gram) / len(gram)
-    return np.asarray(np.linalg.solve(gram, matrix.T @ right), dtype=np.float64)
+    return matrix.T @ matrix, matrix.T @ right
+
+
+def _solve(gram: Array, right: Array) -> Array:
+    """Coefficients (n_terms, n_functions)."""
+    ridge = RIDGE * np.trace(gram) / len(gram) * np.eye(len(gram))
+    return np.asarray(np.linalg.solve(gram + ridge, right), dtype=np.float64)
 
 
 class _Fit:
@@ -67,15 +71,21 @@ class _Fit:
     def missed(self, indices: NDArray[np.int64]) -> float:
         """Relative root-mean-square error of the values of samples that were left out."""
         design, missed = self._design(indices), 0.0
-        for fold in range(FOLDS):
-            left = self._folds == fold
-            coefficients = _solve(design[:, ~left], self._targets[:, ~left], self._gradient_weight)
-            missed += float(np.sum((design[0, left] @ coefficients - self._targets[0, left]) ** 2))
+        folds = [self._folds == fold for fold in range(FOLDS)]
+        parts = [self._equations(design, fold) for fold in folds]
+        gram, right = sum(part[0] for part in parts), sum(part[1] for part in parts)
+        for fold, part in zip(folds, parts, strict=True):
+            coefficients = _solve(gram - part[0], right - part[1])
+            missed += float(np.sum((design[0, fold] @ coefficients - self._targets[0, fold]) ** 2))
         return float(np.sqrt(missed / np.sum(self._targets[0] ** 2)))
 
     def functions(self, indices: NDArray[np.int64]) -> ParameterFunctions:
-        coefficients = _solve(self._design(indices), self._targets, self._gradient_weight)
+        everything = np.ones(len(self._samples), dtype=bool)
+        coefficients = _solve(*self._equations(self._design(indices), everything))
         return ParameterFunctions(self._box[0], self._box[1], indices, coefficients)
+
+    def _equations(self, design: Array, which: NDArray[np.bool_]) -> tuple[Array, Array]:
+        return _normal_equations(design[:, which], self._targets[:, which], self._gradient_weight)
 
     def _design(self, indices: NDArray[np.int64]) -> Array:
         return design_matrix(self._samples, self._box[0], self._box[1], indices)[: len(self._targets)]
@@ -101,7 +111,7 @@ def fit_functions(
     groups : (n,) label of the fold that each sample is left out with; mirror images share one.
     gradient_weight : weight of gradients (over the half range) relative to values.
     raise_single : whether parameters may have higher degrees than the others where that predicts clearly
-        better, up to twice ``max_degree``.
+        better, up to three times ``max_degree``.
 
     Returns
     -------
@@ -129,7 +139,7 @@ def fit_functions(
     best = min(errors, key=lambda degree: errors[degree])
     indices = total_degree_indices(d, best)
     if raise_single and d > 1:
-        indices = _raised(fit, [best] * d, errors[best], 2 * max_degree)
+        indices = _raised(fit, [best] * d, errors[best], 3 * max_degree)
     return fit.functions(indices), errors
 
 
@@ -137,8 +147,8 @@ def _raised(fit: _Fit, degrees: list[int], error: float, highest: int) -> NDArra
     """Multi-indices with the degrees of single parameters raised by half while that predicts better."""
     best = weighted_degree_indices(degrees)
     for k in range(len(degrees)):
-        while 3 * degrees[k] // 2 <= highest:
-            tried = [*degrees[:k], 3 * degrees[k] // 2, *degrees[k + 1 :]]
+        while degrees[k] < highest:
+            tried = [*degrees[:k], min(3 * degrees[k] // 2, highest), *degrees[k + 1 :]]
             indices = weighted_degree_indices(tried)
             if not fit.suits(indices) or (missed := fit.missed(indices)) > WORTH_RAISING * error:
                 break
