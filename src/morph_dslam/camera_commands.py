@@ -21,7 +21,9 @@ def _slam(arguments: argparse.Namespace) -> None:
             first=first,
             last=last,
             map_file=arguments.map,
+            extend=arguments.extend,
             freeze_at=arguments.freeze_at,
+            freeze_when_deforming=arguments.freeze_when_deforming,
             use_depth=not arguments.no_depth,
             video=not arguments.no_video,
             overwrite=arguments.overwrite,
@@ -72,7 +74,15 @@ def add_camera_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         "--map", type=Path, metavar="MAP", help="map.h5 of an earlier run, to find the camera in"
     )
     slam.add_argument(
+        "--extend", action="store_true", help="with --map: let the map grow, instead of keeping it as it is"
+    )
+    slam.add_argument(
         "--freeze-at", type=int, metavar="N", help="from this frame on keep the map and only find the camera"
+    )
+    slam.add_argument(
+        "--freeze-when-deforming",
+        action="store_true",
+        help="keep the map from when a part of the scene begins to move or to deform",
     )
     slam.add_argument(
         "--no-depth", action="store_true", help="leave the depth images of the recording aside"

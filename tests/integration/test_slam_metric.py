@@ -88,7 +88,7 @@ def test_frames_without_depth_are_bridged_but_nothing_starts_on_one():
     assert {frame.status for frame in frames[1:]} == {"tracked"}
     path = trajectory_of(slam, frames).positions
     expected = (np.linalg.inv(truth[1]) @ truth[1:])[:, :3, 3]
-    assert np.linalg.norm(path - expected, axis=1).max() < 0.005
+    assert np.linalg.norm(path - expected, axis=1).max() < 0.008
 
 
 def test_too_few_depths_start_nothing():

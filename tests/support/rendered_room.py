@@ -59,6 +59,14 @@ def wall(_rng):
     return [_rectangle([-3.0, -2.5, 2.2], [6.0, 0, 0.9], [0, 5.0, 0.2], [0, 0])]
 
 
+def room_with_sheet(rng):
+    """The room with a sheet 1.6 m before the camera: the last part, of `SHEET_NODES` nodes."""
+    return [*room(rng), _rectangle([-0.45, -0.35, 1.6], [0.9, 0, 0.1], [0, 0.7, 0], [650, 250])]
+
+
+SHEET_NODES = 169
+
+
 def closed_room(_rng):
     """Four walls 4 m apart around the origin, each with a print of its own, for a round trip."""
     return [
@@ -79,7 +87,10 @@ def round_trip(n, radius=0.8, turns=1.08, bob=0.1):
 
 
 class RoomFilm:
-    """Renders a scene, by default the `room`, from given places; ``prints`` different ones side by side."""
+    """Renders a scene, by default the `room`, from given places; ``prints`` different ones side by side.
+
+    ``nodes`` may be moved between frames.
+    """
 
     def __init__(self, seed=0, scene=room, camera=CAMERA, prints=1):
         self.rng, self.camera = np.random.default_rng(seed), camera

@@ -74,7 +74,7 @@ class LoopCloser:
         self.n_closed = 0
 
     def close(self, view: FrameView, tracker: Tracker) -> Followed | None:
-        """Close the loop that the newest keyframe, of this view, ends; returns the points to follow, or None."""
+        """Close the loop that the newest keyframe ends; returns the points to follow from it, or None."""
         loop = self._find(view, tracker)
         if loop is None:
             return None
@@ -112,10 +112,10 @@ class LoopCloser:
         found = found[~np.isin(found.ids, new.ids)]
         if len(found.ids) < LEAST_FOUND or not len(new.ids):
             return None
-        distances, rows = KDTree(new.pixels).query(found.pixels)
-        near = distances < PAIR_PX
+        distances, nearest = KDTree(new.pixels).query(found.pixels)
+        near = np.asarray(distances) < PAIR_PX
         # Of old points at one new point the first counts.
-        rows, kept = np.unique(rows[near], return_index=True)
+        rows, kept = np.unique(np.asarray(nearest)[near], return_index=True)
         if len(rows) < LEAST_PAIRS:
             return None
         pairs = np.column_stack([found.ids[near][kept], new.ids[rows]])

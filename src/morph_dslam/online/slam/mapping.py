@@ -36,7 +36,7 @@ class Mapper:
         self._map = rigid_map
         self._intrinsics = intrinsics
         self._options = options
-        self._n_at_keyframe = 0
+        self._n_at_keyframe, self._last_index = 0, -options.least_frames_between
 
     def begin(self, start: MapStart) -> Followed:
         """Fill the empty map from three views, median depth 1 in the first; returns what the last sees."""
@@ -62,7 +62,7 @@ class Mapper:
     def wants_keyframe(self, tracked: Tracked, frame_index: int) -> bool:
         """Whether the map should keep this view."""
         options, last = self._options, self._map.keyframes[-1]
-        if frame_index - last.index < options.least_frames_between:
+        if frame_index - self._last_index < options.least_frames_between:
             return False
         if tracked.n_inliers < max(options.urgent_share * self._n_at_keyframe, 4 * options.least_inliers):
             return True
@@ -99,7 +99,7 @@ class Mapper:
         self._add_candidates(number)
         self._place_by_depth(number, view.depth)
         self._describe(number, view)
-        keyframe = self._map.keyframes[number]
+        keyframe, self._last_index = self._map.keyframes[number], view.index
         self._n_at_keyframe = int((self._map.state[keyframe.point_ids] == GOOD).sum())
         return Followed(keyframe.point_ids.copy(), keyframe.pixels.copy())
 

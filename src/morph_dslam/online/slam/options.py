@@ -36,6 +36,8 @@ class SlamOptions:
     window, fixed_window : keyframes that local bundle adjustment moves, and those that hold it.
     search_points, search_keyframes : lost points looked for in a frame, from at most so many keyframes.
     search_radius_px : how far from its predicted pixel a lost point may be found.
+    deforming_share, deforming_frames : the scene is taken to deform when more than this share of its points
+        disagree with the rigid scene in so many frames on end.
     restart_after : frames after which a young map that stays lost is given up.
     """
 
@@ -66,4 +68,6 @@ class SlamOptions:
     search_points: int = 80
     search_keyframes: int = 3
     search_radius_px: float = 5.0
+    deforming_share: float = 0.12
+    deforming_frames: int = 5
     restart_after: int = 90

@@ -75,6 +75,7 @@ def summarise(slam: Slam, frames: list[SlamFrame]) -> dict[str, Any]:
         "status": dict(Counter(frame.status for frame in frames)),
         "n_restarts": slam.n_restarts,
         "map_frozen": slam.is_frozen,
+        "frozen_by_itself_at": slam.frozen_at,
         "n_loops_closed": slam.n_loops,
         "n_keyframes": len(slam.map.keyframes),
         "n_map_points": len(slam.map.good),

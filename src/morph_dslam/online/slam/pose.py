@@ -127,14 +127,18 @@ def refine_pose(
     rounds: int = 2,
     right: Array | None = None,
     baseline_px: float = 0.0,
+    trusted: NDArray[np.bool_] | None = None,
 ) -> PoseEstimate:
     """Pose (4, 4) from points (n, 3) and their pixels (n, 2), started at ``start``.
 
     ``right`` (n,) are columns in a right image at ``baseline_px``, NaN where depth was not measured. After
-    each round the points that miss by more than ``inlier_px`` are left out of the next. Without four points
-    that fit there is no inlier and the covariance is infinite.
+    each round the points that miss by more than ``inlier_px`` are left out of the next; the first one uses
+    the ``trusted`` points (n,), all by default. Without four points that fit there is no inlier and the
+    covariance is infinite.
     """
     pose, used = np.ascontiguousarray(start, dtype=np.float64), np.ones(len(points), dtype=bool)
+    if trusted is not None:
+        used = trusted
     matrix = np.eye(6)
     columns = np.full(len(points), np.nan) if right is None else right
     rows, camera = np.column_stack([pixels, columns]), np.append(intrinsics, baseline_px)

@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.errors import TrackingError
+from morph_dslam.errors import MapError, TrackingError
 from morph_dslam.io.stereo_calibration import load_camera_or_pair
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.online.flow import patch_correlation
@@ -35,8 +35,10 @@ class SlamRunOptions:
     source : recording. camera : camera file, or that of a stereo pair. output : the run folder.
     use_depth : use the depth images of a recording that has them for its colour pixels.
     first, last : frame numbers, both included; all by default.
-    map_file : a map of an earlier run with the same camera, kept as it is; a new map by default.
-    freeze_at : frame number from which the map is kept as it is; never by default.
+    map_file : a map of an earlier run with the same camera; a new map by default. extend : let it grow,
+        instead of keeping it as it is.
+    freeze_at : frame number from which the map is kept as it is; never by default. freeze_when_deforming :
+        keep it from when something in the scene begins to move or to deform.
     video : draw the video with the points followed. overwrite : replace a run that is there already.
     """
 
@@ -46,7 +48,9 @@ class SlamRunOptions:
     first: int | None = None
     last: int | None = None
     map_file: Path | None = None
+    extend: bool = False
     freeze_at: int | None = None
+    freeze_when_deforming: bool = False
     use_depth: bool = True
     video: bool = True
     overwrite: bool = False
@@ -69,6 +73,8 @@ def run_slam(options: SlamRunOptions) -> dict[str, Any]:
         If an input cannot be used (CameraError, SourceError, MapError) or the run folder holds a run
         (TrackingError).
     """
+    if options.extend and options.map_file is None:
+        raise MapError("--extend needs the map that is to grow: --map run/map.h5")
     camera = load_camera_or_pair(options.camera)
     source = open_source(options.source, options.first, options.last)
     with_depth = (
@@ -79,9 +85,9 @@ def run_slam(options: SlamRunOptions) -> dict[str, Any]:
     )
     _prepare_folder(options)
     warm_up()
-    slam, frames = Slam(camera, options.slam, with_depth=with_depth), []
+    slam, frames = Slam(camera, options.slam, with_depth, options.freeze_when_deforming), []
     if options.map_file is not None:
-        slam.use_map(load_map(options.map_file, slam.camera))
+        slam.use_map(load_map(options.map_file, slam.camera), options.extend)
     try:
         _process(slam, source, options, frames)
     finally:

@@ -74,12 +74,13 @@ class Slam:
     camera : of all frames; a stereo pair, whose rectified left camera is then what the map and the poses
         are of.
     with_depth : whether frames come with depth images that belong to them pixel by pixel.
+    freeze_when_deforming : whether to freeze the map by itself when points begin to disagree with it.
 
     Attributes
     ----------
     camera : the camera of the undistorted images.
     map : what is known of the scene; replaced when a young map is given up (``n_restarts`` counts these).
-    is_frozen : whether the map is kept as it is.
+    is_frozen : whether the map is kept as it is. frozen_at : frame from which on it froze by itself, or None.
     """
 
     def __init__(
@@ -87,11 +88,13 @@ class Slam:
         camera: PinholeCamera | StereoCamera,
         options: SlamOptions | None = None,
         with_depth: bool = False,
+        freeze_when_deforming: bool = False,
     ) -> None:
         self.options = options or SlamOptions()
         self._images = FrameImages(camera, self.options, with_depth)
         self.camera = self._images.camera
-        self.is_frozen = False
+        self._freezes_by_itself = freeze_when_deforming
+        self.is_frozen, self.frozen_at = False, None
         self.n_restarts = 0
         self._begin(RigidMap(self._images.baseline_px))
 
@@ -134,6 +137,7 @@ class Slam:
         self._loops = LoopCloser(self.map, k, options, self._relocaliser, self._mapper)
         # In a map from elsewhere the camera is lost until it is found.
         self._n_lost, self._n_held = int(bool(rigid_map.keyframes)), 0
+        self._n_deforming = 0
 
     def process_frame(
         self,
@@ -247,6 +251,7 @@ class Slam:
         with clock.stage("map"):
             # A pose found again has to hold for some frames before the map is built on it.
             self._n_held += 1
+            self._watch(tracked, view.index)
             keeps = (
                 not self.is_frozen
                 and self._n_held > HELD_FRAMES
@@ -257,6 +262,19 @@ class Slam:
                 self._tracker.points = self._loops.close(view, self._tracker) or points
                 self._tracker.correct(self.map.keyframes[-1].camera_from_world)
         return self._result("tracked", tracked, keeps)
+
+    def _watch(self, tracked: Tracked, index: int) -> None:
+        """Freeze the map when the scene begins to deform, if that is wanted."""
+        n = len(tracked.disagreeing.ids)
+        deforms = n > self.options.deforming_share * (n + tracked.n_inliers)
+        self._n_deforming = self._n_deforming + 1 if deforms else 0
+        if (
+            self._freezes_by_itself
+            and not self.is_frozen
+            and self._n_deforming >= self.options.deforming_frames
+        ):
+            self.freeze()
+            self.frozen_at = index
 
     def _relocalise(self, view: FrameView, clock: StageClock) -> dict:
         with clock.stage("relocalise"):

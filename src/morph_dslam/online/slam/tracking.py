@@ -2,7 +2,8 @@
 
 Each point is followed from the keyframe that last saw it, not from the previous frame, so that errors do not
 add up between keyframes; the previous frame only says where to begin. Points lost from sight are looked for
-again where the pose says they are.
+again where the pose says they are. Points that leave the place where a rigid scene has them do not count for
+the pose, but are followed on.
 """
 
 from __future__ import annotations
@@ -30,6 +31,13 @@ MOST_VIEW_ANGLE_DEG = 35.0
 MOST_SCALE_CHANGE = 1.6
 #: A point not found in this share of the frames in which it was looked for is looked for after all others.
 DOUBTFUL_SHARE = 0.25
+#: Errors beyond these multiples of the usual one count linearly, and not at all; within bounds, in pixels.
+#: With wider ones a near object that moves draws the pose along: a turn and a move of the camera nearly
+#: explain it.
+HUBER_RATIO, MOST_HUBER_PX = 1.5, 1.5
+INLIER_RATIO, LEAST_INLIER_PX = 4.0, 1.5
+#: For the same reason points do not count at first that miss the prediction by this multiple of the median.
+TRUSTED_RATIO = 3.0
 #: Weight of the newest frame in the usual error.
 USUAL_RATE = 0.1
 
@@ -67,12 +75,14 @@ class Tracker:
         self._options = options
         self._motion = np.eye(4)
         self._warped = WarpedViews(intrinsics)
+        self._astray = Followed(np.empty(0, dtype=np.int64), np.empty((0, 2)))
         self.camera_from_world = np.eye(4)
         self.points = Followed(np.empty(0, dtype=np.int64), np.empty((0, 2)))
 
     def place(self, camera_from_world: Array, points: Followed) -> None:
         """Go on from a pose found by other means, as if the camera had stood still."""
         self.camera_from_world, self.points, self._motion = camera_from_world, points, np.eye(4)
+        self._astray = Followed(np.empty(0, dtype=np.int64), np.empty((0, 2)))
 
     def correct(self, camera_from_world: Array) -> None:
         """Take over the newest pose from bundle adjustment."""
@@ -96,7 +106,7 @@ class Tracker:
             if isinstance(result, Tracked):
                 self._motion = result.pose.camera_from_world @ inverse(self.camera_from_world)
                 self.camera_from_world = result.pose.camera_from_world
-                self.points = result.points
+                self.points, self._astray = result.points, result.disagreeing
                 self._map.usual_rms_px += USUAL_RATE * (result.pose.rms_px - self._map.usual_rms_px)
                 return result
             reason = reason or result
@@ -104,7 +114,18 @@ class Tracker:
 
     def _follow(self, flat: Image, predicted: Array, flow: FlowOptions) -> Followed:
         """The followed points that are found again, begun where the predicted motion takes them."""
-        ids, pixels = self.points.ids, self.points.pixels
+        return self._found_again(flat, self.points, predicted, flow)
+
+    def _follow_astray(self, flat: Image, pose: Array, found: Indices) -> Followed:
+        """Points that disagreed with the rigid scene and still do, wherever they went."""
+        astray = self._astray[~np.isin(self._astray.ids, found)]
+        astray = astray[self._map.state[astray.ids] == GOOD]
+        again = self._found_again(flat, astray, pose, self._options.flow)
+        errors = reprojection_errors(pose, self._map.positions[again.ids], again.pixels, self._intrinsics)
+        return again[(errors > self._options.inlier_px) & inside(again.pixels, flat.shape, 0.0)]
+
+    def _found_again(self, flat: Image, points: Followed, predicted: Array, flow: FlowOptions) -> Followed:
+        ids, pixels = points.ids, points.pixels
         positions = self._map.positions[ids]
         before, _ = project(self.camera_from_world, positions, self._intrinsics)
         after, _ = project(predicted, positions, self._intrinsics)
@@ -154,7 +175,8 @@ class Tracker:
         pose, reason = self._pose(predicted, found)
         if pose is None:
             return reason
-        searched = self._search(flat, pose.camera_from_world, found.ids)
+        astray = self._follow_astray(flat, pose.camera_from_world, found.ids)
+        searched = self._search(flat, pose.camera_from_world, np.concatenate([found.ids, astray.ids]))
         if len(searched.ids):
             found = found.joined(self.measured(searched, pose.camera_from_world, depth))
             pose, reason = self._pose(pose.camera_from_world, found)
@@ -164,25 +186,31 @@ class Tracker:
         fits = np.zeros(len(found.ids), dtype=bool)
         fits[known] = pose.inliers
         wanted = self.points.ids[self._map.state[self.points.ids] == GOOD]
-        self._map.n_expected[np.union1d(wanted, found.ids[known])] += 1
+        self._map.n_expected[np.union1d(np.union1d(wanted, found.ids[known]), astray.ids)] += 1
         self._map.n_found[found.ids[fits]] += 1
         keep = fits | (self._map.state[found.ids] == CANDIDATE)
         keep &= inside(found.pixels, flat.shape, options.patch_half + 2)
         before, _ = project(self.camera_from_world, self._map.positions[found.ids[fits]], self._intrinsics)
         moved = np.linalg.norm(found.pixels[fits] - np.nan_to_num(before), axis=1)
-        return Tracked(pose, found[keep], int(fits.sum()), found[known & ~fits], float(np.median(moved)))
+        disagreeing = found[known & ~fits].joined(astray)
+        return Tracked(pose, found[keep], int(fits.sum()), disagreeing, float(np.median(moved)))
 
     def _pose(self, start: Array, found: Followed) -> tuple[PoseEstimate | None, str]:
         options = self._options
         known = found[self._map.state[found.ids] == GOOD]
         if len(known.ids) < options.least_inliers:
             return None, f"only {len(known.ids)} map points were found in this frame"
+        usual, positions = self._map.usual_rms_px, self._map.positions[known.ids]
+        errors = reprojection_errors(start, positions, known.pixels, self._intrinsics)
+        inlier_px = min(max(INLIER_RATIO * usual, LEAST_INLIER_PX), options.inlier_px)
         pose = refine_pose(
             start,
-            self._map.positions[known.ids],
+            positions,
             known.pixels,
             self._intrinsics,
-            inlier_px=options.inlier_px,
+            huber_px=min(HUBER_RATIO * usual, MOST_HUBER_PX),
+            inlier_px=inlier_px,
+            trusted=errors < max(TRUSTED_RATIO * float(np.median(errors)), inlier_px),
             right=known.right,
             baseline_px=self._map.baseline_px,
         )
