@@ -200,7 +200,7 @@ def run(arguments: argparse.Namespace) -> None:
         folder = Path(name)
         held_out = folder / "held_out"
         table = Table(solve_or_read(reduced_by(study, "pgd"), held_out, workers=1).unseen)
-        for method in METHODS:
+        for method in arguments.methods:
             model, seconds = own_model(reduced_by(study, method), held_out, folder / method)
             solves = model.certificate["samples"]["training"]
             table.add_field(method, solves, model.displacement, seconds)
@@ -216,6 +216,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), help="of the project")
     return run_and_report_errors(run, parser.parse_args(), "nothing was kept")
 
 
