@@ -38,6 +38,8 @@ MOST_HARMONICS = 12
 def turned_model(model: ReducedModel, point: Array, direction: Array, name: str = "turn") -> ReducedModel:
     """The model with the angle about an axis as its last parameter, from -360 to 360 degrees, default 0.
 
+    Reactions, which belong to sets that need not turn with the mesh, are left out.
+
     Parameters
     ----------
     point, direction : (3,) a point on the axis, metres, and the direction of the axis, object frame.
@@ -59,7 +61,11 @@ def turned_model(model: ReducedModel, point: Array, direction: Array, name: str 
     angle = Parameter(
         name, "angle", "deg", -2.0 * np.pi, 2.0 * np.pi, 0.0, "angle about the axis from which it is loaded"
     )
-    fields = {key: _turned(field, images, direction, key) for key, field in model.fields.items()}
+    fields = {
+        key: _turned(field, images, direction, key)
+        for key, field in model.fields.items()
+        if field.modes.shape[1] == len(model.nodes)
+    }
     return replace(
         model,
         parameters=(*model.parameters, angle),
