@@ -59,6 +59,11 @@ def wall(_rng):
     return [_rectangle([-3.0, -2.5, 2.2], [6.0, 0, 0.9], [0, 5.0, 0.2], [0, 0])]
 
 
+def checkerboard(_rng):
+    """The plane of `wall`, with squares of 9 cm all over: `RoomFilm` prints them for this scene."""
+    return wall(_rng)
+
+
 def room_with_sheet(rng):
     """The room with a sheet 1.6 m before the camera: the last part, of `SHEET_NODES` nodes."""
     return [*room(rng), _rectangle([-0.45, -0.35, 1.6], [0.9, 0, 0.1], [0, 0.7, 0], [650, 250])]
@@ -99,6 +104,10 @@ class RoomFilm:
         self.nodes = np.concatenate([nodes for nodes, _, _ in parts])
         self.triangles = np.concatenate([t + o for (_, t, _), o in zip(parts, offsets, strict=False)])
         self.coordinates = np.concatenate([coordinates for _, _, coordinates in parts])
+        if scene is checkerboard:
+            squares = np.indices((95, 95)).sum(axis=0) % 2 == 0
+            self.texture = np.kron(np.where(squares, 30, 220), np.ones((19, 19))).astype(np.uint8)
+            return
         tiles = [printed_texture(900, 900, seed + 100 * (i % prints)) for i in range(4)]
         self.texture = np.block([tiles[:2], tiles[2:]])
 

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.io.point_cloud import save_ply
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
+from morph_dslam.online.slam.calibration_check import suspected_focal_factor
 from morph_dslam.online.slam.map_file import save_map
 from morph_dslam.online.slam.projection import inverse
 from morph_dslam.online.slam.slam import STAGES, Slam, SlamFrame
@@ -65,6 +66,12 @@ def summarise(slam: Slam, frames: list[SlamFrame]) -> dict[str, Any]:
     flags = [f"{len(lost)} frames after the start were lost: frames.csv says why"] if lost else []
     if slam.n_restarts:
         flags.append(f"{slam.n_restarts} young maps were lost for too long and given up, with their poses")
+    factor = suspected_focal_factor(slam.map, slam.camera.intrinsics)
+    if factor is not None:
+        flags.append(
+            f"a focal length {factor:.2f} times that of the camera file would explain the map clearly "
+            "better: check the calibration"
+        )
     if not found:
         flags.append(f"no map was begun: {frames[-1].reason}")
     return {
@@ -79,6 +86,7 @@ def summarise(slam: Slam, frames: list[SlamFrame]) -> dict[str, Any]:
         "n_loops_closed": slam.n_loops,
         "n_keyframes": len(slam.map.keyframes),
         "n_map_points": len(slam.map.good),
+        "suspected_focal_factor": factor,
         "median_rms_px": float(np.median(errors)) if errors else None,
         "median_ms": float(np.median(times)),
         "p95_ms": float(np.percentile(times, 95)),

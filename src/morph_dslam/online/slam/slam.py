@@ -124,6 +124,11 @@ class Slam:
         """An image (h, w[, 3]) as ``camera`` would have seen it; stereo: the left one, rectified."""
         return self._images.undistort(image)
 
+    def reset(self) -> None:
+        """Forget the map, frozen or not, and wait for a start."""
+        self.is_frozen, self.frozen_at = False, None
+        self._restart()
+
     def _restart(self) -> None:
         self.n_restarts += 1
         self._begin(RigidMap(self._images.baseline_px))
