@@ -1,16 +1,18 @@
 """Galerkin solutions at any parameters, predicted from full solutions and corrected by quasi-Newton steps.
 
-A prediction is polynomial regression of the full solutions and their sensitivities, shifted by what it
-missed at the nearest solution known. Corrections start with the inverse of the projected tangent there and
-update it by Broyden's method (Kelley, Iterative Methods for Linear and Nonlinear Equations, 1995, chapter 7),
-so that each costs one residual in place of a tangent; the updated inverse is kept with the new solution.
-Where they do not converge, Newton's method does, or follows the path from the nearest full solution.
+A prediction is polynomial regression of the full solutions and their sensitivities, later of all reduced
+solutions, shifted by what it missed at the nearest solution known. Corrections start with the inverse of the
+projected tangent there and update it by Broyden's method (Kelley, Iterative Methods for Linear and Nonlinear
+Equations, 1995, chapter 7), so that each costs one residual in place of a tangent, which is made anew where
+they converge slowly; the updated inverse is kept with the new solution. Where they do not converge, Newton's
+method does, or follows the path from the nearest full solution.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import comb
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +34,12 @@ MODE_TOLERANCE = 0.02
 SOLVER_TOLERANCE = 1e-2
 #: Most modes that equilibrium is projected on; more cost little, for assembly takes nearly all of the time.
 MOST_MODES = 60
-MOST_CORRECTIONS = 15
+MOST_CORRECTIONS = 20
+#: After so many corrections the last must be so small a part of the first, or the tangent is made anew.
+PATIENCE, SLOW = 3, 0.05
+#: The prediction is fitted anew, with this highest degree, at so many times as many solutions as a cubic has
+#: terms, and whenever their number has doubled since.
+REFIT, REFIT_DEGREE = 4, 5
 #: A correction larger than this part of the largest solution is not trusted.
 TOO_LARGE = 2.0
 
@@ -118,11 +125,11 @@ class ReducedSolver:
         self._prediction, _ = fit_functions(
             solutions.samples, known, slopes, box[:, 0], box[:, 1], max_degree, np.arange(len(known))
         )
-        predicted = np.array([self._prediction.evaluate(mu)[0] for mu in solutions.samples])
-        # what is known so far: parameters, what the prediction missed there, inverse tangent (when needed)
+        # what is known so far: parameters, coefficients, inverse tangent (when needed)
         self._samples: list[Array] = list(solutions.samples)
-        self._missed: list[Array] = list(known - predicted)
+        self._values: list[Array] = list(known)
         self._inverses: list[Array | None] = [None] * len(known)
+        self._next_fit = REFIT * comb(len(box) + 3, 3)
 
     def solve(self, mu: Array) -> Array:
         """Coefficients (k,) of the modes at ``mu`` (d,).
@@ -134,16 +141,26 @@ class ReducedSolver:
         """
         nearest = self._nearest(np.array(self._samples), mu)
         predicted, _ = self._prediction.evaluate(mu)
-        start = predicted + self._missed[nearest]
+        start = predicted + self._values[nearest] - self._prediction.evaluate(self._samples[nearest])[0]
         corrected = self._corrected(start, mu, self._inverse(nearest))
         if corrected is None:
             found, inverse = self._solved_by_newton(start, mu), None
         else:
             found, inverse = corrected
         self._samples.append(np.array(mu, dtype=float))
-        self._missed.append(found - predicted)
+        self._values.append(found)
         self._inverses.append(inverse)
+        if len(self._values) >= self._next_fit:
+            self._predict_from_all()
         return found
+
+    def _predict_from_all(self) -> None:
+        """Fit the prediction to the reduced solutions too."""
+        samples, values = np.array(self._samples), np.array(self._values)
+        folds = np.arange(len(samples))
+        lower, upper = self._box.T
+        self._prediction, _ = fit_functions(samples, values, None, lower, upper, REFIT_DEGREE, folds)
+        self._next_fit = 2 * len(samples)
 
     def _nearest(self, samples: Array, mu: Array) -> int:
         return int(np.argmin(np.linalg.norm((samples - mu) / np.diff(self._box, axis=1).T, axis=1)))
@@ -170,10 +187,12 @@ class ReducedSolver:
         inverse = self._inverses[number]
         if inverse is None:
             mu = self._samples[number]
-            y = self._prediction.evaluate(mu)[0] + self._missed[number]
-            inverse = self.galerkin.linearise(y, mu).solve(np.eye(len(y))).T
+            inverse = self._inverse_tangent(self._values[number], mu)
             self._inverses[number] = inverse
         return inverse
+
+    def _inverse_tangent(self, y: Array, mu: Array) -> Array:
+        return self.galerkin.linearise(y, mu).solve(np.eye(len(y))).T
 
     def _corrected(self, y: Array, mu: Array, inverse: Array) -> tuple[Array, Array] | None:
         """The solution and inverse tangent by Broyden's method from ``y`` (k,); None if it diverges."""
@@ -183,13 +202,17 @@ class ReducedSolver:
         def residual(y: Array) -> Array:
             return modes @ self.equations.residual(prescribed + y @ modes, mu)
 
-        inverse = inverse.copy()
+        inverse, lengths = inverse.copy(), []
         r = residual(y)
         for _ in range(MOST_CORRECTIONS):
             step = -inverse @ r
             length = float(np.linalg.norm(step))
             if not length < TOO_LARGE * self._size:
                 return None
+            lengths.append(length)
+            if len(lengths) > PATIENCE and length > SLOW * lengths[0]:
+                inverse, lengths = self._inverse_tangent(y, mu), []
+                continue
             y = y + step
             if length <= self._allowed:
                 return y, inverse
