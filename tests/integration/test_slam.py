@@ -205,6 +205,7 @@ def test_the_command_writes_a_run_that_evaluate_reads(tmp_path, room_film, capsy
     assert written == {
         *("trajectory.txt", "map.ply", "map.h5", "frames.csv", "summary.json", "tracked.mp4"),
         *("plots/trajectory.png", "plots/frames.png"),
+        *("colmap/cameras.txt", "colmap/images.txt", "colmap/points3D.txt"),
     }
     summary = json.loads((run / "summary.json").read_text())
     assert summary["n_frames"] == 40

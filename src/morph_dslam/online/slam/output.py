@@ -15,11 +15,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from morph_dslam.io.colmap_model import ColmapImage, write_colmap_model
 from morph_dslam.io.point_cloud import save_ply
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
 from morph_dslam.online.slam.calibration_check import suspected_focal_factor
 from morph_dslam.online.slam.map_file import save_map
 from morph_dslam.online.slam.projection import inverse
+from morph_dslam.online.slam.rigid_map import GOOD
 from morph_dslam.online.slam.slam import STAGES, Slam, SlamFrame
 
 Array = NDArray[np.float64]
@@ -45,10 +47,12 @@ def write_run(folder: Path, slam: Slam, frames: list[SlamFrame], extra: dict[str
     save_trajectory(folder / "trajectory.txt", trajectory)
     save_ply(folder / "map.ply", points)
     save_map(folder / "map.h5", slam.map, slam.camera)
+    _write_colmap(folder / "colmap", slam)
     _write_csv(folder / "frames.csv", slam, frames)
     plots = folder / "plots"
     plots.mkdir(exist_ok=True)
-    _plot_trajectory(plots / "trajectory.png", trajectory, points)
+    unit = "m" if slam.map.is_metric else "map unit"
+    _plot_trajectory(plots / "trajectory.png", trajectory, points, unit)
     _plot_frames(plots / "frames.png", frames)
     summary = summarise(slam, frames) | extra
     (folder / "summary.json").write_text(json.dumps(summary, indent=2, default=str) + "\n")
@@ -97,6 +101,18 @@ def summarise(slam: Slam, frames: list[SlamFrame]) -> dict[str, Any]:
     }
 
 
+def _write_colmap(folder: Path, slam: Slam) -> None:
+    """The map's points and keyframes as a COLMAP model."""
+    good = slam.map.state == GOOD
+    rows = np.cumsum(good) - 1
+    images = []
+    for keyframe in slam.map.keyframes:
+        seen = keyframe.seen[good[keyframe.point_ids]]
+        name = f"{keyframe.index:06d}.png"
+        images.append(ColmapImage(name, keyframe.camera_from_world, rows[seen.ids], seen.pixels))
+    write_colmap_model(folder, slam.camera, images, slam.map.positions[good])
+
+
 def _write_csv(path: Path, slam: Slam, frames: list[SlamFrame]) -> None:
     header = ["frame", "timestamp_s", "status", "reason", *"xyz", "qx", "qy", "qz", "qw"]
     header += ["position_std", "rotation_std_deg", "rms_px", "n_points", "n_candidates", "n_disagreeing"]
@@ -126,7 +142,7 @@ def _pose_columns(slam: Slam, frame: SlamFrame) -> list[str]:
     ]
 
 
-def _plot_trajectory(path: Path, trajectory: Trajectory, points: Array) -> None:
+def _plot_trajectory(path: Path, trajectory: Trajectory, points: Array, unit: str) -> None:
     """The path and the map from above and from the side, as the first view stands."""
     figure = Figure(figsize=(10.0, 4.6), layout="constrained")
     if len(points):
@@ -144,8 +160,8 @@ def _plot_trajectory(path: Path, trajectory: Trajectory, points: Array) -> None:
             path_points[:, 0], path_points[:, vertical], color=PATH_COLOUR, linewidth=1.4, label="camera"
         )
         axes.set_aspect("equal", adjustable="datalim")
-        axes.set_xlabel("x [map unit]")
-        axes.set_ylabel(f"{'xyz'[vertical]} [map unit]")
+        axes.set_xlabel(f"x [{unit}]")
+        axes.set_ylabel(f"{'xyz'[vertical]} [{unit}]")
         axes.set_title(name, fontsize=10)
         if vertical == 1:
             axes.invert_yaxis()
