@@ -20,6 +20,7 @@ from morph_dslam.model.functions import Functions
 from morph_dslam.offline.reduction.bases import parameter_bases
 from morph_dslam.offline.reduction.fields import field_names, model_of
 from morph_dslam.offline.reduction.grid_functions import (
+    MOST_NODES,
     functions_on_grid,
     interpolation_nodes,
     sizes_along_lines,
@@ -131,7 +132,7 @@ def _on_grid(task: ReductionTask, sampled: SampledFields) -> _Grid:
     """All fields on the grid that lines through the box ask for."""
     basis = task.options.basis or "chebyshev"
     leading = sampled.parts["displacement"]
-    sizes = sizes_along_lines(sampled.in_allowed_units, task.parameters, basis, leading)
+    sizes = sizes_along_lines(sampled.in_allowed_units, task.parameters, basis, leading, MOST_NODES)
     bases = parameter_bases(basis, task.parameters, sizes)
     values = values_on_grid(sampled, tuple(interpolation_nodes(basis) for basis in bases))
     return _Grid(

@@ -32,6 +32,8 @@ Array = NDArray[np.float64]
 #: Nodes along the lines that decide the size of a grid, and how far from the middle lines run.
 FINEST, OFF_CENTRE = 17, 0.7
 LEAST = 4
+#: Most nodes of a grid.
+MOST_NODES = 1000
 #: Error of a derivative along a line that is good enough, relative to the largest on the parameter's lines.
 SLOPE_ERROR = 2e-2
 #: Most terms of a CP form.
@@ -57,6 +59,7 @@ def sizes_along_lines(
     parameters: tuple[Parameter, ...],
     basis: BasisName,
     leading: slice,
+    most_nodes: float = np.inf,
 ) -> tuple[int, ...]:
     """For each parameter the least number of functions that interpolates well enough along its lines.
 
@@ -64,6 +67,7 @@ def sizes_along_lines(
     ----------
     evaluate : values (n,) at parameters (d,), in units of the error allowed.
     leading : the values whose derivatives count too (`SLOPE_ERROR`).
+    most_nodes : of the grid; where more are asked for, all errors allowed are doubled until fewer will do.
     """
     lower = np.array([parameter.lower for parameter in parameters])
     upper = np.array([parameter.upper for parameter in parameters])
@@ -71,7 +75,7 @@ def sizes_along_lines(
     signs = np.array([(-1.0) ** k for k in range(len(parameters))])
     starts = [middle, middle + OFF_CENTRE * half, middle - OFF_CENTRE * signs * half]
     starts = starts if len(parameters) > 1 else starts[:1]
-    sizes = []
+    sampled = []
     with tqdm(
         total=len(parameters) * len(starts) * FINEST, desc="choosing the grid", unit="sample"
     ) as progress:
@@ -82,12 +86,22 @@ def sizes_along_lines(
                 points[:, k] = interpolation_nodes(fine)
                 lines.append(fine.interpolate(points[:, k], np.array([evaluate(p) for p in points])))
                 progress.update(FINEST)
-            sizes.append(_size_for(np.array(lines), fine, basis, parameter, leading))
-    return tuple(sizes)
+            sampled.append((np.array(lines), fine))
+    factor = 1.0
+    while True:
+        sizes = tuple(
+            _size_for(factor, values, fine, basis, parameter, leading)
+            for (values, fine), parameter in zip(sampled, parameters, strict=True)
+        )
+        if np.prod([float(size) for size in sizes]) <= most_nodes or max(sizes) == LEAST:
+            return sizes
+        factor *= 2.0
 
 
-def _size_for(lines: Array, fine: Basis, name: BasisName, parameter: Parameter, leading: slice) -> int:
-    """The least size of a basis that is good enough for lines (n_lines, FINEST, n) in the fine one."""
+def _size_for(
+    factor: float, lines: Array, fine: Basis, name: BasisName, parameter: Parameter, leading: slice
+) -> int:
+    """The least size of a basis good enough, to a ``factor``, for lines (n_lines, FINEST, n) in ``fine``."""
     between = np.linspace(fine.lower, fine.upper, 4 * FINEST)
     truth = fine.evaluate(between) @ lines
     slopes = fine.evaluate(between, 1) @ lines[:, :, leading]
@@ -98,9 +112,9 @@ def _size_for(lines: Array, fine: Basis, name: BasisName, parameter: Parameter, 
         basis = parameter_basis(name, parameter, size)
         nodes = interpolation_nodes(basis)
         through = np.linalg.pinv(basis.evaluate(nodes)) @ fine.evaluate(nodes)
-        if _largest(basis.evaluate(between) @ through @ lines - truth) > 1.0:
+        if _largest(basis.evaluate(between) @ through @ lines - truth) > factor:
             continue
-        if _largest(basis.evaluate(between, 1) @ through @ lines[:, :, leading] - slopes) <= allowed:
+        if _largest(basis.evaluate(between, 1) @ through @ lines[:, :, leading] - slopes) <= factor * allowed:
             return basis.size
     return largest
 
