@@ -113,24 +113,23 @@ class Tracker:
         return reason
 
     def _follow(self, flat: Image, predicted: Array, flow: FlowOptions) -> Followed:
-        """The followed points that are found again, begun where the predicted motion takes them."""
-        return self._found_again(flat, self.points, predicted, flow)
-
-    def _follow_astray(self, flat: Image, pose: Array, found: Indices) -> Followed:
-        """Points that disagreed with the rigid scene and still do, wherever they went."""
-        astray = self._astray[~np.isin(self._astray.ids, found)]
-        astray = astray[self._map.state[astray.ids] == GOOD]
-        again = self._found_again(flat, astray, pose, self._options.flow)
-        errors = reprojection_errors(pose, self._map.positions[again.ids], again.pixels, self._intrinsics)
-        return again[(errors > self._options.inlier_px) & inside(again.pixels, flat.shape, 0.0)]
-
-    def _found_again(self, flat: Image, points: Followed, predicted: Array, flow: FlowOptions) -> Followed:
-        ids, pixels = points.ids, points.pixels
-        positions = self._map.positions[ids]
+        """Followed points, astray ones too, found again, begun where the predicted motion takes them."""
+        # A further keyframe costs as much as all points of one: those astray come along with others only.
+        views = self._map.template_keyframe
+        along = np.isin(views[self._astray.ids], views[self.points.ids])
+        points = self.points.joined(self._astray[along])
+        positions = self._map.positions[points.ids]
         before, _ = project(self.camera_from_world, positions, self._intrinsics)
         after, _ = project(predicted, positions, self._intrinsics)
-        guesses = pixels + np.nan_to_num(after - before)
-        return self.find(flat, Followed(ids, guesses), predicted, flow)
+        guesses = points.pixels + np.nan_to_num(after - before)
+        return self.find(flat, Followed(points.ids, guesses), predicted, flow)
+
+    def _still_astray(self, pose: Array, followed: Followed) -> Followed:
+        """Those of the points that had left the rigid scene that are still away from their places."""
+        followed = followed[self._map.state[followed.ids] == GOOD]
+        positions = self._map.positions[followed.ids]
+        errors = reprojection_errors(pose, positions, followed.pixels, self._intrinsics)
+        return followed[errors > self._options.inlier_px]
 
     def find(self, flat: Image, guesses: Followed, pose: Array, flow: FlowOptions) -> Followed:
         """Points found near their guessed pixels, by the patches of their keyframes as seen from a pose."""
@@ -170,12 +169,12 @@ class Tracker:
         self, flat: Image, depth: FrameDepth | None, predicted: Array, found: Followed
     ) -> Tracked | str:
         """Pose from what was followed, then with the lost points that are found again."""
-        options = self._options
-        found = self.measured(found, predicted, depth)
+        options, was_astray = self._options, np.isin(found.ids, self._astray.ids)
+        followed_astray, found = found[was_astray], self.measured(found[~was_astray], predicted, depth)
         pose, reason = self._pose(predicted, found)
         if pose is None:
             return reason
-        astray = self._follow_astray(flat, pose.camera_from_world, found.ids)
+        astray = self._still_astray(pose.camera_from_world, followed_astray)
         searched = self._search(flat, pose.camera_from_world, np.concatenate([found.ids, astray.ids]))
         if len(searched.ids):
             found = found.joined(self.measured(searched, pose.camera_from_world, depth))

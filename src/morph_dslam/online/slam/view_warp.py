@@ -7,6 +7,8 @@ small within a patch (Klein and Murray 2007 warp each patch by itself).
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -53,9 +55,13 @@ def local_change(homography: Array, pixel: Array) -> Array:
 
 def is_small(change: Array, part: float = 1.0) -> bool:
     """Whether patches changed by this matrix (2, 2) can be followed as they are."""
-    u, stretches, vt = np.linalg.svd(change)
-    turn = np.degrees(np.arccos(np.clip(0.5 * np.trace(u @ vt), -1.0, 1.0)))
-    return bool(turn < part * MOST_TURN_DEG and np.abs(np.log(stretches)).max() < part * np.log(MOST_STRETCH))
+    (a, b), (c, d) = change.tolist()
+    # The turn of the nearest rotation, and the singular values of a 2 x 2 matrix.
+    turn, sheared = math.hypot(a + d, c - b), math.hypot(a - d, c + b)
+    largest, smallest = 0.5 * (turn + sheared), 0.5 * (turn - sheared)
+    angle = abs(math.degrees(math.atan2(c - b, a + d)))
+    limit = MOST_STRETCH**part
+    return angle < part * MOST_TURN_DEG and largest < limit and smallest > 1.0 / limit
 
 
 class WarpedViews:
