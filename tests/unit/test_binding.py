@@ -1,11 +1,22 @@
 """Binding positions and pixels to the mesh, and which side of it is seen."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.optimize import minimize
+from scipy.spatial import ConvexHull
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.online.binding import bind_pixels, draw_view, facing, nearest_surface_points, view_of
+from morph_dslam.model import ReducedModel, SeparatedField
+from morph_dslam.online.binding import (
+    DrawnSurface,
+    bind_pixels,
+    draw_view,
+    facing,
+    nearest_surface_points,
+    view_of,
+)
 from morph_dslam.online.estimation import BoundPoints, State
 from tests.support.bent_sheet import bent_sheet_model
 
@@ -68,3 +79,27 @@ def test_drawn_view_covers_the_projected_rectangle():
     covered = draw_view(view_of(model, CAMERA, flat), model.triangles, CAMERA).covered
     expected = 0.420 * 0.297 * (528.0 / 0.6) ** 2
     assert abs(covered.sum() - expected) < 0.01 * expected
+
+
+def test_drawn_surface_of_a_solid_is_the_whole_surface_and_is_known_to_be_closed():
+    """A cube of six tetrahedra about a node inside, and the cube without its lid."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+    nodes = np.concatenate([[[0.5, 0.5, 0.5]], corners])
+    triangles = 1 + ConvexHull(corners).simplices.astype(np.int64)
+    a, b, c = (nodes[triangles[:, k]] for k in range(3))
+    inwards = np.einsum("mx,mx->m", np.cross(b - a, c - a), a - nodes[0]) < 0.0
+    triangles[inwards] = triangles[inwards][:, ::-1]
+    rng = np.random.default_rng(0)
+    functions = bent_sheet_model(6, 5).displacement.functions
+    field = SeparatedField(0.1 * rng.standard_normal((functions.n_functions, 9, 3)), functions)
+    parameters = bent_sheet_model(6, 5).parameters
+    solid = ReducedModel("cube", nodes, triangles, parameters, field)
+    drawn = DrawnSurface.of(solid)
+    assert drawn.closed
+    mu = np.array([0.03, 0.2, 0.1])
+    moved, expected = drawn.model.positions(mu)[drawn.model.triangles], solid.positions(mu)[triangles]
+    assert len(drawn.model.nodes) == 8
+    np.testing.assert_allclose(moved, expected, rtol=1e-6, atol=1e-9)
+    for other in (triangles[:-2], triangles[:, ::-1], np.concatenate([triangles[:1, ::-1], triangles[1:]])):
+        assert not DrawnSurface.of(replace(solid, triangles=other)).closed
+    assert not DrawnSurface.of(bent_sheet_model(6, 5)).closed

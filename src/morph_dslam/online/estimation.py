@@ -141,6 +141,12 @@ def bounded_step(hessian: Array, gradient: Array, lower: Array, upper: Array) ->
     """
     step = np.zeros_like(gradient)
     free = ~(((lower == 0.0) & (gradient > 0.0)) | ((upper == 0.0) & (gradient < 0.0)))
+    if free.all():
+        # The usual case, without the cost of selecting rows.
+        step[:] = np.linalg.solve(hessian, -gradient)
+        if ((step >= lower) & (step <= upper)).all():
+            return step
+        step[:] = 0.0
     while free.any():
         held = ~free
         right = -gradient[free] - hessian[np.ix_(free, held)] @ step[held]

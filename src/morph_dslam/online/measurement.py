@@ -65,7 +65,7 @@ def visible_surface(
     ----------
     positions : (p, 3) of the points in the camera frame. pixels : (p, 2) of them.
     """
-    same_side = (facing(view, triangles) == appearance.facing)[points.triangles]
+    same_side = facing(view, triangles[points.triangles]) == appearance.facing[points.triangles]
     depths = positions[:, 2]
     tolerance = DEPTH_TOLERANCE * float(np.median(depths))
     return same_side & visible_points(pixels, depths, rendering.depth, tolerance)

@@ -18,7 +18,7 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.model import ReducedModel
 from morph_dslam.online.appearance import ReferenceAppearance
-from morph_dslam.online.binding import View, bind_pixels, draw_view, view_of
+from morph_dslam.online.binding import DrawnSurface, View, bind_pixels, draw_view, view_of
 from morph_dslam.online.estimation import BoundPoints, Estimate, EstimationOptions, Estimator, State
 from morph_dslam.online.features import interior, spread_corners
 from morph_dslam.online.flow import FlowOptions, flatten, follow
@@ -117,12 +117,14 @@ class Tracker:
         self.estimator = Estimator(model, camera, self.options.estimation)
         self._undistortion = camera.undistortion_maps()
         picture = self._prepare(reference)
-        view = view_of(model, camera, state)
-        self.appearance = ReferenceAppearance(model, camera, picture.flat, view)
+        surface = DrawnSurface.of(model)
+        self._drawn = surface.model
+        view = view_of(self._drawn, camera, state)
+        self.appearance = ReferenceAppearance(self._drawn, camera, picture.flat, view, surface.closed)
         margin = self.options.measurement.patch_half + 2
-        mask = interior(draw_view(view, model.triangles, camera).covered, margin)
+        mask = interior(draw_view(view, self._drawn.triangles, camera).covered, margin)
         self.points = self._choose_points(picture, mask, view)
-        self.relocaliser = Relocaliser(self.estimator, picture.grey, mask, view)
+        self.relocaliser = Relocaliser(self.estimator, self._drawn, picture.grey, mask, view)
         self.outline = None
         if self.options.use_outline:
             self.outline = Outline(model, camera, picture.grey, state, self.options.outline)
@@ -190,7 +192,7 @@ class Tracker:
     ) -> _Attempt:
         """Measure against the reference view rendered in ``state`` and estimate from these measurements."""
         with clock.stage("render"):
-            view = view_of(self.model, self.camera, state)
+            view = view_of(self._drawn, self.camera, state)
             rendering = self.appearance.render(view)
         with clock.stage("correct"):
             positions = self.points.in_camera(state)
@@ -200,7 +202,7 @@ class Tracker:
                 positions,
                 predicted,
                 view,
-                self.model.triangles,
+                self._drawn.triangles,
                 self.appearance,
                 rendering,
             )
@@ -324,7 +326,7 @@ class Tracker:
 
     def _choose_points(self, picture: _Picture, mask: NDArray[np.uint8], view: View) -> BoundPoints:
         corners = spread_corners(picture.flat, mask, self.options.n_points)
-        surface, _ = bind_pixels(self.model, self.camera, view, corners)
+        surface, _ = bind_pixels(self._drawn, self.camera, view, corners)
         if len(surface) < 2 * (len(self.model.parameters) + 6):
             raise RegistrationError(
                 f"the object shows only {len(surface)} corners in the reference frame, too few to follow it: "

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.model import ReducedModel
 from morph_dslam.online.binding import View, bind_pixels
 from morph_dslam.online.estimation import BoundPoints, Estimator, State
 from morph_dslam.online.features import detect_orb, match_descriptors
@@ -31,12 +32,14 @@ class Relocaliser:
 
     Parameters
     ----------
-    grey : the reference image (h, w). mask : 255 where the object is seen. view : the mesh in it.
+    drawn : the model as it is drawn. grey : the reference image (h, w). mask : 255 where the object is seen.
+    view : the drawn mesh in it.
     """
 
     def __init__(
         self,
         estimator: Estimator,
+        drawn: ReducedModel,
         grey: NDArray[np.uint8],
         mask: NDArray[np.uint8],
         view: View,
@@ -45,7 +48,7 @@ class Relocaliser:
         self.options = options or RelocalisationOptions()
         self._estimator = estimator
         pixels, descriptors = detect_orb(grey, self.options.n_features, mask)
-        surface, met = bind_pixels(estimator.model, estimator.camera, view, pixels)
+        surface, met = bind_pixels(drawn, estimator.camera, view, pixels)
         self._points = BoundPoints.from_surface(estimator.model, surface)
         self._descriptors = descriptors[met]
 

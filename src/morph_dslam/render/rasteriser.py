@@ -2,7 +2,8 @@
 
 Edge functions decide coverage (Pineda 1988); inverse depth is linear in the image, so it both decides
 visibility and turns image-plane weights into perspective-correct barycentric weights. Pixel (0, 0) is the
-centre of the first pixel. Both faces of a triangle are drawn.
+centre of the first pixel. Both faces of a triangle are drawn, unless the surface is said to be closed: of a
+closed surface nothing but the faces turned to the camera can be seen from outside.
 """
 
 from __future__ import annotations
@@ -52,6 +53,8 @@ def _fill_triangle(triangle_id, u, v, inverse_depth, triangle_ids, weights, dept
     right = int(np.floor(min(max(u[0], u[1], u[2]), width - 1.0)))
     top = int(np.ceil(max(min(v[0], v[1], v[2]), 0.0)))
     bottom = int(np.floor(min(max(v[0], v[1], v[2]), height - 1.0)))
+    if left > right or top > bottom:  # it lies between the centres of pixels
+        return
     b0_step, b1_step = (v[1] - v[2]) / area, (v[2] - v[0]) / area
     q0, q1, q2 = inverse_depth[0], inverse_depth[1], inverse_depth[2]
     for row in range(top, bottom + 1):
@@ -73,18 +76,21 @@ def _fill_triangle(triangle_id, u, v, inverse_depth, triangle_ids, weights, dept
 
 
 @njit(cache=True, nogil=True)
-def _fill_triangles(pixels, depths, triangles, triangle_ids, weights, depth):
+def _fill_triangles(pixels, depths, triangles, closed, triangle_ids, weights, depth):
     u, v, inverse_depth = np.empty(3), np.empty(3), np.empty(3)
     for t in range(triangles.shape[0]):
         in_front = True
         for corner in range(3):
             node = triangles[t, corner]
             in_front &= depths[node] > 0.0 and np.isfinite(pixels[node, 0] + pixels[node, 1])
-            if in_front:
-                u[corner], v[corner] = pixels[node, 0], pixels[node, 1]
-                inverse_depth[corner] = 1.0 / depths[node]
-        if in_front:
-            _fill_triangle(t, u, v, inverse_depth, triangle_ids, weights, depth)
+            u[corner], v[corner] = pixels[node, 0], pixels[node, 1]
+        if not in_front:
+            continue
+        if closed and (u[1] - u[0]) * (v[2] - v[0]) - (u[2] - u[0]) * (v[1] - v[0]) >= 0.0:
+            continue
+        for corner in range(3):
+            inverse_depth[corner] = 1.0 / depths[triangles[t, corner]]
+        _fill_triangle(t, u, v, inverse_depth, triangle_ids, weights, depth)
 
 
 def _empty_buffers(height: int, width: int) -> Buffers:
@@ -95,7 +101,9 @@ def _empty_buffers(height: int, width: int) -> Buffers:
     )
 
 
-def rasterise(pixels: Array, depths: Array, triangles: NDArray, height: int, width: int) -> Buffers:
+def rasterise(
+    pixels: Array, depths: Array, triangles: NDArray, height: int, width: int, closed: bool = False
+) -> Buffers:
     """Draw triangles into a z-buffer.
 
     Parameters
@@ -104,6 +112,8 @@ def rasterise(pixels: Array, depths: Array, triangles: NDArray, height: int, wid
     depths : (n,) depth of the nodes along the optical axis, any length unit.
     triangles : (m, 3) node indices. A triangle with a node not in front of the camera is left out.
     height, width : size of the image, pixels.
+    closed : whether the triangles close a volume, run anticlockwise seen from outside it, and the camera is
+        outside: then those turned away, which others hide, are left out.
 
     Returns
     -------
@@ -114,6 +124,7 @@ def rasterise(pixels: Array, depths: Array, triangles: NDArray, height: int, wid
         np.ascontiguousarray(pixels, dtype=np.float64),
         np.ascontiguousarray(depths, dtype=np.float64),
         np.ascontiguousarray(triangles, dtype=np.int64),
+        closed,
         buffers.triangle_ids,
         buffers.weights,
         buffers.depth,
@@ -121,7 +132,9 @@ def rasterise(pixels: Array, depths: Array, triangles: NDArray, height: int, wid
     return buffers
 
 
-def rasterise_numpy(pixels: Array, depths: Array, triangles: NDArray, height: int, width: int) -> Buffers:
+def rasterise_numpy(
+    pixels: Array, depths: Array, triangles: NDArray, height: int, width: int, closed: bool = False
+) -> Buffers:
     """The plain twin of `rasterise`: each triangle's weights by solving its 3x3 system over a window."""
     buffers = _empty_buffers(height, width)
     for t, nodes in enumerate(triangles):
@@ -129,7 +142,8 @@ def rasterise_numpy(pixels: Array, depths: Array, triangles: NDArray, height: in
         if not (np.isfinite(corners).all() and (z > 0.0).all()):
             continue
         system = np.vstack([corners.T, np.ones(3)])
-        if abs(np.linalg.det(system)) < 1e-12:
+        area = np.linalg.det(system)
+        if abs(area) < 1e-12 or (closed and area >= 0.0):
             continue
         low = np.ceil(np.maximum(corners.min(axis=0), 0)).astype(int)
         high = np.floor(np.minimum(corners.max(axis=0), [width - 1, height - 1])).astype(int)
