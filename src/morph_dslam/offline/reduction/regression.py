@@ -18,6 +18,8 @@ RIDGE = 1e-8
 FOLDS = 5
 #: A parameter gets a higher degree than the others if the error falls below this part of what it was.
 WORTH_RAISING = 0.9
+#: Most terms that raised degrees may lead to: the time of a fit grows with their square.
+MOST_TERMS = 2000
 
 
 def design_matrix(samples: Array, lower: Array, upper: Array, indices: NDArray[np.int64]) -> Array:
@@ -150,7 +152,9 @@ def _raised(fit: _Fit, degrees: list[int], error: float, highest: int) -> NDArra
         while degrees[k] < highest:
             tried = [*degrees[:k], min(3 * degrees[k] // 2, highest), *degrees[k + 1 :]]
             indices = weighted_degree_indices(tried)
-            if not fit.suits(indices) or (missed := fit.missed(indices)) > WORTH_RAISING * error:
+            if len(indices) > MOST_TERMS or not fit.suits(indices):
+                break
+            if (missed := fit.missed(indices)) > WORTH_RAISING * error:
                 break
             best, degrees, error = indices, tried, missed
     return best
