@@ -34,8 +34,10 @@ OUTPUT = Path(__file__).resolve().parent / "output" / "reduction_growth"
 TRAINING = {1: 8, 2: 24, 3: 64, 4: 128, 5: 200, 6: 300}
 #: Points along each parameter of the full grid that is stated for comparison.
 GRID_POINTS = 20
+#: Tolerance of Galerkin models by the number of parameters: a third of what is asked of 3, half of that of 6.
+TOLERANCE = {1: 3e-4, 2: 3e-4, 3: 3e-4, 4: 1e-3, 5: 1e-3, 6: 1e-3}
 METHODS: dict[str, dict[str, Any]] = {
-    "galerkin": {"tolerance": 3e-4},
+    "galerkin": {},
     "pod": {"tolerance": 1e-5, "max_modes": 40, "max_degree": 12},
     "sparse_pgd": {"max_modes": 30, "max_degree": 8},
 }
@@ -110,7 +112,8 @@ def run(arguments: argparse.Namespace) -> None:
         folder = arguments.output / f"bar_{count}"
         solved = solve_study(study, folder, arguments.workers)
         for method in arguments.methods:
-            line, errors[count, method] = row(count, method, solved, **METHODS[method])
+            options = METHODS[method] or {"tolerance": TOLERANCE[count]}
+            line, errors[count, method] = row(count, method, solved, **options)
             print(line, flush=True)
         print(f"   a full grid of {GRID_POINTS} values needs {GRID_POINTS**count} solves", flush=True)
     print(" ".join(f"{method}_{count}={error:.2e}" for (count, method), error in errors.items()))
