@@ -18,6 +18,7 @@ from morph_dslam import __version__
 from morph_dslam.camera_commands import add_camera_commands
 from morph_dslam.command_arguments import frame_range
 from morph_dslam.errors import EvaluationError, MorphError
+from morph_dslam.inner_commands import add_inner_commands
 from morph_dslam.registration_commands import add_registration_commands
 from morph_dslam.view_commands import add_view_commands
 
@@ -83,6 +84,7 @@ def _track(arguments: argparse.Namespace) -> None:
             reference_frame=arguments.reference_frame,
             refine_reference=arguments.refine,
             use_outline=arguments.outline,
+            inner=tuple(arguments.inner),
             overlay=not arguments.no_video,
             overwrite=arguments.overwrite,
         )
@@ -139,6 +141,7 @@ def _parser() -> argparse.ArgumentParser:
     add_view_commands(partial(_add, commands))
     _add_online_commands(commands)
     add_camera_commands(partial(_add, commands))
+    add_inner_commands(partial(_add, commands))
     add_registration_commands(partial(_add, commands))
     return parser
 
@@ -233,6 +236,14 @@ def _add_online_commands(commands: argparse._SubParsersAction) -> None:
         "--outline",
         action="store_true",
         help="let the object's outline count too, where it stands out from the background",
+    )
+    track.add_argument(
+        "--inner",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="a structure inside of the object (`morph inner`) to draw and report; may be repeated",
     )
     track.add_argument("--no-video", action="store_true", help="do not draw the augmented video")
     evaluate = _add(

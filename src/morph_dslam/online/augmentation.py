@@ -13,15 +13,23 @@ from tqdm import tqdm
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.model import ReducedModel
+from morph_dslam.model.inner_structure import CarriedStructure
 from morph_dslam.online.binding import View, facing, view_of
 from morph_dslam.online.estimation import State
 from morph_dslam.online.results import RunResults
 from morph_dslam.render.colour_maps import text_patch
-from morph_dslam.render.overlay import draw_overlay
+from morph_dslam.render.overlay import draw_inner_surface, draw_overlay
 from morph_dslam.render.shading import lambert, vertex_normals
 from morph_dslam.sources import FrameSource
 
 Array = NDArray[np.float64]
+
+#: Opacity of the object's surface, and of one that shows what it has inside.
+OPACITY, SEE_THROUGH = 0.65, 0.4
+#: Colours of inner structures in turn: blue, green, red.
+INNER_COLOURS = ((235, 60, 235), (60, 220, 255), (90, 235, 90), (255, 190, 60))
+#: Direction to the light, camera frame, and what it leaves in the shade.
+LIGHT, AMBIENT = np.array([0.3, -0.4, -1.0]), 0.55
 
 
 def seen_field(model: ReducedModel, state: State, view: View) -> tuple[Array, str]:
@@ -59,12 +67,13 @@ def draw_frame(
     state: State,
     limits: tuple[float, float],
     caption: str,
+    inner: Sequence[CarriedStructure] = (),
 ) -> NDArray[np.uint8]:
-    """One undistorted frame (h, w, 3) with the object drawn over it."""
+    """One undistorted frame (h, w, 3) with the object drawn over it, and in it its inner structures."""
     view = view_of(model, camera, state)
     values, label = seen_field(model, state, view)
     normals = vertex_normals(view.nodes, model.triangles)
-    return draw_overlay(
+    drawn = draw_overlay(
         image,
         view.pixels,
         view.nodes[:, 2],
@@ -72,12 +81,31 @@ def draw_frame(
         values,
         limits,
         label=label,
-        brightness=lambert(normals, np.array([0.3, -0.4, -1.0]), ambient=0.55),
+        alpha=SEE_THROUGH if inner else OPACITY,
+        brightness=lambert(normals, LIGHT, AMBIENT),
         caption=caption,
     )
+    for number, structure in enumerate(inner):
+        nodes = state.camera_from_object.apply(structure.nodes(state.parameters))
+        drawn = draw_inner_surface(
+            drawn,
+            camera.project(nodes),
+            nodes[:, 2],
+            structure.triangles,
+            INNER_COLOURS[number % len(INNER_COLOURS)],
+            label=structure.name,
+            brightness=lambert(vertex_normals(nodes, structure.triangles), LIGHT, AMBIENT),
+        )
+    return drawn
 
 
-def write_video(path: Path, source: FrameSource, camera: PinholeCamera, run: RunResults) -> None:
+def write_video(
+    path: Path,
+    source: FrameSource,
+    camera: PinholeCamera,
+    run: RunResults,
+    inner: Sequence[CarriedStructure] = (),
+) -> None:
     """Draw every frame of the run; lost frames are shown as they are, with the reason."""
     states = run.states()
     limits = value_range(run.model, camera, states)
@@ -93,7 +121,8 @@ def write_video(path: Path, source: FrameSource, camera: PinholeCamera, run: Run
             if state is None:
                 video.write(_with_caption(image, f"frame {frame.index}: {result.reason}"))
             else:
-                video.write(draw_frame(run.model, camera, image, state, limits, f"frame {frame.index}"))
+                caption = f"frame {frame.index}"
+                video.write(draw_frame(run.model, camera, image, state, limits, caption, inner))
 
 
 def _with_caption(image: NDArray[np.uint8], caption: str) -> NDArray[np.uint8]:

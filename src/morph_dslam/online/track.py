@@ -20,8 +20,10 @@ from morph_dslam.errors import SourceError, TrackingError
 from morph_dslam.io.calibration import load_camera
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel, load_model, save_model
+from morph_dslam.model.inner_structure import InnerStructure, load_inner_structure
 from morph_dslam.online.augmentation import write_video
 from morph_dslam.online.estimation import State
+from morph_dslam.online.inner_positions import write_inner_positions
 from morph_dslam.online.outline import rim
 from morph_dslam.online.pipeline import Tracker, TrackerOptions
 from morph_dslam.online.placement import Placement, load_placement, place_by_landmarks
@@ -53,6 +55,7 @@ class TrackOptions:
     reference_frame : the frame that the landmarks belong to; the first one tracked by default.
     refine_reference : after tracking, refine the reference state over the whole sequence and track once more.
     use_outline : let the object's outline count beside its texture.
+    inner : files of inner structures (`morph inner`), whose positions are written and drawn.
     overlay : draw the augmented video. overwrite : replace a run that is there already.
     """
 
@@ -67,6 +70,7 @@ class TrackOptions:
     reference_frame: int | None = None
     refine_reference: bool = False
     use_outline: bool = False
+    inner: tuple[Path, ...] = ()
     overlay: bool = True
     overwrite: bool = False
     registration: RegistrationOptions = field(default_factory=RegistrationOptions)
@@ -101,6 +105,9 @@ def track(options: TrackOptions) -> dict[str, Any]:
         placement = load_placement(options.placement, model)
         first = placement.frame if options.first is None else options.first
         options = replace(options, reference_frame=placement.frame, first=first)
+    inner = [load_inner_structure(path) for path in options.inner]
+    for structure in inner:
+        structure.carried_by(model)  # says so before the tracking if it is not for this model
     source = open_source(options.frames, options.first, options.last)
     reference = _reference_frame(options)
     camera.check_image(reference.image, f"frame {reference.index} of {options.frames}")
@@ -116,7 +123,7 @@ def track(options: TrackOptions) -> dict[str, Any]:
             _follow(source, camera, reference, state, options, again)
             run = again
     finally:
-        summary = _write_run(options, source, camera, run, placement) if len(run) else {}
+        summary = _write_run(options, source, camera, run, placement, inner) if len(run) else {}
     return summary
 
 
@@ -215,10 +222,12 @@ def _write_run(
     camera: PinholeCamera,
     run: RunResults,
     placement: Placement,
+    inner: list[InnerStructure],
 ) -> dict[str, Any]:
     """Write all files of the run folder; the video last, because it takes longest."""
-    folder = options.output
+    folder, carried = options.output, [structure.carried_by(run.model) for structure in inner]
     write_hdf5(folder / "result.h5", run)
+    write_inner_positions(folder / "result.h5", run, carried)
     write_csv(folder / "frames.csv", run)
     save_model(folder / "model.morph", placement.model)
     _copy(options.camera, folder / "camera.yaml")
@@ -240,7 +249,7 @@ def _write_run(
     summary = write_summary(folder / "summary.json", run, extra)
     write_plots(folder / "plots", run)
     if options.overlay:
-        write_video(folder / "augmented.mp4", source, camera, run)
+        write_video(folder / "augmented.mp4", source, camera, run, carried)
     return summary
 
 

@@ -53,9 +53,11 @@ def blend_surface_numpy(image, triangle_ids, weights, triangles, levels, brightn
     image[covered] = ((1.0 - alpha) * image[covered] + alpha * colour + 0.5).astype(np.uint8)
 
 
-def _draw_outline(image: NDArray[np.uint8], covered: NDArray[np.bool_]) -> None:
+def _draw_outline(
+    image: NDArray[np.uint8], covered: NDArray[np.bool_], colour: tuple[int, int, int] = (245, 245, 245)
+) -> None:
     contours, _ = cv2.findContours(covered.view(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(image, contours, -1, (245, 245, 245), 1, cv2.LINE_AA)
+    cv2.drawContours(image, contours, -1, colour, 1, cv2.LINE_AA)
 
 
 def _blend_panel(image: NDArray[np.uint8], panel: NDArray[np.uint8], top: int, left: int) -> None:
@@ -149,4 +151,48 @@ def draw_overlay(
     if caption:
         line = text_patch(caption, scale)
         _blend_panel(result, line, height - margin - line.shape[0], margin)
+    return result
+
+
+def draw_inner_surface(
+    image: NDArray[np.uint8],
+    pixels: Array,
+    depths: Array,
+    triangles: NDArray,
+    colour: tuple[int, int, int],
+    *,
+    label: str = "",
+    alpha: float = 0.6,
+    brightness: Array | None = None,
+) -> NDArray[np.uint8]:
+    """Draw a surface of one colour through all that hides it: what lies inside of the object.
+
+    Parameters
+    ----------
+    image : (h, w, 3) uint8, blue, green, red, with the object drawn in it already; not changed.
+    pixels, depths, triangles, brightness : of the inner surface, as of `draw_overlay`.
+    colour : blue, green, red. label : written beside it. alpha : opacity, 0 to 1.
+
+    Returns
+    -------
+    (h, w, 3) uint8, a new image.
+    """
+    result = image.copy()
+    buffers = rasterise(pixels, depths, triangles, *image.shape[:2])
+    blend_surface(
+        result,
+        buffers.triangle_ids,
+        buffers.weights,
+        np.ascontiguousarray(triangles, dtype=np.int64),
+        np.zeros(len(pixels)),
+        np.ones(len(pixels)) if brightness is None else np.asarray(brightness, dtype=np.float64),
+        np.tile(np.array(colour, dtype=np.float64), (256, 1)),
+        float(alpha),
+    )
+    _draw_outline(result, buffers.covered, colour)
+    if label and buffers.covered.any():
+        rows, columns = np.nonzero(buffers.covered)
+        patch = text_patch(label, 0.42 * max(image.shape[0] / 480.0, 0.6))
+        left = min(int(columns.max()) + 6, image.shape[1] - patch.shape[1])
+        _blend_panel(result, patch, max(int(rows.min()) - patch.shape[0], 0), max(left, 0))
     return result
