@@ -107,8 +107,8 @@ def linear_solid(sweep: SweepProblem) -> LinearSolid:
     forces = separate(load, parameters, "the load")
     if not forces.n_terms:
         raise StudyError(
-            'reduction.method = "pgd": nothing moves this solid: it needs a load or a prescribed displacement '
-            "that is not zero"
+            'reduction.method = "pgd": nothing moves this solid: it needs a load or a prescribed displacement'
+            " that is not zero"
         )
     return LinearSolid(
         problem,

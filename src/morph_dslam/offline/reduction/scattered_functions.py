@@ -87,7 +87,7 @@ def fit_expansion(
 
     Parameters
     ----------
-    tolerance : error (root mean square, over the largest value) at which the expansion is good enough.
+    tolerance : relative error (root mean squares) at which the expansion is good enough.
     leading : the values that the error is measured on.
     """
     bound = 1.0
@@ -99,8 +99,7 @@ def fit_expansion(
         rows = expansion_rows(samples, box, indices)
         coefficients = _least_squares(rows[~aside], values[~aside])
         missed = (rows[aside] @ coefficients - values[aside])[:, leading]
-        largest = np.linalg.norm(values[:, leading], axis=1).max()
-        error = float(np.sqrt(np.mean(np.sum(missed**2, axis=1))) / largest)
+        error = float(np.linalg.norm(missed) / np.linalg.norm(values[aside][:, leading]))
         larger = weighted_degree_indices(degrees, bound * GROWTH)
         if error <= tolerance or len(larger) > MOST_TERMS:
             return indices, _least_squares(rows, values), error
