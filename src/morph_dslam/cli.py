@@ -85,6 +85,7 @@ def _track(arguments: argparse.Namespace) -> None:
             refine_reference=arguments.refine,
             use_outline=arguments.outline,
             inner=tuple(arguments.inner),
+            per_sequence=tuple(arguments.per_sequence),
             overlay=not arguments.no_video,
             overwrite=arguments.overwrite,
         )
@@ -244,6 +245,13 @@ def _add_online_commands(commands: argparse._SubParsersAction) -> None:
         default=[],
         metavar="FILE",
         help="a structure inside of the object (`morph inner`) to draw and report; may be repeated",
+    )
+    track.add_argument(
+        "--per-sequence",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a parameter that is one over the whole sequence; may be repeated",
     )
     track.add_argument("--no-video", action="store_true", help="do not draw the augmented video")
     evaluate = _add(

@@ -75,6 +75,20 @@ class BoundPoints:
 
 
 @dataclass(frozen=True)
+class Prior:
+    """What is known of the parameters beforehand, as one more term of the cost.
+
+    Attributes
+    ----------
+    mean : (d,), SI. information : (d, d), the Hessian of the cost (mu - mean)' I (mu - mean) / 2, in squared
+        pixels as the cost; zero for parameters of which nothing is known.
+    """
+
+    mean: Array
+    information: Array
+
+
+@dataclass(frozen=True)
 class EstimationOptions:
     """When to stop, and what is too far off.
 
@@ -97,7 +111,7 @@ class Estimate:
     Attributes
     ----------
     state : parameters and pose.
-    cost : Huber cost, pixels squared.
+    cost : Huber cost and that of the prior, pixels squared.
     residuals : (p, 2) projected minus measured, pixels.
     sigma_px : robust standard deviation of one pixel coordinate's residual.
     covariance : (d + 6, d + 6) of [parameters, rotation vector, translation]; infinite when undetermined.
@@ -177,21 +191,40 @@ class Estimator:
         self._linearise = linearise
         size = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
         half_ranges = 0.5 * (model.upper - model.lower)
-        self._scale = np.concatenate([half_ranges, np.ones(3), np.full(3, size)])
+        self.scale = np.concatenate([half_ranges, np.ones(3), np.full(3, size)])
 
     def evaluate(
-        self, points: BoundPoints, pixels: Array, weights: Array, state: State, normals: Array | None = None
-    ):
+        self,
+        points: BoundPoints,
+        pixels: Array,
+        weights: Array,
+        state: State,
+        normals: Array | None = None,
+        prior: Prior | None = None,
+    ) -> tuple[float, Array, Array, Array]:
         """Cost, Hessian, gradient and residuals at a state; see `reprojection.linearise`."""
         pose = state.camera_from_object
         normals = np.zeros_like(pixels) if normals is None else normals
-        return self._linearise(
+        cost, hessian, gradient, residuals = self._linearise(
             points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
             points.field.modes, self.camera.intrinsics, pixels, weights, normals, self.options.huber_px,
         )  # fmt: skip
+        if prior is not None:
+            d, away = len(prior.mean), state.parameters - prior.mean
+            push = prior.information @ away
+            cost += 0.5 * float(away @ push)
+            hessian[:d, :d] += prior.information
+            gradient[:d] += push
+        return cost, hessian, gradient, residuals
 
     def estimate(
-        self, points: BoundPoints, pixels: Array, weights: Array, start: State, normals: Array | None = None
+        self,
+        points: BoundPoints,
+        pixels: Array,
+        weights: Array,
+        start: State,
+        normals: Array | None = None,
+        prior: Prior | None = None,
     ) -> Estimate:
         """Minimise the Huber cost from ``start``.
 
@@ -200,11 +233,12 @@ class Estimator:
         pixels : (p, 2) measured, in the undistorted image.
         weights : (p,) non-negative; points of weight 0 are ignored (their residuals are still reported).
         normals : (p, 2), for points that count only along a direction; see `reprojection.linearise`.
+        prior : what is known of the parameters beforehand; nothing by default.
         """
-        options, scale = self.options, self._scale
+        options, scale = self.options, self.scale
         state = State(np.clip(start.parameters, self.model.lower, self.model.upper), start.camera_from_object)
         normals = np.zeros_like(pixels) if normals is None else normals
-        cost, hessian, gradient, residuals = self.evaluate(points, pixels, weights, state, normals)
+        cost, hessian, gradient, residuals = self.evaluate(points, pixels, weights, state, normals, prior)
         damping, iterations, converged = 1e-3, 0, False
         while iterations < options.max_iterations and not converged:
             iterations += 1
@@ -215,7 +249,7 @@ class Estimator:
                 damping = min(damping * 0.01, 1e-2)
                 continue
             trial = self._inside(moved(state, step * scale))
-            attempt = self.evaluate(points, pixels, weights, trial, normals)
+            attempt = self.evaluate(points, pixels, weights, trial, normals, prior)
             if attempt[0] < cost:
                 ratio = (cost - attempt[0]) / predicted
                 state, (cost, hessian, gradient, residuals) = trial, attempt
@@ -238,7 +272,7 @@ class Estimator:
         self, hessian: Array, gradient: Array, state: State, damping: float
     ) -> tuple[Array, float]:
         """Step in scaled unknowns and the decrease of the cost that the quadratic model predicts for it."""
-        scale, d = self._scale, len(state.parameters)
+        scale, d = self.scale, len(state.parameters)
         scaled_hessian = hessian * np.outer(scale, scale)
         scaled_gradient = gradient * scale
         diagonal = np.diag(scaled_hessian)
@@ -293,9 +327,9 @@ class Estimator:
         factor = np.minimum(1.0, huber / np.maximum(length, 1e-300))
         psi_squared = float(np.sum(weights * (factor * length) ** 2)) / freedom
         mean_slope = max(float(np.mean(0.5 * (factor + (length <= huber)))), 1e-3)
-        scaled = hessian * np.outer(self._scale, self._scale)
+        scaled = hessian * np.outer(self.scale, self.scale)
         eigenvalues, vectors = np.linalg.eigh(scaled)
         floored = np.maximum(eigenvalues, max(eigenvalues[-1], 1e-30) * EIGENVALUE_FLOOR)
         inverse = (vectors / floored) @ vectors.T
         variance = psi_squared * float(factor.mean()) / mean_slope**2
-        return sigma, variance * inverse * np.outer(self._scale, self._scale)
+        return sigma, variance * inverse * np.outer(self.scale, self.scale)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from morph_dslam.online.estimation import Estimate
 
 #: The stages of a frame that are timed, in order.
-STAGES = ("prepare", "flow", "estimate", "render", "correct", "search", "recover", "outline")
+STAGES = ("prepare", "flow", "estimate", "render", "correct", "search", "recover", "outline", "fuse")
 
 FOLLOWED = "followed from the previous frame"
 FOUND_AGAIN = "found again where it was last seen"

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.errors import RegistrationError
+from morph_dslam.errors import RegistrationError, TrackingError
 from morph_dslam.model import ReducedModel
 from morph_dslam.online.appearance import ReferenceAppearance
 from morph_dslam.online.binding import DrawnSurface, View, bind_pixels, draw_view, view_of
@@ -32,6 +32,12 @@ from morph_dslam.online.measurement import (
 from morph_dslam.online.outline import Outline, OutlineMeasurement, OutlineOptions
 from morph_dslam.online.reference_refinement import Keyframe
 from morph_dslam.online.relocalisation import Relocaliser
+from morph_dslam.online.sequence_filter import (
+    FilterOptions,
+    Measured,
+    SequenceFilter,
+    window_correlation,
+)
 from morph_dslam.online.shape_search import ShapeSearch, with_undetermined_at_default
 from morph_dslam.online.timing import StageClock
 
@@ -55,6 +61,7 @@ class TrackerOptions:
         the frame as starts, in turn, lest the estimate stay in a local minimum.
     least_inliers, least_share : points that must support it, as a number or a share of all, if that is fewer.
     use_outline : whether the object's outline counts too; it needs a background that it stands out from.
+    per_sequence : names of the parameters that are one over the whole sequence.
     """
 
     n_points: int = 350
@@ -65,10 +72,12 @@ class TrackerOptions:
     search_above_px: float = 0.25
     searches: int = 2
     use_outline: bool = False
+    per_sequence: tuple[str, ...] = ()
     flow: FlowOptions = field(default_factory=FlowOptions)
     measurement: MeasurementOptions = field(default_factory=MeasurementOptions)
     outline: OutlineOptions = field(default_factory=OutlineOptions)
     estimation: EstimationOptions = field(default_factory=EstimationOptions)
+    filter: FilterOptions = field(default_factory=FilterOptions)
 
 
 @dataclass(frozen=True)
@@ -129,13 +138,14 @@ class Tracker:
         if self.options.use_outline:
             self.outline = Outline(model, camera, picture.grey, state, self.options.outline)
             self._with_outline = self.points.joined(self.outline.points)
-        self._picture = picture
+        self._picture, self._reference = picture, state
         self._pixels = self.reference_pixels = camera.project(self.points.in_camera(state))
         self.last_seen: Keyframe | None = None
         self._supported = np.ones(len(self.points), dtype=bool)
         self._search = ShapeSearch(model, self.options.searches)
         brief = replace(self.options.estimation, max_iterations=10, tolerance=1e-3)
         self._scout = Estimator(model, camera, brief)
+        self._filter, self._correlation = self._new_filter()
         self._last, self._velocity_base, self._lost = state, state, not in_sequence
         self._start = state
 
@@ -158,9 +168,12 @@ class Tracker:
                 candidate = self._correct(picture, candidate.estimate.state, None, clock)
                 if not self._refusal(candidate):
                     attempt, refusal, how = candidate, "", RECOVERED
-        if not refusal and self.outline is not None:
-            with clock.stage("outline"):
-                attempt = self._fit_outline(picture, attempt, self.outline)
+        if not refusal:
+            if self.outline is not None:
+                with clock.stage("outline"):
+                    attempt = self._fit_outline(picture, attempt, self.outline)
+            with clock.stage("fuse"):
+                attempt = self._fuse(attempt)
         self._remember(picture, attempt, bool(refusal))
         return self._result(attempt, refusal, how, clock)
 
@@ -264,8 +277,35 @@ class Tracker:
                 estimate.state,
                 np.concatenate([np.zeros((count, 2)), seen.normals]),
             )
-        estimate = replace(estimate, residuals=estimate.residuals[:count])
         return replace(attempt, estimate=estimate, outline=seen)
+
+    def _new_filter(self) -> tuple[SequenceFilter, Array]:
+        """The filter of what is one per sequence, and how the errors of all points are correlated."""
+        names = [parameter.name for parameter in self.model.parameters]
+        unknown = [name for name in self.options.per_sequence if name not in names]
+        if unknown:
+            raise TrackingError(
+                f"'{unknown[0]}' cannot be one over the sequence: the model's parameters are "
+                + ", ".join(names)
+            )
+        points = self.points if self.outline is None else self._with_outline
+        places = self.camera.project(points.in_camera(self._reference))
+        indices = [names.index(name) for name in self.options.per_sequence]
+        correlation = window_correlation(places, self.options.flow.window)
+        return SequenceFilter(self.estimator, indices, self.options.filter), correlation
+
+    def _fuse(self, attempt: _Attempt) -> _Attempt:
+        """The attempt with what earlier frames tell of the parameters that are one per sequence."""
+        points, pixels = self.points, attempt.measurement.pixels
+        weights = np.where(attempt.inliers, 1.0, 0.0)
+        normals = np.zeros_like(pixels)
+        if attempt.outline is not None:
+            points, seen = self._with_outline, attempt.outline
+            pixels, normals = np.concatenate([pixels, seen.pixels]), np.concatenate([normals, seen.normals])
+            weights = np.concatenate([weights, np.where(seen.valid, self.options.outline.weight, 0.0)])
+        measured = Measured(points, pixels, weights, normals, self._correlation)
+        estimate = self._filter.fuse(measured, attempt.estimate)
+        return replace(attempt, estimate=replace(estimate, residuals=estimate.residuals[: len(self.points)]))
 
     def _refusal(self, attempt: _Attempt) -> str:
         """Why an attempt is not to be believed; empty when it is."""

@@ -28,6 +28,8 @@ class Placement:
     model : the model to track with; with the angle about its axis as a parameter where that is not known.
     frame : number of the reference frame; None for the first one tracked.
     state : of the object there. facts : for the summary. flags : what a reader must know.
+    per_sequence : names of the parameters that the placement leaves open and that do not change: the angle
+        about an axis.
     """
 
     model: ReducedModel
@@ -35,6 +37,7 @@ class Placement:
     state: State
     facts: dict[str, Any]
     flags: tuple[str, ...]
+    per_sequence: tuple[str, ...] = ()
 
 
 def load_placement(path: Path, model: ReducedModel) -> Placement:
@@ -56,14 +59,18 @@ def load_placement(path: Path, model: ReducedModel) -> Placement:
         raise RegistrationError(f"cannot read the registration {path}: {error.strerror}") from error
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise RegistrationError(f"{path} is not a registration.json of `morph register` ({error})") from error
+    open_angles: tuple[str, ...] = ()
     flags = ["registration ambiguous: another place in the map is nearly as good"] if ambiguous else []
     if axis is not None:
         model = turned_model(model, np.array(axis["point_m"]), np.array(axis["direction"]))
+        open_angles = (model.parameters[-1].name,)
         flags.append(
             f"the angle about the object's axis cannot be seen before it deforms: it is the parameter "
-            f"'{model.parameters[-1].name}'"
+            f"'{open_angles[0]}'"
         )
-    return Placement(model, frame, State(model.default, pose), {"from": "map", **facts}, tuple(flags))
+    return Placement(
+        model, frame, State(model.default, pose), {"from": "map", **facts}, tuple(flags), open_angles
+    )
 
 
 def place_by_landmarks(

@@ -56,6 +56,8 @@ class TrackOptions:
     refine_reference : after tracking, refine the reference state over the whole sequence and track once more.
     use_outline : let the object's outline count beside its texture.
     inner : files of inner structures (`morph inner`), whose positions are written and drawn.
+    per_sequence : names of the parameters that are one over the whole sequence, beside those that the
+        placement leaves open.
     overlay : draw the augmented video. overwrite : replace a run that is there already.
     """
 
@@ -71,6 +73,7 @@ class TrackOptions:
     refine_reference: bool = False
     use_outline: bool = False
     inner: tuple[Path, ...] = ()
+    per_sequence: tuple[str, ...] = ()
     overlay: bool = True
     overwrite: bool = False
     registration: RegistrationOptions = field(default_factory=RegistrationOptions)
@@ -113,6 +116,8 @@ def track(options: TrackOptions) -> dict[str, Any]:
     camera.check_image(reference.image, f"frame {reference.index} of {options.frames}")
     if landmarks is not None:
         placement = place_by_landmarks(model, camera, landmarks, options.registration)
+    constant = tuple(dict.fromkeys((*placement.per_sequence, *options.per_sequence)))
+    options = replace(options, tracker=replace(options.tracker, per_sequence=constant))
     _warm_up(camera, reference, placement, options)
     run = RunResults(placement.model, reference.index)
     try:
@@ -237,7 +242,7 @@ def _write_run(
         "outline_used": options.use_outline,
         "flags": list(placement.flags),
         "start_of_each_frame": "previous state; the first guess of image motion assumes constant velocity",
-        "temporal_prior": "none",
+        "temporal_prior": _temporal_prior(options.tracker.per_sequence),
         "inputs": {name: str(getattr(options, name)) for name in _INPUTS if getattr(options, name)},
         "settings": {
             "registration": asdict(options.registration),
@@ -251,6 +256,12 @@ def _write_run(
     if options.overlay:
         write_video(folder / "augmented.mp4", source, camera, run, carried)
     return summary
+
+
+def _temporal_prior(per_sequence: tuple[str, ...]) -> str:
+    if not per_sequence:
+        return "none"
+    return f"one over the sequence, from all frames so far: {', '.join(per_sequence)}; none on the others"
 
 
 def _copy(source: Path, target: Path) -> None:

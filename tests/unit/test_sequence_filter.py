@@ -1,0 +1,122 @@
+"""The filter of what is one per sequence, against the errors of simulated measurements."""
+
+import numpy as np
+import pytest
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.model import SurfacePoints
+from morph_dslam.online.estimation import BoundPoints, Estimator, State
+from morph_dslam.online.sequence_filter import Measured, SequenceFilter, window_correlation
+from tests.support.bent_sheet import bent_sheet_model
+
+CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
+MODEL = bent_sheet_model(22, 16)
+ESTIMATOR = Estimator(MODEL, CAMERA)
+TWIST = 2
+SIGMA = 0.4
+
+
+def truth(number, twist_deg=5.0):
+    """Arch and position change from frame to frame, the twist does not."""
+    turn = rotation_exp(np.array([0.1 * np.sin(0.2 * number), 0.2, 0.05 * number]))
+    pose = RigidTransform(turn @ np.diag([1.0, -1.0, -1.0]), np.array([0.01 * np.sin(number), 0.0, 0.6]))
+    return State(np.array([0.03 * np.cos(0.1 * number), 0.1, np.radians(twist_deg)]), pose)
+
+
+def bound(count, seed=0):
+    rng = np.random.default_rng(seed)
+    surface = SurfacePoints(rng.integers(0, len(MODEL.triangles), count), rng.dirichlet(np.ones(3), count))
+    return BoundPoints.from_surface(MODEL, surface)
+
+
+def fused(filtered, points, errors, states, correlation):
+    """The estimates of frames whose pixels are off by ``errors`` (f, p, 2)."""
+    estimates = []
+    for state, error in zip(states, errors, strict=True):
+        pixels, weights = CAMERA.project(points.in_camera(state)) + error, np.ones(len(points))
+        alone = ESTIMATOR.estimate(points, pixels, weights, state)
+        measured = Measured(points, pixels, weights, np.zeros_like(pixels), correlation)
+        estimates.append(filtered.fuse(measured, alone))
+    return estimates
+
+
+def twist_errors(estimates, states):
+    error = [e.state.parameters[TWIST] - s.parameters[TWIST] for e, s in zip(estimates, states, strict=True)]
+    return np.array(error), np.array([e.parameter_std[TWIST] for e in estimates])
+
+
+def runs(draw, frames=25, repeats=20, count=60):
+    """Errors and stated deviations (repeats, frames) of the twist when the noise is drawn by ``draw``."""
+    points, states = bound(count), [truth(number) for number in range(frames)]
+    found = []
+    for seed in range(repeats):
+        errors = draw(np.random.default_rng(seed), (frames, count, 2))
+        estimates = fused(SequenceFilter(ESTIMATOR, [TWIST]), points, errors, states, np.eye(count))
+        found.append(twist_errors(estimates, states))
+    return np.array(found).transpose(1, 0, 2)
+
+
+def test_noise_that_is_new_in_every_frame_averages_out():
+    errors, deviations = runs(lambda rng, shape: SIGMA * rng.standard_normal(shape))
+    ratio = np.median(deviations[:, -1] / deviations[:, 0])
+    assert ratio == pytest.approx(1.0 / np.sqrt(25), rel=0.35)
+    rms = np.sqrt(np.mean(errors**2, axis=0))
+    assert rms[-8:].mean() < 0.35 * rms[0]
+    assert 0.6 < np.sqrt(np.mean((errors / deviations)[:, 10:] ** 2)) < 1.4
+
+
+def test_noise_that_stays_with_the_points_does_not_and_is_not_said_to():
+    errors, deviations = runs(lambda rng, shape: np.tile(SIGMA * rng.standard_normal(shape[1:]), (25, 1, 1)))
+    assert np.median(deviations[:, -1] / deviations[:, 0]) > 0.7
+    assert 0.6 < np.sqrt(np.mean((errors / deviations)[:, 10:] ** 2)) < 1.4
+
+
+def test_wrong_early_value_is_given_up():
+    points, rng = bound(60), np.random.default_rng(0)
+    states = [truth(n, -8.0) for n in range(6)] + [truth(n) for n in range(6, 16)]
+    errors = SIGMA * rng.standard_normal((16, 60, 2))
+    estimates = fused(SequenceFilter(ESTIMATOR, [TWIST]), points, errors, states, np.eye(60))
+    # A frame that contradicts the past stands by itself.
+    found = np.degrees([estimate.state.parameters[TWIST] for estimate in estimates])
+    np.testing.assert_allclose(found[:6], -8.0, atol=1.0)
+    np.testing.assert_allclose(found[6:], 5.0, atol=1.0)
+    deviations = [estimate.parameter_std[TWIST] for estimate in estimates]
+    assert deviations[5] < deviations[6] > deviations[15]
+
+
+def test_covariance_of_one_frame_is_that_of_repeated_measurements_with_overlapping_windows():
+    points, state = bound(150, seed=3), truth(0)
+    rng = np.random.default_rng(1)
+    pixels = CAMERA.project(points.in_camera(state))
+    correlation = window_correlation(pixels, 60)
+    root = np.linalg.cholesky(correlation + 1e-12 * np.eye(150))
+    found, stated = [], []
+    for _ in range(150):
+        errors = SIGMA * np.einsum("ij,jc->ic", root, rng.standard_normal((150, 2)))
+        (estimate,) = fused(SequenceFilter(ESTIMATOR, []), points, [errors], [state], correlation)
+        found.append(
+            np.concatenate([estimate.state.parameters, estimate.state.camera_from_object.translation])
+        )
+        stated.append(np.concatenate([estimate.parameter_std, estimate.pose_std[3:]]))
+    spread = np.std(found, axis=0)
+    # Residuals are smaller than the errors by what the estimate takes up of these.
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(stated), axis=0)), spread, rtol=0.3)
+    independent = ESTIMATOR.estimate(points, pixels + errors, np.ones(150), state)
+    assert (independent.parameter_std < 0.75 * spread[:3]).all()
+
+
+def test_windows_correlate_by_what_they_share():
+    pixels = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 5.0], [30.0, 0.0]])
+    expected = np.array([1.0, 6 / 10, 6 / 10 * 5 / 10, 0.0])
+    np.testing.assert_allclose(window_correlation(pixels, 10)[0], expected)
+
+
+def test_parameter_that_nothing_tells_has_a_large_deviation():
+    """One point seen four times tells of three directions at most."""
+    points = bound(1)
+    same = BoundPoints(points.surface.take(np.zeros(8, dtype=int)), np.repeat(points.rest, 8, axis=0),
+                       points.field.with_modes(np.repeat(points.field.modes, 8, axis=1)))  # fmt: skip
+    errors = SIGMA * np.random.default_rng(0).standard_normal((1, 8, 2))
+    (estimate,) = fused(SequenceFilter(ESTIMATOR, []), same, errors, [truth(0)], np.eye(8))
+    assert estimate.parameter_std.max() > np.ptp([MODEL.lower[TWIST], MODEL.upper[TWIST]])
