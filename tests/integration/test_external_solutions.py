@@ -111,7 +111,12 @@ def test_an_xdmf_series_is_read_step_by_step(tmp_path, monkeypatch):
         ("runs/table.csv", "file,", "name,", r"needs a column 'file'"),
         ("study.toml", '"U"', '"u"', r"no point data 'u'; it has: U, S, E"),
         ("study.toml", '"runs/table.csv"', '"table.csv"', r"cannot read the table .*No such file"),
-        ("study.toml", "max_degree", "degree", r"unknown key reduction\.degree; known here: method, format, basis"),
+        (
+            "study.toml",
+            "max_degree",
+            "degree",
+            r"unknown key reduction\.degree; known here: method, format, basis",
+        ),
     ],
 )
 def test_a_mistake_is_one_message(folder, capsys, file, before, after, message):
