@@ -196,3 +196,24 @@ def test_refined_reference_is_named_and_still_right(inputs, tmp_path):
     truth = sheet_state(TIMES[-1])
     expected = truth.camera_from_object.apply(run.model.positions(truth.parameters))
     assert np.linalg.norm(run.camera_points(6) - expected, axis=1).mean() < 1e-3
+
+
+def test_run_without_the_object_is_whole_and_says_that_nothing_was_found(inputs, tmp_path):
+    """Only the blank frame is tracked; the object is known from another one."""
+    chosen = options(inputs, tmp_path / "run", first=24, last=24, reference_frame=20)
+    summary = track(chosen)
+    assert (summary["n_tracked"], summary["n_lost"]) == (0, 1)
+    assert summary["flags"][-1].startswith("1 of 1 frames were lost")
+    assert not load_run(tmp_path / "run").tracked.any()
+    assert (tmp_path / "run" / "augmented.mp4").is_file()
+
+
+def test_parameter_that_is_one_over_the_sequence_is_named(inputs, finished, tmp_path):
+    summary = track(options(inputs, tmp_path / "run", last=23, per_sequence=("twist",), overlay=False))
+    assert (
+        summary["temporal_prior"]
+        == "one over the sequence, from all frames so far: twist; none on the others"
+    )
+    assert finished[1]["temporal_prior"] == "none"
+    with pytest.raises(TrackingError, match="'bend' cannot be one over the sequence"):
+        track(options(inputs, tmp_path / "other", per_sequence=("bend",)))

@@ -7,6 +7,7 @@ import pytest
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.online.binding import draw_view, view_of
 from morph_dslam.online.estimation import State
 from morph_dslam.online.frame_result import STAGES
 from morph_dslam.online.pipeline import Tracker
@@ -125,3 +126,75 @@ def test_same_frames_give_the_same_states(model):
         states = [tracker.process_frame(film.frame(sheet_state(t))).estimate.state for t in (0.03, 0.06)]
         runs.append(np.array([state.parameters for state in states]))
     np.testing.assert_array_equal(*runs)
+
+
+def aside(state, x, y=0.0, z=0.0):
+    """The same shape, moved in the camera frame, metres."""
+    pose = state.camera_from_object
+    return State(state.parameters, RigidTransform(pose.rotation, pose.translation + np.array([x, y, z])))
+
+
+def test_covered_object_is_lost_and_never_put_elsewhere(model, film):
+    """A board is pushed over all of the object, stays, and is drawn away again."""
+    tracker = start(model, film)
+    shares = [0.3, 0.6, 0.9, 1.0, 1.0, 1.0, 1.0, 0.9, 0.6, 0.3, 0.0]
+    seen = []
+    for step, share in enumerate(shares):
+        truth = sheet_state(0.01 * step)
+        board = (0, 0, int(640 * share), 480) if share else None
+        result = tracker.process_frame(film.frame(truth, occluder=board))
+        seen.append(result.status == "tracked")
+        if result.estimate is None:
+            assert "points agree, at least" in result.reason
+        else:
+            # Of a third of the object the shape of the rest is not known well, and that is said.
+            found, pose = result.estimate.state, result.estimate.state.camera_from_object
+            off = np.abs(found.parameters - truth.parameters) / result.estimate.parameter_std
+            away = np.abs(pose.translation - truth.camera_from_object.translation)
+            assert off.max() < 5.0
+            assert (away / result.estimate.pose_std[3:]).max() < 5.0
+    assert mean_error(model, result.estimate.state, truth) < 0.5e-3
+    assert not any(seen[2:8])
+    assert seen[0]
+    assert seen[-1]
+
+
+def test_object_absent_from_the_beginning_is_waited_for(model, film):
+    """Another print on a sheet of the same shape is not the object either."""
+    truth = sheet_state(0.1)
+    tracker = Tracker(model, CAMERA, film.frame(sheet_state(0.0)), sheet_state(0.0), in_sequence=False)
+    for frame in (film.blank(), SheetFilm(model, seed=9).frame(truth), film.blank()):
+        result = tracker.process_frame(frame)
+        assert (result.status, result.estimate) == ("lost", None)
+        assert "features of the reference view were found again" in result.reason
+    result = tracker.process_frame(film.frame(truth))
+    assert result.status == "tracked", result.reason
+    assert mean_error(model, result.estimate.state, truth) < 1.5e-3
+
+
+def test_second_identical_object_is_not_taken_for_the_first(model, film):
+    """Followed, the object stays what it is; after a loss two that look the same cannot be told apart."""
+    here = aside(sheet_state(0.0), -0.16, 0.0, 0.55)
+    there = aside(here, 0.42, 0.08)
+    tracker = Tracker(model, CAMERA, film.frame(here), here)
+
+    def both(first, second):
+        image, other = film.frame(first), film.frame(second)
+        view = view_of(model, CAMERA, second)
+        covered = draw_view(view, model.triangles, CAMERA).covered
+        return np.where(covered[:, :, None], other, image)
+
+    for step in range(3):
+        moved = aside(here, 0.002 * step)
+        result = tracker.process_frame(both(moved, there))
+        assert result.status == "tracked"
+        assert mean_error(model, result.estimate.state, moved) < 1e-3
+    assert tracker.process_frame(film.blank()).status == "lost"
+    changed = aside(here, 0.0, -0.05), aside(there, 0.0, 0.04)
+    result = tracker.process_frame(both(*changed))
+    assert (result.status, result.estimate) == ("lost", None)
+    assert "it could be in two places" in result.reason
+    # With one of them gone there is no doubt.
+    result = tracker.process_frame(film.frame(changed[1]))
+    assert result.status == "tracked", result.reason
+    assert mean_error(model, result.estimate.state, changed[1]) < 1.5e-3

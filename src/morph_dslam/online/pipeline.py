@@ -8,7 +8,7 @@ only say where to start.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,65 +19,31 @@ from morph_dslam.errors import RegistrationError, TrackingError
 from morph_dslam.model import ReducedModel
 from morph_dslam.online.appearance import ReferenceAppearance
 from morph_dslam.online.binding import DrawnSurface, View, bind_pixels, draw_view, view_of
-from morph_dslam.online.estimation import BoundPoints, Estimate, EstimationOptions, Estimator, State
+from morph_dslam.online.estimation import BoundPoints, Estimate, Estimator, State
 from morph_dslam.online.features import interior, spread_corners
-from morph_dslam.online.flow import FlowOptions, flatten, follow
+from morph_dslam.online.flow import flatten, follow
 from morph_dslam.online.frame_result import FOLLOWED, FOUND_AGAIN, RECOVERED, STAGES, FrameResult
 from morph_dslam.online.measurement import (
     Measurement,
-    MeasurementOptions,
     compare_with_rendering,
     visible_surface,
 )
-from morph_dslam.online.outline import Outline, OutlineMeasurement, OutlineOptions
+from morph_dslam.online.outline import Outline, OutlineMeasurement
 from morph_dslam.online.reference_refinement import Keyframe
 from morph_dslam.online.relocalisation import Relocaliser
 from morph_dslam.online.sequence_filter import (
-    FilterOptions,
     Measured,
     SequenceFilter,
     window_correlation,
 )
 from morph_dslam.online.shape_search import ShapeSearch, with_undetermined_at_default
 from morph_dslam.online.timing import StageClock
+from morph_dslam.online.tracker_options import TrackerOptions
 
 Array = NDArray[np.float64]
 
 #: Share of the cost below which another shape is a better explanation and not the same one.
 CLEARLY_BETTER = 0.95
-
-
-@dataclass(frozen=True)
-class TrackerOptions:
-    """What the tracker follows and what it demands before it believes a frame.
-
-    Attributes
-    ----------
-    n_points : corners followed, spread over the reference view.
-    inlier_sigmas, inlier_px : a point supports the estimate when its residual is below so many robust
-        standard deviations, within these limits in pixels: a model that is a pixel off must not cost it good
-        points, and occluders that happen to look alike must not get in where it fits well.
-    search_above_px, searches : where the residuals' spread exceeds this, so many other shapes are tried in
-        the frame as starts, in turn, lest the estimate stay in a local minimum.
-    least_inliers, least_share : points that must support it, as a number or a share of all, if that is fewer.
-    use_outline : whether the object's outline counts too; it needs a background that it stands out from.
-    per_sequence : names of the parameters that are one over the whole sequence.
-    """
-
-    n_points: int = 350
-    inlier_sigmas: float = 6.0
-    inlier_px: tuple[float, float] = (2.0, 8.0)
-    least_inliers: int = 30
-    least_share: float = 0.3
-    search_above_px: float = 0.25
-    searches: int = 2
-    use_outline: bool = False
-    per_sequence: tuple[str, ...] = ()
-    flow: FlowOptions = field(default_factory=FlowOptions)
-    measurement: MeasurementOptions = field(default_factory=MeasurementOptions)
-    outline: OutlineOptions = field(default_factory=OutlineOptions)
-    estimation: EstimationOptions = field(default_factory=EstimationOptions)
-    filter: FilterOptions = field(default_factory=FilterOptions)
 
 
 @dataclass(frozen=True)
@@ -159,15 +125,7 @@ class Tracker:
             attempt = self._search_other_shapes(attempt)
         refusal, how = self._refusal(attempt), FOUND_AGAIN if self._lost else FOLLOWED
         if refusal:
-            with clock.stage("recover"):
-                state, matches = self.relocaliser.find(picture.grey, self._shapes())
-            if state is None:
-                refusal += f"; only {matches} features of the reference view were found again"
-            else:
-                candidate = self._correct(picture, state, None, clock)
-                candidate = self._correct(picture, candidate.estimate.state, None, clock)
-                if not self._refusal(candidate):
-                    attempt, refusal, how = candidate, "", RECOVERED
+            attempt, refusal, how = self._recover(picture, attempt, refusal, clock)
         if not refusal:
             if self.outline is not None:
                 with clock.stage("outline"):
@@ -176,6 +134,43 @@ class Tracker:
                 attempt = self._fuse(attempt)
         self._remember(picture, attempt, bool(refusal))
         return self._result(attempt, refusal, how, clock)
+
+    def _recover(
+        self, picture: _Picture, attempt: _Attempt, refusal: str, clock: StageClock
+    ) -> tuple[_Attempt, str, str]:
+        """Look for the object by its features in the whole frame; refused if it may be in two places."""
+        found, matches = self._find(picture, None, clock)
+        if matches is not None:
+            return attempt, f"{refusal}; only {matches} features of the reference view were found again", ""
+        if found is None:
+            return attempt, refusal, ""
+        with clock.stage("recover"):
+            covered = draw_view(
+                view_of(self._drawn, self.camera, found.estimate.state), self._drawn.triangles, self.camera
+            ).covered
+            elsewhere = np.where(covered, 0, 255).astype(np.uint8)
+        other, _ = self._find(picture, elsewhere, clock)
+        if other is not None and self._apart(found, other):
+            counts = f"{int(found.inliers.sum())} and {int(other.inliers.sum())} points agree"
+            return attempt, f"{refusal}; it could be in two places, where {counts}", ""
+        return found, "", RECOVERED
+
+    def _find(
+        self, picture: _Picture, mask: NDArray[np.uint8] | None, clock: StageClock
+    ) -> tuple[_Attempt | None, int | None]:
+        """A place where the object is to be believed, or None; and how many features agreed, if too few."""
+        with clock.stage("recover"):
+            state, matches = self.relocaliser.find(picture.grey, self._shapes(), mask)
+        if state is None:
+            return None, matches
+        candidate = self._correct(picture, state, None, clock)
+        candidate = self._correct(picture, candidate.estimate.state, None, clock)
+        return (None if self._refusal(candidate) else candidate), None
+
+    def _apart(self, found: _Attempt, other: _Attempt) -> bool:
+        """Whether two attempts are of different places in the image."""
+        between = np.linalg.norm(found.measurement.pixels - other.measurement.pixels, axis=1)
+        return float(np.nanmedian(between)) > self.options.measurement.largest_correction_px
 
     def _attempt_from_last(self, picture: _Picture, clock: StageClock) -> _Attempt:
         """Estimate from the last known state; by way of the previous frame if the object was seen there."""

@@ -52,18 +52,21 @@ class Relocaliser:
         self._points = BoundPoints.from_surface(estimator.model, surface)
         self._descriptors = descriptors[met]
 
-    def find(self, grey: NDArray[np.uint8], shapes: list[Array]) -> tuple[State | None, int]:
+    def find(
+        self, grey: NDArray[np.uint8], shapes: list[Array], mask: NDArray[np.uint8] | None = None
+    ) -> tuple[State | None, int]:
         """The object's state in a frame from matched features alone, and how many matches support it.
 
         Parameters
         ----------
         grey : (h, w). shapes : parameters (d,) to try the first pose with.
+        mask : (h, w), 0 where not to look.
 
         Returns
         -------
         None in place of the state when fewer matches than ``least_matches`` agree on one.
         """
-        pixels, descriptors = detect_orb(grey, self.options.n_features)
+        pixels, descriptors = detect_orb(grey, self.options.n_features, mask)
         mine, theirs = match_descriptors(self._descriptors, descriptors)
         if len(mine) < self.options.least_matches:
             return None, len(mine)

@@ -1,0 +1,44 @@
+"""What the tracker follows and what it demands before it believes a frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from morph_dslam.online.estimation import EstimationOptions
+from morph_dslam.online.flow import FlowOptions
+from morph_dslam.online.measurement import MeasurementOptions
+from morph_dslam.online.outline import OutlineOptions
+from morph_dslam.online.sequence_filter import FilterOptions
+
+
+@dataclass(frozen=True)
+class TrackerOptions:
+    """What the tracker follows and what it demands before it believes a frame.
+
+    Attributes
+    ----------
+    n_points : corners followed, spread over the reference view.
+    inlier_sigmas, inlier_px : a point supports the estimate when its residual is below so many robust
+        standard deviations, within these limits in pixels: a model that is a pixel off must not cost it good
+        points, and occluders that happen to look alike must not get in where it fits well.
+    search_above_px, searches : where the residuals' spread exceeds this, so many other shapes are tried in
+        the frame as starts, in turn, lest the estimate stay in a local minimum.
+    least_inliers, least_share : points that must support it, as a number or a share of all, if that is fewer.
+    use_outline : whether the object's outline counts too; it needs a background that it stands out from.
+    per_sequence : names of the parameters that are one over the whole sequence.
+    """
+
+    n_points: int = 350
+    inlier_sigmas: float = 6.0
+    inlier_px: tuple[float, float] = (2.0, 8.0)
+    least_inliers: int = 30
+    least_share: float = 0.3
+    search_above_px: float = 0.25
+    searches: int = 2
+    use_outline: bool = False
+    per_sequence: tuple[str, ...] = ()
+    flow: FlowOptions = field(default_factory=FlowOptions)
+    measurement: MeasurementOptions = field(default_factory=MeasurementOptions)
+    outline: OutlineOptions = field(default_factory=OutlineOptions)
+    estimation: EstimationOptions = field(default_factory=EstimationOptions)
+    filter: FilterOptions = field(default_factory=FilterOptions)
