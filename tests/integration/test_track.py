@@ -94,6 +94,7 @@ def test_result_file_has_the_documented_layout(finished):
         "at_bound": (7, 3),
     }
     rows = ("frame", "timestamp", "status", "reason", "residual_rms_px", "n_points", "n_inliers")
+    rows += ("largest_displacement", "largest_displacement_std")
     assert shapes == {**states, **dict.fromkeys(rows, (7,)), "timings_ms": (7, len(STAGES) + 1)}
 
 
@@ -105,6 +106,9 @@ def test_table_and_summary_are_in_display_units(finished):
     assert float(rows[2]["arch_mm"]) == pytest.approx(1e3 * truth.parameters[0], abs=0.3)
     assert float(rows[2]["twist_deg"]) == pytest.approx(np.degrees(truth.parameters[2]), abs=0.2)
     assert float(rows[2]["z_mm"]) == pytest.approx(1e3 * truth.camera_from_object.translation[2], abs=0.5)
+    largest = np.linalg.norm(bent_sheet_model(43, 31).displacement.value(truth.parameters), axis=1).max()
+    assert float(rows[2]["largest_displacement_mm"]) == pytest.approx(1e3 * largest, abs=0.3)
+    assert 0.0 < float(rows[2]["largest_displacement_std_mm"]) < 0.3
     assert rows[BLANK]["arch_mm"] == ""
     assert json.loads((folder / "summary.json").read_text()) == json.loads(json.dumps(summary, default=str))
     assert (summary["n_tracked"], summary["n_lost"]) == (6, 1)

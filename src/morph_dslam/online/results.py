@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.model import ReducedModel
+from morph_dslam.online.binding import DrawnSurface
+from morph_dslam.online.confidence import largest_displacement
 from morph_dslam.online.estimation import State
 from morph_dslam.online.frame_result import STAGES, FrameResult
 
@@ -32,6 +34,7 @@ class RunResults:
     frames: list[int] = field(default_factory=list)
     timestamps: list[float] = field(default_factory=list)
     results: list[FrameResult] = field(default_factory=list)
+    _largest: list[tuple[float, float]] = field(default_factory=list, repr=False)
 
     def add(self, frame: int, timestamp: float, result: FrameResult) -> None:
         self.frames.append(frame)
@@ -70,6 +73,14 @@ class RunResults:
         lost = np.zeros(len(self.model.parameters), dtype=bool)
         return np.array([r.estimate.at_bound if r.estimate else lost for r in self.results])
 
+    def largest_displacements(self) -> Array:
+        """The largest displacement of a node of the surface and its standard deviation (f, 2), metres."""
+        surface = DrawnSurface.of(self.model).model
+        for result in self.results[len(self._largest) :]:
+            found = result.estimate
+            self._largest.append((np.nan, np.nan) if found is None else largest_displacement(surface, found))
+        return np.array(self._largest).reshape(-1, 2)
+
     def timings_ms(self) -> Array:
         """(f, len(STAGES) + 1): each stage, then the whole frame."""
         return np.array([[*(r.timings_ms[s] for s in STAGES), r.total_ms] for r in self.results])
@@ -94,6 +105,7 @@ def write_hdf5(path: Path, run: RunResults) -> None:
         file["reason"] = np.array([result.reason for result in run.results], dtype=text)
         file["camera_from_object"], file["parameters"] = run.poses(), run.parameters()
         file["parameter_std"], file["at_bound"] = run.parameter_std(), run.at_bound()
+        file["largest_displacement"], file["largest_displacement_std"] = run.largest_displacements().T
         file["residual_rms_px"] = run.residuals_px()
         file["n_points"], file["n_inliers"] = run.counts().T
         file["timings_ms"] = run.timings_ms()
@@ -108,20 +120,23 @@ def write_csv(path: Path, run: RunResults) -> None:
     header = ["frame", "timestamp_s", "status", "reason"]
     for p in parameters:
         header += [f"{p.name}_{p.unit}", f"{p.name}_std_{p.unit}", f"{p.name}_at_bound"]
+    header += ["largest_displacement_mm", "largest_displacement_std_mm"]
     header += ["x_mm", "y_mm", "z_mm", "rotation_x_deg", "rotation_y_deg", "rotation_z_deg"]
     header += ["residual_rms_px", "n_points", "n_inliers", "time_ms"]
+    rows = zip(run.frames, run.timestamps, run.results, 1e3 * run.largest_displacements(), strict=True)
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(header)
-        for frame, timestamp, result in zip(run.frames, run.timestamps, run.results, strict=True):
+        for frame, timestamp, result, largest in rows:
             row: list[Any] = [frame, f"{timestamp:.6f}", result.status, result.reason]
             if result.estimate is None:
-                row += [""] * (3 * len(parameters) + 7)
+                row += [""] * (3 * len(parameters) + 9)
             else:
                 state, std = result.estimate.state, result.estimate.parameter_std
                 for k, p in enumerate(parameters):
                     row += [f"{p.display(state.parameters[k]):.6g}", f"{p.display(std[k]):.3g}"]
                     row.append(int(result.estimate.at_bound[k]))
+                row += [f"{largest[0]:.4f}", f"{largest[1]:.3g}"]
                 pose = state.camera_from_object
                 row += [f"{1e3 * value:.4f}" for value in pose.translation]
                 row += [f"{value:.4f}" for value in np.degrees(rotation_log(pose.rotation))]
