@@ -41,7 +41,8 @@ from tests.support.rendered_room import (
 
 from morph_dslam.online.slam.output import trajectory_of
 from morph_dslam.online.slam.run import warm_up
-from morph_dslam.online.slam.slam import Slam, SlamFrame
+from morph_dslam.online.slam.slam import Slam
+from morph_dslam.online.slam.slam_frame import SlamFrame
 from morph_dslam.similarity import fit_similarity
 
 Array = NDArray[np.float64]

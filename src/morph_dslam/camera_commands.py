@@ -59,7 +59,7 @@ def add_camera_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         "the frames tracked so far and their map are kept in the run folder",
         "find the path of a camera through a rigid scene, and a map of the scene",
     )
-    slam.add_argument("source", type=Path, help="recording (docs/sources.md)")
+    slam.add_argument("source", type=Path, help="recording (docs/sources.md), or webcam:0")
     slam.add_argument(
         "--camera",
         type=Path,

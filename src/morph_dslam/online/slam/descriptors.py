@@ -29,15 +29,21 @@ OCTAVES = (0, 2, 4)
 N_BITS = 256
 
 
-def orientations(image: Image, points: Array) -> Array:
+@njit(cache=True, nogil=True)
+def orientations(image, points):
     """Direction (n,), degrees, from each point (n, 2) to the centroid of grey of the disc around it."""
-    offsets = np.arange(-PATCH_RADIUS, PATCH_RADIUS + 1)
-    dx, dy = np.meshgrid(offsets, offsets)
-    disc = (dx**2 + dy**2 <= PATCH_RADIUS**2).ravel()
-    dx, dy = dx.ravel()[disc], dy.ravel()[disc]
-    columns, rows = np.rint(points).astype(int).T
-    grey = image[rows[:, None] + dy, columns[:, None] + dx].astype(np.float32)
-    return np.degrees(np.arctan2(grey @ dy.astype(np.float32), grey @ dx.astype(np.float32))) % 360.0
+    result = np.empty(len(points))
+    for j in range(len(points)):
+        column, row = round(points[j, 0]), round(points[j, 1])
+        along_x = along_y = 0
+        for dy in range(-PATCH_RADIUS, PATCH_RADIUS + 1):
+            half = int(np.sqrt(PATCH_RADIUS**2 - dy**2))
+            for dx in range(-half, half + 1):
+                grey = np.int64(image[row + dy, column + dx])
+                along_x += dx * grey
+                along_y += dy * grey
+        result[j] = np.degrees(np.arctan2(float(along_y), float(along_x))) % 360.0
+    return result
 
 
 def describe(grey: Image, points: Array, octaves: tuple[int, ...]) -> tuple[Indices, Descriptors]:

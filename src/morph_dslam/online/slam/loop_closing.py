@@ -8,6 +8,7 @@ are made one, and the whole map is adjusted.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from scipy.spatial import KDTree
 
 from morph_dslam.online.slam.frame_images import FrameView
 from morph_dslam.online.slam.mapping import Mapper
+from morph_dslam.online.slam.mapping_work import Work
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.slam.pose_graph import Similarities, optimise
 from morph_dslam.online.slam.projection import project
@@ -61,30 +63,27 @@ class LoopCloser:
     n_closed : loops closed so far.
     """
 
-    def __init__(
-        self,
-        rigid_map: RigidMap,
-        intrinsics: Array,
-        options: SlamOptions,
-        relocaliser: Relocaliser,
-        mapper: Mapper,
-    ) -> None:
-        self._map, self._intrinsics, self._options = rigid_map, intrinsics, options
-        self._relocaliser, self._mapper = relocaliser, mapper
+    def __init__(self, rigid_map: RigidMap, intrinsics: Array, options: SlamOptions, mapper: Mapper) -> None:
+        self._map, self._intrinsics, self._mapper = rigid_map, intrinsics, mapper
+        # Its own ones: it may look for loops while the frames' are at work.
+        self._relocaliser = Relocaliser(rigid_map, intrinsics, options)
+        self._tracker = Tracker(rigid_map, intrinsics, options)
         self.n_closed = 0
 
-    def close(self, view: FrameView, tracker: Tracker) -> Followed | None:
-        """Close the loop that the newest keyframe ends; returns the points to follow from it, or None."""
-        loop = self._find(view, tracker)
+    def close(self, view: FrameView) -> Work:
+        """Close the loop that the newest keyframe ends, if there is one."""
+        loop = yield partial(self._find, view)
         if loop is None:
-            return None
-        self._spread(loop)
+            return
+        before = Similarities.of_poses(np.array([k.camera_from_world for k in self._map.keyframes]))
+        edges, measured = self._pose_graph(loop, before)
+        after = yield partial(optimise, before, edges, measured, with_scale=not self._map.is_metric)
+        self._spread(before, after)
         self._join(loop)
-        self._mapper.adjust_all()
+        yield from self._mapper.adjust_all()
         self.n_closed += 1
-        return self._map.keyframes[loop.number].seen
 
-    def _find(self, view: FrameView, tracker: Tracker) -> Loop | None:
+    def _find(self, view: FrameView) -> Loop | None:
         number = len(self._map.keyframes) - 1
         ids = self._map.keyframes[number].point_ids
         shared = self._map.shared_points(ids[self._map.state[ids] == GOOD])
@@ -100,7 +99,7 @@ class LoopCloser:
         if neighbours.any() and likeness[best] < LEAST_LIKENESS * likeness[neighbours].max():
             return None
         group = self._relocaliser.group(best)
-        located = self._relocaliser.locate(view, group, tracker)
+        located = self._relocaliser.locate(view, group, self._tracker)
         return (
             None if located is None else self._loop(number, group, located[0].camera_from_world, located[1])
         )
@@ -126,10 +125,8 @@ class LoopCloser:
         scale = 1.0 if self._map.is_metric else float(np.median(old_depths / new_depths))
         return Loop(number, group, pose, scale, found, pairs)
 
-    def _spread(self, loop: Loop) -> None:
-        """Move keyframes and points so that the loop closes."""
-        keyframes = self._map.keyframes
-        before = Similarities.of_poses(np.array([k.camera_from_world for k in keyframes]))
+    def _pose_graph(self, loop: Loop, before: Similarities) -> tuple[Indices, Similarities]:
+        """Pairs of keyframes (m, 2) that hold each other, and how each first one is seen from the second."""
         edges = self._edges()
         measured = before[edges[:, 0]].inverse @ before[edges[:, 1]]
         closed = Similarities.of_poses(np.repeat(loop.camera_from_world[None], len(loop.old), axis=0))
@@ -141,11 +138,14 @@ class LoopCloser:
             np.concatenate([measured.rotations, held.rotations]),
             np.concatenate([measured.translations, held.translations]),
         )
-        after = optimise(before, edges, measured, with_scale=not self._map.is_metric)
+        return edges, measured
+
+    def _spread(self, before: Similarities, after: Similarities) -> None:
+        """Move keyframes, and points with the keyframes that saw them."""
         owners = self._map.template_keyframe
         moved = after[owners] @ before[owners].inverse
         self._map.positions[:] = moved.apply(self._map.positions)
-        for keyframe, pose in zip(keyframes, after.camera_from_world(), strict=True):
+        for keyframe, pose in zip(self._map.keyframes, after.camera_from_world(), strict=True):
             keyframe.camera_from_world = pose
 
     def _edges(self) -> Indices:

@@ -35,6 +35,7 @@ class SlamOptions:
     least_frames_between : keyframes are at least this many frames apart.
     window, fixed_window : keyframes that local bundle adjustment moves, and those that hold it.
     search_points, search_keyframes : lost points looked for in a frame, from at most so many keyframes.
+    enough_points : in a frozen map lost points are looked for while fewer than this are followed.
     search_radius_px : how far from its predicted pixel a lost point may be found.
     deforming_share, deforming_frames : the scene is taken to deform when more than this share of its points
         disagree with the rigid scene in so many frames on end.
@@ -67,6 +68,7 @@ class SlamOptions:
     fixed_window: int = 6
     search_points: int = 80
     search_keyframes: int = 3
+    enough_points: int = 340
     search_radius_px: float = 5.0
     deforming_share: float = 0.12
     deforming_frames: int = 5

@@ -22,7 +22,8 @@ from morph_dslam.online.slam.calibration_check import suspected_focal_factor
 from morph_dslam.online.slam.map_file import save_map
 from morph_dslam.online.slam.projection import inverse
 from morph_dslam.online.slam.rigid_map import GOOD
-from morph_dslam.online.slam.slam import STAGES, Slam, SlamFrame
+from morph_dslam.online.slam.slam import Slam
+from morph_dslam.online.slam.slam_frame import STAGES, SlamFrame
 
 Array = NDArray[np.float64]
 

@@ -89,6 +89,9 @@ class Followed:
         )
 
 
+NOWHERE = Followed(np.empty(0, dtype=np.int64), np.empty((0, 2)))
+
+
 class RigidMap:
     """Points and keyframes.
 

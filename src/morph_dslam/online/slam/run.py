@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sized
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,9 +22,12 @@ from morph_dslam.online.slam.map_file import load_map
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.slam.output import draw_frame, write_run
 from morph_dslam.online.slam.pose import refine_pose
-from morph_dslam.online.slam.slam import Slam, SlamFrame
-from morph_dslam.sources import FrameSource, open_source
+from morph_dslam.online.slam.slam import Slam
+from morph_dslam.online.slam.slam_frame import SlamFrame
+from morph_dslam.sources import FrameStream, open_stream
+from morph_dslam.sources.live import LiveCamera
 from morph_dslam.sources.recorded import RecordedFrames
+from morph_dslam.stereo import StereoCamera
 
 
 @dataclass(frozen=True)
@@ -32,7 +36,7 @@ class SlamRunOptions:
 
     Attributes
     ----------
-    source : recording. camera : camera file, or that of a stereo pair. output : the run folder.
+    source : recording, or `webcam:0`. camera : camera file, or that of a stereo pair. output : run folder.
     use_depth : use the depth images of a recording that has them for its colour pixels.
     first, last : frame numbers, both included; all by default.
     map_file : a map of an earlier run with the same camera; a new map by default. extend : let it grow,
@@ -58,10 +62,11 @@ class SlamRunOptions:
 
 
 def run_slam(options: SlamRunOptions) -> dict[str, Any]:
-    """Track the camera through a recording and write the run folder.
+    """Track the camera through a recording, or a live camera's, and write the run folder.
 
-    An interrupt, or a recording that ends early, keeps what was done: the run folder is completed with the
-    frames so far and the exception goes on.
+    The map is made in step with a recording's frames, and beside those of a live camera. An interrupt, or a
+    source that ends early, keeps what was done: the run folder is completed with the frames so far and the
+    exception goes on.
 
     Returns
     -------
@@ -76,31 +81,42 @@ def run_slam(options: SlamRunOptions) -> dict[str, Any]:
     if options.extend and options.map_file is None:
         raise MapError("--extend needs the map that is to grow: --map run/map.h5")
     camera = load_camera_or_pair(options.camera)
-    source = open_source(options.source, options.first, options.last)
+    source = open_stream(options.source, options.first, options.last)
+    with source if isinstance(source, LiveCamera) else nullcontext():
+        _prepare_folder(options)
+        warm_up()
+        return _run(options, camera, source)
+
+
+def _run(
+    options: SlamRunOptions, camera: PinholeCamera | StereoCamera, source: FrameStream
+) -> dict[str, Any]:
     with_depth = (
         options.use_depth
         and isinstance(camera, PinholeCamera)
         and isinstance(source, RecordedFrames)
         and source.has_registered_depth
     )
-    _prepare_folder(options)
-    warm_up()
-    slam, frames = Slam(camera, options.slam, with_depth, options.freeze_when_deforming), []
+    is_live = isinstance(source, LiveCamera)
+    slam, frames = Slam(camera, options.slam, with_depth, options.freeze_when_deforming, is_live), []
     if options.map_file is not None:
         slam.use_map(load_map(options.map_file, slam.camera), options.extend)
+    n_before = source.dropped if isinstance(source, LiveCamera) else 0
     try:
         _process(slam, source, options, frames)
     finally:
-        summary = _finish(slam, frames, options) if frames else {}
+        dropped = {"n_dropped": source.dropped - n_before} if isinstance(source, LiveCamera) else {}
+        summary = _finish(slam, frames, options, dropped) if frames else {}
     return summary
 
 
-def _process(slam: Slam, source: FrameSource, options: SlamRunOptions, frames: list[SlamFrame]) -> None:
+def _process(slam: Slam, source: FrameStream, options: SlamRunOptions, frames: list[SlamFrame]) -> None:
     """Process all frames into ``frames``."""
     size = (slam.camera.width, slam.camera.height)
     video = VideoWriter(options.output / "tracked.mp4", source.fps, size) if options.video else nullcontext()
     with video as writer:
-        for frame in tqdm(source, total=len(source), desc="tracking", unit="frame"):
+        total = len(source) if isinstance(source, Sized) else None
+        for frame in tqdm(source, total=total, desc="tracking", unit="frame"):
             if options.freeze_at is not None and frame.index >= options.freeze_at and not slam.is_frozen:
                 slam.freeze()
             frames.append(
@@ -110,10 +126,12 @@ def _process(slam: Slam, source: FrameSource, options: SlamRunOptions, frames: l
                 writer.write(draw_frame(slam.undistort(frame.image), frames[-1]))
 
 
-def _finish(slam: Slam, frames: list[SlamFrame], options: SlamRunOptions) -> dict[str, Any]:
+def _finish(
+    slam: Slam, frames: list[SlamFrame], options: SlamRunOptions, extra: dict[str, Any]
+) -> dict[str, Any]:
     slam.refine_map()
     inputs = {"source": str(options.source), "camera": str(options.camera)}
-    return write_run(options.output, slam, frames, {"inputs": inputs})
+    return write_run(options.output, slam, frames, {"inputs": inputs} | extra)
 
 
 def _prepare_folder(options: SlamRunOptions) -> None:

@@ -7,8 +7,6 @@ its first view is 1. With depth images, or a stereo pair, it is metric and begin
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,52 +16,20 @@ from morph_dslam.online.slam.frame_images import FrameImages, FrameView
 from morph_dslam.online.slam.initialisation import Initialiser, MapStart
 from morph_dslam.online.slam.loop_closing import LoopCloser
 from morph_dslam.online.slam.mapping import Mapper, pose_in_keyframe
+from morph_dslam.online.slam.mapping_work import MappingWork, Work, do_all
 from morph_dslam.online.slam.options import SlamOptions
-from morph_dslam.online.slam.pose import PoseEstimate, refine_pose
+from morph_dslam.online.slam.pose import refine_pose
 from morph_dslam.online.slam.relocalisation import Relocaliser
-from morph_dslam.online.slam.rigid_map import CANDIDATE, GOOD, Followed, RigidMap
+from morph_dslam.online.slam.rigid_map import CANDIDATE, GOOD, NOWHERE, Followed, RigidMap
+from morph_dslam.online.slam.slam_frame import STAGES, SlamFrame
 from morph_dslam.online.slam.tracking import Tracked, Tracker
 from morph_dslam.online.timing import StageClock
 from morph_dslam.stereo import StereoCamera
 
 Array = NDArray[np.float64]
 
-STAGES = ("prepare", "start", "track", "map", "relocalise")
 #: Frames that a relocalised pose has to be tracked for before the map grows again.
 HELD_FRAMES = 3
-NOWHERE = Followed(np.empty(0, dtype=np.int64), np.empty((0, 2)))
-
-
-@dataclass(frozen=True)
-class SlamFrame:
-    """What one frame gave.
-
-    Attributes
-    ----------
-    status : "waiting" for a start, "tracked", "relocalised", or "lost". reason : why there is no pose.
-    pose : from the map points, None without one.
-    points : map points that agree with it, and their pixels.
-    candidates : (c, 2) pixels of corners without depth.
-    disagreeing : points that look like their map point but do not obey the rigid scene.
-    keyframe : number of the keyframe in whose frame ``from_keyframe`` (4, 4) has the camera.
-    map_number : how many maps had been given up before the one that the pose is in.
-    is_keyframe : whether the map kept this view. timings_ms : by stage. total_ms : the whole frame.
-    """
-
-    index: int
-    timestamp: float
-    status: str
-    reason: str
-    pose: PoseEstimate | None = None
-    points: Followed = NOWHERE
-    candidates: Array = field(default_factory=lambda: np.empty((0, 2)))
-    disagreeing: Followed = NOWHERE
-    keyframe: int = -1
-    from_keyframe: Array | None = None
-    map_number: int = 0
-    is_keyframe: bool = False
-    timings_ms: dict[str, float] = field(default_factory=dict)
-    total_ms: float = 0.0
 
 
 class Slam:
@@ -75,6 +41,8 @@ class Slam:
         are of.
     with_depth : whether frames come with depth images that belong to them pixel by pixel.
     freeze_when_deforming : whether to freeze the map by itself when points begin to disagree with it.
+    threaded : whether the map is made beside the frames, in a thread that they never wait for, instead of
+        in step with them: for live cameras. What comes out then depends on how fast the machine is.
 
     Attributes
     ----------
@@ -89,6 +57,7 @@ class Slam:
         options: SlamOptions | None = None,
         with_depth: bool = False,
         freeze_when_deforming: bool = False,
+        threaded: bool = False,
     ) -> None:
         self.options = options or SlamOptions()
         self._images = FrameImages(camera, self.options, with_depth)
@@ -96,6 +65,7 @@ class Slam:
         self._freezes_by_itself = freeze_when_deforming
         self.is_frozen, self.frozen_at = False, None
         self.n_restarts = 0
+        self._work = MappingWork(threaded)
         self._begin(RigidMap(self._images.baseline_px))
 
     def use_map(self, rigid_map: RigidMap, extend: bool = False) -> None:
@@ -135,14 +105,17 @@ class Slam:
 
     def _begin(self, rigid_map: RigidMap) -> None:
         self.map, k, options = rigid_map, self.camera.intrinsics, self.options
+        self._work.drop()
         self._initialiser = Initialiser(k, options)
         self._tracker = Tracker(self.map, k, options)
         self._mapper = Mapper(self.map, k, options)
         self._relocaliser = Relocaliser(self.map, k, options)
-        self._loops = LoopCloser(self.map, k, options, self._relocaliser, self._mapper)
+        self._loops = LoopCloser(self.map, k, options, self._mapper)
         # In a map from elsewhere the camera is lost until it is found.
         self._n_lost, self._n_held = int(bool(rigid_map.keyframes)), 0
         self._n_deforming = 0
+        if self.is_frozen:
+            self._tracker.choose_templates()
 
     def process_frame(
         self,
@@ -167,6 +140,8 @@ class Slam:
         clock = StageClock(STAGES)
         with clock.stage("prepare"):
             view = self._images.prepare(image, index, timestamp, depth, right)
+        with clock.stage("map"):
+            self._go_on_mapping()
         if not self.map.keyframes:
             result = self._start(view, clock)
         elif self._n_lost:
@@ -180,15 +155,21 @@ class Slam:
         return SlamFrame(index, timestamp, **result, timings_ms=clock.milliseconds, total_ms=clock.total)
 
     def freeze(self) -> None:
-        """Keep the map as it is from now on and only find the camera in it; before a start, do nothing."""
+        """Keep the map as it is from now on and only find the camera in it; before a start, do nothing.
+
+        What the mapper has begun is brought to its end first.
+        """
         if self.map.keyframes:
+            self._work.finish()
             self.is_frozen = True
             self._tracker.drop_candidates()
+            self._tracker.choose_templates()
 
     def refine_map(self) -> None:
         """Adjust all keyframes and points together, once the sequence is over; a frozen map stays."""
+        self._work.finish()
         if len(self.map.keyframes) > 2 and not self.is_frozen:
-            self._mapper.adjust_all()
+            do_all(self._mapper.adjust_all())
 
     @property
     def n_loops(self) -> int:
@@ -237,15 +218,19 @@ class Slam:
 
     def _start_moving(self, view: FrameView) -> Followed | str:
         start = self._initialiser.process(view)
-        return self._mapper.begin(start) if isinstance(start, MapStart) else start
+        if not isinstance(start, MapStart):
+            return start
+        self._mapper.begin(start)
+        return self.map.keyframes[-1].seen
 
     def _start_metric(self, view: FrameView) -> Followed | str:
         if view.depth is None:
             return "this frame has no depth"
-        points = self._mapper.begin_metric(view)
-        if isinstance(points, str):
+        n, least = self._mapper.begin_at(view, np.eye(4)), self.options.least_start_points
+        if n < least:
             self._begin(RigidMap(self._images.baseline_px))
-        return points
+            return f"only {n} corners with depth, {least} are needed"
+        return self.map.keyframes[-1].seen
 
     def _track(self, view: FrameView, clock: StageClock) -> dict:
         with clock.stage("track"):
@@ -259,14 +244,33 @@ class Slam:
             self._watch(tracked, view.index)
             keeps = (
                 not self.is_frozen
+                and self._work.is_idle
                 and self._n_held > HELD_FRAMES
                 and self._mapper.wants_keyframe(tracked, view.index)
             )
             if keeps:
-                points = self._mapper.insert(tracked, view)
-                self._tracker.points = self._loops.close(view, self._tracker) or points
-                self._tracker.correct(self.map.keyframes[-1].camera_from_world)
+                self._work.begin(self._keep(tracked, view))
+                keyframe = self.map.keyframes[-1]
+                self._tracker.points = keyframe.seen
+                self._tracker.camera_from_world = keyframe.camera_from_world
         return self._result("tracked", tracked, keeps)
+
+    def _keep(self, tracked: Tracked, view: FrameView) -> Work:
+        yield from self._mapper.insert(tracked, view)
+        yield None
+        yield from self._loops.close(view)
+
+    def _go_on_mapping(self) -> None:
+        """Let the mapper take its next step, and follow what it changed."""
+        if self._work.is_idle:
+            return
+        keyframe = self.map.keyframes[-1]
+        pose, ids = keyframe.camera_from_world, keyframe.point_ids
+        self._work.advance()
+        if keyframe.camera_from_world is not pose:
+            self._tracker.correct(pose, keyframe.camera_from_world)
+        if keyframe.point_ids is not ids:
+            self._tracker.take_up(np.setdiff1d(keyframe.point_ids, ids))
 
     def _watch(self, tracked: Tracked, index: int) -> None:
         """Freeze the map when the scene begins to deform, if that is wanted."""
@@ -276,6 +280,7 @@ class Slam:
         if (
             self._freezes_by_itself
             and not self.is_frozen
+            and self._work.is_idle
             and self._n_deforming >= self.options.deforming_frames
         ):
             self.freeze()

@@ -18,7 +18,8 @@ from morph_dslam.online.slam.depth import FrameDepth
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.slam.pose import LEAST_DEPTH, PoseEstimate, refine_pose, reprojection_errors
 from morph_dslam.online.slam.projection import inside, inverse, project
-from morph_dslam.online.slam.rigid_map import CANDIDATE, GOOD, Followed, Indices, RigidMap
+from morph_dslam.online.slam.rigid_map import CANDIDATE, GOOD, NOWHERE, Followed, Indices, RigidMap
+from morph_dslam.online.slam.template_choice import FewTemplates
 from morph_dslam.online.slam.two_view import camera_centre
 from morph_dslam.online.slam.view_warp import WarpedViews, warp_pixels
 
@@ -75,22 +76,33 @@ class Tracker:
         self._options = options
         self._motion = np.eye(4)
         self._warped = WarpedViews(intrinsics)
-        self._astray = Followed(np.empty(0, dtype=np.int64), np.empty((0, 2)))
+        self._templates: FewTemplates | None = None
+        self._astray = NOWHERE
         self.camera_from_world = np.eye(4)
-        self.points = Followed(np.empty(0, dtype=np.int64), np.empty((0, 2)))
+        self.points = NOWHERE
 
     def place(self, camera_from_world: Array, points: Followed) -> None:
         """Go on from a pose found by other means, as if the camera had stood still."""
         self.camera_from_world, self.points, self._motion = camera_from_world, points, np.eye(4)
-        self._astray = Followed(np.empty(0, dtype=np.int64), np.empty((0, 2)))
+        self._astray = NOWHERE
 
-    def correct(self, camera_from_world: Array) -> None:
-        """Take over the newest pose from bundle adjustment."""
-        self.camera_from_world = camera_from_world
+    def correct(self, before: Array, after: Array) -> None:
+        """Move along with the newest keyframe, whose pose (4, 4) was ``before`` and now is ``after``."""
+        self.camera_from_world = self.camera_from_world @ inverse(before) @ after
+
+    def take_up(self, ids: Indices) -> None:
+        """Follow further points, from where the newest pose has them."""
+        pixels, _ = project(self.camera_from_world, self._map.positions[ids], self._intrinsics)
+        new = Followed(ids, pixels)[np.isfinite(pixels[:, 0]) & ~np.isin(ids, self.points.ids)]
+        self.points = self.points.joined(new)
 
     def drop_candidates(self) -> None:
         """Follow map points only."""
         self.points = self.points[self._map.state[self.points.ids] == GOOD]
+
+    def choose_templates(self) -> None:
+        """The map is complete: look for points from the few keyframes that show most of them."""
+        self._templates = FewTemplates(self._map)
 
     def track(self, flat: Image, depth: FrameDepth | None = None) -> Tracked | str:
         """Pose and points of the next frame, or why it is lost; then the newest pose stays what it was."""
@@ -134,7 +146,10 @@ class Tracker:
     def find(self, flat: Image, guesses: Followed, pose: Array, flow: FlowOptions) -> Followed:
         """Points found near their guessed pixels, by the patches of their keyframes as seen from a pose."""
         ids = guesses.ids
-        views, templates = self._map.template_keyframe[ids], self._map.template_pixels[ids]
+        if self._templates is not None:
+            views, templates = self._templates.choose(ids)
+        else:
+            views, templates = self._map.template_keyframe[ids], self._map.template_pixels[ids]
         found, good = guesses.pixels.copy(), np.zeros(len(ids), dtype=bool)
         for view in np.unique(views):
             rows = np.flatnonzero((views == view) & inside(guesses.pixels, flat.shape, 0.0))
@@ -221,13 +236,19 @@ class Tracker:
     def _search(self, flat: Image, pose: Array, followed: Indices) -> Followed:
         """Map points that are not followed but in view, found where the pose says."""
         options = self._options
+        # In a complete map points have no need to be seen again for their own sake.
+        most = options.search_points
+        if self._templates is not None:
+            most = min(options.enough_points - len(followed), most)
+            if most <= 0:
+                return NOWHERE
         lost = self._map.state == GOOD
         lost[followed] = False
         ids = np.flatnonzero(lost)
         pixels, depths = project(pose, self._map.positions[ids], self._intrinsics)
         seen = inside(pixels, flat.shape, options.flow.window) & self.looks_alike(ids, pose, depths)
         wanted = Followed(ids, pixels)[seen]
-        wanted = wanted[self._chosen(wanted.ids)]
+        wanted = wanted[self._chosen(wanted.ids, most)]
         if not len(wanted.ids):
             return wanted
         found = self.find(flat, wanted, pose, FlowOptions(options.flow.window, 1))
@@ -248,12 +269,12 @@ class Tracker:
         near = (ratio < MOST_SCALE_CHANGE) & (ratio > 1.0 / MOST_SCALE_CHANGE)
         return near & (cosine > np.cos(np.radians(MOST_VIEW_ANGLE_DEG))) & (depths > 0.0)
 
-    def _chosen(self, ids: Indices) -> Indices:
-        """Rows of the points to look for: those of the keyframes that saw most, the reliable ones first."""
+    def _chosen(self, ids: Indices, most: int) -> Indices:
+        """Rows of at most ``most`` points to look for: of keyframes that saw most, reliable ones first."""
         views = self._map.template_keyframe[ids]
         numbers, counts = np.unique(views, return_counts=True)
         best = numbers[np.argsort(-counts, kind="stable")[: self._options.search_keyframes]]
         rows = np.flatnonzero(np.isin(views, best))
         expected, found = self._map.n_expected[ids[rows]], self._map.n_found[ids[rows]]
         doubtful = (expected >= 8) & (found < DOUBTFUL_SHARE * expected)
-        return rows[np.argsort(doubtful, kind="stable")[: self._options.search_points]]
+        return rows[np.argsort(doubtful, kind="stable")[:most]]
