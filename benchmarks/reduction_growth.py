@@ -34,8 +34,8 @@ OUTPUT = Path(__file__).resolve().parent / "output" / "reduction_growth"
 TRAINING = {1: 8, 2: 24, 3: 64, 4: 128, 5: 200, 6: 300}
 #: Points along each parameter of the full grid that is stated for comparison.
 GRID_POINTS = 20
-#: Tolerance of Galerkin models by the number of parameters: a third of what is asked of 3, half of that of 6.
-TOLERANCE = {1: 3e-4, 2: 3e-4, 3: 3e-4, 4: 1e-3, 5: 1e-3, 6: 1e-3}
+#: Tolerance of Galerkin models by the number of parameters: a third of what is asked of 3, a quarter of that of 6.
+TOLERANCE = {1: 3e-4, 2: 3e-4, 3: 3e-4, 4: 5e-4, 5: 5e-4, 6: 5e-4}
 METHODS: dict[str, dict[str, Any]] = {
     "galerkin": {},
     "pod": {"tolerance": 1e-5, "max_modes": 40, "max_degree": 12},
