@@ -84,9 +84,7 @@ def add_camera_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         action="store_true",
         help="keep the map from when a part of the scene begins to move or to deform",
     )
-    slam.add_argument(
-        "--no-depth", action="store_true", help="leave the depth images of the recording aside"
-    )
+    slam.add_argument("--no-depth", action="store_true", help="leave the depth images of the recording aside")
     slam.add_argument("--overwrite", action="store_true", help="replace a run that is in the run folder")
     slam.add_argument("--no-video", action="store_true", help="do not draw the video with tracked points")
     calibrate = add(
