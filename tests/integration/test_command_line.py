@@ -261,7 +261,7 @@ def test_bad_scenes_are_one_message(sequence, tmp_path, capsys, change, expected
         (('length = "297 mm"', "length = 297"), "sheet.length: write the value with its unit"),
         (('length = "297 mm"', 'length = "297 deg"'), "'deg' is not a unit of length"),
         (('length = "297 mm"\n', ""), "sheet.length is missing"),
-        (('bulge = ["-40 mm", "40 mm"]', 'bulge = ["40 mm", "-40 mm"]'), "bulge"),
+        (('bulge = ["-34 mm", "34 mm"]', 'bulge = ["34 mm", "-34 mm"]'), "bulge"),
         (("[sheet]", "[sheet"), "not a TOML file"),
     ],
 )

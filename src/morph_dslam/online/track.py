@@ -234,7 +234,10 @@ def _write_run(
     write_hdf5(folder / "result.h5", run)
     write_inner_positions(folder / "result.h5", run, carried)
     write_csv(folder / "frames.csv", run)
-    save_model(folder / "model.morph", placement.model)
+    if placement.per_sequence:  # the model has the angle that the placement leaves open
+        save_model(folder / "model.morph", placement.model)
+    else:
+        _copy(options.model, folder / "model.morph")
     _copy(options.camera, folder / "camera.yaml")
     extra = {
         "registration": placement.facts,
