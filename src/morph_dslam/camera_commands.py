@@ -20,7 +20,9 @@ def _slam(arguments: argparse.Namespace) -> None:
             output=arguments.output,
             first=first,
             last=last,
-            map_file=arguments.map,
+            map_path=arguments.map,
+            trajectory=arguments.trajectory,
+            images=arguments.images,
             extend=arguments.extend,
             freeze_at=arguments.freeze_at,
             freeze_when_deforming=arguments.freeze_when_deforming,
@@ -71,10 +73,27 @@ def add_camera_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         "--range", type=frame_range, default=(None, None), metavar="FIRST-LAST", help="frames to track"
     )
     slam.add_argument(
-        "--map", type=Path, metavar="MAP", help="map.h5 of an earlier run, to find the camera in"
+        "--map",
+        type=Path,
+        metavar="MAP",
+        help="map.h5 of an earlier run, or the folder of a COLMAP text model, to find the camera in",
     )
     slam.add_argument(
-        "--extend", action="store_true", help="with --map: let the map grow, instead of keeping it as it is"
+        "--trajectory",
+        type=Path,
+        metavar="FILE",
+        help="make the map with these poses, of whatever program (TUM's format), and find the camera in it",
+    )
+    slam.add_argument(
+        "--images",
+        type=Path,
+        metavar="RECORDING",
+        help="recording that the COLMAP model or the poses are of, where it is not the one to track",
+    )
+    slam.add_argument(
+        "--extend",
+        action="store_true",
+        help="with --map or --trajectory: let the map grow, instead of keeping it as it is",
     )
     slam.add_argument(
         "--freeze-at", type=int, metavar="N", help="from this frame on keep the map and only find the camera"

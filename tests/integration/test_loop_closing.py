@@ -28,9 +28,9 @@ def test_a_round_trip_closes(monkeypatch):
     truth, slam = round_trip(200), Slam(CAMERA)
     close, errors = LoopCloser.close, []
 
-    def recorded(closer, view):
+    def recorded(closer):
         before, n_closed = keyframe_errors(slam, truth), closer.n_closed
-        yield from close(closer, view)
+        yield from close(closer)
         if closer.n_closed > n_closed:
             errors.append((before, keyframe_errors(slam, truth)))
 

@@ -1,7 +1,9 @@
 """Camera tracking and mapping on rendered films with exact camera poses."""
 
 import json
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -28,6 +30,7 @@ from tests.support.rendered_room import (
 )
 
 N_FRAMES = 80
+DOCS = Path(__file__).parents[2] / "docs"
 
 
 def follow(images):
@@ -217,6 +220,22 @@ def test_the_command_writes_a_run_that_evaluate_reads(tmp_path, room_film, capsy
     # A second run does not replace the first unless it is told to.
     assert main(command) == 2
     assert "holds a run already" in capsys.readouterr().err
+
+
+def test_the_documented_program_hands_over_each_frame(tmp_path, room_film, monkeypatch):
+    write_film(tmp_path / "film", room_film)
+    monkeypatch.chdir(tmp_path)
+    (program,) = re.findall(r"```python\n(.*?)```", (DOCS / "slam.md").read_text(), flags=re.DOTALL)
+    names = {}
+    exec(program, names)
+    assert names["result"].status == "tracked"
+    local = names["points"] @ names["camera_from_world"][:3, :3].T + names["camera_from_world"][:3, 3]
+    misses = np.linalg.norm(CAMERA.project(local) - names["pixels"], axis=1)
+    assert len(misses) > 100
+    assert misses.max() < 4.0
+    assert np.linalg.eigvalsh(names["covariance"]).min() > 0.0
+    assert names["astray"].shape[1:] == (3,)
+    assert len(names["astray"]) == len(names["moved_to"])
 
 
 def test_an_interrupted_run_keeps_what_was_mapped(tmp_path, room_film, monkeypatch):

@@ -138,7 +138,7 @@ def test_a_webcam_is_tracked_until_it_ends(tmp_path, room_film, monkeypatch, cap
     def released(slam, image, index, *rest):
         if index == 30 and ends == "by an interrupt":
             raise KeyboardInterrupt
-        assert slam._work._thread is not None
+        assert slam._threaded
         result = process(slam, image, index, *rest)
         capture.next.release()
         return result

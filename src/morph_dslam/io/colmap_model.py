@@ -1,7 +1,8 @@
-"""Writing a COLMAP text model: cameras.txt, images.txt, points3D.txt (colmap.github.io/format.html)."""
+"""COLMAP text models: cameras.txt, images.txt, points3D.txt (colmap.github.io/format.html)."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import MapError
 from morph_dslam.io.colmap import PIXEL_CENTRE
 
 Array = NDArray[np.float64]
@@ -30,6 +32,20 @@ class ColmapImage:
     camera_from_world: Array
     point_ids: NDArray[np.int64]
     pixels: Array
+
+    @property
+    def number(self) -> int:
+        """The last number in the file's name.
+
+        Raises
+        ------
+        ValueError
+            If there is none.
+        """
+        digits = re.findall(r"\d+", Path(self.name).stem)
+        if not digits:
+            raise ValueError(f"{self.name} has no number, which says which frame it is")
+        return int(digits[-1])
 
 
 def write_colmap_model(
@@ -60,3 +76,58 @@ def write_colmap_model(
         if tracks[row]
     ]
     (folder / "points3D.txt").write_text("\n".join(rows) + "\n")
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """A model that was read: images in the order of their numbers, and points (n, 3)."""
+
+    images: list[ColmapImage]
+    points: Array
+
+
+def read_colmap_model(folder: Path) -> ColmapModel:
+    """Read images and points of a model; pixels are those of the images as recorded.
+
+    Raises
+    ------
+    MapError
+        If files are missing or damaged, or hold no image or point.
+    """
+    for name in ("images.txt", "points3D.txt"):
+        if not (folder / name).is_file():
+            raise MapError(
+                f"{folder} has no {name}: save the COLMAP model as text "
+                "(colmap model_converter --output_type TXT)"
+            )
+    try:
+        rows = [line.split() for line in _content(folder / "points3D.txt") if line.strip()]
+        numbers = {int(row[0]): place for place, row in enumerate(rows)}
+        points = np.array([row[1:4] for row in rows], dtype=float).reshape(-1, 3)
+        lines = _content(folder / "images.txt")
+        images = [
+            _read_image(head, body, numbers) for head, body in zip(lines[::2], lines[1::2], strict=True)
+        ]
+        images.sort(key=lambda image: image.number)
+    except (ValueError, IndexError, KeyError) as error:
+        raise MapError(f"{folder} is no COLMAP text model, or damaged: {error}") from error
+    if not images or not len(points):
+        raise MapError(f"{folder} holds {len(images)} images and {len(points)} points: there is no map in it")
+    return ColmapModel(images, points)
+
+
+def _content(path: Path) -> list[str]:
+    """The lines of a file that are no comments; those without observations are empty."""
+    return [line for line in path.read_text().splitlines() if not line.startswith("#")]
+
+
+def _read_image(head: str, body: str, numbers: dict[int, int]) -> ColmapImage:
+    words = head.split(maxsplit=9)
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat(np.roll(np.array(words[1:5], dtype=float), -1)).as_matrix()
+    pose[:3, 3] = np.array(words[5:8], dtype=float)
+    seen = np.array(body.split(), dtype=float).reshape(-1, 3)
+    # Keypoints that are no point of the model have the number -1.
+    seen = seen[seen[:, 2] >= 0]
+    ids = np.array([numbers[int(number)] for number in seen[:, 2]], dtype=np.int64)
+    return ColmapImage(words[9], pose, ids, seen[:, :2] - PIXEL_CENTRE)

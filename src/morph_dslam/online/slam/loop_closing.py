@@ -65,16 +65,27 @@ class LoopCloser:
 
     def __init__(self, rigid_map: RigidMap, intrinsics: Array, options: SlamOptions, mapper: Mapper) -> None:
         self._map, self._intrinsics, self._mapper = rigid_map, intrinsics, mapper
-        # Its own ones: it may look for loops while the frames' are at work.
-        self._relocaliser = Relocaliser(rigid_map, intrinsics, options)
-        self._tracker = Tracker(rigid_map, intrinsics, options)
+        # Loops are looked for in a copy, while the map goes on growing.
+        self._copy = RigidMap(rigid_map.baseline_px)
+        self._relocaliser = Relocaliser(self._copy, intrinsics, options)
+        self._tracker = Tracker(self._copy, intrinsics, options)
+        self._found: Loop | None = None
         self.n_closed = 0
 
-    def close(self, view: FrameView) -> Work:
-        """Close the loop that the newest keyframe ends, if there is one."""
-        loop = yield partial(self._find, view)
-        if loop is None:
-            return
+    @property
+    def has_found(self) -> bool:
+        """Whether there is a loop to close."""
+        return self._found is not None
+
+    def search(self, view: FrameView) -> Work:
+        """Look for a loop that the newest keyframe ends."""
+        self._copy.copy_of(self._map)
+        self._found = yield partial(self._find, view)
+
+    def close(self) -> Work:
+        """Close the loop that was found."""
+        loop, self._found = self._found, None
+        assert loop is not None
         before = Similarities.of_poses(np.array([k.camera_from_world for k in self._map.keyframes]))
         edges, measured = self._pose_graph(loop, before)
         after = yield partial(optimise, before, edges, measured, with_scale=not self._map.is_metric)
@@ -84,16 +95,16 @@ class LoopCloser:
         self.n_closed += 1
 
     def _find(self, view: FrameView) -> Loop | None:
-        number = len(self._map.keyframes) - 1
-        ids = self._map.keyframes[number].point_ids
-        shared = self._map.shared_points(ids[self._map.state[ids] == GOOD])
+        number = len(self._copy.keyframes) - 1
+        ids = self._copy.keyframes[number].point_ids
+        shared = self._copy.shared_points(ids[self._copy.state[ids] == GOOD])
         old = shared < MOST_SHARED
         old[max(number - LEAST_AGE, 0) :] = False
         if not old.any():
             return None
         places = self._relocaliser.places
         places.update()
-        likeness = places.similarities(self._map.keyframes[number].descriptors)
+        likeness = places.similarities(self._copy.keyframes[number].descriptors)
         neighbours = (shared >= MOST_SHARED) & (np.arange(len(shared)) != number)
         best = int(np.where(old, likeness, -1.0).argmax())
         if neighbours.any() and likeness[best] < LEAST_LIKENESS * likeness[neighbours].max():
@@ -106,8 +117,8 @@ class LoopCloser:
 
     def _loop(self, number: int, group: Indices, pose: Array, found: Followed) -> Loop | None:
         """The drift, from points that the new view sees twice, as old and as new ones."""
-        keyframe = self._map.keyframes[number]
-        new = keyframe.seen[self._map.state[keyframe.point_ids] == GOOD]
+        keyframe = self._copy.keyframes[number]
+        new = keyframe.seen[self._copy.state[keyframe.point_ids] == GOOD]
         found = found[~np.isin(found.ids, new.ids)]
         if len(found.ids) < LEAST_FOUND or not len(new.ids):
             return None
@@ -118,11 +129,11 @@ class LoopCloser:
         if len(rows) < LEAST_PAIRS:
             return None
         pairs = np.column_stack([found.ids[near][kept], new.ids[rows]])
-        old_depths = project(pose, self._map.positions[pairs[:, 0]], self._intrinsics)[1]
-        new_depths = project(keyframe.camera_from_world, self._map.positions[pairs[:, 1]], self._intrinsics)[
+        old_depths = project(pose, self._copy.positions[pairs[:, 0]], self._intrinsics)[1]
+        new_depths = project(keyframe.camera_from_world, self._copy.positions[pairs[:, 1]], self._intrinsics)[
             1
         ]
-        scale = 1.0 if self._map.is_metric else float(np.median(old_depths / new_depths))
+        scale = 1.0 if self._copy.is_metric else float(np.median(old_depths / new_depths))
         return Loop(number, group, pose, scale, found, pairs)
 
     def _pose_graph(self, loop: Loop, before: Similarities) -> tuple[Indices, Similarities]:
@@ -166,6 +177,7 @@ class LoopCloser:
             if self._map.state[old] == GOOD and self._map.state[new] == GOOD:
                 self._map.merge(old, new)
         keyframe = self._map.keyframes[loop.number]
-        other = loop.found[~np.isin(loop.found.ids, keyframe.point_ids)]
+        known = self._map.state[loop.found.ids] == GOOD
+        other = loop.found[known & ~np.isin(loop.found.ids, keyframe.point_ids)]
         self._map.extend_keyframe(loop.number, other)
         keyframe.keep(np.argsort(keyframe.point_ids))

@@ -9,21 +9,10 @@ import numpy as np
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import MapError
-from morph_dslam.online.slam.rigid_map import Keyframe, RigidMap
+from morph_dslam.online.slam.rigid_map import POINT_ARRAYS, Keyframe, RigidMap
 
 FORMAT, VERSION = "morph-dslam map", 2
 
-#: Arrays of a map with one row a point.
-POINT_ARRAYS = (
-    "positions",
-    "state",
-    "first_keyframe",
-    "first_pixels",
-    "template_keyframe",
-    "template_pixels",
-    "n_expected",
-    "n_found",
-)
 KEYFRAME_ARRAYS = (
     "flat",
     "camera_from_world",

@@ -7,6 +7,7 @@ keep theirs.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,6 +17,17 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 CANDIDATE, GOOD, REMOVED = 0, 1, 2
+#: Arrays of a map with one row a point.
+POINT_ARRAYS = (
+    "positions",
+    "state",
+    "first_keyframe",
+    "first_pixels",
+    "template_keyframe",
+    "template_pixels",
+    "n_expected",
+    "n_found",
+)
 #: Error that poses are taken to have before there is any.
 FIRST_RMS_PX = 4.0
 
@@ -127,6 +139,13 @@ class RigidMap:
     def good(self) -> Indices:
         """Numbers of the map points."""
         return np.flatnonzero(self.state == GOOD)
+
+    def copy_of(self, other: RigidMap) -> None:
+        """Become what another map is now, and stay so while it changes."""
+        self.usual_rms_px = other.usual_rms_px
+        self.keyframes = [copy(keyframe) for keyframe in other.keyframes]
+        for name in POINT_ARRAYS:
+            setattr(self, name, getattr(other, name).copy())
 
     def add_points(self, positions: Array, pixels: Array, keyframe: int, state: int) -> Indices:
         """New points (n, 3), first seen at ``pixels`` (n, 2) of a keyframe; returns their numbers (n,)."""

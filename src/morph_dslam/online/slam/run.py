@@ -14,17 +14,23 @@ from tqdm import tqdm
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import MapError, TrackingError
+from morph_dslam.io.colmap_model import read_colmap_model
 from morph_dslam.io.stereo_calibration import load_camera_or_pair
+from morph_dslam.io.trajectory import load_trajectory
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.online.flow import patch_correlation
 from morph_dslam.online.slam.bundle_adjustment import Observations, adjust
+from morph_dslam.online.slam.colmap_map import map_from_colmap
+from morph_dslam.online.slam.descriptors import least_distances, orientations
 from morph_dslam.online.slam.map_file import load_map
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.slam.output import draw_frame, write_run
 from morph_dslam.online.slam.pose import refine_pose
+from morph_dslam.online.slam.posed_map import map_from_trajectory
+from morph_dslam.online.slam.rigid_map import RigidMap
 from morph_dslam.online.slam.slam import Slam
 from morph_dslam.online.slam.slam_frame import SlamFrame
-from morph_dslam.sources import FrameStream, open_stream
+from morph_dslam.sources import FrameStream, open_source, open_stream
 from morph_dslam.sources.live import LiveCamera
 from morph_dslam.sources.recorded import RecordedFrames
 from morph_dslam.stereo import StereoCamera
@@ -39,8 +45,10 @@ class SlamRunOptions:
     source : recording, or `webcam:0`. camera : camera file, or that of a stereo pair. output : run folder.
     use_depth : use the depth images of a recording that has them for its colour pixels.
     first, last : frame numbers, both included; all by default.
-    map_file : a map of an earlier run with the same camera; a new map by default. extend : let it grow,
-        instead of keeping it as it is.
+    map_path : a map of an earlier run with the same camera, or the folder of a COLMAP model; a new map by
+        default. trajectory : file of poses to make the map with instead. images : recording that belongs to
+        the model or the trajectory; the source by default. extend : let the map grow, instead of keeping it
+        as it is.
     freeze_at : frame number from which the map is kept as it is; never by default. freeze_when_deforming :
         keep it from when something in the scene begins to move or to deform.
     video : draw the video with the points followed. overwrite : replace a run that is there already.
@@ -51,7 +59,9 @@ class SlamRunOptions:
     output: Path
     first: int | None = None
     last: int | None = None
-    map_file: Path | None = None
+    map_path: Path | None = None
+    trajectory: Path | None = None
+    images: Path | None = None
     extend: bool = False
     freeze_at: int | None = None
     freeze_when_deforming: bool = False
@@ -78,8 +88,10 @@ def run_slam(options: SlamRunOptions) -> dict[str, Any]:
         If an input cannot be used (CameraError, SourceError, MapError) or the run folder holds a run
         (TrackingError).
     """
-    if options.extend and options.map_file is None:
+    if options.extend and options.map_path is None and options.trajectory is None:
         raise MapError("--extend needs the map that is to grow: --map run/map.h5")
+    if options.map_path is not None and options.trajectory is not None:
+        raise MapError("a map comes either from --map or from --trajectory, not from both")
     camera = load_camera_or_pair(options.camera)
     source = open_stream(options.source, options.first, options.last)
     with source if isinstance(source, LiveCamera) else nullcontext():
@@ -99,8 +111,9 @@ def _run(
     )
     is_live = isinstance(source, LiveCamera)
     slam, frames = Slam(camera, options.slam, with_depth, options.freeze_when_deforming, is_live), []
-    if options.map_file is not None:
-        slam.use_map(load_map(options.map_file, slam.camera), options.extend)
+    known = _known_map(options, slam)
+    if known is not None:
+        slam.use_map(known, options.extend)
     n_before = source.dropped if isinstance(source, LiveCamera) else 0
     try:
         _process(slam, source, options, frames)
@@ -108,6 +121,18 @@ def _run(
         dropped = {"n_dropped": source.dropped - n_before} if isinstance(source, LiveCamera) else {}
         summary = _finish(slam, frames, options, dropped) if frames else {}
     return summary
+
+
+def _known_map(options: SlamRunOptions, slam: Slam) -> RigidMap | None:
+    """The map to find the camera in; None where a new one is to be made."""
+    path = options.map_path
+    if options.trajectory is None and (path is None or not path.is_dir()):
+        return None if path is None else load_map(path, slam.camera)
+    source, images = open_source(options.images or options.source), slam.frame_images
+    if options.trajectory is not None:
+        return map_from_trajectory(load_trajectory(options.trajectory), source, images, options.slam)
+    assert path is not None
+    return map_from_colmap(read_colmap_model(path), source, images, options.slam)
 
 
 def _process(slam: Slam, source: FrameStream, options: SlamRunOptions, frames: list[SlamFrame]) -> None:
@@ -156,3 +181,6 @@ def warm_up() -> None:
     adjust(np.stack([np.eye(4)] * 2), points, seen, intrinsics, np.array([True, False]), iterations=1)
     image, centre = rng.integers(0, 255, (32, 32)).astype(np.uint8), np.array([[16.0, 16.0]])
     patch_correlation(image, image, centre, centre, 5)
+    orientations(image, centre)
+    words, rows = rng.integers(0, 255, (4, 32)).astype(np.uint8), np.arange(4)
+    least_distances(words, rows, words, rows)

@@ -14,9 +14,8 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import MapError
 from morph_dslam.online.slam.frame_images import FrameImages, FrameView
 from morph_dslam.online.slam.initialisation import Initialiser, MapStart
-from morph_dslam.online.slam.loop_closing import LoopCloser
-from morph_dslam.online.slam.mapping import Mapper, pose_in_keyframe
-from morph_dslam.online.slam.mapping_work import MappingWork, Work, do_all
+from morph_dslam.online.slam.map_making import MapMaking
+from morph_dslam.online.slam.mapping import pose_in_keyframe
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.slam.pose import refine_pose
 from morph_dslam.online.slam.relocalisation import Relocaliser
@@ -46,7 +45,7 @@ class Slam:
 
     Attributes
     ----------
-    camera : the camera of the undistorted images.
+    camera : the camera of the undistorted images. frame_images : makes these of the frames.
     map : what is known of the scene; replaced when a young map is given up (``n_restarts`` counts these).
     is_frozen : whether the map is kept as it is. frozen_at : frame from which on it froze by itself, or None.
     """
@@ -60,16 +59,16 @@ class Slam:
         threaded: bool = False,
     ) -> None:
         self.options = options or SlamOptions()
-        self._images = FrameImages(camera, self.options, with_depth)
-        self.camera = self._images.camera
+        self.frame_images = FrameImages(camera, self.options, with_depth)
+        self.camera = self.frame_images.camera
         self._freezes_by_itself = freeze_when_deforming
         self.is_frozen, self.frozen_at = False, None
         self.n_restarts = 0
-        self._work = MappingWork(threaded)
-        self._begin(RigidMap(self._images.baseline_px))
+        self._threaded = threaded
+        self._begin(RigidMap(self.frame_images.baseline_px))
 
     def use_map(self, rigid_map: RigidMap, extend: bool = False) -> None:
-        """Go on in a map from an earlier run with the same camera (`map_file`).
+        """Go on in a map from an earlier run with the same camera, or from another program.
 
         Frames are lost until the camera is found in it. It is kept as it is, or grows with ``extend``.
 
@@ -78,21 +77,21 @@ class Slam:
         MapError
             If the map is to grow, but its depth comes from another kind of camera.
         """
-        if rigid_map.baseline_px != self._images.baseline_px:
+        if rigid_map.baseline_px != self.frame_images.baseline_px:
             if extend:
                 raise MapError(
                     "a map can only be extended by the kind of camera that made it: its depth comes from "
                     f"{_origin_of(rigid_map.baseline_px)}, "
-                    f"this camera's from {_origin_of(self._images.baseline_px)}"
+                    f"this camera's from {_origin_of(self.frame_images.baseline_px)}"
                 )
             # The map's own depths are enough to find the camera in it.
-            self._images.baseline_px = 0.0
+            self.frame_images.baseline_px = 0.0
         self.is_frozen = not extend
         self._begin(rigid_map)
 
     def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """An image (h, w[, 3]) as ``camera`` would have seen it; stereo: the left one, rectified."""
-        return self._images.undistort(image)
+        return self.frame_images.undistort(image)
 
     def reset(self) -> None:
         """Forget the map, frozen or not, and wait for a start."""
@@ -101,16 +100,14 @@ class Slam:
 
     def _restart(self) -> None:
         self.n_restarts += 1
-        self._begin(RigidMap(self._images.baseline_px))
+        self._begin(RigidMap(self.frame_images.baseline_px))
 
     def _begin(self, rigid_map: RigidMap) -> None:
         self.map, k, options = rigid_map, self.camera.intrinsics, self.options
-        self._work.drop()
         self._initialiser = Initialiser(k, options)
         self._tracker = Tracker(self.map, k, options)
-        self._mapper = Mapper(self.map, k, options)
+        self._making = MapMaking(self.map, k, options, self._tracker, self._threaded)
         self._relocaliser = Relocaliser(self.map, k, options)
-        self._loops = LoopCloser(self.map, k, options, self._mapper)
         # In a map from elsewhere the camera is lost until it is found.
         self._n_lost, self._n_held = int(bool(rigid_map.keyframes)), 0
         self._n_deforming = 0
@@ -139,9 +136,9 @@ class Slam:
         """
         clock = StageClock(STAGES)
         with clock.stage("prepare"):
-            view = self._images.prepare(image, index, timestamp, depth, right)
+            view = self.frame_images.prepare(image, index, timestamp, depth, right)
         with clock.stage("map"):
-            self._go_on_mapping()
+            self._making.advance()
         if not self.map.keyframes:
             result = self._start(view, clock)
         elif self._n_lost:
@@ -160,21 +157,26 @@ class Slam:
         What the mapper has begun is brought to its end first.
         """
         if self.map.keyframes:
-            self._work.finish()
+            self._making.finish(with_loops=False)
             self.is_frozen = True
             self._tracker.drop_candidates()
             self._tracker.choose_templates()
 
     def refine_map(self) -> None:
         """Adjust all keyframes and points together, once the sequence is over; a frozen map stays."""
-        self._work.finish()
+        self._making.finish(with_loops=True)
         if len(self.map.keyframes) > 2 and not self.is_frozen:
-            do_all(self._mapper.adjust_all())
+            self._making.adjust_all()
 
     @property
     def n_loops(self) -> int:
         """Loops closed in the map that there is now."""
-        return self._loops.n_closed
+        return self._making.n_loops
+
+    @property
+    def is_mapping(self) -> bool:
+        """Whether the mapper has work under way that later frames go on with."""
+        return not self._making.is_idle
 
     def is_placed(self, frame: SlamFrame) -> bool:
         """Whether a frame has a pose in the map that there is now."""
@@ -220,15 +222,15 @@ class Slam:
         start = self._initialiser.process(view)
         if not isinstance(start, MapStart):
             return start
-        self._mapper.begin(start)
+        self._making.mapper.begin(start)
         return self.map.keyframes[-1].seen
 
     def _start_metric(self, view: FrameView) -> Followed | str:
         if view.depth is None:
             return "this frame has no depth"
-        n, least = self._mapper.begin_at(view, np.eye(4)), self.options.least_start_points
+        n, least = self._making.mapper.begin_at(view, np.eye(4)), self.options.least_start_points
         if n < least:
-            self._begin(RigidMap(self._images.baseline_px))
+            self._begin(RigidMap(self.frame_images.baseline_px))
             return f"only {n} corners with depth, {least} are needed"
         return self.map.keyframes[-1].seen
 
@@ -244,33 +246,13 @@ class Slam:
             self._watch(tracked, view.index)
             keeps = (
                 not self.is_frozen
-                and self._work.is_idle
+                and self._making.can_keep
                 and self._n_held > HELD_FRAMES
-                and self._mapper.wants_keyframe(tracked, view.index)
+                and self._making.mapper.wants_keyframe(tracked, view.index)
             )
             if keeps:
-                self._work.begin(self._keep(tracked, view))
-                keyframe = self.map.keyframes[-1]
-                self._tracker.points = keyframe.seen
-                self._tracker.camera_from_world = keyframe.camera_from_world
+                self._making.keep(tracked, view)
         return self._result("tracked", tracked, keeps)
-
-    def _keep(self, tracked: Tracked, view: FrameView) -> Work:
-        yield from self._mapper.insert(tracked, view)
-        yield None
-        yield from self._loops.close(view)
-
-    def _go_on_mapping(self) -> None:
-        """Let the mapper take its next step, and follow what it changed."""
-        if self._work.is_idle:
-            return
-        keyframe = self.map.keyframes[-1]
-        pose, ids = keyframe.camera_from_world, keyframe.point_ids
-        self._work.advance()
-        if keyframe.camera_from_world is not pose:
-            self._tracker.correct(pose, keyframe.camera_from_world)
-        if keyframe.point_ids is not ids:
-            self._tracker.take_up(np.setdiff1d(keyframe.point_ids, ids))
 
     def _watch(self, tracked: Tracked, index: int) -> None:
         """Freeze the map when the scene begins to deform, if that is wanted."""
@@ -280,7 +262,7 @@ class Slam:
         if (
             self._freezes_by_itself
             and not self.is_frozen
-            and self._work.is_idle
+            and self._making.can_keep
             and self._n_deforming >= self.options.deforming_frames
         ):
             self.freeze()

@@ -184,7 +184,7 @@ class Tracker:
         self, flat: Image, depth: FrameDepth | None, predicted: Array, found: Followed
     ) -> Tracked | str:
         """Pose from what was followed, then with the lost points that are found again."""
-        options, was_astray = self._options, np.isin(found.ids, self._astray.ids)
+        was_astray = np.isin(found.ids, self._astray.ids)
         followed_astray, found = found[was_astray], self.measured(found[~was_astray], predicted, depth)
         pose, reason = self._pose(predicted, found)
         if pose is None:
@@ -196,6 +196,10 @@ class Tracker:
             pose, reason = self._pose(pose.camera_from_world, found)
             if pose is None:
                 return reason
+        return self._tracked(flat, pose, found, astray)
+
+    def _tracked(self, flat: Image, pose: PoseEstimate, found: Followed, astray: Followed) -> Tracked:
+        """Which points obey a pose; counted in the map."""
         known = self._map.state[found.ids] == GOOD
         fits = np.zeros(len(found.ids), dtype=bool)
         fits[known] = pose.inliers
@@ -203,11 +207,13 @@ class Tracker:
         self._map.n_expected[np.union1d(np.union1d(wanted, found.ids[known]), astray.ids)] += 1
         self._map.n_found[found.ids[fits]] += 1
         keep = fits | (self._map.state[found.ids] == CANDIDATE)
-        keep &= inside(found.pixels, flat.shape, options.patch_half + 2)
+        keep &= inside(found.pixels, flat.shape, self._options.patch_half + 2)
         before, _ = project(self.camera_from_world, self._map.positions[found.ids[fits]], self._intrinsics)
         moved = np.linalg.norm(found.pixels[fits] - np.nan_to_num(before), axis=1)
         disagreeing = found[known & ~fits].joined(astray)
-        return Tracked(pose, found[keep], int(fits.sum()), disagreeing, float(np.median(moved)))
+        return Tracked(
+            pose, found[keep], int(fits.sum()), disagreeing, float(np.median(moved)) if len(moved) else 0.0
+        )
 
     def _pose(self, start: Array, found: Followed) -> tuple[PoseEstimate | None, str]:
         options = self._options
