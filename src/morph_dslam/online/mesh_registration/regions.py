@@ -54,8 +54,9 @@ def plane_points(points: Array, thickness: float, rng: np.random.Generator) -> N
 def candidate_regions(points: Array, seed: int = 0) -> list[NDArray[np.int64]]:
     """Indices of the points of each region where an object may be.
 
-    The pieces that are left when one plane after the other is taken out, joined over short and long
-    distances, the largest first; then the whole map, for objects that are planes themselves.
+    The pieces that there are at first, and those left when one plane after the other is taken out, joined
+    over short and long distances, the largest first; then the whole map, for objects that are planes
+    themselves.
 
     Parameters
     ----------
@@ -66,18 +67,19 @@ def candidate_regions(points: Array, seed: int = 0) -> list[NDArray[np.int64]]:
     usable = np.flatnonzero(without_strays(points))
     regions: list[NDArray[np.int64]] = []
     left = usable
-    for _ in range(MOST_PLANES):
-        if len(left) < FEWEST_POINTS:
-            break
-        on_plane = plane_points(points[left], PLANE_THICKNESS * spacing, rng)
-        if on_plane.sum() < PLANE_SHARE * len(usable):
-            break
-        # The next plane may be a face of the object, so what is left before it counts too.
-        left = left[~on_plane]
+    for taken_out in range(MOST_PLANES + 1):
+        # A scene may have no plane to speak of, and the next one may be a face of the object: so the pieces
+        # count that are there before each plane is taken out.
         for reach in JOINED_OVER:
             for piece in _pieces(points, left, reach * spacing):
                 if not any(_alike(piece, other) for other in regions):
                     regions.append(piece)
+        if taken_out == MOST_PLANES or len(left) < FEWEST_POINTS:
+            break
+        on_plane = plane_points(points[left], PLANE_THICKNESS * spacing, rng)
+        if on_plane.sum() < PLANE_SHARE * len(usable):
+            break
+        left = left[~on_plane]
     regions.sort(key=len, reverse=True)
     return [*regions, usable] if len(usable) >= FEWEST_POINTS else regions
 

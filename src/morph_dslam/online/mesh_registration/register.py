@@ -30,10 +30,11 @@ Array = NDArray[np.float64]
 
 #: Sizes at which the surface starts, over that of the region.
 START_SIZES = (0.85, 1.1, 1.45)
-#: Points used while searching, starts of a region that are followed to their end, and those then scored.
-MOST_POINTS, N_FOLLOWED, N_SCORED = 120, 30, 6
-#: Samples of the surface while searching, and keyframes asked for evidence.
-ROUGH_SAMPLES, MOST_ASKED = 3000, 10
+#: Points used while searching; starts of a region that are followed to their end, scored by few keyframes,
+#: and refined and scored by more.
+MOST_POINTS, N_FOLLOWED, N_SCORED, N_REFINED = 120, 120, 40, 5
+#: Samples of the surface while searching, and keyframes asked for evidence, first and then.
+ROUGH_SAMPLES, FIRST_ASKED, MOST_ASKED = 3000, 3, 10
 #: Widths of the robust weights over the surface's size: for all starts, for the better ones, to refine these.
 COARSE = np.array([0.3, 0.25, 0.2, 0.15])
 MIDDLE = np.array([0.15, 0.12, 0.1, 0.08, 0.07, 0.06, 0.05])
@@ -46,6 +47,10 @@ FEWEST_EXPLAINED = 20
 SAME_PLACE = 0.05
 #: The runner-up's score over the best's above which the two cannot be told apart.
 AMBIGUOUS = 0.8
+#: So many of the best places are compared by the images on them, if they score at least this part of the
+#: best. Images that differ by more than this, pixels, or so many times as much as on another place, speak
+#: against a place.
+N_COMPARED, WORTH_COMPARING, POOR_AGREEMENT_PX, MUCH_WORSE = 4, 0.5, 0.35, 2.0
 
 
 @dataclass(frozen=True)
@@ -73,8 +78,9 @@ class MeshRegistration:
 
     @property
     def ambiguous(self) -> bool:
-        """Whether another place is nearly as good."""
-        return self.runner_up > AMBIGUOUS * self.score
+        """Whether another place is nearly as good, or the images contradict this one."""
+        contradicted = self.rms_px is not None and self.rms_px > POOR_AGREEMENT_PX
+        return contradicted or self.runner_up > AMBIGUOUS * self.score
 
 
 @dataclass(frozen=True)
@@ -106,30 +112,34 @@ def register_mesh(
         If no place in the map explains enough points.
     """
     rough, surface = Surface.of_mesh(nodes, triangles, ROUGH_SAMPLES), Surface.of_mesh(nodes, triangles)
-    attitudes, asked = _attitudes(surface.axis_of_revolution), _spread(views, MOST_ASKED)
+    attitudes = _attitudes(surface.axis_of_revolution)
+
+    def judged(place: SimilarityTransform, asked: Sequence[View]) -> _Place:
+        tolerance = TOLERANCE * surface.size * place.scale
+        return _Place(
+            place, gather_evidence(place, nodes, triangles, points.positions, asked, camera, tolerance)
+        )
+
     places: list[_Place] = []
+    few, more = _spread(views, FIRST_ASKED), _spread(views, MOST_ASKED)
     for region in tqdm(
         candidate_regions(points.positions), desc="registering", unit="region", disable=not progress
     ):
-        for start in _searched(points[region], rough, attitudes, metric):
-            size = surface.size * start.scale
-            near = np.linalg.norm(points.positions - start.apply(surface.centre), axis=1) < size
-            place = fit_surface(points[near], surface, start, FINE * size, metric).world_from_object
-            evidence = gather_evidence(
-                place, nodes, triangles, points.positions, asked, camera, TOLERANCE * size
-            )
-            places.append(_Place(place, evidence))
-    best, runner_up = _decided(places, len(points), surface)
-    alignment = TextureAlignment(nodes, triangles, camera, views, metric).refine(best.transform)
-    return MeshRegistration(
-        best.transform if alignment is None else alignment.world_from_object,
-        None if alignment is None else alignment.covariance,
-        best.evidence.score,
-        runner_up,
-        int(best.evidence.explained.sum()),
-        None if alignment is None else alignment.rms_px,
-        surface.axis_of_revolution,
-    )
+        starts = [judged(place, few) for place in _searched(points[region], rough, attitudes, metric)]
+        for start in sorted(starts, key=lambda place: -place.evidence.score)[:N_REFINED]:
+            places.append(judged(_refined(start.transform, points, surface, metric), more))
+    candidates = _distinct(places, len(points), surface)
+    aligner = TextureAlignment(nodes, triangles, camera, views, metric)
+    return _chosen(candidates, aligner, surface)
+
+
+def _refined(
+    start: SimilarityTransform, points: MapPoints, surface: Surface, metric: bool
+) -> SimilarityTransform:
+    """The place near ``start`` that fits all points around it."""
+    size = surface.size * start.scale
+    near = np.linalg.norm(points.positions - start.apply(surface.centre), axis=1) < size
+    return fit_surface(points[near], surface, start, FINE * size, metric).world_from_object
 
 
 def _spread(views: Sequence[View], most: int) -> list[View]:
@@ -185,8 +195,8 @@ def _same_place(a: SimilarityTransform, b: SimilarityTransform, surface: Surface
     return abs(np.log(between.scale)) < 0.1 and float(distances.mean()) < SAME_PLACE * surface.size
 
 
-def _decided(places: list[_Place], n_points: int, surface: Surface) -> tuple[_Place, float]:
-    """The best place, and the score of the best other one."""
+def _distinct(places: list[_Place], n_points: int, surface: Surface) -> list[_Place]:
+    """The best places, no two of them the same, by their score."""
     places = sorted(places, key=lambda place: -place.evidence.score)
     if not places or places[0].evidence.score < FEWEST_EXPLAINED:
         found = max((int(place.evidence.solid.sum()) for place in places), default=0)
@@ -195,6 +205,33 @@ def _decided(places: list[_Place], n_points: int, surface: Surface) -> tuple[_Pl
             "points without hiding others. Film the undeformed object closer and from more sides, and check "
             "the unit of its mesh"
         )
-    best = places[0]
-    others = [p.evidence.score for p in places if not _same_place(p.transform, best.transform, surface)]
-    return best, max([0.0, *others])
+    kept: list[_Place] = []
+    for place in places:
+        if all(not _same_place(place.transform, other.transform, surface) for other in kept):
+            kept.append(place)
+    return kept
+
+
+def _chosen(candidates: list[_Place], aligner: TextureAlignment, surface: Surface) -> MeshRegistration:
+    """The candidate on which the images agree best, of those that score well."""
+    least = WORTH_COMPARING * candidates[0].evidence.score
+    compared = [place for place in candidates[:N_COMPARED] if place.evidence.score >= least]
+    aligned = [aligner.refine(place.transform) for place in compared]
+    misfits = np.array([np.inf if found is None else found.rms_px for found in aligned])
+    row = int(np.argmin(misfits))  # the first where no images can be compared
+    best, alignment = compared[row], aligned[row]
+    place = best.transform if alignment is None else alignment.world_from_object
+    others = [other.evidence.score for other in candidates[len(compared) :]]
+    for other, found, misfit in zip(compared, aligned, misfits, strict=True):
+        moved = other.transform if found is None else found.world_from_object
+        if misfit <= MUCH_WORSE * misfits[row] and not _same_place(moved, place, surface):
+            others.append(other.evidence.score)
+    return MeshRegistration(
+        place,
+        None if alignment is None else alignment.covariance,
+        best.evidence.score,
+        max([0.0, *others]),
+        int(best.evidence.explained.sum()),
+        None if alignment is None else alignment.rms_px,
+        surface.axis_of_revolution,
+    )
