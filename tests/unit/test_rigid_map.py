@@ -5,6 +5,7 @@ import numpy as np
 
 from morph_dslam.io.point_cloud import save_ply
 from morph_dslam.online.slam.rigid_map import CANDIDATE, GOOD, REMOVED, Followed, Keyframe, RigidMap
+from morph_dslam.online.slam.template_choice import FewTemplates
 
 
 def keyframe(ids, pixels, index=0):
@@ -57,3 +58,27 @@ def test_the_point_cloud_is_read_by_another_program(tmp_path):
     points = np.random.default_rng(0).normal(size=(7, 3))
     save_ply(tmp_path / "map.ply", points)
     assert np.allclose(meshio.read(tmp_path / "map.ply").points, points, atol=1e-6)
+
+
+def test_few_keyframes_are_chosen_that_show_most_points():
+    rigid_map, ids = RigidMap(), np.arange(60)
+    rigid_map.add_points(np.zeros((60, 3)), np.zeros((60, 2)), 0, GOOD)
+    for number, seen in enumerate([ids[:20], ids[5:45], ids[40:55], ids[50:60:2]]):
+        rigid_map.add_keyframe(keyframe(seen, np.column_stack([seen, np.full(len(seen), number)])))
+    views, pixels = FewTemplates(rigid_map).choose(ids[:58])
+    # The second shows 40 points; of the rest the third shows 10; what is left keeps its newest view.
+    expected = [0] * 5 + [1] * 40 + [2] * 10 + [0, 3, 0]
+    assert views.tolist() == expected
+    shown = [*range(55), 56]
+    assert pixels[shown].tolist() == [[i, expected[i]] for i in shown]
+
+
+def test_a_copy_stays_while_the_map_goes_on():
+    rigid_map, kept = small_map(), RigidMap()
+    kept.copy_of(rigid_map)
+    rigid_map.remove(np.array([1]))
+    rigid_map.positions[0] = 9.0
+    rigid_map.add_keyframe(keyframe([2], [[7, 7]]))
+    assert kept.state.tolist() == [GOOD] * 4
+    assert kept.positions[0].tolist() == [0.0, 1.0, 2.0]
+    assert [k.point_ids.tolist() for k in kept.keyframes] == [[0, 1, 2], [1, 3]]

@@ -63,8 +63,7 @@ class Slam:
         self.camera = self.frame_images.camera
         self._freezes_by_itself = freeze_when_deforming
         self.is_frozen, self.frozen_at = False, None
-        self.n_restarts = 0
-        self._threaded = threaded
+        self.n_restarts, self._threaded = 0, threaded
         self._begin(RigidMap(self.frame_images.baseline_px))
 
     def use_map(self, rigid_map: RigidMap, extend: bool = False) -> None:
