@@ -130,7 +130,7 @@ def test_info_prints_the_whole_certificate(tmp_path, capsys):
 
 
 def test_fields_state_their_format_and_numbers_stored():
-    """CP of 2 modes at 12 nodes: 72 numbers in space, 3 + 3 coefficients for 2 terms each, none to mix them."""
+    """CP of 2 modes at 12 nodes: 72 numbers in space, 3 + 3 coefficients for 2 terms each, none to mix."""
     model = stretched_block_model()
     bases = tuple(chebyshev_basis(p.lower, p.upper, 2) for p in model.parameters)
     functions = CPFunctions(bases, (np.ones((3, 2)), np.ones((3, 2))), np.eye(2))
