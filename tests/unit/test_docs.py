@@ -1,13 +1,16 @@
 """The programs in the documentation do what it says."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
-from morph_dslam.model import load_model, save_model
+from morph_dslam.model import SeparatedField, load_model, save_model
+from morph_dslam.model.basis_functions import chebyshev_basis
+from morph_dslam.model.tensor_functions import TuckerFunctions
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.function_formats import FORMATS
 from tests.support.small_models import block_model
@@ -15,14 +18,37 @@ from tests.support.small_models import block_model
 DOCS = Path(__file__).parents[2] / "docs"
 
 
+def documented_readers():
+    """The programs that read model files without the library: the short one, and the one for all formats."""
+    programs = re.findall(r"```python\n(.*?)```", (DOCS / "model-file.md").read_text(), flags=re.DOTALL)
+    readers = []
+    for program in programs:
+        assert "morph_dslam" not in program
+        names = {}
+        exec(program, names)
+        readers.append(names)
+    return readers
+
+
 @pytest.fixture(scope="module")
 def reader():
-    """The program that reads model files without the library, as the documentation gives it."""
-    (program,) = re.findall(r"```python\n(.*?)```", (DOCS / "model-file.md").read_text(), flags=re.DOTALL)
-    assert "morph_dslam" not in program
-    names = {}
-    exec(program, names)
-    return names
+    """The documented program for all formats."""
+    return documented_readers()[1]
+
+
+def test_the_short_reader_reads_what_studies_make(tmp_path):
+    short, sheet = documented_readers()[0]["field"], bent_sheet_model(9, 7)
+    bases = tuple(chebyshev_basis(p.lower, p.upper, 2) for p in sheet.parameters)
+    random = np.random.default_rng(0)
+    factors = tuple(random.standard_normal((3, rank)) for rank in (2, 3, 1))
+    core = random.standard_normal((sheet.displacement.n_modes, 2, 3, 1))
+    tucker = SeparatedField(sheet.displacement.modes, TuckerFunctions(bases, factors, core))
+    mu = np.array([0.025, -0.3, 0.2])
+    for model in (sheet, replace(sheet, displacement=tucker)):
+        save_model(tmp_path / "sheet.morph", model)
+        with h5py.File(tmp_path / "sheet.morph") as file:
+            found = short(file, "displacement", mu)
+        np.testing.assert_allclose(found, model.displacement.value(mu), atol=1e-7)
 
 
 def test_the_model_file_can_be_read_with_the_documented_program(tmp_path, reader):
