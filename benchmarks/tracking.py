@@ -209,7 +209,7 @@ def main() -> None:
     compare(flat, 0.6, arguments.frames)
     solid = tube()
     if arguments.solid.is_file():
-        solid = turned_model(load_model(arguments.solid), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+        solid = turned_model(load_model(arguments.solid), np.array([0.0, 0.0, 1.0]))
     compare(solid, 4.0 * float(np.ptp(solid.nodes, axis=0).max()), arguments.frames)
     estimator_alone(flat)
 

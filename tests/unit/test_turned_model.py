@@ -15,7 +15,7 @@ from morph_dslam.model.turned_model import turned_model
 from morph_dslam.offline.meshing.mesh_generators import block, tube
 from morph_dslam.online.placement import load_placement
 
-AXIS = (np.zeros(3), np.array([0.0, 0.0, 1.0]))
+AXIS = np.array([0.0, 0.0, 1.0])
 
 
 def polynomial(coefficients):
@@ -56,7 +56,7 @@ def turned_stress(nodes, load, angle):
 
 @pytest.mark.parametrize("angle", [0.0, 0.4, -2.3, 2.0 * np.pi / 24 * 5])
 def test_displacement_and_stress_turn_with_the_load(angle):
-    turned = turned_model(bent_tube(), *AXIS)
+    turned = turned_model(bent_tube(), AXIS)
     mu, z = np.array([1.3, angle]), turned.nodes[:, 2]
     expected = 1.3 * z[:, None] ** 2 * np.array([np.cos(angle), np.sin(angle), 0.0])
     np.testing.assert_allclose(turned.displacement.value(mu), expected, atol=1e-12)
@@ -66,7 +66,7 @@ def test_displacement_and_stress_turn_with_the_load(angle):
 
 
 def test_sensitivity_to_the_angle_is_that_of_finite_differences():
-    field = turned_model(bent_tube(), *AXIS).displacement
+    field = turned_model(bent_tube(), AXIS).displacement
     mu, step = np.array([1.3, 0.7]), 1e-6
     _, slopes = field.value_and_sensitivities(mu)
     for k in range(2):
@@ -76,7 +76,7 @@ def test_sensitivity_to_the_angle_is_that_of_finite_differences():
 
 
 def test_a_turned_model_is_kept_in_a_file(tmp_path):
-    turned = turned_model(bent_tube(), *AXIS)
+    turned = turned_model(bent_tube(), AXIS)
     save_model(tmp_path / "turned.morph", turned)
     loaded = load_model(tmp_path / "turned.morph")
     mu = np.array([0.6, 1.1])
@@ -88,12 +88,12 @@ def test_a_turned_model_is_kept_in_a_file(tmp_path):
 def test_a_block_cannot_be_turned():
     mesh = block((0.02, 0.03, 0.1), (2, 3, 4), "hex8")
     with pytest.raises(ModelFileError, match="body of revolution"):
-        turned_model(bent_tube(mesh), *AXIS)
+        turned_model(bent_tube(mesh), AXIS)
 
 
 def test_an_angle_that_there_is_already_is_refused():
     with pytest.raises(ModelFileError, match="'load'"):
-        turned_model(bent_tube(), *AXIS, name="load")
+        turned_model(bent_tube(), AXIS, name="load")
 
 
 def test_products_are_those_of_their_factors():

@@ -35,14 +35,14 @@ HARMONICS_LEFT_OUT = 1e-3
 MOST_HARMONICS = 12
 
 
-def turned_model(model: ReducedModel, point: Array, direction: Array, name: str = "turn") -> ReducedModel:
+def turned_model(model: ReducedModel, direction: Array, name: str = "turn") -> ReducedModel:
     """The model with the angle about an axis as its last parameter, from -360 to 360 degrees, default 0.
 
     Reactions, which belong to sets that need not turn with the mesh, are left out.
 
     Parameters
     ----------
-    point, direction : (3,) a point on the axis, metres, and the direction of the axis, object frame.
+    direction : (3,) roughly that of the axis, object frame; the nodes themselves say where it is exactly.
 
     Raises
     ------
@@ -51,7 +51,7 @@ def turned_model(model: ReducedModel, point: Array, direction: Array, name: str 
     """
     if name in [parameter.name for parameter in model.parameters]:
         raise ModelFileError(f"the model '{model.name}' has a parameter '{name}' of its own already")
-    point, direction = _refined_axis(model.nodes, np.asarray(point), np.asarray(direction))
+    point, direction = _axis_of(model.nodes, np.asarray(direction))
     images = _node_images(model.nodes, point, direction)
     if images is None:
         raise ModelFileError(
@@ -76,8 +76,8 @@ def turned_model(model: ReducedModel, point: Array, direction: Array, name: str 
     )
 
 
-def _refined_axis(nodes: Array, point: Array, direction: Array) -> tuple[Array, Array]:
-    """The nearby axis on which the centres of the nodes' rings lie: that of the nodes' own inertia."""
+def _axis_of(nodes: Array, direction: Array) -> tuple[Array, Array]:
+    """A point on the axis and its direction: the axis of the nodes' inertia that is nearest in direction."""
     centre = nodes.mean(axis=0)
     _, principal = np.linalg.eigh(np.cov((nodes - centre).T))
     best = principal[:, np.abs(principal.T @ direction).argmax()]

@@ -62,7 +62,7 @@ def load_placement(path: Path, model: ReducedModel) -> Placement:
     open_angles: tuple[str, ...] = ()
     flags = ["registration ambiguous: another place in the map is nearly as good"] if ambiguous else []
     if axis is not None:
-        model = turned_model(model, np.array(axis["point_m"]), np.array(axis["direction"]))
+        model = turned_model(model, np.array(axis["direction"]))
         open_angles = (model.parameters[-1].name,)
         flags.append(
             f"the angle about the object's axis cannot be seen before it deforms: it is the parameter "

@@ -21,7 +21,7 @@ from morph_dslam.errors import RegistrationError
 from morph_dslam.online.mesh_registration.evidence import Evidence, gather_evidence
 from morph_dslam.online.mesh_registration.regions import candidate_regions
 from morph_dslam.online.mesh_registration.scaled_icp import Fit, fit_surface
-from morph_dslam.online.mesh_registration.scene import MapPoints, View
+from morph_dslam.online.mesh_registration.scene import MapPoints, View, spread_views
 from morph_dslam.online.mesh_registration.surface import Axis, Surface
 from morph_dslam.online.mesh_registration.texture_alignment import TextureAlignment
 from morph_dslam.similarity import SimilarityTransform
@@ -121,7 +121,7 @@ def register_mesh(
         )
 
     places: list[_Place] = []
-    few, more = _spread(views, FIRST_ASKED), _spread(views, MOST_ASKED)
+    few, more = spread_views(views, FIRST_ASKED), spread_views(views, MOST_ASKED)
     for region in tqdm(
         candidate_regions(points.positions), desc="registering", unit="region", disable=not progress
     ):
@@ -140,12 +140,6 @@ def _refined(
     size = surface.size * start.scale
     near = np.linalg.norm(points.positions - start.apply(surface.centre), axis=1) < size
     return fit_surface(points[near], surface, start, FINE * size, metric).world_from_object
-
-
-def _spread(views: Sequence[View], most: int) -> list[View]:
-    """At most so many of the views, spread over all."""
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int))
-    return [views[index] for index in chosen]
 
 
 def _searched(

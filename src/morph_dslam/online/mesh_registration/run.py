@@ -16,7 +16,7 @@ from morph_dslam.errors import RegistrationError
 from morph_dslam.io.calibration import load_camera
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.online.mesh_registration.register import MeshRegistration, register_mesh
-from morph_dslam.online.mesh_registration.scene import View, scene_of_map
+from morph_dslam.online.mesh_registration.scene import View, scene_of_map, spread_views
 from morph_dslam.online.slam.map_file import load_map
 from morph_dslam.render.overlay import draw_overlay
 from morph_dslam.render.shading import lambert, vertex_normals
@@ -125,11 +125,10 @@ def draw_registration(
     nodes = model.positions(model.default)
     world = found.world_from_object.apply(nodes)
     height = 1e3 * (nodes[:, 2] - nodes[:, 2].min())
-    chosen = np.unique(np.linspace(0, len(views) - 1, N_PICTURES).round().astype(int))
     columns = []
-    for index in chosen:
-        local = views[index].camera_from_world.apply(world)
-        image = cv2.cvtColor(views[index].flat, cv2.COLOR_GRAY2BGR)
+    for view in spread_views(views, N_PICTURES):
+        local = view.camera_from_world.apply(world)
+        image = cv2.cvtColor(view.flat, cv2.COLOR_GRAY2BGR)
         normals = vertex_normals(local, model.triangles)
         drawn = draw_overlay(
             np.asarray(image, dtype=np.uint8),

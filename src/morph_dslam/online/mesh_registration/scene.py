@@ -63,3 +63,9 @@ def scene_of_map(rigid_map: RigidMap) -> tuple[MapPoints, Sequence[View]]:
     everywhere = total.sum(axis=0) / max(count.sum(), 1.0)
     viewpoints = np.where(used[:, None], total / np.maximum(count, 1.0)[:, None], everywhere)
     return MapPoints(rigid_map.positions[good], viewpoints), views
+
+
+def spread_views(views: Sequence[View], most: int) -> list[View]:
+    """At most so many of the views, spread over all."""
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int))
+    return [views[index] for index in chosen]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import rotation_exp
 from morph_dslam.online.flow import NEUTRAL, FlowOptions, follow, patch_correlation
-from morph_dslam.online.mesh_registration.scene import View
+from morph_dslam.online.mesh_registration.scene import View, spread_views
 from morph_dslam.render.rasteriser import Buffers, rasterise
 from morph_dslam.render.texture import render_textured
 from morph_dslam.similarity import SimilarityTransform
@@ -59,11 +59,12 @@ class Alignment:
 
 @dataclass(frozen=True)
 class _Drawn:
-    """The mesh in one view: its projected nodes (n, 2), and what every pixel sees."""
+    """The mesh in one view: its projected nodes (n, 2), what every pixel sees, and corners (c, 2) on it."""
 
     view: View
     pixels: Array
     buffers: Buffers
+    corners: Array
 
 
 @dataclass(frozen=True)
@@ -101,8 +102,7 @@ class TextureAlignment:
     ) -> None:
         self._nodes, self._triangles, self._camera = nodes, triangles, camera
         self._centre, self._first_free = nodes.mean(axis=0), 1 if metric else 0
-        chosen = np.unique(np.linspace(0, len(views) - 1, min(MOST_VIEWS, len(views))).round().astype(int))
-        self._views = [views[index] for index in chosen]
+        self._views = spread_views(views, MOST_VIEWS)
 
     def refine(self, start: SimilarityTransform) -> Alignment | None:
         """The similarity near ``start`` with which all views agree; None where too little can be compared."""
@@ -164,11 +164,12 @@ class TextureAlignment:
         local = view.camera_from_world.apply(world)
         pixels = self._camera.project(local)
         size = (self._camera.height, self._camera.width)
-        return _Drawn(view, pixels, rasterise(pixels, local[:, 2], self._triangles, *size))
+        buffers = rasterise(pixels, local[:, 2], self._triangles, *size)
+        return _Drawn(view, pixels, buffers, _corners(view.flat, buffers))
 
     def _compare(self, first: _Drawn, second: _Drawn, world: Array) -> _Measured | None:
         """Displacements in the second view of points that the first one sees."""
-        corners = _corners(first)
+        corners = first.corners
         if not len(corners):
             return None
         columns, rows = np.rint(corners).astype(int).T
@@ -219,8 +220,8 @@ class TextureAlignment:
         return moved, found & (alike >= LEAST_CORRELATION)
 
 
-def _corners(drawn: _Drawn) -> Array:
-    """Corners (p, 2) of a view's image on the object, away from its rim."""
-    mask = cv2.erode(drawn.buffers.covered.astype(np.uint8), np.ones((9, 9), np.uint8))
-    corners = cv2.goodFeaturesToTrack(drawn.view.flat, N_CORNERS, 0.01, 5.0, mask=mask)
+def _corners(flat: Image, buffers: Buffers) -> Array:
+    """Corners (c, 2) of a view's image on the object, away from its rim."""
+    mask = cv2.erode(buffers.covered.astype(np.uint8), np.ones((9, 9), np.uint8))
+    corners = cv2.goodFeaturesToTrack(flat, N_CORNERS, 0.01, 5.0, mask=mask)
     return np.empty((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
