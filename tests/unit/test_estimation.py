@@ -7,12 +7,13 @@ from scipy.optimize import least_squares
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
+from morph_dslam.online.bounded_step import bounded_step
 from morph_dslam.online.estimation import (
     BoundPoints,
     EstimationOptions,
     Estimator,
+    Prior,
     State,
-    bounded_step,
     moved,
 )
 from morph_dslam.online.reprojection import linearise, linearise_numpy, project_with_jacobian
@@ -279,3 +280,68 @@ def test_bounded_step_solves_the_bounded_quadratic():
         )
     held = bounded_step(np.eye(2), np.array([-5.0, 0.3]), np.array([-1.0, 0.0]), np.array([1.0, 1.0]))
     np.testing.assert_allclose(held, [1.0, 0.0])
+
+
+def pose_prior(information, away=(0.0,) * 6):
+    """A prior of the pose alone, its mean ``away`` from the truth."""
+    pose = moved(TRUTH, np.concatenate([np.zeros(3), away])).camera_from_object
+    return Prior(np.zeros(3), np.zeros((3, 3)), pose, information)
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-5, 0.3, 2.0])
+def test_gradient_of_the_prior_is_that_of_its_cost(turn):
+    rng = np.random.default_rng(13)
+    root = rng.standard_normal((6, 6))
+    prior = Prior(
+        np.array([0.01, 0.1, 0.0]), np.diag([4.0, 2.0, 1.0]),
+        moved(TRUTH, np.concatenate([np.zeros(3), turn * np.array([0.6, -0.5, 0.62]), [0.01, 0.2, -0.1]])
+        ).camera_from_object, root @ root.T,
+    )  # fmt: skip
+    _, hessian, gradient = prior.terms(TRUTH)
+    for k, unit in enumerate(np.eye(9)):
+        ahead, behind = prior.terms(moved(TRUTH, 1e-6 * unit)), prior.terms(moved(TRUTH, -1e-6 * unit))
+        assert gradient[k] == pytest.approx((ahead[0] - behind[0]) / 2e-6, rel=1e-6, abs=1e-7)
+    np.testing.assert_allclose(hessian, hessian.T, atol=1e-12)
+    assert np.linalg.eigvalsh(hessian)[0] > -1e-9
+
+
+def test_cost_of_the_pose_prior_is_quadratic_in_the_increment():
+    increment = np.array([0.3, -0.2, 0.1, 0.02, 0.01, -0.03])
+    information = np.diag([1.0, 2.0, 3.0, 40.0, 50.0, 60.0])
+    cost = pose_prior(information, -increment).terms(TRUTH)[0]
+    assert cost == pytest.approx(0.5 * increment @ information @ increment)
+
+
+def test_sure_prior_of_the_pose_pins_it(model, points):
+    """Also where the images say otherwise; the parameters are then those of the given pose."""
+    rng = np.random.default_rng(14)
+    pixels, weights = observed(points, TRUTH, 0.5, rng), np.ones(len(points))
+    away = np.array([0.02, -0.01, 0.03, 0.002, 0.001, -0.004])
+    prior = pose_prior(1e12 * np.eye(6), away)
+    found = Estimator(model, CAMERA).estimate(points, pixels, weights, start_near(rng, 0.3), prior=prior)
+    np.testing.assert_allclose(found.state.camera_from_object.matrix, prior.pose.matrix, atol=1e-6)
+    assert (found.pose_std < 1e-5).all()
+
+
+def test_weak_prior_of_the_pose_is_weighed_against_the_images(model, points):
+    """The weighted mean of two Gaussians, with the images' information from numerical derivatives."""
+    pixels, weights = CAMERA.project(points.in_camera(TRUTH)), np.ones(len(points))
+    jacobian = np.stack(
+        [
+            CAMERA.project(points.in_camera(moved(TRUTH, 1e-6 * unit)))
+            - CAMERA.project(points.in_camera(moved(TRUTH, -1e-6 * unit)))
+            for unit in np.eye(9)
+        ]
+    ).reshape(9, -1) / 2e-6  # fmt: skip
+    images, known = jacobian @ jacobian.T, np.zeros((9, 9))
+    known[8, 8] = 3e6
+    away = np.array([0, 0, 0, 0, 0, 0, 0, 0, 2e-4])
+    expected = np.linalg.solve(images + known, known @ away)
+    estimator = Estimator(model, CAMERA, EstimationOptions(tolerance=1e-13))
+    found = estimator.estimate(
+        points, pixels, weights, TRUTH, prior=pose_prior(known[3:, 3:], away[3:])
+    ).state
+    np.testing.assert_allclose(found.parameters - TRUTH.parameters, expected[:3], rtol=0.05, atol=1e-6)
+    moved_by = found.camera_from_object.translation - POSE.translation
+    assert 1e-5 < moved_by[2] < 1.9e-4
+    assert moved_by[2] == pytest.approx(expected[8], rel=0.02)

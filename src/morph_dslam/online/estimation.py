@@ -15,16 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
 from morph_dslam.model import ReducedModel, SeparatedField, SurfacePoints
+from morph_dslam.online.bounded_step import bounded_step
 from morph_dslam.online.reprojection import linearise
+from morph_dslam.online.robust_covariance import huber_covariance
 
 Array = NDArray[np.float64]
 
 #: Largest step of one iteration in scaled unknowns: keeps an unseen direction from crossing the box at once.
 LARGEST_STEP = 1.0
-#: Damping floor and eigenvalue floor, relative to the best-seen direction.
-DAMPING_FLOOR, EIGENVALUE_FLOOR = 1e-6, 1e-12
+#: Damping floor, relative to the best-seen direction.
+DAMPING_FLOOR = 1e-6
 #: A parameter nearer to its bound than this share of its range counts as being at the bound.
 BOUND_SHARE = 1e-3
 
@@ -76,16 +78,50 @@ class BoundPoints:
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of the parameters beforehand, as one more term of the cost.
+    """What is known of the parameters, and of the pose, beforehand, as one more term of the cost.
 
     Attributes
     ----------
     mean : (d,), SI. information : (d, d), the Hessian of the cost (mu - mean)' I (mu - mean) / 2, in squared
         pixels as the cost; zero for parameters of which nothing is known.
+    pose : camera_from_object as known beforehand; None if nothing is.
+    pose_information : (6, 6) in the same unit, of the increment (rotation vector, translation) that `moved`
+        applies to ``pose``; None if nothing is known.
     """
 
     mean: Array
     information: Array
+    pose: RigidTransform | None = None
+    pose_information: Array | None = None
+
+    def terms(self, state: State) -> tuple[float, Array, Array]:
+        """Cost, Hessian (d + 6, d + 6) and gradient (d + 6,) of the prior at a state."""
+        d = len(self.mean)
+        hessian, gradient = np.zeros((d + 6, d + 6)), np.zeros(d + 6)
+        away = state.parameters - self.mean
+        hessian[:d, :d], gradient[:d] = self.information, self.information @ away
+        cost = 0.5 * float(away @ gradient[:d])
+        if self.pose is not None and self.pose_information is not None:
+            pose = state.camera_from_object
+            turn = rotation_log(pose.rotation @ self.pose.rotation.T)
+            away = np.concatenate([turn, pose.translation - self.pose.translation])
+            slope = np.eye(6)
+            slope[:3, :3] = _log_slope(turn)
+            push = self.pose_information @ away
+            hessian[d:, d:], gradient[d:] = slope.T @ self.pose_information @ slope, slope.T @ push
+            cost += 0.5 * float(away @ push)
+        return cost, hessian, gradient
+
+
+def _log_slope(turn: Array) -> Array:
+    """Derivative (3, 3) of log(exp(w) exp(turn)) by w at w = 0: the inverse left Jacobian of SO(3).
+
+    I - [turn]/2 + c [turn]² with c = 1/a² - 1 / (2 a tan(a/2)) (Barfoot, State Estimation for Robotics, 7.1).
+    """
+    angle = float(np.linalg.norm(turn))
+    cross = np.cross(np.eye(3), turn)
+    c = 1.0 / 12.0 if angle < 1e-4 else 1.0 / angle**2 - 0.5 / (angle * np.tan(0.5 * angle))
+    return np.eye(3) - 0.5 * cross + c * cross @ cross
 
 
 @dataclass(frozen=True)
@@ -147,32 +183,6 @@ def moved(state: State, step: Array) -> State:
     return State(state.parameters + step[:d], RigidTransform(rotation, pose.translation + step[d + 3 :]))
 
 
-def bounded_step(hessian: Array, gradient: Array, lower: Array, upper: Array) -> Array:
-    """Minimiser of the quadratic model, with unknowns that would leave [lower, upper] held at the bound.
-
-    Starts with all unknowns free and holds those that violate a bound until none does; unknowns already at a
-    bound (zero distance) that the gradient pushes outwards are thereby held from the start.
-    """
-    step = np.zeros_like(gradient)
-    free = ~(((lower == 0.0) & (gradient > 0.0)) | ((upper == 0.0) & (gradient < 0.0)))
-    if free.all():
-        # The usual case, without the cost of selecting rows.
-        step[:] = np.linalg.solve(hessian, -gradient)
-        if ((step >= lower) & (step <= upper)).all():
-            return step
-        step[:] = 0.0
-    while free.any():
-        held = ~free
-        right = -gradient[free] - hessian[np.ix_(free, held)] @ step[held]
-        step[free] = np.linalg.solve(hessian[np.ix_(free, free)], right)
-        outside = free & ((step < lower) | (step > upper))
-        if not outside.any():
-            break
-        step[outside] = np.clip(step[outside], lower[outside], upper[outside])
-        free &= ~outside
-    return step
-
-
 class Estimator:
     """Finds states from pixels of bound points, with one camera and one model.
 
@@ -210,11 +220,8 @@ class Estimator:
             points.field.modes, self.camera.intrinsics, pixels, weights, normals, self.options.huber_px,
         )  # fmt: skip
         if prior is not None:
-            d, away = len(prior.mean), state.parameters - prior.mean
-            push = prior.information @ away
-            cost += 0.5 * float(away @ push)
-            hessian[:d, :d] += prior.information
-            gradient[:d] += push
+            terms = prior.terms(state)
+            cost, hessian, gradient = cost + terms[0], hessian + terms[1], gradient + terms[2]
         return cost, hessian, gradient, residuals
 
     def estimate(
@@ -233,7 +240,7 @@ class Estimator:
         pixels : (p, 2) measured, in the undistorted image.
         weights : (p,) non-negative; points of weight 0 are ignored (their residuals are still reported).
         normals : (p, 2), for points that count only along a direction; see `reprojection.linearise`.
-        prior : what is known of the parameters beforehand; nothing by default.
+        prior : what is known of the parameters and the pose beforehand; nothing by default.
         """
         options, scale = self.options, self.scale
         state = State(np.clip(start.parameters, self.model.lower, self.model.upper), start.camera_from_object)
@@ -302,34 +309,9 @@ class Estimator:
     ) -> Estimate:
         model = self.model
         used = (weights > 0.0) & np.isfinite(residuals).all(axis=1)
-        sigma, covariance = self._covariance(hessian, residuals[used], weights[used], numbers[used])
+        sigma, covariance = huber_covariance(
+            hessian, residuals[used], weights[used], numbers[used], self.options.huber_px, self.scale
+        )
         margin = BOUND_SHARE * (model.upper - model.lower)
         at_bound = (state.parameters < model.lower + margin) | (state.parameters > model.upper - margin)
         return Estimate(state, cost, residuals, sigma, covariance, at_bound, iterations, converged)
-
-    def _covariance(
-        self, hessian: Array, residuals: Array, weights: Array, numbers: NDArray[np.integer]
-    ) -> tuple[float, Array]:
-        """Huber's estimate of the covariance of an M-estimator (Huber & Ronchetti, Robust Statistics, 7.6).
-
-        (sum psi² / (N - k)) / mean(psi')² (J'J)^-1; J'J is the Huber-weighted Hessian over its mean weight.
-        """
-        size = len(hessian)
-        count = int(numbers.sum())
-        freedom = count - size
-        if freedom <= 0:
-            return float("inf"), np.full((size, size), np.inf)
-        length = np.linalg.norm(residuals, axis=1)
-        # The length of a Gaussian pair has the median 1.1774 sigma (Rayleigh).
-        pairs = length[numbers == 2]
-        sigma = float(np.median(pairs) / 1.1774 * np.sqrt(count / freedom)) if len(pairs) else float("inf")
-        huber = self.options.huber_px
-        factor = np.minimum(1.0, huber / np.maximum(length, 1e-300))
-        psi_squared = float(np.sum(weights * (factor * length) ** 2)) / freedom
-        mean_slope = max(float(np.mean(0.5 * (factor + (length <= huber)))), 1e-3)
-        scaled = hessian * np.outer(self.scale, self.scale)
-        eigenvalues, vectors = np.linalg.eigh(scaled)
-        floored = np.maximum(eigenvalues, max(eigenvalues[-1], 1e-30) * EIGENVALUE_FLOOR)
-        inverse = (vectors / floored) @ vectors.T
-        variance = psi_squared * float(factor.mean()) / mean_slope**2
-        return sigma, variance * inverse * np.outer(self.scale, self.scale)

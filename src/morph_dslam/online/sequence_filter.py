@@ -21,15 +21,9 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from morph_dslam.online.estimation import (
-    EIGENVALUE_FLOOR,
-    BoundPoints,
-    Estimate,
-    Estimator,
-    Prior,
-    State,
-)
+from morph_dslam.online.estimation import BoundPoints, Estimate, Estimator, Prior, State
 from morph_dslam.online.reprojection import project_with_jacobian
+from morph_dslam.online.robust_covariance import EIGENVALUE_FLOOR
 
 Array = NDArray[np.float64]
 
