@@ -148,4 +148,4 @@ def _drop_wrong_depths(rigid_map: RigidMap, keyframe: Keyframe, intrinsics: Arra
     with np.errstate(divide="ignore", invalid="ignore"):
         misses = np.abs(pixels[:, 0] - rigid_map.baseline_px / depths - keyframe.right)
         wrong = (misses > MOST_ERROR_PX) & (rigid_map.state[keyframe.point_ids] == GOOD)
-    keyframe.right[wrong] = np.nan
+    keyframe.right = np.where(wrong, np.nan, keyframe.right)

@@ -60,7 +60,9 @@ class PointMaker:
         right = depth.right_columns(keyframe.pixels[rows])
         near = keyframe.pixels[rows, 0] - right >= self._options.least_disparity_px
         rows, right = rows[near], right[near]
-        keyframe.right[rows] = right
+        columns = keyframe.right.copy()
+        columns[rows] = right
+        keyframe.right = columns
         ids, pixels = keyframe.point_ids[rows], keyframe.pixels[rows]
         depths = depth_of(pixels, right, rigid_map.baseline_px)
         rigid_map.positions[ids] = world_points(keyframe.camera_from_world, pixels, depths, self._intrinsics)

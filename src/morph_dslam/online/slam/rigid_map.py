@@ -147,6 +147,20 @@ class RigidMap:
         for name in POINT_ARRAYS:
             setattr(self, name, getattr(other, name).copy())
 
+    def share(self, other: RigidMap) -> None:
+        """Become what another map is now, at once: with the same arrays, which must not change any more."""
+        self.usual_rms_px, self.keyframes = other.usual_rms_px, other.keyframes
+        for name in POINT_ARRAYS:
+            setattr(self, name, getattr(other, name))
+
+    def take_over(self, draft: RigidMap) -> None:
+        """Become what has been made of a copy of this map, at once; what tracking counted since stays."""
+        new = np.zeros(len(draft.state) - len(self.state), dtype=np.int64)
+        expected, found = (np.concatenate([count, new]) for count in (self.n_expected, self.n_found))
+        usual = self.usual_rms_px
+        self.share(draft)
+        self.n_expected, self.n_found, self.usual_rms_px = expected, found, usual
+
     def add_points(self, positions: Array, pixels: Array, keyframe: int, state: int) -> Indices:
         """New points (n, 3), first seen at ``pixels`` (n, 2) of a keyframe; returns their numbers (n,)."""
         n, before = len(positions), len(self.positions)
@@ -191,8 +205,11 @@ class RigidMap:
         for keyframe in self.keyframes:
             rows, seen = keyframe.rows_of(np.array([kept, dropped]))
             if seen[1] and not seen[0]:
-                keyframe.point_ids[rows[1]] = kept
-                keyframe.keep(np.argsort(keyframe.point_ids))
+                # Copies of the map may have the same array.
+                ids = keyframe.point_ids.copy()
+                ids[rows[1]] = kept
+                keyframe.point_ids = ids
+                keyframe.keep(np.argsort(ids))
         self.remove(np.array([dropped]))
 
     def shared_points(self, ids: Indices) -> Indices:
