@@ -93,8 +93,8 @@ def test_result_file_has_the_documented_layout(finished):
         "parameter_std": (7, 3),
         "at_bound": (7, 3),
     }
-    rows = ("frame", "timestamp", "status", "reason", "residual_rms_px", "n_points", "n_inliers")
-    rows += ("largest_displacement", "largest_displacement_std")
+    rows = ("frame", "timestamp", "status", "reason", "residual_rms_px", "unexplained_px", "n_points")
+    rows += ("n_inliers", "largest_displacement", "largest_displacement_std")
     assert shapes == {**states, **dict.fromkeys(rows, (7,)), "timings_ms": (7, len(STAGES) + 1)}
 
 

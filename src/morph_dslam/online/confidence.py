@@ -31,6 +31,23 @@ def displacement_std(model: ReducedModel, estimate: Estimate) -> Array:
     return np.sqrt(_variances(slopes, estimate).sum(axis=1))
 
 
+def position_std(model: ReducedModel, estimate: Estimate) -> Array:
+    """Standard deviation (n,) of the position of every node in the camera frame, metres.
+
+    It is the root of the mean square distance, over all directions, with the pose's uncertainty in it.
+    """
+    value, slopes = model.displacement.value_and_sensitivities(estimate.state.parameters)
+    rotation = estimate.state.camera_from_object.rotation
+    turned = (model.nodes + value) @ rotation.T
+    d = len(slopes)
+    jacobian = np.empty((len(turned), 3, d + 6))
+    jacobian[:, :, :d] = np.moveaxis(slopes @ rotation.T, 0, 2)
+    jacobian[:, :, d : d + 3] = np.cross(np.eye(3)[None], turned[:, None, :]).transpose(0, 2, 1)
+    jacobian[:, :, d + 3 :] = np.eye(3)
+    variances = np.einsum("nij,jk,nik->n", jacobian, estimate.covariance, jacobian, optimize=True)
+    return np.sqrt(np.maximum(variances, 0.0))
+
+
 def von_mises_std(model: ReducedModel, estimate: Estimate, place: str) -> Array:
     """Standard deviation (n,) of the von Mises stress at ``place``, a key of ``model.stresses``, pascals."""
     stress, slopes = model.stresses[place].value_and_sensitivities(estimate.state.parameters)

@@ -12,6 +12,8 @@ STAGES = ("prepare", "flow", "estimate", "render", "correct", "search", "recover
 FOLLOWED = "followed from the previous frame"
 FOUND_AGAIN = "found again where it was last seen"
 RECOVERED = "recovered from the reference view's features"
+#: Follows the reason of a frame in which the model, not noise, is what is left of the residuals.
+UNEXPLAINED = "the model does not explain the images"
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,7 @@ class FrameResult:
     residual_rms_px : root mean square of the inliers' residuals, NaN when lost.
     n_points, n_inliers : points that the object itself does not hide, and those that support the estimate.
     timings_ms : by stage, milliseconds. total_ms : the whole frame. recovered : found again after a loss.
+    unexplained_px : what the model leaves of the residuals, see `systematic_errors`; NaN when lost.
     """
 
     status: str
@@ -36,3 +39,4 @@ class FrameResult:
     timings_ms: dict[str, float]
     total_ms: float
     recovered: bool = False
+    unexplained_px: float = float("nan")

@@ -22,21 +22,26 @@ from morph_dslam.online.binding import DrawnSurface, View, bind_pixels, draw_vie
 from morph_dslam.online.estimation import BoundPoints, Estimate, Estimator, State
 from morph_dslam.online.features import interior, spread_corners
 from morph_dslam.online.flow import flatten, follow
-from morph_dslam.online.frame_result import FOLLOWED, FOUND_AGAIN, RECOVERED, STAGES, FrameResult
+from morph_dslam.online.frame_result import (
+    FOLLOWED,
+    FOUND_AGAIN,
+    RECOVERED,
+    STAGES,
+    UNEXPLAINED,
+    FrameResult,
+)
 from morph_dslam.online.measurement import (
     Measurement,
     compare_with_rendering,
     visible_surface,
 )
+from morph_dslam.online.measurement_noise import Measured, window_correlation
 from morph_dslam.online.outline import Outline, OutlineMeasurement
 from morph_dslam.online.reference_refinement import Keyframe
 from morph_dslam.online.relocalisation import Relocaliser
-from morph_dslam.online.sequence_filter import (
-    Measured,
-    SequenceFilter,
-    window_correlation,
-)
+from morph_dslam.online.sequence_filter import SequenceFilter
 from morph_dslam.online.shape_search import ShapeSearch, with_undetermined_at_default
+from morph_dslam.online.systematic_errors import SystematicErrors
 from morph_dslam.online.timing import StageClock
 from morph_dslam.online.tracker_options import TrackerOptions
 
@@ -71,7 +76,8 @@ class Tracker:
     ----------
     reference : the reference frame (h, w, 3) uint8, as recorded. state : the object in it.
     in_sequence : whether the first frame to process is the reference frame or follows it; if not, the object
-        is looked for as after a loss.
+        is looked for as after a loss. reference_covariance : (d + 6, d + 6) of ``state``; it enters that of
+        every frame. None where nothing is known of the error of ``state``.
 
     Raises
     ------
@@ -87,6 +93,7 @@ class Tracker:
         state: State,
         options: TrackerOptions | None = None,
         in_sequence: bool = True,
+        reference_covariance: Array | None = None,
     ) -> None:
         self.model, self.camera, self.options = model, camera, options or TrackerOptions()
         self.estimator = Estimator(model, camera, self.options.estimation)
@@ -112,6 +119,8 @@ class Tracker:
         brief = replace(self.options.estimation, max_iterations=10, tolerance=1e-3)
         self._scout = Estimator(model, camera, brief)
         self._filter, self._correlation = self._new_filter()
+        window = self.options.flow.window
+        self._systematic = SystematicErrors(self.estimator, self.points, state, reference_covariance, window)
         self._last, self._velocity_base, self._lost = state, state, not in_sequence
         self._start = state
 
@@ -349,8 +358,11 @@ class Tracker:
             return FrameResult("lost", f"lost: {refusal}", None, np.nan, visible, count, times, total)
         residuals = attempt.estimate.residuals[attempt.inliers]
         rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
+        left = self._systematic.unexplained(attempt.estimate, attempt.inliers)
+        estimate = self._systematic.added(attempt.estimate, attempt.inliers, left)
+        reason = f"{how}; {UNEXPLAINED}: {left.px:.1f} px are left" if left.is_failure else how
         recovered = how != FOLLOWED
-        return FrameResult("tracked", how, attempt.estimate, rms, visible, count, times, total, recovered)
+        return FrameResult("tracked", reason, estimate, rms, visible, count, times, total, recovered, left.px)
 
     def _prepare(self, image: NDArray[np.uint8]) -> _Picture:
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)

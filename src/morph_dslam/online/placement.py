@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
@@ -17,6 +18,8 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.model.turned_model import turned_model
 from morph_dslam.online.estimation import State
 from morph_dslam.online.registration import RegistrationOptions, register
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,7 @@ class Placement:
     state : of the object there. facts : for the summary. flags : what a reader must know.
     per_sequence : names of the parameters that the placement leaves open and that do not change: the angle
         about an axis.
+    covariance : (d + 6, d + 6) of ``state``; None where it is not known.
     """
 
     model: ReducedModel
@@ -38,6 +42,7 @@ class Placement:
     facts: dict[str, Any]
     flags: tuple[str, ...]
     per_sequence: tuple[str, ...] = ()
+    covariance: Array | None = None
 
 
 def load_placement(path: Path, model: ReducedModel) -> Placement:
@@ -55,6 +60,7 @@ def load_placement(path: Path, model: ReducedModel) -> Placement:
         frame, axis = int(keyframe["frame"]), content["axis_of_revolution"]
         facts = {key: content[key] for key in ("score", "runner_up_score", "rms_px", "map_units_per_metre")}
         ambiguous = bool(content["ambiguous"])
+        of_pose = _pose_covariance(content, pose)
     except OSError as error:
         raise RegistrationError(f"cannot read the registration {path}: {error.strerror}") from error
     except (ValueError, KeyError, TypeError, IndexError) as error:
@@ -68,9 +74,38 @@ def load_placement(path: Path, model: ReducedModel) -> Placement:
             f"the angle about the object's axis cannot be seen before it deforms: it is the parameter "
             f"'{open_angles[0]}'"
         )
-    return Placement(
-        model, frame, State(model.default, pose), {"from": "map", **facts}, tuple(flags), open_angles
-    )
+    state = State(model.default, pose)
+    covariance = None if of_pose is None else _of_state(of_pose, len(model.parameters))
+    return Placement(model, frame, state, {"from": "map", **facts}, tuple(flags), open_angles, covariance)
+
+
+def _pose_covariance(content: dict[str, Any], pose: RigidTransform) -> Array | None:
+    """Covariance (6, 6) of the rotation vector and the translation of ``pose``, camera_from_object, metres.
+
+    From that of log scale, rotation vector and mean node in the map, whose unit the scale leaves uncertain:
+    an object that is larger in the map is nearer to the camera.
+    """
+    if content["covariance"] is None:
+        return None
+    scale = float(content["map_units_per_metre"])
+    world_from_object = np.array(content["world_from_object"], dtype=np.float64)[:3, :3] / scale
+    camera_from_world = pose.rotation @ world_from_object.T
+    centre = pose.apply(np.array(content["mean_node_m"], dtype=np.float64))
+    arm = centre - pose.translation
+    across = np.cross(np.eye(3), arm).T  # (a x arm) = across @ a
+    slopes = np.zeros((6, 7))
+    slopes[:3, 1:4] = camera_from_world
+    slopes[3:, 0] = -centre
+    slopes[3:, 1:4] = -across @ camera_from_world
+    slopes[3:, 4:] = camera_from_world / scale
+    return slopes @ np.array(content["covariance"], dtype=np.float64) @ slopes.T
+
+
+def _of_state(of_pose: Array, n_parameters: int) -> Array:
+    """The covariance of parameters that are known exactly, and of a pose."""
+    covariance = np.zeros((n_parameters + 6, n_parameters + 6))
+    covariance[n_parameters:, n_parameters:] = of_pose
+    return covariance
 
 
 def place_by_landmarks(
@@ -85,4 +120,11 @@ def place_by_landmarks(
         "n_landmarks": len(registration.estimate.residuals),
         "n_alternatives": len(registration.alternatives),
     }
-    return Placement(model, None, registration.state, facts, registration.flags)
+    return Placement(
+        model,
+        None,
+        registration.state,
+        facts,
+        registration.flags,
+        covariance=registration.estimate.covariance,
+    )

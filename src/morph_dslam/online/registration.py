@@ -24,6 +24,9 @@ from morph_dslam.online.estimation import BoundPoints, Estimate, EstimationOptio
 
 Array = NDArray[np.float64]
 
+#: Landmarks that fit so many times worse than careful ones do are flagged.
+POOR_FIT = 2.0
+
 
 @dataclass(frozen=True)
 class RegistrationOptions:
@@ -103,7 +106,8 @@ def register(
     rms = float(np.sqrt(np.mean(np.sum(best.residuals**2, axis=1))))
     _check_residual(best, rms, options.residual_share * float(np.hypot(camera.width, camera.height)))
     states = tuple(estimate.state for estimate in alternatives)
-    return Registration(best, states, rms, _flags(model, best, alternatives, len(bound)))
+    flags = _flags(model, best, alternatives, len(bound), options.click_px)
+    return Registration(best, states, rms, flags)
 
 
 def bind_landmarks(model: ReducedModel, points: Array, options: RegistrationOptions) -> BoundPoints:
@@ -234,7 +238,7 @@ def _check_residual(best: Estimate, rms: float, limit: float) -> None:
 
 
 def _flags(
-    model: ReducedModel, best: Estimate, alternatives: tuple[Estimate, ...], count: int
+    model: ReducedModel, best: Estimate, alternatives: tuple[Estimate, ...], count: int, click_px: float
 ) -> tuple[str, ...]:
     flags = []
     unknowns = len(model.parameters) + 6
@@ -242,6 +246,11 @@ def _flags(
         flags.append(
             f"registration underdetermined: {count} landmarks give {2 * count} numbers for {unknowns} "
             f"unknowns, so the shape stays near its default; add landmarks ({unknowns // 2 + 3} or more)"
+        )
+    elif best.sigma_px > POOR_FIT * click_px:
+        flags.append(
+            f"registration poor: the landmarks fit to {best.sigma_px:.1f} px, carefully set ones to "
+            f"{click_px:g} px; check them, the camera file, and whether this is the model of this object"
         )
     if alternatives:
         flags.append(

@@ -17,7 +17,7 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.online.binding import DrawnSurface
 from morph_dslam.online.confidence import largest_displacement
 from morph_dslam.online.estimation import State
-from morph_dslam.online.frame_result import STAGES, FrameResult
+from morph_dslam.online.frame_result import STAGES, UNEXPLAINED, FrameResult
 
 Array = NDArray[np.float64]
 FORMAT = "morph-dslam run"
@@ -89,6 +89,10 @@ class RunResults:
         """Root mean square residual (f,), NaN where lost."""
         return np.array([result.residual_rms_px for result in self.results])
 
+    def unexplained_px(self) -> Array:
+        """What the model leaves of the residuals (f,), see `systematic_errors`; NaN where lost."""
+        return np.array([result.unexplained_px for result in self.results])
+
     def counts(self) -> NDArray[np.int64]:
         """(f, 2): points that could be seen, and those that support the estimate."""
         return np.array([(r.n_points, r.n_inliers) for r in self.results], dtype=np.int64).reshape(-1, 2)
@@ -106,7 +110,7 @@ def write_hdf5(path: Path, run: RunResults) -> None:
         file["camera_from_object"], file["parameters"] = run.poses(), run.parameters()
         file["parameter_std"], file["at_bound"] = run.parameter_std(), run.at_bound()
         file["largest_displacement"], file["largest_displacement_std"] = run.largest_displacements().T
-        file["residual_rms_px"] = run.residuals_px()
+        file["residual_rms_px"], file["unexplained_px"] = run.residuals_px(), run.unexplained_px()
         file["n_points"], file["n_inliers"] = run.counts().T
         file["timings_ms"] = run.timings_ms()
         file["timings_ms"].attrs["names"] = [*STAGES, "total"]
@@ -122,7 +126,7 @@ def write_csv(path: Path, run: RunResults) -> None:
         header += [f"{p.name}_{p.unit}", f"{p.name}_std_{p.unit}", f"{p.name}_at_bound"]
     header += ["largest_displacement_mm", "largest_displacement_std_mm"]
     header += ["x_mm", "y_mm", "z_mm", "rotation_x_deg", "rotation_y_deg", "rotation_z_deg"]
-    header += ["residual_rms_px", "n_points", "n_inliers", "time_ms"]
+    header += ["residual_rms_px", "unexplained_px", "n_points", "n_inliers", "time_ms"]
     rows = zip(run.frames, run.timestamps, run.results, 1e3 * run.largest_displacements(), strict=True)
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
@@ -130,7 +134,7 @@ def write_csv(path: Path, run: RunResults) -> None:
         for frame, timestamp, result, largest in rows:
             row: list[Any] = [frame, f"{timestamp:.6f}", result.status, result.reason]
             if result.estimate is None:
-                row += [""] * (3 * len(parameters) + 9)
+                row += [""] * (3 * len(parameters) + 10)
             else:
                 state, std = result.estimate.state, result.estimate.parameter_std
                 for k, p in enumerate(parameters):
@@ -140,7 +144,7 @@ def write_csv(path: Path, run: RunResults) -> None:
                 pose = state.camera_from_object
                 row += [f"{1e3 * value:.4f}" for value in pose.translation]
                 row += [f"{value:.4f}" for value in np.degrees(rotation_log(pose.rotation))]
-                row.append(f"{result.residual_rms_px:.4f}")
+                row += [f"{result.residual_rms_px:.4f}", f"{result.unexplained_px:.4f}"]
             writer.writerow([*row, result.n_points, result.n_inliers, f"{result.total_ms:.3f}"])
 
 
@@ -173,6 +177,14 @@ def flags(run: RunResults) -> list[str]:
     lost = Counter(result.status for result in run.results)["lost"]
     if lost:
         found.append(f"{lost} of {len(run)} frames were lost; their reasons are in frames.csv")
+    failed = sum(UNEXPLAINED in result.reason for result in run.results)
+    if failed:
+        largest = float(np.nanmax(run.unexplained_px()))
+        found.append(
+            f"{UNEXPLAINED} in {failed} of {len(run)} frames: up to {largest:.1f} px are left that "
+            "neighbouring points have in common; it may be a model of something else, or too stiff, or "
+            "a wrong camera file"
+        )
     range_width = run.model.upper - run.model.lower
     with np.errstate(invalid="ignore"):
         determined = run.parameter_std() < 0.5 * range_width

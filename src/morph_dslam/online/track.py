@@ -19,10 +19,9 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import SourceError, TrackingError
 from morph_dslam.io.calibration import load_camera
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
-from morph_dslam.model import ReducedModel, load_model, save_model
+from morph_dslam.model import load_model, save_model
 from morph_dslam.model.inner_structure import InnerStructure, load_inner_structure
 from morph_dslam.online.augmentation import write_video
-from morph_dslam.online.estimation import State
 from morph_dslam.online.inner_positions import write_inner_positions
 from morph_dslam.online.outline import rim
 from morph_dslam.online.pipeline import Tracker, TrackerOptions
@@ -121,11 +120,11 @@ def track(options: TrackOptions) -> dict[str, Any]:
     _warm_up(camera, reference, placement, options)
     run = RunResults(placement.model, reference.index)
     try:
-        keyframes = _follow(source, camera, reference, placement.state, options, run)
+        keyframes = _follow(source, camera, reference, placement, options, run)
         if options.refine_reference and landmarks is not None:
-            state = _refined(camera, landmarks, placement, keyframes, reference, options)
+            refined = _refined(camera, landmarks, placement, keyframes, reference, options)
             again = RunResults(placement.model, reference.index, refined=True)
-            _follow(source, camera, reference, state, options, again)
+            _follow(source, camera, reference, refined, options, again)
             run = again
     finally:
         summary = _write_run(options, source, camera, run, placement, inner) if len(run) else {}
@@ -136,12 +135,12 @@ def _follow(
     source: FrameSource,
     camera: PinholeCamera,
     reference: Frame,
-    state: State,
+    placement: Placement,
     options: TrackOptions,
     run: RunResults,
 ) -> list[Keyframe]:
     """Track all frames into ``run``; returns where the points were seen if the reference is to be refined."""
-    tracker = _new_tracker(run.model, camera, reference, state, options)
+    tracker = _new_tracker(camera, reference, placement, options)
     keyframes = []
     for frame in tqdm(source, total=len(source), desc="tracking", unit="frame"):
         camera.check_image(frame.image, f"frame {frame.index} of {options.frames}")
@@ -159,25 +158,25 @@ def _refined(
     keyframes: list[Keyframe],
     reference: Frame,
     options: TrackOptions,
-) -> State:
-    """The reference state refined over the sequence."""
+) -> Placement:
+    """The placement refined over the sequence; how sure it is then is not known."""
     print("refining the reference state over the sequence ...", file=sys.stderr)
-    model, state = placement.model, placement.state
-    tracker = _new_tracker(model, camera, reference, state, options)
+    tracker = _new_tracker(camera, reference, placement, options)
     # How well the landmarks fit tells how carefully they were set, where they are enough to tell.
     sigma = placement.facts["sigma_px"]
     stated = options.refinement.landmark_px
     trust = replace(options.refinement, landmark_px=max(sigma, 0.1) if np.isfinite(sigma) else stated)
-    return refine_reference(
+    state = refine_reference(
         tracker.estimator,
-        bind_landmarks(model, landmarks.points, options.registration),
+        bind_landmarks(placement.model, landmarks.points, options.registration),
         camera.undistort_pixels(landmarks.pixels),
         tracker.reference_pixels,
-        state,
+        placement.state,
         choose_keyframes(keyframes, options.refinement.n_keyframes),
         trust,
         tracker.outline,
     )
+    return replace(placement, state=state, covariance=None)
 
 
 def _check_output(options: TrackOptions) -> None:
@@ -206,18 +205,26 @@ def _reference_frame(options: TrackOptions) -> Frame:
 
 
 def _new_tracker(
-    model: ReducedModel, camera: PinholeCamera, reference: Frame, state: State, options: TrackOptions
+    camera: PinholeCamera, reference: Frame, placement: Placement, options: TrackOptions
 ) -> Tracker:
     # A sequence that does not begin with the reference frame is entered as if the object had been lost.
     begins = options.reference_frame in (None, options.first)
     settings = replace(options.tracker, use_outline=options.use_outline)
-    return Tracker(model, camera, reference.image, state, settings, in_sequence=begins)
+    return Tracker(
+        placement.model,
+        camera,
+        reference.image,
+        placement.state,
+        settings,
+        in_sequence=begins,
+        reference_covariance=placement.covariance,
+    )
 
 
 def _warm_up(camera: PinholeCamera, reference: Frame, placement: Placement, options: TrackOptions) -> None:
     """Compile the inner loops, so that the first frame takes no longer than the others."""
     print("preparing: compiling the inner loops (half a minute the first time) ...", file=sys.stderr)
-    tracker = _new_tracker(placement.model, camera, reference, placement.state, options)
+    tracker = _new_tracker(camera, reference, placement, options)
     tracker.process_frame(reference.image)
 
 

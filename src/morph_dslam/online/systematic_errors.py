@@ -1,0 +1,163 @@
+"""Errors that more points and more frames do not average out: of the reference state, and of the model.
+
+The points were bound to the mesh in the reference view, so an error of the object's state there moves them
+on the surface, and every frame's estimate with them. Let a pixel of the reference view move by J0 e where its
+state is off by e; the material point under a fixed pixel then moves so that its pixel moves by -J0 e, in
+another view by -M J0 e, with M the map between the images of the point's triangle. The frame's estimate takes
+this for motion, H^-1 J' W M J0 e, to first order. In the reference view itself that is e.
+
+A model that cannot take the object's shape leaves residuals that are alike over parts of the surface much
+wider than the windows that are compared. Their covariance is measured from pairs of points whose windows do
+not overlap, and enters the estimate through the same H^-1 J' W.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.model import SurfacePoints
+from morph_dslam.online.estimation import BoundPoints, Estimate, Estimator, Prior, State
+from morph_dslam.online.reprojection import project_with_jacobian
+from morph_dslam.online.robust_covariance import EIGENVALUE_FLOOR
+
+Array = NDArray[np.float64]
+
+#: What a model leaves is taken to be alike over this share of the points' spread in the reference view.
+REACH_SHARE = 0.5
+#: More than this, pixels, and more than half of the residuals' variance, is stated as the model's failure.
+UNEXPLAINED_PX = 0.5
+#: A triangle seen so much flatter in the reference view than in another says nothing of the motion there.
+LARGEST_STRETCH = 5.0
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """What the model leaves of the residuals.
+
+    Attributes
+    ----------
+    px : standard deviation of a pixel coordinate that neighbours have in common. total_px : of all of it.
+    """
+
+    px: float
+    total_px: float
+
+    @property
+    def is_failure(self) -> bool:
+        """Whether the model, not noise, is what is left."""
+        return self.px > UNEXPLAINED_PX and self.px**2 > 0.5 * self.total_px**2
+
+
+class SystematicErrors:
+    """Adds to covariances what the reference and the model are off by.
+
+    Parameters
+    ----------
+    points : (p) the texture's points, bound in the reference view. reference : the state there.
+    covariance : (d + 6, d + 6) of that state; None where nothing is known of its error.
+    window : side of the square that is compared around a point, pixels.
+    """
+
+    def __init__(
+        self,
+        estimator: Estimator,
+        points: BoundPoints,
+        reference: State,
+        covariance: Array | None,
+        window: int,
+    ) -> None:
+        self._estimator, self._points = estimator, points
+        known = covariance is not None and np.isfinite(covariance).all()
+        self._covariance = covariance if known else None
+        self._corners = _corners(estimator, points)
+        self._jacobian = self._project(points, reference)[1]
+        self._edges = _edges(estimator.camera, self._corners, reference)
+        places = self._project(points, reference)[0]
+        apart = places[:, None] - places[None]
+        reach = REACH_SHARE * float(np.sqrt(np.mean(np.sum((places - places.mean(axis=0)) ** 2, axis=1))))
+        squared = np.sum(apart**2, axis=2)
+        self._alike = np.exp(-0.5 * squared / reach**2)
+        self._pairs = (squared < reach**2) & (np.abs(apart).max(axis=2) >= window)
+
+    def unexplained(self, estimate: Estimate, used: NDArray[np.bool_]) -> Unexplained:
+        """What the model leaves of the residuals of the points ``used`` (p,)."""
+        residuals = np.where(used[:, None], estimate.residuals[: len(used)], 0.0)
+        total = float(np.sum(residuals**2)) / max(2 * int(used.sum()), 1)
+        pairs = self._pairs & used[:, None] & used[None]
+        count = int(pairs.sum())
+        common = float(np.sum(residuals * (pairs @ residuals))) / max(2 * count, 1)
+        return Unexplained(float(np.sqrt(max(common, 0.0))), float(np.sqrt(total)))
+
+    def added(
+        self, estimate: Estimate, used: NDArray[np.bool_], left: Unexplained, prior: Prior | None = None
+    ) -> Estimate:
+        """The estimate with a covariance that holds both errors.
+
+        Parameters
+        ----------
+        used : (p,) the points that support it. left : of `unexplained`. prior : that it was found with.
+        """
+        _, jacobian = self._project(self._points, estimate.state)
+        length = np.linalg.norm(estimate.residuals[: len(used)], axis=1)
+        usable = used & np.isfinite(length) & np.isfinite(jacobian).all(axis=(1, 2))
+        huber = self._estimator.options.huber_px
+        weights = np.where(usable, np.minimum(1.0, huber / np.maximum(length, 1e-300)), 0.0)
+        jacobian = np.where(usable[:, None, None], jacobian, 0.0)
+        scores = weights[:, None, None] * jacobian
+        gain = self._inverse(np.tensordot(scores, jacobian, axes=([0, 1], [0, 1])), prior)
+        covariance = estimate.covariance.copy()
+        if self._covariance is not None:
+            moved = self._warps(estimate.state) @ self._jacobian
+            transfer = gain @ np.tensordot(scores, moved, axes=([0, 1], [0, 1]))
+            covariance += transfer @ self._covariance @ transfer.T
+        spread = (self._alike @ scores.reshape(len(scores), -1)).reshape(scores.shape)
+        of_model = np.tensordot(scores, spread, axes=([0, 1], [0, 1]))
+        covariance += left.px**2 * gain @ of_model @ gain
+        return replace(estimate, covariance=covariance)
+
+    def _project(self, points: BoundPoints, state: State) -> tuple[Array, Array]:
+        pose = state.camera_from_object
+        functions = points.field.functions.rows(state.parameters)
+        intrinsics = self._estimator.camera.intrinsics
+        return project_with_jacobian(
+            functions, pose.rotation, pose.translation, points.rest, points.field.modes, intrinsics
+        )
+
+    def _inverse(self, hessian: Array, prior: Prior | None) -> Array:
+        """H^-1; nothing moves along what neither the images nor the past determine."""
+        d = len(self._estimator.model.parameters)
+        if prior is not None:
+            hessian[:d, :d] += prior.information
+        scale = self._estimator.scale
+        values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
+        seen = values > max(values[-1], 1e-30) * EIGENVALUE_FLOOR
+        inverse = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T
+        return inverse * np.outer(scale, scale)
+
+    def _warps(self, state: State) -> Array:
+        """How pixels (p, 2, 2) move in a view where they move by one in the reference view."""
+        before, now = self._edges, _edges(self._estimator.camera, self._corners, state)
+        size = before[:, 0, 0] * before[:, 1, 1] - before[:, 0, 1] * before[:, 1, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            adjugate = np.stack(
+                [before[:, 1, 1], -before[:, 0, 1], -before[:, 1, 0], before[:, 0, 0]], axis=1
+            )
+            warps = now @ (adjugate / size[:, None]).reshape(-1, 2, 2)
+            usable = np.abs(warps).max(axis=(1, 2)) < LARGEST_STRETCH
+        return np.where(usable[:, None, None], warps, 0.0)
+
+
+def _corners(estimator: Estimator, points: BoundPoints) -> BoundPoints:
+    """The three corners of each point's triangle, (3 p) points."""
+    surface = SurfacePoints(np.repeat(points.surface.triangles, 3), np.tile(np.eye(3), (len(points), 1)))
+    return BoundPoints.from_surface(estimator.model, surface)
+
+
+def _edges(camera: PinholeCamera, corners: BoundPoints, state: State) -> Array:
+    """Two edges of each triangle in the image, as the columns of (p, 2, 2)."""
+    pixels = camera.project(corners.in_camera(state)).reshape(-1, 3, 2)
+    return np.stack([pixels[:, 1] - pixels[:, 0], pixels[:, 2] - pixels[:, 0]], axis=2)
