@@ -6,8 +6,9 @@ import pytest
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.online.estimation import BoundPoints, Estimator, State
-from morph_dslam.online.sequence_filter import Measured, SequenceFilter, window_correlation
+from morph_dslam.online.estimation import BoundPoints, Estimator, Prior, State, moved
+from morph_dslam.online.measurement_noise import Measured, window_correlation
+from morph_dslam.online.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
@@ -70,6 +71,46 @@ def test_noise_that_stays_with_the_points_does_not_and_is_not_said_to():
     errors, deviations = runs(lambda rng, shape: np.tile(SIGMA * rng.standard_normal(shape[1:]), (25, 1, 1)))
     assert np.median(deviations[:, -1] / deviations[:, 0]) > 0.7
     assert 0.6 < np.sqrt(np.mean((errors / deviations)[:, 10:] ** 2)) < 1.4
+
+
+def runs_with_known_poses(lasting, anew, frames=8, repeats=24, count=40):
+    """Errors and stated deviations (repeats, frames) of the arch when the pose is known with errors.
+
+    ``lasting`` (6, 6) is drawn once a run and ``anew`` (6, 6) in every frame. Only the sheet's middle is seen,
+    where a higher arch looks like a nearer sheet.
+    """
+    middle = np.abs(MODEL.nodes[MODEL.triangles, 0]).max(axis=1) < 0.06
+    rng = np.random.default_rng(5)
+    surface = SurfacePoints(rng.choice(np.flatnonzero(middle), count), rng.dirichlet(np.ones(3), count))
+    points = BoundPoints.from_surface(MODEL, surface)
+    states = [State(np.array([0.03, 0.1, 0.0]), truth(number).camera_from_object) for number in range(frames)]
+    information = SIGMA**2 * np.linalg.inv(lasting @ lasting.T + anew @ anew.T)
+    found = []
+    for seed in range(repeats):
+        rng = np.random.default_rng(seed)
+        filtered, stays = SequenceFilter(ESTIMATOR, [0]), rng.standard_normal(6)
+        for state in states:
+            error = lasting @ stays + anew @ rng.standard_normal(6)
+            pose = moved(state, np.concatenate([np.zeros(3), -error])).camera_from_object
+            known = Prior(np.zeros(3), np.zeros((3, 3)), pose, information, lasting, SIGMA**2)
+            pixels = CAMERA.project(points.in_camera(state)) + SIGMA * rng.standard_normal((count, 2))
+            weights, normals = np.ones(count), np.zeros((count, 2))
+            alone = ESTIMATOR.estimate(points, pixels, weights, state, prior=known)
+            measured = Measured(points, pixels, weights, normals, np.eye(count))
+            fused = filtered.fuse(measured, alone, known)
+            found.append((fused.state.parameters[0] - state.parameters[0], fused.parameter_std[0]))
+    return np.array(found).reshape(repeats, frames, 2).transpose(2, 0, 1)
+
+
+def test_errors_of_a_known_pose_are_stated_and_those_that_last_do_not_average_out():
+    large = np.diag([5e-3, 5e-3, 5e-3, 1e-3, 1e-3, 3e-3])
+    lasting, stated_lasting = runs_with_known_poses(large, 0.1 * large)
+    anew, stated_anew = runs_with_known_poses(0.1 * large, large)
+    for errors, stated in ((lasting, stated_lasting), (anew, stated_anew)):
+        assert 0.6 < np.sqrt(np.mean((errors / stated)[:, 3:] ** 2)) < 1.5
+    assert np.median(stated_lasting[:, -1] / stated_lasting[:, 0]) > 0.8
+    assert np.median(stated_anew[:, -1] / stated_anew[:, 0]) < 0.6
+    assert np.sqrt(np.mean(anew[:, -1] ** 2)) < 0.7 * np.sqrt(np.mean(lasting[:, -1] ** 2))
 
 
 def test_wrong_early_value_is_given_up():

@@ -15,11 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
-from morph_dslam.model import ReducedModel, SeparatedField, SurfacePoints
+from morph_dslam.model import ReducedModel
 from morph_dslam.online.bounded_step import bounded_step
+from morph_dslam.online.prior import Prior
 from morph_dslam.online.reprojection import linearise
 from morph_dslam.online.robust_covariance import huber_covariance
+from morph_dslam.online.state import BoundPoints, State, moved
+
+__all__ = ["BoundPoints", "Estimate", "EstimationOptions", "Estimator", "Prior", "State", "moved"]
 
 Array = NDArray[np.float64]
 
@@ -29,99 +32,6 @@ LARGEST_STEP = 1.0
 DAMPING_FLOOR = 1e-6
 #: A parameter nearer to its bound than this share of its range counts as being at the bound.
 BOUND_SHARE = 1e-3
-
-
-@dataclass(frozen=True)
-class State:
-    """What is estimated in every frame: parameters (d,) in SI units and the object's pose."""
-
-    parameters: Array
-    camera_from_object: RigidTransform
-
-
-@dataclass(frozen=True)
-class BoundPoints:
-    """Surface points with the displacement field restricted to them.
-
-    Attributes
-    ----------
-    surface : where the p points are on the mesh.
-    rest : (p, 3) undeformed positions, metres.
-    field : displacement at the points only, metres.
-    """
-
-    surface: SurfacePoints
-    rest: Array
-    field: SeparatedField
-
-    @classmethod
-    def from_surface(cls, model: ReducedModel, surface: SurfacePoints) -> BoundPoints:
-        return cls(surface, model.rest_positions(surface), model.restrict(surface))
-
-    def __len__(self) -> int:
-        return len(self.rest)
-
-    def joined(self, other: BoundPoints) -> BoundPoints:
-        """These points followed by ``other`` ones of the same model."""
-        surface = SurfacePoints(
-            np.concatenate([self.surface.triangles, other.surface.triangles]),
-            np.concatenate([self.surface.weights, other.surface.weights]),
-        )
-        modes = np.concatenate([self.field.modes, other.field.modes], axis=1)
-        rest = np.concatenate([self.rest, other.rest])
-        return BoundPoints(surface, rest, self.field.with_modes(modes))
-
-    def in_camera(self, state: State) -> Array:
-        """Positions (p, 3) in the camera frame, metres."""
-        return state.camera_from_object.apply(self.rest + self.field.value(state.parameters))
-
-
-@dataclass(frozen=True)
-class Prior:
-    """What is known of the parameters, and of the pose, beforehand, as one more term of the cost.
-
-    Attributes
-    ----------
-    mean : (d,), SI. information : (d, d), the Hessian of the cost (mu - mean)' I (mu - mean) / 2, in squared
-        pixels as the cost; zero for parameters of which nothing is known.
-    pose : camera_from_object as known beforehand; None if nothing is.
-    pose_information : (6, 6) in the same unit, of the increment (rotation vector, translation) that `moved`
-        applies to ``pose``; None if nothing is known.
-    """
-
-    mean: Array
-    information: Array
-    pose: RigidTransform | None = None
-    pose_information: Array | None = None
-
-    def terms(self, state: State) -> tuple[float, Array, Array]:
-        """Cost, Hessian (d + 6, d + 6) and gradient (d + 6,) of the prior at a state."""
-        d = len(self.mean)
-        hessian, gradient = np.zeros((d + 6, d + 6)), np.zeros(d + 6)
-        away = state.parameters - self.mean
-        hessian[:d, :d], gradient[:d] = self.information, self.information @ away
-        cost = 0.5 * float(away @ gradient[:d])
-        if self.pose is not None and self.pose_information is not None:
-            pose = state.camera_from_object
-            turn = rotation_log(pose.rotation @ self.pose.rotation.T)
-            away = np.concatenate([turn, pose.translation - self.pose.translation])
-            slope = np.eye(6)
-            slope[:3, :3] = _log_slope(turn)
-            push = self.pose_information @ away
-            hessian[d:, d:], gradient[d:] = slope.T @ self.pose_information @ slope, slope.T @ push
-            cost += 0.5 * float(away @ push)
-        return cost, hessian, gradient
-
-
-def _log_slope(turn: Array) -> Array:
-    """Derivative (3, 3) of log(exp(w) exp(turn)) by w at w = 0: the inverse left Jacobian of SO(3).
-
-    I - [turn]/2 + c [turn]² with c = 1/a² - 1 / (2 a tan(a/2)) (Barfoot, State Estimation for Robotics, 7.1).
-    """
-    angle = float(np.linalg.norm(turn))
-    cross = np.cross(np.eye(3), turn)
-    c = 1.0 / 12.0 if angle < 1e-4 else 1.0 / angle**2 - 0.5 / (angle * np.tan(0.5 * angle))
-    return np.eye(3) - 0.5 * cross + c * cross @ cross
 
 
 @dataclass(frozen=True)
@@ -153,6 +63,7 @@ class Estimate:
     covariance : (d + 6, d + 6) of [parameters, rotation vector, translation]; infinite when undetermined.
     at_bound : (d,) parameters that ended at a bound of the box.
     iterations, converged : how the iteration ended.
+    measured_covariance : the covariance without any prior on the parameters; None where there was none.
     """
 
     state: State
@@ -163,6 +74,7 @@ class Estimate:
     at_bound: NDArray[np.bool_]
     iterations: int
     converged: bool
+    measured_covariance: Array | None = None
 
     @property
     def parameter_std(self) -> Array:
@@ -173,14 +85,6 @@ class Estimate:
     def pose_std(self) -> Array:
         """Standard deviations (6,) of the rotation vector (rad) and the translation (m)."""
         return np.sqrt(np.diag(self.covariance)[len(self.state.parameters) :])
-
-
-def moved(state: State, step: Array) -> State:
-    """The state after an increment (d + 6,): parameters added, pose increment on the left."""
-    d = len(state.parameters)
-    pose = state.camera_from_object
-    rotation = rotation_exp(step[d : d + 3]) @ pose.rotation
-    return State(state.parameters + step[:d], RigidTransform(rotation, pose.translation + step[d + 3 :]))
 
 
 class Estimator:

@@ -15,15 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from morph_dslam.online.estimation import BoundPoints, Estimate, Estimator, Prior, State
-from morph_dslam.online.reprojection import project_with_jacobian
-from morph_dslam.online.robust_covariance import EIGENVALUE_FLOOR
+from morph_dslam.online.estimation import Estimate, Estimator, Prior, State
+from morph_dslam.online.linear_cost import LinearCost
+from morph_dslam.online.measurement_noise import Measured, PixelNoise
 
 Array = NDArray[np.float64]
 
@@ -47,35 +46,6 @@ class FilterOptions:
     patience: int = 3
 
 
-@dataclass(frozen=True)
-class Measured:
-    """What an estimate was made from, in one frame.
-
-    Attributes
-    ----------
-    points : p of them. pixels : (p, 2) as measured. weights : (p,).
-    normals : (p, 2), zero for points that count in both directions; see `reprojection.linearise`.
-    correlation : (p, p) of the errors of the points' measurements.
-    """
-
-    points: BoundPoints
-    pixels: Array
-    weights: Array
-    normals: Array
-    correlation: Array
-
-
-def window_correlation(pixels: Array, window: int) -> Array:
-    """Correlation (p, p) of measurements at ``pixels`` (p, 2): the share of their windows that is the same.
-
-    ``window`` is the side of the square that is compared, in pixels.
-    """
-    overlap = np.ones((len(pixels), len(pixels)))
-    for column in pixels.T:
-        overlap *= np.maximum(0.0, 1.0 - np.abs(column[:, None] - column[None]) / window)
-    return overlap
-
-
 class SequenceFilter:
     """Fuses the estimates of the frames of one sequence.
 
@@ -90,21 +60,22 @@ class SequenceFilter:
         self.options = options or FilterOptions()
         self._estimator, self._kept = estimator, np.array(indices, dtype=np.int64)
         self._unknowns = len(estimator.model.parameters) + 6
-        self._noise = _Noise(self.options.memory)
+        self._noise = PixelNoise(self.options.memory)
         self._past: _Past | None = None
         self._conflicts = 0
 
-    def fuse(self, measured: Measured, alone: Estimate) -> Estimate:
+    def fuse(self, measured: Measured, alone: Estimate, known: Prior | None = None) -> Estimate:
         """The estimate of a frame from its measurements and all frames before, with its covariance.
 
         Parameters
         ----------
-        alone : the estimate from the frame's measurements only.
+        alone : the estimate from the frame's measurements, and ``known``, only.
+        known : what is known of the frame's pose or parameters from elsewhere, if anything.
         """
         self._noise.add(alone.residuals, measured, self._unknowns)
-        linear = self._linear(measured, alone)
-        errors = self._errors(measured, linear)
-        by_itself = replace(alone, covariance=errors.covariance)
+        linear = LinearCost.about(self._estimator, measured, alone)
+        errors = self._errors(measured, linear, alone.state, known)
+        by_itself = self._with_covariance(alone, measured, linear, errors, known)
         if not len(self._kept):
             return by_itself
         if self._past is not None and self._contradicts(self._past, by_itself):
@@ -116,19 +87,35 @@ class SequenceFilter:
         if self._past is None:
             self._keep(by_itself, errors)
             return by_itself
-        prior = self._prior(self._past, measured, errors, linear)
+        past = self._prior(self._past, measured, errors)
         fused = self._estimator.estimate(
             measured.points,
             measured.pixels,
             measured.weights,
             self._start(by_itself),
             measured.normals,
-            prior,
+            past if known is None else past.joined(known),
         )
-        errors = self._errors(measured, self._linear(measured, fused), prior)
-        fused = replace(fused, covariance=errors.covariance)
+        linear = LinearCost.about(self._estimator, measured, fused)
+        errors = self._errors(measured, linear, fused.state, known, past)
         self._keep(fused, errors)
-        return fused
+        return self._with_covariance(fused, measured, linear, errors, known, past)
+
+    def _with_covariance(
+        self,
+        estimate: Estimate,
+        measured: Measured,
+        linear: LinearCost,
+        errors: _Errors,
+        known: Prior | None,
+        past: Prior | None = None,
+    ) -> Estimate:
+        """The estimate with its covariance, and what it would be without a prior on the parameters."""
+        told = errors.covariance
+        if known is not None and known.information.any():
+            of_pose = replace(known, information=np.zeros_like(known.information))
+            told = self._errors(measured, linear, estimate.state, of_pose, past).covariance
+        return replace(estimate, covariance=errors.covariance, measured_covariance=told)
 
     def _of_kept(self, matrix: Array) -> Array:
         return matrix[np.ix_(self._kept, self._kept)]
@@ -141,6 +128,7 @@ class SequenceFilter:
             grown * self._of_kept(errors.covariance),
             np.sqrt(grown) * errors.by_point[:, :, self._kept],
             grown * self._of_kept(errors.by_frames),
+            np.sqrt(grown) * errors.by_cause[:, self._kept],
         )
 
     def _start(self, alone: Estimate) -> State:
@@ -151,16 +139,18 @@ class SequenceFilter:
         parameters[self._kept[surer]] = self._past.mean[surer]
         return replace(alone.state, parameters=parameters)
 
-    def _prior(self, past: _Past, measured: Measured, errors: _Errors, linear: _Linear) -> Prior:
+    def _prior(self, past: _Past, measured: Measured, errors: _Errors) -> Prior:
         """The past as a term of the frame's cost, of the weight that makes the variance of both least.
 
         In the basis in which the frame's covariance is 1 and the past's p, with the covariance c of both, the
         weight of the past is (1 - c) / (1 + p - 2 c).
         """
         d, own = self._unknowns - 6, self._of_kept(errors.covariance)
-        squared_px = np.trace(np.linalg.solve(self._of_kept(linear.inverse), own)) / len(self._kept)
+        squared_px = np.trace(np.linalg.solve(self._of_kept(errors.inverse), own)) / len(self._kept)
         p, basis = scipy.linalg.eigh(past.covariance, own)
         shared = _quadratic(past.by_point, measured.correlation, errors.by_point[:, :, self._kept])
+        causes = min(len(past.by_cause), len(errors.by_cause))
+        shared += past.by_cause[:causes].T @ errors.by_cause[:causes, self._kept]
         c = np.einsum("ik,ij,jk->k", basis, shared, basis)
         weight = np.clip((1.0 - c) / np.maximum(1.0 + p - 2.0 * c, 1e-12), 0.0, LARGEST_WEIGHT)
         root = basis * np.sqrt(squared_px * weight / (1.0 - weight))
@@ -175,42 +165,38 @@ class SequenceFilter:
         spread = self._of_kept(estimate.covariance) + past.covariance
         return float(apart @ np.linalg.solve(spread, apart)) > self.options.gate**2
 
-    def _linear(self, measured: Measured, estimate: Estimate) -> _Linear:
-        """The cost about an estimate."""
-        state, points = estimate.state, measured.points
-        pose = state.camera_from_object
-        _, jacobian = project_with_jacobian(
-            points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
-            points.field.modes, self._estimator.camera.intrinsics,
-        )  # fmt: skip
-        directed = (measured.normals != 0.0).any(axis=1)
-        normals = measured.normals[directed]
-        jacobian[directed] = (normals[:, :, None] * normals[:, None, :]) @ jacobian[directed]
-        length = np.linalg.norm(estimate.residuals, axis=1)
-        used = (measured.weights > 0.0) & np.isfinite(length)
-        jacobian[~used] = 0.0
-        huber = self._estimator.options.huber_px
-        factor = np.minimum(1.0, huber / np.maximum(np.where(used, length, 0.0), 1e-300))
-        scores = (measured.weights * factor)[:, None, None] * jacobian
-        return _Linear(scores, np.tensordot(scores, jacobian, axes=([0, 1], [0, 1])), self._estimator.scale)
-
-    def _errors(self, measured: Measured, linear: _Linear, prior: Prior | None = None) -> _Errors:
-        """How the measurements' errors, and those of the past if there is a prior, enter the estimate."""
+    def _errors(
+        self,
+        measured: Measured,
+        linear: LinearCost,
+        state: State,
+        known: Prior | None,
+        past: Prior | None = None,
+    ) -> _Errors:
+        """How the measurements' errors, and those of what is known otherwise, enter the estimate."""
         d, kept = self._unknowns - 6, self._kept
         common, frame = self._noise.common, self._noise.frame
         by_point = np.sqrt(common) * linear.scores
         by_frames = frame * _quadratic(linear.scores, measured.correlation)
-        if prior is not None and self._past is not None:
-            hessian = linear.hessian.copy()
-            hessian[:d, :d] += prior.information
-            linear = replace(linear, hessian=hessian)
-            weight = self._of_kept(prior.information)
+        by_cause = np.zeros((0, self._unknowns))
+        hessian = linear.hessian.copy()
+        if known is not None:
+            information, by_cause = known.terms(state)[1], known.lasting_scores
+            hessian += information
+            by_frames += known.squared_px * information - by_cause.T @ by_cause
+        if past is not None and self._past is not None:
+            hessian[:d, :d] += past.information
+            weight = self._of_kept(past.information)
             by_point[:, :, kept] += self._past.by_point @ weight
             by_frames[np.ix_(kept, kept)] += weight @ self._past.by_frames @ weight
+            by_cause = _longer(by_cause, len(self._past.by_cause))
+            by_cause[: len(self._past.by_cause), kept] += self._past.by_cause @ weight
+        linear = replace(linear, hessian=hessian)
         inverse = linear.inverse
-        by_point, by_frames = by_point @ inverse, inverse @ by_frames @ inverse
+        by_point, by_frames, by_cause = by_point @ inverse, inverse @ by_frames @ inverse, by_cause @ inverse
         unseen = (common + frame) * linear.unseen
-        return _Errors(by_point, by_frames, _quadratic(by_point, measured.correlation) + by_frames + unseen)
+        covariance = _quadratic(by_point, measured.correlation) + by_frames + by_cause.T @ by_cause + unseen
+        return _Errors(by_point, by_frames, by_cause, covariance, inverse)
 
 
 @dataclass(frozen=True)
@@ -219,87 +205,34 @@ class _Past:
 
     Attributes
     ----------
-    mean : (k,), SI. covariance : (k, k). by_point, by_frames : as in `_Errors`, (p, 2, k) and (k, k).
+    mean : (k,), SI. covariance : (k, k). by_point, by_frames, by_cause : as in `_Errors`, (p, 2, k), (k, k)
+        and (c, k).
     """
 
     mean: Array
     covariance: Array
     by_point: Array
     by_frames: Array
-
-
-@dataclass(frozen=True)
-class _Linear:
-    """A cost about its minimum.
-
-    Attributes
-    ----------
-    scores : (p, 2, n) by which an error of a pixel enters the gradient. hessian : (n, n). scale : (n,) of
-        the unknowns.
-    """
-
-    scores: Array
-    hessian: Array
-    scale: Array
-
-    @cached_property
-    def _spectrum(self) -> tuple[Array, Array, float]:
-        """Eigenvalues and eigenvectors in scaled unknowns, and the least value that counts."""
-        values, vectors = np.linalg.eigh(self.hessian * np.outer(self.scale, self.scale))
-        return values, self.scale[:, None] * vectors, max(values[-1], 1e-30) * EIGENVALUE_FLOOR
-
-    @cached_property
-    def inverse(self) -> Array:
-        """H^-1 (n, n); what is not seen at all gets the inverse of the least value."""
-        values, vectors, floor = self._spectrum
-        return (vectors / np.maximum(values, floor)) @ vectors.T
-
-    @property
-    def unseen(self) -> Array:
-        """The part (n, n) of `inverse` that is not seen at all."""
-        values, vectors, floor = self._spectrum
-        return (vectors * np.where(values > floor, 0.0, 1.0 / floor)) @ vectors.T
+    by_cause: Array
 
 
 @dataclass(frozen=True)
 class _Errors:
-    """How errors of pixels enter an estimate.
+    """How errors enter an estimate.
 
     Attributes
     ----------
     by_point : (p, 2, n) derivative by the part that stays with a point, in its standard deviations.
-    by_frames : (n, n) covariance from what is new in each frame. covariance : (n, n) from both.
+    by_frames : (n, n) covariance from what is new in each frame.
+    by_cause : (c, n) derivative by what is the same in all frames of a known pose; see `Prior.lasting`.
+    covariance : (n, n) from all of it. inverse : (n, n) of the cost's Hessian.
     """
 
     by_point: Array
     by_frames: Array
+    by_cause: Array
     covariance: Array
-
-
-class _Noise:
-    """The variance of a pixel coordinate: its part that stays with the point, and its part in one frame."""
-
-    def __init__(self, memory: float) -> None:
-        self._fade, self._count, self._product = np.exp(-1.0 / memory), 0.0, 0.0
-        self._before: Array | None = None
-        self.common, self.frame = 0.0, 0.0
-
-    def add(self, residuals: Array, measured: Measured, unknowns: int) -> None:
-        """Learn from the residuals (p, 2) of a frame; those of the frame before tell what stays."""
-        used = (measured.weights > 0.0) & np.isfinite(residuals).all(axis=1)
-        numbers = np.where((measured.normals[used] != 0.0).any(axis=1), 1, 2).sum()
-        residuals = np.where(used[:, None], residuals, np.nan)
-        total = np.nansum(measured.weights[:, None] * residuals**2) / max(numbers - unknowns, 1)
-        if self._before is not None:
-            products = residuals * self._before
-            pairs = np.isfinite(products)
-            self._count = self._fade * self._count + pairs.sum()
-            self._product = self._fade * self._product + np.nansum(products)
-        self._before = residuals
-        # As long as there is nothing to compare with, all of it is taken to stay.
-        stays = self._product / self._count if self._count else np.inf
-        self.common = float(np.clip(stays, 0.0, total))
-        self.frame = float(total - self.common)
+    inverse: Array
 
 
 def _quadratic(scores: Array, correlation: Array, others: Array | None = None) -> Array:
@@ -307,3 +240,8 @@ def _quadratic(scores: Array, correlation: Array, others: Array | None = None) -
     others = scores if others is None else others
     spread = (correlation @ others.reshape(len(others), -1)).reshape(others.shape)
     return np.tensordot(scores, spread, axes=([0, 1], [0, 1]))
+
+
+def _longer(rows: Array, count: int) -> Array:
+    """A copy with zeros below, so that there are at least ``count`` rows."""
+    return np.vstack([rows, np.zeros((max(count - len(rows), 0), rows.shape[1]))])

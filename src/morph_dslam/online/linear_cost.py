@@ -1,0 +1,69 @@
+"""A cost about its minimum: how errors of measurements enter the estimate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.online.estimation import Estimate, Estimator
+from morph_dslam.online.measurement_noise import Measured
+from morph_dslam.online.reprojection import project_with_jacobian
+from morph_dslam.online.robust_covariance import EIGENVALUE_FLOOR
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LinearCost:
+    """A cost about its minimum.
+
+    Attributes
+    ----------
+    scores : (p, 2, n) by which an error of a pixel enters the gradient. hessian : (n, n). scale : (n,) of
+        the unknowns.
+    """
+
+    scores: Array
+    hessian: Array
+    scale: Array
+
+    @classmethod
+    def about(cls, estimator: Estimator, measured: Measured, estimate: Estimate) -> LinearCost:
+        """That of the measurements of a frame, about an estimate made from them."""
+        state, points = estimate.state, measured.points
+        pose = state.camera_from_object
+        _, jacobian = project_with_jacobian(
+            points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
+            points.field.modes, estimator.camera.intrinsics,
+        )  # fmt: skip
+        directed = (measured.normals != 0.0).any(axis=1)
+        normals = measured.normals[directed]
+        jacobian[directed] = (normals[:, :, None] * normals[:, None, :]) @ jacobian[directed]
+        length = np.linalg.norm(estimate.residuals, axis=1)
+        used = (measured.weights > 0.0) & np.isfinite(length)
+        jacobian[~used] = 0.0
+        huber = estimator.options.huber_px
+        factor = np.minimum(1.0, huber / np.maximum(np.where(used, length, 0.0), 1e-300))
+        scores = (measured.weights * factor)[:, None, None] * jacobian
+        return cls(scores, np.tensordot(scores, jacobian, axes=([0, 1], [0, 1])), estimator.scale)
+
+    @cached_property
+    def _spectrum(self) -> tuple[Array, Array, float]:
+        """Eigenvalues and eigenvectors in scaled unknowns, and the least value that counts."""
+        values, vectors = np.linalg.eigh(self.hessian * np.outer(self.scale, self.scale))
+        return values, self.scale[:, None] * vectors, max(values[-1], 1e-30) * EIGENVALUE_FLOOR
+
+    @cached_property
+    def inverse(self) -> Array:
+        """H^-1 (n, n); what is not seen at all gets the inverse of the least value."""
+        values, vectors, floor = self._spectrum
+        return (vectors / np.maximum(values, floor)) @ vectors.T
+
+    @property
+    def unseen(self) -> Array:
+        """The part (n, n) of `inverse` that is not seen at all."""
+        values, vectors, floor = self._spectrum
+        return (vectors * np.where(values > floor, 0.0, 1.0 / floor)) @ vectors.T

@@ -1,0 +1,67 @@
+"""What an estimate was made from, and how large and how alike the errors of its measurements are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.online.estimation import BoundPoints
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What an estimate was made from, in one frame.
+
+    Attributes
+    ----------
+    points : p of them. pixels : (p, 2) as measured. weights : (p,).
+    normals : (p, 2), zero for points that count in both directions; see `reprojection.linearise`.
+    correlation : (p, p) of the errors of the points' measurements.
+    """
+
+    points: BoundPoints
+    pixels: Array
+    weights: Array
+    normals: Array
+    correlation: Array
+
+
+def window_correlation(pixels: Array, window: int) -> Array:
+    """Correlation (p, p) of measurements at ``pixels`` (p, 2): the share of their windows that is the same.
+
+    ``window`` is the side of the square that is compared, in pixels.
+    """
+    overlap = np.ones((len(pixels), len(pixels)))
+    for column in pixels.T:
+        overlap *= np.maximum(0.0, 1.0 - np.abs(column[:, None] - column[None]) / window)
+    return overlap
+
+
+class PixelNoise:
+    """The variance of a pixel coordinate: its part that stays with the point, and its part in one frame."""
+
+    def __init__(self, memory: float) -> None:
+        self._fade, self._count, self._product = np.exp(-1.0 / memory), 0.0, 0.0
+        self._before: Array | None = None
+        self.common, self.frame = 0.0, 0.0
+
+    def add(self, residuals: Array, measured: Measured, unknowns: int) -> None:
+        """Learn from the residuals (p, 2) of a frame; those of the frame before tell what stays."""
+        used = (measured.weights > 0.0) & np.isfinite(residuals).all(axis=1)
+        numbers = np.where((measured.normals[used] != 0.0).any(axis=1), 1, 2).sum()
+        residuals = np.where(used[:, None], residuals, np.nan)
+        total = np.nansum(measured.weights[:, None] * residuals**2) / max(numbers - unknowns, 1)
+        if self._before is not None:
+            products = residuals * self._before
+            pairs = np.isfinite(products)
+            self._count = self._fade * self._count + pairs.sum()
+            self._product = self._fade * self._product + np.nansum(products)
+        self._before = residuals
+        # As long as there is nothing to compare with, all of it is taken to stay.
+        stays = self._product / self._count if self._count else np.inf
+        self.common = float(np.clip(stays, 0.0, total))
+        self.frame = float(total - self.common)
