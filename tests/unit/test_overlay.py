@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from morph_dslam.render.colour_maps import colour_bar, colour_table
-from morph_dslam.render.overlay import blend_surface, blend_surface_numpy, draw_overlay
+from morph_dslam.render.overlay import blend_surface, blend_surface_numpy, draw_overlay, paint_surface
 from morph_dslam.render.rasteriser import rasterise
-from morph_dslam.render.shading import lambert, vertex_normals
+from morph_dslam.render.shading import lambert, vertex_normals, vertex_normals_numpy
 from tests.support.bent_sheet import LENGTH, bent_sheet_model
 
 PIXELS = np.array([[20.0, 40.0], [119.0, 40.0], [119.0, 139.0], [20.0, 139.0]])
@@ -95,7 +95,20 @@ def test_normals_of_an_arch_are_those_of_its_surface():
     slope = -0.04 * 8 * x / LENGTH**2
     expected = np.column_stack([-slope, np.zeros_like(x), np.ones_like(x)]) / np.sqrt(1 + slope**2)[:, None]
     inner = np.abs(x) < 0.49 * LENGTH
-    np.testing.assert_allclose(vertex_normals(points, model.triangles)[inner], expected[inner], atol=2e-3)
+    found = vertex_normals(points, model.triangles)
+    np.testing.assert_allclose(found[inner], expected[inner], atol=2e-3)
+    np.testing.assert_allclose(found, vertex_normals_numpy(points, model.triangles), atol=1e-12)
+
+
+def test_only_the_part_of_the_image_with_the_surface_is_painted():
+    """A square that leaves the image at the left: found where its corners are, cut at the border."""
+    image = GREY.copy()
+    shifted = PIXELS - np.array([60.0, 0.0])
+    painted = paint_surface(image, shifted, np.ones(4), TRIANGLES, np.ones(4), (0.0, 1.0))
+    assert painted.box() == (40, 139, 0, 59)
+    changed = (image != GREY).any(axis=2)
+    assert changed.sum() == painted.covered.sum() == 100 * 60
+    assert changed[40:140, :60].all()
 
 
 def test_lambert_is_two_sided():

