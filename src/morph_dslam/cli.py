@@ -68,6 +68,7 @@ def _info(arguments: argparse.Namespace) -> None:
 
 
 def _track(arguments: argparse.Namespace) -> None:
+    from morph_dslam.online.observability import value_line
     from morph_dslam.online.track import TrackOptions, track
 
     first, last = arguments.range
@@ -92,6 +93,8 @@ def _track(arguments: argparse.Namespace) -> None:
     )
     for flag in summary["flags"]:
         print(f"note: {flag}")
+    for figures in summary["one_over_the_sequence"]:
+        print(value_line(figures))
     print(f"wrote {arguments.output}")
     print(
         f"tracked={summary['n_tracked']}/{summary['n_frames']} "

@@ -218,6 +218,11 @@ def test_parameter_that_is_one_over_the_sequence_is_named(inputs, finished, tmp_
         summary["temporal_prior"]
         == "one over the sequence, from all frames so far: twist; none on the others"
     )
+    (twist,) = summary["one_over_the_sequence"]
+    low, high = twist["interval_95"]
+    assert (twist["name"], twist["unit"]) == ("twist", "deg")
+    assert low < twist["value"] < high
     assert finished[1]["temporal_prior"] == "none"
+    assert finished[1]["one_over_the_sequence"] == []
     with pytest.raises(TrackingError, match="'bend' cannot be one over the sequence"):
         track(options(inputs, tmp_path / "other", per_sequence=("bend",)))

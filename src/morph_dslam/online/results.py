@@ -18,6 +18,7 @@ from morph_dslam.online.binding import DrawnSurface
 from morph_dslam.online.confidence import largest_displacement
 from morph_dslam.online.estimation import State
 from morph_dslam.online.frame_result import STAGES, UNEXPLAINED, FrameResult
+from morph_dslam.online.observability import UNTOLD_SHARE, one_value, statement, untold_in_run
 
 Array = NDArray[np.float64]
 FORMAT = "morph-dslam run"
@@ -26,11 +27,18 @@ VERSION = 1
 
 @dataclass
 class RunResults:
-    """The results of all frames so far, in order; ``refined``: the reference state was refined over them."""
+    """The results of all frames so far, in order.
+
+    Attributes
+    ----------
+    refined : the reference state was refined over them. per_sequence : names of the parameters that are one
+        over the sequence.
+    """
 
     model: ReducedModel
     reference_frame: int
     refined: bool = False
+    per_sequence: tuple[str, ...] = ()
     frames: list[int] = field(default_factory=list)
     timestamps: list[float] = field(default_factory=list)
     results: list[FrameResult] = field(default_factory=list)
@@ -168,6 +176,7 @@ def summarise(run: RunResults) -> dict[str, Any]:
     if tracked.any():
         summary["median_residual_rms_px"] = float(np.median(run.residuals_px()[tracked]))
         summary["median_n_inliers"] = float(np.median(run.counts()[tracked, 1]))
+    summary["one_over_the_sequence"] = values_over_the_sequence(run)
     return summary | {"flags": flags(run)}
 
 
@@ -185,9 +194,15 @@ def flags(run: RunResults) -> list[str]:
             "neighbouring points have in common; it may be a model of something else, or too stiff, or "
             "a wrong camera file"
         )
-    range_width = run.model.upper - run.model.lower
+    found += _at_bound(run)
+    return found + _untold(run)
+
+
+def _at_bound(run: RunResults) -> list[str]:
+    """Parameters that the images put to an end of their range."""
+    found = []
     with np.errstate(invalid="ignore"):
-        determined = run.parameter_std() < 0.5 * range_width
+        determined = run.parameter_std() < UNTOLD_SHARE * (run.model.upper - run.model.lower)
     for k, parameter in enumerate(run.model.parameters):
         count = int((run.at_bound()[:, k] & determined[:, k]).sum())
         if count:
@@ -195,10 +210,34 @@ def flags(run: RunResults) -> list[str]:
                 f"parameter '{parameter.name}' is at a bound of the model's range in {count} frames: "
                 "the object may be outside what the model covers"
             )
-        unseen = int((run.tracked & ~determined[:, k]).sum())
-        if unseen:
-            found.append(f"parameter '{parameter.name}' cannot be told from the images in {unseen} frames")
     return found
+
+
+def _untold(run: RunResults) -> list[str]:
+    """What the images do not tell; of what is one per sequence, only after the last frame."""
+    parameters, estimates = run.model.parameters, [r.estimate for r in run.results if r.estimate]
+    constant = {k for k, p in enumerate(parameters) if p.name in run.per_sequence}
+    found = [
+        statement(parameters, part, f"in {count} frames")
+        for indices, (count, part) in untold_in_run(parameters, estimates).items()
+        if not constant.issuperset(indices)
+    ]
+    for indices, (_, part) in untold_in_run(parameters, estimates[-1:]).items():
+        if constant.issuperset(indices):
+            found.append(statement(parameters, part, "of the whole sequence"))
+    return found
+
+
+def values_over_the_sequence(run: RunResults) -> list[dict[str, object]]:
+    """Value, standard deviation and 95 % interval of each parameter that is one over the sequence."""
+    last = next((r.estimate for r in reversed(run.results) if r.estimate), None)
+    if last is None:
+        return []
+    return [
+        one_value(parameter, last.state.parameters[k], last.parameter_std[k])
+        for k, parameter in enumerate(run.model.parameters)
+        if parameter.name in run.per_sequence
+    ]
 
 
 def write_summary(path: Path, run: RunResults, extra: dict[str, Any]) -> dict[str, Any]:

@@ -111,7 +111,7 @@ class SequenceFilter:
         past: Prior | None = None,
     ) -> Estimate:
         """The estimate with its covariance, and what it would be without a prior on the parameters."""
-        told = errors.covariance
+        told = None
         if known is not None and known.information.any():
             of_pose = replace(known, information=np.zeros_like(known.information))
             told = self._errors(measured, linear, estimate.state, of_pose, past).covariance
@@ -129,6 +129,7 @@ class SequenceFilter:
             np.sqrt(grown) * errors.by_point[:, :, self._kept],
             grown * self._of_kept(errors.by_frames),
             np.sqrt(grown) * errors.by_cause[:, self._kept],
+            grown * self._of_kept(errors.unseen),
         )
 
     def _start(self, alone: Estimate) -> State:
@@ -178,7 +179,7 @@ class SequenceFilter:
         common, frame = self._noise.common, self._noise.frame
         by_point = np.sqrt(common) * linear.scores
         by_frames = frame * _quadratic(linear.scores, measured.correlation)
-        by_cause = np.zeros((0, self._unknowns))
+        by_cause, unseen = np.zeros((0, self._unknowns)), np.zeros_like(linear.hessian)
         hessian = linear.hessian.copy()
         if known is not None:
             information, by_cause = known.terms(state)[1], known.lasting_scores
@@ -191,12 +192,13 @@ class SequenceFilter:
             by_frames[np.ix_(kept, kept)] += weight @ self._past.by_frames @ weight
             by_cause = _longer(by_cause, len(self._past.by_cause))
             by_cause[: len(self._past.by_cause), kept] += self._past.by_cause @ weight
+            unseen[np.ix_(kept, kept)] += weight @ self._past.unseen @ weight
         linear = replace(linear, hessian=hessian)
         inverse = linear.inverse
         by_point, by_frames, by_cause = by_point @ inverse, inverse @ by_frames @ inverse, by_cause @ inverse
-        unseen = (common + frame) * linear.unseen
+        unseen = inverse @ unseen @ inverse + (common + frame) * linear.unseen
         covariance = _quadratic(by_point, measured.correlation) + by_frames + by_cause.T @ by_cause + unseen
-        return _Errors(by_point, by_frames, by_cause, covariance, inverse)
+        return _Errors(by_point, by_frames, by_cause, unseen, covariance, inverse)
 
 
 @dataclass(frozen=True)
@@ -205,8 +207,8 @@ class _Past:
 
     Attributes
     ----------
-    mean : (k,), SI. covariance : (k, k). by_point, by_frames, by_cause : as in `_Errors`, (p, 2, k), (k, k)
-        and (c, k).
+    mean : (k,), SI. covariance : (k, k). by_point, by_frames, by_cause, unseen : as in `_Errors`, (p, 2, k),
+        (k, k), (c, k) and (k, k).
     """
 
     mean: Array
@@ -214,6 +216,7 @@ class _Past:
     by_point: Array
     by_frames: Array
     by_cause: Array
+    unseen: Array
 
 
 @dataclass(frozen=True)
@@ -225,12 +228,14 @@ class _Errors:
     by_point : (p, 2, n) derivative by the part that stays with a point, in its standard deviations.
     by_frames : (n, n) covariance from what is new in each frame.
     by_cause : (c, n) derivative by what is the same in all frames of a known pose; see `Prior.lasting`.
-    covariance : (n, n) from all of it. inverse : (n, n) of the cost's Hessian.
+    unseen : (n, n) covariance of what nothing tells of. covariance : (n, n) from all of it.
+    inverse : (n, n) of the cost's Hessian.
     """
 
     by_point: Array
     by_frames: Array
     by_cause: Array
+    unseen: Array
     covariance: Array
     inverse: Array
 

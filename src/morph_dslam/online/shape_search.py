@@ -9,10 +9,8 @@ import numpy as np
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
 from morph_dslam.online.estimation import Estimate, State
+from morph_dslam.online.observability import UNTOLD_SHARE
 from morph_dslam.online.registration import shape_starts
-
-#: A parameter whose standard deviation exceeds this share of its range is not determined by the images.
-UNDETERMINED_SHARE = 0.25
 
 
 class ShapeSearch:
@@ -39,5 +37,5 @@ def with_undetermined_at_default(model: ReducedModel, estimate: Estimate) -> Sta
     next frame from there would lead into the wrong valley as soon as it has an effect.
     """
     state = estimate.state
-    undetermined = ~(estimate.parameter_std < UNDETERMINED_SHARE * (model.upper - model.lower))
+    undetermined = ~(estimate.parameter_std < UNTOLD_SHARE * (model.upper - model.lower))
     return replace(state, parameters=np.where(undetermined, model.default, state.parameters))

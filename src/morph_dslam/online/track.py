@@ -118,12 +118,12 @@ def track(options: TrackOptions) -> dict[str, Any]:
     constant = tuple(dict.fromkeys((*placement.per_sequence, *options.per_sequence)))
     options = replace(options, tracker=replace(options.tracker, per_sequence=constant))
     _warm_up(camera, reference, placement, options)
-    run = RunResults(placement.model, reference.index)
+    run = RunResults(placement.model, reference.index, per_sequence=constant)
     try:
         keyframes = _follow(source, camera, reference, placement, options, run)
         if options.refine_reference and landmarks is not None:
             refined = _refined(camera, landmarks, placement, keyframes, reference, options)
-            again = RunResults(placement.model, reference.index, refined=True)
+            again = RunResults(placement.model, reference.index, True, constant)
             _follow(source, camera, reference, refined, options, again)
             run = again
     finally:

@@ -1,0 +1,112 @@
+"""What the images do not tell, on models whose blind combinations are known."""
+
+import numpy as np
+import pytest
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.model import Parameter, ReducedModel, SeparatedField, SurfacePoints
+from morph_dslam.model.functions import ParameterFunctions
+from morph_dslam.online.estimation import BoundPoints, Estimator, State
+from morph_dslam.online.frame_result import STAGES, FrameResult
+from morph_dslam.online.measurement_noise import Measured
+from morph_dslam.online.observability import one_value, statement, untold, value_line
+from morph_dslam.online.results import RunResults, summarise
+from morph_dslam.online.sequence_filter import SequenceFilter
+from tests.support.bent_sheet import sheet_mesh
+
+CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
+POSE = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
+
+
+def beam_model():
+    """A sheet bent by load over stiffness to first order, (load - 2 stiffness) w; a colour has no effect.
+
+    ``load`` and ``stiffness`` (-1 to 1 each) can therefore not be told apart; ``shear`` can.
+    """
+    nodes, triangles = sheet_mesh(22, 16)
+    s, zero = 2.0 * nodes[:, 0] / 0.420, np.zeros(len(nodes))
+    bend = 0.02 * np.column_stack([zero, zero, 1.0 - s**2])
+    shear = 0.02 * np.column_stack([zero, s**3, zero])
+    parameters = tuple(
+        Parameter(name, "ratio", "1", -1.0, 1.0, 0.0) for name in ("load", "stiffness", "shear", "colour")
+    )
+    indices = np.eye(4, dtype=np.int64)[:3]
+    rows = np.array([[1.0, 0.0], [-2.0, 0.0], [0.0, 1.0]])
+    functions = ParameterFunctions(-np.ones(4), np.ones(4), indices, rows)
+    return ReducedModel(
+        "beam", nodes, triangles, parameters, SeparatedField(np.stack([bend, shear]), functions)
+    )
+
+
+MODEL = beam_model()
+
+
+def run_of(per_sequence, frames=3):
+    """A run in which 80 points with noise are seen in every frame."""
+    rng = np.random.default_rng(0)
+    surface = SurfacePoints(rng.integers(0, len(MODEL.triangles), 80), rng.dirichlet(np.ones(3), 80))
+    points, truth = BoundPoints.from_surface(MODEL, surface), State(np.array([0.3, 0.1, 0.2, 0.0]), POSE)
+    estimator = Estimator(MODEL, CAMERA)
+    names = [parameter.name for parameter in MODEL.parameters]
+    filtered = SequenceFilter(estimator, [names.index(name) for name in per_sequence])
+    run = RunResults(MODEL, 0, per_sequence=per_sequence)
+    for number in range(frames):
+        pixels = CAMERA.project(points.in_camera(truth)) + 0.3 * rng.standard_normal((80, 2))
+        weights, normals = np.ones(80), np.zeros((80, 2))
+        alone = estimator.estimate(points, pixels, weights, truth)
+        estimate = filtered.fuse(Measured(points, pixels, weights, normals, np.eye(80)), alone)
+        times = dict.fromkeys(STAGES, 1.0)
+        run.add(number, 0.1 * number, FrameResult("tracked", "", estimate, 0.4, 80, 80, times, 9.0))
+    return run
+
+
+def test_parameters_without_effect_and_those_that_act_alike_are_named():
+    told = summarise(run_of(()))["flags"]
+    assert told[0] == "parameter 'colour' cannot be told from the images in 3 frames"
+    assert told[1].startswith(
+        "parameters 'load' and 'stiffness' cannot be told apart from the images in 3 frames"
+    )
+    # 2 stiffness - load stays the same: twice as much of the load as of the stiffness, both in shares of 2.
+    assert "'load' is 0.179 larger and 'stiffness' is 0.0894 larger" in told[1]
+    assert len(told) == 2
+
+
+def test_values_over_the_sequence_have_an_interval_and_say_when_nothing_tells():
+    summary = summarise(run_of(("shear", "stiffness", "colour"), frames=12))
+    stiffness, shear, colour = summary["one_over_the_sequence"]
+    low, high = shear["interval_95"]
+    assert low < 0.2 < high
+    assert high - low < 0.05
+    assert shear["told_by_the_images"]
+    assert not stiffness["told_by_the_images"]
+    assert not colour["told_by_the_images"]
+    assert any("'colour' cannot be told from the images of the whole sequence" in t for t in summary["flags"])
+    assert value_line(shear).startswith("shear = 0.")
+    assert value_line(colour).endswith("the images do not tell")
+
+
+def test_interval_is_in_the_parameters_unit():
+    modulus = Parameter("shear_modulus", "stress", "kPa", 1e4, 9e4, 5e4)
+    figures = one_value(modulus, 5.0e4, 1e3)
+    assert figures["interval_95"] == pytest.approx([50.0 - 1.96, 50.0 + 1.96])
+    assert value_line(figures) == "shear_modulus = 50 kPa over the sequence, 95 % interval 48.04 to 51.96 kPa"
+
+
+def test_combinations_that_share_a_parameter_come_together():
+    """Three angles of which only the sum counts: two directions are open."""
+    seen = np.ones(3) / np.sqrt(3.0)
+    covariance = np.linalg.inv(1e4 * np.outer(seen, seen) + 1e-6 * np.eye(3))
+    (part,) = untold(covariance, np.ones(3))
+    assert part.indices == (0, 1, 2)
+    assert len(part.directions) == 2
+    np.testing.assert_allclose(part.directions @ seen, 0.0, atol=1e-6)
+    names = [Parameter(name, "angle", "deg", -1.0, 1.0, 0.0) for name in "abc"]
+    assert statement(names, part, "in 5 frames") == (
+        "parameters 'a', 'b' and 'c' cannot be told apart from the images in 5 frames"
+    )
+
+
+def test_all_told_and_nothing_told():
+    assert untold(np.diag([0.01, 0.02]) ** 2, np.ones(2)) == []
+    assert [part.indices for part in untold(np.full((2, 2), np.inf), np.ones(2))] == [(0,), (1,)]
