@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from morph_dslam.geometry import RigidTransform
 from morph_dslam.online.estimation import Estimate
+from morph_dslam.online.known_pose import KnownPose
 
 #: The stages of a frame that are timed, in order.
 STAGES = ("prepare", "flow", "estimate", "render", "correct", "search", "recover", "outline", "fuse")
@@ -14,6 +16,8 @@ FOUND_AGAIN = "found again where it was last seen"
 RECOVERED = "recovered from the reference view's features"
 #: Follows the reason of a frame in which the model, not noise, is what is left of the residuals.
 UNEXPLAINED = "the model does not explain the images"
+#: Follows the reason of frames in which an anchored object is away from its place.
+HAS_MOVED = "the object has moved from its place in the map"
 
 
 @dataclass(frozen=True)
@@ -22,12 +26,15 @@ class FrameResult:
 
     Attributes
     ----------
-    status : "tracked" or "lost". reason : how it was found, or why it was not.
-    estimate : None when lost.
+    status : "tracked"; "hidden", where the map tells the pose but too few points the parameters; or "lost".
+    reason : how it was found, or why it was not.
+    estimate : None unless tracked.
     residual_rms_px : root mean square of the inliers' residuals, NaN when lost.
     n_points, n_inliers : points that the object itself does not hide, and those that support the estimate.
     timings_ms : by stage, milliseconds. total_ms : the whole frame. recovered : found again after a loss.
     unexplained_px : what the model leaves of the residuals, see `systematic_errors`; NaN when lost.
+    pose_from : "points", "points and map", "map" where it is hidden, or "" where there is no pose.
+    known : the pose by the map, where that alone tells it.
     """
 
     status: str
@@ -40,3 +47,29 @@ class FrameResult:
     total_ms: float
     recovered: bool = False
     unexplained_px: float = float("nan")
+    pose_from: str = ""
+    known: KnownPose | None = None
+
+    @classmethod
+    def hidden(
+        cls,
+        why: str,
+        known: KnownPose,
+        n_points: int,
+        n_inliers: int,
+        timings_ms: dict[str, float],
+        total_ms: float,
+    ) -> FrameResult:
+        """The map tells where the object is, but it is covered there, or gone."""
+        reason = f"hidden: {why}; its place is known from the map, its parameters are not"
+        return cls(
+            "hidden", reason, None, float("nan"), n_points, n_inliers, timings_ms, total_ms,
+            pose_from="map", known=known,
+        )  # fmt: skip
+
+    @property
+    def pose(self) -> RigidTransform | None:
+        """camera_from_object; None when lost."""
+        if self.estimate is not None:
+            return self.estimate.state.camera_from_object
+        return None if self.known is None else self.known.pose

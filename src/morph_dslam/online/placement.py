@@ -17,6 +17,7 @@ from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.turned_model import turned_model
 from morph_dslam.online.estimation import State
+from morph_dslam.online.place_in_map import PlaceInMap
 from morph_dslam.online.registration import RegistrationOptions, register
 
 Array = NDArray[np.float64]
@@ -34,6 +35,7 @@ class Placement:
     per_sequence : names of the parameters that the placement leaves open and that do not change: the angle
         about an axis.
     covariance : (d + 6, d + 6) of ``state``; None where it is not known.
+    place : in the map of the scene; None where there is none.
     """
 
     model: ReducedModel
@@ -43,6 +45,7 @@ class Placement:
     flags: tuple[str, ...]
     per_sequence: tuple[str, ...] = ()
     covariance: Array | None = None
+    place: PlaceInMap | None = None
 
 
 def load_placement(path: Path, model: ReducedModel) -> Placement:
@@ -60,7 +63,7 @@ def load_placement(path: Path, model: ReducedModel) -> Placement:
         frame, axis = int(keyframe["frame"]), content["axis_of_revolution"]
         facts = {key: content[key] for key in ("score", "runner_up_score", "rms_px", "map_units_per_metre")}
         ambiguous = bool(content["ambiguous"])
-        of_pose = _pose_covariance(content, pose)
+        place = PlaceInMap.from_content(content)
     except OSError as error:
         raise RegistrationError(f"cannot read the registration {path}: {error.strerror}") from error
     except (ValueError, KeyError, TypeError, IndexError) as error:
@@ -75,30 +78,10 @@ def load_placement(path: Path, model: ReducedModel) -> Placement:
             f"'{open_angles[0]}'"
         )
     state = State(model.default, pose)
+    of_pose = place.pose_covariance(pose)
     covariance = None if of_pose is None else _of_state(of_pose, len(model.parameters))
-    return Placement(model, frame, state, {"from": "map", **facts}, tuple(flags), open_angles, covariance)
-
-
-def _pose_covariance(content: dict[str, Any], pose: RigidTransform) -> Array | None:
-    """Covariance (6, 6) of the rotation vector and the translation of ``pose``, camera_from_object, metres.
-
-    From that of log scale, rotation vector and mean node in the map, whose unit the scale leaves uncertain:
-    an object that is larger in the map is nearer to the camera.
-    """
-    if content["covariance"] is None:
-        return None
-    scale = float(content["map_units_per_metre"])
-    world_from_object = np.array(content["world_from_object"], dtype=np.float64)[:3, :3] / scale
-    camera_from_world = pose.rotation @ world_from_object.T
-    centre = pose.apply(np.array(content["mean_node_m"], dtype=np.float64))
-    arm = centre - pose.translation
-    across = np.cross(np.eye(3), arm).T  # (a x arm) = across @ a
-    slopes = np.zeros((6, 7))
-    slopes[:3, 1:4] = camera_from_world
-    slopes[3:, 0] = -centre
-    slopes[3:, 1:4] = -across @ camera_from_world
-    slopes[3:, 4:] = camera_from_world / scale
-    return slopes @ np.array(content["covariance"], dtype=np.float64) @ slopes.T
+    facts = {"from": "map", **facts}
+    return Placement(model, frame, state, facts, tuple(flags), open_angles, covariance, place)
 
 
 def _of_state(of_pose: Array, n_parameters: int) -> Array:

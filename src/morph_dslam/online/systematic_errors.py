@@ -108,7 +108,8 @@ class SystematicErrors:
         weights = np.where(usable, np.minimum(1.0, huber / np.maximum(length, 1e-300)), 0.0)
         jacobian = np.where(usable[:, None, None], jacobian, 0.0)
         scores = weights[:, None, None] * jacobian
-        gain = self._inverse(np.tensordot(scores, jacobian, axes=([0, 1], [0, 1])), prior)
+        hessian = np.tensordot(scores, jacobian, axes=([0, 1], [0, 1]))
+        gain = self._inverse(hessian if prior is None else hessian + prior.terms(estimate.state)[1])
         covariance = estimate.covariance.copy()
         if self._covariance is not None:
             moved = self._warps(estimate.state) @ self._jacobian
@@ -127,11 +128,8 @@ class SystematicErrors:
             functions, pose.rotation, pose.translation, points.rest, points.field.modes, intrinsics
         )
 
-    def _inverse(self, hessian: Array, prior: Prior | None) -> Array:
-        """H^-1; nothing moves along what neither the images nor the past determine."""
-        d = len(self._estimator.model.parameters)
-        if prior is not None:
-            hessian[:d, :d] += prior.information
+    def _inverse(self, hessian: Array) -> Array:
+        """H^-1; nothing moves along what neither the images nor the prior determine."""
         scale = self._estimator.scale
         values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
         seen = values > max(values[-1], 1e-30) * EIGENVALUE_FLOOR

@@ -170,11 +170,11 @@ def _refined(
         tracker.estimator,
         bind_landmarks(placement.model, landmarks.points, options.registration),
         camera.undistort_pixels(landmarks.pixels),
-        tracker.reference_pixels,
+        tracker.reference.pixels,
         placement.state,
         choose_keyframes(keyframes, options.refinement.n_keyframes),
         trust,
-        tracker.outline,
+        tracker.reference.outline,
     )
     return replace(placement, state=state, covariance=None)
 

@@ -1,0 +1,59 @@
+"""What a frame is made into, what an attempt to find the object in it gave, and whether to believe it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.online.estimation import Estimate, Prior
+from morph_dslam.online.measurement import Measurement
+from morph_dslam.online.outline import OutlineMeasurement
+from morph_dslam.online.tracker_options import TrackerOptions
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A frame made ready: the undistorted grey image (h, w), and flattened."""
+
+    grey: NDArray[np.uint8]
+    flat: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """An estimate, which measurements support it (p,), and all the measurements.
+
+    Attributes
+    ----------
+    prior : what was known of the pose from the map when it was made; None if nothing was.
+    """
+
+    estimate: Estimate
+    inliers: NDArray[np.bool_]
+    measurement: Measurement
+    prior: Prior | None = None
+    outline: OutlineMeasurement | None = None
+
+
+def refusal(attempt: Attempt, options: TrackerOptions) -> str:
+    """Why an attempt is not to be believed; empty when it is.
+
+    With a pose from the map the parameters alone are left to be found, which few points can tell. They must
+    agree closely then, and be most of those that were found: what looks alike by chance does neither.
+    """
+    measurement, count = attempt.measurement, int(attempt.inliers.sum())
+    needed = min(options.least_inliers, int(np.ceil(options.least_share * len(attempt.inliers))))
+    if count >= needed:
+        return ""
+    visible = int(measurement.visible.sum())
+    if attempt.prior is None:
+        return f"{count} of {visible} points agree, at least {needed} needed"
+    if count < options.least_anchored:
+        return f"{count} of {visible} points agree, at least {options.least_anchored} needed"
+    found = int(measurement.valid.sum())
+    close = attempt.estimate.sigma_px < options.anchored_sigma_px
+    if close and count >= options.anchored_share * found:
+        return ""
+    return f"of {found} points found only {count} agree on a shape, by {attempt.estimate.sigma_px:.1f} px"

@@ -1,0 +1,87 @@
+"""Where a registered object is in a map, and from there in a camera that was found in the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.online.known_pose import KnownPose
+from morph_dslam.online.slam.pose import PoseEstimate
+from morph_dslam.similarity import SimilarityTransform
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PlaceInMap:
+    """Where an undeformed object is in a map.
+
+    Attributes
+    ----------
+    world_from_object : metres to the map's unit. centre : (3,) the mean node, object frame, metres.
+    covariance : (7, 7) of log scale, rotation vector and translation about ``centre``, in the map; None where
+        nobody knows.
+    """
+
+    world_from_object: SimilarityTransform
+    centre: Array
+    covariance: Array | None
+
+    @classmethod
+    def from_content(cls, content: dict[str, Any]) -> PlaceInMap:
+        """From the content of a registration.json; raises KeyError, TypeError or ValueError if it is none."""
+        matrix = np.array(content["world_from_object"], dtype=np.float64)
+        scale, covariance = float(content["map_units_per_metre"]), content["covariance"]
+        return cls(
+            SimilarityTransform(scale, matrix[:3, :3] / scale, matrix[:3, 3]),
+            np.array(content["mean_node_m"], dtype=np.float64),
+            None if covariance is None else np.array(covariance, dtype=np.float64),
+        )
+
+    def slopes(self, pose: RigidTransform) -> Array:
+        """How the increment (6,) of the object's ``pose`` in a camera depends on the registration: (6, 7).
+
+        The registration's turn is about the mean node. An object that is larger in the map is nearer to the
+        camera, since its true size is known.
+        """
+        placed = self.world_from_object
+        camera_from_world = pose.rotation @ placed.rotation.T
+        arm = pose.rotation @ self.centre
+        result = np.zeros((6, 7))
+        result[:3, 1:4] = camera_from_world
+        result[3:, 0] = -(pose.translation + arm)
+        result[3:, 1:4] = cross_matrix(arm) @ camera_from_world
+        result[3:, 4:] = camera_from_world / placed.scale
+        return result
+
+    def pose_covariance(self, pose: RigidTransform) -> Array | None:
+        """(6, 6) of the object's ``pose`` in an exactly known camera; None where nobody knows."""
+        if self.covariance is None:
+            return None
+        slopes = self.slopes(pose)
+        return slopes @ self.covariance @ slopes.T
+
+    def known_pose(self, camera: PoseEstimate) -> KnownPose:
+        """The object's pose in a camera that was found in the map, metres; needs the covariance."""
+        if self.covariance is None:
+            raise ValueError("the place has no covariance")
+        placed = self.world_from_object
+        turn, shift = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
+        translation = (turn @ placed.translation + shift) / placed.scale
+        pose = RigidTransform(turn @ placed.rotation, translation)
+        # The camera's twist turns everything about the camera, and shifts it in the map's unit.
+        by_camera = np.eye(6)
+        by_camera[3:, :3], by_camera[3:, 3:] = -cross_matrix(translation), np.eye(3) / placed.scale
+        values, vectors = np.linalg.eigh(self.covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        return KnownPose(pose, by_camera @ camera.covariance @ by_camera.T, self.slopes(pose) @ root)
+
+
+def cross_matrix(vector: Array) -> Array:
+    """The matrix [v]x (3, 3), with [v]x w = v x w."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -1,0 +1,111 @@
+"""The reference view: the object's texture, the points bound in it, and features to find it again by."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import RegistrationError
+from morph_dslam.online.appearance import ReferenceAppearance
+from morph_dslam.online.attempt import Picture
+from morph_dslam.online.binding import DrawnSurface, View, bind_pixels, draw_view, view_of
+from morph_dslam.online.estimation import BoundPoints, Estimator, State
+from morph_dslam.online.features import interior, spread_corners
+from morph_dslam.online.measurement import Measurement, compare_with_rendering, visible_surface
+from morph_dslam.online.measurement_noise import window_correlation
+from morph_dslam.online.outline import Outline
+from morph_dslam.online.relocalisation import Relocaliser
+from morph_dslam.online.timing import StageClock
+from morph_dslam.online.tracker_options import TrackerOptions
+
+Array = NDArray[np.float64]
+
+
+class ReferenceView:
+    """A registered view of the object.
+
+    Parameters
+    ----------
+    picture : the view. state : the object in it.
+
+    Attributes
+    ----------
+    surface : what of the model is drawn. points : p of them, bound in the view. pixels : (p, 2) there.
+    outline : the object's rim, None where it is not used. all_points : with those of the outline.
+    correlation : of the errors of all points' measurements.
+    relocaliser : finds the object by the view's features.
+
+    Raises
+    ------
+    RegistrationError
+        If the object shows too few corners.
+    """
+
+    def __init__(self, estimator: Estimator, picture: Picture, state: State, options: TrackerOptions) -> None:
+        self._estimator, self._options, self.state = estimator, options, state
+        model, camera = estimator.model, estimator.camera
+        self.surface = DrawnSurface.of(model)
+        drawn = self.surface.model
+        view = view_of(drawn, camera, state)
+        self.appearance = ReferenceAppearance(drawn, camera, picture.flat, view, self.surface.closed)
+        mask = interior(draw_view(view, drawn.triangles, camera).covered, options.measurement.patch_half + 2)
+        self.points = self._choose_points(picture, mask, view)
+        self.pixels = camera.project(self.points.in_camera(state))
+        self.relocaliser = Relocaliser(estimator, drawn, picture.grey, mask, view)
+        self.outline, self.all_points = None, self.points
+        if options.use_outline:
+            self.outline = Outline(model, camera, picture.grey, state, options.outline)
+            self.all_points = self.points.joined(self.outline.points)
+        places = camera.project(self.all_points.in_camera(state))
+        self.correlation = window_correlation(places, options.flow.window)
+
+    @property
+    def redundancy(self) -> float:
+        """How many of the points count as one, because their windows overlap."""
+        return float(self.correlation.sum() / len(self.correlation))
+
+    def covered(self, state: State) -> NDArray[np.bool_]:
+        """Pixels (h, w) that the object covers in a state."""
+        camera, drawn = self._estimator.camera, self.surface.model
+        return draw_view(view_of(drawn, camera, state), drawn.triangles, camera).covered
+
+    def measure(
+        self, picture: Picture, state: State, followed: Measurement | None, clock: StageClock
+    ) -> Measurement:
+        """Where a frame shows the points, compared with this view rendered in ``state``.
+
+        ``followed`` says where to look first; None where nothing is known but the state.
+        """
+        drawn, camera = self.surface.model, self._estimator.camera
+        with clock.stage("render"):
+            view = view_of(drawn, camera, state)
+            rendering = self.appearance.render(view)
+        with clock.stage("correct"):
+            positions = self.points.in_camera(state)
+            predicted = camera.project(positions)
+            visible = visible_surface(
+                self.points.surface, positions, predicted, view, drawn.triangles, self.appearance, rendering
+            )
+            guesses = predicted
+            if followed is not None:
+                guesses = np.where(followed.valid[:, None], followed.pixels, predicted)
+            return compare_with_rendering(
+                picture.flat,
+                rendering,
+                predicted,
+                guesses,
+                visible,
+                self._options.flow,
+                self._options.measurement,
+            )
+
+    def _choose_points(self, picture: Picture, mask: NDArray[np.uint8], view: View) -> BoundPoints:
+        model, camera = self._estimator.model, self._estimator.camera
+        corners = spread_corners(picture.flat, mask, self._options.n_points)
+        surface, _ = bind_pixels(self.surface.model, camera, view, corners)
+        if len(surface) < 2 * (len(model.parameters) + 6):
+            raise RegistrationError(
+                f"the object shows only {len(surface)} corners in the reference frame, too few to follow it: "
+                "take a sharper reference frame, or give the object a printed texture"
+            )
+        return BoundPoints.from_surface(model, surface)
