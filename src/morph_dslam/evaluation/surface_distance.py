@@ -42,14 +42,15 @@ def _distances(points, corners, centres, radii):
     result = np.empty(len(points))
     for i in range(len(points)):
         best = np.inf
+        # In single numbers: most triangles are left out here, and small arrays would cost more than that.
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
         for t in range(len(corners)):
-            gap = points[i] - centres[t]
-            nearest = np.sqrt(np.dot(gap, gap)) - radii[t]
-            if nearest > 0.0 and nearest * nearest >= best:
+            square = (x - centres[t, 0]) ** 2 + (y - centres[t, 1]) ** 2 + (z - centres[t, 2]) ** 2
+            if square >= (radii[t] + best) ** 2:
                 continue
-            square = _square_distance_to_triangle(points[i], corners[t, 0], corners[t, 1], corners[t, 2])
-            best = min(best, square)
-        result[i] = np.sqrt(best)
+            off = _square_distance_to_triangle(points[i], corners[t, 0], corners[t, 1], corners[t, 2])
+            best = min(best, np.sqrt(off))
+        result[i] = best
     return result
 
 
