@@ -1,22 +1,17 @@
-"""Parameters and pose from pixels: Levenberg-Marquardt with Huber weights inside the parameter box.
-
-The steps are taken in scaled unknowns (half a parameter range, one radian, the object's size), so that the
-damping treats them alike. Directions that the images cannot see get no step and a large standard deviation:
-the damping has a floor relative to the best-seen direction, and the iteration ends when the model predicts no
-worthwhile decrease. Bounds are kept by an active set (Nocedal & Wright, Numerical Optimization, ch. 16.7).
-"""
+"""Parameters and pose from pixels: Levenberg-Marquardt with Huber weights inside the parameter box."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.model import ReducedModel
-from morph_dslam.online.bounded_step import bounded_step
+from morph_dslam.online.depth_residuals import PointDepths
+from morph_dslam.online.levenberg_marquardt import Box, Minimum, minimise
 from morph_dslam.online.prior import Prior
 from morph_dslam.online.reprojection import linearise
 from morph_dslam.online.robust_covariance import huber_covariance
@@ -26,10 +21,6 @@ __all__ = ["BoundPoints", "Estimate", "EstimationOptions", "Estimator", "Prior",
 
 Array = NDArray[np.float64]
 
-#: Largest step of one iteration in scaled unknowns: keeps an unseen direction from crossing the box at once.
-LARGEST_STEP = 1.0
-#: Damping floor, relative to the best-seen direction.
-DAMPING_FLOOR = 1e-6
 #: A parameter nearer to its bound than this share of its range counts as being at the bound.
 BOUND_SHARE = 1e-3
 
@@ -103,9 +94,12 @@ class Estimator:
         self.model, self.camera = model, camera
         self.options = options or EstimationOptions()
         self._linearise = linearise
-        size = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
-        half_ranges = 0.5 * (model.upper - model.lower)
-        self.scale = np.concatenate([half_ranges, np.ones(3), np.full(3, size)])
+        self.box = Box.of(model)
+
+    @property
+    def scale(self) -> Array:
+        """Of the unknowns (d + 6,): half a parameter range, one radian, the object's size."""
+        return self.box.scale
 
     def evaluate(
         self,
@@ -115,16 +109,19 @@ class Estimator:
         state: State,
         normals: Array | None = None,
         prior: Prior | None = None,
+        depths: PointDepths | None = None,
     ) -> tuple[float, Array, Array, Array]:
-        """Cost, Hessian, gradient and residuals at a state; see `reprojection.linearise`."""
+        """Cost, Hessian, gradient and residuals of pixels at a state; see `reprojection.linearise`."""
         pose = state.camera_from_object
         normals = np.zeros_like(pixels) if normals is None else normals
         cost, hessian, gradient, residuals = self._linearise(
             points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
             points.field.modes, self.camera.intrinsics, pixels, weights, normals, self.options.huber_px,
         )  # fmt: skip
-        if prior is not None:
-            terms = prior.terms(state)
+        others = [] if prior is None else [prior.terms(state)]
+        if depths is not None:
+            others.append(depths.terms(points, state)[:3])
+        for terms in others:
             cost, hessian, gradient = cost + terms[0], hessian + terms[1], gradient + terms[2]
         return cost, hessian, gradient, residuals
 
@@ -136,6 +133,7 @@ class Estimator:
         start: State,
         normals: Array | None = None,
         prior: Prior | None = None,
+        depths: PointDepths | None = None,
     ) -> Estimate:
         """Minimise the Huber cost from ``start``.
 
@@ -145,32 +143,17 @@ class Estimator:
         weights : (p,) non-negative; points of weight 0 are ignored (their residuals are still reported).
         normals : (p, 2), for points that count only along a direction; see `reprojection.linearise`.
         prior : what is known of the parameters and the pose beforehand; nothing by default.
+        depths : of the p points, where a depth camera saw them.
         """
-        options, scale = self.options, self.scale
-        state = State(np.clip(start.parameters, self.model.lower, self.model.upper), start.camera_from_object)
         normals = np.zeros_like(pixels) if normals is None else normals
-        cost, hessian, gradient, residuals = self.evaluate(points, pixels, weights, state, normals, prior)
-        damping, iterations, converged = 1e-3, 0, False
-        while iterations < options.max_iterations and not converged:
-            iterations += 1
-            step, predicted = self._damped_step(hessian, gradient, state, damping)
-            if predicted <= options.tolerance * cost + 1e-14:
-                # A damped step predicts little although much could be gained: believe it only undamped.
-                converged = damping <= 1e-2
-                damping = min(damping * 0.01, 1e-2)
-                continue
-            trial = self._inside(moved(state, step * scale))
-            attempt = self.evaluate(points, pixels, weights, trial, normals, prior)
-            if attempt[0] < cost:
-                ratio = (cost - attempt[0]) / predicted
-                state, (cost, hessian, gradient, residuals) = trial, attempt
-                damping = max(damping * (0.1 if ratio > 0.5 else 1.0), 1e-9)
-            else:
-                damping *= 10.0
-                converged = damping > 1e8
+
+        def evaluate(state: State) -> tuple[float, Array, Array, Array]:
+            return self.evaluate(points, pixels, weights, state, normals, prior, depths)
+
+        found = minimise(evaluate, start, self.box, self.options.max_iterations, self.options.tolerance)
         # A point on an outline gives one number, all others give two.
         numbers = np.where((normals != 0.0).any(axis=1), 1, 2)
-        return self._finish(state, cost, hessian, residuals, weights, numbers, iterations, converged)
+        return self.finished(found, weights, numbers)
 
     def estimate_from(
         self, points: BoundPoints, pixels: Array, weights: Array, starts: Sequence[State]
@@ -179,43 +162,20 @@ class Estimator:
         found = [self.estimate(points, pixels, weights, start) for start in starts]
         return sorted(found, key=lambda estimate: estimate.cost)
 
-    def _damped_step(
-        self, hessian: Array, gradient: Array, state: State, damping: float
-    ) -> tuple[Array, float]:
-        """Step in scaled unknowns and the decrease of the cost that the quadratic model predicts for it."""
-        scale, d = self.scale, len(state.parameters)
-        scaled_hessian = hessian * np.outer(scale, scale)
-        scaled_gradient = gradient * scale
-        diagonal = np.diag(scaled_hessian)
-        floor = max(diagonal.max() * DAMPING_FLOOR, 1e-30)
-        damped = scaled_hessian + np.diag(damping * np.maximum(diagonal, floor) + 1e-3 * floor)
-        lower, upper = np.full(d + 6, -LARGEST_STEP), np.full(d + 6, LARGEST_STEP)
-        lower[:d] = np.maximum(lower[:d], (self.model.lower - state.parameters) / scale[:d])
-        upper[:d] = np.minimum(upper[:d], (self.model.upper - state.parameters) / scale[:d])
-        step = bounded_step(damped, scaled_gradient, lower, upper)
-        predicted = -(scaled_gradient @ step + 0.5 * step @ scaled_hessian @ step)
-        return step, float(predicted)
-
-    def _inside(self, state: State) -> State:
-        """Rounding may leave a parameter an ulp outside its range; bring it back exactly."""
-        return replace(state, parameters=np.clip(state.parameters, self.model.lower, self.model.upper))
-
-    def _finish(
-        self,
-        state: State,
-        cost: float,
-        hessian: Array,
-        residuals: Array,
-        weights: Array,
-        numbers: NDArray[np.integer],
-        iterations: int,
-        converged: bool,
-    ) -> Estimate:
-        model = self.model
+    def finished(self, found: Minimum, weights: Array, numbers: NDArray[np.integer]) -> Estimate:
+        """The estimate at a minimum; ``numbers`` (p,) says how many each point gives."""
+        model, state, residuals = self.model, found.state, found.residuals
         used = (weights > 0.0) & np.isfinite(residuals).all(axis=1)
         sigma, covariance = huber_covariance(
-            hessian, residuals[used], weights[used], numbers[used], self.options.huber_px, self.scale
+            found.hessian,
+            residuals[used],
+            weights[used],
+            numbers[used],
+            self.options.huber_px,
+            self.box.scale,
         )
         margin = BOUND_SHARE * (model.upper - model.lower)
         at_bound = (state.parameters < model.lower + margin) | (state.parameters > model.upper - margin)
-        return Estimate(state, cost, residuals, sigma, covariance, at_bound, iterations, converged)
+        return Estimate(
+            state, found.cost, residuals, sigma, covariance, at_bound, found.iterations, found.converged
+        )

@@ -22,11 +22,12 @@ class LinearCost:
 
     Attributes
     ----------
-    scores : (p, 2, n) by which an error of a pixel enters the gradient. hessian : (n, n). scale : (n,) of
-        the unknowns.
+    scores : (p, 2, n) by which an error of a pixel enters the gradient. of_depths : (n, n), covariance of the
+        gradient from errors of depths. hessian : (n, n). scale : (n,) of the unknowns.
     """
 
     scores: Array
+    of_depths: Array
     hessian: Array
     scale: Array
 
@@ -48,7 +49,12 @@ class LinearCost:
         huber = estimator.options.huber_px
         factor = np.minimum(1.0, huber / np.maximum(np.where(used, length, 0.0), 1e-300))
         scores = (measured.weights * factor)[:, None, None] * jacobian
-        return cls(scores, np.tensordot(scores, jacobian, axes=([0, 1], [0, 1])), estimator.scale)
+        hessian = np.tensordot(scores, jacobian, axes=([0, 1], [0, 1]))
+        of_depths = np.zeros_like(hessian)
+        if measured.depths is not None:
+            _, part, _, far = measured.depths.terms(points, state)
+            hessian, of_depths = hessian + part, measured.depths.variance_px(far) * part
+        return cls(scores, of_depths, hessian, estimator.scale)
 
     @cached_property
     def _spectrum(self) -> tuple[Array, Array, float]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.online.depth_residuals import PointDepths
 from morph_dslam.online.estimation import BoundPoints
 
 Array = NDArray[np.float64]
@@ -20,7 +21,7 @@ class Measured:
     ----------
     points : p of them. pixels : (p, 2) as measured. weights : (p,).
     normals : (p, 2), zero for points that count in both directions; see `reprojection.linearise`.
-    correlation : (p, p) of the errors of the points' measurements.
+    correlation : (p, p) of the errors of the points' measurements. depths : where a depth camera saw them.
     """
 
     points: BoundPoints
@@ -28,6 +29,7 @@ class Measured:
     weights: Array
     normals: Array
     correlation: Array
+    depths: PointDepths | None = None
 
 
 def window_correlation(pixels: Array, window: int) -> Array:

@@ -95,6 +95,7 @@ class SequenceFilter:
             self._start(by_itself),
             measured.normals,
             past if known is None else past.joined(known),
+            measured.depths,
         )
         linear = LinearCost.about(self._estimator, measured, fused)
         errors = self._errors(measured, linear, fused.state, known, past)
@@ -178,7 +179,7 @@ class SequenceFilter:
         d, kept = self._unknowns - 6, self._kept
         common, frame = self._noise.common, self._noise.frame
         by_point = np.sqrt(common) * linear.scores
-        by_frames = frame * _quadratic(linear.scores, measured.correlation)
+        by_frames = frame * _quadratic(linear.scores, measured.correlation) + linear.of_depths
         by_cause, unseen = np.zeros((0, self._unknowns)), np.zeros_like(linear.hessian)
         hessian = linear.hessian.copy()
         if known is not None:

@@ -1,0 +1,162 @@
+"""Depth residuals against finite differences, exact planes, and the spread of repeated measurements."""
+
+import numpy as np
+import pytest
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.model import SurfacePoints
+from morph_dslam.online.depth_residuals import (
+    DepthOptions,
+    PointDepths,
+    linearise_depths,
+    linearise_depths_numpy,
+)
+from morph_dslam.online.estimation import BoundPoints, Estimator, State, moved
+from morph_dslam.online.measurement_noise import Measured
+from morph_dslam.online.sequence_filter import SequenceFilter
+from tests.support.bent_sheet import bent_sheet_model
+
+CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
+MODEL = bent_sheet_model(22, 16)
+POSE = RigidTransform(
+    rotation_exp(np.array([0.2, -0.3, 0.05])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.02, -0.01, 0.6])
+)
+TRUTH = State(np.array([0.035, 0.3, 0.1]), POSE)
+SIGMA_PX = 0.4
+
+
+def bound(count=80):
+    rng = np.random.default_rng(0)
+    surface = SurfacePoints(rng.integers(0, len(MODEL.triangles), count), rng.dirichlet(np.ones(3), count))
+    return BoundPoints.from_surface(MODEL, surface)
+
+
+def measured_depths(points, rng, sigma=0.0, huber_px=2.0 * SIGMA_PX):
+    """Depths with noise, of all points but every fifth; weighed against pixels of SIGMA_PX."""
+    depths = points.in_camera(TRUTH)[:, 2] + sigma * rng.standard_normal(len(points))
+    weights = np.full(len(points), SIGMA_PX / max(sigma, 1e-3))
+    weights[::5], depths[::5] = 0.0, 77.0
+    return PointDepths(depths, weights, SIGMA_PX**2, huber_px)
+
+
+def arguments(points, state, depths):
+    pose = state.camera_from_object
+    return (
+        points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
+        points.field.modes, depths.depths, depths.weights, depths.huber_px,
+    )  # fmt: skip
+
+
+def test_compiled_and_plain_normal_equations_agree():
+    points = bound()
+    depths = measured_depths(points, np.random.default_rng(1), 2e-3)
+    given = arguments(points, moved(TRUTH, np.full(9, 4e-3)), depths)
+    for compiled, plain in zip(linearise_depths(*given), linearise_depths_numpy(*given), strict=True):
+        np.testing.assert_allclose(compiled, plain, rtol=1e-9, atol=1e-9 * np.abs(plain).max())
+
+
+def test_gradient_is_that_of_the_cost_of_depths():
+    """The cost is recomputed from positions; some residuals are beyond Huber's limit and some are not."""
+    points = bound()
+    depths = measured_depths(points, np.random.default_rng(1), 2e-3, huber_px=0.4)
+    state = moved(TRUTH, np.full(9, 2e-3))
+
+    def cost(at):
+        far = np.abs(depths.weights * (points.in_camera(at)[:, 2] - depths.depths))[depths.weights > 0.0]
+        h = depths.huber_px
+        assert 0.1 < (far > h).mean() < 0.9
+        return np.sum(np.where(far > h, h * (far - 0.5 * h), 0.5 * far**2))
+
+    found, _, gradient, _ = depths.terms(points, state)
+    assert found == pytest.approx(cost(state))
+    for k, unit in enumerate(np.eye(9)):
+        slope = (cost(moved(state, 1e-7 * unit)) - cost(moved(state, -1e-7 * unit))) / 2e-7
+        assert gradient[k] == pytest.approx(slope, rel=1e-4, abs=1e-3)
+
+
+def test_depth_helps_along_the_sight_line_and_deviations_say_how_much():
+    """Repeated measurements: the spread is as stated, and less than without depth."""
+    points, estimator = bound(), Estimator(MODEL, CAMERA)
+    found, stated = {True: [], False: []}, {True: [], False: []}
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        pixels = CAMERA.project(points.in_camera(TRUTH)) + SIGMA_PX * rng.standard_normal((80, 2))
+        weights, normals = np.ones(80), np.zeros((80, 2))
+        for with_depth in (True, False):
+            depths = measured_depths(points, rng, 0.6e-3) if with_depth else None
+            alone = estimator.estimate(points, pixels, weights, TRUTH, depths=depths)
+            measured = Measured(points, pixels, weights, normals, np.eye(80), depths)
+            estimate = SequenceFilter(estimator, []).fuse(measured, alone)
+            found[with_depth].append(
+                [*estimate.state.parameters, *estimate.state.camera_from_object.translation]
+            )
+            stated[with_depth].append([*estimate.parameter_std, *estimate.pose_std[3:]])
+    spread = {key: np.std(values, axis=0) for key, values in found.items()}
+    assert spread[True][5] < 0.6 * spread[False][5]
+    assert (spread[True][:3] < 0.95 * spread[False][:3]).all()
+    for key in (True, False):
+        np.testing.assert_allclose(np.mean(stated[key], axis=0), spread[key], rtol=0.35)
+
+
+def test_wrong_depths_do_not_take_pixels_along():
+    points, rng = bound(), np.random.default_rng(3)
+    depths = measured_depths(points, rng, 1e-3)
+    depths.depths[1:12] += 0.3
+    pixels = CAMERA.project(points.in_camera(TRUTH))
+    estimate = Estimator(MODEL, CAMERA).estimate(points, pixels, np.ones(80), TRUTH, depths=depths)
+    off = np.linalg.norm(points.in_camera(estimate.state) - points.in_camera(TRUTH), axis=1)
+    assert off.max() < 1.5e-3
+
+
+def plane_image(normal, distance):
+    """Depth (h, w) of the plane normal . x = distance."""
+    rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
+    rays = CAMERA.rays(np.column_stack([columns.ravel(), rows.ravel()]).astype(float))
+    return (distance / (rays @ normal)).reshape(CAMERA.height, CAMERA.width).astype(np.float32)
+
+
+def test_depth_between_pixels_of_a_slanted_plane_with_holes_is_that_of_the_plane():
+    rng, normal = np.random.default_rng(4), np.array([0.5, -0.3, 0.8])
+    image = plane_image(normal, 0.6)
+    image[rng.random(image.shape) < 0.2] = np.nan
+    pixels = rng.uniform([10, 10], [630, 470], (50, 2))
+    used = np.ones(50, dtype=bool)
+    used[7] = False
+    found = PointDepths.sampled(image, pixels, used, CAMERA, SIGMA_PX**2, DepthOptions())
+    exact = 0.6 / (CAMERA.rays(pixels) @ normal)
+    assert found.weights[7] == 0.0
+    seen = found.weights > 0.0
+    assert seen.sum() > 45
+    np.testing.assert_allclose(found.depths[seen], exact[seen], rtol=3e-5)
+    # The weight: half the deviation at half the distance squared.
+    expected = SIGMA_PX / (DepthOptions().sigma_at_1m * exact[seen] ** 2 * 3 / 5)
+    np.testing.assert_allclose(found.weights[seen], expected, rtol=1e-3)
+
+
+def test_jumps_holes_and_the_image_border_have_no_depth():
+    image = plane_image(np.array([0.0, 0.0, 1.0]), 0.6)
+    image[:, 320:] = 0.9
+    image[100:110, 100:110] = np.nan
+    pixels = np.array([[200.0, 200.0], [319.0, 200.0], [105.0, 105.0], [1.0, 200.0], [np.nan, 3.0]])
+    found = PointDepths.sampled(image, pixels, np.ones(5, dtype=bool), CAMERA, 1.0, DepthOptions())
+    assert (found.weights > 0.0).tolist() == [True, False, False, False, False]
+
+
+def test_lens_is_taken_into_account():
+    """The depth image is as recorded, pixels are of the undistorted image."""
+    camera = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0, (-0.3, 0.1, 0.0, 0.0))
+    normal = np.array([0.5, -0.3, 0.8])
+    rows, columns = np.mgrid[:480, :640]
+    recorded = np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
+    rays = camera.rays(camera.undistort_pixels(recorded))
+    image = (0.6 / (rays @ normal)).reshape(480, 640).astype(np.float32)
+    pixels = np.array([[60.0, 60.0], [580.0, 400.0]])
+    found = PointDepths.sampled(image, pixels, np.ones(2, dtype=bool), camera, 1.0, DepthOptions())
+    np.testing.assert_allclose(found.depths, 0.6 / (camera.rays(pixels) @ normal), atol=1e-4)
+
+
+def test_padding_adds_points_without_depth():
+    depths = measured_depths(bound(10), np.random.default_rng(0)).padded(14)
+    assert len(depths.depths) == 14
+    assert depths.count == 8
