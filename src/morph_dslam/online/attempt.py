@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.online.depth_residuals import PointDepths
 from morph_dslam.online.estimation import Estimate, Prior
 from morph_dslam.online.measurement import Measurement
 from morph_dslam.online.outline import OutlineMeasurement
@@ -15,10 +16,17 @@ from morph_dslam.online.tracker_options import TrackerOptions
 
 @dataclass(frozen=True)
 class Picture:
-    """A frame made ready: the undistorted grey image (h, w), and flattened."""
+    """A frame made ready.
+
+    Attributes
+    ----------
+    grey : the undistorted image (h, w). flat : flattened.
+    depth : (h, w) of a depth camera, as recorded, metres, NaN where unknown; None without one.
+    """
 
     grey: NDArray[np.uint8]
     flat: NDArray[np.uint8]
+    depth: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
@@ -28,6 +36,7 @@ class Attempt:
     Attributes
     ----------
     prior : what was known of the pose from the map when it was made; None if nothing was.
+    depths : of the points that support it, where a depth camera saw them.
     """
 
     estimate: Estimate
@@ -35,6 +44,7 @@ class Attempt:
     measurement: Measurement
     prior: Prior | None = None
     outline: OutlineMeasurement | None = None
+    depths: PointDepths | None = None
 
 
 def refusal(attempt: Attempt, options: TrackerOptions) -> str:

@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.online.attempt import Attempt, Picture
+from morph_dslam.online.depth_residuals import PointDepths
 from morph_dslam.online.estimation import Estimate, Estimator, Prior, State
 from morph_dslam.online.measurement import Measurement
+from morph_dslam.online.measurement_noise import Measured
 from morph_dslam.online.reference_view import ReferenceView
 from morph_dslam.online.shape_search import ShapeSearch
 from morph_dslam.online.timing import StageClock
@@ -17,6 +19,8 @@ from morph_dslam.online.tracker_options import TrackerOptions
 
 #: Share of the cost below which another shape is a better explanation and not the same one.
 CLEARLY_BETTER = 0.95
+#: The least spread of residuals, pixels, that is believed when they are weighed against depths.
+LEAST_SIGMA_PX = 0.1
 
 
 class FrameEstimation:
@@ -65,16 +69,19 @@ class FrameEstimation:
 
     def search_other_shapes(self, attempt: Attempt) -> Attempt:
         """The attempt, or a clearly better explanation of its measurements reached from another shape."""
-        measurement, estimate, prior = attempt.measurement, attempt.estimate, attempt.prior
-        if not self._options.search_above_px < estimate.sigma_px < np.inf:
+        if not self._options.search_above_px < attempt.estimate.sigma_px < np.inf:
             return attempt
+        return self.best_of(attempt, self._search.next_starts(attempt.estimate.state.camera_from_object))
+
+    def best_of(self, attempt: Attempt, starts: list[State]) -> Attempt:
+        """The attempt, or a clearly better explanation of its measurements reached from one of the starts."""
+        measurement, estimate, prior = attempt.measurement, attempt.estimate, attempt.prior
         points, weights = self._reference.points, measurement.valid.astype(float)
         cost = self._estimator.evaluate(points, measurement.pixels, weights, estimate.state, prior=prior)[0]
-        starts = self._search.next_starts(estimate.state.camera_from_object)
         found = [
             self._scout.estimate(points, measurement.pixels, weights, start, prior=prior) for start in starts
         ]
-        best = min(found, key=lambda other: other.cost)
+        best = min(found, key=lambda other: other.cost, default=estimate)
         if best.cost > CLEARLY_BETTER * cost:
             return attempt
         return self._trimmed(measurement, best.state, prior)
@@ -96,3 +103,36 @@ class FrameEstimation:
                 attempt.prior,
             )
         return replace(attempt, estimate=estimate, outline=seen)
+
+    def fit_depths(self, picture: Picture, attempt: Attempt) -> Attempt:
+        """Estimate with the depths of the supporting points too, if a depth camera saw them."""
+        if picture.depth is None:
+            return attempt
+        # Points whose windows overlap err alike in the image, and each counts for less than its depth does.
+        squared_px = self._reference.redundancy * max(attempt.estimate.sigma_px, LEAST_SIGMA_PX) ** 2
+        pixels, camera, options = attempt.measurement.pixels, self._estimator.camera, self._options.depth
+        depths = PointDepths.sampled(
+            picture.depth, pixels, attempt.inliers, camera, squared_px, options
+        ).padded(len(self._reference.all_points))
+        attempt = replace(attempt, depths=depths)
+        seen = self.measured(attempt)
+        estimate = self._estimator.estimate(
+            seen.points,
+            seen.pixels,
+            seen.weights,
+            attempt.estimate.state,
+            seen.normals,
+            attempt.prior,
+            depths,
+        )
+        return replace(attempt, estimate=estimate)
+
+    def measured(self, attempt: Attempt) -> Measured:
+        """All that an attempt was made from, the outline's points after the others."""
+        pixels, weights = attempt.measurement.pixels, np.where(attempt.inliers, 1.0, 0.0)
+        normals, seen = np.zeros_like(pixels), attempt.outline
+        if seen is not None:
+            pixels, normals = np.concatenate([pixels, seen.pixels]), np.concatenate([normals, seen.normals])
+            weights = np.concatenate([weights, np.where(seen.valid, self._options.outline.weight, 0.0)])
+        view = self._reference
+        return Measured(view.all_points, pixels, weights, normals, view.correlation, attempt.depths)

@@ -4,12 +4,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.online.estimation import Estimate
 from morph_dslam.online.known_pose import KnownPose
 
-#: The stages of a frame that are timed, in order.
-STAGES = ("prepare", "flow", "estimate", "render", "correct", "search", "recover", "outline", "fuse")
+Array = NDArray[np.float64]
+
+#: The stages of a frame that are timed, in order; "locate" finds the camera in the map.
+STAGES = (
+    "locate",
+    "prepare",
+    "flow",
+    "estimate",
+    "render",
+    "correct",
+    "search",
+    "recover",
+    "outline",
+    "depth",
+    "fuse",
+)
 
 FOLLOWED = "followed from the previous frame"
 FOUND_AGAIN = "found again where it was last seen"
@@ -73,3 +90,10 @@ class FrameResult:
         if self.estimate is not None:
             return self.estimate.state.camera_from_object
         return None if self.known is None else self.known.pose
+
+    @property
+    def pose_std(self) -> Array:
+        """Standard deviations (6,) of the pose's rotation vector (rad) and translation (m); NaN when lost."""
+        if self.estimate is not None:
+            return self.estimate.pose_std
+        return np.full(6, np.nan) if self.known is None else np.sqrt(np.diag(self.known.covariance))

@@ -34,7 +34,6 @@ from morph_dslam.online.frame_result import (
 )
 from morph_dslam.online.known_pose import KnownPose
 from morph_dslam.online.measurement import Measurement
-from morph_dslam.online.measurement_noise import Measured
 from morph_dslam.online.recovery import Recovery
 from morph_dslam.online.reference_refinement import Keyframe
 from morph_dslam.online.reference_view import ReferenceView
@@ -98,14 +97,22 @@ class Tracker:
         self._last, self._velocity_base, self._start = state, state, state
         self._lost, self._n_lost = not in_sequence, 0
 
-    def process_frame(self, image: NDArray[np.uint8], known: KnownPose | None = None) -> FrameResult:
+    def process_frame(
+        self,
+        image: NDArray[np.uint8],
+        known: KnownPose | None = None,
+        depth: NDArray[np.float32] | None = None,
+    ) -> FrameResult:
         """Find the object in the next frame (h, w, 3) uint8, as recorded.
 
-        ``known`` is an anchored object's pose by the map; None for a free one, or where the camera is lost.
+        Parameters
+        ----------
+        known : an anchored object's pose by the map; None for a free one, or where the camera is lost.
+        depth : (h, w) metres, NaN where unknown, of a depth camera that sees what the image shows.
         """
         clock = StageClock(STAGES)
         with clock.stage("prepare"):
-            picture = self._prepare(image)
+            picture = replace(self._prepare(image), depth=depth)
         attempt = self._attempt_from_last(picture, self._anchoring.prior(known), clock)
         with clock.stage("search"):
             attempt = self._estimation.search_other_shapes(attempt)
@@ -118,6 +125,8 @@ class Tracker:
         if not why_not:
             with clock.stage("outline"):
                 attempt = self._estimation.fit_outline(picture, attempt)
+            with clock.stage("depth"):
+                attempt = self._estimation.fit_depths(picture, attempt)
             with clock.stage("fuse"):
                 attempt = self._fuse(attempt)
             if known is not None:
@@ -191,19 +200,11 @@ class Tracker:
 
     def _fuse(self, attempt: Attempt) -> Attempt:
         """The attempt with what earlier frames tell of the parameters that are one per sequence."""
-        view, pixels, weights = (
-            self.reference,
-            attempt.measurement.pixels,
-            np.where(attempt.inliers, 1.0, 0.0),
-        )
-        normals = np.zeros_like(pixels)
-        if attempt.outline is not None:
-            seen = attempt.outline
-            pixels, normals = np.concatenate([pixels, seen.pixels]), np.concatenate([normals, seen.normals])
-            weights = np.concatenate([weights, np.where(seen.valid, self.options.outline.weight, 0.0)])
-        measured = Measured(view.all_points, pixels, weights, normals, view.correlation)
+        measured = self._estimation.measured(attempt)
         estimate = self._filter.fuse(measured, attempt.estimate, attempt.prior)
-        return replace(attempt, estimate=replace(estimate, residuals=estimate.residuals[: len(view.points)]))
+        return replace(
+            attempt, estimate=replace(estimate, residuals=estimate.residuals[: len(attempt.inliers)])
+        )
 
     def _remember(self, picture: Picture, attempt: Attempt, lost: bool, known: KnownPose | None) -> None:
         """Keep what the next frame starts from; a lost frame keeps the last known shape."""

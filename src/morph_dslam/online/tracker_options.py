@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from morph_dslam.online.depth_residuals import DepthOptions
 from morph_dslam.online.estimation import EstimationOptions
 from morph_dslam.online.flow import FlowOptions
 from morph_dslam.online.measurement import MeasurementOptions
@@ -54,5 +55,6 @@ class TrackerOptions:
     flow: FlowOptions = field(default_factory=FlowOptions)
     measurement: MeasurementOptions = field(default_factory=MeasurementOptions)
     outline: OutlineOptions = field(default_factory=OutlineOptions)
+    depth: DepthOptions = field(default_factory=DepthOptions)
     estimation: EstimationOptions = field(default_factory=EstimationOptions)
     filter: FilterOptions = field(default_factory=FilterOptions)
