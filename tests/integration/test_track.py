@@ -92,9 +92,10 @@ def test_result_file_has_the_documented_layout(finished):
         "parameters": (7, 3),
         "parameter_std": (7, 3),
         "at_bound": (7, 3),
+        "pose_std": (7, 6),
     }
     rows = ("frame", "timestamp", "status", "reason", "residual_rms_px", "unexplained_px", "n_points")
-    rows += ("n_inliers", "largest_displacement", "largest_displacement_std")
+    rows += ("n_inliers", "largest_displacement", "largest_displacement_std", "pose_from")
     assert shapes == {**states, **dict.fromkeys(rows, (7,)), "timings_ms": (7, len(STAGES) + 1)}
 
 
@@ -139,11 +140,11 @@ def test_interrupt_keeps_the_frames_so_far(inputs, tmp_path, monkeypatch):
     process = Tracker.process_frame
     calls = []
 
-    def interrupted(self, image):
+    def interrupted(self, image, *rest):
         calls.append(1)
-        if len(calls) == 5:  # one call warms up
+        if len(calls) == 6:  # two calls warm up
             raise KeyboardInterrupt
-        return process(self, image)
+        return process(self, image, *rest)
 
     monkeypatch.setattr(Tracker, "process_frame", interrupted)
     with pytest.raises(KeyboardInterrupt):

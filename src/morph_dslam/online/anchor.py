@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
@@ -33,7 +33,7 @@ def movable_points(positions: Array, place: PlaceInMap, model: ReducedModel) -> 
     """Which map points (n, 3) lie on the object where it can move under the model."""
     nodes = np.unique(model.triangles)
     rest, size = model.nodes[nodes], float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
-    distances, nearest = cKDTree(rest).query(place.world_from_object.inverse.apply(positions))
+    distances, nearest = KDTree(rest).query(place.world_from_object.inverse.apply(positions))
     reach = np.zeros(len(nodes))
     undeformed = model.displacement.value(model.default)[nodes]
     for shape in shape_starts(model):

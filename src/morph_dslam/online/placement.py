@@ -78,7 +78,8 @@ def load_placement(path: Path, model: ReducedModel) -> Placement:
             f"'{open_angles[0]}'"
         )
     state = State(model.default, pose)
-    of_pose = place.pose_covariance(pose)
+    own = keyframe.get("covariance")  # of a keyframe whose pose was adjusted by itself
+    of_pose = place.pose_covariance(pose) if own is None else np.array(own, dtype=np.float64)
     covariance = None if of_pose is None else _of_state(of_pose, len(model.parameters))
     facts = {"from": "map", **facts}
     return Placement(model, frame, state, facts, tuple(flags), open_angles, covariance, place)

@@ -17,7 +17,7 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.online.binding import DrawnSurface
 from morph_dslam.online.confidence import largest_displacement
 from morph_dslam.online.estimation import State
-from morph_dslam.online.frame_result import STAGES, UNEXPLAINED, FrameResult
+from morph_dslam.online.frame_result import HAS_MOVED, STAGES, UNEXPLAINED, FrameResult
 from morph_dslam.online.observability import UNTOLD_SHARE, one_value, statement, untold_in_run
 
 Array = NDArray[np.float64]
@@ -57,14 +57,24 @@ class RunResults:
         """Frames (f,) that have an estimate."""
         return np.array([result.estimate is not None for result in self.results], dtype=bool)
 
+    @property
+    def hidden(self) -> NDArray[np.bool_]:
+        """Frames (f,) in which only the pose is known, from the map."""
+        return np.array([result.status == "hidden" for result in self.results], dtype=bool)
+
     def states(self) -> list[State | None]:
-        """The state of every frame, None where it was lost."""
+        """The state of every frame, None where it was hidden or lost."""
         return [result.estimate.state if result.estimate else None for result in self.results]
 
     def poses(self) -> Array:
         """camera_from_object (f, 4, 4), NaN where lost."""
         lost = np.full((4, 4), np.nan)
-        return np.array([s.camera_from_object.matrix if s else lost for s in self.states()])
+        poses = [result.pose for result in self.results]
+        return np.array([lost if pose is None else pose.matrix for pose in poses])
+
+    def pose_std(self) -> Array:
+        """(f, 6) of the rotation vector (rad) and the translation (m) of the pose, NaN where lost."""
+        return np.array([result.pose_std for result in self.results]).reshape(-1, 6)
 
     def parameters(self) -> Array:
         """(f, d), SI, NaN where lost."""
@@ -116,6 +126,8 @@ def write_hdf5(path: Path, run: RunResults) -> None:
         file["status"] = np.array([result.status for result in run.results], dtype=text)
         file["reason"] = np.array([result.reason for result in run.results], dtype=text)
         file["camera_from_object"], file["parameters"] = run.poses(), run.parameters()
+        file["pose_from"] = np.array([result.pose_from for result in run.results], dtype=text)
+        file["pose_std"] = run.pose_std()
         file["parameter_std"], file["at_bound"] = run.parameter_std(), run.at_bound()
         file["largest_displacement"], file["largest_displacement_std"] = run.largest_displacements().T
         file["residual_rms_px"], file["unexplained_px"] = run.residuals_px(), run.unexplained_px()
@@ -129,7 +141,7 @@ def write_csv(path: Path, run: RunResults) -> None:
     from morph_dslam.geometry import rotation_log
 
     parameters = run.model.parameters
-    header = ["frame", "timestamp_s", "status", "reason"]
+    header = ["frame", "timestamp_s", "status", "reason", "pose_from"]
     for p in parameters:
         header += [f"{p.name}_{p.unit}", f"{p.name}_std_{p.unit}", f"{p.name}_at_bound"]
     header += ["largest_displacement_mm", "largest_displacement_std_mm"]
@@ -140,7 +152,7 @@ def write_csv(path: Path, run: RunResults) -> None:
         writer = csv.writer(file)
         writer.writerow(header)
         for frame, timestamp, result, largest in rows:
-            row: list[Any] = [frame, f"{timestamp:.6f}", result.status, result.reason]
+            row: list[Any] = [frame, f"{timestamp:.6f}", result.status, result.reason, result.pose_from]
             if result.estimate is None:
                 row += [""] * (3 * len(parameters) + 10)
             else:
@@ -164,7 +176,8 @@ def summarise(run: RunResults) -> dict[str, Any]:
         "model": run.model.name,
         "n_frames": len(run),
         "n_tracked": int(tracked.sum()),
-        "n_lost": int((~tracked).sum()),
+        "n_hidden": int(run.hidden.sum()),
+        "n_lost": int((~tracked & ~run.hidden).sum()),
         "n_recovered": sum(result.recovered for result in run.results),
         "first_frame": run.frames[0],
         "last_frame": run.frames[-1],
@@ -186,6 +199,7 @@ def flags(run: RunResults) -> list[str]:
     lost = Counter(result.status for result in run.results)["lost"]
     if lost:
         found.append(f"{lost} of {len(run)} frames were lost; their reasons are in frames.csv")
+    found += _flags_of_place(run)
     failed = sum(UNEXPLAINED in result.reason for result in run.results)
     if failed:
         largest = float(np.nanmax(run.unexplained_px()))
@@ -238,6 +252,23 @@ def values_over_the_sequence(run: RunResults) -> list[dict[str, object]]:
         for k, parameter in enumerate(run.model.parameters)
         if parameter.name in run.per_sequence
     ]
+
+
+def _flags_of_place(run: RunResults) -> list[str]:
+    """What a reader must know of an anchored object."""
+    found, hidden = [], int(run.hidden.sum())
+    if hidden:
+        found.append(
+            f"the object was hidden in {hidden} of {len(run)} frames: its pose there is the map's, its "
+            "parameters are not known"
+        )
+    moved = [frame for frame, r in zip(run.frames, run.results, strict=True) if HAS_MOVED in r.reason]
+    if moved:
+        found.append(
+            f"{HAS_MOVED} in {len(moved)} frames, first in frame {moved[0]}: there its points alone tell "
+            "its pose; register it again to use the map"
+        )
+    return found
 
 
 def write_summary(path: Path, run: RunResults, extra: dict[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,67 @@
+"""From a frame to the object in it: the camera in the map of the scene, then the object.
+
+The two steps can run one after the other or, for different frames, in two threads.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.online.anchor import Anchor
+from morph_dslam.online.frame_result import FrameResult
+from morph_dslam.online.known_pose import KnownPose
+from morph_dslam.online.pipeline import Tracker
+from morph_dslam.sources import Frame
+
+
+@dataclass(frozen=True)
+class Located:
+    """What the map told of a frame.
+
+    Attributes
+    ----------
+    known : the object's pose by the map, None where the camera is lost. why_lost : the camera; empty if not.
+    milliseconds : that it took.
+    """
+
+    known: KnownPose | None = None
+    why_lost: str = ""
+    milliseconds: float = 0.0
+
+
+class Chain:
+    """Both steps; without an anchor the object is free and the first one does nothing."""
+
+    def __init__(self, camera: PinholeCamera, tracker: Tracker, anchor: Anchor | None = None) -> None:
+        self._camera, self.tracker, self.anchor = camera, tracker, anchor
+
+    def process(self, frame: Frame) -> FrameResult:
+        """Both steps for the next frame; raises CameraError if it has not the camera's size."""
+        return self.track(frame.image, self.locate(frame))
+
+    def locate(self, frame: Frame) -> Located:
+        """Find the camera of the next frame in the map."""
+        self._camera.check_image(frame.image, f"frame {frame.index}")
+        if self.anchor is None:
+            return Located()
+        known, camera = self.anchor.locate(frame.image, frame.index, frame.timestamp)
+        return Located(known, camera.reason, camera.total_ms)
+
+    def track(self, image: NDArray[np.uint8], located: Located) -> FrameResult:
+        """Find the object in a frame that `locate` has seen."""
+        result = self.tracker.process_frame(image, located.known)
+        if self.anchor is None:
+            return result
+        reason = result.reason
+        if located.known is None:
+            reason = f"{reason}; the camera is lost in the map: {located.why_lost}"
+        return replace(
+            result,
+            reason=reason,
+            timings_ms=result.timings_ms | {"locate": located.milliseconds},
+            total_ms=result.total_ms + located.milliseconds,
+        )

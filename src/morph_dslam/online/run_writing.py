@@ -1,0 +1,108 @@
+"""The run folder of a tracked sequence, recorded or live: all files but the video."""
+
+from __future__ import annotations
+
+import platform
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numba
+import numpy as np
+
+from morph_dslam import __version__
+from morph_dslam.errors import TrackingError
+from morph_dslam.model import save_model
+from morph_dslam.model.inner_structure import CarriedStructure
+from morph_dslam.online.inner_positions import write_inner_positions
+from morph_dslam.online.placement import Placement
+from morph_dslam.online.plots import write_plots
+from morph_dslam.online.results import RunResults, write_csv, write_hdf5, write_summary
+
+
+@dataclass(frozen=True)
+class RunInputs:
+    """What a run was made from.
+
+    Attributes
+    ----------
+    model, camera : files that the run folder gets copies of. named : other inputs by name, for the summary.
+    """
+
+    model: Path
+    camera: Path
+    named: dict[str, str]
+
+
+def check_run_folder(folder: Path, overwrite: bool) -> None:
+    """Make the run folder.
+
+    Raises
+    ------
+    TrackingError
+        If it cannot be made, or holds a run already that is not to be overwritten.
+    """
+    if (folder / "result.h5").exists() and not overwrite:
+        raise TrackingError(
+            f"{folder} holds a run already: choose another folder, or allow it to be overwritten"
+        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TrackingError(f"cannot make the run folder {folder}: {error.strerror}") from error
+
+
+def write_run(
+    folder: Path,
+    run: RunResults,
+    inputs: RunInputs,
+    placement: Placement,
+    inner: Sequence[CarriedStructure],
+    extra: dict[str, Any],
+) -> dict[str, Any]:
+    """Write tables, summary, plots and copies of the inputs; returns the summary."""
+    write_hdf5(folder / "result.h5", run)
+    write_inner_positions(folder / "result.h5", run, inner)
+    write_csv(folder / "frames.csv", run)
+    if placement.per_sequence:  # the model has the angle that the placement leaves open
+        save_model(folder / "model.morph", placement.model)
+    else:
+        _copy(inputs.model, folder / "model.morph")
+    _copy(inputs.camera, folder / "camera.yaml")
+    given = {"model": str(inputs.model), "camera": str(inputs.camera)} | inputs.named
+    common = {
+        "registration": placement.facts,
+        "flags": list(placement.flags),
+        "start_of_each_frame": "previous state; the first guess of image motion assumes constant velocity",
+        "temporal_prior": _temporal_prior(run.per_sequence),
+        "inputs": given,
+        "versions": _versions(),
+    }
+    summary = write_summary(folder / "summary.json", run, common | extra)
+    write_plots(folder / "plots", run)
+    return summary
+
+
+def _temporal_prior(per_sequence: tuple[str, ...]) -> str:
+    if not per_sequence:
+        return "none"
+    return f"one over the sequence, from all frames so far: {', '.join(per_sequence)}; none on the others"
+
+
+def _copy(source: Path, target: Path) -> None:
+    if source.resolve() != target.resolve():
+        shutil.copyfile(source, target)
+
+
+def _versions() -> dict[str, Any]:
+    return {
+        "morph-dslam": __version__,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "opencv": cv2.__version__,
+        "numba": numba.__version__,
+        "opencv_threads": cv2.getNumThreads(),
+    }

@@ -1,0 +1,191 @@
+"""What tracking starts from, recorded or live: model, camera, the object's place, the map of the scene."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import MapError, TrackingError
+from morph_dslam.io.calibration import load_camera
+from morph_dslam.io.landmarks import Landmarks, load_landmarks
+from morph_dslam.model import ReducedModel, load_model
+from morph_dslam.model.inner_structure import CarriedStructure, InnerStructure, load_inner_structure
+from morph_dslam.online.anchor import Anchor
+from morph_dslam.online.attempt import Picture
+from morph_dslam.online.chain import Chain
+from morph_dslam.online.outline import rim
+from morph_dslam.online.pipeline import Tracker
+from morph_dslam.online.placement import Placement, load_placement, place_by_landmarks
+from morph_dslam.online.registration import RegistrationOptions
+from morph_dslam.online.slam.map_file import load_map
+from morph_dslam.online.tracker_options import TrackerOptions
+from morph_dslam.sources import Frame
+
+#: How an object's pose is found: by the map and its points, by the map alone, by its points alone.
+PoseFrom = Literal["map", "fixed", "free"]
+
+
+@dataclass(frozen=True)
+class ObjectOptions:
+    """The object, its place and the camera.
+
+    Attributes
+    ----------
+    model, camera : files.
+    landmarks : file of landmarks in the reference frame; or placement : registration.json of
+        `morph register`.
+    map_path : map.h5 that the object was registered in; by default the one that the registration names, or
+        the one beside it, if there is one.
+    pose : "map": the object is anchored and the camera is found in the map, "fixed": and the map's pose is
+        taken as exact, "free": it may be anywhere.
+    inner : files of inner structures (`morph inner`), whose positions are written and drawn.
+    per_sequence : names of the parameters that are one over the whole sequence, beside those that the
+        placement leaves open.
+    """
+
+    model: Path
+    camera: Path
+    landmarks: Path | None = None
+    placement: Path | None = None
+    map_path: Path | None = None
+    pose: PoseFrom = "map"
+    use_outline: bool = False
+    inner: tuple[Path, ...] = ()
+    per_sequence: tuple[str, ...] = ()
+    registration: RegistrationOptions = field(default_factory=RegistrationOptions)
+    tracker: TrackerOptions = field(default_factory=TrackerOptions)
+
+
+@dataclass(frozen=True)
+class Setup:
+    """The inputs, read and checked.
+
+    Attributes
+    ----------
+    model : as it is in its file. placement : None as long as the frame that landmarks belong to is not there.
+    map_path : of the map that the object is anchored in; None if it is free.
+    reference : the keyframe of that map in which the object is, None where a frame has to be it.
+    """
+
+    options: ObjectOptions
+    model: ReducedModel
+    camera: PinholeCamera
+    landmarks: Landmarks | None
+    inner: tuple[InnerStructure, ...]
+    placement: Placement | None
+    map_path: Path | None
+    reference: Picture | None
+
+    def placed(self) -> Placement:
+        """The placement; raises RegistrationError as `place_by_landmarks` does."""
+        if self.placement is not None:
+            return self.placement
+        assert self.landmarks is not None
+        return place_by_landmarks(self.model, self.camera, self.landmarks, self.options.registration)
+
+    def carried(self, model: ReducedModel) -> list[CarriedStructure]:
+        """The inner structures in the model that is tracked with."""
+        return [structure.carried_by(model) for structure in self.inner]
+
+    def tracker_options(self, placement: Placement) -> TrackerOptions:
+        """The options with what the placement leaves open."""
+        options = self.options
+        return replace(
+            options.tracker,
+            per_sequence=tuple(dict.fromkeys((*placement.per_sequence, *options.per_sequence))),
+            use_outline=options.use_outline,
+            hold_pose=options.pose == "fixed",
+        )
+
+    def new_chain(
+        self, placement: Placement, reference: NDArray[np.uint8] | Picture, in_sequence: bool
+    ) -> Chain:
+        """A tracker at its beginning; see `Tracker` for the arguments."""
+        tracker = Tracker(
+            placement.model,
+            self.camera,
+            reference,
+            placement.state,
+            self.tracker_options(placement),
+            in_sequence,
+            placement.covariance,
+        )
+        anchor = None
+        if self.map_path is not None and placement.place is not None:
+            rigid_map = load_map(self.map_path, self.camera)
+            anchor = Anchor(rigid_map, self.camera, placement.place, placement.model)
+        return Chain(self.camera, tracker, anchor)
+
+    def warm_up(self, placement: Placement, reference: NDArray[np.uint8] | Picture) -> None:
+        """Compile the inner loops, so that the first frame takes no longer than the others."""
+        print("preparing: compiling the inner loops (half a minute the first time) ...", file=sys.stderr)
+        image = reference
+        if isinstance(image, Picture):
+            image = np.asarray(cv2.cvtColor(image.grey, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+        chain = self.new_chain(placement, reference, True)
+        for number in range(2):
+            chain.process(Frame(number, float(number), image))
+
+
+def load_setup(options: ObjectOptions) -> Setup:
+    """Read and check the inputs.
+
+    Raises
+    ------
+    MorphError
+        If one cannot be used (ModelFileError, CameraError, MapError, RegistrationError), or they do not fit
+        together (TrackingError).
+    """
+    if (options.landmarks is None) == (options.placement is None):
+        raise TrackingError("say where the object is: either landmarks, or a registration in a map")
+    if options.placement is None and options.map_path is not None:
+        raise TrackingError("a map needs the object's place in it: --place registration.json")
+    model, camera = load_model(options.model), load_camera(options.camera)
+    if options.use_outline and not len(rim(model.triangles)):
+        raise TrackingError(
+            f"the surface of '{model.name}' is closed and has no rim: track it without the outline"
+        )
+    inner = tuple(load_inner_structure(path) for path in options.inner)
+    for structure in inner:
+        structure.carried_by(model)  # says so before the tracking if it is not for this model
+    if options.placement is None:
+        assert options.landmarks is not None
+        landmarks = load_landmarks(options.landmarks)
+        return Setup(options, model, camera, landmarks, inner, None, None, None)
+    placement, path = load_placement(options.placement, model), None
+    if options.pose != "free":
+        path = _map_of(options.placement, options.map_path)
+        if path is None:
+            note = "no map was given or found beside the registration: the object is tracked as a free one"
+            placement = replace(placement, flags=(*placement.flags, note))
+    reference = None
+    if path is not None and not options.use_outline:
+        reference = _keyframe(path, camera, placement)
+    return Setup(options, model, camera, None, inner, placement, path, reference)
+
+
+def _map_of(registration: Path, given: Path | None) -> Path | None:
+    """The map: as given, as the registration names it, or beside it; None if there is none."""
+    if given is not None:
+        return given
+    beside = [registration.with_name("map.h5")]
+    named = json.loads(registration.read_text()).get("map")
+    if named:
+        beside.insert(0, registration.parent / named)
+    return next((path for path in beside if path.is_file()), None)
+
+
+def _keyframe(path: Path, camera: PinholeCamera, placement: Placement) -> Picture:
+    """The keyframe that the placement is for; its image is flattened, which is all that is needed of it."""
+    for keyframe in load_map(path, camera).keyframes:
+        if keyframe.index == placement.frame:
+            return Picture(keyframe.flat, keyframe.flat)
+    raise MapError(f"{path} is not the map of the registration: it has no keyframe {placement.frame}")
