@@ -86,7 +86,7 @@ class Tracker:
         picture = reference if isinstance(reference, Picture) else self._prepare(reference)
         self.reference = ReferenceView(self.estimator, picture, state, self.options)
         self._estimation = FrameEstimation(self.estimator, self.reference, self.options)
-        self._recovery = Recovery(model, self.reference, self._estimation, self.options)
+        self._recovery = Recovery(model, camera, self.reference, self._estimation, self.options)
         self._anchoring = Anchoring(self.estimator, self.reference, self.options)
         self._filter = SequenceFilter(self.estimator, self._kept_parameters(), self.options.filter)
         points, window = self.reference.points, self.options.flow.window
@@ -118,7 +118,9 @@ class Tracker:
             attempt = self._estimation.search_other_shapes(attempt)
         if known is not None and attempt.prior is not None:
             attempt = self._without_map_if_moved(picture, attempt, known, clock)
-        why_not, how = refusal(attempt, self.options), FOUND_AGAIN if self._lost else FOLLOWED
+        why_not, how = refusal(attempt, self.options), FOLLOWED
+        if self._lost:
+            why_not, how = self._recovery.refusal(attempt), FOUND_AGAIN
         if why_not and self._is_to_be_looked_for(known):
             found, why_not = self._recovery.recover(picture, self._last.parameters, why_not, clock)
             attempt, how = (attempt, how) if found is None else (found, RECOVERED)
@@ -220,6 +222,8 @@ class Tracker:
             projected = self.camera.project(self.reference.points.in_camera(self._last))
             self._pixels = np.where(attempt.inliers[:, None], attempt.measurement.pixels, projected)
             self._anchoring.learn(estimate)
+            if not self._lost:
+                self._recovery.learn(attempt)
         elif known is not None and not self._anchoring.has_moved:
             self._last = replace(self._last, camera_from_object=known.pose)
         self._picture, self._lost = picture, lost

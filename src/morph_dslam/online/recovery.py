@@ -5,14 +5,25 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.camera import PinholeCamera
 from morph_dslam.model import ReducedModel
 from morph_dslam.online.attempt import Attempt, Picture, refusal
 from morph_dslam.online.frame_estimation import FrameEstimation
 from morph_dslam.online.reference_view import ReferenceView
+from morph_dslam.online.registration import shape_starts, solve_pnp
+from morph_dslam.online.state import State
 from morph_dslam.online.timing import StageClock
 from morph_dslam.online.tracker_options import TrackerOptions
 
 Array = NDArray[np.float64]
+
+#: An object that is found anew is believed if this share of its points agree, or if they agree as closely as
+#: this, pixels, or as so many times the usual spread of their residuals: what looks alike by chance does not.
+MOST_AGREE, CLOSE_PX, CLOSE_TO_USUAL = 0.5, 0.5, 1.5
+#: At most about so many shapes are tried, lest a mirrored one that fits nearly as well is taken.
+MOST_SHAPES = 27
+#: Share of the latest frame in the usual spread.
+LEARNING_RATE = 0.05
 
 
 class Recovery:
@@ -21,12 +32,33 @@ class Recovery:
     def __init__(
         self,
         model: ReducedModel,
+        camera: PinholeCamera,
         reference: ReferenceView,
         estimation: FrameEstimation,
         options: TrackerOptions,
     ) -> None:
-        self._model, self._reference = model, reference
+        self._model, self._reference, self._camera = model, reference, camera
         self._estimation, self._options = estimation, options
+        self._usual_px = 0.0
+
+    def learn(self, attempt: Attempt) -> None:
+        """Take in how closely the points agreed in a frame in which the object was followed."""
+        if np.isfinite(attempt.estimate.sigma_px):
+            self._usual_px += LEARNING_RATE * (attempt.estimate.sigma_px - self._usual_px)
+
+    def refusal(self, attempt: Attempt) -> str:
+        """Why an object that was not seen in the frame before is not to be believed; empty when it is."""
+        why_not = refusal(attempt, self._options)
+        if why_not or attempt.prior is not None:
+            return why_not
+        count = int(attempt.inliers.sum())
+        if count >= MOST_AGREE * len(attempt.inliers) or self._agrees_closely(attempt):
+            return ""
+        visible = int(attempt.measurement.visible.sum())
+        return f"{count} of {visible} points agree, but only by {attempt.estimate.sigma_px:.1f} px"
+
+    def _agrees_closely(self, attempt: Attempt) -> bool:
+        return attempt.estimate.sigma_px < max(CLOSE_PX, CLOSE_TO_USUAL * self._usual_px)
 
     def recover(
         self, picture: Picture, last_shape: Array, why_lost: str, clock: StageClock
@@ -62,7 +94,22 @@ class Recovery:
             return None, matches
         candidate = self._estimation.correct(picture, state, None, None, clock)
         candidate = self._estimation.correct(picture, candidate.estimate.state, None, None, clock)
-        return (None if refusal(candidate, self._options) else candidate), None
+        if refusal(candidate, self._options):
+            return None, None
+        with clock.stage("search"):
+            better = self._estimation.best_of(candidate, self._starts(candidate))
+        candidate = self._estimation.correct(picture, better.estimate.state, None, None, clock)
+        return (None if self.refusal(candidate) else candidate), None
+
+    def _starts(self, candidate: Attempt) -> list[State]:
+        """Shapes spread over the box, each in the poses in which it fits the supporting points best."""
+        points, rows = self._reference.points, candidate.inliers
+        pixels = candidate.measurement.pixels[rows]
+        starts = []
+        for shape in shape_starts(self._model, MOST_SHAPES):
+            positions = (points.rest + points.field.value(shape))[rows]
+            starts += [State(shape, pose) for pose in solve_pnp(positions, pixels, self._camera)]
+        return starts
 
     def _apart(self, found: Attempt, other: Attempt) -> bool:
         """Whether two attempts are of different places in the image."""
