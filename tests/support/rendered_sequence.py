@@ -75,6 +75,14 @@ class SheetFilm:
         return np.repeat(np.clip(image, 0, 255).astype(np.uint8)[:, :, None], 3, axis=2)
 
 
+def sheet_depth(model, state, rng, noise_at_1m=1.4e-3, background=1.5, camera=CAMERA):
+    """What a depth camera measures (h, w), metres: noise grows with the distance squared."""
+    nodes = state.camera_from_object.apply(model.positions(state.parameters))
+    exact = rasterise(camera.project(nodes), nodes[:, 2], model.triangles, camera.height, camera.width).depth
+    exact = np.where(np.isfinite(exact), exact, background)
+    return (exact + noise_at_1m * exact**2 * rng.standard_normal(exact.shape)).astype(np.float32)
+
+
 def mean_error(model, found, truth):
     """Mean distance of the mesh nodes of two states in the camera frame, metres."""
     a = found.camera_from_object.apply(model.positions(found.parameters))

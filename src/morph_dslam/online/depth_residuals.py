@@ -98,6 +98,10 @@ class PointDepths:
         bounded = np.clip(residuals, -self.huber_px, self.huber_px)
         return max(self.squared_px, float(np.sum(bounded**2)) / max(self.count, 1))
 
+    def only(self, kept: NDArray[np.bool_]) -> PointDepths:
+        """These, without what is not ``kept`` (p,)."""
+        return PointDepths(self.depths, np.where(kept, self.weights, 0.0), self.squared_px, self.huber_px)
+
     def padded(self, count: int) -> PointDepths:
         """These, followed by points without depth, ``count`` in all."""
         missing = np.zeros(count - len(self.depths))
