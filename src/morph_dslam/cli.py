@@ -16,10 +16,10 @@ from pathlib import Path
 
 from morph_dslam import __version__
 from morph_dslam.camera_commands import add_camera_commands
-from morph_dslam.command_arguments import frame_range
 from morph_dslam.errors import EvaluationError, MorphError
 from morph_dslam.inner_commands import add_inner_commands
 from morph_dslam.registration_commands import add_registration_commands
+from morph_dslam.tracking_commands import add_tracking_commands
 from morph_dslam.view_commands import add_view_commands
 
 USER_ERROR = 2
@@ -67,41 +67,6 @@ def _info(arguments: argparse.Namespace) -> None:
             print(f"  {line}")
 
 
-def _track(arguments: argparse.Namespace) -> None:
-    from morph_dslam.online.observability import value_line
-    from morph_dslam.online.track import TrackOptions, track
-
-    first, last = arguments.range
-    summary = track(
-        TrackOptions(
-            frames=arguments.frames,
-            model=arguments.model,
-            camera=arguments.camera,
-            landmarks=arguments.landmarks,
-            placement=arguments.place,
-            output=arguments.output,
-            first=first,
-            last=last,
-            reference_frame=arguments.reference_frame,
-            refine_reference=arguments.refine,
-            use_outline=arguments.outline,
-            inner=tuple(arguments.inner),
-            per_sequence=tuple(arguments.per_sequence),
-            overlay=not arguments.no_video,
-            overwrite=arguments.overwrite,
-        )
-    )
-    for flag in summary["flags"]:
-        print(f"note: {flag}")
-    for figures in summary["one_over_the_sequence"]:
-        print(value_line(figures))
-    print(f"wrote {arguments.output}")
-    print(
-        f"tracked={summary['n_tracked']}/{summary['n_frames']} "
-        f"median_ms={summary['median_ms']:.2f} p95_ms={summary['p95_ms']:.2f}"
-    )
-
-
 def _evaluate(arguments: argparse.Namespace) -> None:
     if arguments.trajectory is not None:
         from morph_dslam.evaluation.trajectory_report import evaluate_trajectory, trajectory_line
@@ -143,7 +108,8 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _add_offline_commands(commands)
     add_view_commands(partial(_add, commands))
-    _add_online_commands(commands)
+    add_tracking_commands(partial(_add, commands))
+    _add_evaluation_commands(commands)
     add_camera_commands(partial(_add, commands))
     add_inner_commands(partial(_add, commands))
     add_registration_commands(partial(_add, commands))
@@ -201,62 +167,7 @@ def _add_offline_commands(commands: argparse._SubParsersAction) -> None:
     )
 
 
-def _add_online_commands(commands: argparse._SubParsersAction) -> None:
-    track = _add(
-        commands,
-        "track",
-        _track,
-        "the frames tracked so far are kept in the run folder",
-        "find pose and parameters of a free object in every frame, and draw the stress over the video",
-    )
-    track.add_argument("frames", type=Path, metavar="FRAMES", help="video file, or folder of numbered images")
-    track.add_argument("--model", type=Path, required=True, help="model file of `morph build`")
-    track.add_argument("--camera", type=Path, required=True, help="camera file: size, intrinsics, distortion")
-    start = track.add_mutually_exclusive_group(required=True)
-    start.add_argument("--landmarks", type=Path, help="object points and their pixels in the reference frame")
-    start.add_argument(
-        "--place",
-        type=Path,
-        metavar="JSON",
-        help="registration.json of `morph register` in a map of the frames",
-    )
-    track.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="run folder to write")
-    track.add_argument(
-        "--range", type=frame_range, default=(None, None), metavar="FIRST-LAST", help="frames to track"
-    )
-    track.add_argument(
-        "--reference-frame",
-        type=int,
-        metavar="N",
-        help="frame that the landmarks belong to (default: the first one tracked)",
-    )
-    track.add_argument("--overwrite", action="store_true", help="replace a run that is in the run folder")
-    track.add_argument(
-        "--refine",
-        action="store_true",
-        help="refine the reference state over the whole sequence and track once more",
-    )
-    track.add_argument(
-        "--outline",
-        action="store_true",
-        help="let the object's outline count too, where it stands out from the background",
-    )
-    track.add_argument(
-        "--inner",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="a structure inside of the object (`morph inner`) to draw and report; may be repeated",
-    )
-    track.add_argument(
-        "--per-sequence",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="a parameter that is one over the whole sequence; may be repeated",
-    )
-    track.add_argument("--no-video", action="store_true", help="do not draw the augmented video")
+def _add_evaluation_commands(commands: argparse._SubParsersAction) -> None:
     evaluate = _add(
         commands,
         "evaluate",

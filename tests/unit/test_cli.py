@@ -6,6 +6,7 @@ import sys
 import pytest
 
 from morph_dslam import cli
+from morph_dslam.command_arguments import frame_range
 from morph_dslam.errors import StudyError
 from morph_dslam.model import save_model
 from tests.support.bent_sheet import bent_sheet_model
@@ -81,7 +82,7 @@ def test_defects_are_not_hidden(monkeypatch):
     ("text", "expected"), [("9-100", (9, 100)), ("9-", (9, None)), ("-100", (None, 100)), ("9", (9, 9))]
 )
 def test_frame_ranges(text, expected):
-    assert cli.frame_range(text) == expected
+    assert frame_range(text) == expected
 
 
 @pytest.mark.parametrize("text", ["", "-", "a-b", "9-8", "1-2-3"])

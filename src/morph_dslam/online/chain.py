@@ -7,9 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.online.anchor import Anchor
 from morph_dslam.online.frame_result import FrameResult
@@ -41,7 +38,7 @@ class Chain:
 
     def process(self, frame: Frame) -> FrameResult:
         """Both steps for the next frame; raises CameraError if it has not the camera's size."""
-        return self.track(frame.image, self.locate(frame))
+        return self.track(frame, self.locate(frame))
 
     def locate(self, frame: Frame) -> Located:
         """Find the camera of the next frame in the map."""
@@ -51,9 +48,9 @@ class Chain:
         known, camera = self.anchor.locate(frame.image, frame.index, frame.timestamp)
         return Located(known, camera.reason, camera.total_ms)
 
-    def track(self, image: NDArray[np.uint8], located: Located) -> FrameResult:
+    def track(self, frame: Frame, located: Located) -> FrameResult:
         """Find the object in a frame that `locate` has seen."""
-        result = self.tracker.process_frame(image, located.known)
+        result = self.tracker.process_frame(frame.image, located.known)
         if self.anchor is None:
             return result
         reason = result.reason

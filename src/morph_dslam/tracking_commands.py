@@ -1,0 +1,131 @@
+"""The command that follows an object in a recording, `morph track`, and what `morph live` shares with it."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from morph_dslam.command_arguments import frame_range
+
+
+def _track(arguments: argparse.Namespace) -> None:
+    from morph_dslam.online.observability import value_line
+    from morph_dslam.online.track import TrackOptions, track
+
+    first, last = arguments.range
+    summary = track(
+        TrackOptions(
+            frames=arguments.frames,
+            output=arguments.output,
+            first=first,
+            last=last,
+            reference_frame=arguments.reference_frame,
+            refine_reference=arguments.refine,
+            overlay=not arguments.no_video,
+            overwrite=arguments.overwrite,
+            **object_arguments(arguments),
+        )
+    )
+    for flag in summary["flags"]:
+        print(f"note: {flag}")
+    for figures in summary["one_over_the_sequence"]:
+        print(value_line(figures))
+    print(f"wrote {arguments.output}")
+    print(
+        f"tracked={summary['n_tracked']}/{summary['n_frames']} "
+        f"median_ms={summary['median_ms']:.2f} p95_ms={summary['p95_ms']:.2f}"
+    )
+
+
+def object_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What `add_object_arguments` asked for, by the names of `ObjectOptions`."""
+    return {
+        "model": arguments.model,
+        "camera": arguments.camera,
+        "landmarks": arguments.landmarks,
+        "placement": arguments.place,
+        "map_path": arguments.map,
+        "pose": arguments.pose,
+        "use_outline": arguments.outline,
+        "inner": tuple(arguments.inner),
+        "per_sequence": tuple(arguments.per_sequence),
+    }
+
+
+def add_object_arguments(command: argparse.ArgumentParser) -> None:
+    """The arguments that say what is tracked, with what, and where it is at first."""
+    command.add_argument("--model", type=Path, required=True, help="model file of `morph build`")
+    command.add_argument(
+        "--camera", type=Path, required=True, help="camera file: size, intrinsics, distortion"
+    )
+    start = command.add_mutually_exclusive_group(required=True)
+    start.add_argument("--landmarks", type=Path, help="object points and their pixels in the reference frame")
+    start.add_argument(
+        "--place", type=Path, metavar="JSON", help="registration.json of `morph register` in a map"
+    )
+    command.add_argument(
+        "--map",
+        type=Path,
+        metavar="H5",
+        help="with --place: the map that the camera is found in (default: the one that was registered in)",
+    )
+    command.add_argument(
+        "--pose",
+        choices=("map", "fixed", "free"),
+        default="map",
+        help="the object's pose with --place: by map and points together, by the map alone, or by its points "
+        "alone (default: %(default)s)",
+    )
+    command.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="RUN", help="run folder to write"
+    )
+    command.add_argument("--overwrite", action="store_true", help="replace a run that is in the run folder")
+    command.add_argument(
+        "--outline",
+        action="store_true",
+        help="let the object's outline count too, where it stands out from the background",
+    )
+    command.add_argument(
+        "--inner",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="a structure inside of the object (`morph inner`) to draw and report; may be repeated",
+    )
+    command.add_argument(
+        "--per-sequence",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a parameter that is one over the whole sequence; may be repeated",
+    )
+
+
+def add_tracking_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
+    """Add the command; ``add(name, action, kept, text)`` makes its parser."""
+    track = add(
+        "track",
+        _track,
+        "the frames tracked so far are kept in the run folder",
+        "find an object's pose and parameters in every frame, and draw the stress over the video",
+    )
+    track.add_argument("frames", type=Path, metavar="FRAMES", help="video file, or folder of numbered images")
+    add_object_arguments(track)
+    track.add_argument(
+        "--range", type=frame_range, default=(None, None), metavar="FIRST-LAST", help="frames to track"
+    )
+    track.add_argument(
+        "--reference-frame",
+        type=int,
+        metavar="N",
+        help="frame that the landmarks belong to (default: the first one tracked)",
+    )
+    track.add_argument(
+        "--refine",
+        action="store_true",
+        help="refine the reference state over the whole sequence and track once more",
+    )
+    track.add_argument("--no-video", action="store_true", help="do not draw the augmented video")
