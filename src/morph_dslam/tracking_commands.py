@@ -49,6 +49,7 @@ def object_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
         "map_path": arguments.map,
         "pose": arguments.pose,
         "use_outline": arguments.outline,
+        "use_depth": arguments.depth,
         "inner": tuple(arguments.inner),
         "per_sequence": tuple(arguments.per_sequence),
     }
@@ -86,6 +87,11 @@ def add_object_arguments(command: argparse.ArgumentParser) -> None:
         "--outline",
         action="store_true",
         help="let the object's outline count too, where it stands out from the background",
+    )
+    command.add_argument(
+        "--depth",
+        action="store_true",
+        help="let the depth images of an RGB-D recording count too",
     )
     command.add_argument(
         "--inner",

@@ -50,7 +50,8 @@ class Chain:
 
     def track(self, frame: Frame, located: Located) -> FrameResult:
         """Find the object in a frame that `locate` has seen."""
-        result = self.tracker.process_frame(frame.image, located.known)
+        depth = frame.depth if self.tracker.options.use_depth else None
+        result = self.tracker.process_frame(frame.image, located.known, depth)
         if self.anchor is None:
             return result
         reason = result.reason

@@ -16,11 +16,16 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.turned_model import turned_model
-from morph_dslam.online.estimation import State
+from morph_dslam.online.depth_residuals import DepthOptions
+from morph_dslam.online.estimation import Estimator, State
 from morph_dslam.online.place_in_map import PlaceInMap
-from morph_dslam.online.registration import RegistrationOptions, register
+from morph_dslam.online.reference_depth import refine_by_depth
+from morph_dslam.online.registration import RegistrationOptions, bind_landmarks, register
 
 Array = NDArray[np.float64]
+
+#: Standard deviation of landmarks' pixels where they are too few to tell, and the least that is believed.
+LANDMARK_PX, LEAST_LANDMARK_PX = 2.0, 0.1
 
 
 @dataclass(frozen=True)
@@ -93,9 +98,19 @@ def _of_state(of_pose: Array, n_parameters: int) -> Array:
 
 
 def place_by_landmarks(
-    model: ReducedModel, camera: PinholeCamera, landmarks: Landmarks, options: RegistrationOptions
+    model: ReducedModel,
+    camera: PinholeCamera,
+    landmarks: Landmarks,
+    options: RegistrationOptions,
+    depth: NDArray[np.float32] | None = None,
+    sensor: DepthOptions | None = None,
 ) -> Placement:
-    """The object in the frame of the landmarks; raises RegistrationError as `register` does."""
+    """The object in the frame of the landmarks; raises RegistrationError as `register` does.
+
+    Parameters
+    ----------
+    depth : (h, w) of that frame, metres, NaN where unknown; None without a depth camera, ``sensor``.
+    """
     registration = register(model, camera, landmarks.points, landmarks.pixels, options)
     facts = {
         "from": "landmarks",
@@ -104,11 +119,19 @@ def place_by_landmarks(
         "n_landmarks": len(registration.estimate.residuals),
         "n_alternatives": len(registration.alternatives),
     }
-    return Placement(
-        model,
-        None,
-        registration.state,
-        facts,
-        registration.flags,
-        covariance=registration.estimate.covariance,
-    )
+    placed = registration.estimate
+    if depth is not None:
+        bound = bind_landmarks(model, landmarks.points, options)
+        # How well the landmarks fit tells how carefully they were set, where they are enough to tell.
+        sigma = max(placed.sigma_px, LEAST_LANDMARK_PX) if np.isfinite(placed.sigma_px) else LANDMARK_PX
+        placed = refine_by_depth(
+            Estimator(model, camera),
+            bound,
+            camera.undistort_pixels(landmarks.pixels),
+            placed.state,
+            sigma,
+            depth,
+            sensor or DepthOptions(),
+        )
+        facts["along_the_sight_line"] = "by depth"
+    return Placement(model, None, placed.state, facts, registration.flags, covariance=placed.covariance)

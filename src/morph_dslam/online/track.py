@@ -26,6 +26,7 @@ from morph_dslam.online.run_writing import RunInputs, check_run_folder, write_ru
 from morph_dslam.online.tracker_options import TrackerOptions
 from morph_dslam.online.tracking_setup import ObjectOptions, PoseFrom, Setup, load_setup
 from morph_dslam.sources import Frame, FrameSource, open_source
+from morph_dslam.sources.recorded import RecordedFrames
 
 #: Options that name input files.
 _INPUTS = ("frames", "landmarks", "placement")
@@ -43,7 +44,7 @@ class TrackOptions:
     output : the run folder. first, last : frame numbers to track, both included; all by default.
     reference_frame : the frame that the landmarks belong to; the first one tracked by default.
     refine_reference : after tracking, refine the reference state over the whole sequence and track once more.
-    use_outline : let the object's outline count beside its texture.
+    use_outline, use_depth : let the object's outline, and the recording's depth, count beside its texture.
     inner : files of inner structures (`morph inner`), whose positions are written and drawn.
     per_sequence : names of the parameters that are one over the whole sequence, beside those that the
         placement leaves open.
@@ -63,6 +64,7 @@ class TrackOptions:
     reference_frame: int | None = None
     refine_reference: bool = False
     use_outline: bool = False
+    use_depth: bool = False
     inner: tuple[Path, ...] = ()
     per_sequence: tuple[str, ...] = ()
     overlay: bool = True
@@ -82,6 +84,7 @@ class TrackOptions:
             self.map_path,
             self.pose,
             self.use_outline,
+            self.use_depth,
             self.inner,
             self.per_sequence,
             self.registration,
@@ -113,8 +116,13 @@ def track(options: TrackOptions) -> dict[str, Any]:
             options, reference_frame=frame, first=frame if options.first is None else options.first
         )
     source = open_source(options.frames, options.first, options.last)
+    if options.use_depth and not (isinstance(source, RecordedFrames) and source.has_registered_depth):
+        raise TrackingError(
+            f"{options.frames} has no depth images that belong to its pixels, as TUM RGB-D recordings have: "
+            "track it without --depth"
+        )
     begin = _begin(setup, options)
-    placement = setup.placed()
+    placement = setup.placed(begin.depth)
     setup.warm_up(placement, begin.picture)
     run = RunResults(placement.model, begin.frame, per_sequence=setup.tracker_options(placement).per_sequence)
     try:
@@ -130,11 +138,12 @@ def track(options: TrackOptions) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _Begin:
-    """The reference view: its image, its frame, and whether the sequence begins with it."""
+    """The reference view: its image, frame, whether the sequence begins with it, and its depth, if used."""
 
     picture: np.ndarray | Picture
     frame: int
     in_sequence: bool
+    depth: np.ndarray | None = None
 
 
 def _begin(setup: Setup, options: TrackOptions) -> _Begin:
@@ -146,7 +155,8 @@ def _begin(setup: Setup, options: TrackOptions) -> _Begin:
     reference = _reference_frame(options)
     setup.camera.check_image(reference.image, f"frame {reference.index} of {options.frames}")
     # A sequence that does not begin with the reference frame is entered as if the object had been lost.
-    return _Begin(reference.image, reference.index, options.reference_frame in (None, options.first))
+    depth = reference.depth if options.use_depth else None
+    return _Begin(reference.image, reference.index, options.reference_frame in (None, options.first), depth)
 
 
 def _reference_frame(options: TrackOptions) -> Frame:
@@ -213,6 +223,7 @@ def _write(
     extra = {
         "reference_refined_over_the_sequence": run.refined,
         "outline_used": options.use_outline,
+        "depth_used": options.use_depth,
         "pose": options.pose if setup.map_path is not None else "free",
         "settings": {
             "registration": asdict(options.registration),

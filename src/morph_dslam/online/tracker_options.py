@@ -32,6 +32,7 @@ class TrackerOptions:
         off than this share of its size, and than so many standard deviations, in so many frames on end.
     look_every : a hidden object is looked for elsewhere in every so many frames.
     use_outline : whether the object's outline counts too; it needs a background that it stands out from.
+    use_depth : whether the depth images of frames that have them count too.
     per_sequence : names of the parameters that are one over the whole sequence.
     """
 
@@ -51,6 +52,7 @@ class TrackerOptions:
     search_above_px: float = 0.25
     searches: int = 2
     use_outline: bool = False
+    use_depth: bool = False
     per_sequence: tuple[str, ...] = ()
     flow: FlowOptions = field(default_factory=FlowOptions)
     measurement: MeasurementOptions = field(default_factory=MeasurementOptions)

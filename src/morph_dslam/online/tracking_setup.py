@@ -46,6 +46,7 @@ class ObjectOptions:
         the one beside it, if there is one.
     pose : "map": the object is anchored and the camera is found in the map, "fixed": and the map's pose is
         taken as exact, "free": it may be anywhere.
+    use_outline, use_depth : let the object's outline, and the frames' depth images, count beside its texture.
     inner : files of inner structures (`morph inner`), whose positions are written and drawn.
     per_sequence : names of the parameters that are one over the whole sequence, beside those that the
         placement leaves open.
@@ -58,6 +59,7 @@ class ObjectOptions:
     map_path: Path | None = None
     pose: PoseFrom = "map"
     use_outline: bool = False
+    use_depth: bool = False
     inner: tuple[Path, ...] = ()
     per_sequence: tuple[str, ...] = ()
     registration: RegistrationOptions = field(default_factory=RegistrationOptions)
@@ -84,12 +86,16 @@ class Setup:
     map_path: Path | None
     reference: Picture | None
 
-    def placed(self) -> Placement:
-        """The placement; raises RegistrationError as `place_by_landmarks` does."""
+    def placed(self, depth: NDArray[np.float32] | None = None) -> Placement:
+        """The placement; raises RegistrationError as `place_by_landmarks` does.
+
+        ``depth`` (h, w), metres, is that of the frame that the landmarks belong to, where there is any.
+        """
         if self.placement is not None:
             return self.placement
         assert self.landmarks is not None
-        return place_by_landmarks(self.model, self.camera, self.landmarks, self.options.registration)
+        registration, sensor = self.options.registration, self.options.tracker.depth
+        return place_by_landmarks(self.model, self.camera, self.landmarks, registration, depth, sensor)
 
     def carried(self, model: ReducedModel) -> list[CarriedStructure]:
         """The inner structures in the model that is tracked with."""
@@ -102,6 +108,7 @@ class Setup:
             options.tracker,
             per_sequence=tuple(dict.fromkeys((*placement.per_sequence, *options.per_sequence))),
             use_outline=options.use_outline,
+            use_depth=options.use_depth,
             hold_pose=options.pose == "fixed",
         )
 

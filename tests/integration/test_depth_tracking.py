@@ -1,0 +1,73 @@
+"""`morph track --depth` on a rendered RGB-D recording in the layout of TUM RGB-D."""
+
+import cv2
+import numpy as np
+import pytest
+
+from morph_dslam.cli import main
+from morph_dslam.evaluation.run_folder import load_run
+from morph_dslam.io.calibration import save_camera
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
+from morph_dslam.model import save_model
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_depth, sheet_state
+
+TIMES = np.linspace(0.0, 0.24, 7)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """Frames with depth, model, camera, and landmarks of the first frame as a hand sets them."""
+    folder = tmp_path_factory.mktemp("recording")
+    model, rng = bent_sheet_model(43, 31), np.random.default_rng(3)
+    film, lists = SheetFilm(model), {"rgb": [], "depth": []}
+    for kind in lists:
+        (folder / kind).mkdir()
+    for number, time in enumerate(TIMES):
+        state = sheet_state(time)
+        images = {"rgb": film.frame(state), "depth": (5000.0 * sheet_depth(model, state, rng))}
+        images["depth"] = np.rint(images["depth"]).astype(np.uint16)
+        for kind, image in images.items():
+            cv2.imwrite(str(folder / kind / f"{number}.png"), image)
+            lists[kind].append(f"{0.1 * number:.6f} {kind}/{number}.png")
+    for kind, lines in lists.items():
+        (folder / f"{kind}.txt").write_text("\n".join(lines) + "\n")
+    save_model(folder / "sheet.morph", model)
+    save_camera(folder / "camera.yaml", CAMERA)
+    state, nodes = sheet_state(0.0), rng.choice(len(model.nodes), 14, replace=False)
+    seen = CAMERA.project(state.camera_from_object.apply(model.positions(state.parameters)))[nodes]
+    landmarks = Landmarks(model.nodes[nodes], seen + 1.0 * rng.standard_normal((14, 2)))
+    save_landmarks(folder / "landmarks.csv", landmarks)
+    return folder
+
+
+def tracked(recording, output, *more):
+    arguments = [str(recording), "--model", str(recording / "sheet.morph"), "--camera"]
+    arguments += [str(recording / "camera.yaml"), "--landmarks", str(recording / "landmarks.csv")]
+    assert main(["track", *arguments, "-o", str(output), "--no-video", *more]) == 0
+    return load_run(output)
+
+
+def along_the_sight_line(run):
+    """Mean error of all nodes in all frames along the optical axis, metres."""
+    model, errors = bent_sheet_model(43, 31), []
+    for row, time in enumerate(TIMES):
+        truth = sheet_state(time)
+        exact = truth.camera_from_object.apply(model.positions(truth.parameters))
+        errors.append(np.abs(run.camera_points(row) - exact)[:, 2].mean())
+    return np.mean(errors)
+
+
+def test_depth_puts_the_object_right_along_the_sight_line(recording, tmp_path):
+    without = along_the_sight_line(tracked(recording, tmp_path / "without"))
+    with_depth = along_the_sight_line(tracked(recording, tmp_path / "with", "--depth"))
+    assert without > 1.0e-3
+    assert with_depth < 0.35 * without
+    assert '"depth_used": true' in (tmp_path / "with" / "summary.json").read_text()
+
+
+def test_recording_without_depth_is_refused(recording, tmp_path, capsys):
+    arguments = ["--model", str(recording / "sheet.morph"), "--camera", str(recording / "camera.yaml")]
+    arguments += ["--landmarks", str(recording / "landmarks.csv"), "-o", str(tmp_path / "run")]
+    assert main(["track", str(recording / "rgb"), *arguments, "--depth"]) == 2
+    assert "has no depth images that belong to its pixels" in capsys.readouterr().err
