@@ -18,9 +18,12 @@ from morph_dslam.online.slam.rigid_map import GOOD, Indices, Keyframe, RigidMap
 
 Array = NDArray[np.float64]
 
-#: Observations that miss by more after adjustment are taken out, pixels.
-MOST_ERROR_PX = 4.0
-HUBER_PX, TOLERANCE = 1.5, 1e-4
+#: Observations that miss by more than this multiple of the median error after adjustment are taken out, and
+#: those beyond a smaller multiple before it count linearly; within bounds, in pixels. With bounds alone a few
+#: wrong points would bend an otherwise exact map.
+MISS_RATIO, LEAST_MISS_PX, MOST_MISS_PX = 6.0, 1.5, 4.0
+HUBER_RATIO, LEAST_HUBER_PX, MOST_HUBER_PX = 2.0, 0.2, 1.5
+TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,7 @@ class MapProblem:
 
     def solve(self) -> Adjustment:
         """Adjusted poses and points; touches no map."""
+        usual = usual_error(self.errors(self.camera_from_world, self.positions))
         return adjust(
             self.camera_from_world,
             self.positions,
@@ -53,10 +57,22 @@ class MapProblem:
             self.intrinsics,
             self.held,
             self.baseline_px,
-            huber_px=HUBER_PX,
+            huber_px=min(max(HUBER_RATIO * usual, LEAST_HUBER_PX), MOST_HUBER_PX),
             iterations=self.iterations,
             tolerance=TOLERANCE,
         )
+
+    def errors(self, camera_from_world: Array, positions: Array) -> Array:
+        """Distances (o,) in pixels between the observations and the projected points."""
+        seen = self.observations
+        poses, points = camera_from_world[seen.camera_idx], positions[seen.point_idx]
+        local = np.einsum("oij,oj->oi", poses[:, :3, :3], points) + poses[:, :3, 3]
+        return reprojection_errors(np.eye(4), local, seen.pixels, self.intrinsics)
+
+
+def usual_error(errors: Array) -> float:
+    """Median of some errors (n,), which outliers do not raise; infinite without any."""
+    return float(np.median(errors)) if len(errors) else float("inf")
 
 
 def local_window(rigid_map: RigidMap, options: SlamOptions) -> tuple[Indices, Indices]:
@@ -122,10 +138,12 @@ def put_back(rigid_map: RigidMap, problem: MapProblem, result: Adjustment) -> No
     rigid_map.positions[problem.ids] = result.points
     for k, pose in zip(problem.numbers, result.camera_from_world, strict=True):
         rigid_map.keyframes[k].camera_from_world = pose
-    _drop_misses(rigid_map, problem.free, problem.intrinsics)
+    usual = usual_error(problem.errors(result.camera_from_world, result.points))
+    most = min(max(MISS_RATIO * usual, LEAST_MISS_PX), MOST_MISS_PX)
+    _drop_misses(rigid_map, problem.free, problem.intrinsics, most)
 
 
-def _drop_misses(rigid_map: RigidMap, numbers: Indices, intrinsics: Array) -> None:
+def _drop_misses(rigid_map: RigidMap, numbers: Indices, intrinsics: Array, most_px: float) -> None:
     """Take out the observations that contradict the map, then points that fewer than two views see."""
     for k in numbers:
         keyframe = rigid_map.keyframes[k]
@@ -133,7 +151,7 @@ def _drop_misses(rigid_map: RigidMap, numbers: Indices, intrinsics: Array) -> No
         errors = reprojection_errors(
             keyframe.camera_from_world, rigid_map.positions[ids], keyframe.pixels, intrinsics
         )
-        keyframe.keep((errors < MOST_ERROR_PX) | (rigid_map.state[ids] != GOOD))
+        keyframe.keep((errors < most_px) | (rigid_map.state[ids] != GOOD))
         _drop_wrong_depths(rigid_map, keyframe, intrinsics)
     seen = rigid_map.n_observations()
     rigid_map.remove(np.flatnonzero((rigid_map.state == GOOD) & (seen < 2)))
@@ -147,5 +165,5 @@ def _drop_wrong_depths(rigid_map: RigidMap, keyframe: Keyframe, intrinsics: Arra
     pixels, depths = project(keyframe.camera_from_world, points, intrinsics)
     with np.errstate(divide="ignore", invalid="ignore"):
         misses = np.abs(pixels[:, 0] - rigid_map.baseline_px / depths - keyframe.right)
-        wrong = (misses > MOST_ERROR_PX) & (rigid_map.state[keyframe.point_ids] == GOOD)
+        wrong = (misses > MOST_MISS_PX) & (rigid_map.state[keyframe.point_ids] == GOOD)
     keyframe.right = np.where(wrong, np.nan, keyframe.right)

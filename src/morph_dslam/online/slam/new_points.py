@@ -15,8 +15,8 @@ from morph_dslam.online.slam.two_view import check_points, triangulate
 
 Array = NDArray[np.float64]
 
-#: Points that miss by more in either of two views are at no place, pixels.
-MOST_ERROR_PX = 4.0
+#: Points that miss a view by more than this multiple of the usual error are at no place; bounds in pixels.
+MISS_RATIO, LEAST_MISS_PX, MOST_MISS_PX = 4.0, 1.5, 4.0
 #: Points of one place: this near in the image, pixels, and their depths alike to this part.
 SAME_PIXEL, SAME_DEPTH = 2.0, 0.1
 #: Fewer missing corners than this are not worth a search.
@@ -93,8 +93,11 @@ class PointMaker:
             return ids[:0]
         points = triangulate(start, now, first_rays[open_enough], second_rays[open_enough])
         seen = [first_pixels[open_enough], pixels[open_enough]]
-        good = check_points(points, [start, now], seen, self._intrinsics, MOST_ERROR_PX)
+        most = min(max(MISS_RATIO * self._map.usual_rms_px, LEAST_MISS_PX), MOST_MISS_PX)
+        good = check_points(points, [start, now], seen, self._intrinsics, most)
         chosen = ids[open_enough]
+        poses = np.array([k.camera_from_world for k in self._map.keyframes])
+        good &= self._map.passing.agree(chosen, points, poses, self._intrinsics, most)
         self._map.positions[chosen[good]] = points[good]
         self._map.state[chosen[good]] = GOOD
         return chosen[~good]

@@ -19,6 +19,10 @@ Array = NDArray[np.float64]
 
 #: Points nearer than this to the camera plane do not count.
 LEAST_DEPTH = 1e-6
+#: Points that miss by more than this multiple of the inliers' median do not count in the next round: without
+#: this a few points that move draw the pose along for as long as they stay below ``inlier_px``. Pixels below
+#: which all count.
+CORE_RATIO, LEAST_CORE_PX = 3.0, 0.6
 
 
 @njit(cache=True, nogil=True)
@@ -132,9 +136,9 @@ def refine_pose(
     """Pose (4, 4) from points (n, 3) and their pixels (n, 2), started at ``start``.
 
     ``right`` (n,) are columns in a right image at ``baseline_px``, NaN where depth was not measured. After
-    each round the points that miss by more than ``inlier_px`` are left out of the next; the first one uses
-    the ``trusted`` points (n,), all by default. Without four points that fit there is no inlier and the
-    covariance is infinite.
+    each round the points that miss by more than ``inlier_px``, or by much more than most inliers, are left
+    out of the next; the first one uses the ``trusted`` points (n,), all by default. Without four points that
+    fit there is no inlier and the covariance is infinite.
     """
     pose, used = np.ascontiguousarray(start, dtype=np.float64), np.ones(len(points), dtype=bool)
     if trusted is not None:
@@ -157,14 +161,20 @@ def refine_pose(
         )
         pose = orthonormal(pose)
         errors = reprojection_errors(pose, points, pixels, intrinsics)
-        used = errors < inlier_px
-    errors = reprojection_errors(pose, points, pixels, intrinsics)
+        used = errors < _core_px(errors, inlier_px)
+    used = errors < inlier_px
     if not used.any():
         return PoseEstimate(pose, np.full((6, 6), np.inf), used, float("inf"))
     rms = float(np.sqrt(np.mean(errors[used] ** 2)))
     # Two residuals a point: the noise of one coordinate is the rms over sqrt(2).
     covariance = np.asarray(np.linalg.pinv(matrix) * max(rms, 0.1) ** 2 / 2.0, dtype=float)
     return PoseEstimate(pose, covariance, used, rms)
+
+
+def _core_px(errors: Array, inlier_px: float) -> float:
+    """How far the points (n,) that determine a pose may miss, at most ``inlier_px``."""
+    inliers = errors[errors < inlier_px]
+    return min(inlier_px, max(CORE_RATIO * float(np.median(inliers)), LEAST_CORE_PX)) if len(inliers) else 0.0
 
 
 def find_pose(

@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.online.slam.passing_views import PassingViews
+
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
@@ -118,12 +120,14 @@ class RigidMap:
     usual_rms_px : running mean of the errors of the poses found in it.
     baseline_px : focal length times the baseline that right columns refer to, px m; 0 where no depth is
         measured, and lengths are in map units instead of metres.
+    passing : frames that are not kept, but tell which candidates move.
     """
 
     def __init__(self, baseline_px: float = 0.0) -> None:
         self.baseline_px = baseline_px
         self.keyframes: list[Keyframe] = []
         self.usual_rms_px = FIRST_RMS_PX
+        self.passing = PassingViews()
         self.positions = np.empty((0, 3))
         self.state = np.empty(0, dtype=np.int8)
         self.first_keyframe, self.first_pixels = np.empty(0, dtype=np.int64), np.empty((0, 2))
@@ -142,7 +146,7 @@ class RigidMap:
 
     def copy_of(self, other: RigidMap) -> None:
         """Become what another map is now, and stay so while it changes."""
-        self.usual_rms_px = other.usual_rms_px
+        self.usual_rms_px, self.passing = other.usual_rms_px, other.passing.copy()
         self.keyframes = [copy(keyframe) for keyframe in other.keyframes]
         for name in POINT_ARRAYS:
             setattr(self, name, getattr(other, name).copy())

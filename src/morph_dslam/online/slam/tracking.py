@@ -93,7 +93,8 @@ class Tracker:
     def take_up(self, ids: Indices) -> None:
         """Follow further points, from where the newest pose has them."""
         pixels, _ = project(self.camera_from_world, self._map.positions[ids], self._intrinsics)
-        new = Followed(ids, pixels)[np.isfinite(pixels[:, 0]) & ~np.isin(ids, self.points.ids)]
+        followed = np.concatenate([self.points.ids, self._astray.ids])
+        new = Followed(ids, pixels)[np.isfinite(pixels[:, 0]) & ~np.isin(ids, followed)]
         self.points = self.points.joined(new)
 
     def drop_candidates(self) -> None:
@@ -120,9 +121,19 @@ class Tracker:
                 self.camera_from_world = result.pose.camera_from_world
                 self.points, self._astray = result.points, result.disagreeing
                 self._map.usual_rms_px += USUAL_RATE * (result.pose.rms_px - self._map.usual_rms_px)
+                self._note_candidates(result.points)
                 return result
             reason = reason or result
         return reason
+
+    def _note_candidates(self, points: Followed) -> None:
+        """Let the map know where points without depth are."""
+        if self._templates is not None:
+            return
+        waiting = points[self._map.state[points.ids] == CANDIDATE]
+        newest = len(self._map.keyframes) - 1
+        at = self._map.keyframes[newest].camera_from_world
+        self._map.passing.note(newest, at, self.camera_from_world, waiting.ids, waiting.pixels)
 
     def _follow(self, flat: Image, predicted: Array, flow: FlowOptions) -> Followed:
         """Followed points, astray ones too, found again, begun where the predicted motion takes them."""
