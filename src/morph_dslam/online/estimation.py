@@ -12,6 +12,8 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.model import ReducedModel
 from morph_dslam.online.depth_residuals import PointDepths
 from morph_dslam.online.levenberg_marquardt import Box, Minimum, minimise
+from morph_dslam.online.linear_cost import LinearCost
+from morph_dslam.online.measurement_noise import Measured
 from morph_dslam.online.prior import Prior
 from morph_dslam.online.reprojection import linearise
 from morph_dslam.online.robust_covariance import huber_covariance
@@ -154,6 +156,23 @@ class Estimator:
         # A point on an outline gives one number, all others give two.
         numbers = np.where((normals != 0.0).any(axis=1), 1, 2)
         return self.finished(found, weights, numbers)
+
+    def fit(self, measured: Measured, start: State, prior: Prior | None = None) -> Estimate:
+        """`estimate` from all that was measured in a frame."""
+        return self.estimate(
+            measured.points,
+            measured.pixels,
+            measured.weights,
+            start,
+            measured.normals,
+            prior,
+            measured.depths,
+        )
+
+    def linear(self, measured: Measured, estimate: Estimate) -> LinearCost:
+        """The cost of what was measured, about an estimate made from it."""
+        huber = self.options.huber_px
+        return LinearCost.about(measured, estimate.state, estimate.residuals, self.camera, huber, self.scale)
 
     def estimate_from(
         self, points: BoundPoints, pixels: Array, weights: Array, starts: Sequence[State]

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.online.estimation import Estimate, Estimator
+from morph_dslam.camera import PinholeCamera
 from morph_dslam.online.measurement_noise import Measured
 from morph_dslam.online.reprojection import project_with_jacobian
 from morph_dslam.online.robust_covariance import EIGENVALUE_FLOOR
+from morph_dslam.online.state import State
 
 Array = NDArray[np.float64]
 
@@ -32,29 +34,50 @@ class LinearCost:
     scale: Array
 
     @classmethod
-    def about(cls, estimator: Estimator, measured: Measured, estimate: Estimate) -> LinearCost:
-        """That of the measurements of a frame, about an estimate made from them."""
-        state, points = estimate.state, measured.points
-        pose = state.camera_from_object
+    def about(
+        cls,
+        measured: Measured,
+        state: State,
+        residuals: Array,
+        camera: PinholeCamera,
+        huber_px: float,
+        scale: Array,
+    ) -> LinearCost:
+        """That of the measurements of a frame, about a state that leaves these residuals (p, 2)."""
+        points, pose = measured.points, state.camera_from_object
         _, jacobian = project_with_jacobian(
             points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
-            points.field.modes, estimator.camera.intrinsics,
+            points.field.modes, camera.intrinsics,
         )  # fmt: skip
         directed = (measured.normals != 0.0).any(axis=1)
         normals = measured.normals[directed]
         jacobian[directed] = (normals[:, :, None] * normals[:, None, :]) @ jacobian[directed]
-        length = np.linalg.norm(estimate.residuals, axis=1)
+        length = np.linalg.norm(residuals, axis=1)
         used = (measured.weights > 0.0) & np.isfinite(length)
         jacobian[~used] = 0.0
-        huber = estimator.options.huber_px
-        factor = np.minimum(1.0, huber / np.maximum(np.where(used, length, 0.0), 1e-300))
+        factor = np.minimum(1.0, huber_px / np.maximum(np.where(used, length, 0.0), 1e-300))
         scores = (measured.weights * factor)[:, None, None] * jacobian
         hessian = np.tensordot(scores, jacobian, axes=([0, 1], [0, 1]))
         of_depths = np.zeros_like(hessian)
         if measured.depths is not None:
             _, part, _, far = measured.depths.terms(points, state)
             hessian, of_depths = hessian + part, measured.depths.variance_px(far) * part
-        return cls(scores, of_depths, hessian, estimator.scale)
+        return cls(scores, of_depths, hessian, scale)
+
+    def in_unknowns(self, chain: Array) -> LinearCost:
+        """The same cost of other unknowns, whose increments ``chain`` (n, m) turns into these."""
+        hessian, of_depths = (chain.T @ matrix @ chain for matrix in (self.hessian, self.of_depths))
+        return LinearCost(self.scores @ chain, of_depths, hessian, self.scale)
+
+    @staticmethod
+    def joined(costs: Sequence[LinearCost]) -> LinearCost:
+        """The sum of costs of the same unknowns, their points one after the other."""
+        return LinearCost(
+            np.concatenate([cost.scores for cost in costs]),
+            np.sum([cost.of_depths for cost in costs], axis=0),
+            np.sum([cost.hessian for cost in costs], axis=0),
+            costs[0].scale,
+        )
 
     @cached_property
     def _spectrum(self) -> tuple[Array, Array, float]:

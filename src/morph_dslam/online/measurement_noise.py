@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from morph_dslam.online.depth_residuals import PointDepths
-from morph_dslam.online.estimation import BoundPoints
+from morph_dslam.online.state import BoundPoints
 
 Array = NDArray[np.float64]
 
@@ -31,6 +33,33 @@ class Measured:
     correlation: Array
     depths: PointDepths | None = None
 
+    @property
+    def numbers(self) -> NDArray[np.int64]:
+        """How many numbers each point (p,) gives: one on an outline, two otherwise."""
+        return np.where((self.normals != 0.0).any(axis=1), 1, 2)
+
+
+@dataclass(frozen=True)
+class RigMeasured:
+    """What several cameras measured at the same time, by camera; their points come one after the other."""
+
+    views: tuple[Measured, ...]
+
+    @cached_property
+    def weights(self) -> Array:
+        """(p,) of all points."""
+        return np.concatenate([view.weights for view in self.views])
+
+    @cached_property
+    def numbers(self) -> NDArray[np.int64]:
+        """(p,) as in `Measured`."""
+        return np.concatenate([view.numbers for view in self.views])
+
+    @cached_property
+    def correlation(self) -> Array:
+        """(p, p); the errors of different cameras have nothing in common."""
+        return np.asarray(scipy.linalg.block_diag(*(view.correlation for view in self.views)))
+
 
 def window_correlation(pixels: Array, window: int) -> Array:
     """Correlation (p, p) of measurements at ``pixels`` (p, 2): the share of their windows that is the same.
@@ -51,10 +80,10 @@ class PixelNoise:
         self._before: Array | None = None
         self.common, self.frame = 0.0, 0.0
 
-    def add(self, residuals: Array, measured: Measured, unknowns: int) -> None:
+    def add(self, residuals: Array, measured: Measured | RigMeasured, unknowns: int) -> None:
         """Learn from the residuals (p, 2) of a frame; those of the frame before tell what stays."""
         used = (measured.weights > 0.0) & np.isfinite(residuals).all(axis=1)
-        numbers = np.where((measured.normals[used] != 0.0).any(axis=1), 1, 2).sum()
+        numbers = measured.numbers[used].sum()
         residuals = np.where(used[:, None], residuals, np.nan)
         total = np.nansum(measured.weights[:, None] * residuals**2) / max(numbers - unknowns, 1)
         if self._before is not None:

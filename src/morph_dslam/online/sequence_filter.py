@@ -15,19 +15,37 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from morph_dslam.online.estimation import Estimate, Estimator, Prior, State
+from morph_dslam.model import ReducedModel
+from morph_dslam.online.estimation import Estimate, Prior, State
 from morph_dslam.online.linear_cost import LinearCost
-from morph_dslam.online.measurement_noise import Measured, PixelNoise
+from morph_dslam.online.measurement_noise import Measured, PixelNoise, RigMeasured
 
 Array = NDArray[np.float64]
 
 #: The weight of the past in the mean of past and frame stays below this.
 LARGEST_WEIGHT = 0.999
+
+
+#: What was measured in a frame.
+Frame = TypeVar("Frame", Measured, RigMeasured)
+_Taken = TypeVar("_Taken", Measured, RigMeasured, contravariant=True)
+
+
+class Fitter(Protocol[_Taken]):
+    """What makes estimates from what was measured: `Estimator`, or `RigEstimator`."""
+
+    @property
+    def model(self) -> ReducedModel: ...
+
+    def fit(self, measured: _Taken, start: State, prior: Prior | None = None) -> Estimate: ...
+
+    def linear(self, measured: _Taken, estimate: Estimate) -> LinearCost: ...
 
 
 @dataclass(frozen=True)
@@ -46,7 +64,7 @@ class FilterOptions:
     patience: int = 3
 
 
-class SequenceFilter:
+class SequenceFilter(Generic[Frame]):
     """Fuses the estimates of the frames of one sequence.
 
     Parameters
@@ -55,7 +73,7 @@ class SequenceFilter:
     """
 
     def __init__(
-        self, estimator: Estimator, indices: Sequence[int], options: FilterOptions | None = None
+        self, estimator: Fitter[Frame], indices: Sequence[int], options: FilterOptions | None = None
     ) -> None:
         self.options = options or FilterOptions()
         self._estimator, self._kept = estimator, np.array(indices, dtype=np.int64)
@@ -64,7 +82,7 @@ class SequenceFilter:
         self._past: _Past | None = None
         self._conflicts = 0
 
-    def fuse(self, measured: Measured, alone: Estimate, known: Prior | None = None) -> Estimate:
+    def fuse(self, measured: Frame, alone: Estimate, known: Prior | None = None) -> Estimate:
         """The estimate of a frame from its measurements and all frames before, with its covariance.
 
         Parameters
@@ -73,7 +91,7 @@ class SequenceFilter:
         known : what is known of the frame's pose or parameters from elsewhere, if anything.
         """
         self._noise.add(alone.residuals, measured, self._unknowns)
-        linear = LinearCost.about(self._estimator, measured, alone)
+        linear = self._estimator.linear(measured, alone)
         errors = self._errors(measured, linear, alone.state, known)
         by_itself = self._with_covariance(alone, measured, linear, errors, known)
         if not len(self._kept):
@@ -88,16 +106,9 @@ class SequenceFilter:
             self._keep(by_itself, errors)
             return by_itself
         past = self._prior(self._past, measured, errors)
-        fused = self._estimator.estimate(
-            measured.points,
-            measured.pixels,
-            measured.weights,
-            self._start(by_itself),
-            measured.normals,
-            past if known is None else past.joined(known),
-            measured.depths,
-        )
-        linear = LinearCost.about(self._estimator, measured, fused)
+        prior = past if known is None else past.joined(known)
+        fused = self._estimator.fit(measured, self._start(by_itself), prior)
+        linear = self._estimator.linear(measured, fused)
         errors = self._errors(measured, linear, fused.state, known, past)
         self._keep(fused, errors)
         return self._with_covariance(fused, measured, linear, errors, known, past)
@@ -105,7 +116,7 @@ class SequenceFilter:
     def _with_covariance(
         self,
         estimate: Estimate,
-        measured: Measured,
+        measured: Frame,
         linear: LinearCost,
         errors: _Errors,
         known: Prior | None,
@@ -141,7 +152,7 @@ class SequenceFilter:
         parameters[self._kept[surer]] = self._past.mean[surer]
         return replace(alone.state, parameters=parameters)
 
-    def _prior(self, past: _Past, measured: Measured, errors: _Errors) -> Prior:
+    def _prior(self, past: _Past, measured: Frame, errors: _Errors) -> Prior:
         """The past as a term of the frame's cost, of the weight that makes the variance of both least.
 
         In the basis in which the frame's covariance is 1 and the past's p, with the covariance c of both, the
@@ -169,7 +180,7 @@ class SequenceFilter:
 
     def _errors(
         self,
-        measured: Measured,
+        measured: Frame,
         linear: LinearCost,
         state: State,
         known: Prior | None,

@@ -1,0 +1,124 @@
+"""Several cameras in one estimate, against finite differences and what each camera alone can tell."""
+
+import numpy as np
+import pytest
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.model import SurfacePoints
+from morph_dslam.online.estimation import BoundPoints, Estimator, Prior, State, moved
+from morph_dslam.online.measurement_noise import Measured, RigMeasured
+from morph_dslam.online.rig import RigCamera, RigEstimator
+from morph_dslam.online.sequence_filter import SequenceFilter
+from tests.support.bent_sheet import bent_sheet_model
+
+MODEL = bent_sheet_model(22, 16)
+LEFT = RigCamera(PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0), RigidTransform.identity())
+#: Half a metre to the right, turned towards the object, of another make.
+ASIDE = RigCamera(
+    PinholeCamera(800, 600, 700.0, 690.0, 400.0, 290.0),
+    RigidTransform(rotation_exp(np.array([0.05, 0.7, -0.1])), np.array([-0.45, 0.02, 0.15])),
+)
+TRUTH = State(
+    np.array([0.035, 0.3, 0.1]),
+    RigidTransform(
+        rotation_exp(np.array([0.2, -0.3, 0.05])) @ np.diag([1.0, -1.0, -1.0]), np.array([0, 0, 0.6])
+    ),
+)
+SIGMA = 0.4
+
+
+def bound(count, seed, columns=(-1.0, 1.0)):
+    """Points between two shares of the sheet's half length."""
+    rng = np.random.default_rng(seed)
+    x = MODEL.nodes[MODEL.triangles, 0].mean(axis=1) / 0.21
+    inside = np.flatnonzero((x > columns[0]) & (x < columns[1]))
+    surface = SurfacePoints(rng.choice(inside, count), rng.dirichlet(np.ones(3), count))
+    return BoundPoints.from_surface(MODEL, surface)
+
+
+def seen_by(part, points, rng, sigma=SIGMA):
+    pixels = part.camera.project(points.in_camera(part.seen(TRUTH)))
+    pixels = pixels + sigma * rng.standard_normal(pixels.shape)
+    count = len(points)
+    return Measured(points, pixels, np.ones(count), np.zeros((count, 2)), np.eye(count))
+
+
+def test_gradient_and_cost_are_those_of_all_cameras():
+    rng = np.random.default_rng(0)
+    views = RigMeasured((seen_by(LEFT, bound(40, 0), rng), seen_by(ASIDE, bound(50, 1), rng)))
+    estimator = RigEstimator(MODEL, [LEFT, ASIDE])
+    state = moved(TRUTH, np.full(9, 3e-3))
+    cost, hessian, gradient, residuals = estimator.evaluate(views, state)
+    by_hand = 0.0
+    for part, view in zip((LEFT, ASIDE), views.views, strict=True):
+        length = np.linalg.norm(
+            part.camera.project(view.points.in_camera(part.seen(state))) - view.pixels, axis=1
+        )
+        by_hand += np.sum(np.where(length <= 3.0, 0.5 * length**2, 3.0 * (length - 1.5)))
+    assert cost == pytest.approx(by_hand)
+    assert residuals.shape == (90, 2)
+    np.testing.assert_allclose(hessian, hessian.T, rtol=1e-9)
+    for k, unit in enumerate(np.eye(9)):
+        ends = [estimator.evaluate(views, moved(state, sign * 1e-7 * unit))[0] for sign in (1.0, -1.0)]
+        assert gradient[k] == pytest.approx((ends[0] - ends[1]) / 2e-7, rel=1e-4, abs=1e-2)
+
+
+def test_one_camera_in_a_rig_is_that_camera():
+    view = seen_by(LEFT, bound(60, 2), np.random.default_rng(2))
+    alone = Estimator(MODEL, LEFT.camera).fit(view, TRUTH)
+    rig = RigEstimator(MODEL, [LEFT]).fit(RigMeasured((view,)), TRUTH)
+    np.testing.assert_allclose(rig.state.parameters, alone.state.parameters, rtol=1e-9)
+    np.testing.assert_allclose(rig.covariance, alone.covariance, rtol=1e-6)
+
+
+def test_both_cameras_are_better_than_one_and_deviations_say_so():
+    """Repeated measurements of a camera in front and one aside."""
+    points = bound(60, 3), bound(60, 4)
+    estimators = {"left": Estimator(MODEL, LEFT.camera), "rig": RigEstimator(MODEL, [LEFT, ASIDE])}
+    found, stated = {"left": [], "rig": []}, {"left": [], "rig": []}
+    for seed in range(80):
+        rng = np.random.default_rng(seed)
+        views = seen_by(LEFT, points[0], rng), seen_by(ASIDE, points[1], rng)
+        for name, measured in (("left", views[0]), ("rig", RigMeasured(views))):
+            estimator = estimators[name]
+            estimate = SequenceFilter(estimator, []).fuse(measured, estimator.fit(measured, TRUTH))
+            found[name].append([*estimate.state.parameters, *estimate.state.camera_from_object.translation])
+            stated[name].append([*estimate.parameter_std, *estimate.pose_std[3:]])
+    spread = {name: np.std(values, axis=0) for name, values in found.items()}
+    assert (spread["rig"] < 0.75 * spread["left"]).all()
+    assert spread["rig"][5] < 0.5 * spread["left"][5]
+    for name in ("left", "rig"):
+        np.testing.assert_allclose(np.mean(stated[name], axis=0), spread[name], rtol=0.3)
+
+
+def test_what_one_camera_cannot_see_is_seen_by_the_other():
+    """The left camera sees the middle of the sheet, where the skew has hardly any effect."""
+    rng = np.random.default_rng(5)
+    middle, end = seen_by(LEFT, bound(60, 5, (-0.1, 0.1)), rng), seen_by(ASIDE, bound(60, 6, (0.2, 1.0)), rng)
+    alone = Estimator(MODEL, LEFT.camera).fit(middle, TRUTH)
+    rig = RigEstimator(MODEL, [LEFT, ASIDE]).fit(RigMeasured((middle, end)), TRUTH)
+    half = 0.5 * (MODEL.upper - MODEL.lower)
+    assert alone.parameter_std[1] > half[1]
+    assert (rig.parameter_std < 0.2 * half).all()
+    np.testing.assert_allclose(rig.state.parameters, TRUTH.parameters, atol=4.0 * rig.parameter_std.max())
+
+
+def test_parameter_over_the_sequence_sharpens_with_a_rig():
+    points, estimator = (bound(30, 7), bound(30, 8)), RigEstimator(MODEL, [LEFT, ASIDE])
+    filtered, deviations = SequenceFilter(estimator, [2]), []
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        measured = RigMeasured((seen_by(LEFT, points[0], rng), seen_by(ASIDE, points[1], rng)))
+        estimate = filtered.fuse(measured, estimator.fit(measured, TRUTH))
+        deviations.append(estimate.parameter_std[2])
+    assert deviations[-1] == pytest.approx(deviations[0] / 4.0, rel=0.35)
+    assert abs(estimate.state.parameters[2] - TRUTH.parameters[2]) < 4.0 * deviations[-1]
+
+
+def test_prior_of_the_pose_is_in_the_rigs_frame():
+    measured = RigMeasured((seen_by(ASIDE, bound(60, 9), np.random.default_rng(9)),))
+    pose = moved(TRUTH, np.full(9, 0.01)).camera_from_object
+    prior = Prior(np.zeros(3), np.zeros((3, 3)), pose, 1e12 * np.eye(6))
+    found = RigEstimator(MODEL, [ASIDE]).fit(measured, TRUTH, prior)
+    np.testing.assert_allclose(found.state.camera_from_object.matrix, pose.matrix, atol=1e-6)
