@@ -5,9 +5,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from morph_dslam.command_arguments import frame_range
+
+if TYPE_CHECKING:
+    from morph_dslam.online.augmented_view import DrawOptions
 
 
 def _track(arguments: argparse.Namespace) -> None:
@@ -25,6 +28,7 @@ def _track(arguments: argparse.Namespace) -> None:
             refine_reference=arguments.refine,
             overlay=not arguments.no_video,
             overwrite=arguments.overwrite,
+            drawing=drawing(arguments),
             **object_arguments(arguments),
         )
     )
@@ -53,6 +57,15 @@ def object_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
         "inner": tuple(arguments.inner),
         "per_sequence": tuple(arguments.per_sequence),
     }
+
+
+def drawing(arguments: argparse.Namespace) -> DrawOptions:
+    """What is to be drawn; raises TrackingError if the section is none."""
+    from morph_dslam.online.augmented_view import DrawOptions
+    from morph_dslam.online.section import SectionPlane
+
+    section = None if arguments.section is None else SectionPlane.parse(arguments.section)
+    return DrawOptions(arguments.show, section)
 
 
 def add_object_arguments(command: argparse.ArgumentParser) -> None:
@@ -107,6 +120,16 @@ def add_object_arguments(command: argparse.ArgumentParser) -> None:
         default=[],
         metavar="NAME",
         help="a parameter that is one over the whole sequence; may be repeated",
+    )
+    command.add_argument(
+        "--show",
+        choices=("stress", "strain", "displacement"),
+        help="what colours the object: von Mises stress (the default), equivalent strain, displacement",
+    )
+    command.add_argument(
+        "--section",
+        metavar="PLANE",
+        help="draw a solid cut open: x=12 takes away all beyond x = 12 mm, -x=12 all before it; also y and z",
     )
 
 

@@ -10,7 +10,7 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel, SeparatedField, SurfacePoints
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.online.appearance import ReferenceAppearance
-from morph_dslam.online.augmentation import seen_field, value_range
+from morph_dslam.online.augmented_view import AugmentedView
 from morph_dslam.online.binding import view_of
 from morph_dslam.online.estimation import BoundPoints, Estimate, State
 from morph_dslam.online.frame_result import STAGES, FrameResult
@@ -59,21 +59,24 @@ def test_stress_shown_is_that_of_the_side_turned_to_the_camera():
     parameters = np.array([0.04, 0.0, 0.0])
     for pose, expected in ((FRONT, True), (BACK, False)):
         state = State(parameters, pose)
-        values, label = seen_field(model, state, view_of(model, CAMERA, state))
-        assert label == "von Mises stress [MPa]"
-        assert (values.max() > 0.0) == expected
+        view = AugmentedView(model, CAMERA)
+        assert view.label == "von Mises stress [MPa]"
+        assert (view.values(state).max() > 0.0) == expected
 
 
 def test_models_without_stress_show_the_displacement():
     model = replace(bent_sheet_model(22, 16), stresses={})
     state = State(np.array([0.04, 0.0, 0.0]), FRONT)
-    values, label = seen_field(model, state, view_of(model, CAMERA, state))
-    assert label == "displacement [mm]"
+    view = AugmentedView(model, CAMERA)
+    assert view.label == "displacement [mm]"
+    values = view.values(state)
     assert values.max() == pytest.approx(40.0, rel=0.02)
-    low, high = value_range(model, CAMERA, [None, state])
+    low, high = view.range_of([state])
     assert low == 0.0
     assert 30.0 < high <= values.max()
-    assert value_range(model, CAMERA, [None]) == (0.0, 1.0)
+    assert view.range_of([]) == (0.0, 1.0)
+    # The box allows arches of 60 mm.
+    assert high < view.range_of_box()[1] < 66.0
 
 
 def two_layers():

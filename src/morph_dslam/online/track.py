@@ -13,6 +13,7 @@ from tqdm import tqdm
 from morph_dslam.errors import SourceError, TrackingError
 from morph_dslam.online.attempt import Picture
 from morph_dslam.online.augmentation import write_video
+from morph_dslam.online.augmented_view import AugmentedView, DrawOptions
 from morph_dslam.online.placement import Placement
 from morph_dslam.online.reference_refinement import (
     Keyframe,
@@ -48,7 +49,7 @@ class TrackOptions:
     inner : files of inner structures (`morph inner`), whose positions are written and drawn.
     per_sequence : names of the parameters that are one over the whole sequence, beside those that the
         placement leaves open.
-    overlay : draw the augmented video. overwrite : replace a run that is there already.
+    overlay : draw the augmented video, drawing : with what. overwrite : replace a run that is there already.
     """
 
     frames: Path
@@ -68,6 +69,7 @@ class TrackOptions:
     inner: tuple[Path, ...] = ()
     per_sequence: tuple[str, ...] = ()
     overlay: bool = True
+    drawing: DrawOptions = field(default_factory=DrawOptions)
     overwrite: bool = False
     registration: RegistrationOptions = field(default_factory=RegistrationOptions)
     refinement: RefinementOptions = field(default_factory=RefinementOptions)
@@ -115,6 +117,8 @@ def track(options: TrackOptions) -> dict[str, Any]:
         options = replace(
             options, reference_frame=frame, first=frame if options.first is None else options.first
         )
+    if options.overlay:
+        AugmentedView(setup.model, setup.camera, options.drawing)  # says so now if it cannot be drawn
     source = open_source(options.frames, options.first, options.last)
     if options.use_depth and not (isinstance(source, RecordedFrames) and source.has_registered_depth):
         raise TrackingError(
@@ -234,5 +238,6 @@ def _write(
     inputs = RunInputs(options.model, options.camera, named)
     summary = write_run(options.output, run, inputs, placement, carried, extra)
     if options.overlay:
-        write_video(options.output / "augmented.mp4", source, setup.camera, run, carried)
+        view = AugmentedView(run.model, setup.camera, options.drawing, carried)
+        write_video(options.output / "augmented.mp4", source, setup.camera, run, view)
     return summary
