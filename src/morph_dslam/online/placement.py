@@ -119,7 +119,7 @@ def place_by_landmarks(
         "n_landmarks": len(registration.estimate.residuals),
         "n_alternatives": len(registration.alternatives),
     }
-    placed = registration.estimate
+    placed, covariance = registration.estimate, registration.covariance
     if depth is not None:
         bound = bind_landmarks(model, landmarks.points, options)
         # How well the landmarks fit tells how carefully they were set, where they are enough to tell.
@@ -133,5 +133,5 @@ def place_by_landmarks(
             depth,
             sensor or DepthOptions(),
         )
-        facts["along_the_sight_line"] = "by depth"
-    return Placement(model, None, placed.state, facts, registration.flags, covariance=placed.covariance)
+        facts["along_the_sight_line"], covariance = "by depth", placed.covariance
+    return Placement(model, None, placed.state, facts, registration.flags, covariance=covariance)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import product
+from itertools import permutations, product
 
 import cv2
 import numpy as np
@@ -26,6 +26,10 @@ Array = NDArray[np.float64]
 
 #: Landmarks that fit so many times worse than careful ones do are flagged.
 POOR_FIT = 2.0
+#: Objects of another size, metres, are flagged: a mesh in millimetres that was taken for metres is such.
+SIZES = (0.005, 10.0)
+#: Units that meshes come in, metres.
+UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 1e-3, "inches": 0.0254}
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,7 @@ class RegistrationOptions:
 
     Attributes
     ----------
+    spread_share : least extent of the landmarks, as a share of the object's size.
     surface_share : how far a landmark may lie off the undeformed surface, as a share of the object's size.
     residual_share : largest residual (root mean square) as a share of the image's diagonal.
     click_px : standard deviation of a carefully set landmark, pixels; minima that fit equally well within it
@@ -42,6 +47,7 @@ class RegistrationOptions:
         camera frame) are different.
     """
 
+    spread_share: float = 0.12
     surface_share: float = 0.01
     residual_share: float = 0.005
     click_px: float = 0.5
@@ -58,16 +64,27 @@ class Registration:
     alternatives : other states that fit the landmarks about as well, best first.
     residual_rms_px : root mean square of the landmarks' residuals.
     flags : what could be wrong with it, in words.
+    click_px : standard deviation that a landmark has at the least.
     """
 
     estimate: Estimate
     alternatives: tuple[State, ...]
     residual_rms_px: float
     flags: tuple[str, ...]
+    click_px: float = 0.0
 
     @property
     def state(self) -> State:
         return self.estimate.state
+
+    @property
+    def covariance(self) -> Array:
+        """That of the state (d + 6, d + 6), with landmarks taken to be no better than ``click_px``.
+
+        A few landmarks that happen to fit well, or that a wrong model fits, do not say that they are exact.
+        """
+        sigma = self.estimate.sigma_px
+        return self.estimate.covariance * max(1.0, (self.click_px / max(sigma, 1e-12)) ** 2)
 
 
 def register(
@@ -107,7 +124,7 @@ def register(
     _check_residual(best, rms, options.residual_share * float(np.hypot(camera.width, camera.height)))
     states = tuple(estimate.state for estimate in alternatives)
     flags = _flags(model, best, alternatives, len(bound), options.click_px)
-    return Registration(best, states, rms, flags)
+    return Registration(best, states, rms, flags, options.click_px)
 
 
 def bind_landmarks(model: ReducedModel, points: Array, options: RegistrationOptions) -> BoundPoints:
@@ -117,8 +134,9 @@ def bind_landmarks(model: ReducedModel, points: Array, options: RegistrationOpti
             f"{len(points)} landmarks are too few to place the object: give at least 4, better "
             f"{(len(model.parameters) + 6) // 2 + 3} or more spread over it"
         )
+    size, spread = _extent(model.nodes), _extent(points)
     surface, distances = nearest_surface_points(model.nodes, model.triangles, points)
-    limit = options.surface_share * float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
+    limit = options.surface_share * size
     worst = int(distances.argmax())
     if distances[worst] > limit:
         x, y, z = 1e3 * points[worst]
@@ -127,9 +145,35 @@ def bind_landmarks(model: ReducedModel, points: Array, options: RegistrationOpti
         raise RegistrationError(
             f"landmark {worst + 1} at ({x:g}, {y:g}, {z:g}) mm is {1e3 * distances[worst]:.1f} mm off the "
             f"object, at most {1e3 * limit:.1f} mm are allowed: landmarks are points of the "
-            f"undeformed object ({ranges} mm)"
+            f"undeformed object ({ranges} mm){_unit_hint(model, points, options)}"
+        )
+    if spread < options.spread_share * size:
+        raise RegistrationError(
+            f"the landmarks are {1e3 * spread:.3g} mm apart on an object of {1e3 * size:.3g} mm: spread them "
+            f"over all that is seen of it{_unit_hint(model, points, options)}"
         )
     return BoundPoints.from_surface(model, surface)
+
+
+def _unit_hint(model: ReducedModel, points: Array, options: RegistrationOptions) -> str:
+    """What to say where the landmarks would lie on the object if its mesh were in another unit."""
+    size = _extent(model.nodes)
+    best, hint = 0.2 * size, ""  # landmarks that shrink to a point lie anywhere
+    for (meant, a), (taken, b) in permutations(UNITS.items(), 2):
+        scaled = points * (b / a)
+        _, distances = nearest_surface_points(model.nodes, model.triangles, scaled)
+        if distances.max() <= options.surface_share * size and _extent(scaled) > best:
+            best = _extent(scaled)
+            hint = (
+                f"; they fit if its mesh is multiplied by {a / b:.4g}: one in {meant} was taken for one in "
+                f"{taken}, perhaps, so mend its unit in the study"
+            )
+    return hint
+
+
+def _extent(points: Array) -> float:
+    """Length of the diagonal of the box around points (n, 3)."""
+    return float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
 def _check_pixels(camera: PinholeCamera, pixels: Array) -> None:
@@ -206,7 +250,7 @@ def _distinct_minima(
     model: ReducedModel, found: list[Estimate], options: RegistrationOptions
 ) -> tuple[Estimate, tuple[Estimate, ...]]:
     """The best minimum and the different ones that landmarks of the stated accuracy cannot exclude."""
-    limit = options.distinct_share * float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
+    limit = options.distinct_share * _extent(model.nodes)
     best = found[0]
     freedom = max(2 * len(best.residuals) - len(best.covariance), 1)
     variance = max(options.click_px**2, 2.0 * best.cost / freedom)
@@ -251,6 +295,12 @@ def _flags(
         flags.append(
             f"registration poor: the landmarks fit to {best.sigma_px:.1f} px, carefully set ones to "
             f"{click_px:g} px; check them, the camera file, and whether this is the model of this object"
+        )
+    size = _extent(model.nodes)
+    if not SIZES[0] < size < SIZES[1]:
+        flags.append(
+            f"the model is {size:.3g} m across: if that is not so, the unit of its mesh is wrong; one camera "
+            "cannot tell, because an object twice as large at twice the distance looks the same"
         )
     if alternatives:
         flags.append(
