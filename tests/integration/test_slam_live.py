@@ -25,28 +25,29 @@ def room_film():
     return [film.frame(place) for place in truth], truth
 
 
-def steps(log, job):
+def steps(log, job=lambda: "done"):
     log.append("begun")
-    log.append((yield job))
-    yield None
+    log.append(job())
+    yield
     log.append("ended")
 
 
-def test_work_in_step_does_its_jobs_at_once_and_pauses_where_it_may():
+def test_work_in_step_is_done_one_step_at_a_time():
     work, log = MappingWork(threaded=False), []
-    work.begin(steps(log, lambda: "done"))
+    work.begin(steps(log))
     assert log == ["begun", "done"]
     assert not work.is_idle
     work.advance()
     assert log == ["begun", "done", "ended"]
     assert work.is_idle
-    do_all(steps(log, lambda: "again"))
-    assert log[3:] == ["begun", "again", "ended"]
+    do_all(steps(log))
+    assert log[3:] == ["begun", "done", "ended"]
 
 
-def test_nobody_waits_for_a_job_in_the_thread():
-    """The job ends only after `advance` has returned: with any waiting this would hang."""
-    work, log, may_end = MappingWork(threaded=True), [], threading.Event()
+def test_nobody_waits_for_a_step_in_the_thread():
+    """The step ends only after `advance` has returned: with any waiting this would hang."""
+    log, may_end = [], threading.Event()
+    work = MappingWork(True, lambda: log.append("before"), lambda: log.append("after"))
 
     def job():
         assert may_end.wait(timeout=30.0)
@@ -55,31 +56,36 @@ def test_nobody_waits_for_a_job_in_the_thread():
     work.begin(steps(log, job))
     for _ in range(3):
         work.advance()
-    assert log == ["begun"]
+    assert "after" not in log
+    assert "ended" not in log
     may_end.set()
     work.finish()
-    assert log[1].startswith("mapper")
-    assert log[2] == "ended"
+    assert log[:2] == ["before", "begun"]
+    assert log[2].startswith("mapper")
+    assert log[3:] == ["after", "before", "ended", "after"]
     assert work.is_idle
 
 
 def test_what_goes_wrong_in_the_thread_is_told():
     def fails():
-        raise ValueError("a job that fails")
+        raise ValueError("a step that fails")
 
     work = MappingWork(threaded=True)
     work.begin(steps([], fails))
-    with pytest.raises(ValueError, match="a job that fails"):
+    with pytest.raises(ValueError, match="a step that fails"):
         work.finish()
 
 
-def test_dropped_work_changes_nothing_more():
-    work, log = MappingWork(threaded=True), []
-    work.begin(steps(log, lambda: "done"))
+def test_dropped_work_is_not_taken_over():
+    log, may_end = [], threading.Event()
+    work = MappingWork(True, after=lambda: log.append("after"))
+    work.begin(steps(log, lambda: may_end.wait(timeout=30.0)))
     work.drop()
     assert work.is_idle
+    may_end.set()
     work.finish()
-    assert log == ["begun"]
+    assert "after" not in log
+    assert "ended" not in log
 
 
 def test_a_map_made_beside_the_frames_is_as_good(room_film):

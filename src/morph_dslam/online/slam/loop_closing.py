@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from morph_dslam.online.slam.frame_images import FrameView
 from morph_dslam.online.slam.mapping import Mapper
-from morph_dslam.online.slam.mapping_work import Work
+from morph_dslam.online.slam.mapping_work import Work, one_step
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.slam.pose_graph import Similarities, optimise
 from morph_dslam.online.slam.projection import project
@@ -65,7 +65,7 @@ class LoopCloser:
 
     def __init__(self, rigid_map: RigidMap, intrinsics: Array, options: SlamOptions, mapper: Mapper) -> None:
         self._map, self._intrinsics, self._mapper = rigid_map, intrinsics, mapper
-        # Loops are looked for in a copy, while the map goes on growing.
+        # Loops are looked for in the map as it was, while it goes on growing.
         self._copy = RigidMap(rigid_map.baseline_px)
         self._relocaliser = Relocaliser(self._copy, intrinsics, options)
         self._tracker = Tracker(self._copy, intrinsics, options)
@@ -78,20 +78,23 @@ class LoopCloser:
         return self._found is not None
 
     def search(self, view: FrameView) -> Work:
-        """Look for a loop that the newest keyframe ends."""
-        self._copy.copy_of(self._map)
-        self._found = yield partial(self._find, view)
+        """Look for a loop that the newest keyframe ends, in the map as it is when this is called."""
+        self._copy.share(self._map)
+        return one_step(partial(self._look, view))
 
-    def close(self) -> Work:
+    def _look(self, view: FrameView) -> None:
+        self._found = self._find(view)
+
+    def close(self) -> None:
         """Close the loop that was found."""
         loop, self._found = self._found, None
         assert loop is not None
         before = Similarities.of_poses(np.array([k.camera_from_world for k in self._map.keyframes]))
         edges, measured = self._pose_graph(loop, before)
-        after = yield partial(optimise, before, edges, measured, with_scale=not self._map.is_metric)
+        after = optimise(before, edges, measured, with_scale=not self._map.is_metric)
         self._spread(before, after)
         self._join(loop)
-        yield from self._mapper.adjust_all()
+        self._mapper.adjust_all()
         self.n_closed += 1
 
     def _find(self, view: FrameView) -> Loop | None:

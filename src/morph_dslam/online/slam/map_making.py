@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.online.slam.frame_images import FrameView
+from morph_dslam.online.slam.initialisation import MapStart
 from morph_dslam.online.slam.loop_closing import LoopCloser
 from morph_dslam.online.slam.mapping import Mapper
-from morph_dslam.online.slam.mapping_work import MappingWork, Work, do_all
+from morph_dslam.online.slam.mapping_work import MappingWork, Work, one_step
 from morph_dslam.online.slam.options import SlamOptions
-from morph_dslam.online.slam.rigid_map import RigidMap
+from morph_dslam.online.slam.rigid_map import Indices, RigidMap
 from morph_dslam.online.slam.tracking import Tracked, Tracker
 
 Array = NDArray[np.float64]
@@ -22,18 +23,22 @@ class MapMaking:
     Keeping a view, and closing a loop, are work of which there is one piece at a time. Loops are looked for
     apart from it, so that the map can grow meanwhile.
 
-    Attributes
+    Parameters
     ----------
-    mapper : for the map's beginning.
+    threaded : whether that is done beside the frames: on a draft, a copy of the map, which is taken over
+        after each step. Tracking then changes nothing of the map but its counts.
     """
 
     def __init__(
         self, rigid_map: RigidMap, intrinsics: Array, options: SlamOptions, tracker: Tracker, threaded: bool
     ) -> None:
-        self._map, self._tracker = rigid_map, tracker
-        self.mapper = Mapper(rigid_map, intrinsics, options)
-        self._loops = LoopCloser(rigid_map, intrinsics, options, self.mapper)
-        self._work, self._search = MappingWork(threaded), MappingWork(threaded)
+        self._map, self._tracker, self._threaded = rigid_map, tracker, threaded
+        self._draft = RigidMap(rigid_map.baseline_px) if threaded else rigid_map
+        self._renew()
+        self._mapper = Mapper(self._draft, intrinsics, options)
+        self._loops = LoopCloser(self._draft, intrinsics, options, self._mapper)
+        self._work, self._search = MappingWork(threaded, self._renew, self._publish), MappingWork(threaded)
+        self._kept: tuple[FrameView, Tracked] | None = None
 
     @property
     def can_keep(self) -> bool:
@@ -50,46 +55,92 @@ class MapMaking:
         """Loops closed."""
         return self._loops.n_closed
 
+    def begin(self, start: MapStart) -> None:
+        """Fill the empty map from three views."""
+        self._mapper.begin(start)
+        self._publish()
+
+    def begin_at(self, view: FrameView, camera_from_world: Array) -> int:
+        """Fill the empty map from one view at a pose (4, 4); returns how many points have a depth."""
+        n = self._mapper.begin_at(view, camera_from_world)
+        self._publish()
+        return n
+
+    def wants_keyframe(self, tracked: Tracked, frame_index: int) -> bool:
+        """Whether the map should keep a view."""
+        return self.can_keep and self._mapper.wants_keyframe(tracked, frame_index)
+
     def keep(self, tracked: Tracked, view: FrameView) -> None:
         """Keep the view of the newest frame, and follow its points."""
-        self._work.begin(self._keep(tracked, view))
-        keyframe = self._map.keyframes[-1]
-        self._tracker.points = keyframe.seen
-        self._tracker.camera_from_world = keyframe.camera_from_world
+        self._kept = view, tracked
+        self._work.begin(self._insert(tracked, view))
+        if not self._threaded:
+            keyframe = self._map.keyframes[-1]
+            self._tracker.points = keyframe.seen
+            self._tracker.camera_from_world = keyframe.camera_from_world
 
     def advance(self) -> None:
         """Take the next step, and let the tracker follow what it changed."""
         self._search.advance()
         self._proceed(to_end=False)
 
-    def finish(self, with_loops: bool) -> None:
-        """Bring what has been begun to its end; a search for loops only if wanted."""
-        if with_loops:
-            self._search.finish()
+    def stop(self) -> None:
+        """Leave the map as it is from now on.
+
+        A step of work that is being done beside the frames does not count any more: they wait for nothing.
+        """
         self._search.drop()
+        if self._threaded:
+            self._work.drop()
+        else:
+            self._proceed(to_end=True)
+
+    def finish(self) -> None:
+        """Bring what has been begun to its end, and adjust all keyframes and points together."""
+        self._search.finish()
         self._proceed(to_end=True)
+        if len(self._map.keyframes) > 2:
+            self._renew()
+            self._mapper.adjust_all()
+            self._publish()
 
-    def adjust_all(self) -> None:
-        """Adjust all keyframes and points together."""
-        do_all(self.mapper.adjust_all())
+    def _insert(self, tracked: Tracked, view: FrameView) -> Work:
+        yield from self._mapper.insert(tracked, view)
+        # A search for loops may follow, in another frame.
+        yield
 
-    def _keep(self, tracked: Tracked, view: FrameView) -> Work:
-        yield from self.mapper.insert(tracked, view)
-        yield None
-        if self._search.is_idle:
-            self._search.begin(self._loops.search(view))
+    def _renew(self) -> None:
+        if self._threaded:
+            self._draft.copy_of(self._map)
+
+    def _publish(self) -> None:
+        if self._threaded:
+            self._map.take_over(self._draft)
 
     def _proceed(self, to_end: bool) -> None:
         if not self._map.keyframes:
             return
-        keyframe = self._map.keyframes[-1]
-        pose, ids = keyframe.camera_from_world, keyframe.point_ids
+        newest, n_keyframes = self._map.keyframes[-1], len(self._map.keyframes)
+        pose, ids = newest.camera_from_world, newest.point_ids
         proceed = self._work.finish if to_end else self._work.advance
         proceed()
+        if self._kept is not None and len(self._map.keyframes) > n_keyframes:
+            # The view kept came with the draft: tracking went on from what it was as a frame.
+            _, tracked = self._kept
+            pose, ids = tracked.pose.camera_from_world, tracked.points.ids
+        if self._kept is not None and self._work.is_idle:
+            view, self._kept = self._kept[0], None
+            if self._search.is_idle:
+                self._search.begin(self._loops.search(view))
         if self._loops.has_found and self._work.is_idle:
-            self._work.begin(self._loops.close())
+            self._work.begin(one_step(self._loops.close))
             proceed()
-        if keyframe.camera_from_world is not pose:
-            self._tracker.correct(pose, keyframe.camera_from_world)
-        if keyframe.point_ids is not ids:
-            self._tracker.take_up(np.setdiff1d(keyframe.point_ids, ids))
+        self._follow(pose, ids)
+
+    def _follow(self, pose: Array, ids: Indices) -> None:
+        """Let the tracker follow what changed for the newest keyframe, whose pose and points these were."""
+        newest = self._map.keyframes[-1]
+        if newest.camera_from_world is not pose:
+            self._tracker.correct(pose, newest.camera_from_world)
+        if newest.point_ids is not ids:
+            self._tracker.take_up(np.setdiff1d(newest.point_ids, ids))

@@ -1,11 +1,9 @@
 """Building the map: a kept view's new points, culling, fusion, local bundle adjustment.
 
-What takes long is done in jobs that touch no map, so that it can be done beside tracking (`mapping_work`).
+A view is worked in by steps, between which tracking goes on (`mapping_work`).
 """
 
 from __future__ import annotations
-
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,9 +58,9 @@ class Mapper:
             scaled = pose.copy()
             scaled[:3, 3] *= scale
             self._map.add_keyframe(_keyframe(view.frame, scaled, Followed(ids.copy(), view.pixels)))
-        do_all(self._adjust_locally())
+        self._adjust_locally()
         for number in (0, 1):
-            do_all(self._describe(number, start.views[number].frame))
+            self._describe(number, start.views[number].frame)
         do_all(self._finish(2, start.views[2].frame))
 
     def begin_at(self, view: FrameView, camera_from_world: Array) -> int:
@@ -81,19 +79,19 @@ class Mapper:
         self._points.place_by_depth(number, view.depth)
         self._points.triangulate(number)
         self._points.fuse(number)
-        yield from self._adjust_locally()
+        self._adjust_locally()
         self._cull()
         yield from self._finish(number, view)
 
-    def adjust_all(self, iterations: int = 20) -> Work:
+    def adjust_all(self, iterations: int = 20) -> None:
         """Bundle adjustment of the whole map."""
         everything = np.arange(len(self._map.keyframes))
-        yield from self._adjust(everything, np.empty(0, dtype=np.int64), iterations)
+        self._adjust(everything, np.empty(0, dtype=np.int64), iterations)
 
     def _finish(self, number: int, view: FrameView) -> Work:
         """New corners to follow, and a description of what the view sees, so that it can be recognised."""
         keyframe = self._map.keyframes[number]
-        corners = yield partial(free_corners, keyframe.flat, keyframe.pixels, self._options)
+        corners = free_corners(keyframe.flat, keyframe.pixels, self._options)
         if len(corners):
             depth = median_depth(
                 self._map,
@@ -105,24 +103,22 @@ class Mapper:
             self._points.add_candidates(number, corners, depth)
         self._points.place_by_depth(number, view.depth)
         self._choice.kept(number, view.index)
-        yield None
-        yield from self._describe(number, view)
+        yield
+        self._describe(number, view)
 
-    def _describe(self, number: int, view: FrameView) -> Work:
+    def _describe(self, number: int, view: FrameView) -> None:
         keyframe = self._map.keyframes[number]
-        ids = keyframe.point_ids
-        rows, descriptors = yield partial(describe, view.grey, keyframe.pixels, OCTAVES)
-        keyframe.described_ids, keyframe.descriptors = ids[rows], descriptors
+        rows, descriptors = describe(view.grey, keyframe.pixels, OCTAVES)
+        keyframe.described_ids, keyframe.descriptors = keyframe.point_ids[rows], descriptors
 
-    def _adjust_locally(self) -> Work:
+    def _adjust_locally(self) -> None:
         """Bundle adjustment of the newest keyframes that see the same points, held by others that do."""
         window, holders = local_window(self._map, self._options)
-        yield from self._adjust(window, holders, LOCAL_ITERATIONS)
+        self._adjust(window, holders, LOCAL_ITERATIONS)
 
-    def _adjust(self, free: Indices, fixed: Indices, iterations: int) -> Work:
+    def _adjust(self, free: Indices, fixed: Indices, iterations: int) -> None:
         problem = gather(self._map, self._intrinsics, free, fixed, iterations, self._hold_poses)
-        result = yield problem.solve
-        put_back(self._map, problem, result)
+        put_back(self._map, problem, problem.solve())
 
     def _cull(self) -> None:
         """Take out map points that are hardly ever found where they should be."""

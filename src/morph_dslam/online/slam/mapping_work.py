@@ -1,29 +1,39 @@
 """The mapper's work as steps, between which tracking goes on.
 
-Work is a generator. It changes the map only between its yields. It yields jobs that leave the map as it is,
-and is sent what they return; or None where what follows can wait for another frame. In step with the frames a
-job is done at once, so that the same frames give the same map. Beside them, a thread does the jobs and work
-goes on in the first frame after a job's end: frames never wait for it.
+Work is a generator that pauses where what follows can wait for another frame. In step with the frames each
+step changes the map itself, one step a frame, so that the same frames give the same map. Beside them, a
+thread does each step on a copy of the map, which replaces the map when the step has ended: frames wait for
+none.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
 
-Work = Generator[Callable[[], Any] | None, Any, None]
+Work = Generator[None, None, None]
+
+#: How long a thread may keep the interpreter while another waits for it, seconds. Tracking gives it up some
+#: fifty times a frame, whenever compiled code runs, and may wait for so long each time; Python's own is 5 ms.
+SWITCH_INTERVAL = 1e-4
+
+
+def share_interpreter() -> None:
+    """Let the threads of this process take turns quickly; for the main program, before it tracks live."""
+    sys.setswitchinterval(SWITCH_INTERVAL)
 
 
 def do_all(work: Work) -> None:
     """Do work from its beginning to its end."""
-    result = None
-    while True:
-        try:
-            job = work.send(result)
-        except StopIteration:
-            return
-        result = job() if job is not None else None
+    for _ in work:
+        pass
+
+
+def one_step(do: Callable[[], None]) -> Work:
+    """Work without a pause."""
+    do()
+    yield from ()
 
 
 class MappingWork:
@@ -31,12 +41,19 @@ class MappingWork:
 
     Parameters
     ----------
-    threaded : whether jobs are done in a thread beside the frames.
+    threaded : whether steps are done in a thread beside the frames.
+    before : done there before each step. after : done after each, by who goes on with the work.
     """
 
-    def __init__(self, threaded: bool) -> None:
+    def __init__(
+        self,
+        threaded: bool,
+        before: Callable[[], None] = lambda: None,
+        after: Callable[[], None] = lambda: None,
+    ) -> None:
         self._work: Work | None = None
-        self._running: Future | None = None
+        self._running: Future[bool] | None = None
+        self._before, self._after = before, after
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="mapper") if threaded else None
 
     @property
@@ -45,37 +62,47 @@ class MappingWork:
         return self._work is None
 
     def begin(self, work: Work) -> None:
-        """Begin new work, up to its first pause."""
+        """Begin new work: do its first step, or have it done."""
         self._work = work
-        self._go_on(None)
+        self._next_step()
 
     def advance(self) -> None:
-        """Go on to the next pause; do nothing while a job is running in the thread."""
+        """Go on with the next step; do nothing while one is running in the thread."""
         if self._running is None:
-            self._go_on(None)
+            self._next_step()
         elif self._running.done():
-            self._go_on(self._running.result())
+            self._end_step(self._running.result())
+            self._next_step()
 
     def finish(self) -> None:
         """Do all that is left now."""
         while self._work is not None:
-            self._go_on(self._running.result() if self._running is not None else None)
+            if self._running is not None:
+                self._end_step(self._running.result())
+            self._next_step()
 
     def drop(self) -> None:
         """Leave what is under way; the map is as its last step left it."""
         self._work, self._running = None, None
 
-    def _go_on(self, result: Any) -> None:
-        while self._work is not None:
-            self._running = None
-            try:
-                job = self._work.send(result)
-            except StopIteration:
-                self._work = None
-                return
-            if job is None:
-                return
-            if self._thread is not None:
-                self._running = self._thread.submit(job)
-                return
-            result = job()
+    def _next_step(self) -> None:
+        if self._work is None:
+            return
+        if self._thread is None:
+            self._end_step(self._step(self._work))
+        else:
+            self._running = self._thread.submit(self._step, self._work)
+
+    def _step(self, work: Work) -> bool:
+        """Do work up to its next pause; whether that was its end."""
+        self._before()
+        return next(work, _END) is _END
+
+    def _end_step(self, is_end: bool) -> None:
+        self._running = None
+        if is_end:
+            self._work = None
+        self._after()
+
+
+_END = object()

@@ -62,7 +62,7 @@ def map_from_trajectory(
             do_all(mapper.insert(tracked, view))
             tracker.points = rigid_map.keyframes[-1].seen
     _check(trajectory, source, options, n_posed, times, rigid_map)
-    do_all(mapper.adjust_all())
+    mapper.adjust_all()
     return rigid_map
 
 

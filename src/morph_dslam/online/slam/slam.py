@@ -153,19 +153,18 @@ class Slam:
     def freeze(self) -> None:
         """Keep the map as it is from now on and only find the camera in it; before a start, do nothing.
 
-        What the mapper has begun is brought to its end first.
+        What the mapper has begun is brought to its end first, or given up where it is done beside the frames.
         """
         if self.map.keyframes:
-            self._making.finish(with_loops=False)
+            self._making.stop()
             self.is_frozen = True
             self._tracker.drop_candidates()
             self._tracker.choose_templates()
 
     def refine_map(self) -> None:
         """Adjust all keyframes and points together, once the sequence is over; a frozen map stays."""
-        self._making.finish(with_loops=True)
-        if len(self.map.keyframes) > 2 and not self.is_frozen:
-            self._making.adjust_all()
+        if not self.is_frozen:
+            self._making.finish()
 
     @property
     def n_loops(self) -> int:
@@ -221,13 +220,13 @@ class Slam:
         start = self._initialiser.process(view)
         if not isinstance(start, MapStart):
             return start
-        self._making.mapper.begin(start)
+        self._making.begin(start)
         return self.map.keyframes[-1].seen
 
     def _start_metric(self, view: FrameView) -> Followed | str:
         if view.depth is None:
             return "this frame has no depth"
-        n, least = self._making.mapper.begin_at(view, np.eye(4)), self.options.least_start_points
+        n, least = self._making.begin_at(view, np.eye(4)), self.options.least_start_points
         if n < least:
             self._begin(RigidMap(self.frame_images.baseline_px))
             return f"only {n} corners with depth, {least} are needed"
@@ -245,9 +244,8 @@ class Slam:
             self._watch(tracked, view.index)
             keeps = (
                 not self.is_frozen
-                and self._making.can_keep
                 and self._n_held > HELD_FRAMES
-                and self._making.mapper.wants_keyframe(tracked, view.index)
+                and self._making.wants_keyframe(tracked, view.index)
             )
             if keeps:
                 self._making.keep(tracked, view)
