@@ -100,7 +100,7 @@ def test_what_one_camera_cannot_see_is_seen_by_the_other():
     rig = RigEstimator(MODEL, [LEFT, ASIDE]).fit(RigMeasured((middle, end)), TRUTH)
     half = 0.5 * (MODEL.upper - MODEL.lower)
     assert alone.parameter_std[1] > half[1]
-    assert (rig.parameter_std < 0.2 * half).all()
+    assert (rig.parameter_std < 0.3 * half).all()
     np.testing.assert_allclose(rig.state.parameters, TRUTH.parameters, atol=4.0 * rig.parameter_std.max())
 
 

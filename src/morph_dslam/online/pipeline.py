@@ -61,6 +61,7 @@ class Tracker:
     Attributes
     ----------
     reference : the reference view. last_seen : where the points were in the last frame that showed them.
+    last_measured : what the last frame's estimate was made from; without weights if the object was lost.
 
     Raises
     ------
@@ -88,10 +89,13 @@ class Tracker:
         self._estimation = FrameEstimation(self.estimator, self.reference, self.options)
         self._recovery = Recovery(model, camera, self.reference, self._estimation, self.options)
         self._anchoring = Anchoring(self.estimator, self.reference, self.options)
-        self._filter = SequenceFilter(self.estimator, self._kept_parameters(), self.options.filter)
+        self._filter = SequenceFilter(
+            self.estimator, kept_parameters(model, self.options), self.options.filter
+        )
         points, window = self.reference.points, self.options.flow.window
         self._systematic = SystematicErrors(self.estimator, points, state, reference_covariance, window)
         self.last_seen: Keyframe | None = None
+        self.last_measured = self.reference.nothing_measured
         self._picture, self._pixels = picture, self.reference.pixels
         self._supported = np.ones(len(points), dtype=bool)
         self._last, self._velocity_base, self._start = state, state, state
@@ -135,6 +139,12 @@ class Tracker:
                 self._anchoring.note(self._anchoring.contradicts(known, attempt))
         self._remember(picture, attempt, bool(why_not), known)
         return self._result(attempt, why_not, how, known, clock)
+
+    def continue_from(self, state: State) -> None:
+        """Go on from a state of the last frame that is known better from elsewhere, also when it is lost."""
+        self._last = self._start = state
+        projected = self.camera.project(self.reference.points.in_camera(state))
+        self._pixels = np.where(self._supported[:, None], self._pixels, projected)
 
     def _attempt_from_last(self, picture: Picture, prior: Prior | None, clock: StageClock) -> Attempt:
         """Estimate from the last known state; by way of the previous frame if the object was seen there."""
@@ -189,20 +199,9 @@ class Tracker:
         """A hidden object, whose place is known from the map, is looked for elsewhere now and then."""
         return known is None or self._anchoring.has_moved or self._n_lost % self.options.look_every == 0
 
-    def _kept_parameters(self) -> list[int]:
-        """Rows of the parameters that are one over the sequence."""
-        names = [parameter.name for parameter in self.model.parameters]
-        unknown = [name for name in self.options.per_sequence if name not in names]
-        if unknown:
-            raise TrackingError(
-                f"'{unknown[0]}' cannot be one over the sequence: the model's parameters are "
-                + ", ".join(names)
-            )
-        return [names.index(name) for name in self.options.per_sequence]
-
     def _fuse(self, attempt: Attempt) -> Attempt:
         """The attempt with what earlier frames tell of the parameters that are one per sequence."""
-        measured = self._estimation.measured(attempt)
+        self.last_measured = measured = self._estimation.measured(attempt)
         estimate = self._filter.fuse(measured, attempt.estimate, attempt.prior)
         return replace(
             attempt, estimate=replace(estimate, residuals=estimate.residuals[: len(attempt.inliers)])
@@ -226,6 +225,8 @@ class Tracker:
                 self._recovery.learn(attempt)
         elif known is not None and not self._anchoring.has_moved:
             self._last = replace(self._last, camera_from_object=known.pose)
+        if lost:
+            self.last_measured = self.reference.nothing_measured
         self._picture, self._lost = picture, lost
         self._n_lost = self._n_lost + 1 if lost else 0
 
@@ -265,3 +266,14 @@ class Tracker:
             grey = cv2.remap(grey, *self._undistortion, interpolation=cv2.INTER_LINEAR)
         flat = flatten(grey, self.options.flow.flatten_window)  # type: ignore[arg-type]
         return Picture(grey, flat)  # type: ignore[arg-type]
+
+
+def kept_parameters(model: ReducedModel, options: TrackerOptions) -> list[int]:
+    """Rows of the parameters that are one over the sequence; raises TrackingError as `Tracker` does."""
+    names = [parameter.name for parameter in model.parameters]
+    unknown = [name for name in options.per_sequence if name not in names]
+    if unknown:
+        raise TrackingError(
+            f"'{unknown[0]}' cannot be one over the sequence: the model's parameters are " + ", ".join(names)
+        )
+    return [names.index(name) for name in options.per_sequence]

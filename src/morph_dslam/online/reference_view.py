@@ -12,7 +12,7 @@ from morph_dslam.online.binding import DrawnSurface, View, bind_pixels, draw_vie
 from morph_dslam.online.estimation import BoundPoints, Estimator, State
 from morph_dslam.online.features import interior, spread_corners
 from morph_dslam.online.measurement import Measurement, compare_with_rendering, visible_surface
-from morph_dslam.online.measurement_noise import window_correlation
+from morph_dslam.online.measurement_noise import Measured, window_correlation
 from morph_dslam.online.outline import Outline
 from morph_dslam.online.relocalisation import Relocaliser
 from morph_dslam.online.timing import StageClock
@@ -63,6 +63,13 @@ class ReferenceView:
     def redundancy(self) -> float:
         """How many of the points count as one, because their windows overlap."""
         return float(self.correlation.sum() / len(self.correlation))
+
+    @property
+    def nothing_measured(self) -> Measured:
+        """What a frame tells that does not show the object."""
+        count = len(self.all_points)
+        none = np.zeros((count, 2))
+        return Measured(self.all_points, none, np.zeros(count), none, self.correlation)
 
     def covered(self, state: State) -> NDArray[np.bool_]:
         """Pixels (h, w) that the object covers in a state."""

@@ -1,0 +1,83 @@
+"""One object in front of two rendered cameras that are fixed to each other."""
+
+import numpy as np
+import pytest
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import RegistrationError
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.online.pipeline import Tracker
+from morph_dslam.online.rig import RigCamera
+from morph_dslam.online.rig_tracking import RigTracker
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.rendered_sequence import SheetFilm, mean_error, sheet_state
+
+#: Two cameras of wide lenses, so that one by itself tells little along its sight line; 0.4 m apart.
+FRONT = RigCamera(PinholeCamera(480, 360, 330.0, 330.0, 240.0, 180.0), RigidTransform.identity())
+TURN = rotation_exp(np.array([0.0, 0.5, 0.0]))
+ASIDE = RigCamera(
+    PinholeCamera(480, 360, 350.0, 350.0, 235.0, 182.0),
+    RigidTransform(TURN, np.array([0.0, 0.0, 0.62]) - TURN @ np.array([0.0, 0.0, 0.62])),
+)
+RIG = (FRONT, ASIDE)
+TIMES = np.linspace(0.0, 0.3, 10)[1:]
+
+
+@pytest.fixture(scope="module")
+def model():
+    return bent_sheet_model(43, 31)
+
+
+@pytest.fixture
+def films(model):
+    return [SheetFilm(model, part.camera) for part in RIG]
+
+
+def images(films, time, **changes):
+    state = sheet_state(time)
+    return [film.frame(part.seen(state), noise=6.0, **changes) for film, part in zip(films, RIG, strict=True)]
+
+
+def test_two_cameras_are_nearer_to_the_truth_than_one(model, films):
+    """Something hides most of the object from the first camera, and some of it from the second."""
+    first = images(films, 0.0)
+    alone = Tracker(model, FRONT.camera, first[0], sheet_state(0.0))
+    rig = RigTracker(model, RIG, first, sheet_state(0.0))
+    errors, deviations = {"alone": [], "rig": []}, {"alone": [], "rig": []}
+    for time in TIMES:
+        seen = images(films, time)
+        seen[0][:, 250:] = 90
+        seen[1][:160] = 90
+        for name, result in (("alone", alone.process_frame(seen[0])), ("rig", rig.process_frame(seen))):
+            assert result.status == "tracked", result.reason
+            errors[name].append(mean_error(model, result.estimate.state, sheet_state(time)))
+            deviations[name].append(result.estimate.pose_std[5])
+    assert np.mean(errors["rig"]) < 0.5 * np.mean(errors["alone"])
+    assert np.mean(deviations["rig"]) < 0.5 * np.mean(deviations["alone"])
+
+
+def test_covered_camera_goes_on_from_the_other(model, films):
+    rig = RigTracker(model, RIG, images(films, 0.0), sheet_state(0.0))
+    for number, time in enumerate(TIMES):
+        seen = images(films, time)
+        if 2 <= number <= 6:
+            seen[1] = films[1].blank()
+        result = rig.process_frame(seen)
+        assert result.status == "tracked", result.reason
+        assert mean_error(model, result.estimate.state, sheet_state(time)) < 0.6e-3
+        assert ("camera 1: lost" in result.reason) == (2 <= number <= 6)
+    assert rig.trackers[1].last_measured.weights.sum() > 100
+
+
+def test_object_that_no_camera_sees_is_lost(model, films):
+    rig = RigTracker(model, RIG, images(films, 0.0), sheet_state(0.0))
+    result = rig.process_frame([film.blank() for film in films])
+    assert result.status == "lost"
+    assert "camera 0: lost" in result.reason
+    assert "camera 1: lost" in result.reason
+
+
+def test_reference_frame_without_texture_names_its_camera(model, films):
+    first = [images(films, 0.0)[0], np.full((360, 480, 3), 128, np.uint8)]
+    with pytest.raises(RegistrationError, match="camera 1: the object shows only"):
+        RigTracker(model, RIG, first, sheet_state(0.0))
