@@ -8,7 +8,9 @@ import pytest
 
 from morph_dslam.errors import SourceError
 from morph_dslam.sources import open_source, open_stream
-from morph_dslam.sources.live import LiveCamera
+from morph_dslam.sources.frames import Frame
+from morph_dslam.sources.live import LiveCamera, PacedRecording
+from morph_dslam.sources.newest import Newest
 
 
 class FakeCapture:
@@ -42,9 +44,10 @@ def deliver(capture, camera, n_frames):
     for _ in range(n_frames):
         capture.allowed.release()
     wanted = capture.delivered_goal = getattr(capture, "delivered_goal", 0) + n_frames
-    with camera._changed:
-        assert camera._changed.wait_for(
-            lambda: camera._newest is not None and camera._newest.index == wanted - 1, timeout=10.0
+    place = camera._newest
+    with place._changed:
+        assert place._changed.wait_for(
+            lambda: place._item is not None and place._item.index == wanted - 1, timeout=10.0
         )
 
 
@@ -61,6 +64,7 @@ def test_a_slow_consumer_gets_the_newest_frame():
     assert [frame.index for frame in (first, second, third)] == [0, 9, 10]
     assert [int(frame.image[0, 0, 0]) for frame in (first, second, third)] == [0, 9, 10]
     assert [frame.timestamp for frame in (first, second, third)] == [0.0, 9.0, 10.0]
+    assert [frame.captured for frame in (first, second, third)] == [100.0, 109.0, 110.0]
     assert camera.dropped == 8
     assert camera.fps == 25.0
     capture.allowed.release()
@@ -90,6 +94,71 @@ def test_a_recording_gives_every_frame_to_a_slow_consumer(tmp_path):
     threading.Event().wait(0.05)
     seen += [frame.index for frame in frames]
     assert seen == [0, 1, 2, 3, 4]
+
+
+class Film:
+    """A recording of five frames, ten a second, numbered from 3."""
+
+    name, fps = "film", 10.0
+
+    def __iter__(self):
+        for k in range(5):
+            yield Frame(3 + k, 7.0 + 0.1 * k, np.full((2, 2, 3), k, dtype=np.uint8))
+
+
+class FakeClock:
+    """Time passes only while somebody sleeps, and when the test says so."""
+
+    def __init__(self):
+        self.now, self.slept = 50.0, []
+
+    def __call__(self):
+        return self.now
+
+    def sleep(self, seconds):
+        self.slept.append(seconds)
+        self.now += seconds
+
+
+def test_a_recording_plays_at_its_own_pace():
+    clock = FakeClock()
+    stream = PacedRecording(Film(), clock, clock.sleep)
+    frames = []
+    for frame in stream.read():
+        frames.append(frame)
+        if frame.index == 4:
+            clock.now += 0.25  # something else took long: two frames come late
+    assert [frame.index for frame in frames] == [3, 4, 5, 6, 7]
+    assert [frame.timestamp for frame in frames] == pytest.approx([7.0, 7.1, 7.2, 7.3, 7.4])
+    assert [frame.captured for frame in frames] == pytest.approx([50.0, 50.1, 50.35, 50.35, 50.4])
+    assert clock.slept == pytest.approx([0.1, 0.05])
+
+
+def test_a_recording_that_plays_ends_with_its_newest_frame_and_tells_its_errors():
+    with PacedRecording(Film(), sleep=lambda seconds: None) as stream:
+        assert [frame.index for frame in stream][-1] == 7
+
+    class Broken(Film):
+        def __iter__(self):
+            yield next(super().__iter__())
+            raise SourceError("frame 4 is damaged")
+
+    with (
+        PacedRecording(Broken(), sleep=lambda seconds: None) as stream,
+        pytest.raises(SourceError, match="frame 4 is damaged"),
+    ):
+        list(stream)
+
+
+def test_the_newest_item_is_taken_and_an_error_comes_last():
+    place = Newest()
+    place.put("old")
+    place.put("new")
+    place.end(SourceError("gone"))
+    assert place.take() == "new"
+    assert place.dropped == 1
+    with pytest.raises(SourceError, match="gone"):
+        place.take()
 
 
 def test_webcams_that_cannot_be_opened():

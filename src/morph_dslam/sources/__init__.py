@@ -9,13 +9,13 @@ from morph_dslam.errors import SourceError
 from morph_dslam.sources.euroc import euroc_recording, is_euroc
 from morph_dslam.sources.folder import image_folder
 from morph_dslam.sources.frames import Frame, FrameSource, FrameStream
-from morph_dslam.sources.live import open_webcam
+from morph_dslam.sources.live import LiveStream, PacedRecording, open_webcam
 from morph_dslam.sources.ros_bag import RosBag, is_bag
 from morph_dslam.sources.seven_scenes import is_seven_scenes, seven_scenes_recording
 from morph_dslam.sources.tum import is_tum, tum_recording
 from morph_dslam.sources.video import VideoFile
 
-__all__ = ["Frame", "FrameSource", "FrameStream", "open_source", "open_stream"]
+__all__ = ["Frame", "FrameSource", "FrameStream", "open_live", "open_source", "open_stream"]
 
 _WEBCAM = re.compile(r"webcam:(\d+)")
 
@@ -70,6 +70,18 @@ def open_stream(source: str | Path, first: int | None = None, last: int | None =
     if first is not None or last is not None:
         raise SourceError(f"{source} is live and has no range of frames to choose from")
     return open_webcam(int(webcam[1]))
+
+
+def open_live(source: str | Path, first: int | None = None, last: int | None = None) -> LiveStream:
+    """Open a webcam, or a recording that plays as if it were live: frames that come too fast are dropped.
+
+    Raises
+    ------
+    SourceError
+        As `open_stream` does.
+    """
+    stream = open_stream(source, first, last)
+    return stream if isinstance(stream, LiveStream) else PacedRecording(stream)
 
 
 def _split_topic(path: Path) -> tuple[Path, str | None]:

@@ -24,6 +24,7 @@ class Frame:
     image : (h, w, 3) uint8, blue, green, red.
     depth : (h, w) metres along the optical axis, NaN where not measured; None without a depth camera.
     right : (h, w, 3) uint8, what the right camera of a stereo pair saw; None without one.
+    captured : when a live frame came, seconds of `time.monotonic`; None in a recording.
     """
 
     index: int
@@ -31,6 +32,7 @@ class Frame:
     image: NDArray[np.uint8]
     depth: NDArray[np.float32] | None = None
     right: NDArray[np.uint8] | None = None
+    captured: float | None = None
 
 
 class FrameStream(Protocol):

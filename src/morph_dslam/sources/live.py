@@ -1,4 +1,4 @@
-"""A live camera, which waits for nobody: of the frames that come during work on one the newest is kept."""
+"""Live sources, which wait for nobody: of the frames that come during work on one the newest is kept."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SourceError
-from morph_dslam.sources.frames import Frame
+from morph_dslam.sources.frames import Frame, FrameStream
+from morph_dslam.sources.newest import Newest
 
 
 class Capture(Protocol):
@@ -43,78 +44,131 @@ def open_webcam(device: int) -> LiveCamera:
     return LiveCamera(capture, f"webcam {device}")
 
 
-class LiveCamera:
+class LiveStream:
     """A `FrameStream` that a thread reads without pause, so that each frame handed out is the newest.
 
-    A context manager: leaving it stops the thread and frees the device. Frames are numbered as they come, so
-    a dropped frame leaves a gap; timestamps are seconds since the first.
-
-    Attributes
-    ----------
-    dropped : number of frames so far that came while another was worked on.
+    A context manager: leaving it stops the thread. Frames have the time at which they were captured.
     """
 
-    def __init__(
-        self, capture: Capture, name: str = "camera", clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        self.name = name
-        fps = capture.get(cv2.CAP_PROP_FPS)
-        self.fps = fps if np.isfinite(fps) and fps > 0 else 30.0
-        self.dropped = 0
-        self._capture = capture
-        self._clock = clock
-        self._changed = threading.Condition()
-        self._newest: Frame | None = None
-        self._ended = False
-        self._closing = False
-        self._thread = threading.Thread(target=self._read, name=f"{name} reader", daemon=True)
+    def __init__(self, name: str, fps: float) -> None:
+        self.name, self.fps = name, fps
+        self.closing = False
+        self._newest: Newest[Frame] = Newest()
+        self._thread = threading.Thread(target=self._read_all, name=f"{name} reader", daemon=True)
+
+    @property
+    def dropped(self) -> int:
+        """Number of frames so far that came while another was worked on."""
+        return self._newest.dropped
+
+    def read(self) -> Iterator[Frame]:
+        """The frames as they come; runs in the thread."""
+        raise NotImplementedError
+
+    def release(self) -> None:
+        """Free what was read from."""
+
+    def start(self) -> None:
+        """Begin to read."""
         self._thread.start()
 
-    def _read(self) -> None:
-        index, start = 0, 0.0
-        while not self._closing:
-            delivered, image = self._capture.read()
-            now = self._clock()
-            if not delivered or image is None:
-                break
-            start = now if index == 0 else start
-            # Captures may hand out the same memory again.
-            frame = Frame(index, now - start, np.array(image, dtype=np.uint8))
-            with self._changed:
-                self.dropped += self._newest is not None
-                self._newest = frame
-                self._changed.notify()
-            index += 1
-        with self._changed:
-            self._ended = True
-            self._changed.notify()
+    def _read_all(self) -> None:
+        try:
+            for frame in self.read():
+                self._newest.put(frame)
+                if self.closing:
+                    break
+        except Exception as error:  # told in the thread that takes the frames
+            self._newest.end(error)
+        else:
+            self._newest.end()
 
     def __iter__(self) -> Iterator[Frame]:
-        last = None
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._newest is not None or self._ended)
-                frame, self._newest = self._newest, None
-            if frame is None:
-                if self._closing:
-                    return
-                after = "before the first frame" if last is None else f"after frame {last}"
-                raise SourceError(f"{self.name} stopped delivering {after}: check its cable")
-            last = frame.index
+        while (frame := self._newest.take()) is not None:
             yield frame
 
     def close(self) -> None:
-        """Stop reading and free the device; iterating ends."""
-        self._closing = True
+        """Stop reading and free what was read from; iterating ends."""
+        self.closing = True
         # A read that hangs in a broken driver must not hang the program; its thread is a daemon.
         self._thread.join(timeout=2.0)
         if not self._thread.is_alive():
-            self._capture.release()
+            self.release()
+        self._newest.end()
 
-    def __enter__(self) -> LiveCamera:
+    def __enter__(self) -> LiveStream:
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+class LiveCamera(LiveStream):
+    """A camera. Frames are numbered as they come, so a dropped frame leaves a gap.
+
+    Timestamps are seconds since the first frame.
+    """
+
+    def __init__(
+        self, capture: Capture, name: str = "camera", clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        fps = capture.get(cv2.CAP_PROP_FPS)
+        super().__init__(name, fps if np.isfinite(fps) and fps > 0 else 30.0)
+        self._capture, self._clock = capture, clock
+        self.start()
+
+    def read(self) -> Iterator[Frame]:
+        index, start = 0, 0.0
+        while not self.closing:
+            delivered, image = self._capture.read()
+            now = self._clock()
+            if not delivered or image is None:
+                if self.closing:
+                    return
+                after = f"after frame {index - 1}" if index else "before the first frame"
+                raise SourceError(f"{self.name} stopped delivering {after}: check its cable")
+            start = now if index == 0 else start
+            # Captures may hand out the same memory again.
+            yield Frame(index, now - start, np.array(image, dtype=np.uint8), captured=now)
+            index += 1
+
+    def release(self) -> None:
+        self._capture.release()
+
+
+class PacedRecording(LiveStream):
+    """A recording that plays as if it were live: each frame comes when its time has come.
+
+    It begins with the first frame taken, and ends with the last one.
+    """
+
+    def __init__(
+        self,
+        source: FrameStream,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        super().__init__(source.name, source.fps)
+        self._source, self._clock, self._sleep = source, clock, sleep
+
+    def read(self) -> Iterator[Frame]:
+        first: tuple[float, float] | None = None
+        for frame in self._source:
+            if self.closing:
+                return
+            first = first or (self._clock(), frame.timestamp)
+            wait = first[0] + frame.timestamp - first[1] - self._clock()
+            if wait > 0.0:
+                self._sleep(wait)
+            yield Frame(frame.index, frame.timestamp, frame.image, captured=self._clock())
+
+    def __iter__(self) -> Iterator[Frame]:
+        if self._thread.ident is None:
+            self.start()
+        return super().__iter__()
+
+    def close(self) -> None:
+        if self._thread.ident is not None:
+            super().close()
