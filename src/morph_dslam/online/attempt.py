@@ -22,11 +22,13 @@ class Picture:
     ----------
     grey : the undistorted image (h, w). flat : flattened.
     depth : (h, w) of a depth camera, as recorded, metres, NaN where unknown; None without one.
+    in_front : (h, w) depth of other objects, metres, infinite where there are none; None if none is known.
     """
 
     grey: NDArray[np.uint8]
     flat: NDArray[np.uint8]
     depth: NDArray[np.float32] | None = None
+    in_front: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,8 @@ class Tracker:
 
     Attributes
     ----------
-    reference : the reference view. last_seen : where the points were in the last frame that showed them.
+    reference : the reference view. state : last known of the object.
+    last_seen : where the points were in the last frame that showed them.
     last_measured : what the last frame's estimate was made from; without weights if the object was lost.
 
     Raises
@@ -106,6 +107,7 @@ class Tracker:
         image: NDArray[np.uint8],
         known: KnownPose | None = None,
         depth: NDArray[np.float32] | None = None,
+        in_front: NDArray[np.float32] | None = None,
     ) -> FrameResult:
         """Find the object in the next frame (h, w, 3) uint8, as recorded.
 
@@ -113,10 +115,12 @@ class Tracker:
         ----------
         known : an anchored object's pose by the map; None for a free one, or where the camera is lost.
         depth : (h, w) metres, NaN where unknown, of a depth camera that sees what the image shows.
+        in_front : (h, w) depth of other objects, metres, infinite where there are none: points that they hide
+            do not count.
         """
         clock = StageClock(STAGES)
         with clock.stage("prepare"):
-            picture = replace(self._prepare(image), depth=depth)
+            picture = replace(self._prepare(image), depth=depth, in_front=in_front)
         attempt = self._attempt_from_last(picture, self._anchoring.prior(known), clock)
         with clock.stage("search"):
             attempt = self._estimation.search_other_shapes(attempt)
@@ -139,6 +143,10 @@ class Tracker:
                 self._anchoring.note(self._anchoring.contradicts(known, attempt))
         self._remember(picture, attempt, bool(why_not), known)
         return self._result(attempt, why_not, how, known, clock)
+
+    @property
+    def state(self) -> State:
+        return self._last
 
     def continue_from(self, state: State) -> None:
         """Go on from a state of the last frame that is known better from elsewhere, also when it is lost."""

@@ -11,12 +11,18 @@ from morph_dslam.online.attempt import Picture
 from morph_dslam.online.binding import DrawnSurface, View, bind_pixels, draw_view, view_of
 from morph_dslam.online.estimation import BoundPoints, Estimator, State
 from morph_dslam.online.features import interior, spread_corners
-from morph_dslam.online.measurement import Measurement, compare_with_rendering, visible_surface
+from morph_dslam.online.measurement import (
+    DEPTH_TOLERANCE,
+    Measurement,
+    compare_with_rendering,
+    visible_surface,
+)
 from morph_dslam.online.measurement_noise import Measured, window_correlation
 from morph_dslam.online.outline import Outline
 from morph_dslam.online.relocalisation import Relocaliser
 from morph_dslam.online.timing import StageClock
 from morph_dslam.online.tracker_options import TrackerOptions
+from morph_dslam.render.rasteriser import visible_points
 
 Array = NDArray[np.float64]
 
@@ -76,6 +82,11 @@ class ReferenceView:
         camera, drawn = self._estimator.camera, self.surface.model
         return draw_view(view_of(drawn, camera, state), drawn.triangles, camera).covered
 
+    def depth(self, state: State) -> NDArray[np.float32]:
+        """Depth (h, w) of the object in a state, metres, infinite where it is not."""
+        camera, drawn = self._estimator.camera, self.surface.model
+        return draw_view(view_of(drawn, camera, state), drawn.triangles, camera).depth
+
     def measure(
         self, picture: Picture, state: State, followed: Measurement | None, clock: StageClock
     ) -> Measurement:
@@ -93,6 +104,9 @@ class ReferenceView:
             visible = visible_surface(
                 self.points.surface, positions, predicted, view, drawn.triangles, self.appearance, rendering
             )
+            if picture.in_front is not None:
+                tolerance = DEPTH_TOLERANCE * float(np.median(positions[:, 2]))
+                visible &= visible_points(predicted, positions[:, 2], picture.in_front, tolerance)
             guesses = predicted
             if followed is not None:
                 guesses = np.where(followed.valid[:, None], followed.pixels, predicted)

@@ -1,0 +1,93 @@
+"""Two rendered sheets in one image, one of which passes in front of the other."""
+
+import numpy as np
+import pytest
+
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.online.estimation import State
+from morph_dslam.online.pipeline import Tracker
+from morph_dslam.online.several_objects import ObjectTracker
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.rendered_sequence import CAMERA, UPRIGHT, SheetFilm, mean_error, sheet_depth
+
+TIMES = np.linspace(0.0, 1.0, 21)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return bent_sheet_model(43, 31)
+
+
+@pytest.fixture(scope="module")
+def films(model):
+    return {"behind": SheetFilm(model, seed=1), "before": SheetFilm(model, seed=2)}
+
+
+def states(time):
+    """The sheet behind bends; the one before passes it from right to left."""
+    bend = np.array([0.03 * np.sin(4.0 * time), 0.2, 0.1])
+    behind = RigidTransform(
+        rotation_exp(np.array([0.1, 0.2, 0.1 * time])) @ UPRIGHT, np.array([-0.1, 0.0, 0.9])
+    )
+    before = RigidTransform(
+        rotation_exp(np.array([0.0, -0.3, 0.0])) @ UPRIGHT, np.array([0.33 - 0.35 * time, 0.12, 0.75])
+    )
+    return {"behind": State(bend, behind), "before": State(np.array([0.02, 0.0, 0.05]), before)}
+
+
+def frame(model, films, time):
+    """Both sheets, the nearer one before the other."""
+    images = {name: film.frame(states(time)[name]) for name, film in films.items()}
+    no_noise = np.random.default_rng(0)
+    depths = {name: sheet_depth(model, states(time)[name], no_noise, 0.0, 9.0) for name in films}
+    nearer = depths["before"] < depths["behind"]
+    return np.where(nearer[:, :, None], images["before"], images["behind"])
+
+
+def new_trackers(model, films):
+    first = frame(model, films, 0.0)
+    return {name: Tracker(model, CAMERA, first, states(0.0)[name]) for name in films}
+
+
+def test_object_that_passes_before_another_one_costs_it_no_accuracy(model, films):
+    objects = ObjectTracker(new_trackers(model, films))
+    errors = {name: [] for name in films}
+    visible = []
+    for time in TIMES[1:]:
+        results = objects.process_frame(frame(model, films, time))
+        for name, result in results.items():
+            assert result.status == "tracked", (name, time, result.reason)
+            errors[name].append(mean_error(model, result.estimate.state, states(time)[name]))
+        visible.append(results["behind"].n_points)
+    assert max(errors["before"]) < 0.3e-3
+    # Two thirds of its points are hidden at last.
+    assert min(visible) < 0.4 * visible[0]
+    assert np.mean(errors["behind"]) < 0.3e-3
+    assert max(errors["behind"]) < 1.0e-3
+
+
+def test_hidden_points_are_known_to_be_hidden(model, films):
+    """By themselves, points behind the other sheet count as visible, and have to be thrown out by looks."""
+    aware, unaware = ObjectTracker(new_trackers(model, films)), new_trackers(model, films)["behind"]
+    for time in TIMES[1:]:
+        image = frame(model, films, time)
+        counts = aware.process_frame(image)["behind"].n_points, unaware.process_frame(image).n_points
+    tracker = aware.trackers["behind"]
+    positions = tracker.reference.points.in_camera(states(1.0)["behind"])
+    pixels = np.rint(CAMERA.project(positions)).astype(int)
+    depth = sheet_depth(model, states(1.0)["before"], np.random.default_rng(0), 0.0, 9.0)
+    hidden = depth[pixels[:, 1], pixels[:, 0]] < positions[:, 2]
+    assert hidden.sum() > 60
+    assert counts[0] <= counts[1] - hidden.sum()
+
+
+def test_lost_object_hides_nothing(model, films):
+    objects = ObjectTracker(new_trackers(model, films))
+    for time in TIMES[1:14]:
+        objects.process_frame(frame(model, films, time))
+    image = films["behind"].frame(states(TIMES[14])["behind"])
+    results = objects.process_frame(image)
+    assert results["before"].status == "lost"
+    again = objects.process_frame(image)
+    assert again["behind"].status == "tracked"
+    assert again["behind"].n_points > results["behind"].n_points
