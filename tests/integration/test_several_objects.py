@@ -84,10 +84,7 @@ def test_hidden_points_are_known_to_be_hidden(model, films):
 def test_lost_object_hides_nothing(model, films):
     objects = ObjectTracker(new_trackers(model, films))
     for time in TIMES[1:14]:
-        objects.process_frame(frame(model, films, time))
-    image = films["behind"].frame(states(TIMES[14])["behind"])
-    results = objects.process_frame(image)
+        before = objects.process_frame(frame(model, films, time))
+    results = objects.process_frame(films["behind"].frame(states(TIMES[14])["behind"]))
     assert results["before"].status == "lost"
-    again = objects.process_frame(image)
-    assert again["behind"].status == "tracked"
-    assert again["behind"].n_points > results["behind"].n_points
+    assert results["behind"].n_points > before["behind"].n_points + 80
