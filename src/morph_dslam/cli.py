@@ -18,6 +18,7 @@ from morph_dslam import __version__
 from morph_dslam.camera_commands import add_camera_commands
 from morph_dslam.errors import EvaluationError, MorphError
 from morph_dslam.inner_commands import add_inner_commands
+from morph_dslam.live_commands import add_live_commands
 from morph_dslam.registration_commands import add_registration_commands
 from morph_dslam.tracking_commands import add_tracking_commands
 from morph_dslam.view_commands import add_view_commands
@@ -109,6 +110,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_offline_commands(commands)
     add_view_commands(partial(_add, commands))
     add_tracking_commands(partial(_add, commands))
+    add_live_commands(partial(_add, commands))
     _add_evaluation_commands(commands)
     add_camera_commands(partial(_add, commands))
     add_inner_commands(partial(_add, commands))

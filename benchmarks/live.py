@@ -1,0 +1,190 @@
+"""How fast live tracking is with everything on: frames a second, drops, latency, memory.
+
+    python benchmarks/live.py [--minutes 10] [--size 640x480|1280x720]
+
+The boot seal's recording (`examples/boot_seal/track.py`, from its last keyframe on) plays back and forth from
+memory at 30 frames a second: the camera is found in the map of the scan, the seal in it, its stress drawn over
+the picture, and the picture recorded. The latency is that from a frame's capture to its finished picture.
+Processor time by thread says what a frame costs where other programs disturb the clock. For 1280x720 the scene
+is rendered once more at that size, scanned and registered, and kept in benchmarks/output/live.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.cli import run_and_report_errors
+from morph_dslam.errors import SourceError
+from morph_dslam.experiment import keep, keep_sequence
+from morph_dslam.io.video import VideoWriter
+from morph_dslam.online.augmented_view import AugmentedView
+from morph_dslam.online.frame_result import STAGES
+from morph_dslam.online.live.session import LivePicture, LiveSession
+from morph_dslam.online.live.sinks import VideoSink
+from morph_dslam.online.mesh_registration.run import run_registration
+from morph_dslam.online.results import RunResults
+from morph_dslam.online.slam.run import SlamRunOptions, run_slam
+from morph_dslam.online.tracking_setup import ObjectOptions, load_setup
+from morph_dslam.sources import Frame, open_source
+from morph_dslam.sources.live import PacedRecording
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLE = ROOT / "examples" / "boot_seal"
+FPS, SCANNED = 30.0, 150
+
+
+class BackAndForth:
+    """Frames from memory, forwards and backwards in turn, at 30 a second."""
+
+    name, fps = "the boot seal's recording", FPS
+
+    def __init__(self, images: list[NDArray[np.uint8]], minutes: float) -> None:
+        self._images, self._count = images, round(60.0 * FPS * minutes)
+
+    def __iter__(self) -> Iterator[Frame]:
+        there_and_back = [*range(len(self._images)), *range(len(self._images) - 2, 0, -1)]
+        for number in range(self._count):
+            image = self._images[there_and_back[number % len(there_and_back)]]
+            yield Frame(number, number / FPS, image)
+
+
+class Timed:
+    """Processor time that calls of a method take, by the thread they run in."""
+
+    def __init__(self, target: object, method: str) -> None:
+        self.milliseconds: list[float] = []
+        self._call = getattr(target, method)
+        setattr(target, method, self)
+
+    def __call__(self, *arguments):
+        begin = time.thread_time()
+        try:
+            return self._call(*arguments)
+        finally:
+            self.milliseconds.append(1e3 * (time.thread_time() - begin))
+
+
+def large_scene(folder: Path) -> Path:
+    """The example's scene file for 1280x720: seen a little closer."""
+    text = (EXAMPLE / "scene.toml").read_text()
+    wanted = {
+        'model = "output/boot_seal.morph"': f'model = "{EXAMPLE / "output" / "boot_seal.morph"}"',
+        "width = 640": "width = 1280",
+        "height = 480": "height = 720",
+        "fx = 560.0": "fx = 950.0",
+        "fy = 560.0": "fy = 950.0",
+        "cx = 320.0": "cx = 640.0",
+        "cy = 240.0": "cy = 360.0",
+    }
+    for before, after in wanted.items():
+        if before not in text:
+            raise SourceError(f"{EXAMPLE / 'scene.toml'} has changed: it does not say '{before}'")
+        text = text.replace(before, after)
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "scene.toml"
+    path.write_text(text)
+    return path
+
+
+def make_large(folder: Path, model: Path) -> None:
+    """Render, scan and register at 1280x720, unless it was done before."""
+    sequence = folder / "recording"
+    keep_sequence(large_scene(folder), model, sequence)
+    camera = sequence / "camera.yaml"
+
+    def scan() -> None:
+        run_slam(
+            SlamRunOptions(
+                source=sequence / "frames",
+                camera=camera,
+                output=folder / "scan",
+                first=0,
+                last=SCANNED,
+                overwrite=True,
+                video=False,
+            )
+        )
+        run_registration(folder / "scan" / "map.h5", model, camera, folder / "registration")
+
+    keep(folder / "scan", [folder / "scene.toml", model], scan)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    model = EXAMPLE / "output" / "boot_seal.morph"
+    folder = EXAMPLE / "output"
+    if not model.is_file():
+        raise SourceError(f"there is no {model}: make it with examples/boot_seal/run.py first")
+    if arguments.size == "1280x720":
+        folder = ROOT / "benchmarks" / "output" / "live"
+        make_large(folder, model)
+    place = folder / "registration" / "registration.json"
+    if not place.is_file():
+        raise SourceError(f"there is no {place}: make it with examples/boot_seal/track.py first")
+    setup = load_setup(
+        ObjectOptions(
+            model=model,
+            camera=folder / "recording" / "camera.yaml",
+            placement=place,
+            map_path=folder / "scan" / "map.h5",
+        )
+    )
+    placement, reference = setup.placed(), setup.reference
+    assert reference is not None
+    images = [frame.image for frame in open_source(folder / "recording" / "frames", placement.frame)]
+    setup.warm_up(placement, reference)
+    chain = setup.new_chain(placement, reference, in_sequence=False)
+    picture = LivePicture(setup.camera, AugmentedView(placement.model, setup.camera))
+    picture_time, locate, track = Timed(picture, "draw"), Timed(chain, "locate"), Timed(chain, "track")
+    results = RunResults(placement.model, placement.frame or 0)
+    stream = PacedRecording(BackAndForth(images, arguments.minutes))
+    with tempfile.TemporaryDirectory() as temporary:
+        size = (setup.camera.width, setup.camera.height)
+        with VideoWriter(Path(temporary) / "augmented.mp4", FPS, size) as writer:
+            sink = VideoSink(writer, FPS)
+            record = Timed(sink, "show")
+            session = LiveSession(stream, chain, picture, results, [sink])
+            begin = time.process_time()
+            session.run()
+            spent = 1e3 * (time.process_time() - begin)
+    report(session, spent, {"locate": locate, "track": track, "draw": picture_time, "record": record})
+
+
+def report(session: LiveSession, spent: float, timed: dict[str, Timed]) -> None:
+    """Print processor time by thread and by stage, how it went, and the result line."""
+    times, results = session.times, session.results.results
+    print(f"\n{'processor time [ms]':<22}{'median':>8}{'p95':>8}")
+    for name, one in timed.items():
+        print(f"{name:<22}{np.median(one.milliseconds):>8.1f}{np.percentile(one.milliseconds, 95):>8.1f}")
+    print(f"{'all, a drawn frame':<22}{spent / max(len(times.frames), 1):>8.1f}")
+    stages = {stage: np.median([result.timings_ms[stage] for result in results]) for stage in STAGES}
+    print("wall time by stage [ms]: " + ", ".join(f"{k} {v:.1f}" for k, v in stages.items() if v > 0.05))
+    statuses = {result.status for result in results}
+    counts = {status: sum(result.status == status for result in results) for status in sorted(statuses)}
+    print(f"drawn frames: {len(results)}, {counts}")
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    print(
+        f"fps={times.fps:.2f} dropped={times.n_dropped} latency_median_ms={times.latency_ms(50):.1f} "
+        f"latency_p95_ms={times.latency_ms(95):.1f} memory_MB={memory:.0f}"
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--minutes", type=float, default=1.0, help="how long (default: %(default)s)")
+    parser.add_argument("--size", choices=("640x480", "1280x720"), default="640x480")
+    return run_and_report_errors(run, parser.parse_args(), "nothing was written")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

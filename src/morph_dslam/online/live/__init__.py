@@ -1,0 +1,1 @@
+"""Live tracking: capture, localisation, tracking and drawing side by side."""
