@@ -15,8 +15,9 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.io.calibration import load_camera
 from morph_dslam.model import ReducedModel, load_model
-from morph_dslam.online.mesh_registration.register import MeshRegistration, register_mesh
+from morph_dslam.online.mesh_registration.register import MeshRegistration
 from morph_dslam.online.mesh_registration.scene import View, scene_of_map, spread_views
+from morph_dslam.online.mesh_registration.unit_check import register_in_unit
 from morph_dslam.online.slam.map_file import load_map
 from morph_dslam.render.overlay import draw_overlay
 from morph_dslam.render.shading import lambert, vertex_normals
@@ -51,7 +52,8 @@ def run_registration(map_path: Path, model_path: Path, camera_path: Path, output
     except OSError as error:
         raise RegistrationError(f"cannot write the registration to {output}: {error.strerror}") from error
     nodes = model.positions(model.default)
-    found = register_mesh(nodes, model.triangles, points, views, camera, rigid_map.is_metric, progress=True)
+    metric = rigid_map.is_metric
+    found = register_in_unit(nodes, model.triangles, points, views, camera, metric, progress=True)
     content = _content(found, nodes) | {"keyframes": _keyframes(found, views)}
     (output / "registration.json").write_text(json.dumps(content, indent=2) + "\n")
     cv2.imwrite(str(output / "registration.jpg"), draw_registration(found, model, views, camera))
