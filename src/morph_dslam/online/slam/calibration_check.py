@@ -48,16 +48,16 @@ def suspected_focal_factor(rigid_map: RigidMap, intrinsics: Array) -> float | No
 
 def _cost(rigid_map: RigidMap, intrinsics: Array, factor: float) -> float:
     """Huber cost, px^2, of keyframes spread over the map after adjustment with another focal length."""
-    n = len(rigid_map.keyframes)
-    numbers = np.unique(np.linspace(0, n - 1, min(n, MOST_KEYFRAMES)).astype(int))
-    keyframes = [rigid_map.keyframes[k] for k in numbers]
+    kept = rigid_map.kept_keyframes
+    chosen = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), MOST_KEYFRAMES)).astype(int))
+    keyframes = [rigid_map.keyframes[k] for k in kept[chosen]]
     counts = np.zeros(len(rigid_map.state), dtype=int)
     for keyframe in keyframes:
         counts[keyframe.point_ids] += 1
     wanted = (counts >= 2) & (rigid_map.state == GOOD)
     local = np.cumsum(wanted) - 1
-    chosen = [wanted[keyframe.point_ids] for keyframe in keyframes]
-    seen = [(local[k.point_ids[rows]], k.pixels[rows]) for k, rows in zip(keyframes, chosen, strict=True)]
+    rows_of = [wanted[keyframe.point_ids] for keyframe in keyframes]
+    seen = [(local[k.point_ids[rows]], k.pixels[rows]) for k, rows in zip(keyframes, rows_of, strict=True)]
     observations = Observations(
         np.repeat(np.arange(len(keyframes)), [len(ids) for ids, _ in seen]),
         np.concatenate([ids for ids, _ in seen]),

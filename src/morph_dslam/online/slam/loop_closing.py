@@ -169,9 +169,8 @@ class LoopCloser:
         for row, keyframe in zip(seen, self._map.keyframes, strict=True):
             row[keyframe.point_ids[state[keyframe.point_ids] == GOOD]] = 1.0
         first, second = np.nonzero(np.triu(seen @ seen.T >= LEAST_COVISIBLE, k=1))
-        pairs = np.concatenate(
-            [np.column_stack([np.arange(n - 1), np.arange(1, n)]), np.column_stack([first, second])]
-        )
+        kept = self._map.kept_keyframes
+        pairs = np.concatenate([np.column_stack([kept[:-1], kept[1:]]), np.column_stack([first, second])])
         return np.unique(pairs, axis=0)
 
     def _join(self, loop: Loop) -> None:

@@ -30,9 +30,14 @@ def save_map(path: Path, rigid_map: RigidMap, camera: PinholeCamera) -> None:
         file.attrs.update({"format": FORMAT, "version": VERSION, "usual_rms_px": rigid_map.usual_rms_px})
         file.attrs["baseline_px"] = rigid_map.baseline_px
         file.attrs.update({"intrinsics": camera.intrinsics, "size": (camera.width, camera.height)})
+        kept = rigid_map.kept_keyframes
+        # Keyframes that were taken out are left out; points that were refer to nothing.
+        renumbered = np.zeros(len(rigid_map.keyframes), dtype=np.int64)
+        renumbered[kept] = np.arange(len(kept))
         for name in POINT_ARRAYS:
-            file[f"points/{name}"] = getattr(rigid_map, name)
-        for number, keyframe in enumerate(rigid_map.keyframes):
+            array = getattr(rigid_map, name)
+            file[f"points/{name}"] = renumbered[array] if name.endswith("keyframe") else array
+        for number, keyframe in enumerate(rigid_map.keyframes[k] for k in kept):
             group = file.create_group(f"keyframes/{number:06d}")
             group.attrs.update({"index": keyframe.index, "timestamp": keyframe.timestamp})
             for name in KEYFRAME_ARRAYS:

@@ -12,6 +12,7 @@ from morph_dslam.online.slam.descriptors import OCTAVES, describe
 from morph_dslam.online.slam.frame_images import FrameView
 from morph_dslam.online.slam.initialisation import MapStart
 from morph_dslam.online.slam.keyframe_choice import KeyframeChoice, median_depth
+from morph_dslam.online.slam.keyframe_culling import cull_keyframes
 from morph_dslam.online.slam.local_adjustment import gather, local_window, put_back
 from morph_dslam.online.slam.mapping_work import Work, do_all
 from morph_dslam.online.slam.new_points import PointMaker, free_corners
@@ -81,12 +82,12 @@ class Mapper:
         self._points.fuse(number)
         self._adjust_locally()
         self._cull()
+        cull_keyframes(self._map)
         yield from self._finish(number, view)
 
     def adjust_all(self, iterations: int = 20) -> None:
         """Bundle adjustment of the whole map."""
-        everything = np.arange(len(self._map.keyframes))
-        self._adjust(everything, np.empty(0, dtype=np.int64), iterations)
+        self._adjust(self._map.kept_keyframes, np.empty(0, dtype=np.int64), iterations)
 
     def _finish(self, number: int, view: FrameView) -> Work:
         """New corners to follow, and a description of what the view sees, so that it can be recognised."""

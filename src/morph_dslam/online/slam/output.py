@@ -89,7 +89,7 @@ def summarise(slam: Slam, frames: list[SlamFrame]) -> dict[str, Any]:
         "map_frozen": slam.is_frozen,
         "frozen_by_itself_at": slam.frozen_at,
         "n_loops_closed": slam.n_loops,
-        "n_keyframes": len(slam.map.keyframes),
+        "n_keyframes": len(slam.map.kept_keyframes),
         "n_map_points": len(slam.map.good),
         "suspected_focal_factor": factor,
         "median_rms_px": float(np.median(errors)) if errors else None,
@@ -107,7 +107,7 @@ def _write_colmap(folder: Path, slam: Slam) -> None:
     good = slam.map.state == GOOD
     rows = np.cumsum(good) - 1
     images = []
-    for keyframe in slam.map.keyframes:
+    for keyframe in (slam.map.keyframes[k] for k in slam.map.kept_keyframes):
         seen = keyframe.seen[good[keyframe.point_ids]]
         name = f"{keyframe.index:06d}.png"
         images.append(ColmapImage(name, keyframe.camera_from_world, rows[seen.ids], seen.pixels))

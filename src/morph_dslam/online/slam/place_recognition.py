@@ -84,4 +84,6 @@ class PlaceIndex:
         seen = weights * self._vocabulary.histogram(descriptors)
         known = weights * self._histograms
         common = np.minimum(known, seen).sum(axis=1)
+        # Keyframes that were taken out resemble nothing.
+        common[[not len(keyframe.descriptors) for keyframe in self._map.keyframes]] = 0.0
         return common / np.maximum(np.maximum(known.sum(axis=1), seen.sum()), 1e-12)

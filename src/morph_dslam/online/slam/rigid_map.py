@@ -44,6 +44,8 @@ class Keyframe:
     camera_from_world : (4, 4). point_ids : (k,) points seen, ascending. pixels : (k, 2) where.
     right : (k,) their columns in a right image (`Followed`); all unmeasured by default.
     described_ids, descriptors : (d,), (d, 32) what points looked like, by `descriptors.describe`.
+    carrier : number of the keyframe that stands for this one since it was taken out, -1 before.
+    from_carrier : (4, 4) this one as seen from it.
     """
 
     index: int
@@ -55,6 +57,8 @@ class Keyframe:
     right: Array = None  # type: ignore[assignment]
     described_ids: Indices = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     descriptors: NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 32), dtype=np.uint8))
+    carrier: int = field(default=-1, kw_only=True)
+    from_carrier: Array = field(default_factory=lambda: np.eye(4), kw_only=True)
 
     def __post_init__(self) -> None:
         if self.right is None:
@@ -187,6 +191,49 @@ class RigidMap:
         self.template_keyframe[keyframe.point_ids] = number
         self.template_pixels[keyframe.point_ids] = keyframe.pixels
         return number
+
+    @property
+    def kept_keyframes(self) -> Indices:
+        """Numbers of the keyframes that have not been taken out."""
+        return np.array([k for k, keyframe in enumerate(self.keyframes) if keyframe.carrier < 0], dtype=int)
+
+    def pose_of(self, number: int) -> Array:
+        """camera_from_world (4, 4) of a keyframe; one that was taken out moves along with its carrier."""
+        keyframe, moved = self.keyframes[number], np.eye(4)
+        while keyframe.carrier >= 0:
+            moved = moved @ keyframe.from_carrier
+            keyframe = self.keyframes[keyframe.carrier]
+        return moved @ keyframe.camera_from_world
+
+    def remove_keyframe(self, number: int, carrier: int) -> None:
+        """Take a keyframe out; it keeps its number, and another one stands for it.
+
+        Its points go over to the newest keyframes that see them; map points that fewer than two see go too.
+        """
+        old = self.keyframes[number]
+        relative = old.camera_from_world @ np.linalg.inv(self.keyframes[carrier].camera_from_world)
+        self.keyframes[number] = Keyframe(
+            old.index,
+            old.timestamp,
+            np.empty((0, 0), dtype=np.uint8),
+            old.camera_from_world,
+            old.point_ids[:0],
+            old.pixels[:0],
+            carrier=carrier,
+            from_carrier=relative,
+        )
+        self.remove(np.flatnonzero((self.state == GOOD) & (self.n_observations() < 2)))
+        for views, pixels in (
+            (self.template_keyframe, self.template_pixels),
+            (self.first_keyframe, self.first_pixels),
+        ):
+            left = np.flatnonzero((views == number) & (self.state != REMOVED))
+            for k in range(len(self.keyframes) - 1, -1, -1):
+                if not len(left):
+                    break
+                rows, seen = self.keyframes[k].rows_of(left)
+                views[left[seen]], pixels[left[seen]] = k, self.keyframes[k].pixels[rows[seen]]
+                left = left[~seen]
 
     def extend_keyframe(self, number: int, new: Followed) -> None:
         """Add observations of points newer than all that the keyframe has."""

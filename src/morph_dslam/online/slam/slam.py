@@ -187,7 +187,7 @@ class Slam:
         """
         if frame.from_keyframe is None or not self.is_placed(frame):
             return None
-        start = frame.from_keyframe @ self.map.keyframes[frame.keyframe].camera_from_world
+        start = frame.from_keyframe @ self.map.pose_of(frame.keyframe)
         points = frame.points[self.map.state[frame.points.ids] == GOOD]
         if len(points.ids) < self.options.least_inliers:
             return start
