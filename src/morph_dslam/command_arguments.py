@@ -17,3 +17,15 @@ def frame_range(text: str) -> tuple[int | None, int | None]:
     if text in ("", "-") or (None not in numbers and numbers[0] > numbers[1]):  # type: ignore[operator]
         raise argparse.ArgumentTypeError(f"'{text}' is not a range of frames such as 9-100")
     return numbers
+
+
+def named_value(text: str) -> tuple[str, float]:
+    """A name and a positive number, "NAME=VALUE"."""
+    name, _, number = text.partition("=")
+    try:
+        value = float(number)
+    except ValueError:
+        value = 0.0
+    if not name or not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a name and a positive number such as load=0.5")
+    return name, value

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from morph_dslam.command_arguments import frame_range
+from morph_dslam.command_arguments import frame_range, named_value
 
 if TYPE_CHECKING:
     from morph_dslam.online.augmented_view import DrawOptions
@@ -56,6 +56,8 @@ def object_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
         "use_depth": arguments.depth,
         "inner": tuple(arguments.inner),
         "per_sequence": tuple(arguments.per_sequence),
+        "random_walk": tuple(arguments.random_walk),
+        "start": arguments.start,
     }
 
 
@@ -120,6 +122,21 @@ def add_object_arguments(command: argparse.ArgumentParser) -> None:
         default=[],
         metavar="NAME",
         help="a parameter that is one over the whole sequence; may be repeated",
+    )
+    command.add_argument(
+        "--random-walk",
+        type=named_value,
+        action="append",
+        default=[],
+        metavar="NAME=STEP",
+        help="a prior on a parameter: the standard deviation of its change from frame to frame, in its own "
+        "unit; may be repeated (default: none)",
+    )
+    command.add_argument(
+        "--start",
+        choices=("previous", "constant-velocity"),
+        default="previous",
+        help="where the search for a frame's state starts (default: %(default)s state)",
     )
     command.add_argument(
         "--show",

@@ -216,6 +216,16 @@ def test_run_without_the_object_is_whole_and_says_that_nothing_was_found(inputs,
     assert (tmp_path / "run" / "augmented.mp4").is_file()
 
 
+def test_random_walk_and_start_are_named(inputs, tmp_path):
+    walk = {"random_walk": (("twist", 2.0),), "start": "constant-velocity"}
+    summary = track(options(inputs, tmp_path / "run", last=22, overlay=False, **walk))
+    assert "random walk" in summary["temporal_prior"]
+    assert "twist by 2 deg" in summary["temporal_prior"]
+    assert summary["start_of_each_frame"] == "the state that the last two lead to at constant velocity"
+    twists = load_run(tmp_path / "run").parameters[:, 2]
+    np.testing.assert_allclose(twists, [sheet_state(time).parameters[2] for time in TIMES[:3]], atol=0.01)
+
+
 def test_parameter_that_is_one_over_the_sequence_is_named(inputs, finished, tmp_path):
     summary = track(options(inputs, tmp_path / "run", last=23, per_sequence=("twist",), overlay=False))
     assert (

@@ -76,8 +76,8 @@ def test_noise_that_stays_with_the_points_does_not_and_is_not_said_to():
 def runs_with_known_poses(lasting, anew, frames=8, repeats=24, count=40):
     """Errors and stated deviations (repeats, frames) of the arch when the pose is known with errors.
 
-    ``lasting`` (6, 6) is drawn once a run and ``anew`` (6, 6) in every frame. Only the sheet's middle is seen,
-    where a higher arch looks like a nearer sheet.
+    ``lasting`` (6, 6) is drawn once a run and ``anew`` (6, 6) in every frame. Only the middle of the sheet is
+    seen, where a higher arch looks like a nearer sheet.
     """
     middle = np.abs(MODEL.nodes[MODEL.triangles, 0]).max(axis=1) < 0.06
     rng = np.random.default_rng(5)
@@ -111,6 +111,30 @@ def test_errors_of_a_known_pose_are_stated_and_those_that_last_do_not_average_ou
     assert np.median(stated_lasting[:, -1] / stated_lasting[:, 0]) > 0.8
     assert np.median(stated_anew[:, -1] / stated_anew[:, 0]) < 0.6
     assert np.sqrt(np.mean(anew[:, -1] ** 2)) < 0.7 * np.sqrt(np.mean(lasting[:, -1] ** 2))
+
+
+def test_walking_parameter_is_smoothed_as_much_as_its_step_says():
+    """The twist changes by 0.2 degrees a frame at random; its deviation is that of a scalar Kalman filter."""
+    points, step, frames = bound(40), np.radians(0.2), 30
+    raw, smooth, stated = [], [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        twists = np.degrees(0.05 + np.cumsum(step * rng.standard_normal(frames)))
+        states = [truth(number, twist) for number, twist in enumerate(twists)]
+        errors = SIGMA * rng.standard_normal((frames, 40, 2))
+        for found, steps in ((raw, None), (smooth, {TWIST: step})):
+            estimates = fused(SequenceFilter(ESTIMATOR, [], None, steps), points, errors, states, np.eye(40))
+            found.append(twist_errors(estimates, states))
+            if steps:
+                stated.append([np.sqrt(e.measured_covariance[TWIST, TWIST]) for e in estimates[5:]])
+    raw, smooth = (np.array(found)[:, :, 10:] for found in (raw, smooth))
+    own = np.median(raw[:, 1])
+    expected = np.sqrt(0.5 * (np.sqrt(step**4 + 4.0 * step**2 * own**2) - step**2))
+    assert np.median(smooth[:, 1]) == pytest.approx(expected, rel=0.2)
+    assert np.sqrt(np.mean(smooth[:, 0] ** 2)) < 0.75 * np.sqrt(np.mean(raw[:, 0] ** 2))
+    assert 0.7 < np.sqrt(np.mean((smooth[:, 0] / smooth[:, 1]) ** 2)) < 1.4
+    # What the frame alone tells is kept beside it.
+    assert np.median(stated) == pytest.approx(own, rel=0.2)
 
 
 def test_wrong_early_value_is_given_up():

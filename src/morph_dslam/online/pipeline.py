@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.errors import TrackingError
 from morph_dslam.model import ReducedModel
 from morph_dslam.online.anchoring import Anchoring
 from morph_dslam.online.attempt import Attempt, Picture, refusal
@@ -37,9 +36,9 @@ from morph_dslam.online.measurement import Measurement
 from morph_dslam.online.recovery import Recovery
 from morph_dslam.online.reference_refinement import Keyframe
 from morph_dslam.online.reference_view import ReferenceView
-from morph_dslam.online.sequence_filter import SequenceFilter
 from morph_dslam.online.shape_search import with_undetermined_at_default
 from morph_dslam.online.systematic_errors import SystematicErrors
+from morph_dslam.online.temporal import at_constant_velocity, new_filter
 from morph_dslam.online.timing import StageClock
 from morph_dslam.online.tracker_options import TrackerOptions
 
@@ -69,7 +68,7 @@ class Tracker:
     RegistrationError
         If the object shows too few corners in the reference frame.
     TrackingError
-        If a parameter is to be one over the sequence that the model does not have.
+        If a parameter is to be one over the sequence, or to walk, that the model does not have.
     """
 
     def __init__(
@@ -90,9 +89,7 @@ class Tracker:
         self._estimation = FrameEstimation(self.estimator, self.reference, self.options)
         self._recovery = Recovery(model, camera, self.reference, self._estimation, self.options)
         self._anchoring = Anchoring(self.estimator, self.reference, self.options)
-        self._filter = SequenceFilter(
-            self.estimator, kept_parameters(model, self.options), self.options.filter
-        )
+        self._filter = new_filter(self.estimator, self.options)
         points, window = self.reference.points, self.options.flow.window
         self._systematic = SystematicErrors(self.estimator, points, state, reference_covariance, window)
         self.last_seen: Keyframe | None = None
@@ -225,6 +222,8 @@ class Tracker:
             self._velocity_base = estimate.state if self._lost else self._last
             self._last = estimate.state
             self._start = with_undetermined_at_default(self.model, estimate)
+            if self.options.start == "constant-velocity":
+                self._start = at_constant_velocity(self._velocity_base, self._start)
             self._supported = attempt.inliers
             projected = self.camera.project(self.reference.points.in_camera(self._last))
             self._pixels = np.where(attempt.inliers[:, None], attempt.measurement.pixels, projected)
@@ -274,14 +273,3 @@ class Tracker:
             grey = cv2.remap(grey, *self._undistortion, interpolation=cv2.INTER_LINEAR)
         flat = flatten(grey, self.options.flow.flatten_window)  # type: ignore[arg-type]
         return Picture(grey, flat)  # type: ignore[arg-type]
-
-
-def kept_parameters(model: ReducedModel, options: TrackerOptions) -> list[int]:
-    """Rows of the parameters that are one over the sequence; raises TrackingError as `Tracker` does."""
-    names = [parameter.name for parameter in model.parameters]
-    unknown = [name for name in options.per_sequence if name not in names]
-    if unknown:
-        raise TrackingError(
-            f"'{unknown[0]}' cannot be one over the sequence: the model's parameters are " + ", ".join(names)
-        )
-    return [names.index(name) for name in options.per_sequence]

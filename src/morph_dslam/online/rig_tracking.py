@@ -17,9 +17,9 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.online.estimation import Estimate, State
 from morph_dslam.online.frame_result import FOLLOWED, STAGES, FrameResult
 from morph_dslam.online.measurement_noise import RigMeasured
-from morph_dslam.online.pipeline import Tracker, kept_parameters
+from morph_dslam.online.pipeline import Tracker
 from morph_dslam.online.rig import RigCamera, RigEstimator
-from morph_dslam.online.sequence_filter import SequenceFilter
+from morph_dslam.online.temporal import new_filter
 from morph_dslam.online.timing import StageClock
 from morph_dslam.online.tracker_options import TrackerOptions
 
@@ -58,8 +58,7 @@ class RigTracker:
             for number, (part, image) in enumerate(zip(self.cameras, references, strict=True))
         ]
         self.estimator = RigEstimator(model, self.cameras, self.options.estimation)
-        kept = kept_parameters(model, self.options)
-        self._filter = SequenceFilter(self.estimator, kept, self.options.filter)
+        self._filter = new_filter(self.estimator, self.options)
 
     def process_frame(self, images: Sequence[Image]) -> FrameResult:
         """Find the object in the next frames (h, w, 3) uint8 of all cameras, in their order."""
@@ -117,8 +116,8 @@ class RigTracker:
         self, number: int, part: RigCamera, image: Image, state: State, in_sequence: bool
     ) -> Tracker:
         part.camera.check_image(image, f"the reference frame of camera {number}")
-        # What is one over the sequence is found from all cameras together.
-        single = replace(self.options, per_sequence=())
+        # What is one over the sequence, or walks, is found from all cameras together.
+        single = replace(self.options, per_sequence=(), random_walk=())
         try:
             return Tracker(self.model, part.camera, image, state, single, in_sequence)
         except RegistrationError as error:

@@ -21,6 +21,8 @@ from morph_dslam.online.inner_positions import write_inner_positions
 from morph_dslam.online.placement import Placement
 from morph_dslam.online.plots import write_plots
 from morph_dslam.online.results import RunResults, write_csv, write_hdf5, write_summary
+from morph_dslam.online.temporal import temporal_facts
+from morph_dslam.online.tracker_options import TrackerOptions
 
 
 @dataclass(frozen=True)
@@ -61,9 +63,15 @@ def write_run(
     inputs: RunInputs,
     placement: Placement,
     inner: Sequence[CarriedStructure],
+    tracker: TrackerOptions,
     extra: dict[str, Any],
 ) -> dict[str, Any]:
-    """Write tables, summary, plots and copies of the inputs; returns the summary."""
+    """Write tables, summary, plots and copies of the inputs; returns the summary.
+
+    Parameters
+    ----------
+    inner : structures inside of the object. tracker : what was tracked with. extra : for the summary.
+    """
     write_hdf5(folder / "result.h5", run)
     write_inner_positions(folder / "result.h5", run, inner)
     write_csv(folder / "frames.csv", run)
@@ -73,23 +81,15 @@ def write_run(
         _copy(inputs.model, folder / "model.morph")
     _copy(inputs.camera, folder / "camera.yaml")
     given = {"model": str(inputs.model), "camera": str(inputs.camera)} | inputs.named
-    common = {
+    common = temporal_facts(run.model.parameters, tracker) | {
         "registration": placement.facts,
         "flags": list(placement.flags),
-        "start_of_each_frame": "previous state; the first guess of image motion assumes constant velocity",
-        "temporal_prior": _temporal_prior(run.per_sequence),
         "inputs": given,
         "versions": _versions(),
     }
     summary = write_summary(folder / "summary.json", run, common | extra)
     write_plots(folder / "plots", run)
     return summary
-
-
-def _temporal_prior(per_sequence: tuple[str, ...]) -> str:
-    if not per_sequence:
-        return "none"
-    return f"one over the sequence, from all frames so far: {', '.join(per_sequence)}; none on the others"
 
 
 def _copy(source: Path, target: Path) -> None:

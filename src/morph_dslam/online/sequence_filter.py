@@ -5,7 +5,8 @@ reference view once, and every frame is compared with that view. It is the same 
 points whose windows overlap there. The other is new in every frame. Only the second averages out.
 
 The filter keeps the estimate of the parameters that are one per sequence, from all frames so far, with its
-covariance; in the next frame it is a prior, as in any Kalman filter in the information form. Beside it goes,
+covariance; in the next frame it is a prior, as in any Kalman filter in the information form. Parameters may
+also walk: their variance then grows by that of a step from frame to frame. Beside it goes,
 for every point, how its own error has entered the estimate. So the covariance holds the points' errors in
 full, however many frames there are: they are "considered" but not estimated, as in Schmidt's filter
 (Jazwinski, Stochastic Processes and Filtering Theory, 1970, ch. 8.4).
@@ -13,7 +14,7 @@ full, however many frames there are: they are "considered" but not estimated, as
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
@@ -70,13 +71,22 @@ class SequenceFilter(Generic[Frame]):
     Parameters
     ----------
     indices : of the parameters that are one per sequence; none is allowed, and only covariances are found.
+    steps : of parameters that walk, by index: the standard deviation of their change from frame to frame, SI.
     """
 
     def __init__(
-        self, estimator: Fitter[Frame], indices: Sequence[int], options: FilterOptions | None = None
+        self,
+        estimator: Fitter[Frame],
+        indices: Sequence[int],
+        options: FilterOptions | None = None,
+        steps: Mapping[int, float] | None = None,
     ) -> None:
         self.options = options or FilterOptions()
-        self._estimator, self._kept = estimator, np.array(indices, dtype=np.int64)
+        walking = dict(steps or {})
+        self._estimator, self._constant = estimator, np.array(indices, dtype=np.int64)
+        self._kept = np.concatenate([self._constant, np.array(list(walking), dtype=np.int64)])
+        self._step = np.diag([0.0] * len(indices) + [step**2 for step in walking.values()])
+        self._walks = bool(walking)
         self._unknowns = len(estimator.model.parameters) + 6
         self._noise = PixelNoise(self.options.memory)
         self._past: _Past | None = None
@@ -111,7 +121,8 @@ class SequenceFilter(Generic[Frame]):
         linear = self._estimator.linear(measured, fused)
         errors = self._errors(measured, linear, fused.state, known, past)
         self._keep(fused, errors)
-        return self._with_covariance(fused, measured, linear, errors, known, past)
+        fused = self._with_covariance(fused, measured, linear, errors, known, past)
+        return self._without_walk(fused, by_itself) if self._walks else fused
 
     def _with_covariance(
         self,
@@ -129,6 +140,15 @@ class SequenceFilter(Generic[Frame]):
             told = self._errors(measured, linear, estimate.state, of_pose, past).covariance
         return replace(estimate, covariance=errors.covariance, measured_covariance=told)
 
+    def _without_walk(self, fused: Estimate, by_itself: Estimate) -> Estimate:
+        """The estimate with the covariance that its frame alone gives what walks, and all frames the rest."""
+        own = by_itself.covariance
+        own = own if by_itself.measured_covariance is None else by_itself.measured_covariance
+        share = np.ones(len(own))
+        rows = self._constant
+        share[rows] = np.sqrt(np.minimum(np.diag(fused.covariance)[rows] / np.diag(own)[rows], 1.0))
+        return replace(fused, measured_covariance=own * np.outer(share, share))
+
     def _of_kept(self, matrix: Array) -> Array:
         return matrix[np.ix_(self._kept, self._kept)]
 
@@ -137,9 +157,9 @@ class SequenceFilter(Generic[Frame]):
         grown = np.exp(1.0 / self.options.memory)
         self._past = _Past(
             estimate.state.parameters[self._kept],
-            grown * self._of_kept(errors.covariance),
+            grown * self._of_kept(errors.covariance) + self._step,
             np.sqrt(grown) * errors.by_point[:, :, self._kept],
-            grown * self._of_kept(errors.by_frames),
+            grown * self._of_kept(errors.by_frames) + self._step,
             np.sqrt(grown) * errors.by_cause[:, self._kept],
             grown * self._of_kept(errors.unseen),
         )

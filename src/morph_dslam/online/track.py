@@ -24,7 +24,7 @@ from morph_dslam.online.reference_refinement import (
 from morph_dslam.online.registration import RegistrationOptions, bind_landmarks
 from morph_dslam.online.results import RunResults
 from morph_dslam.online.run_writing import RunInputs, check_run_folder, write_run
-from morph_dslam.online.tracker_options import TrackerOptions
+from morph_dslam.online.tracker_options import StartFrom, TrackerOptions
 from morph_dslam.online.tracking_setup import ObjectOptions, PoseFrom, Setup, load_setup
 from morph_dslam.sources import Frame, FrameSource, open_source
 from morph_dslam.sources.recorded import RecordedFrames
@@ -47,6 +47,7 @@ class TrackOptions:
     refine_reference : after tracking, refine the reference state over the whole sequence and track once more.
     use_outline, use_depth : let the object's outline, and the recording's depth, count beside its texture.
     inner : files of inner structures (`morph inner`), whose positions are written and drawn.
+    random_walk, start : see `ObjectOptions`; neither is used by default.
     per_sequence : names of the parameters that are one over the whole sequence, beside those that the
         placement leaves open.
     overlay : draw the augmented video, drawing : with what. overwrite : replace a run that is there already.
@@ -68,6 +69,8 @@ class TrackOptions:
     use_depth: bool = False
     inner: tuple[Path, ...] = ()
     per_sequence: tuple[str, ...] = ()
+    random_walk: tuple[tuple[str, float], ...] = ()
+    start: StartFrom = "previous"
     overlay: bool = True
     drawing: DrawOptions = field(default_factory=DrawOptions)
     overwrite: bool = False
@@ -89,6 +92,8 @@ class TrackOptions:
             self.use_depth,
             self.inner,
             self.per_sequence,
+            self.random_walk,
+            self.start,
             self.registration,
             self.tracker,
         )
@@ -224,6 +229,7 @@ def _write(
     carried = setup.carried(run.model)
     named = {name: str(getattr(options, name)) for name in _INPUTS if getattr(options, name)}
     named |= {} if setup.map_path is None else {"map": str(setup.map_path)}
+    tracker = setup.tracker_options(placement)
     extra = {
         "reference_refined_over_the_sequence": run.refined,
         "outline_used": options.use_outline,
@@ -232,11 +238,11 @@ def _write(
         "settings": {
             "registration": asdict(options.registration),
             "refinement": asdict(options.refinement),
-            "tracker": asdict(setup.tracker_options(placement)),
+            "tracker": asdict(tracker),
         },
     }
     inputs = RunInputs(options.model, options.camera, named)
-    summary = write_run(options.output, run, inputs, placement, carried, extra)
+    summary = write_run(options.output, run, inputs, placement, carried, tracker, extra)
     if options.overlay:
         view = AugmentedView(run.model, setup.camera, options.drawing, carried)
         write_video(options.output / "augmented.mp4", source, setup.camera, run, view)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from morph_dslam.online.depth_residuals import DepthOptions
 from morph_dslam.online.estimation import EstimationOptions
@@ -10,6 +11,9 @@ from morph_dslam.online.flow import FlowOptions
 from morph_dslam.online.measurement import MeasurementOptions
 from morph_dslam.online.outline import OutlineOptions
 from morph_dslam.online.sequence_filter import FilterOptions
+
+#: Where the search for a frame's state starts.
+StartFrom = Literal["previous", "constant-velocity"]
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,10 @@ class TrackerOptions:
     use_outline : whether the object's outline counts too; it needs a background that it stands out from.
     use_depth : whether the depth images of frames that have them count too.
     per_sequence : names of the parameters that are one over the whole sequence.
+    random_walk : names of parameters that hardly change from frame to frame, each with the standard deviation
+        of the change, SI: a prior on them. None by default.
+    start : where the search for a frame's state starts: from the previous state, or from where the last two
+        lead at constant velocity.
     """
 
     n_points: int = 350
@@ -54,6 +62,8 @@ class TrackerOptions:
     use_outline: bool = False
     use_depth: bool = False
     per_sequence: tuple[str, ...] = ()
+    random_walk: tuple[tuple[str, float], ...] = ()
+    start: StartFrom = "previous"
     flow: FlowOptions = field(default_factory=FlowOptions)
     measurement: MeasurementOptions = field(default_factory=MeasurementOptions)
     outline: OutlineOptions = field(default_factory=OutlineOptions)

@@ -26,8 +26,9 @@ from morph_dslam.online.pipeline import Tracker
 from morph_dslam.online.placement import Placement, load_placement, place_by_landmarks
 from morph_dslam.online.registration import RegistrationOptions
 from morph_dslam.online.slam.map_file import load_map
-from morph_dslam.online.tracker_options import TrackerOptions
+from morph_dslam.online.tracker_options import StartFrom, TrackerOptions
 from morph_dslam.sources import Frame
+from morph_dslam.units import to_si
 
 #: How an object's pose is found: by the map and its points, by the map alone, by its points alone.
 PoseFrom = Literal["map", "fixed", "free"]
@@ -50,6 +51,8 @@ class ObjectOptions:
     inner : files of inner structures (`morph inner`), whose positions are written and drawn.
     per_sequence : names of the parameters that are one over the whole sequence, beside those that the
         placement leaves open.
+    random_walk : names of parameters and the standard deviation of their change from frame to frame, in the
+        parameter's own unit. start : see `TrackerOptions`.
     """
 
     model: Path
@@ -62,6 +65,8 @@ class ObjectOptions:
     use_depth: bool = False
     inner: tuple[Path, ...] = ()
     per_sequence: tuple[str, ...] = ()
+    random_walk: tuple[tuple[str, float], ...] = ()
+    start: StartFrom = "previous"
     registration: RegistrationOptions = field(default_factory=RegistrationOptions)
     tracker: TrackerOptions = field(default_factory=TrackerOptions)
 
@@ -109,6 +114,8 @@ class Setup:
             per_sequence=tuple(dict.fromkeys((*placement.per_sequence, *options.per_sequence))),
             use_outline=options.use_outline,
             use_depth=options.use_depth,
+            random_walk=tuple((name, _in_si(placement, name, step)) for name, step in options.random_walk),
+            start=options.start,
             hold_pose=options.pose == "fixed",
         )
 
@@ -140,6 +147,12 @@ class Setup:
         chain = self.new_chain(placement, reference, True)
         for number in range(2):
             chain.process(Frame(number, float(number), image))
+
+
+def _in_si(placement: Placement, name: str, value: float) -> float:
+    """A value in a parameter's own unit; of a name that is none it stays as it is, to be refused later."""
+    known = {parameter.name: parameter for parameter in placement.model.parameters}
+    return to_si(value, known[name].unit, known[name].quantity) if name in known else value
 
 
 def load_setup(options: ObjectOptions) -> Setup:

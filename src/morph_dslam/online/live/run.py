@@ -137,15 +137,16 @@ def _write(setup: Setup, begin: _Begin, session: LiveSession, options: LiveOptio
     for name, path in (("landmarks", of_object.landmarks), ("placement", of_object.placement)):
         named |= {} if path is None else {name: str(path)}
     named |= {} if setup.map_path is None else {"map": str(setup.map_path)}
+    tracker = setup.tracker_options(begin.placement)
     extra = {
         "live": live_figures(session.times),
         "pose": of_object.pose if setup.map_path is not None else "free",
         "outline_used": of_object.use_outline,
-        "settings": {"tracker": asdict(setup.tracker_options(begin.placement))},
+        "settings": {"tracker": asdict(tracker)},
     }
     inputs = RunInputs(of_object.model, of_object.camera, named)
     carried = setup.carried(session.results.model)
-    summary = write_run(options.output, session.results, inputs, begin.placement, carried, extra)
+    summary = write_run(options.output, session.results, inputs, begin.placement, carried, tracker, extra)
     write_latencies(options.output / "latency.csv", session.times)
     return summary
 
