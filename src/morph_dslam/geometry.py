@@ -35,11 +35,34 @@ def rotation_exp(rotation_vector):
     return result
 
 
-def rotation_log(rotation: Array) -> Array:
-    """Rotation vector (3,) in radians of a rotation matrix (3, 3); the inverse of `rotation_exp` up to pi."""
-    from scipy.spatial.transform import Rotation
+@njit(cache=True, nogil=True)
+def rotation_log(rotation):
+    """Rotation vector (3,) in radians of a rotation matrix (3, 3); the inverse of `rotation_exp` up to pi.
 
-    return Rotation.from_matrix(rotation).as_rotvec()
+    By way of the unit quaternion, of which the largest component is found first (Shepperd 1978).
+    """
+    trace = rotation[0, 0] + rotation[1, 1] + rotation[2, 2]
+    vector, best = np.empty(3), 3
+    largest = trace
+    for k in range(3):
+        if rotation[k, k] > largest:
+            largest, best = rotation[k, k], k
+    if best == 3:
+        w = 1.0 + trace
+        vector[0] = rotation[2, 1] - rotation[1, 2]
+        vector[1] = rotation[0, 2] - rotation[2, 0]
+        vector[2] = rotation[1, 0] - rotation[0, 1]
+    else:
+        i, j, k = best, (best + 1) % 3, (best + 2) % 3
+        w = rotation[k, j] - rotation[j, k]
+        vector[i] = 1.0 - trace + 2.0 * rotation[i, i]
+        vector[j] = rotation[j, i] + rotation[i, j]
+        vector[k] = rotation[k, i] + rotation[i, k]
+    if w < 0.0:
+        w, vector = -w, -vector
+    sine = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    # For small angles 2 atan(sine / w) / sine is 2 / w.
+    return vector * (2.0 / w if sine < 1e-10 * w else 2.0 * np.arctan2(sine, w) / sine)
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,16 @@ def test_rotation_log_inverts_exp():
         np.testing.assert_allclose(rotation_log(rotation_exp(vector)), vector, atol=1e-12)
 
 
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-8, 1e-3, 1.0, 2.5, 3.0, np.pi - 1e-6])
+def test_rotation_log_is_scipys(angle):
+    axes = np.concatenate([np.eye(3), -np.eye(3), np.random.default_rng(3).normal(size=(20, 3))])
+    for axis in axes:
+        matrix = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
+        expected = Rotation.from_matrix(matrix).as_rotvec()
+        np.testing.assert_allclose(rotation_log(matrix), expected, atol=1e-9)
+        np.testing.assert_allclose(rotation_log.py_func(matrix), expected, atol=1e-9)
+
+
 def random_transform(rng):
     return RigidTransform(Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3))
 

@@ -10,10 +10,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.geometry import RigidTransform
 from morph_dslam.online.attempt import Attempt
-from morph_dslam.online.estimation import Estimate, Estimator, Prior
+from morph_dslam.online.estimation import Estimate, Estimator, Prior, moved
 from morph_dslam.online.known_pose import KnownPose
 from morph_dslam.online.reference_view import ReferenceView
+from morph_dslam.online.robust_covariance import EIGENVALUE_FLOOR
 from morph_dslam.online.tracker_options import TrackerOptions
 
 Array = NDArray[np.float64]
@@ -52,16 +54,32 @@ class Anchoring:
         Both must hold: it is farther off than the registration's usual error, and than the standard
         deviations of both poses explain.
         """
-        weights = attempt.inliers.astype(float)
-        free = self._estimator.estimate(
-            self._reference.points, attempt.measurement.pixels, weights, attempt.estimate.state
-        )
+        pose, covariance = self._by_points_alone(attempt)
         points = self._reference.points.rest[attempt.inliers]
-        pose = free.state.camera_from_object
         apart = np.sqrt(np.mean(np.sum((pose.apply(points) - known.pose.apply(points)) ** 2, axis=1)))
         if not apart > self._options.moved_share * self._size:
             return False
-        return _mahalanobis(known, free, self._reference.redundancy) > self._options.moved_sigmas
+        away, spread = known.away(pose), known.covariance + covariance
+        return float(np.sqrt(away @ np.linalg.solve(spread, away))) > self._options.moved_sigmas
+
+    def _by_points_alone(self, attempt: Attempt) -> tuple[RigidTransform, Array]:
+        """The pose by an attempt's points and its covariance (6, 6), to first order from where it is.
+
+        What the points do not tell at all stays as the attempt has it, with a very large variance.
+        """
+        estimate, points = attempt.estimate, self._reference.points
+        weights = attempt.inliers.astype(float)
+        _, hessian, gradient, _ = self._estimator.evaluate(
+            points, attempt.measurement.pixels, weights, estimate.state
+        )
+        scale = self._estimator.scale
+        values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
+        vectors, floor = scale[:, None] * vectors, max(values[-1], 1e-30) * EIGENVALUE_FLOOR
+        along = np.where(values > floor, vectors.T @ gradient / np.maximum(values, floor), 0.0)
+        rows = vectors[self._d :]
+        covariance = (rows / np.maximum(values, floor)) @ rows.T
+        covariance *= self._reference.redundancy * max(estimate.sigma_px, LEAST_SIGMA_PX) ** 2
+        return moved(estimate.state, -vectors @ along).camera_from_object, covariance
 
     def note(self, elsewhere: bool) -> None:
         """Take in whether a frame showed the object elsewhere; several on end change the opinion."""
@@ -73,13 +91,3 @@ class Anchoring:
         """Take in how well the points of an accepted frame agree."""
         if np.isfinite(estimate.sigma_px):
             self._sigma_px = max(estimate.sigma_px, LEAST_SIGMA_PX)
-
-
-def _mahalanobis(known: KnownPose, free: Estimate, redundancy: float) -> float:
-    """How many standard deviations a pose from points is off the known one."""
-    d = len(free.state.parameters)
-    away = known.away(free.state.camera_from_object)
-    spread = known.covariance + redundancy * free.covariance[d:, d:]
-    if not np.isfinite(spread).all():
-        return 0.0
-    return float(np.sqrt(away @ np.linalg.solve(spread, away)))

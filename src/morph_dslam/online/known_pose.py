@@ -41,7 +41,7 @@ class KnownPose:
         ``squared_px`` is the variance of an image coordinate: it makes a covariance a weight in that cost.
         ``firmness`` multiplies the weight.
         """
-        information = firmness * squared_px * np.linalg.inv(self.covariance)
+        information = np.asarray(firmness * squared_px * np.linalg.inv(self.covariance), dtype=np.float64)
         nothing = np.zeros((d, d))
         return Prior(np.zeros(d), nothing, self.pose, information, self.lasting, squared_px)
 

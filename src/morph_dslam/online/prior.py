@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.geometry import RigidTransform, rotation_log
@@ -70,12 +71,15 @@ class Prior:
         return replace(other, mean=np.linalg.pinv(information) @ pushed, information=information)
 
 
-def _log_slope(turn: Array) -> Array:
+@njit(cache=True, nogil=True)
+def _log_slope(turn):
     """Derivative (3, 3) of log(exp(w) exp(turn)) by w at w = 0: the inverse left Jacobian of SO(3).
 
     I - [turn]/2 + c [turn]² with c = 1/a² - 1 / (2 a tan(a/2)) (Barfoot, State Estimation for Robotics, 7.1).
     """
-    angle = float(np.linalg.norm(turn))
-    cross = np.cross(np.eye(3), turn)
+    angle = np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
+    cross = np.zeros((3, 3))
+    cross[0, 1], cross[0, 2], cross[1, 2] = -turn[2], turn[1], -turn[0]
+    cross[1, 0], cross[2, 0], cross[2, 1] = turn[2], -turn[1], turn[0]
     c = 1.0 / 12.0 if angle < 1e-4 else 1.0 / angle**2 - 0.5 / (angle * np.tan(0.5 * angle))
     return np.eye(3) - 0.5 * cross + c * cross @ cross
