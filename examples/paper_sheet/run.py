@@ -44,6 +44,8 @@ OUTPUT = HERE / "output"
 
 POSITIONS = 801
 HEIGHT = 0.169
+#: Along x, the fibres, and y, m.
+SIZE = (0.420, 0.297)
 #: Office paper with its machine direction along the sheet, as in examples/kinect_paper.
 PAPER = OrthotropicSheet(young_fibre=5e9, young_cross=2.5e9, poisson=0.3, shear=1.4e9, thickness=1e-4)
 #: The outputs of a position, in the order in which they are tabulated.
@@ -59,7 +61,7 @@ DPI = 110
 
 def run(arguments: argparse.Namespace) -> None:
     began = time.perf_counter()
-    sheet = BuckledSheet(0.420, 0.297, PAPER, cells=tuple(arguments.cells))
+    sheet = BuckledSheet(*SIZE, PAPER, cells=tuple(arguments.cells))
     folder = BucklingFolder.of(arguments.output, sheet, HEIGHT, arguments.positions)
     eigenvalue, _ = folder.buckling(sheet)
     path = trace(sheet, folder)
