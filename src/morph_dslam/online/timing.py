@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from time import perf_counter
+from time import perf_counter, thread_time
 
 
 class StageClock:
@@ -26,3 +26,14 @@ class StageClock:
             yield
         finally:
             self.milliseconds[name] += 1e3 * (perf_counter() - start)
+
+
+class WaitClock:
+    """Tells for how long its thread has not run since the clock was made."""
+
+    def __init__(self) -> None:
+        self._start, self._ran = perf_counter(), thread_time()
+
+    @property
+    def milliseconds(self) -> float:
+        return 1e3 * max(perf_counter() - self._start - (thread_time() - self._ran), 0.0)

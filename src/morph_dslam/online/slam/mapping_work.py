@@ -12,6 +12,8 @@ import sys
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 
+import cv2
+
 Work = Generator[None, None, None]
 
 #: How long a thread may keep the interpreter while another waits for it, seconds. Tracking gives it up some
@@ -20,8 +22,12 @@ SWITCH_INTERVAL = 1e-4
 
 
 def share_interpreter() -> None:
-    """Let the threads of this process take turns quickly; for the main program, before it tracks live."""
+    """Let tracking and mapping run side by side; for the main program, before it tracks live.
+
+    The threads of this process then take turns quickly, and OpenCV begins no threads of its own.
+    """
     sys.setswitchinterval(SWITCH_INTERVAL)
+    cv2.setNumThreads(1)
 
 
 def do_all(work: Work) -> None:

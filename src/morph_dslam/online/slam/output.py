@@ -65,6 +65,7 @@ def summarise(slam: Slam, frames: list[SlamFrame]) -> dict[str, Any]:
     found = [frame for frame in frames if slam.is_placed(frame)]
     after = [frame for frame in frames if found and frame.index >= found[0].index]
     times = np.array([frame.total_ms for frame in after] or [0.0])
+    waits = np.array([frame.waited_ms for frame in after] or [0.0])
     stages = {s: float(np.median([f.timings_ms[s] for f in after] or [0.0])) for s in STAGES}
     errors = [frame.pose.rms_px for frame in found if frame.pose is not None]
     lost = [frame for frame in after if frame.status == "lost"]
@@ -96,6 +97,8 @@ def summarise(slam: Slam, frames: list[SlamFrame]) -> dict[str, Any]:
         "median_ms": float(np.median(times)),
         "p95_ms": float(np.percentile(times, 95)),
         "stage_median_ms": stages,
+        "longest_wait_for_mapper_ms": float(np.max(waits)),
+        "p99_wait_for_mapper_ms": float(np.percentile(waits, 99)),
         "scale": "metres" if slam.map.is_metric else "the median depth of the map's first view is 1",
         "settings": asdict(slam.options),
         "flags": flags,
@@ -124,7 +127,7 @@ def _write_csv(path: Path, slam: Slam, frames: list[SlamFrame]) -> None:
         for frame in frames:
             row: list[Any] = [frame.index, f"{frame.timestamp:.6f}", frame.status, frame.reason]
             row += _pose_columns(slam, frame) if slam.is_placed(frame) else [""] * 10
-            row += [len(frame.points.ids), len(frame.candidates), len(frame.disagreeing.ids)]
+            row += [frame.n_points, frame.n_candidates, frame.n_disagreeing]
             row += [int(frame.is_keyframe), *(f"{frame.timings_ms[s]:.3f}" for s in STAGES)]
             writer.writerow([*row, f"{frame.total_ms:.3f}"])
 
@@ -175,10 +178,8 @@ def _plot_frames(path: Path, frames: list[SlamFrame]) -> None:
     figure = Figure(figsize=(9.0, 6.0), layout="constrained")
     counts, errors, times = figure.subplots(3, 1, sharex=True)
     numbers = [frame.index for frame in frames]
-    counts.plot(numbers, [len(f.points.ids) for f in frames], color=PATH_COLOUR, label="map points")
-    counts.plot(
-        numbers, [len(f.candidates) for f in frames], color=POINT_COLOUR, label="corners without depth"
-    )
+    counts.plot(numbers, [f.n_points for f in frames], color=PATH_COLOUR, label="map points")
+    counts.plot(numbers, [f.n_candidates for f in frames], color=POINT_COLOUR, label="corners without depth")
     counts.set_ylabel("points followed")
     counts.legend(fontsize=8, frameon=False)
     errors.plot(numbers, [f.pose.rms_px if f.pose else np.nan for f in frames], color=PATH_COLOUR)

@@ -99,6 +99,11 @@ class Followed:
     def __getitem__(self, rows: NDArray) -> Followed:
         return Followed(self.ids[rows], self.pixels[rows], self.right[rows])
 
+    def without_unmeasured(self) -> Followed:
+        """The same in less memory, where no depth was measured."""
+        unmeasured = np.broadcast_to(np.nan, len(self.ids))
+        return self if np.isfinite(self.right).any() else Followed(self.ids, self.pixels, unmeasured)
+
     def joined(self, other: Followed) -> Followed:
         return Followed(
             np.concatenate([self.ids, other.ids]),

@@ -23,6 +23,7 @@ from morph_dslam.online.slam.bundle_adjustment import Observations, adjust
 from morph_dslam.online.slam.colmap_map import map_from_colmap
 from morph_dslam.online.slam.descriptors import least_distances, orientations
 from morph_dslam.online.slam.map_file import load_map
+from morph_dslam.online.slam.mapping_work import share_interpreter
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.slam.output import draw_frame, write_run
 from morph_dslam.online.slam.pose import refine_pose
@@ -110,6 +111,8 @@ def _run(
         and source.has_registered_depth
     )
     is_live = isinstance(source, LiveCamera)
+    if is_live:
+        share_interpreter()
     slam, frames = Slam(camera, options.slam, with_depth, options.freeze_when_deforming, is_live), []
     known = _known_map(options, slam)
     if known is not None:
@@ -144,11 +147,10 @@ def _process(slam: Slam, source: FrameStream, options: SlamRunOptions, frames: l
         for frame in tqdm(source, total=total, desc="tracking", unit="frame"):
             if options.freeze_at is not None and frame.index >= options.freeze_at and not slam.is_frozen:
                 slam.freeze()
-            frames.append(
-                slam.process_frame(frame.image, frame.index, frame.timestamp, frame.depth, frame.right)
-            )
+            result = slam.process_frame(frame.image, frame.index, frame.timestamp, frame.depth, frame.right)
+            frames.append(result.record(is_final=slam.is_frozen))
             if writer is not None:
-                writer.write(draw_frame(slam.undistort(frame.image), frames[-1]))
+                writer.write(draw_frame(slam.undistort(frame.image), result))
 
 
 def _finish(

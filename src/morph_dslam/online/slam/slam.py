@@ -20,9 +20,9 @@ from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.slam.pose import refine_pose
 from morph_dslam.online.slam.relocalisation import Relocaliser
 from morph_dslam.online.slam.rigid_map import CANDIDATE, GOOD, NOWHERE, Followed, RigidMap
-from morph_dslam.online.slam.slam_frame import STAGES, SlamFrame
+from morph_dslam.online.slam.slam_frame import STAGES, SlamFrame, corners_of, points_of
 from morph_dslam.online.slam.tracking import Tracked, Tracker
-from morph_dslam.online.timing import StageClock
+from morph_dslam.online.timing import StageClock, WaitClock
 from morph_dslam.stereo import StereoCamera
 
 Array = NDArray[np.float64]
@@ -133,7 +133,8 @@ class Slam:
         CameraError
             If an image has not the camera's size.
         """
-        clock = StageClock(STAGES)
+        clock, waits = StageClock(STAGES), WaitClock()
+        is_beside = self._threaded and self.is_mapping
         with clock.stage("prepare"):
             view = self.frame_images.prepare(image, index, timestamp, depth, right)
         with clock.stage("map"):
@@ -148,7 +149,10 @@ class Slam:
         is_young = len(self.map.keyframes) < self.options.window and not self.is_frozen
         if is_young and self._n_lost > self.options.restart_after:
             self._restart()
-        return SlamFrame(index, timestamp, **result, timings_ms=clock.milliseconds, total_ms=clock.total)
+        is_beside |= self._threaded and self.is_mapping
+        waited = waits.milliseconds + clock.milliseconds["map"] if is_beside else 0.0
+        times = {"timings_ms": clock.milliseconds, "total_ms": clock.total, "waited_ms": waited}
+        return SlamFrame(index, timestamp, **result, **times)
 
     def freeze(self) -> None:
         """Keep the map as it is from now on and only find the camera in it; before a start, do nothing.
@@ -208,7 +212,7 @@ class Slam:
         with clock.stage("start"):
             points = self._start_metric(view) if self.map.is_metric else self._start_moving(view)
             if not isinstance(points, Followed):
-                return {"status": "waiting", "reason": points, "candidates": self._initialiser.followed}
+                return {"status": "waiting", "reason": points} | corners_of(self._initialiser.followed)
             self._tracker.place(self.map.keyframes[-1].camera_from_world, points)
             tracked = self._tracker.track(view.flat, view.depth)
         if not isinstance(tracked, Tracked):
@@ -279,14 +283,11 @@ class Slam:
     def _result(self, status: str, tracked: Tracked, is_keyframe: bool) -> dict:
         number = len(self.map.keyframes) - 1
         camera_from_world = self._tracker.camera_from_world
-        candidate = self.map.state[tracked.points.ids] == CANDIDATE
-        return {
+        is_candidate = self.map.state[tracked.points.ids] == CANDIDATE
+        return points_of(tracked, is_candidate) | {
             "status": status,
             "reason": "",
             "pose": tracked.pose,
-            "points": tracked.points[~candidate],
-            "candidates": tracked.points.pixels[candidate],
-            "disagreeing": tracked.disagreeing,
             "keyframe": number,
             "from_keyframe": pose_in_keyframe(camera_from_world, self.map.keyframes[number]),
             "map_number": self.n_restarts,

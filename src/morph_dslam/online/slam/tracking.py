@@ -275,8 +275,8 @@ class Tracker:
 
     def looks_alike(self, ids: Indices, pose: Array, depths: Array) -> Mask:
         """Whether points look from here about as from their keyframe."""
-        views = self._map.template_keyframe[ids]
-        poses = np.array([keyframe.camera_from_world for keyframe in self._map.keyframes])
+        numbers, views = np.unique(self._map.template_keyframe[ids], return_inverse=True)
+        poses = np.array([self._map.keyframes[k].camera_from_world for k in numbers]).reshape(-1, 4, 4)
         centres = -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])[views]
         points = self._map.positions[ids]
         there, here = centres - points, camera_centre(pose) - points
