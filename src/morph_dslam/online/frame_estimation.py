@@ -32,6 +32,13 @@ class FrameEstimation:
         brief = replace(options.estimation, max_iterations=10, tolerance=1e-3)
         self._scout = Estimator(estimator.model, estimator.camera, brief)
 
+    def rough(self, followed: Measurement, start: State, prior: Prior | None) -> State:
+        """The state by what was followed from the previous frame; only a start for `correct`."""
+        weights = followed.valid.astype(float)
+        return self._scout.estimate(
+            self._reference.points, followed.pixels, weights, start, prior=prior
+        ).state
+
     def correct(
         self,
         picture: Picture,

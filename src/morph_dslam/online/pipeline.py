@@ -154,19 +154,17 @@ class Tracker:
     def _attempt_from_last(self, picture: Picture, prior: Prior | None, clock: StageClock) -> Attempt:
         """Estimate from the last known state; by way of the previous frame if the object was seen there."""
         if self._lost:
-            start = (
-                self._last
-                if prior is None or prior.pose is None
-                else replace(self._last, camera_from_object=prior.pose)
-            )
-            return self._estimation.correct(picture, start, None, prior, clock)
+            start = self._last if prior is None else prior.placed(self._last)
+            attempt = self._estimation.correct(picture, start, None, prior, clock)
+            if refusal(attempt, self.options):
+                return attempt
+            # It may have another shape by now: what that hides or shows is only known once it is found.
+            return self._estimation.correct(picture, attempt.estimate.state, None, prior, clock)
         with clock.stage("flow"):
             followed = self._follow(picture, prior)
         with clock.stage("estimate"):
-            weights = followed.valid.astype(float)
-            points = self.reference.points
-            start = self.estimator.estimate(points, followed.pixels, weights, self._start, prior=prior)
-        return self._estimation.correct(picture, start.state, followed, prior, clock)
+            start = self._estimation.rough(followed, self._start, prior)
+        return self._estimation.correct(picture, start, followed, prior, clock)
 
     def _follow(self, picture: Picture, prior: Prior | None) -> Measurement:
         """Follow the points that supported the previous frame's estimate from that frame to this one."""
@@ -183,8 +181,8 @@ class Tracker:
         """Image motion (p, 2) as the map has it, or at the velocity of two frames; only a first guess."""
         points = self.reference.points
         last = self.camera.project(points.in_camera(self._last))
-        if prior is not None and prior.pose is not None:
-            there = replace(self._last, camera_from_object=prior.pose)
+        if prior is not None:
+            there = prior.placed(self._last)
             return np.nan_to_num(self.camera.project(points.in_camera(there)) - last)
         return np.nan_to_num(last - self.camera.project(points.in_camera(self._velocity_base)))
 

@@ -55,6 +55,10 @@ class Prior:
             cost += 0.5 * float(away @ push)
         return cost, hessian, gradient
 
+    def placed(self, state: State) -> State:
+        """The state in the known pose, if there is one."""
+        return state if self.pose is None else replace(state, camera_from_object=self.pose)
+
     @property
     def lasting_scores(self) -> Array:
         """How the lasting errors enter the gradient (k, d + 6)."""
