@@ -7,7 +7,7 @@ from scipy.optimize import least_squares
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.online.bounded_step import bounded_step
+from morph_dslam.online.bounded_step import bounded_step, bounded_step_numpy
 from morph_dslam.online.estimation import (
     BoundPoints,
     EstimationOptions,
@@ -280,6 +280,21 @@ def test_bounded_step_solves_the_bounded_quadratic():
         )
     held = bounded_step(np.eye(2), np.array([-5.0, 0.3]), np.array([-1.0, 0.0]), np.array([1.0, 1.0]))
     np.testing.assert_allclose(held, [1.0, 0.0])
+
+
+def test_compiled_bounded_step_is_that_of_numpy_inside_tight_boxes():
+    rng = np.random.default_rng(14)
+    n_held = 0
+    for _ in range(50):
+        root = rng.standard_normal((8, 6))
+        hessian, gradient = root.T @ root + 0.05 * np.eye(6), 3.0 * rng.standard_normal(6)
+        lower, upper = -rng.uniform(0.0, 0.8, 6), rng.uniform(0.0, 0.8, 6)
+        lower[0], upper[1] = 0.0, 0.0
+        step = bounded_step(hessian, gradient, lower, upper)
+        np.testing.assert_allclose(step, bounded_step_numpy(hessian, gradient, lower, upper), atol=1e-12)
+        assert ((step >= lower) & (step <= upper)).all()
+        n_held += int(((step == lower) | (step == upper)).sum())
+    assert n_held > 50
 
 
 def pose_prior(information, away=(0.0,) * 6):

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.model import ReducedModel
@@ -74,7 +75,9 @@ def minimise(
     damping, iterations, converged = 1e-3, 0, False
     while iterations < max_iterations and not converged:
         iterations += 1
-        step, predicted = _damped_step(hessian, gradient, state, box, damping)
+        step, predicted = damped_step(
+            hessian, gradient, state.parameters, box.lower, box.upper, box.scale, damping
+        )
         if predicted <= tolerance * cost + 1e-14:
             # A damped step predicts little although much could be gained: believe it only undamped.
             converged = damping <= 1e-2
@@ -93,19 +96,27 @@ def minimise(
     return Minimum(state, cost, hessian, residuals, iterations, converged)
 
 
-def _damped_step(
-    hessian: Array, gradient: Array, state: State, box: Box, damping: float
-) -> tuple[Array, float]:
-    """Step in scaled unknowns and the decrease of the cost that the quadratic model predicts for it."""
-    scale, d = box.scale, len(state.parameters)
-    scaled_hessian = hessian * np.outer(scale, scale)
-    scaled_gradient = gradient * scale
-    diagonal = np.diag(scaled_hessian)
-    floor = max(diagonal.max() * DAMPING_FLOOR, 1e-30)
-    damped = scaled_hessian + np.diag(damping * np.maximum(diagonal, floor) + 1e-3 * floor)
-    lower, upper = np.full(d + 6, -LARGEST_STEP), np.full(d + 6, LARGEST_STEP)
-    lower[:d] = np.maximum(lower[:d], (box.lower - state.parameters) / scale[:d])
-    upper[:d] = np.minimum(upper[:d], (box.upper - state.parameters) / scale[:d])
-    step = bounded_step(damped, scaled_gradient, lower, upper)
-    predicted = -(scaled_gradient @ step + 0.5 * step @ scaled_hessian @ step)
-    return step, float(predicted)
+@njit(cache=True, nogil=True)
+def damped_step(hessian, gradient, parameters, lowest, highest, scale, damping):
+    """Step in scaled unknowns and the decrease of the cost that the quadratic model predicts for it.
+
+    Parameters
+    ----------
+    hessian, gradient : (n, n) and (n,) of the cost, SI. parameters : (d,), the first of the unknowns.
+    lowest, highest : (d,) their box. scale : (n,) of the unknowns. damping : relative to the diagonal.
+    """
+    n, d = len(gradient), len(parameters)
+    scaled, slope = np.empty((n, n)), gradient * scale
+    for a in range(n):
+        for b in range(n):
+            scaled[a, b] = hessian[a, b] * scale[a] * scale[b]
+    damped = scaled.copy()
+    floor = max(np.diag(scaled).max() * DAMPING_FLOOR, 1e-30)
+    for a in range(n):
+        damped[a, a] += damping * max(scaled[a, a], floor) + 1e-3 * floor
+    lower, upper = np.full(n, -LARGEST_STEP), np.full(n, LARGEST_STEP)
+    for k in range(d):
+        lower[k] = max(lower[k], (lowest[k] - parameters[k]) / scale[k])
+        upper[k] = min(upper[k], (highest[k] - parameters[k]) / scale[k])
+    step = bounded_step(damped, slope, lower, upper)
+    return step, -(slope @ step + 0.5 * step @ (scaled @ step))
