@@ -71,42 +71,59 @@ class Relocaliser:
         if len(mine) < self.options.least_matches:
             return None, len(mine)
         points = BoundPoints.from_surface(self._estimator.model, self._points.surface.take(mine))
-        matched = pixels[theirs]
-        best, inliers = None, np.zeros(len(mine), dtype=bool)
-        for shape in shapes:
-            pose, agreeing = self._ransac(points.rest + points.field.value(shape), matched)
-            if pose is not None and agreeing.sum() > inliers.sum():
-                best, inliers = State(shape, pose), agreeing
-        if best is None or inliers.sum() < self.options.least_matches:
-            return None, int(inliers.sum())
-        return self._refine(points, matched, best, inliers)
+        state, agreeing = state_from_matches(self._estimator, points, pixels[theirs], shapes, self.options)
+        return state, int(agreeing.sum())
 
-    def _ransac(self, points: Array, pixels: Array) -> tuple[RigidTransform | None, NDArray[np.bool_]]:
-        agreeing = np.zeros(len(points), dtype=bool)
-        found, rotation, translation, rows = cv2.solvePnPRansac(
-            points,
-            pixels,
-            self._estimator.camera.matrix,
-            None,  # type: ignore[arg-type]
-            iterationsCount=200,
-            reprojectionError=self.options.pnp_px,
-            flags=cv2.SOLVEPNP_SQPNP,
-        )
-        if not found or rows is None:
-            return None, agreeing
-        agreeing[np.asarray(rows, dtype=np.int64).ravel()] = True
-        return RigidTransform(
-            rotation_exp(rotation.ravel()), np.asarray(translation, dtype=float).ravel()
-        ), agreeing
 
-    def _refine(
-        self, points: BoundPoints, pixels: Array, start: State, inliers: NDArray[np.bool_]
-    ) -> tuple[State | None, int]:
-        """Estimate from the agreeing matches, then once more from all that agree with the result."""
-        state = start
-        for _ in range(2):
-            estimate = self._estimator.estimate(points, pixels, inliers.astype(float), state)
-            state = estimate.state
-            inliers = np.linalg.norm(estimate.residuals, axis=1) < self.options.pnp_px
-        count = int(inliers.sum())
-        return (state if count >= self.options.least_matches else None), count
+def state_from_matches(
+    estimator: Estimator,
+    points: BoundPoints,
+    pixels: Array,
+    shapes: list[Array],
+    options: RelocalisationOptions,
+) -> tuple[State | None, NDArray[np.bool_]]:
+    """The object's state from matches of which many may be wrong, and which of them (k,) agree with it.
+
+    Parameters
+    ----------
+    points, pixels : (k) and (k, 2). shapes : parameters (d,) to try the first pose with.
+
+    Returns
+    -------
+    None in place of the state when fewer than ``least_matches`` agree on one.
+    """
+    best, inliers = None, np.zeros(len(points), dtype=bool)
+    for shape in shapes:
+        positions = points.rest + points.field.value(shape)
+        pose, agreeing = _ransac(positions, pixels, estimator.camera.matrix, options.pnp_px)
+        if pose is not None and agreeing.sum() > inliers.sum():
+            best, inliers = State(shape, pose), agreeing
+    if best is None or inliers.sum() < options.least_matches:
+        return None, inliers
+    # Estimated from the agreeing matches, then once more from all that agree with the result.
+    for _ in range(2):
+        estimate = estimator.estimate(points, pixels, inliers.astype(float), best)
+        best = estimate.state
+        inliers = np.linalg.norm(estimate.residuals, axis=1) < options.pnp_px
+    return (best if inliers.sum() >= options.least_matches else None), inliers
+
+
+def _ransac(
+    points: Array, pixels: Array, matrix: Array, limit_px: float
+) -> tuple[RigidTransform | None, NDArray[np.bool_]]:
+    """A pose (camera from object) with which most points (k, 3) are near their pixels, and which are."""
+    agreeing = np.zeros(len(points), dtype=bool)
+    found, rotation, translation, rows = cv2.solvePnPRansac(
+        points,
+        pixels,
+        matrix,
+        None,  # type: ignore[arg-type]
+        iterationsCount=200,
+        reprojectionError=limit_px,
+        flags=cv2.SOLVEPNP_SQPNP,
+    )
+    if not found or rows is None:
+        return None, agreeing
+    agreeing[np.asarray(rows, dtype=np.int64).ravel()] = True
+    pose = RigidTransform(rotation_exp(rotation.ravel()), np.asarray(translation, dtype=float).ravel())
+    return pose, agreeing

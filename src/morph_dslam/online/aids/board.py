@@ -1,0 +1,194 @@
+"""Printed boards of square markers (ArUco, AprilTag), alone or in a chessboard: read, found, printed.
+
+A board's frame has its origin in the upper left corner of the print, x to the right and y down along the
+paper, z into it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from scipy.spatial.transform import Rotation
+
+from morph_dslam.errors import RegistrationError
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.io.toml_file import read_toml
+
+Array = NDArray[np.float64]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+
+#: Names of the dictionaries of markers, as in OpenCV without its prefix, in lower case.
+DICTIONARIES = tuple(
+    sorted({name[5:].lower() for name in dir(cv2.aruco) if name.startswith("DICT_")})  # type: ignore[attr-defined]
+)
+#: Fewer corners are not believed: one marker has four.
+FEWEST_CORNERS = 4
+DOTS_PER_INCH = 300
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class Place(_Section):
+    """Where the undeformed object's frame is on the board: origin, and turn about x, then y, then z."""
+
+    position_mm: Vector
+    rotation_deg: Vector = (0.0, 0.0, 0.0)
+
+
+class BoardFile(_Section):
+    """A board file.
+
+    A "grid" has ``columns`` x ``rows`` markers of ``marker_mm``, ``gap_mm`` apart; a "charuco" board has so
+    many chessboard squares of ``square_mm`` with markers of ``marker_mm`` in the white ones.
+    """
+
+    kind: Literal["grid", "charuco"] = "grid"
+    dictionary: str
+    columns: int = Field(ge=1, le=50)
+    rows: int = Field(ge=1, le=50)
+    marker_mm: Positive
+    gap_mm: Positive | None = None
+    square_mm: Positive | None = None
+    object: Place | None = None
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> BoardFile:
+        if self.dictionary.lower() not in DICTIONARIES:
+            raise ValueError(f"dictionary must be one of {', '.join(DICTIONARIES)}, not '{self.dictionary}'")
+        if self.kind == "grid" and self.gap_mm is None:
+            raise ValueError("a grid needs gap_mm, the white between its markers")
+        if self.kind == "charuco" and (self.square_mm is None or self.square_mm <= self.marker_mm):
+            raise ValueError("a charuco board needs square_mm, larger than marker_mm")
+        if self.kind == "charuco" and min(self.columns, self.rows) < 3:
+            raise ValueError("a charuco board needs 3 x 3 squares at least")
+        return self
+
+
+@dataclass(frozen=True)
+class FiducialBoard:
+    """A board as its file describes it."""
+
+    description: BoardFile
+
+    @property
+    def board_from_object(self) -> RigidTransform | None:
+        """Where the undeformed object is on it, metres; None for a board that only gives the scale."""
+        place = self.description.object
+        if place is None:
+            return None
+        turn = Rotation.from_euler("xyz", place.rotation_deg, degrees=True).as_matrix()
+        return RigidTransform(turn, 1e-3 * np.array(place.position_mm))
+
+    @property
+    def pitch(self) -> float:
+        """From one marker or square to the next, metres."""
+        d = self.description
+        return 1e-3 * (d.marker_mm + (d.gap_mm or 0.0) if d.kind == "grid" else d.square_mm or 0.0)
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height of the print without its margin, metres."""
+        d = self.description
+        gap = 1e-3 * (d.gap_mm or 0.0) if d.kind == "grid" else 0.0
+        return d.columns * self.pitch - gap, d.rows * self.pitch - gap
+
+    @cached_property
+    def _board(self) -> Any:
+        d, aruco = self.description, cv2.aruco  # type: ignore[attr-defined]
+        names = {name[5:].lower(): name for name in dir(aruco) if name.startswith("DICT_")}
+        dictionary = aruco.getPredefinedDictionary(getattr(aruco, names[d.dictionary.lower()]))
+        size, marker = (d.columns, d.rows), 1e-3 * d.marker_mm
+        if d.kind == "grid":
+            return aruco.GridBoard(size, marker, self.pitch - marker, dictionary)
+        return aruco.CharucoBoard(size, self.pitch, marker, dictionary)
+
+    def find(self, grey: NDArray[np.uint8]) -> tuple[Array, Array]:
+        """Corners of the board (k, 3), board frame, metres, and their pixels (k, 2) in an image (h, w)."""
+        aruco, board = cv2.aruco, self._board  # type: ignore[attr-defined]
+        parameters = aruco.DetectorParameters()
+        if self.description.kind == "charuco":
+            corners, ids, _, _ = aruco.CharucoDetector(board).detectBoard(grey)
+        else:
+            parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
+            corners, ids, _ = aruco.ArucoDetector(board.getDictionary(), parameters).detectMarkers(grey)
+        if ids is None or not len(ids):
+            return np.empty((0, 3)), np.empty((0, 2))
+        points, pixels = board.matchImagePoints(corners, ids)
+        if points is None or not len(points):
+            return np.empty((0, 3)), np.empty((0, 2))
+        return (
+            np.asarray(points, dtype=np.float64).reshape(-1, 3),
+            np.asarray(pixels, dtype=np.float64).reshape(-1, 2),
+        )
+
+    def image(self, pixels_per_metre: float) -> NDArray[np.uint8]:
+        """The print (h, w) without a margin, 0 black."""
+        width, height = (max(1, round(side * pixels_per_metre)) for side in self.size)
+        return np.asarray(self._board.generateImage((width, height), marginSize=0), dtype=np.uint8)
+
+
+def load_board(path: Path) -> FiducialBoard:
+    """Read a board file.
+
+    Raises
+    ------
+    RegistrationError
+        If it is missing, no TOML, or says something impossible.
+    """
+    content = read_toml(path, "board file", RegistrationError)
+    try:
+        description = BoardFile.model_validate(content)
+        board = FiducialBoard(description)
+        _ = board._board
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        message = first["msg"].removeprefix("Value error, ")
+        raise RegistrationError(f"{path}: {where}: {message}" if where else f"{path}: {message}") from error
+    except cv2.error as error:
+        raise RegistrationError(
+            f"{path}: the dictionary '{description.dictionary}' has too few markers for "
+            f"{description.columns} x {description.rows}"
+        ) from error
+    return board
+
+
+def print_board(board: FiducialBoard, path: Path) -> None:
+    """Write the board in its true size as a PNG or PDF file, with a white margin and a line to measure.
+
+    Raises
+    ------
+    RegistrationError
+        If the file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    inch, margin = 0.0254, 0.015
+    width, height = board.size
+    total = (width + 2 * margin, height + 2 * margin + 0.01)
+    figure = Figure(figsize=(total[0] / inch, total[1] / inch))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set_xlim(0.0, total[0])
+    axes.set_ylim(total[1], 0.0)
+    axes.axis("off")
+    extent = (margin, margin + width, margin + height, margin)
+    axes.imshow(board.image(2.0 * DOTS_PER_INCH / inch), cmap="gray", extent=extent, interpolation="nearest")
+    axes.set_aspect("auto")
+    length = 0.1 if width > 0.1 else 0.01 * max(1, int(width / 0.01))
+    line = margin + height + 0.01
+    axes.plot([margin, margin + length], [line, line], "k|-", linewidth=0.6, markersize=8)
+    axes.text(margin + length + 0.003, line, f"{1e3 * length:.0f} mm", fontsize=8, va="center")
+    try:
+        figure.savefig(path, dpi=DOTS_PER_INCH)
+    except (OSError, ValueError) as error:
+        raise RegistrationError(f"cannot write the board to {path}: {error}") from error
