@@ -99,6 +99,7 @@ def test_result_file_has_the_documented_layout(finished):
     }
     rows = ("frame", "timestamp", "status", "reason", "residual_rms_px", "unexplained_px", "n_points")
     rows += ("n_inliers", "largest_displacement", "largest_displacement_std", "pose_from")
+    rows += ("largest_von_mises", "largest_von_mises_std")
     assert shapes == {**states, **dict.fromkeys(rows, (7,)), "timings_ms": (7, len(STAGES) + 1)}
 
 
@@ -128,6 +129,7 @@ def test_video_and_plots_are_there(finished):
     # The colours of the stress lie over the grey film where the object is.
     assert np.ptp(first[220:260, 250:390], axis=2).mean() > 20.0
     assert {path.name for path in (folder / "plots").iterdir()} == {
+        "confidence.png",
         "parameters.png",
         "residual.png",
         "timings.png",

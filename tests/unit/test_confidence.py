@@ -5,7 +5,12 @@ import pytest
 
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model.reduced_model import von_mises
-from morph_dslam.online.confidence import displacement_std, largest_displacement, von_mises_std
+from morph_dslam.online.confidence import (
+    displacement_std,
+    largest_displacement,
+    largest_von_mises,
+    von_mises_std,
+)
 from morph_dslam.online.estimation import Estimate, State
 from tests.support.bent_sheet import bent_sheet_model
 
@@ -43,6 +48,21 @@ def test_largest_displacement_spreads_as_stated(estimate, drawn):
     lengths = [np.linalg.norm(MODEL.displacement.value(mu)[node]) for mu in drawn]
     assert value == pytest.approx(np.mean(lengths), rel=1e-3)
     assert deviation == pytest.approx(np.std(lengths), rel=0.06)
+
+
+def test_largest_stress_spreads_as_stated(estimate, drawn):
+    """At the node where it is largest on either face."""
+    value, deviation = largest_von_mises(MODEL, estimate)
+    by_face = {place: von_mises(MODEL.stresses[place].value(MU)) for place in MODEL.stresses}
+    place = max(by_face, key=lambda name: by_face[name].max())
+    node = by_face[place].argmax()
+    assert value == pytest.approx(by_face[place][node])
+    sizes = [von_mises(MODEL.stresses[place].value(mu)[node]) for mu in drawn]
+    assert deviation == pytest.approx(np.std(sizes), rel=0.06)
+
+
+def test_model_without_stresses_has_no_largest_one(estimate):
+    assert np.isnan(largest_von_mises(type(MODEL)(**{**vars(MODEL), "stresses": {}}), estimate)).all()
 
 
 @pytest.mark.parametrize("components", [3, 6])

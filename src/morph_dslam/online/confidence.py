@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.model import ReducedModel
+from morph_dslam.model.reduced_model import von_mises
 from morph_dslam.online.estimation import Estimate
 
 Array = NDArray[np.float64]
@@ -66,6 +67,20 @@ def largest_displacement(model: ReducedModel, estimate: Estimate) -> tuple[float
     direction = value[node] / max(float(length[node]), 1e-300)
     along = slopes[:, node] @ direction
     return float(length[node]), float(np.sqrt(_variances(along[:, None, None], estimate)[0, 0]))
+
+
+def largest_von_mises(model: ReducedModel, estimate: Estimate) -> tuple[float, float]:
+    """The largest von Mises stress of a node at any place, pascals, and its standard deviation; or NaN."""
+    found = (float("nan"), float("nan"))
+    for place in model.stresses:
+        stress, slopes = model.stresses[place].value_and_sensitivities(estimate.state.parameters)
+        sizes = von_mises(stress)
+        node = int(sizes.argmax())
+        if not sizes[node] <= found[0]:
+            form = _PLANE if stress.shape[1] == 3 else _SOLID
+            along = slopes[:, node] @ (form @ stress[node]) / max(float(sizes[node]), 1e-300)
+            found = (float(sizes[node]), float(np.sqrt(_variances(along[:, None, None], estimate)[0, 0])))
+    return found
 
 
 def _variances(slopes: Array, estimate: Estimate) -> Array:

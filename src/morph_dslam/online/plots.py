@@ -15,8 +15,9 @@ DPI = 110
 
 
 def write_plots(folder: Path, run: RunResults) -> None:
-    """Write ``parameters.png``, ``residual.png`` and ``timings.png``."""
+    """Write ``parameters.png``, ``confidence.png``, ``residual.png`` and ``timings.png``."""
     folder.mkdir(exist_ok=True)
+    plot_confidence(folder / "confidence.png", run)
     plot_parameters(folder / "parameters.png", run)
     plot_residual(folder / "residual.png", run)
     plot_timings(folder / "timings.png", run)
@@ -57,6 +58,30 @@ def plot_parameters(path: Path, run: RunResults) -> None:
             axes.axhline(bound, color="#888888", linewidth=0.8, linestyle="--")
         axes.set_ylim(low - margin, high + margin)
         axes.set_ylabel(f"{parameter.name} [{parameter.unit}]")
+        _shade_lost(axes, run)
+    all_axes[0].legend(loc="upper left", fontsize=8)
+    all_axes[-1].set_xlabel("frame")
+    figure.savefig(path, dpi=DPI)
+
+
+def plot_confidence(path: Path, run: RunResults) -> None:
+    """The largest displacement and the largest stress, each with a band of two standard deviations."""
+    rows = [("largest displacement [mm]", 1e3 * run.largest_displacements())]
+    if run.model.stresses:
+        rows.append(("largest von Mises stress [MPa]", 1e-6 * run.largest_stresses()))
+    figure = Figure(figsize=(9.0, 1.0 + 2.2 * len(rows)), layout="constrained")
+    all_axes = np.atleast_1d(figure.subplots(len(rows), 1, sharex=True))
+    for axes, (label, (value, deviation)) in zip(all_axes, [(n, v.T) for n, v in rows], strict=True):
+        low, high = value - 2.0 * deviation, value + 2.0 * deviation
+        # A frame that tells nothing must not hide what the others tell.
+        top = 1.5 * float(np.nanmax(value, initial=0.0)) or 1.0
+        low, high = np.clip(low, 0.0, top), np.clip(high, 0.0, top)
+        axes.fill_between(
+            run.frames, low, high, color="#4878a8", alpha=0.3, linewidth=0, label="±2 standard deviations"
+        )
+        axes.plot(run.frames, value, color="#1f4e79", linewidth=1.2)
+        axes.set_ylabel(label)
+        axes.set_ylim(bottom=0.0)
         _shade_lost(axes, run)
     all_axes[0].legend(loc="upper left", fontsize=8)
     all_axes[-1].set_xlabel("frame")

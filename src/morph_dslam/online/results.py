@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.model import ReducedModel
 from morph_dslam.online.binding import DrawnSurface
-from morph_dslam.online.confidence import largest_displacement
+from morph_dslam.online.confidence import largest_displacement, largest_von_mises
 from morph_dslam.online.estimation import State
 from morph_dslam.online.frame_result import HAS_MOVED, STAGES, UNEXPLAINED, FrameResult
 from morph_dslam.online.observability import UNTOLD_SHARE, one_value, statement, untold_in_run
@@ -99,6 +99,17 @@ class RunResults:
             self._largest.append((np.nan, np.nan) if found is None else largest_displacement(surface, found))
         return np.array(self._largest).reshape(-1, 2)
 
+    def largest_stresses(self) -> Array:
+        """The largest von Mises stress of a node of the surface and its standard deviation (f, 2), pascals.
+
+        NaN where lost, and in models without stresses.
+        """
+        used = np.unique(self.model.triangles)
+        stresses = {place: f.with_modes(f.modes[:, used]) for place, f in self.model.stresses.items()}
+        surface, none = replace(self.model, stresses=stresses), (np.nan, np.nan)
+        estimates = [result.estimate for result in self.results]
+        return np.array([none if e is None else largest_von_mises(surface, e) for e in estimates])
+
     def timings_ms(self) -> Array:
         """(f, len(STAGES) + 1): each stage, then the whole frame."""
         return np.array([[*(r.timings_ms[s] for s in STAGES), r.total_ms] for r in self.results])
@@ -130,6 +141,8 @@ def write_hdf5(path: Path, run: RunResults) -> None:
         file["pose_std"] = run.pose_std()
         file["parameter_std"], file["at_bound"] = run.parameter_std(), run.at_bound()
         file["largest_displacement"], file["largest_displacement_std"] = run.largest_displacements().T
+        if run.model.stresses:
+            file["largest_von_mises"], file["largest_von_mises_std"] = run.largest_stresses().T
         file["residual_rms_px"], file["unexplained_px"] = run.residuals_px(), run.unexplained_px()
         file["n_points"], file["n_inliers"] = run.counts().T
         file["timings_ms"] = run.timings_ms()
