@@ -1,6 +1,8 @@
 """What must neither crash nor mislead camera tracking: wrong calibration, noise, black frames, a reset."""
 
 import json
+import threading
+import time
 from dataclasses import replace
 
 import cv2
@@ -9,7 +11,10 @@ import pytest
 
 from morph_dslam.cli import main
 from morph_dslam.errors import CameraError
+from morph_dslam.io.trajectory import load_trajectory
 from morph_dslam.online.slam.calibration_check import suspected_focal_factor
+from morph_dslam.online.slam.map_file import load_map
+from morph_dslam.online.slam.mapping import Mapper
 from morph_dslam.online.slam.rigid_map import RigidMap
 from morph_dslam.online.slam.slam import Slam
 from tests.support.rendered_room import CAMERA, RoomFilm, hand_held, wall
@@ -103,3 +108,88 @@ def test_a_reset_begins_anew_in_any_mode(images, mode):
     assert status[0] == "waiting"
     assert status[-1] == "tracked"
     assert len(slam.map.keyframes) > 2
+
+
+def all_frames(slam, images, first=0):
+    """Frames at a pace that leaves the mapper's thread the time it needs."""
+    for index, image in enumerate(images, start=first):
+        yield slam.process_frame(image, index, index / 30.0)
+        while slam._making.is_running:
+            time.sleep(0.001)
+
+
+def under_way(slam, images):
+    """Go on until the mapper has begun work that is not done; returns the next frame's number."""
+    for index, image in enumerate(images):
+        slam.process_frame(image, index, index / 30.0)
+        if slam.map.keyframes and slam._making.is_running:
+            return index + 1
+        while slam._making.is_running:
+            time.sleep(0.001)
+    raise AssertionError("the mapper was never at work")
+
+
+def test_a_reset_while_the_mapper_is_at_work_forgets_what_it_does(images, monkeypatch):
+    slam, may_go_on, insert = Slam(CAMERA, threaded=True), threading.Event(), Mapper.insert
+
+    def held_up(mapper, tracked, view):
+        assert may_go_on.wait(timeout=60.0)
+        yield from insert(mapper, tracked, view)
+
+    monkeypatch.setattr(Mapper, "insert", held_up)
+    under_way(slam, images)
+    slam.reset()
+    may_go_on.set()
+    assert not slam.map.keyframes
+    status = [frame.status for frame in all_frames(slam, images[30:60])]
+    assert status[0] == "waiting"
+    assert status[-1] == "tracked"
+    # The new map's points have nothing of the old one.
+    assert {keyframe.index for keyframe in slam.map.keyframes} <= set(range(30))
+    assert len(slam.map.keyframes) > 2
+
+
+def test_freezing_waits_for_nobody_and_the_map_stays(images, monkeypatch):
+    """Freezing returns though the mapper's step cannot end before: with any waiting this would hang."""
+    slam, may_go_on, insert = Slam(CAMERA, threaded=True), threading.Event(), Mapper.insert
+
+    def held_up(mapper, tracked, view):
+        assert may_go_on.wait(timeout=60.0)
+        yield from insert(mapper, tracked, view)
+
+    monkeypatch.setattr(Mapper, "insert", held_up)
+    after = under_way(slam, images)
+    n_keyframes, positions = len(slam.map.keyframes), slam.map.positions.copy()
+    slam.freeze()
+    may_go_on.set()
+    later = list(all_frames(slam, images[after : after + 10], after))
+    slam.refine_map()
+    assert {frame.status for frame in later} == {"tracked"}
+    assert len(slam.map.keyframes) == n_keyframes
+    assert np.array_equal(slam.map.positions, positions)
+    slam.reset()
+    assert not slam.is_frozen
+    assert [frame.status for frame in all_frames(slam, images[30:60])][-1] == "tracked"
+
+
+@pytest.mark.parametrize("at", [3, 12, 20, 33])
+def test_an_interrupt_at_any_frame_keeps_what_was_mapped(tmp_path, images, monkeypatch, at):
+    write_film(tmp_path / "film", images)
+    (tmp_path / "camera.yaml").write_text("width: 640\nheight: 480\nfx: 525\nfy: 525\ncx: 319.5\ncy: 239.5\n")
+    track = Slam.process_frame
+
+    def interrupted(slam, image, index, *rest):
+        if index == at:
+            raise KeyboardInterrupt
+        return track(slam, image, index, *rest)
+
+    monkeypatch.setattr(Slam, "process_frame", interrupted)
+    run = tmp_path / "run"
+    command = ["slam", str(tmp_path / "film"), "--camera", str(tmp_path / "camera.yaml"), "--no-video"]
+    assert main([*command, "-o", str(run)]) == 130
+    summary = json.loads((run / "summary.json").read_text())
+    assert summary["n_frames"] == at
+    assert (summary["n_tracked"] > 0) == (at > 10)
+    if summary["n_tracked"]:
+        assert len(load_trajectory(run / "trajectory.txt")) == summary["n_tracked"]
+        assert len(load_map(run / "map.h5", CAMERA).good) == summary["n_map_points"] > 80

@@ -51,6 +51,11 @@ class MapMaking:
         return self._work.is_idle and self._search.is_idle
 
     @property
+    def is_running(self) -> bool:
+        """Whether something is being done beside the frames just now."""
+        return self._work.is_running or self._search.is_running
+
+    @property
     def n_loops(self) -> int:
         """Loops closed."""
         return self._loops.n_closed

@@ -67,6 +67,11 @@ class MappingWork:
         """Whether nothing is under way."""
         return self._work is None
 
+    @property
+    def is_running(self) -> bool:
+        """Whether a step is being done in the thread."""
+        return self._running is not None and not self._running.done()
+
     def begin(self, work: Work) -> None:
         """Begin new work: do its first step, or have it done."""
         self._work = work
