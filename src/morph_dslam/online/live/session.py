@@ -104,6 +104,7 @@ class LiveSession:
         self._located: Newest[tuple[Frame, Located]] = Newest()
         self._tracked: Newest[tuple[Frame, FrameResult]] = Newest()
         self._errors: list[BaseException] = []
+        self._done = threading.Event()
         self._threads = [
             threading.Thread(target=self._guarded, args=(work, following), name=name, daemon=True)
             for name, work, following in (
@@ -123,8 +124,9 @@ class LiveSession:
                 thread.start()
             try:
                 end = None if seconds is None else self._clock() + seconds
-                while self._threads[-1].is_alive() and (end is None or self._clock() < end):
-                    self._threads[-1].join(timeout=0.1)
+                # Not by joining: a thread whose join is interrupted counts as ended in Python 3.11.
+                while not self._done.wait(0.1) and (end is None or self._clock() < end):
+                    pass
             finally:
                 self.stop()
                 places = (self._stream, self._located, self._tracked)
@@ -146,7 +148,9 @@ class LiveSession:
             self._errors.append(error)
             self._stream.closing = True
         finally:
-            if following is not None:
+            if following is None:
+                self._done.set()
+            else:
                 following.end()
 
     def _locate(self) -> None:

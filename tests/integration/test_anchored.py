@@ -1,0 +1,231 @@
+"""An anchored object, by the camera in the map: recorded and live, covered, moved, and without a camera."""
+
+import _thread
+import json
+from dataclasses import replace
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from morph_dslam.cli import main
+from morph_dslam.errors import MapError, TrackingError
+from morph_dslam.evaluation.run_folder import load_run
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.online.frame_result import HAS_MOVED
+from morph_dslam.online.known_pose import KnownPose
+from morph_dslam.online.live.run import LiveOptions, run_live
+from morph_dslam.online.live.sinks import VideoSink
+from morph_dslam.online.track import TrackOptions, track
+from morph_dslam.online.tracking_setup import ObjectOptions, load_setup
+from morph_dslam.sources import open_source
+from tests.support.rendered_anchored import SCAN, make_anchored_recording
+
+#: What the map made from the scan is off by, and the registration with it, metres.
+MAP_ERROR = 2.5e-3
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("anchored")
+    return folder, make_anchored_recording(folder)
+
+
+def of_object(folder, **others):
+    known = {"placement": folder / "registration.json", "map_path": folder / "map.h5"} | others
+    return ObjectOptions(folder / "sheet.morph", folder / "sequence" / "camera.yaml", **known)
+
+
+def new_chain(folder, **others):
+    setup = load_setup(of_object(folder, **others))
+    placement = setup.placed()
+    return setup, setup.new_chain(placement, setup.reference, in_sequence=False)
+
+
+def frames_of(folder, first, last):
+    return list(open_source(folder / "sequence" / "frames", first, last))
+
+
+def true_pose(truth, frame):
+    return RigidTransform.from_matrix(truth["camera_from_object"][frame])
+
+
+def pixels_of(setup, truth, frame):
+    nodes = setup.model.positions(truth["parameters"][frame])
+    return setup.camera.project(true_pose(truth, frame).apply(nodes))
+
+
+def test_a_recording_is_tracked_with_the_camera_in_the_map(recording):
+    folder, truth = recording
+    summary = track(
+        TrackOptions(
+            frames=folder / "sequence" / "frames",
+            model=folder / "sheet.morph",
+            camera=folder / "sequence" / "camera.yaml",
+            placement=folder / "registration.json",
+            output=folder / "run",
+            first=SCAN,
+            overlay=False,
+        )
+    )
+    # The map is the one beside the registration.
+    assert summary["inputs"]["map"] == str(folder / "map.h5")
+    assert (summary["pose"], summary["n_tracked"], summary["n_hidden"]) == ("map", 20, 0)
+    run = load_run(folder / "run")
+    with h5py.File(folder / "run" / "result.h5") as file:
+        assert set(file["pose_from"].asstr()[()]) == {"points and map"}
+        assert (file["pose_std"][:] > 0.0).all()
+    expected = truth["parameters"][run.frames]
+    np.testing.assert_allclose(run.parameters[:, 0], expected[:, 0], atol=0.5e-3)
+    apart = run.camera_from_object[:, :3, 3] - truth["camera_from_object"][run.frames][:, :3, 3]
+    assert np.linalg.norm(apart, axis=1).max() < MAP_ERROR
+
+
+def test_a_covered_object_is_hidden_in_its_place_and_few_points_tell_its_shape(recording):
+    folder, truth = recording
+    setup, chain = new_chain(folder)
+    rng = np.random.default_rng(2)
+    seen = {}
+    for frame in frames_of(folder, 44, 57):
+        image = frame.image.copy()
+        left, top = np.floor(pixels_of(setup, truth, frame.index).min(axis=0)).astype(int) - 12
+        right, bottom = np.ceil(pixels_of(setup, truth, frame.index).max(axis=0)).astype(int) + 12
+        if 48 <= frame.index < 52:  # a cloth with a pattern of its own over all of it
+            cloth = rng.integers(30, 220, (60, 80, 3), dtype=np.uint8)
+            cloth = cv2.resize(cloth, (right - left, bottom - top), interpolation=cv2.INTER_CUBIC)
+            image[top:bottom, left:right] = cloth
+        if frame.index >= 54:  # and over most of it
+            image[top:bottom, left : left + round(0.86 * (right - left))] = 120
+        seen[frame.index] = chain.process(replace(frame, image=image))
+    for index in range(48, 52):
+        result = seen[index]
+        assert (result.status, result.pose_from, result.estimate) == ("hidden", "map", None)
+        assert "its place is known from the map, its parameters are not" in result.reason
+        apart = result.pose.translation - truth["camera_from_object"][index][:3, 3]
+        assert np.linalg.norm(apart) < MAP_ERROR
+        assert 0.0 < result.pose_std[5] < 5e-3
+    for index in (53, 55, 56, 57):
+        result = seen[index]
+        assert (result.status, result.pose_from) == ("tracked", "points and map"), result.reason
+        error = result.estimate.state.parameters[0] - truth["parameters"][index, 0]
+        assert abs(error) < (0.5e-3 if index == 53 else 3.0 * result.estimate.parameter_std[0])
+    # Fewer than a free object needs, and all at one end: they tell the arch, and that they tell it worse.
+    assert seen[57].n_inliers < 30
+    assert 1e-3 < seen[57].estimate.parameter_std[0] < 10e-3
+
+
+def test_where_the_camera_is_lost_the_points_alone_tell_the_pose(recording):
+    folder, truth = recording
+    setup, chain = new_chain(folder)
+    for frame in frames_of(folder, 44, 51):
+        image = frame.image
+        if frame.index >= 47:
+            outline = cv2.convexHull(np.rint(pixels_of(setup, truth, frame.index)).astype(np.int32))
+            sheet = cv2.fillConvexPoly(np.zeros(image.shape[:2], dtype=np.uint8), outline, 1)
+            image = np.where(sheet[:, :, None] > 0, image, np.uint8(110))
+        result = chain.process(replace(frame, image=image))
+        assert result.status == "tracked", result.reason
+        assert abs(result.estimate.state.parameters[0] - truth["parameters"][frame.index, 0]) < 1e-3
+    assert result.pose_from == "points"
+    assert "the camera is lost in the map: " in result.reason
+
+
+def test_an_object_that_was_moved_is_said_to_be_and_is_followed_by_its_points(recording):
+    """The map's pose is shifted, as if the object had been pushed by 15 mm, and later back."""
+    folder, truth = recording
+    _, chain = new_chain(folder)
+    push = np.array([0.015, 0.0, 0.0])
+    moved, sources = {}, {}
+    for frame in frames_of(folder, 40, 55):
+        known = chain.locate(frame).known
+        if 44 <= frame.index < 50:
+            pose = known.pose
+            there = RigidTransform(pose.rotation, pose.translation + pose.rotation @ push)
+            known = KnownPose(there, known.from_camera, known.lasting)
+        result = chain.tracker.process_frame(frame.image, known)
+        assert result.status == "tracked", result.reason
+        apart = result.pose.translation - truth["camera_from_object"][frame.index][:3, 3]
+        assert np.linalg.norm(apart) < MAP_ERROR
+        moved[frame.index], sources[frame.index] = HAS_MOVED in result.reason, result.pose_from
+    assert sources[43] == "points and map"
+    assert {sources[index] for index in range(44, 50)} == {"points"}
+    # Three frames on end make it sure, both ways.
+    assert [index for index, told in moved.items() if told] == list(range(46, 52))
+    assert sources[54] == "points and map"
+
+
+def test_a_pose_that_is_held_is_the_maps(recording):
+    folder, _ = recording
+    _, chain = new_chain(folder, pose="fixed")
+    for frame in frames_of(folder, 44, 46):
+        located = chain.locate(frame)
+        result = chain.track(frame, located)
+        np.testing.assert_allclose(result.pose.matrix, located.known.pose.matrix, atol=1e-5)
+        assert result.pose_from == "points and map"
+
+
+def test_a_live_run_keeps_the_pace_and_everything_it_found(recording):
+    folder, truth = recording
+    options = LiveOptions(
+        str(folder / "sequence" / "frames"), folder / "live", of_object(folder), first=30, serve=0
+    )
+    summary = run_live(options)
+    drawn, dropped = summary["n_frames"], summary["live"]["n_dropped"]
+    assert drawn + dropped == 30
+    assert summary["live"]["latency_p95_ms"] >= summary["live"]["latency_median_ms"] > 0.0
+    run = load_run(folder / "live")
+    assert (np.diff(run.frames) > 0).all()
+    assert run.frames[-1] == 59
+    assert run.status[-1] == "tracked"
+    assert run.parameters[-1, 0] == pytest.approx(truth["parameters"][59, 0], abs=1e-3)
+    rows = (folder / "live" / "latency.csv").read_text().splitlines()
+    assert rows[0] == "frame,captured_s,latency_ms"
+    assert len(rows) == 1 + drawn
+    # Where frames were dropped the video stands still.
+    capture = cv2.VideoCapture(str(folder / "live" / "augmented.mp4"))
+    assert int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) == run.frames[-1] - run.frames[0] + 1
+    capture.release()
+
+
+def test_an_interrupt_keeps_a_live_run(recording, monkeypatch, capsys):
+    folder, _ = recording
+    show, shown = VideoSink.show, []
+
+    def interrupted(self, frame, picture):
+        show(self, frame, picture)
+        shown.append(frame.index)
+        if len(shown) == 3:
+            _thread.interrupt_main()
+
+    monkeypatch.setattr(VideoSink, "show", interrupted)
+    command = ["live", str(folder / "sequence" / "frames"), "--model", str(folder / "sheet.morph")]
+    command += ["--camera", str(folder / "sequence" / "camera.yaml"), "--show", "displacement"]
+    command += ["--place", str(folder / "registration.json"), "-o", str(folder / "stopped")]
+    assert main([*command, "--range", "20-"]) == 130
+    assert "everything until then is kept" in capsys.readouterr().err
+    frames = load_run(folder / "stopped").frames.tolist()
+    assert frames == shown
+    assert 3 <= len(frames) < 39
+    assert (folder / "stopped" / "augmented.mp4").is_file()
+
+
+def test_inputs_that_do_not_fit_are_refused(recording, tmp_path):
+    folder, _ = recording
+    content = json.loads((folder / "registration.json").read_text())
+    (tmp_path / "registration.json").write_text(
+        json.dumps(content | {"keyframes": [content["keyframes"][0] | {"frame": 1234}]})
+    )
+    with pytest.raises(MapError, match="is not the map of the registration: it has no keyframe 1234"):
+        load_setup(of_object(folder, placement=tmp_path / "registration.json"))
+    alone = load_setup(of_object(folder, placement=tmp_path / "registration.json", map_path=None))
+    assert alone.map_path is None
+    assert "no map was given or found" in alone.placement.flags[-1]
+    with pytest.raises(TrackingError, match="a registration needs the map that it was made in"):
+        run_live(
+            LiveOptions(
+                str(folder / "sequence" / "frames"), tmp_path / "run", replace(alone.options, pose="free")
+            )
+        )
+    with pytest.raises(TrackingError, match="a map needs the object's place in it"):
+        load_setup(of_object(folder, placement=None, landmarks=tmp_path / "landmarks.csv"))

@@ -1,0 +1,117 @@
+"""A sheet that lies on a printed table and bulges there, before a moving camera; its map and its place in it.
+
+The place comes from the truth and the camera's path in the map, not from `morph register`.
+"""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+
+from morph_dslam.io.calibration import load_camera
+from morph_dslam.online.slam.map_file import save_map
+from morph_dslam.online.slam.output import trajectory_of
+from morph_dslam.online.slam.slam import Slam
+from morph_dslam.render.simulation import simulate
+from morph_dslam.similarity import fit_similarity
+from morph_dslam.sources import open_source
+from tests.support.scenes import write_scene
+
+#: Frames of the scan, in which the sheet is flat, and all frames.
+SCAN, FRAMES = 40, 60
+
+_CAMERA = "camera = { width = 480, height = 360, fx = 420.0, fy = 420.0, cx = 239.5, cy = 179.5 }\n"
+_TAIL = """
+[[parameters]]
+frame = 41
+arch = 0.0
+[[parameters]]
+frame = 59
+arch = 30.0
+skew = 0.2
+
+[sensor]
+noise = 1.5
+
+[[environment.rectangles]]
+texture = "table.png"
+centre_mm = [0, 0, -2]
+right_mm = [1200, 0, 0]
+down_mm = [0, -1200, 0]
+[[environment.rectangles]]
+texture = "table.png"
+centre_mm = [0, 500, 100]
+right_mm = [1200, 0, 0]
+down_mm = [0, 0, -400]
+
+[[camera_path]]
+frame = 0
+position_mm = [-150, -420, 480]
+target_mm = [0, 0, 0]
+[[camera_path]]
+frame = 18
+position_mm = [20, -340, 600]
+target_mm = [0, 0, 0]
+[[camera_path]]
+frame = 39
+position_mm = [180, -420, 480]
+target_mm = [0, 0, 0]
+[[camera_path]]
+frame = 59
+position_mm = [60, -450, 500]
+target_mm = [0, 0, 0]
+"""
+
+
+def make_anchored_recording(folder):
+    """Write `sheet.morph`, `sequence/`, `map.h5` and `registration.json` in ``folder``; returns the truth."""
+    noise = np.random.default_rng(5).integers(20, 236, (150, 150, 3), dtype=np.uint8)
+    table = cv2.resize(noise, (900, 900), interpolation=cv2.INTER_CUBIC)
+    cv2.imwrite(str(folder / "table.png"), table)
+    scene = write_scene(folder, top=f"frames = {FRAMES}\n", tail=_TAIL, camera=_CAMERA)
+    simulate(scene, folder / "sequence", progress=False)
+    truth = np.load(folder / "sequence" / "truth.npz")
+    camera = load_camera(folder / "sequence" / "camera.yaml")
+    slam = Slam(camera)
+    frames = [
+        slam.process_frame(frame.image, frame.index, frame.timestamp)
+        for frame in open_source(folder / "sequence" / "frames", 0, SCAN - 1)
+    ]
+    slam.refine_map()
+    save_map(folder / "map.h5", slam.map, camera)
+    write_registration(folder / "registration.json", slam, frames, truth)
+    return truth
+
+
+def write_registration(path, slam, frames, truth):
+    """A registration that is as good as the camera's path in the map."""
+    path_in_map = trajectory_of(slam, frames)
+    seen = [frame.index for frame in frames if frame.pose is not None]
+    # The sheet's own frame is the world's: camera_from_object is camera_from_world.
+    centres = [-pose[:3, :3].T @ pose[:3, 3] for pose in truth["camera_from_object"][seen]]
+    placed = fit_similarity(np.array(centres), path_in_map.positions)
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = placed.scale * placed.rotation, placed.translation
+    size = 0.5 * placed.scale
+    spread = np.array([1e-3, *[1e-3] * 3, *[1e-3 * size] * 3])
+    content = {
+        "world_from_object": matrix.tolist(),
+        "map_units_per_metre": placed.scale,
+        "mean_node_m": [0.0, 0.0, 0.0],
+        "covariance": np.diag(spread**2).tolist(),
+        "score": 100.0,
+        "runner_up_score": 10.0,
+        "rms_px": 0.1,
+        "ambiguous": False,
+        "axis_of_revolution": None,
+        "keyframes": [],
+    }
+    for keyframe in slam.map.keyframes:
+        pose = np.eye(4)
+        pose[:3, :3] = keyframe.camera_from_world[:3, :3] @ placed.rotation
+        moved = keyframe.camera_from_world[:3, :3] @ placed.translation + keyframe.camera_from_world[:3, 3]
+        pose[:3, 3] = moved / placed.scale
+        content["keyframes"].append({"frame": keyframe.index, "camera_from_object": pose.tolist()})
+    path.write_text(json.dumps(content))
