@@ -3,10 +3,10 @@
     python benchmarks/live.py [--minutes 10] [--size 640x480|1280x720]
 
 The boot seal's recording (`examples/boot_seal/track.py`, from its last keyframe on) plays back and forth from
-memory at 30 frames a second: the camera is found in the map of the scan, the seal in it, its stress drawn over
-the picture, and the picture recorded. The latency is that from a frame's capture to its finished picture.
-Processor time by thread says what a frame costs where other programs disturb the clock. For 1280x720 the scene
-is rendered once more at that size, scanned and registered, and kept in benchmarks/output/live.
+memory at 30 frames a second: the camera is found in the map of the scan, the seal in it, its stress drawn
+over the picture, and the picture recorded. The latency is that from a frame's capture to its finished
+picture. Processor time by thread says what a frame costs where other programs disturb the clock. For 1280x720
+the scene is rendered, scanned and registered once more at that size, and kept in benchmarks/output/live.
 """
 
 from __future__ import annotations
