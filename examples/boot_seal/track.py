@@ -2,8 +2,8 @@
 
 A camera goes round the undeformed seal on a table and maps the scene; the seal's mesh is found in the map,
 which gives the map its scale; then the lever turns, from a side that the registration cannot know because the
-seal is a body of revolution, and the angle of the lever, that of the side, and the deformation of the whole
-solid are estimated in every frame. The recording is rendered, so that its truth is exact. Everything is left
+seal is a body of revolution, and the camera in the map, the angle of the lever, that of the side, and the
+deformation of the whole solid are estimated in every frame. The recording is rendered, so that its truth is exact. Everything is left
 in output/.
 """
 
@@ -119,6 +119,7 @@ def run(arguments: argparse.Namespace) -> None:
             model=model,
             camera=camera,
             placement=output / "registration" / "registration.json",
+            map_path=output / "scan" / "map.h5",
             output=output / "run",
             overwrite=True,
         )
