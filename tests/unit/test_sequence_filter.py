@@ -7,6 +7,7 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
 from morph_dslam.online.estimation import BoundPoints, Estimator, Prior, State, moved
+from morph_dslam.online.known_pose import KnownPose
 from morph_dslam.online.measurement_noise import Measured, window_correlation
 from morph_dslam.online.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model
@@ -111,6 +112,23 @@ def test_errors_of_a_known_pose_are_stated_and_those_that_last_do_not_average_ou
     assert np.median(stated_lasting[:, -1] / stated_lasting[:, 0]) > 0.8
     assert np.median(stated_anew[:, -1] / stated_anew[:, 0]) < 0.6
     assert np.sqrt(np.mean(anew[:, -1] ** 2)) < 0.7 * np.sqrt(np.mean(lasting[:, -1] ** 2))
+
+
+def test_pose_that_is_held_is_not_said_to_be_better_known():
+    points, state, rng = bound(60), truth(0), np.random.default_rng(0)
+    lasting, anew = np.diag([5e-3, 4e-3, 3e-3, 1e-3, 2e-3, 3e-3]), 1e-3 * np.eye(6)
+    known = KnownPose(state.camera_from_object, anew @ anew.T, lasting).prior(3, SIGMA**2, 1e6)
+    pixels = CAMERA.project(points.in_camera(state)) + SIGMA * rng.standard_normal((60, 2))
+    measured = Measured(points, pixels, np.ones(60), np.zeros((60, 2)), np.eye(60))
+    filtered = SequenceFilter(ESTIMATOR, [TWIST])
+    for _ in range(3):
+        alone = ESTIMATOR.fit(measured, state, known)
+        fused = filtered.fuse(measured, alone, known)
+        np.testing.assert_allclose(
+            fused.state.camera_from_object.matrix, state.camera_from_object.matrix, atol=1e-5
+        )
+        np.testing.assert_allclose(fused.pose_std, np.sqrt(np.diag(lasting**2 + anew**2)), rtol=0.01)
+        assert np.linalg.eigvalsh(fused.covariance)[0] > -1e-12
 
 
 def test_walking_parameter_is_smoothed_as_much_as_its_step_says():

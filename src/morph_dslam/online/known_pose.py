@@ -39,9 +39,11 @@ class KnownPose:
         """As a term of the estimator's cost, which knows nothing of the ``d`` parameters.
 
         ``squared_px`` is the variance of an image coordinate: it makes a covariance a weight in that cost.
-        ``firmness`` multiplies the weight.
+        ``firmness`` multiplies the weight, but makes the pose no better known: its errors stay in what is
+        stated of the estimate.
         """
-        information = np.asarray(firmness * squared_px * np.linalg.inv(self.covariance), dtype=np.float64)
+        squared_px = firmness * squared_px
+        information = np.asarray(squared_px * np.linalg.inv(self.covariance), dtype=np.float64)
         nothing = np.zeros((d, d))
         return Prior(np.zeros(d), nothing, self.pose, information, self.lasting, squared_px)
 
