@@ -2,9 +2,9 @@
 
 A camera goes round the undeformed seal on a table and maps the scene; the seal's mesh is found in the map,
 which gives the map its scale; then the lever turns, from a side that the registration cannot know because the
-seal is a body of revolution, and the camera in the map, the angle of the lever, that of the side, and the
-deformation of the whole solid are estimated in every frame. The recording is rendered, so that its truth is exact. Everything is left
-in output/.
+seal is a body of revolution. In every frame the camera is found in the map, and with the seal's place there
+the angle of the lever, that of the side, and the deformation of the whole solid are estimated. The recording
+is rendered, so that its truth is exact. Everything is left in output/.
 """
 
 from __future__ import annotations

@@ -95,6 +95,12 @@ class BrowserSink:
         """Count who looks on."""
         with self._changed:
             self._lookers += delta
+            self._changed.notify_all()
+
+    def wait_for_looker(self, seconds: float) -> bool:
+        """Wait until somebody looks on; whether anybody does."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._lookers > 0, timeout=seconds)
 
     def next_after(self, number: int) -> tuple[int, bytes]:
         """The number and JPEG of a picture newer than ``number``; waits for it. Empty at the end."""

@@ -1,0 +1,116 @@
+"""Where a registered object is in a camera that was found in the map, and how well that is known."""
+
+import numpy as np
+import pytest
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import RegistrationError
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.online.anchor import Anchor, movable_points
+from morph_dslam.online.place_in_map import PlaceInMap
+from morph_dslam.online.slam.pose import PoseEstimate
+from morph_dslam.online.slam.rigid_map import GOOD, Keyframe, RigidMap
+from morph_dslam.online.state import State, moved
+from morph_dslam.similarity import SimilarityTransform
+from tests.support.bent_sheet import bent_sheet_model
+
+CENTRE = np.array([0.01, 0.02, 0.05])
+
+
+def similarity(rng):
+    return SimilarityTransform(2.3, rotation_exp(rng.normal(size=3)), rng.normal(size=3))
+
+
+def camera_pose(rng):
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation_exp(rng.normal(size=3)), [0.1, 0.2, 1.5]
+    return pose
+
+
+def test_a_point_of_the_object_is_seen_where_the_map_has_it():
+    """Its direction in the camera is that of its place in the map; its distance is that in metres."""
+    rng = np.random.default_rng(0)
+    placed, pose = similarity(rng), camera_pose(rng)
+    place = PlaceInMap(placed, CENTRE, np.eye(7) * 1e-8)
+    known = place.known_pose(PoseEstimate(pose, np.eye(6) * 1e-8, np.ones(5, dtype=bool), 0.3))
+    points = 0.1 * rng.normal(size=(6, 3))
+    in_map_units = placed.apply(points) @ pose[:3, :3].T + pose[:3, 3]
+    np.testing.assert_allclose(known.pose.apply(points), in_map_units / 2.3, atol=1e-12)
+
+
+def test_the_covariance_is_that_of_samples():
+    """30 000 registrations and cameras with normally distributed errors, moved one by one."""
+    rng = np.random.default_rng(1)
+    placed, pose = similarity(rng), camera_pose(rng)
+    of_place = np.diag(rng.uniform(1.0, 3.0, 7)) * 1e-8
+    of_place[0, 3] = of_place[3, 0] = 0.8e-8
+    of_camera = np.diag(rng.uniform(1.0, 3.0, 6)) * 1e-8
+    found = PoseEstimate(pose, of_camera, np.ones(5, dtype=bool), 0.3)
+    known = PlaceInMap(placed, CENTRE, of_place).known_pose(found)
+    middle, away = placed.apply(CENTRE), []
+    for place_error, camera_error in zip(
+        rng.multivariate_normal(np.zeros(7), of_place, 30_000),
+        rng.multivariate_normal(np.zeros(6), of_camera, 30_000),
+        strict=True,
+    ):
+        scale = placed.scale * np.exp(place_error[0])
+        rotation = rotation_exp(place_error[1:4]) @ placed.rotation
+        shift = middle + place_error[4:] - scale * rotation @ CENTRE
+        turn = rotation_exp(camera_error[:3])
+        camera_rotation = turn @ pose[:3, :3]
+        camera_shift = turn @ pose[:3, 3] + camera_error[3:]
+        sample = RigidTransform(camera_rotation @ rotation, (camera_rotation @ shift + camera_shift) / scale)
+        away.append(known.away(sample))
+    expected = np.cov(np.array(away).T)
+    np.testing.assert_allclose(known.covariance, expected, atol=0.03 * np.abs(expected).max())
+    lasting = known.lasting @ known.lasting.T
+    assert (np.linalg.eigvalsh(known.covariance - lasting) > 0.0).all()
+
+
+def test_the_increment_to_another_pose_is_the_one_that_leads_there():
+    rng = np.random.default_rng(2)
+    known = PlaceInMap(similarity(rng), CENTRE, np.eye(7) * 1e-8).known_pose(
+        PoseEstimate(camera_pose(rng), np.eye(6) * 1e-8, np.ones(5, dtype=bool), 0.3)
+    )
+    step = 0.1 * rng.normal(size=6)
+    there = moved(State(np.zeros(0), known.pose), step).camera_from_object
+    np.testing.assert_allclose(known.away(there), step, atol=1e-12)
+
+
+def sheet_map():
+    """Points on a sheet that arches between its fixed short edges, and points far off it, in map units."""
+    model = bent_sheet_model(43, 31)
+    x = np.concatenate([np.linspace(-0.2099, 0.2099, 42), np.linspace(-0.2, 0.2, 10)])
+    points = np.column_stack([x, np.zeros(52), np.r_[np.zeros(42), np.full(10, -0.2)]])
+    place = PlaceInMap(
+        SimilarityTransform(3.0, rotation_exp(np.array([0.3, -0.2, 0.5])), np.array([1.0, 2.0, 3.0])),
+        np.zeros(3),
+        np.eye(7) * 1e-8,
+    )
+    return model, place, place.world_from_object.apply(points), x
+
+
+def test_only_what_can_move_is_taken_out_of_the_scene():
+    model, place, positions, x = sheet_map()
+    movable = movable_points(positions, place, model)
+    assert not movable[42:].any()
+    # The arch of up to 60 mm ends at the edges.
+    assert movable[:42][np.abs(x[:42]) < 0.19].all()
+    assert not movable[:42][np.abs(x[:42]) > 0.2095].any()
+
+
+def test_an_anchor_keeps_the_scene_and_needs_to_know_how_well_the_place_is_known():
+    model, place, positions, _ = sheet_map()
+    camera = PinholeCamera(320, 240, 300.0, 300.0, 160.0, 120.0)
+    rigid_map = RigidMap()
+    ids = rigid_map.add_points(positions, np.zeros((52, 2)), 0, GOOD)
+    flat = np.full((240, 320), 128, dtype=np.uint8)
+    rigid_map.add_keyframe(Keyframe(0, 0.0, flat, np.eye(4), ids, np.zeros((52, 2))))
+    expected = movable_points(positions, place, model)
+    blind = PlaceInMap(place.world_from_object, place.centre, None)
+    with pytest.raises(RegistrationError, match="does not say how well the object's place is known"):
+        Anchor(rigid_map, camera, blind, model)
+    assert blind.pose_covariance(RigidTransform.identity()) is None
+    anchor = Anchor(rigid_map, camera, place, model)
+    assert (anchor.n_movable, anchor.n_scene) == (expected.sum(), (~expected).sum())
+    np.testing.assert_array_equal(rigid_map.good, ids[~expected])
