@@ -9,7 +9,7 @@ other one are kept, and the best is refined by comparing the keyframes' images o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +19,11 @@ from tqdm import tqdm
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.online.mesh_registration.evidence import Evidence, gather_evidence
+from morph_dslam.online.mesh_registration.keyframe_adjustment import AdjustedKeyframes, KeyframeAdjustment
 from morph_dslam.online.mesh_registration.regions import candidate_regions
 from morph_dslam.online.mesh_registration.scaled_icp import Fit, fit_surface
 from morph_dslam.online.mesh_registration.scene import MapPoints, View, spread_views
+from morph_dslam.online.mesh_registration.similarity_of_path import similarity_of_path
 from morph_dslam.online.mesh_registration.surface import Axis, Surface
 from morph_dslam.online.mesh_registration.texture_alignment import TextureAlignment
 from morph_dslam.similarity import SimilarityTransform
@@ -60,12 +62,12 @@ class MeshRegistration:
     Attributes
     ----------
     world_from_object : metres to the map's unit.
-    covariance : (7, 7) of log scale, rotation vector and translation about the mean node, world; from the
-        images' noise alone, without the error of the map's camera path.
+    covariance : (7, 7) of log scale, rotation vector and translation about the mean node, world.
     score, runner_up : of `Evidence`, for this place and for the next best.
     n_explained : points on the surface.
     rms_px : how far the keyframes' images of the surface agree; None if there was too little to compare.
     axis : about which the surface can be turned without a difference, so that this angle is not known.
+    keyframes : those with a pose of their own about the object; None if there was too little to compare.
     """
 
     world_from_object: SimilarityTransform
@@ -75,6 +77,7 @@ class MeshRegistration:
     n_explained: int
     rms_px: float | None
     axis: Axis | None
+    keyframes: AdjustedKeyframes | None = None
 
     @property
     def ambiguous(self) -> bool:
@@ -130,7 +133,15 @@ def register_mesh(
             places.append(judged(_refined(start.transform, points, surface, metric), more))
     candidates = _distinct(places, len(points), surface)
     aligner = TextureAlignment(nodes, triangles, camera, views, metric)
-    return _chosen(candidates, aligner, surface)
+    found = _chosen(candidates, aligner, surface)
+    if found.rms_px is None:
+        return found
+    adjustment = KeyframeAdjustment(nodes, triangles, camera, points, views, surface.axis_of_revolution)
+    keyframes = adjustment.adjust(found.world_from_object)
+    if keyframes is None:
+        return found
+    placed, covariance = similarity_of_path(keyframes, found.world_from_object, nodes.mean(axis=0), metric)
+    return replace(found, world_from_object=placed, covariance=covariance, keyframes=keyframes)
 
 
 def _refined(
@@ -222,7 +233,7 @@ def _chosen(candidates: list[_Place], aligner: TextureAlignment, surface: Surfac
             others.append(other.evidence.score)
     return MeshRegistration(
         place,
-        None if alignment is None else alignment.covariance,
+        None,
         best.evidence.score,
         max([0.0, *others]),
         int(best.evidence.explained.sum()),

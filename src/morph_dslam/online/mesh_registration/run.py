@@ -16,7 +16,12 @@ from morph_dslam.errors import RegistrationError
 from morph_dslam.io.calibration import load_camera
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.online.mesh_registration.register import MeshRegistration
-from morph_dslam.online.mesh_registration.scene import View, scene_of_map, spread_views
+from morph_dslam.online.mesh_registration.scene import (
+    View,
+    camera_from_object,
+    scene_of_map,
+    spread_views,
+)
 from morph_dslam.online.mesh_registration.unit_check import register_in_unit
 from morph_dslam.online.slam.map_file import load_map
 from morph_dslam.render.overlay import draw_overlay
@@ -83,15 +88,17 @@ def _content(found: MeshRegistration, nodes: NDArray[np.float64]) -> dict[str, A
 
 
 def _keyframes(found: MeshRegistration, views: Sequence[View]) -> list[dict[str, Any]]:
-    """The object's pose in every keyframe, metres."""
-    placed = found.world_from_object
+    """The object's pose in every keyframe, metres, with its covariance where it has one of its own."""
+    adjusted = found.keyframes
+    row = {} if adjusted is None else {view.frame: k for k, view in enumerate(adjusted.views)}
     poses = []
     for view in views:
-        camera = view.camera_from_world
-        matrix = np.eye(4)
-        matrix[:3, :3] = camera.rotation @ placed.rotation
-        matrix[:3, 3] = camera.apply(placed.translation) / placed.scale
-        poses.append({"frame": view.frame, "camera_from_object": matrix.tolist()})
+        pose, covariance = camera_from_object(view, found.world_from_object), None
+        if adjusted is not None and view.frame in row:
+            pose = adjusted.poses[row[view.frame]]
+            covariance = adjusted.covariance_of(row[view.frame]).tolist()
+        entry = {"frame": view.frame, "camera_from_object": pose.matrix.tolist(), "covariance": covariance}
+        poses.append(entry)
     return poses
 
 

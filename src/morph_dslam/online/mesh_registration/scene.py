@@ -8,10 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.online.slam.rigid_map import GOOD, RigidMap
+from morph_dslam.similarity import SimilarityTransform
 
 Array = NDArray[np.float64]
+
+#: A view sees an object of which at least this part projects into its image.
+SEEN_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,7 @@ def scene_of_map(rigid_map: RigidMap) -> tuple[MapPoints, Sequence[View]]:
     row = np.full(len(rigid_map.state), -1)
     row[good] = np.arange(len(good))
     views, total, count = [], np.zeros((len(good), 3)), np.zeros(len(good))
-    for keyframe in rigid_map.keyframes:
+    for keyframe in (rigid_map.keyframes[k] for k in rigid_map.kept_keyframes):
         pose = RigidTransform.from_matrix(keyframe.camera_from_world)
         seen = row[keyframe.point_ids]
         kept = seen >= 0
@@ -69,3 +74,28 @@ def spread_views(views: Sequence[View], most: int) -> list[View]:
     """At most so many of the views, spread over all."""
     chosen = np.unique(np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int))
     return [views[index] for index in chosen]
+
+
+def camera_from_object(view: View, world_from_object: SimilarityTransform) -> RigidTransform:
+    """The object's pose in a view, metres."""
+    camera, placed = view.camera_from_world, world_from_object
+    return RigidTransform(camera.rotation @ placed.rotation, camera.apply(placed.translation) / placed.scale)
+
+
+def views_of(
+    nodes: Array, placed: SimilarityTransform, views: Sequence[View], camera: PinholeCamera, most: int
+) -> list[View]:
+    """At most so many of the views that have the object in their image, spread over all.
+
+    ``nodes`` are its (n, 3), metres.
+    """
+    seeing = []
+    for view in views:
+        local = camera_from_object(view, placed).apply(nodes[:: max(1, len(nodes) // 200)])
+        pixels = camera.project(local)
+        inside = (local[:, 2] > 0.0) & ((pixels >= 0.0) & (pixels < [camera.width, camera.height])).all(
+            axis=1
+        )
+        if inside.mean() >= SEEN_SHARE:
+            seeing.append(view)
+    return spread_views(seeing, most)

@@ -1,0 +1,124 @@
+"""Keyframes adjusted about an object: from a path that is off to known poses, with honest deviations."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from morph_dslam.geometry import RigidTransform, rotation_log
+from morph_dslam.online.mesh_registration.keyframe_adjustment import KeyframeAdjustment
+from morph_dslam.online.mesh_registration.scene import camera_from_object
+from morph_dslam.online.mesh_registration.similarity_of_path import similarity_of_path
+from morph_dslam.online.mesh_registration.surface import Axis
+from morph_dslam.online.mesh_registration.texture_alignment import (
+    moved_similarity,
+    similarity_jacobian,
+)
+from morph_dslam.online.mesh_registration.texture_comparison import moved_pose, pose_jacobian
+from morph_dslam.similarity import SimilarityTransform
+from tests.support.rendered_object import CAMERA, cameras, scanned, wedge
+
+WORLD = SimilarityTransform(
+    3.7, Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix(), np.array([0.5, -1.2, 2.0])
+)
+
+
+@pytest.fixture(scope="module")
+def disturbed():
+    """Points, and views whose poses are off by 0.6 mm and 0.1 degrees each, of a scan with exact images."""
+    points, views = scanned(WORLD, with_images=True)
+    rng = np.random.default_rng(1)
+    moved = []
+    for view in views:
+        turn = Rotation.from_rotvec(rng.normal(0.0, np.radians(0.1), 3)).as_matrix()
+        shift = rng.normal(0.0, 6e-4, 3) * WORLD.scale
+        pose = RigidTransform(turn, shift) @ view.camera_from_world
+        noisy = view.pixels + rng.normal(0.0, 0.3, view.pixels.shape)
+        moved.append(replace(view, camera_from_world=pose, pixels=noisy))
+    return points, moved
+
+
+@pytest.fixture(scope="module")
+def adjusted(disturbed):
+    nodes, triangles, _ = wedge()
+    points, views = disturbed
+    return KeyframeAdjustment(nodes, triangles, CAMERA, points, views, None).adjust(WORLD)
+
+
+def pose_errors(found, true):
+    turns = rotation_log(found.rotation @ true.rotation.T)
+    return np.concatenate([turns, found.translation - true.translation])
+
+
+def test_poses_of_a_path_that_is_off_are_found_by_the_images(disturbed, adjusted):
+    _, views = disturbed
+    truth = cameras()
+    before = [
+        pose_errors(camera_from_object(view, WORLD), true) for view, true in zip(views, truth, strict=True)
+    ]
+    after = np.array([pose_errors(found, true) for found, true in zip(adjusted.poses, truth, strict=True)])
+    assert np.sqrt(np.mean(np.square(before)[:, 3:])) > 4e-4
+    assert np.sqrt(np.mean(after[:, 3:] ** 2)) < 1.5e-4
+    assert np.sqrt(np.mean(after[:, :3] ** 2)) < np.radians(0.05)
+    assert adjusted.rms_px < 0.1
+
+
+def test_the_covariance_is_of_the_size_of_the_errors(adjusted):
+    errors = [pose_errors(found, true) for found, true in zip(adjusted.poses, cameras(), strict=True)]
+    deviations = [np.sqrt(np.diag(adjusted.covariance_of(view))) for view in range(len(errors))]
+    normalised = np.array(errors) / np.array(deviations)
+    assert 0.2 < np.sqrt(np.mean(normalised**2)) < 3.0
+
+
+def test_the_similarity_of_the_path_has_the_scale_of_the_map(adjusted):
+    nodes, _, _ = wedge()
+    start = moved_similarity(WORLD, np.array([0.01, 0.01, 0, 0, 0.01, 0, 0]), nodes.mean(axis=0))
+    placed, covariance = similarity_of_path(adjusted, start, nodes.mean(axis=0))
+    error = np.log(placed.scale / WORLD.scale)
+    # Eight views of a path that is off by 0.6 mm everywhere do not tell its scale any better.
+    assert abs(error) < 5e-3
+    assert abs(error) < 4.0 * np.sqrt(covariance[0, 0])
+    metric, fixed = similarity_of_path(adjusted, WORLD, nodes.mean(axis=0), metric=True)
+    assert metric.scale == WORLD.scale
+    assert fixed[0, 0] == 0.0
+
+
+def test_an_axis_of_revolution_leaves_its_turn_alone(disturbed):
+    nodes, triangles, _ = wedge()
+    points, views = disturbed
+    axis = Axis(nodes.mean(axis=0), np.array([0.0, 0.0, 1.0]))
+    found = KeyframeAdjustment(nodes, triangles, CAMERA, points, views, axis).adjust(WORLD)
+    turns = [
+        np.concatenate([pose.rotation @ axis.direction, np.cross(pose.rotation @ axis.direction, arm)])
+        for pose in found.poses
+        for arm in [pose.translation - pose.apply(axis.point)]
+    ]
+    turn = np.concatenate(turns)
+    # All poses turned together is what no image can tell.
+    units = np.tile([1.0] * 3 + [np.linalg.norm(np.ptp(nodes, axis=0))] * 3, len(found.poses))
+    along = (turn / units) @ (found.covariance / np.outer(units, units)) @ (turn / units)
+    assert along < 1e-6 * np.trace(found.covariance / np.outer(units, units)) * (turn / units) @ (
+        turn / units
+    )
+
+
+def test_nothing_to_compare_is_no_adjustment():
+    nodes, triangles, _ = wedge()
+    points, views = scanned(WORLD)
+    assert KeyframeAdjustment(nodes, triangles, CAMERA, points, views, None).adjust(WORLD) is None
+
+
+def test_derivatives_of_points_and_poses_are_those_of_differences():
+    nodes, _, _ = wedge()
+    pose, step = cameras()[2], np.array([0.3, -0.2, 0.4, 0.02, 0.01, -0.03])
+    points, h = pose.apply(nodes), 1e-6
+    numeric = (moved_pose(pose, h * step).apply(nodes) - moved_pose(pose, -h * step).apply(nodes)) / (2 * h)
+    np.testing.assert_allclose(pose_jacobian(points, pose) @ step, numeric, atol=1e-8)
+    _, views = scanned(WORLD)
+    seven, centre = np.array([0.1, 0.2, -0.3, 0.1, 0.4, 0.2, -0.5]), nodes.mean(axis=0)
+    pair = [camera_from_object(views[2], moved_similarity(WORLD, s * h * seven, centre)) for s in (1, -1)]
+    slope = similarity_jacobian(camera_from_object(views[2], WORLD), WORLD, centre) @ seven
+    turn = rotation_log(pair[0].rotation @ pair[1].rotation.T) / (2 * h)
+    np.testing.assert_allclose(slope[:3], turn, atol=1e-6)
+    np.testing.assert_allclose(slope[3:], (pair[0].translation - pair[1].translation) / (2 * h), atol=1e-8)
