@@ -7,8 +7,9 @@ root mean square distance of the camera centres after Sim(3) alignment, over all
 itself is good to about a centimetre. Times are of one frame, decoding excluded, one thread, mapping included.
 
 With --live frames come at 30 a second, as from a camera, those that come while another is worked on are
-dropped, and the map is made in a thread beside them. Last come how many were dropped, and the median time of
-a frame while the thread worked and while it did not: tracking waits for the interpreter by their difference.
+dropped, and the map is made in a thread beside them. Last come how many were dropped, the median time of a
+frame while the thread worked and while it did not, and what a frame waited at most for the mapper, and at the
+99th percentile (`benchmarks/slam_long.py` says what counts).
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import MorphError
 from morph_dslam.evaluation.trajectory_error import absolute_error, match
 from morph_dslam.io.trajectory import load_trajectory
+from morph_dslam.online.slam.mapping_work import share_interpreter
 from morph_dslam.online.slam.output import trajectory_of
 from morph_dslam.online.slam.run import warm_up
 from morph_dslam.online.slam.slam import Slam
@@ -52,6 +54,7 @@ def follow(slam: Slam, source: FrameSource) -> list[SlamFrame]:
 
 def follow_live(slam: Slam, source: FrameSource) -> tuple[list[SlamFrame], str]:
     """The frames that are there in time, and what came of mapping beside them."""
+    share_interpreter()
     recorded = list(tqdm(source, total=len(source), desc="loading", unit="frame"))
     frames, while_mapping, start = [], [], time.perf_counter()
     while (newest := int((time.perf_counter() - start) * FPS)) < len(recorded):
@@ -62,9 +65,11 @@ def follow_live(slam: Slam, source: FrameSource) -> tuple[list[SlamFrame], str]:
         while_mapping.append(slam.is_mapping)
         frames.append(slam.process_frame(frame.image, frame.index, frame.timestamp))
     times, busy = np.array([frame.total_ms for frame in frames]), np.array(while_mapping)
+    waited = np.array([frame.waited_ms for frame in frames])
     return frames, (
         f" dropped={len(recorded) - len(frames)} mapping_ms={np.median(times[busy]):.2f} "
-        f"resting_ms={np.median(times[~busy]):.2f}"
+        f"resting_ms={np.median(times[~busy]):.2f} longest_wait_ms={waited.max():.2f} "
+        f"p99_wait_ms={np.percentile(waited, 99):.2f}"
     )
 
 
