@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pictures import Picture
 from recording import CLAMP_X
-from silhouette import Matches, match
+from silhouette import FINER, Matches, match
 from silicone import PUBLISHED_SHEAR
 
 from morph_dslam.model import ReducedModel
@@ -29,6 +29,8 @@ REACHES, ROUNDS = (60, 40, 25, 15, 12, 10), 30
 DEPTH_STEP = 32
 #: Half the width of a 95 % interval in standard deviations.
 INTERVAL_95 = 1.96
+#: An outline is read no better than so, however well it fits: to the spacing of its points, pixels.
+LEAST_PX = 1.0 / FINER
 #: Softness to start from; the bar's end is far from the outline's where it is wrong.
 STARTS = (0.5, 1.0, 1.6)
 
@@ -40,7 +42,7 @@ class Fit:
     Attributes
     ----------
     state : softness and pose. softness_std : its standard deviation.
-    outline_rms : px. alike : neighbouring points of the outline that have one error together, on average.
+    outline_rms : px, at least `LEAST_PX`. alike : neighbouring points of the outline that have one error together, on average.
     turn : by which the pose differs from the marker's, radians.
     """
 
@@ -89,7 +91,8 @@ def _fit_from(model: ReducedModel, picture: Picture, turn_std: float, softness: 
         state = estimator.estimate(points, pixels, weights, state, normals, prior, depths).state
         _, hessian, _, residuals = estimator.evaluate(points, pixels, weights, state, normals, prior, depths)
         off = np.einsum("px,px->p", residuals[:count], matches.normals)
-        variance, alike = float(np.mean(off**2)), points_alike(off[np.argsort(matches.places)])
+        variance = max(float(np.mean(off**2)), LEAST_PX**2)
+        alike = points_alike(off[np.argsort(matches.places)])
     turned = state.camera_from_object.rotation @ picture.camera_from_object.rotation.T
     turn = float(np.arccos(np.clip(0.5 * (np.trace(turned) - 1.0), -1.0, 1.0)))
     softness_std = float(np.sqrt(variance * np.linalg.inv(hessian)[0, 0]))

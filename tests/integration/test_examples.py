@@ -11,8 +11,8 @@ from tests.support.real_data import ROOT, real_data
 RESULT = r"mean_mm=([\d.]+) median_mm=[\d.]+ p95_mm=[\d.]+ tracked=(\d+)/(\d+) median_ms=[\d.]+ p95_ms=[\d.]+"
 
 
-def run_example(name, *options):
-    program = ROOT / "examples" / name / "run.py"
+def run_example(name, *options, program="run.py"):
+    program = ROOT / "examples" / name / program
     return subprocess.run([sys.executable, str(program), *options], capture_output=True, text=True)
 
 
@@ -54,3 +54,16 @@ def test_the_hanging_silicone_bar_is_where_its_depth_image_shows_it():
     found = dict(re.findall(r"(\w+)=(-?[\d.]+)", done.stdout.splitlines()[-1]))
     assert float(found["published_mean_mm"]) <= 3.0
     assert float(found["fitted_mean_mm"]) <= 2.5
+
+
+@pytest.mark.slow
+def test_the_stiffness_that_pictures_tell_is_the_published_one_with_the_published_elements():
+    data = str(real_data("diffcal_silicone"))
+    done = run_example("diffcal_silicone", "--data", data, program="estimate.py")
+    assert done.returncode == 0, done.stderr[-2000:]
+    found = dict(re.findall(r"(\w+)=([\d.-]+)", done.stdout.splitlines()[-1]))
+    low, high = (float(value) for value in found["interval_kPa"].split("-"))
+    assert low < 50.1 < high
+    assert float(found["shear_kPa"]) == pytest.approx(50.1, rel=0.25)
+    assert float(found["converged_kPa"]) > 1.5 * float(found["shear_kPa"])
+    assert float(found["surface_mean_mm"]) <= 2.5

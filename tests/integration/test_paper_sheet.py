@@ -9,11 +9,17 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+import cv2
 import numpy as np
 import pytest
 
 from morph_dslam import load_model
+from morph_dslam.evaluation.evaluate import evaluate
+from morph_dslam.evaluation.run_folder import load_run
+from morph_dslam.model import save_model
 from morph_dslam.offline.problem import Snapshot
+from morph_dslam.online.track import TrackOptions, track
+from morph_dslam.render.simulation import simulate
 from tests.support.real_data import ROOT
 
 RESULT = r"positions=(\d+) largest_mm=([\d.]+) pcr_path_N=([\d.]+) pcr_eigen_N=([\d.]+) seconds=(\d+)"
@@ -101,3 +107,101 @@ def test_a_rolled_sheet_is_given_by_few_modes_and_by_products_of_x_y_and_the_pat
     assert max(figures["normalised_error"], figures["separated_error"]) <= 2e-4
     assert max(figures["von_mises_error"], figures["separated_von_mises_error"]) <= 1e-3
     assert (tmp_path / "reduction.png").is_file()
+
+
+@pytest.fixture
+def sides(reduction: ModuleType, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The example's module of this name."""
+    monkeypatch.delitem(sys.modules, "sides", raising=False)
+    return importlib.import_module("sides")
+
+
+def test_a_sheet_below_its_plane_is_the_one_above_it_in_a_mirror(
+    reduction: ModuleType, sides: ModuleType
+) -> None:
+    """Against the closed form with a negative curvature, which no snapshot has."""
+    model = sides.tracked_model(
+        [rolled(path) for path in np.linspace(0.0, 1.0, 81)], reduction.Grid((LENGTH, WIDTH), CELLS)
+    )
+    x, curvature = model.nodes[:, 0], -4.0 * 0.3377
+    rolled_down = np.stack([np.sin(curvature * x), 0.0 * x, 1.0 - np.cos(curvature * x)], axis=1) / curvature
+    rolled_down[:, 1] = model.nodes[:, 1]
+    assert np.abs(model.positions(np.array([-0.3377])) - rolled_down).max() <= 1e-5
+    # Bent down, what was stretched is pressed: the upper face has the stress that the lower one had.
+    upper = model.stresses["top"].value(np.array([-0.3377]))[:, 0]
+    along = YOUNG * THICKNESS / 2.0 * 4.0 * 0.3377
+    np.testing.assert_allclose(upper, along, rtol=1e-3)
+    # The flat sheet lies inside of the range, and its height changes in proportion to the path there.
+    assert model.parameters[0].lower == -1.0
+    slope = (model.positions(np.array([1e-3])) - model.positions(np.array([-1e-3])))[:, 2] / 2e-3
+    np.testing.assert_allclose(slope, 2.0 * x**2, atol=1e-5)
+
+
+SCENE = """
+model = "sheet.morph"
+frames = 19
+seed = 1
+supersampling = 1
+image_format = "png"
+camera = { width = 480, height = 360, fx = 450.0, fy = 450.0, cx = 239.5, cy = 179.5 }
+[surface]
+texture = "print.png"
+[sensor]
+noise = 1.0
+[[pose]]
+frame = 0
+position_mm = [0, 0, 560]
+rotation_deg = [195, 20, 0]
+[[pose]]
+frame = 18
+position_mm = [10, -5, 560]
+rotation_deg = [185, -15, 4]
+[[parameters]]
+frame = 0
+path = 0.0
+[[parameters]]
+frame = 5
+path = 0.6
+[[parameters]]
+frame = 10
+path = 0.0
+[[parameters]]
+frame = 15
+path = -0.6
+[[parameters]]
+frame = 18
+path = -0.2
+"""
+
+
+def test_a_flat_sheet_is_followed_to_whichever_side_it_bends(
+    reduction: ModuleType, sides: ModuleType, tmp_path: Path
+) -> None:
+    snapshots = [rolled(path) for path in np.linspace(0.0, 1.0, 81)]
+    save_model(
+        tmp_path / "sheet.morph", sides.tracked_model(snapshots, reduction.Grid((LENGTH, WIDTH), CELLS))
+    )
+    noise = np.random.default_rng(3).integers(0, 256, (40, 60, 3)).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "print.png"), cv2.resize(noise, (900, 600), interpolation=cv2.INTER_CUBIC))
+    (tmp_path / "scene.toml").write_text(SCENE)
+    sequence, run = tmp_path / "sequence", tmp_path / "run"
+    simulate(tmp_path / "scene.toml", sequence)
+    track(
+        TrackOptions(
+            frames=sequence / "frames",
+            model=tmp_path / "sheet.morph",
+            camera=sequence / "camera.yaml",
+            landmarks=sequence / "landmarks.csv",
+            output=run,
+            overlay=False,
+        )
+    )
+    figures = evaluate(run, sequence / "truth.npz", 0)
+    assert figures["n_frames_tracked"] == 19
+    assert figures["mean_mm"] <= 0.5
+    found, truth = load_run(run).parameters[:, 0], np.load(sequence / "truth.npz")["parameters"][:, 0]
+    bent = np.abs(truth) > 0.02
+    assert (truth > 0.02).any()
+    assert (truth < -0.02).any()
+    np.testing.assert_array_equal(np.sign(found[bent]), np.sign(truth[bent]))
+    np.testing.assert_allclose(found, truth, atol=0.01)
