@@ -14,29 +14,39 @@ if TYPE_CHECKING:
 
 
 def _track(arguments: argparse.Namespace) -> None:
-    from morph_dslam.online.observability import value_line
     from morph_dslam.online.track import TrackOptions, track
+    from morph_dslam.online.track_objects import OtherObject, track_objects
 
     first, last = arguments.range
-    summary = track(
-        TrackOptions(
-            frames=arguments.frames,
-            output=arguments.output,
-            first=first,
-            last=last,
-            reference_frame=arguments.reference_frame,
-            refine_reference=arguments.refine,
-            overlay=not arguments.no_video,
-            overwrite=arguments.overwrite,
-            drawing=drawing(arguments),
-            **object_arguments(arguments),
-        )
+    options = TrackOptions(
+        frames=arguments.frames,
+        output=arguments.output,
+        first=first,
+        last=last,
+        reference_frame=arguments.reference_frame,
+        refine_reference=arguments.refine,
+        overlay=not arguments.no_video,
+        overwrite=arguments.overwrite,
+        drawing=drawing(arguments),
+        **object_arguments(arguments),
     )
+    if not arguments.also:
+        _say(options.output, track(options))
+        return
+    others = [OtherObject(name, Path(model), Path(landmarks)) for name, model, landmarks in arguments.also]
+    for folder, summary in track_objects(options, others).items():
+        _say(folder, summary)
+
+
+def _say(folder: Path, summary: dict[str, Any]) -> None:
+    """What the command line says of a run."""
+    from morph_dslam.online.observability import value_line
+
     for flag in summary["flags"]:
         print(f"note: {flag}")
     for figures in summary["one_over_the_sequence"]:
         print(value_line(figures))
-    print(f"wrote {arguments.output}")
+    print(f"wrote {folder}")
     print(
         f"tracked={summary['n_tracked']}/{summary['n_frames']} "
         f"median_ms={summary['median_ms']:.2f} p95_ms={summary['p95_ms']:.2f}"
@@ -173,5 +183,13 @@ def add_tracking_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         "--refine",
         action="store_true",
         help="refine the reference state over the whole sequence and track once more",
+    )
+    track.add_argument(
+        "--also",
+        nargs=3,
+        action="append",
+        default=[],
+        metavar=("NAME", "MODEL", "LANDMARKS"),
+        help="another free object in the same frames, its results in RUN/NAME; may be repeated",
     )
     track.add_argument("--no-video", action="store_true", help="do not draw the augmented video")

@@ -1,9 +1,15 @@
 """Two rendered sheets in one image, one of which passes in front of the other."""
 
+import cv2
 import numpy as np
 import pytest
 
+from morph_dslam.cli import main
+from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.io.calibration import save_camera
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
+from morph_dslam.model import save_model
 from morph_dslam.online.estimation import State
 from morph_dslam.online.pipeline import Tracker
 from morph_dslam.online.several_objects import ObjectTracker
@@ -88,3 +94,47 @@ def test_lost_object_hides_nothing(model, films):
     results = objects.process_frame(films["behind"].frame(states(TIMES[14])["behind"]))
     assert results["before"].status == "lost"
     assert results["behind"].n_points > before["behind"].n_points + 80
+
+
+@pytest.fixture(scope="module")
+def recording(model, films, tmp_path_factory):
+    """Frames, model, camera, and landmarks of both sheets in the first frame."""
+    folder = tmp_path_factory.mktemp("recording")
+    (folder / "frames").mkdir()
+    for number, time in enumerate(TIMES[:12:2]):
+        cv2.imwrite(str(folder / "frames" / f"{number:03d}.png"), frame(model, films, time))
+    save_model(folder / "sheet.morph", model)
+    save_camera(folder / "camera.yaml", CAMERA)
+    nodes = np.random.default_rng(0).choice(len(model.nodes), 24, replace=False)
+    for name, state in states(0.0).items():
+        positions = state.camera_from_object.apply(model.positions(state.parameters))
+        pixels = CAMERA.project(positions)[nodes]
+        inside = (pixels > 5.0).all(axis=1) & (pixels < [635.0, 475.0]).all(axis=1)
+        landmarks = Landmarks(model.nodes[nodes[inside]], pixels[inside])
+        save_landmarks(folder / f"{name}.csv", landmarks)
+    return folder
+
+
+def command(recording, output, *more):
+    arguments = [str(recording / "frames"), "--model", str(recording / "sheet.morph"), "--camera"]
+    arguments += [str(recording / "camera.yaml"), "--landmarks", str(recording / "behind.csv")]
+    return ["track", *arguments, "-o", str(output), "--no-video", *more]
+
+
+def test_command_writes_a_run_folder_for_each_object(model, recording, tmp_path, capsys):
+    also = ["--also", "before", str(recording / "sheet.morph"), str(recording / "before.csv")]
+    assert main(command(recording, tmp_path / "run", *also)) == 0
+    assert capsys.readouterr().out.count("tracked=6/6") == 2
+    for folder, name in ((tmp_path / "run", "behind"), (tmp_path / "run" / "before", "before")):
+        run = load_run(folder)
+        for row, time in enumerate(TIMES[:12:2]):
+            state = states(time)[name]
+            exact = state.camera_from_object.apply(model.positions(state.parameters))
+            assert np.linalg.norm(run.camera_points(row) - exact, axis=1).mean() < 0.5e-3
+
+
+@pytest.mark.parametrize("name", ["a/b", "..", "plots"])
+def test_names_that_are_no_folders_are_refused(recording, tmp_path, capsys, name):
+    also = ["--also", name, str(recording / "sheet.morph"), str(recording / "before.csv")]
+    assert main(command(recording, tmp_path / "run", *also)) == 2
+    assert "cannot be the name of another object's folder" in capsys.readouterr().err

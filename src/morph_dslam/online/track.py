@@ -124,13 +124,8 @@ def track(options: TrackOptions) -> dict[str, Any]:
         )
     if options.overlay:
         AugmentedView(setup.model, setup.camera, options.drawing)  # says so now if it cannot be drawn
-    source = open_source(options.frames, options.first, options.last)
-    if options.use_depth and not (isinstance(source, RecordedFrames) and source.has_registered_depth):
-        raise TrackingError(
-            f"{options.frames} has no depth images that belong to its pixels, as TUM RGB-D recordings have: "
-            "track it without --depth"
-        )
-    begin = _begin(setup, options)
+    source = open_frames(options)
+    begin = find_begin(setup, options)
     placement = setup.placed(begin.depth)
     setup.warm_up(placement, begin.picture)
     run = RunResults(placement.model, begin.frame, per_sequence=setup.tracker_options(placement).per_sequence)
@@ -141,12 +136,23 @@ def track(options: TrackOptions) -> dict[str, Any]:
             run = replace(run, refined=True, frames=[], timestamps=[], results=[])
             _follow(source, setup, placement, begin, False, run)
     finally:
-        summary = _write(setup, placement, source, options, run) if len(run) else {}
+        summary = write_results(setup, placement, source, options, run) if len(run) else {}
     return summary
 
 
+def open_frames(options: TrackOptions) -> FrameSource:
+    """The frames to track; raises SourceError, or TrackingError if there is no depth that is to be used."""
+    source = open_source(options.frames, options.first, options.last)
+    if options.use_depth and not (isinstance(source, RecordedFrames) and source.has_registered_depth):
+        raise TrackingError(
+            f"{options.frames} has no depth images that belong to its pixels, as TUM RGB-D recordings have: "
+            "track it without --depth"
+        )
+    return source
+
+
 @dataclass(frozen=True)
-class _Begin:
+class Begin:
     """The reference view: its image, frame, whether the sequence begins with it, and its depth, if used."""
 
     picture: np.ndarray | Picture
@@ -155,17 +161,18 @@ class _Begin:
     depth: np.ndarray | None = None
 
 
-def _begin(setup: Setup, options: TrackOptions) -> _Begin:
+def find_begin(setup: Setup, options: TrackOptions) -> Begin:
+    """The reference view; raises SourceError or CameraError if it is not there, or of another size."""
     if setup.reference is not None:
         assert setup.placement is not None
         assert setup.placement.frame is not None
         # The frames may be those of another recording: the object is looked for as after a loss.
-        return _Begin(setup.reference, setup.placement.frame, False)
+        return Begin(setup.reference, setup.placement.frame, False)
     reference = _reference_frame(options)
     setup.camera.check_image(reference.image, f"frame {reference.index} of {options.frames}")
     # A sequence that does not begin with the reference frame is entered as if the object had been lost.
     depth = reference.depth if options.use_depth else None
-    return _Begin(reference.image, reference.index, options.reference_frame in (None, options.first), depth)
+    return Begin(reference.image, reference.index, options.reference_frame in (None, options.first), depth)
 
 
 def _reference_frame(options: TrackOptions) -> Frame:
@@ -176,7 +183,7 @@ def _reference_frame(options: TrackOptions) -> Frame:
 
 
 def _follow(
-    source: FrameSource, setup: Setup, placement: Placement, begin: _Begin, refines: bool, run: RunResults
+    source: FrameSource, setup: Setup, placement: Placement, begin: Begin, refines: bool, run: RunResults
 ) -> list[Keyframe]:
     """Track all frames into ``run``; returns where the points were seen if the reference is to be refined."""
     chain = setup.new_chain(placement, begin.picture, begin.in_sequence)
@@ -190,7 +197,7 @@ def _follow(
 
 
 def _refined(
-    setup: Setup, placement: Placement, begin: _Begin, keyframes: list[Keyframe], options: TrackOptions
+    setup: Setup, placement: Placement, begin: Begin, keyframes: list[Keyframe], options: TrackOptions
 ) -> Placement:
     """The placement refined over the sequence; how sure it is then is not known."""
     print("refining the reference state over the sequence ...", file=sys.stderr)
@@ -222,7 +229,7 @@ def _check(options: TrackOptions) -> None:
     check_run_folder(options.output, options.overwrite)
 
 
-def _write(
+def write_results(
     setup: Setup, placement: Placement, source: FrameSource, options: TrackOptions, run: RunResults
 ) -> dict[str, Any]:
     """Write all files of the run folder; the video last, because it takes longest."""
