@@ -1,11 +1,15 @@
 """Where a registered object is in a camera that was found in the map, and how well that is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.model import SeparatedField
+from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.online.anchor import Anchor, movable_points
 from morph_dslam.online.place_in_map import PlaceInMap
 from morph_dslam.online.slam.pose import PoseEstimate
@@ -78,10 +82,16 @@ def test_the_increment_to_another_pose_is_the_one_that_leads_there():
 
 
 def sheet_map():
-    """Points on a sheet that arches between its fixed short edges, and points far off it, in map units."""
-    model = bent_sheet_model(43, 31)
-    x = np.concatenate([np.linspace(-0.2099, 0.2099, 42), np.linspace(-0.2, 0.2, 10)])
-    points = np.column_stack([x, np.zeros(52), np.r_[np.zeros(42), np.full(10, -0.2)]])
+    """A sheet of 420 mm that turns about one end, points along it, and points off it, in map units."""
+    sheet = bent_sheet_model(5, 3)
+    powers = np.array([[0, 0, 0], [1, 0, 0]])
+    functions = ParameterFunctions(-np.ones(3), np.ones(3), powers, np.array([[0.0], [1.0]]))
+    lift = np.zeros((1, len(sheet.nodes), 3))
+    lift[0, :, 2] = 0.1 * (sheet.nodes[:, 0] + 0.21)
+    parameters = tuple(replace(p, lower=-1.0, upper=1.0, default=0.0) for p in sheet.parameters)
+    model = replace(sheet, displacement=SeparatedField(lift, functions), parameters=parameters)
+    x = np.concatenate([np.linspace(-0.2, 0.2, 41), np.linspace(-0.2, 0.2, 10)])
+    points = np.column_stack([x, np.zeros(51), np.r_[np.zeros(41), np.full(10, -0.03)]])
     place = PlaceInMap(
         SimilarityTransform(3.0, rotation_exp(np.array([0.3, -0.2, 0.5])), np.array([1.0, 2.0, 3.0])),
         np.zeros(3),
@@ -93,19 +103,20 @@ def sheet_map():
 def test_only_what_can_move_is_taken_out_of_the_scene():
     model, place, positions, x = sheet_map()
     movable = movable_points(positions, place, model)
-    assert not movable[42:].any()
-    # The arch of up to 60 mm ends at the edges.
-    assert movable[:42][np.abs(x[:42]) < 0.19].all()
-    assert not movable[:42][np.abs(x[:42]) > 0.2095].any()
+    # The sheet is 514 mm large. What lies 30 mm off it is not on it; what moves by less than 2.6 mm does not
+    # move: that is 39 mm from the end at two thirds of the largest turn. Samples are a few mm apart.
+    assert not movable[41:].any()
+    assert movable[:41][x[:41] > -0.165].all()
+    assert not movable[:41][x[:41] < -0.177].any()
 
 
 def test_an_anchor_keeps_the_scene_and_needs_to_know_how_well_the_place_is_known():
     model, place, positions, _ = sheet_map()
     camera = PinholeCamera(320, 240, 300.0, 300.0, 160.0, 120.0)
     rigid_map = RigidMap()
-    ids = rigid_map.add_points(positions, np.zeros((52, 2)), 0, GOOD)
+    ids = rigid_map.add_points(positions, np.zeros((51, 2)), 0, GOOD)
     flat = np.full((240, 320), 128, dtype=np.uint8)
-    rigid_map.add_keyframe(Keyframe(0, 0.0, flat, np.eye(4), ids, np.zeros((52, 2))))
+    rigid_map.add_keyframe(Keyframe(0, 0.0, flat, np.eye(4), ids, np.zeros((51, 2))))
     expected = movable_points(positions, place, model)
     blind = PlaceInMap(place.world_from_object, place.centre, None)
     with pytest.raises(RegistrationError, match="does not say how well the object's place is known"):
