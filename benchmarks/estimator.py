@@ -18,7 +18,7 @@ from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField, SurfacePoints
 from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
 from morph_dslam.online.estimation import BoundPoints, Estimator, State, moved
-from morph_dslam.online.reprojection import linearise_numpy, project_with_jacobian
+from morph_dslam.online.reprojection import linearise_numpy, project_with_jacobian_numpy
 
 N_POINTS, N_MODES, DEGREE = 500, 16, 7
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
@@ -84,7 +84,7 @@ def main() -> None:
         """With the left Jacobian of the rotation, because scipy's step is measured from the start."""
         state = moved(start, step)
         pose, rows = state.camera_from_object, functions.rows(state.parameters)
-        result = project_with_jacobian(
+        result = project_with_jacobian_numpy(
             rows, pose.rotation, pose.translation, points.rest, points.field.modes, CAMERA.intrinsics
         )[1].reshape(-1, 10)
         result[:, 4:7] = result[:, 4:7] @ left_jacobian(step[4:7])

@@ -16,7 +16,13 @@ from morph_dslam.online.estimation import (
     State,
     moved,
 )
-from morph_dslam.online.reprojection import linearise, linearise_numpy, project_with_jacobian
+from morph_dslam.online.reprojection import (
+    linearise,
+    linearise_numpy,
+    project_with_jacobian,
+    project_with_jacobian_numpy,
+)
+from morph_dslam.online.robust_covariance import huber_covariance, huber_covariance_numpy
 from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 528.0, 520.0, 320.0, 240.0)
@@ -64,6 +70,31 @@ def test_jacobian_agrees_with_finite_differences(points):
         ahead = CAMERA.project(points.in_camera(moved(TRUTH, step)))
         behind = CAMERA.project(points.in_camera(moved(TRUTH, -step)))
         np.testing.assert_allclose(jacobian[:, :, k], (ahead - behind) / 2e-6, rtol=1e-5, atol=1e-4)
+
+
+def test_compiled_and_plain_jacobian_agree_also_behind_the_camera(points):
+    near = State(TRUTH.parameters, RigidTransform(POSE.rotation, np.array([0.0, 0.0, 0.02])))
+    n_behind = 0
+    for state in (TRUTH, near):
+        given = arguments(points, state, None, None)[:6]
+        compiled, plain = project_with_jacobian(*given), project_with_jacobian_numpy(*given)
+        behind = np.isnan(plain[0]).any(axis=1)
+        n_behind += int(behind.sum())
+        np.testing.assert_allclose(compiled[0], plain[0], rtol=1e-9)
+        np.testing.assert_allclose(compiled[1][~behind], plain[1][~behind], rtol=1e-8, atol=1e-6)
+        assert np.isnan(compiled[1][behind]).all()
+    assert 0 < n_behind < len(points)
+
+
+def test_compiled_and_plain_covariance_agree():
+    rng = np.random.default_rng(2)
+    root, scale = rng.standard_normal((40, 7)), rng.uniform(0.1, 2.0, 7)
+    residuals = rng.standard_normal((60, 2)) * np.where(rng.uniform(size=60) < 0.1, 8.0, 0.7)[:, None]
+    weights, numbers = rng.uniform(0.5, 2.0, 60), np.where(np.arange(60) < 45, 2, 1)
+    for count in (60, 3):
+        given = root.T @ root, residuals[:count], weights[:count], numbers[:count], 2.0, scale
+        for compiled, plain in zip(huber_covariance(*given), huber_covariance_numpy(*given), strict=True):
+            np.testing.assert_allclose(compiled, plain, rtol=1e-9)
 
 
 def test_compiled_and_plain_normal_equations_agree(points):

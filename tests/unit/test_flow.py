@@ -17,6 +17,7 @@ from morph_dslam.online.flow import (
     patch_correlation,
     patch_correlation_numpy,
 )
+from morph_dslam.online.textured_view import draw_textured, draw_textured_numpy
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, printed_texture, sheet_state
 
@@ -128,6 +129,28 @@ def test_rendering_looks_like_the_frame_it_predicts():
     assert inside.sum() > 50_000
     assert np.corrcoef(rendering.image[inside], actual[inside])[0, 1] > 0.97
     assert (rendering.image[~np.isfinite(rendering.depth)] == NEUTRAL).all()
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_drawing_in_one_pass_equals_drawing_in_two(closed):
+    model = bent_sheet_model(22, 16)
+    texture = np.random.default_rng(4).integers(0, 256, (480, 640)).astype(np.uint8)
+    view, other = (view_of(model, CAMERA, sheet_state(bend)) for bend in (0.0, 0.15))
+    pictures = []
+    for draw in (draw_textured, draw_textured_numpy):
+        image, depth = np.full((480, 640), NEUTRAL, np.uint8), np.full((480, 640), np.inf, np.float32)
+        # Something is drawn there already, nearer than the right half.
+        depth[:, 320:400] = 0.01
+        depths = np.ascontiguousarray(other.nodes[:, 2])
+        draw(other.pixels, depths, model.triangles, view.pixels, texture, closed, image, depth)
+        pictures.append((image, depth))
+    (image, depth), (expected, expected_depth) = pictures
+    np.testing.assert_allclose(depth, expected_depth, rtol=1e-6)
+    drawn = np.isfinite(depth) & (depth > 0.01)
+    assert drawn[:, 320:400].sum() == 0
+    assert closed or drawn.sum() > 30_000
+    # Weights are kept in single precision there: a grey level may round the other way.
+    assert np.abs(image.astype(int) - expected).max() <= 1
 
 
 def test_rendering_an_object_outside_the_image_is_empty():

@@ -15,8 +15,7 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.model import ReducedModel
 from morph_dslam.online.binding import View, facing
 from morph_dslam.online.flow import NEUTRAL
-from morph_dslam.render.rasteriser import Buffers, image_region, rasterise
-from morph_dslam.render.texture import render_textured
+from morph_dslam.online.textured_view import draw_textured
 
 Array = NDArray[np.float64]
 
@@ -51,29 +50,25 @@ class ReferenceAppearance:
         view: View,
         closed: bool = False,
     ) -> None:
-        self._triangles, self._closed = model.triangles, closed
+        self._triangles, self._closed = np.ascontiguousarray(model.triangles, dtype=np.int64), closed
         self._camera = camera
-        self._texture = flat
-        self._coordinates = view.pixels
+        self._texture = np.ascontiguousarray(flat)
+        self._coordinates = np.ascontiguousarray(view.pixels)
         self.facing = facing(view, model.triangles)
 
-    def render(self, view: View, margin: int = 12) -> Rendering:
+    def render(self, view: View) -> Rendering:
         """The object alone, in another view of it."""
         height, width = self._camera.height, self._camera.width
         image = np.full((height, width), NEUTRAL, dtype=np.uint8)
         depth = np.full((height, width), np.inf, dtype=np.float32)
-        region = image_region(view.pixels, height, width, margin)
-        if region is None:
-            return Rendering(image, depth)
-        rows, columns = region
-        buffers = self._rasterise(view, rows, columns)
-        textured = render_textured(buffers, self._triangles, self._coordinates, self._texture)
-        image[rows, columns] = np.where(buffers.triangle_ids >= 0, textured, NEUTRAL)
-        depth[rows, columns] = buffers.depth
+        draw_textured(
+            view.pixels,
+            np.ascontiguousarray(view.nodes[:, 2]),
+            self._triangles,
+            self._coordinates,
+            self._texture,
+            self._closed,
+            image,
+            depth,
+        )
         return Rendering(image, depth)
-
-    def _rasterise(self, view: View, rows: slice, columns: slice) -> Buffers:
-        origin = np.array([columns.start, rows.start], dtype=float)
-        size = (rows.stop - rows.start, columns.stop - columns.start)
-        pixels = view.pixels - origin
-        return rasterise(pixels, view.nodes[:, 2], self._triangles, *size, closed=self._closed)

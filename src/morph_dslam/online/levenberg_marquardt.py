@@ -9,7 +9,7 @@ kept by an active set (Nocedal & Wright, Numerical Optimization, ch. 16.7).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -51,7 +51,9 @@ class Box:
 
     def nearest(self, state: State) -> State:
         """The state with its parameters inside the box."""
-        return replace(state, parameters=np.clip(state.parameters, self.lower, self.upper))
+        # Several times as fast as np.clip on a few numbers, and called in every iteration.
+        inside = np.minimum(np.maximum(state.parameters, self.lower), self.upper)
+        return State(inside, state.camera_from_object)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from morph_dslam.render.rasteriser import visible_points
 
 Array = NDArray[np.float64]
 
+#: Pyramid levels that reach as far as a correction may: a quarter of the size, with windows of 17 pixels.
+CORRECTION_LEVELS = 2
 #: A point this share of the object's depth behind the z-buffer counts as hidden.
 DEPTH_TOLERANCE = 0.01
 
@@ -88,7 +90,8 @@ def compare_with_rendering(
     guesses : (p, 2) where to start looking for them in the frame.
     """
     rows = np.flatnonzero(visible)
-    found, ok = follow(rendering.image, frame, predicted[rows], guesses[rows], flow)
+    near = replace(flow, levels=min(flow.levels, CORRECTION_LEVELS))
+    found, ok = follow(rendering.image, frame, predicted[rows], guesses[rows], near)
     correction = np.linalg.norm(found - predicted[rows], axis=1)
     correlation = patch_correlation(rendering.image, frame, predicted[rows], found, options.patch_half)
     ok &= (correction < options.largest_correction_px) & (correlation > options.least_correlation)

@@ -84,16 +84,16 @@ class Outline:
         self._camera, self.options = camera, options
         edges = _spread(model.nodes, rim(model.triangles), options.n_points)
         self.points = BoundPoints.from_surface(model, _on_edges(model.triangles, edges))
-        # The direction along the rim comes from the edge's own ends.
-        ends = [_at_nodes(model.triangles, edges[:, k]) for k in range(2)]
-        self._ends = [BoundPoints.from_surface(model, end) for end in ends]
+        # The direction along the rim comes from the edge's own ends; evaluated with the points at once.
+        ends = [BoundPoints.from_surface(model, _at_nodes(model.triangles, edges[:, k])) for k in range(2)]
+        self._with_ends = self.points.joined(ends[0]).joined(ends[1])
         pixels, normals = self._predict(state)
         self._brightness = _inner_brightness(grey, pixels, normals, options.side_px)
 
     def _predict(self, state: State) -> tuple[Array, Array]:
         """Pixels (p, 2) of the rim points and outward normals (p, 2); NaN behind the camera."""
-        pixels = self._camera.project(self.points.in_camera(state))
-        start, end = (self._camera.project(points.in_camera(state)) for points in self._ends)
+        seen = self._camera.project(self._with_ends.in_camera(state))
+        pixels, start, end = seen.reshape(3, -1, 2)
         along = end - start
         length = np.maximum(np.linalg.norm(along, axis=1), 1e-9)
         normals = np.column_stack([along[:, 1], -along[:, 0]]) / length[:, None]

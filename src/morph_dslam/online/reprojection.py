@@ -109,8 +109,33 @@ def linearise(functions, rotation, translation, rest, modes, intrinsics, pixels,
     return cost, hessian, gradient, residuals
 
 
+@njit(cache=True, nogil=True)
 def project_with_jacobian(functions, rotation, translation, rest, modes, intrinsics):
-    """Pixels (p, 2) and their Jacobian (p, 2, d + 6), in plain numpy; NaN behind the camera."""
+    """Pixels (p, 2) and their Jacobian (p, 2, d + 6), compiled; NaN behind the camera.
+
+    The parameters are those of `linearise`.
+    """
+    n_points, d = rest.shape[0], functions.shape[0] - 1
+    fields = combine_modes(functions, modes.reshape(modes.shape[0], 3 * n_points)).reshape(1 + d, n_points, 3)
+    pixels, jacobian = np.full((n_points, 2), np.nan), np.full((n_points, 2, d + 6), np.nan)
+    turned = np.empty(3)
+    for j in range(n_points):
+        for c in range(3):
+            turned[c] = 0.0
+            for k in range(3):
+                turned[c] += rotation[c, k] * (rest[j, k] + fields[0, j, k])
+        depth = turned[2] + translation[2]
+        if depth < MINIMUM_DEPTH:
+            continue
+        x, y = (turned[0] + translation[0]) / depth, (turned[1] + translation[1]) / depth
+        pixels[j, 0] = intrinsics[0] * x + intrinsics[2]
+        pixels[j, 1] = intrinsics[1] * y + intrinsics[3]
+        _point_jacobian(jacobian[j], fields, j, rotation, turned, 1.0 / depth, x, y, intrinsics)
+    return pixels, jacobian
+
+
+def project_with_jacobian_numpy(functions, rotation, translation, rest, modes, intrinsics):
+    """The plain twin of `project_with_jacobian`."""
     fields = np.tensordot(functions, modes, axes=1)
     turned = (rest + fields[0]) @ rotation.T
     x, y, z = (turned + translation).T
@@ -132,7 +157,9 @@ def linearise_numpy(
     functions, rotation, translation, rest, modes, intrinsics, pixels, weights, normals, huber
 ):
     """The plain twin of `linearise`."""
-    projected, jacobian = project_with_jacobian(functions, rotation, translation, rest, modes, intrinsics)
+    projected, jacobian = project_with_jacobian_numpy(
+        functions, rotation, translation, rest, modes, intrinsics
+    )
     residuals = projected - pixels
     directed = (normals != 0.0).any(axis=1)
     onto = np.where(directed[:, None, None], normals[:, :, None] * normals[:, None, :], np.eye(2))
