@@ -13,7 +13,8 @@ import os
 import sys
 from pathlib import Path
 
-from morph_dslam.cli import frame_range, run_and_report_errors
+from morph_dslam.cli import run_and_report_errors
+from morph_dslam.command_arguments import frame_range
 from morph_dslam.experiment import Recording, check_recording, keep_model, report, track_and_evaluate
 
 HERE = Path(__file__).resolve().parent
