@@ -4,7 +4,9 @@ A camera goes round the undeformed seal on a table and maps the scene; the seal'
 which gives the map its scale; then the lever turns, from a side that the registration cannot know because the
 seal is a body of revolution. In every frame the camera is found in the map, and with the seal's place there
 the angle of the lever, that of the side, and the deformation of the whole solid are estimated. The recording
-is rendered, so that its truth is exact. Everything is left in output/.
+is rendered, so that its truth is exact. Everything is left in output/; of another scene than scene.toml in a
+folder there with the scene's name. In scene_occluded.toml a disc as wide as a hand hides two fifths of the
+seal while it is deformed.
 """
 
 from __future__ import annotations
@@ -95,11 +97,12 @@ def result_line(found: Errors, summary: dict, sequence: Path) -> str:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    output = arguments.output
-    model, sequence = output / "boot_seal.morph", output / "recording"
+    model, scene = arguments.output / "boot_seal.morph", arguments.scene
+    output = arguments.output if scene.stem == "scene" else arguments.output / scene.stem
+    sequence = output / "recording"
     if not model.is_file():
         raise TrackingError(f"there is no model {model}: build it with `python {HERE.name}/run.py` first")
-    keep_sequence(arguments.scene, model, sequence)
+    keep_sequence(scene, model, sequence)
     camera, frames = sequence / "camera.yaml", sequence / "frames"
     run_slam(
         SlamRunOptions(

@@ -40,6 +40,9 @@ MOST_EXTRAPOLATED = 4.0
 MOST_VIEWS = 24
 #: Fewer measurements for each view are no evidence.
 FEWEST = 30
+#: Windows as large as the patches reach into the next ones: the sum over a patch holds only (2 / 3)^2 of what
+#: they have in common.
+ACROSS_PATCHES = 9.0 / 4.0
 #: Directions that are seen worse than this, over the best one, stay as they are.
 LEAST_SEEN = 1e-9
 
@@ -147,11 +150,12 @@ class KeyframeAdjustment:
         self, on_mesh: PoseScores, beside: PoseScores, poses: list[RigidTransform]
     ) -> tuple[Array, Array]:
         """The step (6 K,) of all poses, and their covariance (6 K, 6 K)."""
-        scores = np.concatenate([on_mesh.scores, beside.scores])
+        scores = np.concatenate([np.sqrt(ACROSS_PATCHES) * on_mesh.scores, beside.scores])
+        right = on_mesh.scores.sum(axis=0) + beside.scores.sum(axis=0)
         units = self._units(len(poses))
         information = (on_mesh.information + beside.information) * np.outer(units, units)
         inverse = _inverse(information, self._turn(poses) / units)
-        step = inverse @ (scores.sum(axis=0) * units)
+        step = inverse @ (right * units)
         half = (scores * units) @ inverse
         return step * units, half.T @ half * np.outer(units, units)
 

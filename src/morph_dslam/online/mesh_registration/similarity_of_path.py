@@ -31,7 +31,8 @@ def similarity_of_path(
     Returns
     -------
     The similarity, and the covariance (7, 7) of log scale, rotation vector and translation about the centre,
-    world: that of the adjusted poses, and what the two paths differ by in ways that no similarity explains.
+    world. It holds that of the adjusted poses, what the fit makes of the path's own errors, and these errors
+    as they are in a single keyframe: a camera that is found in the map has them.
     """
     transform, free = start, slice(1 if metric else 0, 7)
     size, count = start.scale, len(adjusted.poses)
@@ -57,7 +58,19 @@ def similarity_of_path(
         meat = scores.T @ scores + gain @ adjusted.covariance @ gain.T
         covariance[free, free] = inverse @ meat @ inverse * np.outer(units, units)
         transform = moved_similarity(transform, step, centre)
+    covariance[1:, 1:] += _scatter(adjusted, transform, centre)
     return transform, covariance
+
+
+def _scatter(adjusted: AdjustedKeyframes, transform: SimilarityTransform, centre: Array) -> Array:
+    """Mean square (6, 6) of what the object is turned and moved by, in the world, between the two paths."""
+    misses = []
+    for view, pose in zip(adjusted.views, adjusted.poses, strict=True):
+        placed, world_from_camera = camera_from_object(view, transform), view.camera_from_world.rotation.T
+        turn = rotation_log(pose.rotation @ placed.rotation.T)
+        shift = transform.scale * (pose.apply(centre) - placed.apply(centre))
+        misses.append(np.concatenate([world_from_camera @ turn, world_from_camera @ shift]))
+    return np.array(misses).T @ np.array(misses) / len(misses)
 
 
 def _metric(pose: RigidTransform, centre: Array) -> Array:
