@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from morph_dslam.command_arguments import frame_range, named_value
+from morph_dslam.errors import TrackingError
 
 if TYPE_CHECKING:
     from morph_dslam.online.augmented_view import DrawOptions
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 def _track(arguments: argparse.Namespace) -> None:
     from morph_dslam.online.track import TrackOptions, track
     from morph_dslam.online.track_objects import OtherObject, track_objects
+    from morph_dslam.online.track_rig import track_rig
 
     first, last = arguments.range
     options = TrackOptions(
@@ -30,6 +32,13 @@ def _track(arguments: argparse.Namespace) -> None:
         drawing=drawing(arguments),
         **object_arguments(arguments),
     )
+    if arguments.other_cameras and arguments.also:
+        raise TrackingError(
+            "several objects and several cameras cannot go together: leave out --also or --with"
+        )
+    if arguments.other_cameras:
+        _say(options.output, track_rig(options, arguments.other_cameras))
+        return
     if not arguments.also:
         _say(options.output, track(options))
         return
@@ -183,6 +192,15 @@ def add_tracking_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         "--refine",
         action="store_true",
         help="refine the reference state over the whole sequence and track once more",
+    )
+    track.add_argument(
+        "--with",
+        type=Path,
+        action="append",
+        default=[],
+        dest="other_cameras",
+        metavar="FRAMES",
+        help="what the next camera of the rig saw; with --camera camchain.yaml#cam0; may be repeated",
     )
     track.add_argument(
         "--also",

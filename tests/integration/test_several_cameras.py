@@ -1,11 +1,17 @@
 """One object in front of two rendered cameras that are fixed to each other."""
 
+import cv2
 import numpy as np
 import pytest
+import yaml
 
 from morph_dslam.camera import PinholeCamera
+from morph_dslam.cli import main
 from morph_dslam.errors import RegistrationError
+from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
+from morph_dslam.model import save_model
 from morph_dslam.online.pipeline import Tracker
 from morph_dslam.online.rig import RigCamera
 from morph_dslam.online.rig_tracking import RigTracker
@@ -81,3 +87,62 @@ def test_reference_frame_without_texture_names_its_camera(model, films):
     first = [images(films, 0.0)[0], np.full((360, 480, 3), 128, np.uint8)]
     with pytest.raises(RegistrationError, match="camera 1: the object shows only"):
         RigTracker(model, RIG, first, sheet_state(0.0))
+
+
+@pytest.fixture(scope="module")
+def recording(model, tmp_path_factory):
+    """What both cameras recorded, their camchain, the model, and landmarks in the first camera."""
+    folder = tmp_path_factory.mktemp("rig")
+    films = [SheetFilm(model, part.camera) for part in RIG]
+    for number, time in enumerate([0.0, *TIMES[:4]]):
+        for name, image in zip(("front", "aside"), images(films, time), strict=True):
+            (folder / name).mkdir(exist_ok=True)
+            cv2.imwrite(str(folder / name / f"{number:03d}.png"), image)
+    chain = {
+        f"cam{number}": {
+            "camera_model": "pinhole",
+            "intrinsics": part.camera.intrinsics.tolist(),
+            "distortion_model": "none",
+            "distortion_coeffs": [],
+            "resolution": [part.camera.width, part.camera.height],
+        }
+        for number, part in enumerate(RIG)
+    }
+    chain["cam1"]["T_cn_cnm1"] = ASIDE.camera_from_rig.matrix.tolist()
+    (folder / "camchain.yaml").write_text(yaml.safe_dump(chain))
+    save_model(folder / "sheet.morph", model)
+    state, nodes = sheet_state(0.0), np.random.default_rng(0).choice(len(model.nodes), 24, replace=False)
+    positions = state.camera_from_object.apply(model.positions(state.parameters))[nodes]
+    landmarks = Landmarks(model.nodes[nodes], FRONT.camera.project(positions))
+    save_landmarks(folder / "landmarks.csv", landmarks)
+    return folder
+
+
+def command(recording, output, *more, camera="camchain.yaml#cam0"):
+    arguments = [str(recording / "front"), "--camera", str(recording / camera)]
+    arguments += ["--model", str(recording / "sheet.morph"), "--landmarks", str(recording / "landmarks.csv")]
+    return ["track", *arguments, "-o", str(output), *more]
+
+
+def test_command_tracks_with_both_cameras(model, recording, tmp_path, capsys):
+    assert main(command(recording, tmp_path / "run", "--with", str(recording / "aside"))) == 0
+    assert "tracked=5/5" in capsys.readouterr().out
+    run = load_run(tmp_path / "run")
+    for row, time in enumerate([0.0, *TIMES[:4]]):
+        state = sheet_state(time)
+        exact = state.camera_from_object.apply(model.positions(state.parameters))
+        assert np.linalg.norm(run.camera_points(row) - exact, axis=1).mean() < 0.4e-3
+
+
+@pytest.mark.parametrize(
+    ("more", "camera", "message"),
+    [
+        (["--with", "aside", "--with", "aside"], "camchain.yaml#cam0", "has 2 cameras, but there are 3"),
+        (["--with", "aside"], "camchain.yaml#cam1", "give the first camera of a Kalibr camchain"),
+        (["--with", "aside", "--depth"], "camchain.yaml#cam0", "leave out --place, --refine and --depth"),
+    ],
+)
+def test_what_does_not_fit_a_rig_is_refused(recording, tmp_path, capsys, more, camera, message):
+    more = [str(recording / word) if word == "aside" else word for word in more]
+    assert main(command(recording, tmp_path / "run", *more, camera=camera)) == 2
+    assert message in capsys.readouterr().err

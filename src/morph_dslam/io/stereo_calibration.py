@@ -54,6 +54,28 @@ def load_camera_or_pair(path: Path) -> PinholeCamera | StereoCamera:
     return load_camera(path)
 
 
+def load_rig(path: Path) -> list[tuple[PinholeCamera, RigidTransform]]:
+    """Read all cameras of a Kalibr camchain, cam0 first, each with camera_from_cam0, metres.
+
+    Raises
+    ------
+    CameraError
+        If the file is missing or malformed, has fewer than two cameras, or does not say where one is.
+    """
+    chain = read_opencv_yaml(Path(path))
+    chain = chain if isinstance(chain, dict) else {}
+    count = sum(str(name).startswith("cam") for name in chain)
+    if count < 2 or not all(isinstance(chain.get(f"cam{n}"), dict) for n in range(count)):
+        raise CameraError(f"{path} is no rig: a Kalibr camchain of several cameras has cam0, cam1 and so on")
+    cameras, pose = [], RigidTransform.identity()
+    for number in range(count):
+        what, entry = f"{path}#cam{number}", chain[f"cam{number}"]
+        if number:
+            pose = _transform(entry.get("T_cn_cnm1"), f"{what}: T_cn_cnm1") @ pose
+        cameras.append((parse_camera(from_kalibr(entry, what), what), pose))
+    return cameras
+
+
 def _from_kalibr(path: Path) -> StereoCamera:
     chain = read_opencv_yaml(path)
     if not isinstance(chain, dict) or not all(isinstance(chain.get(c), dict) for c in ("cam0", "cam1")):

@@ -15,6 +15,7 @@ import numpy as np
 
 from morph_dslam import __version__
 from morph_dslam.errors import TrackingError
+from morph_dslam.io.calibration import load_camera, save_camera
 from morph_dslam.model import save_model
 from morph_dslam.model.inner_structure import CarriedStructure
 from morph_dslam.online.inner_positions import write_inner_positions
@@ -79,7 +80,10 @@ def write_run(
         save_model(folder / "model.morph", placement.model)
     else:
         _copy(inputs.model, folder / "model.morph")
-    _copy(inputs.camera, folder / "camera.yaml")
+    if inputs.camera.is_file():
+        _copy(inputs.camera, folder / "camera.yaml")
+    else:  # one of several cameras in a file, camchain.yaml#cam0
+        save_camera(folder / "camera.yaml", load_camera(inputs.camera))
     given = {"model": str(inputs.model), "camera": str(inputs.camera)} | inputs.named
     common = temporal_facts(run.model.parameters, tracker) | {
         "registration": placement.facts,
