@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+import yaml
 
 from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import CameraError
 from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.io.stereo_calibration import load_rig
 from morph_dslam.model import SurfacePoints
 from morph_dslam.online.estimation import BoundPoints, Estimator, Prior, State, moved
 from morph_dslam.online.measurement_noise import Measured, RigMeasured
@@ -122,3 +125,30 @@ def test_prior_of_the_pose_is_in_the_rigs_frame():
     prior = Prior(np.zeros(3), np.zeros((3, 3)), pose, 1e12 * np.eye(6))
     found = RigEstimator(MODEL, [ASIDE]).fit(measured, TRUTH, prior)
     np.testing.assert_allclose(found.state.camera_from_object.matrix, pose.matrix, atol=1e-6)
+
+
+def camchain(path, poses):
+    """A camchain whose camera n + 1 is at ``poses[n]`` in the frame of camera n."""
+    camera = {"camera_model": "pinhole", "intrinsics": [500.0, 500.0, 320.0, 240.0], "resolution": [640, 480]}
+    camera |= {"distortion_model": "none", "distortion_coeffs": []}
+    chain = {f"cam{n}": dict(camera) for n in range(len(poses) + 1)}
+    for number, pose in enumerate(poses, 1):
+        chain[f"cam{number}"]["T_cn_cnm1"] = pose.matrix.tolist()
+    path.write_text(yaml.safe_dump(chain))
+
+
+def test_camchain_gives_every_camera_in_the_frame_of_the_first(tmp_path):
+    first = RigidTransform(rotation_exp(np.array([0.0, 0.3, 0.0])), np.array([-0.2, 0.0, 0.0]))
+    second = RigidTransform(rotation_exp(np.array([0.1, 0.0, 0.0])), np.array([-0.1, 0.05, 0.0]))
+    camchain(tmp_path / "chain.yaml", [first, second])
+    cameras = load_rig(tmp_path / "chain.yaml")
+    point = np.array([0.1, -0.2, 1.0])
+    np.testing.assert_allclose(cameras[0][1].apply(point), point)
+    np.testing.assert_allclose(cameras[2][1].apply(point), second.apply(first.apply(point)))
+    assert cameras[2][0].fx == 500.0
+
+
+def test_single_camera_is_no_rig(tmp_path):
+    camchain(tmp_path / "chain.yaml", [])
+    with pytest.raises(CameraError, match="is no rig"):
+        load_rig(tmp_path / "chain.yaml")
