@@ -75,7 +75,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
         print(trajectory_line(evaluate_trajectory(arguments.run, arguments.trajectory)))
         return
     from morph_dslam.evaluation.evaluate import evaluate, evaluate_depth
-    from morph_dslam.evaluation.statements import depth_line, remarks, result_line
+    from morph_dslam.evaluation.statements import alignment_line, depth_line, remarks, result_line
 
     if arguments.depth is not None:
         found = evaluate_depth(
@@ -92,6 +92,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     for remark in remarks(figures):
         print(f"note: {remark}")
     print(f"wrote {arguments.run / 'evaluation.json'} and {arguments.run / 'report.html'}")
+    print(alignment_line(figures))
     print(result_line(figures))
 
 

@@ -148,10 +148,11 @@ def track_and_evaluate(recording: Recording, model: Path, run: Path) -> dict[str
 
 def report(figures: dict[str, Any], run: Path) -> None:
     """Print where the results are and, last, the result line."""
-    from morph_dslam.evaluation.statements import remarks, result_line
+    from morph_dslam.evaluation.statements import alignment_line, remarks, result_line
 
     for remark in remarks(figures):
         print(f"note: {remark}")
     print(f"video   {run / 'augmented.mp4'}")
     print(f"report  {run / 'report.html'}")
+    print(alignment_line(figures))
     print(result_line(figures))

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import EvaluationError
+from morph_dslam.evaluation.alignment import summarise_alignment
 from morph_dslam.evaluation.material_error import bind_truth, material_error, summarise
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.evaluation.truth import load_truth
+from morph_dslam.geometry import rotation_exp
 from tests.support.run_folders import exact_truth, write_run
 
 
@@ -163,3 +165,25 @@ def test_run_folders_that_cannot_be_read(tmp_path):
     (tmp_path / "result.h5").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(EvaluationError, match="damaged"):
         load_run(tmp_path)
+
+
+def test_a_turned_truth_is_told_apart_from_errors_of_shape(tracked, tmp_path):
+    run, truth = tracked
+    turn = np.radians([0.5, -2.0, 1.0])
+    points = truth["points_mm"] @ rotation_exp(turn) + np.array([3.0, 0.0, -4.0])
+    points[3] += [0.0, 0.0, 5.0]  # one frame is moved by itself
+    points[4, 7] = np.nan
+    error = material_error(run, saved(tmp_path / "truth.npz", truth | {"points_mm": points}), 10)
+    figures = summarise_alignment(error)
+    # Of five frames one is 5 mm off the others: the best motion lies a fifth of the way.
+    together = figures["after_one_rigid_motion"]
+    assert error.mean > 5e-3
+    assert together["mean_mm"] == pytest.approx(4 / 5 * 1.0 + 1 / 5 * 4.0, rel=0.1)
+    np.testing.assert_allclose(together["rotation_deg"], [0.5, -2.0, 1.0], atol=0.2)
+    assert figures["after_one_in_each_frame"]["mean_mm"] < 1e-3
+    even = points.copy()
+    even[3] -= [0.0, 0.0, 5.0]
+    error = material_error(run, saved(tmp_path / "even.npz", truth | {"points_mm": even}), 10)
+    together = summarise_alignment(error)["after_one_rigid_motion"]
+    assert together["mean_mm"] < 1e-3
+    np.testing.assert_allclose(together["rotation_deg"], [0.5, -2.0, 1.0], atol=1e-3)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from morph_dslam.evaluation.alignment import summarise_alignment
 from morph_dslam.evaluation.depth_error import depth_error, summarise_depth
 from morph_dslam.evaluation.material_error import material_error, summarise
 from morph_dslam.evaluation.plots import (
@@ -41,6 +42,7 @@ def evaluate(folder: Path, truth_path: Path, bind_frame: int) -> dict[str, Any]:
     error = material_error(run, truth, bind_frame)
     figures = {
         **summarise(error),
+        **summarise_alignment(error),
         "truth": str(truth_path),
         "n_frames": len(run.frames),
         "n_frames_tracked": int(run.tracked.sum()),

@@ -50,13 +50,15 @@ class MaterialError:
     Attributes
     ----------
     frames : (e,) the frames compared. vectors : (e, b, 3) estimate minus truth in the camera frame, NaN where
-        a point was not measured. sight : (e, b, 3) unit directions from the camera to the truth points.
+        a point was not measured. measured : (e, b, 3) the truth points.
+    sight : (e, b, 3) unit directions from the camera to the truth points.
     untracked : truth frames that the run has but did not track. outside : truth frames that it does not have.
     """
 
     binding: Binding
     frames: NDArray[np.int64]
     vectors: Array
+    measured: Array
     sight: Array
     untracked: tuple[int, ...]
     outside: tuple[int, ...]
@@ -142,7 +144,7 @@ def material_error(run: Run, truth: PointTruth, bind_frame: int) -> MaterialErro
     """
     binding = bind_truth(run, truth, bind_frame)
     corners, weights = run.model.triangles[binding.points.triangles], binding.points.weights
-    frames, vectors, sight, untracked, outside = [], [], [], [], []
+    frames, vectors, truths, sight, untracked, outside = [], [], [], [], [], []
     for index, frame in enumerate(truth.frames.tolist()):
         row = run.row(frame)
         if frame == bind_frame:
@@ -156,6 +158,7 @@ def material_error(run: Run, truth: PointTruth, bind_frame: int) -> MaterialErro
             predicted = np.einsum("bc,bcx->bx", weights, run.camera_points(row)[corners])
             frames.append(frame)
             vectors.append(predicted - measured)
+            truths.append(measured)
             sight.append(measured / np.linalg.norm(measured, axis=1, keepdims=True))
     if not frames or not np.isfinite(vectors).any():
         raise EvaluationError(
@@ -163,7 +166,13 @@ def material_error(run: Run, truth: PointTruth, bind_frame: int) -> MaterialErro
             f"not tracked {untracked or 'none'}, outside the run {outside or 'none'}"
         )
     return MaterialError(
-        binding, np.array(frames), np.array(vectors), np.array(sight), tuple(untracked), tuple(outside)
+        binding,
+        np.array(frames),
+        np.array(vectors),
+        np.array(truths),
+        np.array(sight),
+        tuple(untracked),
+        tuple(outside),
     )
 
 

@@ -56,6 +56,8 @@ def _error_section(run: Run, figures: Mapping[str, Any]) -> Section:
         "largest": f"{figures['max_mm']:.3f} mm",
         "mean along the sight line": f"{figures['mean_along_sight_mm']:.3f} mm",
         "mean across the sight line": f"{figures['mean_across_sight_mm']:.3f} mm",
+        "mean after one rigid motion of the truth": f"{figures['after_one_rigid_motion']['mean_mm']:.3f} mm",
+        "mean after one in each frame": f"{figures['after_one_in_each_frame']['mean_mm']:.3f} mm",
         "points compared": f"{figures['n_points_bound']} of {figures['n_points']}",
         "frames compared": f"{len(figures['frames_compared'])}, bound in frame {figures['bind_frame']}",
         "frames tracked": f"{figures['n_frames_tracked']} of {figures['n_frames']}",

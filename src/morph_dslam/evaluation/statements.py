@@ -28,6 +28,17 @@ def remarks(figures: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def alignment_line(figures: Mapping[str, Any]) -> str:
+    """How much of the error is one rigid motion between truth and estimate, as commands print it."""
+    together, single = figures["after_one_rigid_motion"], figures["after_one_in_each_frame"]
+    turn = ", ".join(f"{angle:.2f}" for angle in together["rotation_deg"])
+    return (
+        f"after one rigid motion of all truth points (rotation {turn} degrees about x, y, z): mean "
+        f"{together['mean_mm']:.3f} mm, median {together['median_mm']:.3f} mm; after one in each frame: mean "
+        f"{single['mean_mm']:.3f} mm, median {single['median_mm']:.3f} mm"
+    )
+
+
 def result_line(figures: Mapping[str, Any]) -> str:
     """The last line that commands and examples print."""
     return (
