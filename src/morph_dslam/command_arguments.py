@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 
 def frame_range(text: str) -> tuple[int | None, int | None]:
@@ -29,3 +30,13 @@ def named_value(text: str) -> tuple[str, float]:
     if not name or not 0.0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"'{text}' is not a name and a positive number such as load=0.5")
     return name, value
+
+
+def frame_and_file(text: str) -> tuple[int, Path | None]:
+    """A frame number, and a file that belongs to it: "120" or "120=landmarks.csv"."""
+    number, equals, name = text.partition("=")
+    if not number.isdecimal() or (equals and not name):
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is not a frame, or a frame and a file, such as 120=new.csv"
+        )
+    return int(number), Path(name) if name else None

@@ -1,4 +1,4 @@
-"""Commands that place an object in a mapped scene: `morph register`."""
+"""Commands that place an object: in a mapped scene (`morph register`), or help to (`morph board`)."""
 
 from __future__ import annotations
 
@@ -17,8 +17,19 @@ def _register(arguments: argparse.Namespace) -> None:
     print(registration_line(content))
 
 
+def _board(arguments: argparse.Namespace) -> None:
+    from morph_dslam.online.aids.board import load_board, print_board
+
+    board = load_board(arguments.board)
+    print_board(board, arguments.output)
+    width, height = (1e3 * side for side in board.size)
+    print(
+        f"wrote {arguments.output}: {width:g} x {height:g} mm without its margin; print it in its true size"
+    )
+
+
 def add_registration_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
-    """Add the command; ``add(name, action, kept, text)`` makes its parser."""
+    """Add the commands; ``add(name, action, kept, text)`` makes its parser."""
     register = add(
         "register",
         _register,
@@ -30,4 +41,9 @@ def add_registration_commands(add: Callable[..., argparse.ArgumentParser]) -> No
     register.add_argument("--camera", type=Path, required=True, help="camera file of the map")
     register.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FOLDER", help="folder to write"
+    )
+    board = add("board", _board, "nothing was written", "print a board of markers that places an object")
+    board.add_argument("board", type=Path, help="board file (docs/registration-aids.md)")
+    board.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="FILE", help="PNG or PDF file to write"
     )

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from morph_dslam.command_arguments import frame_range, named_value
+from morph_dslam.command_arguments import frame_and_file, frame_range, named_value
 from morph_dslam.errors import TrackingError
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ def _track(arguments: argparse.Namespace) -> None:
         first=first,
         last=last,
         reference_frame=arguments.reference_frame,
+        reregister_at=tuple(arguments.reregister_at),
         refine_reference=arguments.refine,
         overlay=not arguments.no_video,
         overwrite=arguments.overwrite,
@@ -64,11 +65,14 @@ def _say(folder: Path, summary: dict[str, Any]) -> None:
 
 def object_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
     """What `add_object_arguments` asked for, by the names of `ObjectOptions`."""
+    from morph_dslam.online.aids.start import AidFiles
+
     return {
         "model": arguments.model,
         "camera": arguments.camera,
         "landmarks": arguments.landmarks,
         "placement": arguments.place,
+        "aids": AidFiles(arguments.board, arguments.picture, arguments.guess),
         "map_path": arguments.map,
         "pose": arguments.pose,
         "use_outline": arguments.outline,
@@ -99,6 +103,15 @@ def add_object_arguments(command: argparse.ArgumentParser) -> None:
     start.add_argument("--landmarks", type=Path, help="object points and their pixels in the reference frame")
     start.add_argument(
         "--place", type=Path, metavar="JSON", help="registration.json of `morph register` in a map"
+    )
+    start.add_argument(
+        "--board", type=Path, metavar="TOML", help="a printed board of markers, and where the object is on it"
+    )
+    start.add_argument(
+        "--picture", type=Path, metavar="TOML", help="a picture of the object's print, and where it is on it"
+    )
+    start.add_argument(
+        "--guess", type=Path, metavar="TOML", help="about where the object is in the reference frame"
     )
     command.add_argument(
         "--map",
@@ -186,7 +199,16 @@ def add_tracking_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         "--reference-frame",
         type=int,
         metavar="N",
-        help="frame that the landmarks belong to (default: the first one tracked)",
+        help="frame that the landmarks, or another aid, belong to (default: the first one tracked)",
+    )
+    track.add_argument(
+        "--reregister-at",
+        type=frame_and_file,
+        action="append",
+        default=[],
+        metavar="N[=FILE]",
+        help="place the object anew in frame N, by landmarks there or by the board, picture or guess that the "
+        "run starts from; may be repeated",
     )
     track.add_argument(
         "--refine",

@@ -11,6 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from morph_dslam.errors import SourceError, TrackingError
+from morph_dslam.online.aids.start import AidFiles
 from morph_dslam.online.attempt import Picture
 from morph_dslam.online.augmentation import write_video
 from morph_dslam.online.augmented_view import AugmentedView, DrawOptions
@@ -22,6 +23,7 @@ from morph_dslam.online.reference_refinement import (
     refine_reference,
 )
 from morph_dslam.online.registration import RegistrationOptions, bind_landmarks
+from morph_dslam.online.reregistration import Reregistration
 from morph_dslam.online.results import RunResults
 from morph_dslam.online.run_writing import RunInputs, check_run_folder, write_run
 from morph_dslam.online.tracker_options import StartFrom, TrackerOptions
@@ -41,7 +43,9 @@ class TrackOptions:
     ----------
     frames : video file or folder of images. model, camera : files.
     landmarks : file of landmarks in the reference frame; or placement : registration.json of
-        `morph register`, whose last keyframe is the reference frame. map_path, pose : see `ObjectOptions`.
+        `morph register`, whose last keyframe is the reference frame; or aids. map_path, pose : see
+        `ObjectOptions`.
+    reregister_at : frames in which to place the object anew, with landmarks there, or None for the aid.
     output : the run folder. first, last : frame numbers to track, both included; all by default.
     reference_frame : the frame that the landmarks belong to; the first one tracked by default.
     refine_reference : after tracking, refine the reference state over the whole sequence and track once more.
@@ -59,6 +63,8 @@ class TrackOptions:
     output: Path
     landmarks: Path | None = None
     placement: Path | None = None
+    aids: AidFiles = field(default_factory=AidFiles)
+    reregister_at: tuple[tuple[int, Path | None], ...] = ()
     map_path: Path | None = None
     pose: PoseFrom = "map"
     first: int | None = None
@@ -86,6 +92,7 @@ class TrackOptions:
             self.camera,
             self.landmarks,
             self.placement,
+            self.aids,
             self.map_path,
             self.pose,
             self.use_outline,
@@ -126,16 +133,18 @@ def track(options: TrackOptions) -> dict[str, Any]:
         AugmentedView(setup.model, setup.camera, options.drawing)  # says so now if it cannot be drawn
     source = open_frames(options)
     begin = find_begin(setup, options)
-    placement = setup.placed(begin.depth)
+    placement = setup.placed(begin.picture, begin.depth)
+    again = Reregistration(setup, placement, options.reregister_at)
     setup.warm_up(placement, begin.picture)
     run = RunResults(placement.model, begin.frame, per_sequence=setup.tracker_options(placement).per_sequence)
     try:
-        keyframes = _follow(source, setup, placement, begin, options.refine_reference, run)
+        keyframes = _follow(source, setup, placement, begin, options.refine_reference, run, again)
         if options.refine_reference and setup.landmarks is not None:
             placement = _refined(setup, placement, begin, keyframes, options)
             run = replace(run, refined=True, frames=[], timestamps=[], results=[])
             _follow(source, setup, placement, begin, False, run)
     finally:
+        placement = replace(placement, flags=(*placement.flags, *again.notes))
         summary = write_results(setup, placement, source, options, run) if len(run) else {}
     return summary
 
@@ -183,13 +192,22 @@ def _reference_frame(options: TrackOptions) -> Frame:
 
 
 def _follow(
-    source: FrameSource, setup: Setup, placement: Placement, begin: Begin, refines: bool, run: RunResults
+    source: FrameSource,
+    setup: Setup,
+    placement: Placement,
+    begin: Begin,
+    refines: bool,
+    run: RunResults,
+    again: Reregistration | None = None,
 ) -> list[Keyframe]:
     """Track all frames into ``run``; returns where the points were seen if the reference is to be refined."""
     chain = setup.new_chain(placement, begin.picture, begin.in_sequence)
     keyframes = []
     for frame in tqdm(source, total=len(source), desc="tracking", unit="frame"):
+        chain = chain if again is None else again.chain(frame, chain)
         result = chain.process(frame)
+        if again is not None:
+            again.take_in(result)
         run.add(frame.index, frame.timestamp, result)
         if refines and result.estimate is not None and chain.tracker.last_seen is not None:
             keyframes.append(chain.tracker.last_seen)
@@ -221,6 +239,11 @@ def _refined(
 
 
 def _check(options: TrackOptions) -> None:
+    if options.reregister_at and options.refine_reference:
+        raise TrackingError(
+            "a reference refined over the whole sequence cannot be changed in mid-sequence: leave out "
+            "--refine or --reregister-at"
+        )
     if options.placement is not None and (options.refine_reference or options.reference_frame is not None):
         raise TrackingError(
             "a registration in a map brings its own reference frame, refined already: leave out --refine and "
@@ -235,7 +258,8 @@ def write_results(
     """Write all files of the run folder; the video last, because it takes longest."""
     carried = setup.carried(run.model)
     named = {name: str(getattr(options, name)) for name in _INPUTS if getattr(options, name)}
-    named |= {} if setup.map_path is None else {"map": str(setup.map_path)}
+    aids = {name: str(path) for name, path in vars(options.aids).items() if path is not None}
+    named |= aids | {} if setup.map_path is None else {"map": str(setup.map_path)}
     tracker = setup.tracker_options(placement)
     extra = {
         "reference_refined_over_the_sequence": run.refined,

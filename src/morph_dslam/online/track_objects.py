@@ -10,6 +10,7 @@ from typing import Any
 from tqdm import tqdm
 
 from morph_dslam.errors import TrackingError
+from morph_dslam.online.aids.start import AidFiles
 from morph_dslam.online.placement import Placement
 from morph_dslam.online.results import RunResults
 from morph_dslam.online.run_writing import check_run_folder
@@ -94,6 +95,7 @@ def _for_other(options: TrackOptions, other: OtherObject) -> TrackOptions:
         options,
         model=other.model,
         landmarks=other.landmarks,
+        aids=AidFiles(),
         output=options.output / other.name,
         inner=(),
         per_sequence=(),
@@ -103,7 +105,7 @@ def _for_other(options: TrackOptions, other: OtherObject) -> TrackOptions:
 
 
 def _prepare(options: TrackOptions, setup: Setup, begin: Begin) -> _Object:
-    placement = setup.placed(begin.depth)
+    placement = setup.placed(begin.picture, begin.depth)
     setup.warm_up(placement, begin.picture)
     constant = setup.tracker_options(placement).per_sequence
     return _Object(options, setup, placement, RunResults(placement.model, begin.frame, per_sequence=constant))

@@ -18,6 +18,7 @@ from morph_dslam.io.calibration import load_camera
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.inner_structure import CarriedStructure, InnerStructure, load_inner_structure
+from morph_dslam.online.aids.start import Aid, AidFiles, place_by_aid
 from morph_dslam.online.anchor import Anchor
 from morph_dslam.online.attempt import Picture
 from morph_dslam.online.chain import Chain
@@ -42,7 +43,7 @@ class ObjectOptions:
     ----------
     model, camera : files.
     landmarks : file of landmarks in the reference frame; or placement : registration.json of
-        `morph register`.
+        `morph register`; or aids : another thing to place the object by there.
     map_path : map.h5 that the object was registered in; by default the one that the registration names, or
         the one beside it, if there is one.
     pose : "map": the object is anchored and the camera is found in the map, "fixed": and the map's pose is
@@ -59,6 +60,7 @@ class ObjectOptions:
     camera: Path
     landmarks: Path | None = None
     placement: Path | None = None
+    aids: AidFiles = field(default_factory=AidFiles)
     map_path: Path | None = None
     pose: PoseFrom = "map"
     use_outline: bool = False
@@ -80,6 +82,7 @@ class Setup:
     model : as it is in its file. placement : None as long as the frame that landmarks belong to is not there.
     map_path : of the map that the object is anchored in; None if it is free.
     reference : the keyframe of that map in which the object is, None where a frame has to be it.
+    aid : that places the object in the reference frame; None if something else does.
     """
 
     options: ObjectOptions
@@ -90,14 +93,22 @@ class Setup:
     placement: Placement | None
     map_path: Path | None
     reference: Picture | None
+    aid: Aid | None = None
 
-    def placed(self, depth: NDArray[np.float32] | None = None) -> Placement:
-        """The placement; raises RegistrationError as `place_by_landmarks` does.
+    def placed(
+        self, image: NDArray[np.uint8] | Picture, depth: NDArray[np.float32] | None = None
+    ) -> Placement:
+        """The placement; raises RegistrationError as `place_by_landmarks` and `Aid.place` do.
 
-        ``depth`` (h, w), metres, is that of the frame that the landmarks belong to, where there is any.
+        Parameters
+        ----------
+        image : (h, w, 3) the reference frame. depth : (h, w) there, metres, where there is any.
         """
         if self.placement is not None:
             return self.placement
+        if self.aid is not None:
+            assert not isinstance(image, Picture)
+            return place_by_aid(self.aid, self.model, self.camera, image)
         assert self.landmarks is not None
         registration, sensor = self.options.registration, self.options.tracker.depth
         return place_by_landmarks(self.model, self.camera, self.landmarks, registration, depth, sensor)
@@ -164,8 +175,12 @@ def load_setup(options: ObjectOptions) -> Setup:
         If one cannot be used (ModelFileError, CameraError, MapError, RegistrationError), or they do not fit
         together (TrackingError).
     """
-    if (options.landmarks is None) == (options.placement is None):
-        raise TrackingError("say where the object is: either landmarks, or a registration in a map")
+    aid = options.aids.load()
+    if sum(start is not None for start in (options.landmarks, options.placement, aid)) != 1:
+        raise TrackingError(
+            "say where the object is, in one way: by landmarks, a registration in a map, a board, a picture or "
+            "a guess"
+        )
     if options.placement is None and options.map_path is not None:
         raise TrackingError("a map needs the object's place in it: --place registration.json")
     model, camera = load_model(options.model), load_camera(options.camera)
@@ -177,9 +192,8 @@ def load_setup(options: ObjectOptions) -> Setup:
     for structure in inner:
         structure.carried_by(model)  # says so before the tracking if it is not for this model
     if options.placement is None:
-        assert options.landmarks is not None
-        landmarks = load_landmarks(options.landmarks)
-        return Setup(options, model, camera, landmarks, inner, None, None, None)
+        landmarks = None if options.landmarks is None else load_landmarks(options.landmarks)
+        return Setup(options, model, camera, landmarks, inner, None, None, None, aid)
     placement, path = load_placement(options.placement, model), None
     if options.pose != "free":
         path = _map_of(options.placement, options.map_path)

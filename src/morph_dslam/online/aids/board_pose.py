@@ -77,7 +77,13 @@ def locate_board(board: FiducialBoard, camera: PinholeCamera, grey: NDArray[np.u
         )
     variance = max(cost / freedom, LEAST_CORNER_PX**2)
     ambiguous = any(_turned(pose, other) > 0.05 and c < AMBIGUOUS * cost + 1.0 for other, c, _ in fits[1:])
-    return BoardPose(pose, variance * np.linalg.pinv(information), len(points), rms, ambiguous)
+    return BoardPose(
+        pose,
+        np.asarray(variance * np.linalg.pinv(information), dtype=np.float64),
+        len(points),
+        rms,
+        ambiguous,
+    )
 
 
 def _refined(
@@ -88,7 +94,7 @@ def _refined(
     for _ in range(10):
         residuals, jacobian = _linear(state.camera_from_object, points, pixels, camera)
         step, *_ = np.linalg.lstsq(jacobian, -residuals, rcond=None)
-        state = moved(state, step)
+        state = moved(state, np.asarray(step, dtype=np.float64))
     residuals, jacobian = _linear(state.camera_from_object, points, pixels, camera)
     return state.camera_from_object, float(residuals @ residuals), jacobian.T @ jacobian
 

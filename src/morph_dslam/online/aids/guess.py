@@ -219,4 +219,4 @@ def _steepest(
     inner = steps[2:-2]
     # Of two edges alike the nearer one is the object's.
     best = (fall * np.exp(-0.5 * (inner / max(reach, 1)) ** 2)).argmax(axis=1)
-    return inner[best], fall[np.arange(len(best)), best]
+    return inner[best], np.asarray(fall[np.arange(len(best)), best], dtype=np.float64)

@@ -113,7 +113,7 @@ def _begin(setup: Setup, stream: LiveStream, options: LiveOptions) -> _Begin:
         )
     for frame in stream:
         setup.camera.check_image(frame.image, f"frame {frame.index} of {options.source}")
-        return _Begin(frame.image, setup.placed(), frame.index)
+        return _Begin(frame.image, setup.placed(frame.image), frame.index)
     raise SourceError(f"{options.source} ended before the first frame")
 
 
