@@ -207,8 +207,8 @@ def add_tracking_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         action="append",
         default=[],
         metavar="N[=FILE]",
-        help="place the object anew in frame N, by landmarks there or by the board, picture or guess that the "
-        "run starts from; may be repeated",
+        help="place the object anew in frame N, by landmarks there or by the board, picture or guess that "
+        "the run starts from; may be repeated",
     )
     track.add_argument(
         "--refine",

@@ -113,15 +113,18 @@ def _ransac(
 ) -> tuple[RigidTransform | None, NDArray[np.bool_]]:
     """A pose (camera from object) with which most points (k, 3) are near their pixels, and which are."""
     agreeing = np.zeros(len(points), dtype=bool)
-    found, rotation, translation, rows = cv2.solvePnPRansac(
-        points,
-        pixels,
-        matrix,
-        None,  # type: ignore[arg-type]
-        iterationsCount=200,
-        reprojectionError=limit_px,
-        flags=cv2.SOLVEPNP_SQPNP,
-    )
+    try:
+        found, rotation, translation, rows = cv2.solvePnPRansac(
+            points,
+            pixels,
+            matrix,
+            None,  # type: ignore[arg-type]
+            iterationsCount=200,
+            reprojectionError=limit_px,
+            flags=cv2.SOLVEPNP_SQPNP,
+        )
+    except cv2.error:
+        return None, agreeing  # matches of nearly the same few points span no pose
     if not found or rows is None:
         return None, agreeing
     agreeing[np.asarray(rows, dtype=np.int64).ravel()] = True

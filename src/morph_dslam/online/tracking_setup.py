@@ -178,8 +178,8 @@ def load_setup(options: ObjectOptions) -> Setup:
     aid = options.aids.load()
     if sum(start is not None for start in (options.landmarks, options.placement, aid)) != 1:
         raise TrackingError(
-            "say where the object is, in one way: by landmarks, a registration in a map, a board, a picture or "
-            "a guess"
+            "say where the object is, in one way: by landmarks, a registration in a map, a board, a picture "
+            "or a guess"
         )
     if options.placement is None and options.map_path is not None:
         raise TrackingError("a map needs the object's place in it: --place registration.json")

@@ -1,0 +1,296 @@
+"""Boards, pictures of the print and guesses place objects where they are, or are refused."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from morph_dslam.cli import main
+from morph_dslam.errors import RegistrationError, TrackingError
+from morph_dslam.evaluation.run_folder import load_run
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.io.calibration import save_camera
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
+from morph_dslam.model import save_model
+from morph_dslam.online.aids.board import FiducialBoard, load_board
+from morph_dslam.online.aids.board_pose import BoardStart, locate_board
+from morph_dslam.online.aids.guess import GuessFile, GuessStart
+from morph_dslam.online.aids.picture import PictureStart, load_picture
+from morph_dslam.online.state import State
+from morph_dslam.online.track import TrackOptions, track
+from morph_dslam.render.rasteriser import rasterise
+from morph_dslam.render.texture import render_textured
+from tests.support.bent_sheet import LENGTH, WIDTH
+from tests.support.rendered_sequence import CAMERA
+from tests.support.staged_scenes import SCENES, aside
+
+GRID = """
+kind = "grid"
+dictionary = "apriltag_36h11"
+columns = 4
+rows = 3
+marker_mm = 30
+gap_mm = 9
+[object]
+position_mm = [20, -40, -15]
+rotation_deg = [10, 5, 30]
+"""
+CHARUCO = GRID.replace('"grid"', '"charuco"').replace("gap_mm = 9", "square_mm = 40").replace("36h11", "25h9")
+BOARD_POSE = RigidTransform(rotation_exp(np.array([0.35, -0.5, 0.2])), np.array([-0.06, -0.05, 0.55]))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return SCENES["sheet"](0)
+
+
+def written(folder, text):
+    path = folder / "board.toml"
+    path.write_text(text)
+    return path
+
+
+def picture_of(board: FiducialBoard, pose: RigidTransform, noise=2.0):
+    """A print (h, w) with a white margin of 2 cm in the camera, in front of grey."""
+    density, margin = 8000.0, 0.02
+    print_ = cv2.copyMakeBorder(
+        board.image(density), *[int(margin * density)] * 4, cv2.BORDER_CONSTANT, value=255
+    )
+    width, height = board.size
+    a, b = np.meshgrid(np.linspace(-margin, width + margin, 30), np.linspace(-margin, height + margin, 30))
+    nodes = np.column_stack([a.ravel(), b.ravel(), np.zeros(a.size)])
+    i = np.arange(900).reshape(30, 30)
+    p, q, r, s = (part.ravel() for part in (i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]))
+    triangles = np.concatenate([np.column_stack([p, q, r]), np.column_stack([p, r, s])])
+    local = pose.apply(nodes)
+    fine = 4
+    pixels = fine * (CAMERA.project(local) + 0.5) - 0.5
+    buffers = rasterise(pixels, local[:, 2], triangles, fine * CAMERA.height, fine * CAMERA.width)
+    coordinates = (nodes[:, :2] + margin) * density - 0.5
+    image = render_textured(buffers, triangles, coordinates, print_).astype(float)
+    image[~buffers.covered] = 120.0
+    image = cv2.resize(image, (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_AREA)
+    image += noise * np.random.default_rng(0).standard_normal(image.shape)
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def mean_distance(model, one, other):
+    """Of the nodes of two states in the camera frame, millimetres."""
+    a, b = (s.camera_from_object.apply(model.positions(s.parameters)) for s in (one, other))
+    return 1e3 * np.linalg.norm(a - b, axis=1).mean()
+
+
+@pytest.mark.parametrize("text", [GRID, CHARUCO], ids=["apriltag grid", "charuco"])
+def test_a_board_tells_its_pose_within_half_a_millimetre(tmp_path, text):
+    board = load_board(written(tmp_path, text))
+    found = locate_board(board, CAMERA, picture_of(board, BOARD_POSE))
+    assert found is not None
+    assert found.n_corners >= 6
+    assert found.rms_px < 0.3
+    assert not found.ambiguous
+    corners = np.array([[0, 0, 0], [*board.size, 0.0]])
+    off = found.camera_from_board.apply(corners) - BOARD_POSE.apply(corners)
+    assert 1e3 * np.linalg.norm(off, axis=1).max() < 1.0
+    away = found.camera_from_board.translation - BOARD_POSE.translation
+    assert (np.abs(away) < 5.0 * np.sqrt(np.diag(found.covariance)[3:])).all()
+
+
+def test_an_object_on_a_board_is_where_the_file_says(tmp_path, scene):
+    board = load_board(written(tmp_path, GRID))
+    placed = BoardStart(board).place(scene.model, CAMERA, picture_of(board, BOARD_POSE))
+    turn = Rotation.from_euler("xyz", [10, 5, 30], degrees=True).as_matrix()
+    truth = BOARD_POSE @ RigidTransform(turn, np.array([0.020, -0.040, -0.015]))
+    assert mean_distance(scene.model, placed.state, State(scene.model.default, truth)) < 1.0
+    assert "undeformed" in placed.flags[0]
+    off = placed.state.camera_from_object.translation - truth.translation
+    d = len(scene.model.parameters)
+    assert (np.abs(off) < 5.0 * np.sqrt(np.diag(placed.covariance)[d + 3 :])).all()
+
+
+def test_a_board_that_is_not_seen_or_of_other_sizes_is_refused(tmp_path, scene):
+    board = load_board(written(tmp_path, GRID))
+    blank = np.full((CAMERA.height, CAMERA.width), 120, dtype=np.uint8)
+    with pytest.raises(RegistrationError, match="the board is not seen in the reference frame"):
+        BoardStart(board).place(scene.model, CAMERA, blank)
+    narrow = load_board(written(tmp_path, GRID.replace("gap_mm = 9", "gap_mm = 20")))
+    with pytest.raises(RegistrationError, match="corners of the board do not lie as they should"):
+        locate_board(narrow, CAMERA, picture_of(board, BOARD_POSE))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (('"apriltag_36h11"', '"4x4_49"'), "dictionary must be one of"),
+        (("gap_mm = 9", ""), "a grid needs gap_mm"),
+        (("columns = 4", "columns = 0"), "columns: "),
+        (("columns = 4", "columns = 50\nmargin = 3"), "margin: "),
+    ],
+)
+def test_mistakes_in_a_board_file_are_named(tmp_path, change, message):
+    with pytest.raises(RegistrationError, match=message):
+        load_board(written(tmp_path, GRID.replace(*change)))
+
+
+@pytest.mark.parametrize("suffix", ["png", "pdf"])
+def test_a_board_is_printed_in_its_size(tmp_path, suffix, capsys):
+    target = tmp_path / f"board.{suffix}"
+    assert main(["board", str(written(tmp_path, GRID)), "-o", str(target)]) == 0
+    assert "147 x 108 mm" in capsys.readouterr().out
+    if suffix == "png":
+        image = cv2.imread(str(target), cv2.IMREAD_GRAYSCALE)
+        dots = 300 / 0.0254
+        assert image.shape[1] == pytest.approx((0.147 + 0.03) * dots, abs=2)
+        points, pixels = load_board(tmp_path / "board.toml").find(image)
+        assert len(points) == 4 * 12
+        # A metre of the board is as many dots in the file.
+        apart = np.linalg.norm(np.ptp(pixels, axis=0)) / np.linalg.norm(np.ptp(points, axis=0))
+        assert apart == pytest.approx(dots, rel=0.005)
+
+
+def print_on_sheet(scene):
+    corners = [[-LENGTH / 2, WIDTH / 2, 0], [LENGTH, 0, 0], [0, -WIDTH, 0]]
+    return PictureStart(scene.stage.texture, np.array(corners), None)
+
+
+def grey(scene, states):
+    return np.ascontiguousarray(scene.stage.frame(states)[:, :, 0])
+
+
+def test_a_picture_of_the_print_places_a_bent_sheet(scene):
+    truth = scene.state(0.3)
+    by_rectangle = print_on_sheet(scene).place(scene.model, CAMERA, grey(scene, [truth]))
+    assert mean_distance(scene.model, by_rectangle.state, truth) < 3.0
+    by_nodes = PictureStart(scene.stage.texture, None, scene.stage.coordinates)
+    placed = by_nodes.place(scene.model, CAMERA, grey(scene, [truth]))
+    assert mean_distance(scene.model, placed.state, truth) < 1.5
+    assert placed.facts["n_agreeing"] > 200
+    assert not any("ambiguous" in flag for flag in placed.flags)
+
+
+def test_a_second_sheet_with_the_print_is_told_and_another_print_is_refused(scene):
+    truth = scene.state(0.3)
+    two = grey(scene, [truth, aside(truth, [scene.beside, 0.02, 0.0])])
+    placed = print_on_sheet(scene).place(scene.model, CAMERA, two)
+    assert any("the print is in two places" in flag for flag in placed.flags)
+    other = SCENES["sheet"](7)
+    with pytest.raises(RegistrationError, match="print is not found in the reference frame"):
+        print_on_sheet(scene).place(scene.model, CAMERA, grey(other, [other.state(0.3)]))
+
+
+def test_a_picture_file_is_read_and_its_mistakes_named(tmp_path, scene):
+    cv2.imwrite(str(tmp_path / "print.png"), scene.stage.texture)
+    path = tmp_path / "picture.toml"
+    path.write_text(
+        'image = "print.png"\n[rectangle]\ncorner_mm = [-210, 148.5, 0]\nright_mm = [420, 0, 0]\n'
+        "down_mm = [0, -297, 0]\n"
+    )
+    read = load_picture(path)
+    np.testing.assert_allclose(read.rectangle, print_on_sheet(scene).rectangle)
+    np.testing.assert_array_equal(read.image, scene.stage.texture)
+    path.write_text('image = "print.png"\n')
+    with pytest.raises(RegistrationError, match="either rectangle, or coordinates"):
+        load_picture(path)
+
+
+def guess_near(scene, truth, shift, turn):
+    pose = truth.camera_from_object
+    angles = Rotation.from_matrix(rotation_exp(np.array(turn)) @ pose.rotation).as_euler("xyz", degrees=True)
+    position = 1e3 * (pose.translation + shift)
+    values = {p.name: p.display(v) for p, v in zip(scene.model.parameters, truth.parameters, strict=True)}
+    return GuessStart(
+        GuessFile.model_validate(
+            {"pose": {"position_mm": tuple(position), "rotation_deg": tuple(angles)}, "parameters": values}
+        )
+    )
+
+
+@pytest.mark.parametrize("name", ["sheet", "wedge in the hand"])
+def test_a_guess_is_refined_to_a_hundredth_of_the_distance(name):
+    scene = SCENES[name](0)
+    truth = scene.state(0.0)
+    guess = guess_near(scene, truth, np.array([6e-3, -5e-3, 8e-3]), [0.02, -0.03, 0.03])
+    placed = guess.place(scene.model, scene.stage.camera, grey(scene, [truth]))
+    off = mean_distance(scene.model, placed.state, truth)
+    assert off < mean_distance(scene.model, guess.state(scene.model), truth)
+    assert off < 25.0 * truth.camera_from_object.translation[2]
+    assert placed.facts["outline_on_edges"] > 0.8
+    assert placed.facts["by_chance"] < 0.15
+
+
+@pytest.mark.parametrize("name", ["sheet", "wedge in the hand"])
+def test_a_guess_that_the_image_contradicts_is_refused(name):
+    scene = SCENES[name](0)
+    truth = scene.state(0.0)
+    far = guess_near(scene, truth, np.array([0.08, 0.05, 0.0]), [0.1, 0.1, 0.3])
+    with pytest.raises(RegistrationError, match=r"the image contradicts the guess|out of the image"):
+        far.place(scene.model, scene.stage.camera, grey(scene, [truth]))
+    near = guess_near(scene, truth, np.zeros(3), [0.0, 0.0, 0.0])
+    with pytest.raises(RegistrationError, match="the image contradicts the guess"):
+        near.place(scene.model, scene.stage.camera, grey(scene, []))
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory, scene):
+    """Twelve frames of the sheet, which jumps to another place behind a covered camera at frame 6."""
+    folder = tmp_path_factory.mktemp("recording")
+    (folder / "frames").mkdir()
+    for number in range(12):
+        image = scene.stage.frame([state_of(scene, number)], cover=1.0 if number in (4, 5) else 0.0)
+        cv2.imwrite(str(folder / "frames" / f"{number:06d}.png"), image)
+    save_model(folder / "sheet.morph", scene.model)
+    save_camera(folder / "camera.yaml", CAMERA)
+    cv2.imwrite(str(folder / "print.png"), scene.stage.texture)
+    (folder / "picture.toml").write_text(
+        'image = "print.png"\n[rectangle]\ncorner_mm = [-210, 148.5, 0]\nright_mm = [420, 0, 0]\n'
+        "down_mm = [0, -297, 0]\n"
+    )
+    return folder
+
+
+def state_of(scene, number):
+    return scene.state(0.01 * number + (0.3 if number > 5 else 0.0))
+
+
+def options(recording, output, **changes):
+    files = {"frames": "frames", "model": "sheet.morph", "camera": "camera.yaml"}
+    return TrackOptions(
+        **{name: recording / path for name, path in files.items()}, output=output, overlay=False, **changes
+    )
+
+
+def test_a_run_starts_from_a_picture_and_is_placed_anew(recording, scene, tmp_path):
+    arguments = ["track", str(recording / "frames"), "--model", str(recording / "sheet.morph")]
+    arguments += ["--camera", str(recording / "camera.yaml"), "--picture", str(recording / "picture.toml")]
+    arguments += ["--reregister-at", "7", "--reregister-at", "5", "--no-video", "-o", str(tmp_path / "run")]
+    assert main(arguments) == 0
+    run = load_run(tmp_path / "run")
+    assert run.tracked.tolist() == [number not in (4, 5) for number in range(12)]
+    for position in (0, 3, 7, 11):
+        truth = state_of(scene, position)
+        expected = truth.camera_from_object.apply(scene.model.positions(truth.parameters))
+        assert 1e3 * np.linalg.norm(run.camera_points(position) - expected, axis=1).mean() < 4.0
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["registration"]["from"] == "picture"
+    assert "placed anew in frame 7" in summary["flags"]
+    assert any(flag.startswith("not placed anew in frame 5") for flag in summary["flags"])
+
+
+def test_landmarks_of_another_frame_place_the_object_anew(recording, scene, tmp_path):
+    nodes = np.random.default_rng(1).choice(len(scene.model.nodes), 16, replace=False)
+    files = []
+    for number in (0, 8):
+        state = state_of(scene, number)
+        seen = CAMERA.project(state.camera_from_object.apply(scene.model.positions(state.parameters)))[nodes]
+        files.append(tmp_path / f"landmarks_{number}.csv")
+        save_landmarks(files[-1], Landmarks(scene.model.nodes[nodes], seen))
+    summary = track(
+        options(recording, tmp_path / "run", landmarks=files[0], reregister_at=((8, files[1]),), last=9)
+    )
+    assert "placed anew in frame 8" in summary["flags"]
+    run, truth = load_run(tmp_path / "run"), state_of(scene, 9)
+    expected = truth.camera_from_object.apply(scene.model.positions(truth.parameters))
+    assert 1e3 * np.linalg.norm(run.camera_points(9) - expected, axis=1).mean() < 0.5
+    with pytest.raises(TrackingError, match="give landmarks of that frame"):
+        track(options(recording, tmp_path / "other", landmarks=files[0], reregister_at=((8, None),)))
