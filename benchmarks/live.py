@@ -137,7 +137,8 @@ def run(arguments: argparse.Namespace) -> None:
             map_path=folder / "scan" / "map.h5",
         )
     )
-    placement, reference = setup.placed(), setup.reference
+    placement, reference = setup.placement, setup.reference
+    assert placement is not None
     assert reference is not None
     images = [frame.image for frame in open_source(folder / "recording" / "frames", placement.frame)]
     setup.warm_up(placement, reference)

@@ -39,8 +39,7 @@ def of_object(folder, **others):
 
 def new_chain(folder, **others):
     setup = load_setup(of_object(folder, **others))
-    placement = setup.placed()
-    return setup, setup.new_chain(placement, setup.reference, in_sequence=False)
+    return setup, setup.new_chain(setup.placement, setup.reference, in_sequence=False)
 
 
 def frames_of(folder, first, last):
