@@ -45,6 +45,8 @@ from morph_dslam.sources import open_source
 Image = NDArray[np.uint8]
 
 FPS = 30
+#: Of the round trip, in which drift then grows until there is a loop to close.
+SMALL_CAMERA = PinholeCamera(480, 360, 380.0, 380.0, 239.5, 179.5)
 #: Frames of the rendered film, and between two looks at the memory.
 FILM_FRAMES, LOOK_EVERY = 400, 50
 SCHEDULE = Path("/proc/thread-self/schedstat")
@@ -112,9 +114,10 @@ def _figures(times: list[float]) -> str:
 def waits() -> str:
     """What frames wait for the mapper, at the pace of a camera, in a round trip that closes a loop."""
     share_interpreter()
-    film, places = RoomFilm(seed=4, scene=closed_room, prints=4), round_trip(220)
+    film = RoomFilm(seed=4, scene=closed_room, camera=SMALL_CAMERA, prints=4)
+    places = round_trip(200)
     images = [film.frame(place) for place in tqdm(places, desc="rendering", unit="frame")]
-    slam, frames, queued, start = Slam(CAMERA, threaded=True), [], [], time.perf_counter()
+    slam, frames, queued, start = Slam(SMALL_CAMERA, threaded=True), [], [], time.perf_counter()
     for index, image in enumerate(tqdm(images, desc="round trip", unit="frame")):
         while time.perf_counter() - start < index / FPS:
             time.sleep(0.001)
