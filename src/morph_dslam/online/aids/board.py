@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.toml_file import read_toml
+from morph_dslam.online.aids.marker_edges import refined_corners
 
 Array = NDArray[np.float64]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -115,14 +116,16 @@ class FiducialBoard:
     def find(self, grey: NDArray[np.uint8]) -> tuple[Array, Array]:
         """Corners of the board (k, 3), board frame, metres, and their pixels (k, 2) in an image (h, w)."""
         aruco, board = cv2.aruco, self._board  # type: ignore[attr-defined]
-        parameters = aruco.DetectorParameters()
         if self.description.kind == "charuco":
             corners, ids, _, _ = aruco.CharucoDetector(board).detectBoard(grey)
         else:
-            parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
-            corners, ids, _ = aruco.ArucoDetector(board.getDictionary(), parameters).detectMarkers(grey)
+            detector = aruco.ArucoDetector(board.getDictionary(), aruco.DetectorParameters())
+            corners, ids, _ = detector.detectMarkers(grey)
         if ids is None or not len(ids):
             return np.empty((0, 3)), np.empty((0, 2))
+        if self.description.kind == "grid":
+            found = np.array(corners, dtype=np.float64).reshape(-1, 4, 2)
+            corners = [marker[None].astype(np.float32) for marker in refined_corners(grey, found)]
         points, pixels = board.matchImagePoints(corners, ids)
         if points is None or not len(points):
             return np.empty((0, 3)), np.empty((0, 2))
