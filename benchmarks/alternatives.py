@@ -1,6 +1,6 @@
 """The tracker beside plain alternatives on the same rendered recordings, in the same run.
 
-    python benchmarks/alternatives.py [--frames 150]
+    python benchmarks/alternatives.py [--frames 150] [--only "demo sheet"]
 
 Each recording is tracked frame by frame with the tracker as it is, and with one thing replaced at a time:
 
@@ -223,10 +223,12 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--frames", type=int, default=150, help="of each recording (%(default)s)")
+    parser.add_argument("--only", choices=[r.name for r in RECORDINGS], help="one of the recordings")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     for recording in RECORDINGS:
-        compare(recording, arguments.frames)
+        if arguments.only in (None, recording.name):
+            compare(recording, arguments.frames)
 
 
 if __name__ == "__main__":
