@@ -99,9 +99,10 @@ class FrameEstimation:
         if outline is None:
             return attempt
         estimate, count, seen = attempt.estimate, len(self._reference.points), None
-        for reach in (options.reach_px, options.reach_px // 2):
+        # After the first search the state only says where to look the second time: it need not be exact.
+        for reach, estimator in ((options.reach_px, self._scout), (options.reach_px // 2, self._estimator)):
             seen = outline.measure(picture.grey, estimate.state, reach)
-            estimate = self._estimator.estimate(
+            estimate = estimator.estimate(
                 self._reference.all_points,
                 np.concatenate([attempt.measurement.pixels, seen.pixels]),
                 np.concatenate([attempt.inliers, options.weight * seen.valid]).astype(float),
