@@ -75,7 +75,12 @@ class Mapper:
         return self._choice.wants(tracked, frame_index)
 
     def insert(self, tracked: Tracked, view: FrameView) -> Work:
-        """Keep a view."""
+        """Keep a view.
+
+        Points that have left the rigid scene are taken out: when an object comes back to where it was, its
+        points must not hold the camera.
+        """
+        self._map.remove(tracked.moved)
         number = self._map.add_keyframe(_keyframe(view, tracked.pose.camera_from_world, tracked.points))
         self._points.place_by_depth(number, view.depth)
         self._points.triangulate(number)

@@ -96,7 +96,7 @@ class PointMaker:
         most = min(max(MISS_RATIO * self._map.usual_rms_px, LEAST_MISS_PX), MOST_MISS_PX)
         good = check_points(points, [start, now], seen, self._intrinsics, most)
         chosen = ids[open_enough]
-        poses = np.array([k.camera_from_world for k in self._map.keyframes])
+        poses = np.array([self._map.pose_of(k) for k in range(len(self._map.keyframes))])
         good &= self._map.passing.agree(chosen, points, poses, self._intrinsics, most)
         self._map.positions[chosen[good]] = points[good]
         self._map.state[chosen[good]] = GOOD

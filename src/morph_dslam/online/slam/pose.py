@@ -161,8 +161,8 @@ def refine_pose(
         )
         pose = orthonormal(pose)
         errors = reprojection_errors(pose, points, pixels, intrinsics)
-        used = errors < _core_px(errors, inlier_px)
-    used = errors < inlier_px
+        used = np.asarray(errors < _core_px(errors, inlier_px))
+    used = np.asarray(errors < inlier_px)
     if not used.any():
         return PoseEstimate(pose, np.full((6, 6), np.inf), used, float("inf"))
     rms = float(np.sqrt(np.mean(errors[used] ** 2)))

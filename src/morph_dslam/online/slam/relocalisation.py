@@ -2,7 +2,7 @@
 
 Keyframes are ranked by `place_recognition`. The points of the likeliest one and of those that share most
 points with it are matched with the image's corners; P3P in RANSAC gives a rough pose, which is believed only
-if the points are found where it has them.
+if the points are found where it has them. Before that the place is tried at which the camera was lost.
 """
 
 from __future__ import annotations
@@ -75,6 +75,9 @@ class Relocaliser:
 
     def find(self, view: FrameView, tracker: Tracker) -> tuple[PoseEstimate, Followed] | str:
         """The pose and the points that support it, or why there is none."""
+        found = self._where_it_was(view, tracker)
+        if found is not None:
+            return found
         corners = _described_corners(view)
         if len(corners.rows) < self._options.least_inliers:
             return f"too little texture: {len(corners.pixels)} corners"
@@ -84,6 +87,13 @@ class Relocaliser:
             if found is not None:
                 return found
         return "the view resembles no keyframe"
+
+    def _where_it_was(self, view: FrameView, tracker: Tracker) -> tuple[PoseEstimate, Followed] | None:
+        """The pose if the camera is still near where it was lost: of places that look alike the likeliest."""
+        if not len(tracker.points.ids):
+            return None
+        number = int(np.bincount(self._map.template_keyframe[tracker.points.ids]).argmax())
+        return self._confirmed(self.group(number), view.flat, tracker.camera_from_world, tracker)
 
     def locate(
         self, view: FrameView, group: Indices, tracker: Tracker
@@ -95,7 +105,7 @@ class Relocaliser:
         self, view: FrameView, corners: _Corners, group: Indices, tracker: Tracker
     ) -> tuple[PoseEstimate, Followed] | None:
         rough = self._rough_pose(group, corners)
-        return None if rough is None else self._confirmed(group, view.flat, rough, tracker)
+        return None if rough is None else self._confirmed(group, view.flat, rough.camera_from_world, tracker)
 
     def _candidates(self, descriptors: Descriptors) -> list[int]:
         order = np.argsort(-self.places.similarities(descriptors), kind="stable").tolist()
@@ -124,10 +134,9 @@ class Relocaliser:
         return find_pose(positions, corners.pixels[first], self._intrinsics, ROUGH_PX, least=ROUGH_INLIERS)
 
     def _confirmed(
-        self, group: Indices, flat: Image, rough: PoseEstimate, tracker: Tracker
+        self, group: Indices, flat: Image, pose: Array, tracker: Tracker
     ) -> tuple[PoseEstimate, Followed] | None:
-        """The pose from all points of the group, found where the rough pose has them; None if too few."""
-        pose = rough.camera_from_world
+        """The pose from all points of the group, found near a rough pose (4, 4); None if too few are."""
         ids = np.unique(np.concatenate([self._map.keyframes[k].point_ids for k in group]))
         ids = ids[self._map.state[ids] == GOOD]
         guesses, depths = project(pose, self._map.positions[ids], self._intrinsics)

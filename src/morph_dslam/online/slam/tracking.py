@@ -8,17 +8,26 @@ the pose, but are followed on.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.online.flow import FlowOptions, follow, patch_correlation
+from morph_dslam.online.slam.consensus import Sight
 from morph_dslam.online.slam.depth import FrameDepth
 from morph_dslam.online.slam.options import SlamOptions
-from morph_dslam.online.slam.pose import LEAST_DEPTH, PoseEstimate, refine_pose, reprojection_errors
+from morph_dslam.online.slam.pose import LEAST_DEPTH, PoseEstimate, reprojection_errors
 from morph_dslam.online.slam.projection import inside, inverse, project
-from morph_dslam.online.slam.rigid_map import CANDIDATE, GOOD, NOWHERE, Followed, Indices, RigidMap
+from morph_dslam.online.slam.rigid_map import (
+    CANDIDATE,
+    FIRST_RMS_PX,
+    GOOD,
+    NOWHERE,
+    Followed,
+    Indices,
+    RigidMap,
+)
 from morph_dslam.online.slam.template_choice import FewTemplates
 from morph_dslam.online.slam.two_view import camera_centre
 from morph_dslam.online.slam.view_warp import WarpedViews, warp_pixels
@@ -32,13 +41,9 @@ MOST_VIEW_ANGLE_DEG = 35.0
 MOST_SCALE_CHANGE = 1.6
 #: A point not found in this share of the frames in which it was looked for is looked for after all others.
 DOUBTFUL_SHARE = 0.25
-#: Errors beyond these multiples of the usual one count linearly, and not at all; within bounds, in pixels.
-#: With wider ones a near object that moves draws the pose along: a turn and a move of the camera nearly
-#: explain it.
-HUBER_RATIO, MOST_HUBER_PX = 1.5, 1.5
-INLIER_RATIO, LEAST_INLIER_PX = 4.0, 1.5
-#: For the same reason points do not count at first that miss the prediction by this multiple of the median.
-TRUSTED_RATIO = 3.0
+#: Points that disagree have moved if they did so in the frame before, too, or if all at once they are more
+#: than this share of the points that agree.
+MOST_LEAVING = 0.1
 #: Weight of the newest frame in the usual error.
 USUAL_RATE = 0.1
 
@@ -51,7 +56,7 @@ class Tracked:
     ----------
     pose : from the map points; its ``inliers`` belong to the rows of ``points`` that are map points.
     points : inliers and candidates. disagreeing : points that look like their map point but are not where a
-        rigid scene would have them.
+        rigid scene would have them. moved : (m,) those that surely have moved.
     image_motion_px : how far the points moved since the previous frame, median.
     """
 
@@ -59,6 +64,7 @@ class Tracked:
     points: Followed
     n_inliers: int
     disagreeing: Followed
+    moved: Indices = field(default_factory=lambda: NOWHERE.ids)
     image_motion_px: float = 0.0
 
 
@@ -120,7 +126,8 @@ class Tracker:
                 self._motion = result.pose.camera_from_world @ inverse(self.camera_from_world)
                 self.camera_from_world = result.pose.camera_from_world
                 self.points, self._astray = result.points, result.disagreeing
-                self._map.usual_rms_px += USUAL_RATE * (result.pose.rms_px - self._map.usual_rms_px)
+                rate = 1.0 if self._map.usual_rms_px == FIRST_RMS_PX else USUAL_RATE
+                self._map.usual_rms_px += rate * (result.pose.rms_px - self._map.usual_rms_px)
                 self._note_candidates(result.points)
                 return result
             reason = reason or result
@@ -197,16 +204,16 @@ class Tracker:
         """Pose from what was followed, then with the lost points that are found again."""
         was_astray = np.isin(found.ids, self._astray.ids)
         followed_astray, found = found[was_astray], self.measured(found[~was_astray], predicted, depth)
-        pose, reason = self._pose(predicted, found)
-        if pose is None:
-            return reason
+        pose = self._pose(predicted, found)
+        if isinstance(pose, str):
+            return pose
         astray = self._still_astray(pose.camera_from_world, followed_astray)
         searched = self._search(flat, pose.camera_from_world, np.concatenate([found.ids, astray.ids]))
         if len(searched.ids):
             found = found.joined(self.measured(searched, pose.camera_from_world, depth))
-            pose, reason = self._pose(pose.camera_from_world, found)
-            if pose is None:
-                return reason
+            pose = self._pose(pose.camera_from_world, found)
+            if isinstance(pose, str):
+                return pose
         return self._tracked(flat, pose, found, astray)
 
     def _tracked(self, flat: Image, pose: PoseEstimate, found: Followed, astray: Followed) -> Tracked:
@@ -221,34 +228,23 @@ class Tracker:
         keep &= inside(found.pixels, flat.shape, self._options.patch_half + 2)
         before, _ = project(self.camera_from_world, self._map.positions[found.ids[fits]], self._intrinsics)
         moved = np.linalg.norm(found.pixels[fits] - np.nan_to_num(before), axis=1)
-        disagreeing = found[known & ~fits].joined(astray)
+        leaving = found[known & ~fits]
+        left = astray.ids
+        if len(leaving.ids) > MOST_LEAVING * fits.sum():
+            left = np.concatenate([left, leaving.ids])
+        disagreeing = leaving.joined(astray)
         return Tracked(
-            pose, found[keep], int(fits.sum()), disagreeing, float(np.median(moved)) if len(moved) else 0.0
+            pose,
+            found[keep],
+            int(fits.sum()),
+            disagreeing,
+            left,
+            float(np.median(moved)) if len(moved) else 0.0,
         )
 
-    def _pose(self, start: Array, found: Followed) -> tuple[PoseEstimate | None, str]:
-        options = self._options
+    def _pose(self, start: Array, found: Followed) -> PoseEstimate | str:
         known = found[self._map.state[found.ids] == GOOD]
-        if len(known.ids) < options.least_inliers:
-            return None, f"only {len(known.ids)} map points were found in this frame"
-        usual, positions = self._map.usual_rms_px, self._map.positions[known.ids]
-        errors = reprojection_errors(start, positions, known.pixels, self._intrinsics)
-        inlier_px = min(max(INLIER_RATIO * usual, LEAST_INLIER_PX), options.inlier_px)
-        pose = refine_pose(
-            start,
-            positions,
-            known.pixels,
-            self._intrinsics,
-            huber_px=min(HUBER_RATIO * usual, MOST_HUBER_PX),
-            inlier_px=inlier_px,
-            trusted=errors < max(TRUSTED_RATIO * float(np.median(errors)), inlier_px),
-            right=known.right,
-            baseline_px=self._map.baseline_px,
-        )
-        n = int(pose.inliers.sum())
-        if n < max(options.least_inliers, 0.3 * len(known.ids)):
-            return None, f"only {n} of {len(known.ids)} map points agree on a pose"
-        return pose, ""
+        return Sight(self._map, known, self._intrinsics, self._options).pose(start)
 
     def _search(self, flat: Image, pose: Array, followed: Indices) -> Followed:
         """Map points that are not followed but in view, found where the pose says."""
