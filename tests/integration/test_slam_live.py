@@ -160,5 +160,6 @@ def test_a_webcam_is_tracked_until_it_ends(tmp_path, room_film, monkeypatch, cap
     summary = json.loads((run / "summary.json").read_text())
     assert summary["n_frames"] == (40 if ends == "by itself" else 30)
     assert summary["n_dropped"] == 0
+    assert summary["longest_wait_for_mapper_ms"] >= summary["p99_wait_for_mapper_ms"] > 0.0
     assert len(load_trajectory(run / "trajectory.txt")) == summary["n_tracked"] > 5
     assert (run / "map.h5").exists()
