@@ -391,3 +391,15 @@ def test_weak_prior_of_the_pose_is_weighed_against_the_images(model, points):
     moved_by = found.camera_from_object.translation - POSE.translation
     assert 1e-5 < moved_by[2] < 1.9e-4
     assert moved_by[2] == pytest.approx(expected[8], rel=0.02)
+
+
+def test_joined_priors_are_their_weighted_mean_in_any_units():
+    """A modulus in pascals beside a height in metres; the third parameter is known to neither."""
+    first = Prior(np.array([5e4, 0.02, 7.0]), np.diag([1e-10, 1e11, 0.0]))
+    second = Prior(np.array([7e4, 0.0, 0.0]), np.diag([3e-10, 0.0, 0.0]), POSE, np.eye(6))
+    both = first.joined(second)
+    np.testing.assert_allclose(both.mean, [6.5e4, 0.02, 0.0])
+    assert both.pose is POSE
+    state = State(np.array([6e4, 0.021, 3.0]), POSE)
+    apart = [first.terms(state)[2] + second.terms(state)[2], both.terms(state)[2]]
+    np.testing.assert_allclose(apart[0], apart[1], rtol=1e-9)

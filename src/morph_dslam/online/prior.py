@@ -71,8 +71,12 @@ class Prior:
         """Both together; ``other`` says what is known of the pose."""
         information = self.information + other.information
         pushed = self.information @ self.mean + other.information @ other.mean
+        # Parameters of different units differ by many powers of ten, so they are scaled before the inverse.
         # Directions of which neither knows anything keep a mean of zero, with no weight.
-        return replace(other, mean=np.linalg.pinv(information) @ pushed, information=information)
+        diagonal = np.diag(information)
+        scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+        inverse = np.linalg.pinv(information * np.outer(scale, scale))
+        return replace(other, mean=scale * (inverse @ (scale * pushed)), information=information)
 
 
 @njit(cache=True, nogil=True)
