@@ -8,8 +8,16 @@ from pathlib import Path
 
 
 def _register(arguments: argparse.Namespace) -> None:
+    from morph_dslam.online.aids.board_in_map import register_by_board
     from morph_dslam.online.mesh_registration.run import registration_line, remarks, run_registration
 
+    if arguments.board is not None:
+        content = register_by_board(
+            arguments.map, arguments.model, arguments.camera, arguments.board, arguments.output
+        )
+        print(f"wrote {arguments.output / 'registration.json'}")
+        print(registration_line(content))
+        return
     content = run_registration(arguments.map, arguments.model, arguments.camera, arguments.output)
     for remark in remarks(content):
         print(f"note: {remark}")
@@ -41,6 +49,12 @@ def add_registration_commands(add: Callable[..., argparse.ArgumentParser]) -> No
     register.add_argument("--camera", type=Path, required=True, help="camera file of the map")
     register.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FOLDER", help="folder to write"
+    )
+    register.add_argument(
+        "--board",
+        type=Path,
+        metavar="TOML",
+        help="place the object, and find the map's unit, by a board that stands in the scene",
     )
     board = add("board", _board, "nothing was written", "print a board of markers that places an object")
     board.add_argument("board", type=Path, help="board file (docs/registration-aids.md)")

@@ -18,10 +18,15 @@ from morph_dslam.online.aids.board import FiducialBoard, load_board
 from morph_dslam.online.aids.board_pose import BoardStart, locate_board
 from morph_dslam.online.aids.guess import GuessFile, GuessStart
 from morph_dslam.online.aids.picture import PictureStart, load_picture
+from morph_dslam.online.flow import flatten
+from morph_dslam.online.placement import load_placement
+from morph_dslam.online.slam.map_file import save_map
+from morph_dslam.online.slam.rigid_map import GOOD, Keyframe, RigidMap
 from morph_dslam.online.state import State
 from morph_dslam.online.track import TrackOptions, track
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
+from morph_dslam.similarity import SimilarityTransform
 from tests.support.bent_sheet import LENGTH, WIDTH
 from tests.support.rendered_sequence import CAMERA
 from tests.support.staged_scenes import SCENES, aside
@@ -147,6 +152,34 @@ def test_a_board_is_printed_in_its_size(tmp_path, suffix, capsys):
         # A metre of the board is as many dots in the file.
         apart = np.linalg.norm(np.ptp(pixels, axis=0)) / np.linalg.norm(np.ptp(points, axis=0))
         assert apart == pytest.approx(dots, rel=0.005)
+
+
+def test_a_board_in_a_map_tells_the_unit_and_the_place(tmp_path, scene):
+    board = load_board(written(tmp_path, GRID))
+    world = SimilarityTransform(3.7, rotation_exp(np.array([0.4, -0.9, 1.3])), np.array([0.5, -1.2, 2.0]))
+    rigid_map = RigidMap()
+    rigid_map.add_points(np.zeros((1, 3)), np.zeros((1, 2)), 0, GOOD)
+    for k, angle in enumerate((-0.3, 0.0, 0.3)):
+        pose = RigidTransform(
+            rotation_exp(np.array([0.2, angle, 0.1])) @ BOARD_POSE.rotation, BOARD_POSE.translation
+        )
+        rotation = pose.rotation @ world.rotation.T
+        view = np.eye(4)
+        view[:3, :3], view[:3, 3] = rotation, 3.7 * pose.translation - rotation @ world.translation
+        flat = flatten(picture_of(board, pose), 31)
+        rigid_map.add_keyframe(Keyframe(k, 0.1 * k, flat, view, np.arange(1), np.zeros((1, 2))))
+    save_map(tmp_path / "map.h5", rigid_map, CAMERA)
+    save_camera(tmp_path / "camera.yaml", CAMERA)
+    save_model(tmp_path / "sheet.morph", scene.model)
+    files = [str(tmp_path / name) for name in ("map.h5", "sheet.morph", "camera.yaml", "board.toml", "place")]
+    arguments = ["register", files[0], "--model", files[1], "--camera", files[2], "--board", files[3]]
+    assert main([*arguments, "-o", files[4]]) == 0
+    placed = load_placement(tmp_path / "place" / "registration.json", scene.model)
+    assert placed.facts["map_units_per_metre"] == pytest.approx(3.7, rel=2e-3)
+    turn = Rotation.from_euler("xyz", [10, 5, 30], degrees=True).as_matrix()
+    truth = pose @ RigidTransform(turn, np.array([0.020, -0.040, -0.015]))
+    assert mean_distance(scene.model, placed.state, State(scene.model.default, truth)) < 1.5
+    assert placed.covariance is not None
 
 
 def print_on_sheet(scene):
