@@ -142,8 +142,8 @@ def register_by_board(
     found = find_board_in_map(board, views, camera)
     if rigid_map.is_metric and abs(found.world_from_board.scale - 1.0) > METRIC_SHARE:
         raise RegistrationError(
-            f"the map is metric, but a metre of the board is {found.world_from_board.scale:.3g} m in it: measure "
-            "the print, and mend the board file or the depth camera's calibration"
+            f"the map is metric, but a metre of the board is {found.world_from_board.scale:.3g} m in it: "
+            "measure the print, and mend the board file or the depth camera's calibration"
         )
     placed = found.world_from_board @ SimilarityTransform(1.0, on_board.rotation, on_board.translation)
     nodes = model.positions(model.default)
