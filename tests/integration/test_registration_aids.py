@@ -13,16 +13,18 @@ from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.calibration import save_camera
 from morph_dslam.io.landmarks import Landmarks, save_landmarks
-from morph_dslam.model import save_model
+from morph_dslam.model import SurfacePoints, save_model
 from morph_dslam.online.aids.board import FiducialBoard, load_board
 from morph_dslam.online.aids.board_pose import BoardStart, locate_board
 from morph_dslam.online.aids.guess import GuessFile, GuessStart
 from morph_dslam.online.aids.picture import PictureStart, load_picture
+from morph_dslam.online.estimation import Estimator
 from morph_dslam.online.flow import flatten
 from morph_dslam.online.placement import load_placement
+from morph_dslam.online.relocalisation import RelocalisationOptions, state_from_matches
 from morph_dslam.online.slam.map_file import save_map
 from morph_dslam.online.slam.rigid_map import GOOD, Keyframe, RigidMap
-from morph_dslam.online.state import State
+from morph_dslam.online.state import BoundPoints, State
 from morph_dslam.online.track import TrackOptions, track
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
@@ -327,3 +329,17 @@ def test_landmarks_of_another_frame_place_the_object_anew(recording, scene, tmp_
     assert 1e3 * np.linalg.norm(run.camera_points(9) - expected, axis=1).mean() < 0.5
     with pytest.raises(TrackingError, match="give landmarks of that frame"):
         track(options(recording, tmp_path / "other", landmarks=files[0], reregister_at=((8, None),)))
+
+
+def test_matches_of_one_spot_span_no_pose(scene):
+    """A texture that repeats makes many matches of the same few points; they must not stop a run."""
+    points = BoundPoints.from_surface(
+        scene.model, SurfacePoints(np.full(20, 5), np.tile([0.2, 0.3, 0.5], (20, 1)))
+    )
+    pixels = np.random.default_rng(0).uniform(100.0, 300.0, (20, 2))
+    options = RelocalisationOptions()
+    state, agreeing = state_from_matches(
+        Estimator(scene.model, CAMERA), points, pixels, [scene.model.default], options
+    )
+    assert state is None
+    assert agreeing.sum() < options.least_matches

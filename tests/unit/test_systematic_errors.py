@@ -1,0 +1,109 @@
+"""Errors of the reference and of the model in the covariance: against what they do to estimates."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morph_dslam.online.binding import bind_pixels, view_of
+from morph_dslam.online.confidence import position_std
+from morph_dslam.online.estimation import BoundPoints, EstimationOptions, Estimator
+from morph_dslam.online.state import moved
+from morph_dslam.online.systematic_errors import SystematicErrors
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.rendered_sequence import CAMERA, sheet_state
+
+REFERENCE, LATER = sheet_state(0.1), sheet_state(0.6)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return bent_sheet_model(43, 31)
+
+
+@pytest.fixture(scope="module")
+def estimator(model):
+    return Estimator(model, CAMERA, EstimationOptions(huber_px=50.0))
+
+
+@pytest.fixture(scope="module")
+def pixels(model):
+    """Places of 200 corners in the reference view, on the sheet with a margin."""
+    nodes = np.random.default_rng(0).choice(len(model.nodes), 200, replace=False)
+    inside = np.abs(model.nodes[nodes]) < [0.19, 0.13, 1.0]
+    seen = REFERENCE.camera_from_object.apply(model.positions(REFERENCE.parameters))[nodes]
+    return CAMERA.project(seen[inside.all(axis=1)])
+
+
+def bound(model, state, pixels):
+    surface, met = bind_pixels(model, CAMERA, view_of(model, CAMERA, state), pixels)
+    assert met.all()
+    return BoundPoints.from_surface(model, surface)
+
+
+def test_an_error_of_the_reference_moves_later_estimates_as_predicted(model, estimator, pixels):
+    """Points are bound in a wrong reference state, and a later frame is estimated from exact measurements."""
+    true_points = bound(model, REFERENCE, pixels)
+    seen = CAMERA.project(true_points.in_camera(LATER))
+    scale = np.array([2e-4, 2e-3, 5e-4, 3e-4, 3e-4, 3e-4, 2e-4, 2e-4, 5e-4])
+    weights = np.ones(len(pixels))
+    for k in range(9):
+        step = np.zeros(9)
+        step[k] = scale[k]
+        off = moved(REFERENCE, step)
+        points = bound(model, off, pixels)
+        found = estimator.estimate(points, seen, weights, LATER)
+        covariance = np.outer(step, step)
+        errors = SystematicErrors(estimator, points, off, covariance, 17)
+        used = np.ones(len(pixels), dtype=bool)
+        plain = replace(found, covariance=np.zeros((9, 9)))
+        left = replace(errors.unexplained(plain, used), px=0.0)
+        stated = errors.added(plain, used, left)
+        truth = LATER.camera_from_object.apply(model.positions(LATER.parameters))
+        now = found.state.camera_from_object.apply(model.positions(found.state.parameters))
+        off_by = np.sqrt(np.mean(np.sum((now - truth) ** 2, axis=1)))
+        predicted = np.sqrt(np.mean(position_std(model, stated) ** 2))
+        assert predicted == pytest.approx(off_by, rel=0.1), k
+
+
+def test_in_the_reference_view_itself_the_error_is_that_of_the_reference(model, estimator, pixels):
+    points = bound(model, REFERENCE, pixels)
+    root = np.random.default_rng(1).standard_normal((9, 9)) * estimator.scale[:, None] * 1e-3
+    errors = SystematicErrors(estimator, points, REFERENCE, root @ root.T, 17)
+    found = estimator.estimate(points, pixels, np.ones(len(pixels)), REFERENCE)
+    used = np.ones(len(pixels), dtype=bool)
+    plain = replace(found, covariance=np.zeros((9, 9)))
+    stated = errors.added(plain, used, errors.unexplained(plain, used))
+    np.testing.assert_allclose(stated.covariance, root @ root.T, rtol=1e-3, atol=1e-9)
+
+
+def test_what_neighbours_have_in_common_is_not_noise(model, estimator, pixels):
+    points = bound(model, REFERENCE, pixels)
+    errors = SystematicErrors(estimator, points, REFERENCE, None, 17)
+    found = estimator.estimate(points, pixels, np.ones(len(pixels)), REFERENCE)
+    used = np.ones(len(pixels), dtype=bool)
+    noise = np.random.default_rng(2).standard_normal(pixels.shape)
+    by_noise = errors.unexplained(replace(found, residuals=noise), used)
+    assert by_noise.total_px == pytest.approx(1.0, abs=0.1)
+    assert by_noise.px < 0.3
+    assert not by_noise.is_failure
+    wave = np.column_stack([np.sin(pixels[:, 0] / 60.0), np.cos(pixels[:, 1] / 60.0)]) * np.sqrt(2.0)
+    by_model = errors.unexplained(replace(found, residuals=wave + 0.1 * noise), used)
+    assert by_model.px == pytest.approx(1.0, abs=0.25)
+    assert by_model.is_failure
+
+
+def test_a_failure_of_the_model_widens_the_deviations(model, estimator, pixels):
+    points = bound(model, REFERENCE, pixels)
+    errors = SystematicErrors(estimator, points, REFERENCE, None, 17)
+    found = estimator.estimate(points, pixels, np.ones(len(pixels)), REFERENCE)
+    used = np.ones(len(pixels), dtype=bool)
+    left = errors.unexplained(found, used)
+    narrow, wide = (errors.added(found, used, replace(left, px=px)) for px in (0.0, 1.0))
+    np.testing.assert_allclose(narrow.covariance, found.covariance)
+    # Errors that are alike over many points average out less than independent ones of the same size.
+    independent = np.linalg.inv(estimator.evaluate(points, pixels, np.ones(len(pixels)), REFERENCE)[1])
+    assert (
+        position_std(model, wide).mean()
+        > 2.0 * position_std(model, replace(found, covariance=independent)).mean()
+    )
