@@ -187,6 +187,27 @@ def test_a_live_run_keeps_the_pace_and_everything_it_found(recording):
     capture.release()
 
 
+def test_a_free_object_starts_live_from_landmarks_in_the_first_frame(recording):
+    folder, truth = recording
+    landmarks = folder / "sequence" / "landmarks.csv"
+    summary = run_live(
+        LiveOptions(
+            str(folder / "sequence" / "frames"),
+            folder / "free",
+            of_object(folder, landmarks=landmarks, placement=None, map_path=None),
+            record=False,
+            last=20,
+        )
+    )
+    assert (summary["pose"], summary["reference_frame"]) == ("free", 0)
+    run = load_run(folder / "free")
+    assert run.frames[-1] == 20
+    assert run.status[-1] == "tracked"
+    apart = run.camera_from_object[-1][:3, 3] - truth["camera_from_object"][20][:3, 3]
+    assert np.linalg.norm(apart) < 3e-3
+    assert not (folder / "free" / "augmented.mp4").exists()
+
+
 def test_an_interrupt_keeps_a_live_run(recording, monkeypatch, capsys):
     folder, _ = recording
     show, shown = VideoSink.show, []

@@ -24,8 +24,8 @@ from morph_dslam.online.placement import Placement
 from morph_dslam.online.results import RunResults
 from morph_dslam.online.run_writing import RunInputs, check_run_folder, write_run
 from morph_dslam.online.tracking_setup import ObjectOptions, Setup, load_setup
-from morph_dslam.sources import open_live
-from morph_dslam.sources.live import LiveStream
+from morph_dslam.sources import open_live, open_stream
+from morph_dslam.sources.live import LiveCamera, LiveStream
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,9 @@ def _begin(setup: Setup, stream: LiveStream, options: LiveOptions) -> _Begin:
             "a registration needs the map that it was made in, to know what the object looks like: give "
             "--map, and leave out --outline"
         )
-    for frame in stream:
+    # A recording is not begun by that: it would play while everything is made ready.
+    is_camera = isinstance(stream, LiveCamera)
+    for frame in stream if is_camera else open_stream(options.source, options.first, options.last):
         setup.camera.check_image(frame.image, f"frame {frame.index} of {options.source}")
         return _Begin(frame.image, setup.placed(frame.image), frame.index)
     raise SourceError(f"{options.source} ended before the first frame")
