@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -60,6 +61,7 @@ def run_registration(map_path: Path, model_path: Path, camera_path: Path, output
     metric = rigid_map.is_metric
     found = register_in_unit(nodes, model.triangles, points, views, camera, metric, progress=True)
     content = _content(found, nodes) | {"keyframes": _keyframes(found, views)}
+    content["map"] = os.path.relpath(map_path, output)
     (output / "registration.json").write_text(json.dumps(content, indent=2) + "\n")
     cv2.imwrite(str(output / "registration.jpg"), draw_registration(found, model, views, camera))
     return content
