@@ -12,12 +12,16 @@ the scene is rendered, scanned and registered once more at that size, and kept i
 from __future__ import annotations
 
 import argparse
+import os
 import resource
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+
+# As `morph live` does it; only before numpy is loaded has it an effect.
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"))
 
 import numpy as np
 from numpy.typing import NDArray

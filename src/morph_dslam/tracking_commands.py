@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 
 def _track(arguments: argparse.Namespace) -> None:
+    one_thread_for_algebra()
     from morph_dslam.online.track import TrackOptions, track
     from morph_dslam.online.track_objects import OtherObject, track_objects
     from morph_dslam.online.track_rig import track_rig
