@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from morph_dslam.command_arguments import frame_and_file, frame_range, named_value
 from morph_dslam.errors import TrackingError
+from morph_dslam.threads import one_thread_for_algebra
 
 if TYPE_CHECKING:
     from morph_dslam.online.augmented_view import DrawOptions
