@@ -46,7 +46,7 @@ ROUGH_INLIERS, ROUGH_PX = 12, 6.0
 #: A pose is believed if this share of the group's points in view are found where it has them, most of these
 #: fit it, and their error is at most so many times the usual one, or this: repeated texture fits badly
 #: somewhere else, but beside all keyframes the map's own errors show.
-LEAST_SHARE, LEAST_FIT, MOST_ERROR_RATIO, MOST_ERROR_PX = 0.35, 0.7, 2.0, 1.2
+LEAST_SHARE, LEAST_FIT, MOST_ERROR_RATIO, MOST_ERROR_PX = 0.35, 0.7, 2.0, 2.0
 
 
 @dataclass(frozen=True)
