@@ -34,16 +34,16 @@ def without_strays(points: Array) -> NDArray[np.bool_]:
 
 def plane_points(points: Array, thickness: float, rng: np.random.Generator) -> NDArray[np.bool_]:
     """Points (n,) of the plane that holds most of them, by RANSAC; none if it holds too few."""
-    best = np.zeros(len(points), dtype=bool)
-    for _ in range(TRIALS):
-        a, b, c = points[rng.choice(len(points), 3, replace=False)]
-        normal = np.cross(b - a, c - a)
-        length = np.linalg.norm(normal)
-        if length == 0.0:
-            continue
-        near = np.abs((points - a) @ (normal / length)) <= thickness
-        if near.sum() > best.sum():
-            best = near
+    chosen = np.array([rng.choice(len(points), 3, replace=False) for _ in range(TRIALS)])
+    a, b, c = points[chosen].transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1)
+    planes = lengths > 0.0
+    a, normals = a[planes], normals[planes] / lengths[planes, None]
+    near = np.abs(normals @ points.T - np.einsum("tx,tx->t", normals, a)[:, None]) <= thickness
+    if not len(near):
+        return np.zeros(len(points), dtype=bool)
+    best = near[near.sum(axis=1).argmax()]
     if best.sum() < 3:
         return np.zeros(len(points), dtype=bool)
     centre = points[best].mean(axis=0)
