@@ -102,7 +102,7 @@ def _paint(
     triangles: NDArray,
     levels: Array,
     brightness: Array | None,
-    table: Array,
+    table: NDArray,
     alpha: float,
     closed: bool,
 ) -> Painted:
