@@ -92,7 +92,9 @@ def draw(path: Path, figures: dict[str, Any], surface: dict[str, Any], height: A
     ):
         frames = content["frames_compared"]
         means = [content["per_frame"][str(frame)]["mean_mm"] for frame in frames]
-        axes.plot(frames, means, color=colour, linewidth=1.3, label=f"{label}, mean {content['mean_mm']:.2f} mm")
+        axes.plot(
+            frames, means, color=colour, linewidth=1.3, label=f"{label}, mean {content['mean_mm']:.2f} mm"
+        )
     axes.axhline(PAPER_MEAN, color="#b4530a", label=f"the paper, its own recording: mean {PAPER_MEAN} mm")
     axes.axhline(
         PAPER_CAMERA,
