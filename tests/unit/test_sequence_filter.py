@@ -168,6 +168,24 @@ def test_wrong_early_value_is_given_up():
     assert deviations[5] < deviations[6] > deviations[15]
 
 
+def test_frame_that_knows_little_does_not_overrule_many_that_know_much():
+    """Twelve frames see the sheet's twist of 5 degrees well; the next only its middle, as if of -18 degrees."""
+    points, rng = bound(120), np.random.default_rng(2)
+    in_middle = np.abs(points.rest[:, :2]).max(axis=1) < 0.09
+    filtered = SequenceFilter(ESTIMATOR, [TWIST])
+    for number in range(14):
+        is_odd = number == 12
+        state = truth(number, -18.0 if is_odd else 5.0)
+        pixels = CAMERA.project(points.in_camera(state)) + SIGMA * rng.standard_normal((120, 2))
+        weights = in_middle.astype(float) if is_odd else np.ones(120)
+        measured = Measured(points, pixels, weights, np.zeros((120, 2)), np.eye(120))
+        alone = ESTIMATOR.fit(measured, state)
+        twists = np.degrees([e.state.parameters[TWIST] for e in (alone, filtered.fuse(measured, alone))])
+        if is_odd:
+            assert twists[0] < -10.0
+        assert abs(twists[1] - 5.0) < 1.0
+
+
 def test_covariance_of_one_frame_is_that_of_repeated_measurements_with_overlapping_windows():
     points, state = bound(150, seed=3), truth(0)
     rng = np.random.default_rng(1)

@@ -31,7 +31,8 @@ Array = NDArray[np.float64]
 
 #: The weight of the past in the mean of past and frame stays below this.
 LARGEST_WEIGHT = 0.999
-
+#: A past with this part of a frame's standard deviation is believed against it.
+FAR_SURER = 0.2
 
 #: What was measured in a frame.
 Frame = TypeVar("Frame", Measured, RigMeasured)
@@ -56,7 +57,8 @@ class FilterOptions:
     Attributes
     ----------
     memory : frames over which the past fades, by a factor e.
-    gate : a frame whose own estimate is so many standard deviations off the past's does not take part.
+    gate : a frame whose own estimate is so many standard deviations off the past's changes nothing of it.
+        It stands by itself, unless the past is far surer of what does not change.
     patience : after so many such frames in a row the past was wrong and is forgotten.
     """
 
@@ -106,21 +108,22 @@ class SequenceFilter(Generic[Frame]):
         by_itself = self._with_covariance(alone, measured, linear, errors, known)
         if not len(self._kept):
             return by_itself
-        if self._past is not None and self._contradicts(self._past, by_itself):
-            self._conflicts += 1
-            if self._conflicts < self.options.patience:
-                return by_itself
-            self._past = None
-        self._conflicts = 0
+        conflict = self._past is not None and self._contradicts(self._past, by_itself)
+        self._conflicts = self._conflicts + 1 if conflict else 0
+        if self._conflicts >= self.options.patience:
+            self._past, self._conflicts = None, 0
         if self._past is None:
             self._keep(by_itself, errors)
+            return by_itself
+        if conflict and (self._walks or not self._is_far_surer(self._past, by_itself)):
             return by_itself
         past = self._prior(self._past, measured, errors)
         prior = past if known is None else past.joined(known)
         fused = self._estimator.fit(measured, self._start(by_itself), prior)
         linear = self._estimator.linear(measured, fused)
         errors = self._errors(measured, linear, fused.state, known, past)
-        self._keep(fused, errors)
+        if not conflict:
+            self._keep(fused, errors)
         fused = self._with_covariance(fused, measured, linear, errors, known, past)
         return self._without_walk(fused, by_itself) if self._walks else fused
 
@@ -197,6 +200,11 @@ class SequenceFilter(Generic[Frame]):
         apart = estimate.state.parameters[self._kept] - past.mean
         spread = self._of_kept(estimate.covariance) + past.covariance
         return float(apart @ np.linalg.solve(spread, apart)) > self.options.gate**2
+
+    def _is_far_surer(self, past: _Past, estimate: Estimate) -> bool:
+        """Whether the past knows far better than a frame by itself whatever both tell of."""
+        shares = scipy.linalg.eigvalsh(past.covariance, self._of_kept(estimate.covariance))
+        return float(shares.max()) < FAR_SURER**2
 
     def _errors(
         self,
