@@ -31,28 +31,25 @@ LEAST_DEPTH = 1e-6
 
 
 @njit(cache=True, nogil=True)
-def _residual(pose, point, pixel, camera, out):
-    """Reprojection error (3,) into ``out``; returns the rows that count: 0 behind the camera, 2, or 3."""
-    x = pose[0, 0] * point[0] + pose[0, 1] * point[1] + pose[0, 2] * point[2] + pose[0, 3]
-    y = pose[1, 0] * point[0] + pose[1, 1] * point[1] + pose[1, 2] * point[2] + pose[1, 3]
-    z = pose[2, 0] * point[0] + pose[2, 1] * point[1] + pose[2, 2] * point[2] + pose[2, 3]
-    if z < LEAST_DEPTH:
-        return 0
-    u = camera[0] * x / z + camera[2]
-    out[0] = u - pixel[0]
-    out[1] = camera[1] * y / z + camera[3] - pixel[1]
-    if np.isnan(pixel[2]):
-        return 2
-    out[2] = u - camera[4] / z - pixel[2]
-    return 3
+def _local(poses, c, points, p):
+    """A point in the axes of a camera, three numbers."""
+    x = poses[c, 0, 0] * points[p, 0] + poses[c, 0, 1] * points[p, 1] + poses[c, 0, 2] * points[p, 2]
+    y = poses[c, 1, 0] * points[p, 0] + poses[c, 1, 1] * points[p, 1] + poses[c, 1, 2] * points[p, 2]
+    z = poses[c, 2, 0] * points[p, 0] + poses[c, 2, 1] * points[p, 1] + poses[c, 2, 2] * points[p, 2]
+    return x + poses[c, 0, 3], y + poses[c, 1, 3], z + poses[c, 2, 3]
 
 
 @njit(cache=True, nogil=True)
-def _jacobians(pose, point, camera, by_pose, by_point):
+def _residual(x, y, z, pixels, o, camera):
+    """Reprojection error of a point before the camera: column, row, right column (0 if not measured)."""
+    u = camera[0] * x / z + camera[2]
+    in_right = 0.0 if np.isnan(pixels[o, 2]) else u - camera[4] / z - pixels[o, 2]
+    return u - pixels[o, 0], camera[1] * y / z + camera[3] - pixels[o, 1], in_right
+
+
+@njit(cache=True, nogil=True)
+def _jacobians(x, y, z, poses, c, camera, by_pose, by_point):
     """Derivatives of `_residual` by the pose's twist (rotation, translation; from the left) and the point."""
-    x = pose[0, 0] * point[0] + pose[0, 1] * point[1] + pose[0, 2] * point[2] + pose[0, 3]
-    y = pose[1, 0] * point[0] + pose[1, 1] * point[1] + pose[1, 2] * point[2] + pose[1, 3]
-    z = pose[2, 0] * point[0] + pose[2, 1] * point[1] + pose[2, 2] * point[2] + pose[2, 3]
     for row in range(3):
         gx, gy = (0.0, camera[1] / z) if row == 1 else (camera[0] / z, 0.0)
         gz = -(gx * x + gy * y) / z + (camera[4] / (z * z) if row == 2 else 0.0)
@@ -61,7 +58,7 @@ def _jacobians(pose, point, camera, by_pose, by_point):
         by_pose[row, 2] = gy * x - gx * y
         by_pose[row, 3], by_pose[row, 4], by_pose[row, 5] = gx, gy, gz
         for k in range(3):
-            by_point[row, k] = gx * pose[0, k] + gy * pose[1, k] + gz * pose[2, k]
+            by_point[row, k] = gx * poses[c, 0, k] + gy * poses[c, 1, k] + gz * poses[c, 2, k]
 
 
 @njit(cache=True, nogil=True)
@@ -75,58 +72,63 @@ def _huber(error, width):
 @njit(cache=True, nogil=True)
 def total_cost(poses, points, camera_idx, point_idx, pixels, camera, width):
     """Huber cost of all observations; one that falls behind its camera costs as much as a miss of 1000 px."""
-    cost, residual = 0.0, np.zeros(3)
+    cost = 0.0
     for o in range(len(pixels)):
-        rows = _residual(poses[camera_idx[o]], points[point_idx[o]], pixels[o], camera, residual)
-        square = 0.0
-        for row in range(rows):
-            square += residual[row] ** 2
-        cost += _huber(np.sqrt(square) if rows else 1000.0, width)[0]
+        x, y, z = _local(poses, camera_idx[o], points, point_idx[o])
+        error = 1000.0
+        if z >= LEAST_DEPTH:
+            first, second, third = _residual(x, y, z, pixels, o, camera)
+            error = np.sqrt(first * first + second * second + third * third)
+        cost += _huber(error, width)[0]
     return cost
 
 
 @njit(cache=True, nogil=True)
 def _normal_equations(poses, points, slot, camera_idx, point_idx, pixels, camera, width):
-    """Blocks of the normal equations: poses and their right-hand side, points and theirs, observations."""
+    """Blocks of the normal equations: poses and their right-hand side, points and theirs, observations.
+
+    Of the poses' blocks only the lower half is filled, of the points' the upper one.
+    """
     n_free = slot.max() + 1
     pose_block, pose_right = np.zeros((n_free, 6, 6)), np.zeros((n_free, 6))
     point_block, point_right = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
-    cross = np.zeros((len(pixels), 6, 3))
+    cross = np.zeros((len(pixels), 3, 6))
     residual, by_pose, by_point = np.zeros(3), np.zeros((3, 6)), np.zeros((3, 3))
     for o in range(len(pixels)):
         c, p = camera_idx[o], point_idx[o]
-        rows = _residual(poses[c], points[p], pixels[o], camera, residual)
-        if rows == 0:
+        x, y, z = _local(poses, c, points, p)
+        if z < LEAST_DEPTH:
             continue
-        square = 0.0
-        for row in range(rows):
-            square += residual[row] ** 2
+        residual[0], residual[1], residual[2] = _residual(x, y, z, pixels, o, camera)
+        square = residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2
         weight = _huber(np.sqrt(square), width)[1]
-        _jacobians(poses[c], points[p], camera, by_pose, by_point)
+        _jacobians(x, y, z, poses, c, camera, by_pose, by_point)
         free = slot[c]
-        for row in range(rows):
+        for row in range(2 if np.isnan(pixels[o, 2]) else 3):
             for i in range(3):
-                point_right[p, i] -= weight * by_point[row, i] * residual[row]
-                for j in range(3):
-                    point_block[p, i, j] += weight * by_point[row, i] * by_point[row, j]
+                weighted = weight * by_point[row, i]
+                point_right[p, i] -= weighted * residual[row]
+                for j in range(i, 3):
+                    point_block[p, i, j] += weighted * by_point[row, j]
             if free < 0:
                 continue
             for i in range(6):
-                pose_right[free, i] -= weight * by_pose[row, i] * residual[row]
-                for j in range(6):
-                    pose_block[free, i, j] += weight * by_pose[row, i] * by_pose[row, j]
+                weighted = weight * by_pose[row, i]
+                pose_right[free, i] -= weighted * residual[row]
+                for j in range(i + 1):
+                    pose_block[free, i, j] += weighted * by_pose[row, j]
                 for j in range(3):
-                    cross[o, i, j] += weight * by_pose[row, i] * by_point[row, j]
+                    cross[o, j, i] += weighted * by_point[row, j]
     return pose_block, pose_right, point_block, point_right, cross
 
 
 @njit(cache=True, nogil=True)
 def _reduced_system(pose_block, pose_right, point_inverse, point_right, cross, slot, camera_idx, start):
-    """Schur complement (6 c, 6 c) and right-hand side (6 c,) of the free cameras."""
+    """Schur complement (6 c, 6 c) of the free cameras, its lower half, and right-hand side (6 c,)."""
     n_free = len(pose_block)
-    system, right = np.zeros((6 * n_free, 6 * n_free)), np.zeros(6 * n_free)
+    blocks, right = np.zeros((n_free, n_free, 6, 6)), np.zeros(6 * n_free)
     for c in range(n_free):
-        system[6 * c : 6 * c + 6, 6 * c : 6 * c + 6] = pose_block[c]
+        blocks[c, c] = pose_block[c]
         right[6 * c : 6 * c + 6] = pose_right[c]
     half = np.zeros((6, 3))
     for p in range(len(point_inverse)):
@@ -138,21 +140,23 @@ def _reduced_system(pose_block, pose_right, point_inverse, point_right, cross, s
                 for j in range(3):
                     half[i, j] = 0.0
                     for k in range(3):
-                        half[i, j] += cross[first, i, k] * point_inverse[p, k, j]
+                        half[i, j] += cross[first, k, i] * point_inverse[p, k, j]
                 for j in range(3):
                     right[6 * row + i] -= half[i, j] * point_right[p, j]
+            # Observations of a point are in the order of their cameras: these blocks are the lower ones.
             for second in range(start[p], first + 1):
                 column = slot[camera_idx[second]]
                 if column < 0:
                     continue
+                block, other = blocks[row, column], cross[second]
                 for i in range(6):
+                    by_x, by_y, by_z = half[i, 0], half[i, 1], half[i, 2]
                     for j in range(6):
-                        value = 0.0
-                        for k in range(3):
-                            value += half[i, k] * cross[second, j, k]
-                        system[6 * row + i, 6 * column + j] -= value
-                        if second < first:
-                            system[6 * column + j, 6 * row + i] -= value
+                        block[i, j] -= by_x * other[0, j] + by_y * other[1, j] + by_z * other[2, j]
+    system = np.zeros((6 * n_free, 6 * n_free))
+    for c in range(n_free):
+        for d in range(c + 1):
+            system[6 * c : 6 * c + 6, 6 * d : 6 * d + 6] = blocks[c, d]
     return system, right
 
 
@@ -193,7 +197,7 @@ def _step(blocks, slot, camera_idx, start, damping):
                 continue
             for i in range(3):
                 for j in range(6):
-                    rest[i] -= cross[o, j, i] * pose_step[6 * free + j]
+                    rest[i] -= cross[o, i, j] * pose_step[6 * free + j]
         for i in range(3):
             for j in range(3):
                 point_step[p, i] += point_inverse[p, i, j] * rest[j]
@@ -277,7 +281,7 @@ def adjust(
     huber_px : errors longer than this count linearly.
     tolerance : ends when an iteration lowers the cost by less than this part.
     """
-    order = np.argsort(observations.point_idx, kind="stable")
+    order = np.lexsort([observations.camera_idx, observations.point_idx])
     camera_idx = np.ascontiguousarray(observations.camera_idx[order], dtype=np.int64)
     point_idx = np.ascontiguousarray(observations.point_idx[order], dtype=np.int64)
     start = np.searchsorted(point_idx, np.arange(len(points) + 1))

@@ -87,6 +87,7 @@ class Mapper:
         self._points.fuse(number)
         self._adjust_locally()
         self._cull()
+        yield
         cull_keyframes(self._map)
         yield from self._finish(number, view)
 

@@ -24,6 +24,7 @@ from morph_dslam.online.slam.rigid_map import (
     FIRST_RMS_PX,
     GOOD,
     NOWHERE,
+    REMOVED,
     Followed,
     Indices,
     RigidMap,
@@ -148,6 +149,8 @@ class Tracker:
         views = self._map.template_keyframe
         along = np.isin(views[self._astray.ids], views[self.points.ids])
         points = self.points.joined(self._astray[along])
+        # The mapper may have taken some out, and the view with their patches too.
+        points = points[self._map.state[points.ids] != REMOVED]
         positions = self._map.positions[points.ids]
         before, _ = project(self.camera_from_world, positions, self._intrinsics)
         after, _ = project(predicted, positions, self._intrinsics)
