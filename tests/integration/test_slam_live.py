@@ -1,6 +1,8 @@
 """Mapping beside the frames, and live cameras."""
 
 import json
+import os
+import sys
 import threading
 import time
 
@@ -64,6 +66,16 @@ def test_nobody_waits_for_a_step_in_the_thread():
     assert log[2].startswith("mapper")
     assert log[3:] == ["after", "before", "ended", "after"]
     assert work.is_idle
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads have priorities of their own on Linux only")
+def test_frames_go_before_work_in_the_thread():
+    log, own = [], os.getpriority(os.PRIO_PROCESS, 0)
+    work = MappingWork(threaded=True)
+    work.begin(steps(log, lambda: os.getpriority(os.PRIO_PROCESS, 0)))
+    work.finish()
+    assert log[1] == min(own + 5, 19)
+    assert os.getpriority(os.PRIO_PROCESS, 0) == own
 
 
 def test_what_goes_wrong_in_the_thread_is_told():

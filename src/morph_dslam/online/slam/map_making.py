@@ -110,7 +110,12 @@ class MapMaking:
             self._publish()
 
     def _insert(self, tracked: Tracked, view: FrameView) -> Work:
-        yield from self._mapper.insert(tracked, view)
+        steps = self._mapper.insert(tracked, view)
+        next(steps)
+        # Beside the frames the new corners are not put off: they would only be followed later.
+        if not self._threaded:
+            yield
+        yield from steps
         # A search for loops may follow, in another frame.
         yield
 

@@ -75,7 +75,7 @@ class Mapper:
         return self._choice.wants(tracked, frame_index)
 
     def insert(self, tracked: Tracked, view: FrameView) -> Work:
-        """Keep a view.
+        """Keep a view: its points and the adjustment, then new corners, then its description.
 
         Points that have left the rigid scene are taken out: when an object comes back to where it was, its
         points must not hold the camera.

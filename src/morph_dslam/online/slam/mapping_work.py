@@ -8,7 +8,9 @@ none.
 
 from __future__ import annotations
 
+import os
 import sys
+import threading
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 
@@ -19,6 +21,9 @@ Work = Generator[None, None, None]
 #: How long a thread may keep the interpreter while another waits for it, seconds. Tracking gives it up some
 #: fifty times a frame, whenever compiled code runs, and may wait for so long each time; Python's own is 5 ms.
 SWITCH_INTERVAL = 1e-4
+#: By how much the thread's priority is lower, in steps of `nice`: with this it still gets a third of what
+#: another program gets. With far less it would be stopped for long while it holds the interpreter.
+STANDS_BACK = 5
 
 
 def share_interpreter() -> None:
@@ -42,6 +47,17 @@ def one_step(do: Callable[[], None]) -> Work:
     yield from ()
 
 
+def _stand_back() -> None:
+    """Let this thread run behind the one that tracks, where both want the same processor.
+
+    Where other programs run too, frames would else wait for whole slices of the scheduler, some milliseconds
+    each. On Linux each thread has a priority of its own.
+    """
+    if sys.platform == "linux":
+        own = os.getpriority(os.PRIO_PROCESS, 0)
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), own + STANDS_BACK)
+
+
 class MappingWork:
     """Work under way, at most one at a time.
 
@@ -60,7 +76,7 @@ class MappingWork:
         self._work: Work | None = None
         self._running: Future[bool] | None = None
         self._before, self._after = before, after
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="mapper") if threaded else None
+        self._thread = ThreadPoolExecutor(1, "mapper", _stand_back) if threaded else None
 
     @property
     def is_idle(self) -> bool:
