@@ -169,7 +169,7 @@ def test_wrong_early_value_is_given_up():
 
 
 def test_frame_that_knows_little_does_not_overrule_many_that_know_much():
-    """Twelve frames see the sheet's twist of 5 degrees well; the next only its middle, as if of -18 degrees."""
+    """Twelve frames see the sheet's twist of 5 degrees well; the next its middle, as of -18 degrees."""
     points, rng = bound(120), np.random.default_rng(2)
     in_middle = np.abs(points.rest[:, :2]).max(axis=1) < 0.09
     filtered = SequenceFilter(ESTIMATOR, [TWIST])
