@@ -57,8 +57,7 @@ def test_an_error_of_the_reference_moves_later_estimates_as_predicted(model, est
         errors = SystematicErrors(estimator, points, off, covariance, 17)
         used = np.ones(len(pixels), dtype=bool)
         plain = replace(found, covariance=np.zeros((9, 9)))
-        left = replace(errors.unexplained(plain, used), px=0.0)
-        stated = errors.added(plain, used, left)
+        stated = errors.added(plain, used, 0.0)
         truth = LATER.camera_from_object.apply(model.positions(LATER.parameters))
         now = found.state.camera_from_object.apply(model.positions(found.state.parameters))
         off_by = np.sqrt(np.mean(np.sum((now - truth) ** 2, axis=1)))
@@ -73,7 +72,7 @@ def test_in_the_reference_view_itself_the_error_is_that_of_the_reference(model, 
     found = estimator.estimate(points, pixels, np.ones(len(pixels)), REFERENCE)
     used = np.ones(len(pixels), dtype=bool)
     plain = replace(found, covariance=np.zeros((9, 9)))
-    stated = errors.added(plain, used, errors.unexplained(plain, used))
+    stated = errors.added(plain, used, errors.unexplained(plain, used).px)
     np.testing.assert_allclose(stated.covariance, root @ root.T, rtol=1e-3, atol=1e-9)
 
 
@@ -98,8 +97,7 @@ def test_a_failure_of_the_model_widens_the_deviations(model, estimator, pixels):
     errors = SystematicErrors(estimator, points, REFERENCE, None, 17)
     found = estimator.estimate(points, pixels, np.ones(len(pixels)), REFERENCE)
     used = np.ones(len(pixels), dtype=bool)
-    left = errors.unexplained(found, used)
-    narrow, wide = (errors.added(found, used, replace(left, px=px)) for px in (0.0, 1.0))
+    narrow, wide = (errors.added(found, used, px) for px in (0.0, 1.0))
     np.testing.assert_allclose(narrow.covariance, found.covariance)
     # Errors that are alike over many points average out less than independent ones of the same size.
     independent = np.linalg.inv(estimator.evaluate(points, pixels, np.ones(len(pixels)), REFERENCE)[1])
@@ -107,3 +105,32 @@ def test_a_failure_of_the_model_widens_the_deviations(model, estimator, pixels):
         position_std(model, wide).mean()
         > 2.0 * position_std(model, replace(found, covariance=independent)).mean()
     )
+
+
+def test_a_smooth_error_of_the_model_is_stated_as_large_as_it_is_though_the_fit_takes_most_of_it(
+    model, estimator, pixels
+):
+    """Random fields that vary over the whole object; what the fit leaves of them is a small part."""
+    points = bound(model, REFERENCE, pixels)
+    errors = SystematicErrors(estimator, points, REFERENCE, None, 17)
+    used = np.ones(len(pixels), dtype=bool)
+    spread = np.sqrt(np.mean(np.sum((pixels - pixels.mean(axis=0)) ** 2, axis=1)))
+    squared = np.sum((pixels[:, None] - pixels[None]) ** 2, axis=2)
+    kernel = np.exp(-0.5 * squared / (0.75 * spread) ** 2)
+    root = np.linalg.cholesky(kernel + 1e-9 * np.eye(len(pixels)))
+    rng = np.random.default_rng(3)
+    truth = REFERENCE.camera_from_object.apply(model.positions(REFERENCE.parameters))
+    off, stated, left = [], [], []
+    for _ in range(40):
+        seen = pixels + 0.5 * root @ rng.standard_normal(pixels.shape)
+        found = estimator.estimate(points, seen, used.astype(float), REFERENCE)
+        unexplained = errors.unexplained(found, used)
+        with_model = errors.added(replace(found, covariance=np.zeros((9, 9))), used, unexplained.px)
+        now = found.state.camera_from_object.apply(model.positions(found.state.parameters))
+        off.append(np.mean(np.sum((now - truth) ** 2, axis=1)))
+        stated.append(np.mean(position_std(model, with_model) ** 2))
+        left.append(unexplained.px)
+    assert np.sqrt(np.mean(np.square(left))) < 0.35  # of 0.5
+    assert np.sqrt(np.median(off) / np.median(stated)) == pytest.approx(1.0, abs=0.4)
+    # Five times what is stated is exceeded by none.
+    assert (np.sqrt(off) < 5.0 * np.sqrt(stated)).all()

@@ -33,6 +33,8 @@ FOUND_AGAIN = "found again where it was last seen"
 RECOVERED = "recovered from the reference view's features"
 #: Follows the reason of a frame in which the model, not noise, is what is left of the residuals.
 UNEXPLAINED = "the model does not explain the images"
+#: Follows the reason of a frame in which few points agree, and less closely than usual.
+FEW_AGREE = "few points agree, and less closely than usual"
 #: Follows the reason of frames in which an anchored object is away from its place.
 HAS_MOVED = "the object has moved from its place in the map"
 

@@ -23,6 +23,7 @@ from morph_dslam.online.estimation import Estimator, Prior, State
 from morph_dslam.online.flow import flatten, follow
 from morph_dslam.online.frame_estimation import FrameEstimation
 from morph_dslam.online.frame_result import (
+    FEW_AGREE,
     FOLLOWED,
     FOUND_AGAIN,
     HAS_MOVED,
@@ -248,7 +249,11 @@ class Tracker:
         residuals = attempt.estimate.residuals[attempt.inliers]
         rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
         left = self._systematic.unexplained(attempt.estimate, attempt.inliers)
-        estimate = self._systematic.added(attempt.estimate, attempt.inliers, left, attempt.prior)
+        doubt = self._recovery.doubt(attempt)
+        alike_px = max(left.px, doubt)
+        estimate = self._systematic.added(attempt.estimate, attempt.inliers, alike_px, attempt.prior)
+        if doubt:
+            aside += f"; {FEW_AGREE}: by {attempt.estimate.sigma_px:.1f} px"
         if left.is_failure:
             aside += f"; {UNEXPLAINED}: {left.px:.1f} px are left"
         return FrameResult(

@@ -18,8 +18,9 @@ from morph_dslam.online.tracker_options import TrackerOptions
 Array = NDArray[np.float64]
 
 #: An object that is found anew is believed if this share of its points agree, or if they agree as closely as
-#: this, pixels, or as so many times the usual spread of their residuals: what looks alike by chance does not.
-MOST_AGREE, CLOSE_PX, CLOSE_TO_USUAL = 0.5, 0.5, 1.5
+#: this, pixels, or as so many times the usual spread of their residuals: what looks alike by chance does not,
+#: nor do windows that see the rim of what is before the object.
+MOST_AGREE, CLOSE_PX, CLOSE_TO_USUAL = 0.5, 0.25, 1.5
 #: At most about so many shapes are tried, lest a mirrored one that fits nearly as well is taken.
 MOST_SHAPES = 27
 #: Share of the latest frame in the usual spread.
@@ -39,12 +40,29 @@ class Recovery:
     ) -> None:
         self._model, self._reference, self._camera = model, reference, camera
         self._estimation, self._options = estimation, options
-        self._usual_px = 0.0
+        self._usual_px = np.nan
 
     def learn(self, attempt: Attempt) -> None:
         """Take in how closely the points agreed in a frame in which the object was followed."""
-        if np.isfinite(attempt.estimate.sigma_px):
-            self._usual_px += LEARNING_RATE * (attempt.estimate.sigma_px - self._usual_px)
+        spread = attempt.estimate.sigma_px
+        if not np.isfinite(spread):
+            return
+        if np.isnan(self._usual_px):
+            self._usual_px = spread
+        self._usual_px += LEARNING_RATE * (spread - self._usual_px)
+
+    def doubt(self, attempt: Attempt) -> float:
+        """By how much, pixels, the few points that agree may be off together; 0 where nothing is doubtful.
+
+        Where less than half of the points agree, and not as closely as usual, something else is in the
+        windows of many: what their residuals have more than usual is no noise that averages out.
+        """
+        if attempt.prior is not None or self._most_agree(attempt) or np.isnan(self._usual_px):
+            return 0.0
+        spread = attempt.estimate.sigma_px
+        if spread < CLOSE_TO_USUAL * self._usual_px:
+            return 0.0
+        return float(np.sqrt(spread**2 - self._usual_px**2))
 
     def refusal(self, attempt: Attempt) -> str:
         """Why an object that was not seen in the frame before is not to be believed; empty when it is."""
@@ -52,13 +70,17 @@ class Recovery:
         if why_not or attempt.prior is not None:
             return why_not
         count = int(attempt.inliers.sum())
-        if count >= MOST_AGREE * len(attempt.inliers) or self._agrees_closely(attempt):
+        if self._most_agree(attempt) or self._agrees_closely(attempt):
             return ""
         visible = int(attempt.measurement.visible.sum())
         return f"{count} of {visible} points agree, but only by {attempt.estimate.sigma_px:.1f} px"
 
+    def _most_agree(self, attempt: Attempt) -> bool:
+        return int(attempt.inliers.sum()) >= MOST_AGREE * len(attempt.inliers)
+
     def _agrees_closely(self, attempt: Attempt) -> bool:
-        return attempt.estimate.sigma_px < max(CLOSE_PX, CLOSE_TO_USUAL * self._usual_px)
+        usual = np.nan_to_num(self._usual_px)  # 0 where it was never followed yet
+        return attempt.estimate.sigma_px < max(CLOSE_PX, CLOSE_TO_USUAL * usual)
 
     def recover(
         self, picture: Picture, last_shape: Array, why_lost: str, clock: StageClock

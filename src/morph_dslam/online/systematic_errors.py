@@ -8,7 +8,9 @@ this for motion, H^-1 J' W M J0 e, to first order. In the reference view itself 
 
 A model that cannot take the object's shape leaves residuals that are alike over parts of the surface much
 wider than the windows that are compared. Their covariance is measured from pairs of points whose windows do
-not overlap, and enters the estimate through the same H^-1 J' W.
+not overlap, and enters the estimate through the same H^-1 J' W. An estimate takes up most of such an error by
+a wrong pose and shape, so that its residuals show only the rest: what they show is divided by that share, as
+in restricted maximum likelihood (Patterson & Thompson 1971).
 """
 
 from __future__ import annotations
@@ -26,10 +28,13 @@ from morph_dslam.online.robust_covariance import EIGENVALUE_FLOOR
 
 Array = NDArray[np.float64]
 
-#: What a model leaves is taken to be alike over this share of the points' spread in the reference view.
-REACH_SHARE = 0.5
+#: Over these shares of the points' spread in the reference view a model's errors are taken to be alike, and
+#: are pairs of points compared.
+ALIKE_SHARE, PAIR_SHARE = 0.75, 0.5
 #: More than this, pixels, and more than half of the residuals' variance, is stated as the model's failure.
 UNEXPLAINED_PX = 0.5
+#: An estimate that takes up more of the model's error leaves too little to tell how large it is.
+LEAST_LEFT = 0.02
 #: A triangle seen so much flatter in the reference view than in another says nothing of the motion there.
 LARGEST_STRETCH = 5.0
 
@@ -78,10 +83,11 @@ class SystematicErrors:
         self._edges = _edges(estimator.camera, self._corners, reference)
         places = self._project(points, reference)[0]
         apart = places[:, None] - places[None]
-        reach = REACH_SHARE * float(np.sqrt(np.mean(np.sum((places - places.mean(axis=0)) ** 2, axis=1))))
+        spread = float(np.sqrt(np.mean(np.sum((places - places.mean(axis=0)) ** 2, axis=1))))
         squared = np.sum(apart**2, axis=2)
-        self._alike = np.exp(-0.5 * squared / reach**2)
-        self._pairs = (squared < reach**2) & (np.abs(apart).max(axis=2) >= window)
+        self._alike = np.exp(-0.5 * squared / (ALIKE_SHARE * spread) ** 2)
+        near = squared < (PAIR_SHARE * spread) ** 2
+        self._pairs = near & (np.abs(apart).max(axis=2) >= window)
 
     def unexplained(self, estimate: Estimate, used: NDArray[np.bool_]) -> Unexplained:
         """What the model leaves of the residuals of the points ``used`` (p,)."""
@@ -93,13 +99,15 @@ class SystematicErrors:
         return Unexplained(float(np.sqrt(max(common, 0.0))), float(np.sqrt(total)))
 
     def added(
-        self, estimate: Estimate, used: NDArray[np.bool_], left: Unexplained, prior: Prior | None = None
+        self, estimate: Estimate, used: NDArray[np.bool_], alike_px: float, prior: Prior | None = None
     ) -> Estimate:
         """The estimate with a covariance that holds both errors.
 
         Parameters
         ----------
-        used : (p,) the points that support it. left : of `unexplained`. prior : that it was found with.
+        used : (p,) the points that support it. prior : that it was found with.
+        alike_px : standard deviation of a pixel coordinate that neighbours have in common in the residuals,
+            as of `unexplained`.
         """
         _, jacobian = self._project(self._points, estimate.state)
         length = np.linalg.norm(estimate.residuals[: len(used)], axis=1)
@@ -116,9 +124,23 @@ class SystematicErrors:
             transfer = gain @ np.tensordot(scores, moved, axes=([0, 1], [0, 1]))
             covariance += transfer @ self._covariance @ transfer.T
         spread = (self._alike @ scores.reshape(len(scores), -1)).reshape(scores.shape)
-        of_model = np.tensordot(scores, spread, axes=([0, 1], [0, 1]))
-        covariance += left.px**2 * gain @ of_model @ gain
+        of_model = gain @ np.tensordot(scores, spread, axes=([0, 1], [0, 1])) @ gain
+        share = self._share_left(jacobian, spread @ gain, of_model, usable)
+        covariance += alike_px**2 / share * of_model
         return replace(estimate, covariance=covariance)
+
+    def _share_left(self, jacobian: Array, spread: Array, of_model: Array, used: NDArray[np.bool_]) -> float:
+        """How much of the variance of the model's error the estimate leaves in the residuals that show it.
+
+        With G = J H^-1 J' W what the estimate takes up, it leaves (I - G) K (I - G)' of a covariance K; this
+        is summed over the pairs of points that `unexplained` sums over.
+        """
+        pairs = self._pairs & used[:, None] & used[None]
+        beside = np.tensordot(pairs.astype(float), jacobian, axes=(1, 0))
+        whole = 2.0 * float(self._alike[pairs].sum())
+        taken = 2.0 * float(np.sum(beside * spread))
+        twice = float(np.sum(np.tensordot(jacobian, beside, axes=([0, 1], [0, 1])) * of_model))
+        return max((whole - taken + twice) / max(2 * int(pairs.sum()), 1), LEAST_LEFT)
 
     def _project(self, points: BoundPoints, state: State) -> tuple[Array, Array]:
         pose = state.camera_from_object
