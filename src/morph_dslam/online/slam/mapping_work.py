@@ -8,6 +8,7 @@ none.
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 import threading
@@ -29,8 +30,11 @@ STANDS_BACK = 5
 def share_interpreter() -> None:
     """Let tracking and mapping run side by side; for the main program, before it tracks live.
 
-    The threads of this process then take turns quickly, and OpenCV begins no threads of its own.
+    The threads of this process then take turns quickly, and OpenCV begins no threads of its own. What exists
+    already is left out when Python looks for garbage: over all that has been imported that takes many
+    milliseconds, in which no thread goes on.
     """
+    gc.freeze()
     sys.setswitchinterval(SWITCH_INTERVAL)
     cv2.setNumThreads(1)
 

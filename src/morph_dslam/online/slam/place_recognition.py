@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.online.slam.descriptors import Descriptors, Indices
@@ -21,6 +22,21 @@ N_WORDS = 400
 N_TRAINING, ROUNDS = 6000, 6
 #: Words are trained anew when there are this many times the keyframes that they were trained from.
 RETRAIN_AT = 1.5
+
+
+@njit(cache=True, nogil=True)
+def bit_counts(descriptors, members, n_words):
+    """How many of each word's members (n,), descriptors (n, 32), have each bit (w, 256).
+
+    numpy's sums over groups would hold the interpreter for milliseconds.
+    """
+    counts = np.zeros((n_words, 8 * descriptors.shape[1]), dtype=np.int64)
+    for row in range(len(descriptors)):
+        for column in range(descriptors.shape[1]):
+            for bit in range(8):
+                set_bit = (descriptors[row, column] >> (7 - bit)) & 1
+                counts[members[row], 8 * column + bit] += set_bit
+    return counts
 
 
 class Vocabulary:
@@ -37,14 +53,11 @@ class Vocabulary:
         order = rng.permutation(len(descriptors))[:N_TRAINING]
         sample = descriptors[order]
         self.words = sample[:n_words].copy()
-        bits = np.unpackbits(sample, axis=1)
         for _ in range(ROUNDS):
             members = self.assign(sample)
-            ordered = np.argsort(members, kind="stable")
-            used, starts = np.unique(members[ordered], return_index=True)
-            counts = np.diff(np.append(starts, len(ordered)))
-            sums = np.add.reduceat(bits[ordered].astype(np.int32), starts, axis=0)
-            self.words[used] = np.packbits(2 * sums > counts[:, None], axis=1)
+            counts = np.bincount(members, minlength=len(self.words))
+            majority = 2 * bit_counts(sample, members, len(self.words)) > counts[:, None]
+            self.words[counts > 0] = np.packbits(majority[counts > 0], axis=1)
 
     def assign(self, descriptors: Descriptors) -> Indices:
         """The nearest word (n,) of each descriptor (n, 32)."""

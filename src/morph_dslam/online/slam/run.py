@@ -26,6 +26,7 @@ from morph_dslam.online.slam.map_file import load_map
 from morph_dslam.online.slam.mapping_work import share_interpreter
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.slam.output import draw_frame, write_run
+from morph_dslam.online.slam.place_recognition import bit_counts
 from morph_dslam.online.slam.pose import refine_pose
 from morph_dslam.online.slam.posed_map import map_from_trajectory
 from morph_dslam.online.slam.rigid_map import RigidMap
@@ -186,3 +187,4 @@ def warm_up() -> None:
     orientations(image, centre)
     words, rows = rng.integers(0, 255, (4, 32)).astype(np.uint8), np.arange(4)
     least_distances(words, rows, words, rows)
+    bit_counts(words, rows, len(words))
