@@ -68,6 +68,7 @@ def _say(folder: Path, summary: dict[str, Any]) -> None:
 def object_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
     """What `add_object_arguments` asked for, by the names of `ObjectOptions`."""
     from morph_dslam.online.aids.start import AidFiles
+    from morph_dslam.online.tracker_options import TrackerOptions
 
     return {
         "model": arguments.model,
@@ -83,6 +84,7 @@ def object_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
         "per_sequence": tuple(arguments.per_sequence),
         "random_walk": tuple(arguments.random_walk),
         "start": arguments.start,
+        "tracker": TrackerOptions(new_views=not arguments.one_view),
     }
 
 
@@ -136,6 +138,11 @@ def add_object_arguments(command: argparse.ArgumentParser) -> None:
         "--outline",
         action="store_true",
         help="let the object's outline count too, where it stands out from the background",
+    )
+    command.add_argument(
+        "--one-view",
+        action="store_true",
+        help="make no further reference views when the object turns other parts to the camera",
     )
     command.add_argument(
         "--depth",

@@ -32,10 +32,11 @@ class Anchoring:
     Attributes
     ----------
     has_moved : whether the object is away from its place in the map.
+    reference : the view that frames are compared with.
     """
 
     def __init__(self, estimator: Estimator, reference: ReferenceView, options: TrackerOptions) -> None:
-        self._estimator, self._reference, self._options = estimator, reference, options
+        self._estimator, self.reference, self._options = estimator, reference, options
         self._d = len(estimator.model.parameters)
         self._size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
         self._sigma_px, self._n_other = FIRST_SIGMA_PX, 0
@@ -45,7 +46,7 @@ class Anchoring:
         """What the map tells of the pose; None if the camera is lost or the object has moved."""
         if known is None or self.has_moved:
             return None
-        squared_px = self._reference.redundancy * self._sigma_px**2
+        squared_px = self.reference.redundancy * self._sigma_px**2
         return known.prior(self._d, squared_px, HELD if self._options.hold_pose else 1.0)
 
     def contradicts(self, known: KnownPose, attempt: Attempt) -> bool:
@@ -55,7 +56,7 @@ class Anchoring:
         deviations of both poses explain.
         """
         pose, covariance = self._by_points_alone(attempt)
-        points = self._reference.points.rest[attempt.inliers]
+        points = self.reference.points.rest[attempt.inliers]
         apart = np.sqrt(np.mean(np.sum((pose.apply(points) - known.pose.apply(points)) ** 2, axis=1)))
         if not apart > self._options.moved_share * self._size:
             return False
@@ -67,7 +68,7 @@ class Anchoring:
 
         What the points do not tell at all stays as the attempt has it, with a very large variance.
         """
-        estimate, points = attempt.estimate, self._reference.points
+        estimate, points = attempt.estimate, self.reference.points
         weights = attempt.inliers.astype(float)
         _, hessian, gradient, _ = self._estimator.evaluate(
             points, attempt.measurement.pixels, weights, estimate.state
@@ -78,7 +79,7 @@ class Anchoring:
         along = np.where(values > floor, vectors.T @ gradient / np.maximum(values, floor), 0.0)
         rows = vectors[self._d :]
         covariance = (rows / np.maximum(values, floor)) @ rows.T
-        covariance *= self._reference.redundancy * max(estimate.sigma_px, LEAST_SIGMA_PX) ** 2
+        covariance *= self.reference.redundancy * max(estimate.sigma_px, LEAST_SIGMA_PX) ** 2
         return moved(estimate.state, -vectors @ along).camera_from_object, covariance
 
     def note(self, elsewhere: bool) -> None:

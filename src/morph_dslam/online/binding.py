@@ -100,12 +100,21 @@ def bind_pixels(
     return points.take(met), met
 
 
+def signed_areas(pixels: Array) -> Array:
+    """Areas (m,) of triangles with corners ``pixels`` (m, 3, 2), positive where these run clockwise."""
+    a, b, c = pixels[:, 0], pixels[:, 1], pixels[:, 2]
+    with np.errstate(invalid="ignore"):
+        return 0.5 * ((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1]))
+
+
 def facing(view: View, triangles: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Which triangles (m,) show the side on which their corners run clockwise in the image."""
-    a, b, c = (view.pixels[triangles[:, corner]] for corner in range(3))
-    with np.errstate(invalid="ignore"):
-        area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
-        return area > 0.0
+    return signed_areas(view.pixels[triangles]) > 0.0
+
+
+def broadness(view: View, triangles: NDArray[np.int64]) -> Array:
+    """Area (m,) of triangles as seen, at one distance for all: least where the sight line runs along them."""
+    return np.abs(signed_areas(view.pixels[triangles])) * view.nodes[triangles, 2].mean(axis=1) ** 2
 
 
 def nearest_surface_points(

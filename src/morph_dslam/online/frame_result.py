@@ -26,6 +26,7 @@ STAGES = (
     "outline",
     "depth",
     "fuse",
+    "views",
 )
 
 FOLLOWED = "followed from the previous frame"
@@ -54,6 +55,8 @@ class FrameResult:
     unexplained_px : what the model leaves of the residuals, see `systematic_errors`; NaN when lost.
     pose_from : "points", "points and map", "map" where it is hidden, or "" where there is no pose.
     known : the pose by the map, where that alone tells it.
+    view : number of the reference view that the frame was compared with, 0 for the first.
+    made_view : whether the frame has become a reference view itself.
     """
 
     status: str
@@ -68,6 +71,8 @@ class FrameResult:
     unexplained_px: float = float("nan")
     pose_from: str = ""
     known: KnownPose | None = None
+    view: int = 0
+    made_view: bool = False
 
     @classmethod
     def hidden(

@@ -45,11 +45,13 @@ class Measurement:
     ----------
     pixels : (p, 2) where they were found. valid : (p,) which to believe.
     visible : (p,) which no other part of the object hides.
+    depth : (h, w) metres, of the object as it was drawn for the comparison; None where it was not.
     """
 
     pixels: Array
     valid: NDArray[np.bool_]
     visible: NDArray[np.bool_]
+    depth: NDArray[np.float32] | None = None
 
 
 def visible_surface(
@@ -97,4 +99,4 @@ def compare_with_rendering(
     ok &= (correction < options.largest_correction_px) & (correlation > options.least_correlation)
     pixels, valid = predicted.copy(), np.zeros(len(predicted), dtype=bool)
     pixels[rows], valid[rows] = found, ok
-    return Measurement(pixels, valid, visible)
+    return Measurement(pixels, valid, visible, rendering.depth)

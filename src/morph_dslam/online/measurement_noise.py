@@ -80,6 +80,10 @@ class PixelNoise:
         self._before: Array | None = None
         self.common, self.frame = 0.0, 0.0
 
+    def change_points(self) -> None:
+        """The next frame's residuals are of other points: they cannot be compared with the last ones."""
+        self._before = None
+
     def add(self, residuals: Array, measured: Measured | RigMeasured, unknowns: int) -> None:
         """Learn from the residuals (p, 2) of a frame; those of the frame before tell what stays."""
         used = (measured.weights > 0.0) & np.isfinite(residuals).all(axis=1)

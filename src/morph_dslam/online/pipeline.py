@@ -21,7 +21,6 @@ from morph_dslam.online.anchoring import Anchoring
 from morph_dslam.online.attempt import Attempt, Picture, refusal
 from morph_dslam.online.estimation import Estimator, Prior, State
 from morph_dslam.online.flow import flatten, follow
-from morph_dslam.online.frame_estimation import FrameEstimation
 from morph_dslam.online.frame_result import (
     FEW_AGREE,
     FOLLOWED,
@@ -34,11 +33,10 @@ from morph_dslam.online.frame_result import (
 )
 from morph_dslam.online.known_pose import KnownPose
 from morph_dslam.online.measurement import Measurement
-from morph_dslam.online.recovery import Recovery
 from morph_dslam.online.reference_refinement import Keyframe
 from morph_dslam.online.reference_view import ReferenceView
+from morph_dslam.online.reference_views import Change, FollowedView, ReferenceViews
 from morph_dslam.online.shape_search import with_undetermined_at_default
-from morph_dslam.online.systematic_errors import SystematicErrors
 from morph_dslam.online.temporal import at_constant_velocity, new_filter
 from morph_dslam.online.timing import StageClock
 from morph_dslam.online.tracker_options import TrackerOptions
@@ -60,8 +58,8 @@ class Tracker:
 
     Attributes
     ----------
-    reference : the reference view. state : last known of the object.
-    last_seen : where the points were in the last frame that showed them.
+    reference : the reference view that frames are compared with. state : last known of the object.
+    last_seen : where the first view's points were in the last frame that was compared with it.
     last_measured : what the last frame's estimate was made from; without weights if the object was lost.
 
     Raises
@@ -86,17 +84,15 @@ class Tracker:
         self.estimator = Estimator(model, camera, self.options.estimation)
         self._undistortion = camera.undistortion_maps()
         picture = reference if isinstance(reference, Picture) else self._prepare(reference)
-        self.reference = ReferenceView(self.estimator, picture, state, self.options)
-        self._estimation = FrameEstimation(self.estimator, self.reference, self.options)
-        self._recovery = Recovery(model, camera, self.reference, self._estimation, self.options)
-        self._anchoring = Anchoring(self.estimator, self.reference, self.options)
+        reference_view = ReferenceView(self.estimator, picture, state, self.options)
+        self._views = ReferenceViews(self.estimator, reference_view, reference_covariance, self.options)
+        self._anchoring = Anchoring(self.estimator, reference_view, self.options)
         self._filter = new_filter(self.estimator, self.options)
-        points, window = self.reference.points, self.options.flow.window
-        self._systematic = SystematicErrors(self.estimator, points, state, reference_covariance, window)
+        self._unfiltered = np.zeros((len(model.parameters) + 6,) * 2)
         self.last_seen: Keyframe | None = None
         self.last_measured = self.reference.nothing_measured
         self._picture, self._pixels = picture, self.reference.pixels
-        self._supported = np.ones(len(points), dtype=bool)
+        self._supported = np.ones(len(reference_view.points), dtype=bool)
         self._last, self._velocity_base, self._start = state, state, state
         self._lost, self._n_lost = not in_sequence, 0
 
@@ -121,26 +117,36 @@ class Tracker:
             picture = replace(self._prepare(image), depth=depth, in_front=in_front)
         attempt = self._attempt_from_last(picture, self._anchoring.prior(known), clock)
         with clock.stage("search"):
-            attempt = self._estimation.search_other_shapes(attempt)
+            attempt = self._view.estimation.search_other_shapes(attempt)
         if known is not None and attempt.prior is not None:
             attempt = self._without_map_if_moved(picture, attempt, known, clock)
         why_not, how = refusal(attempt, self.options), FOLLOWED
         if self._lost:
-            why_not, how = self._recovery.refusal(attempt), FOUND_AGAIN
+            why_not, how = self._view.recovery.refusal(attempt), FOUND_AGAIN
         if why_not and self._is_to_be_looked_for(known):
-            found, why_not = self._recovery.recover(picture, self._last.parameters, why_not, clock)
+            found, why_not = self._view.recovery.recover(picture, self._last.parameters, why_not, clock)
             attempt, how = (attempt, how) if found is None else (found, RECOVERED)
         if not why_not:
             with clock.stage("outline"):
-                attempt = self._estimation.fit_outline(picture, attempt)
+                attempt = self._view.estimation.fit_outline(picture, attempt)
             with clock.stage("depth"):
-                attempt = self._estimation.fit_depths(picture, attempt)
+                attempt = self._view.estimation.fit_depths(picture, attempt)
             with clock.stage("fuse"):
                 attempt = self._fuse(attempt)
             if known is not None:
                 self._anchoring.note(self._anchoring.contradicts(known, attempt))
         self._remember(picture, attempt, bool(why_not), known)
-        return self._result(attempt, why_not, how, known, clock)
+        result = self._result(attempt, why_not, how, known, clock)
+        change = self._change_of_view(picture, attempt, result, clock)
+        return replace(result, made_view=change is not None and change.is_new, total_ms=clock.total)
+
+    @property
+    def _view(self) -> FollowedView:
+        return self._views.active
+
+    @property
+    def reference(self) -> ReferenceView:
+        return self._view.reference
 
     @property
     def state(self) -> State:
@@ -156,16 +162,16 @@ class Tracker:
         """Estimate from the last known state; by way of the previous frame if the object was seen there."""
         if self._lost:
             start = self._last if prior is None else prior.placed(self._last)
-            attempt = self._estimation.correct(picture, start, None, prior, clock)
+            attempt = self._view.estimation.correct(picture, start, None, prior, clock)
             if refusal(attempt, self.options):
                 return attempt
             # It may have another shape by now: what that hides or shows is only known once it is found.
-            return self._estimation.correct(picture, attempt.estimate.state, None, prior, clock)
+            return self._view.estimation.correct(picture, attempt.estimate.state, None, prior, clock)
         with clock.stage("flow"):
             followed = self._follow(picture, prior)
         with clock.stage("estimate"):
-            start = self._estimation.rough(followed, self._start, prior)
-        return self._estimation.correct(picture, start, followed, prior, clock)
+            start = self._view.estimation.rough(followed, self._start, prior)
+        return self._view.estimation.correct(picture, start, followed, prior, clock)
 
     def _follow(self, picture: Picture, prior: Prior | None) -> Measurement:
         """Follow the points that supported the previous frame's estimate from that frame to this one."""
@@ -205,7 +211,7 @@ class Tracker:
 
     def _fuse(self, attempt: Attempt) -> Attempt:
         """The attempt with what earlier frames tell of the parameters that are one per sequence."""
-        self.last_measured = measured = self._estimation.measured(attempt)
+        self.last_measured = measured = self._view.estimation.measured(attempt)
         estimate = self._filter.fuse(measured, attempt.estimate, attempt.prior)
         return replace(
             attempt, estimate=replace(estimate, residuals=estimate.residuals[: len(attempt.inliers)])
@@ -215,9 +221,11 @@ class Tracker:
         """Keep what the next frame starts from; a lost frame keeps the last known shape."""
         if not lost:
             estimate, weights = attempt.estimate, attempt.inliers.astype(float)
-            self.last_seen = Keyframe(
-                attempt.measurement.pixels, weights, estimate.state, estimate.sigma_px, attempt.outline
-            )
+            self.last_seen = None
+            if not self._view.number:
+                self.last_seen = Keyframe(
+                    attempt.measurement.pixels, weights, estimate.state, estimate.sigma_px, attempt.outline
+                )
             self._velocity_base = estimate.state if self._lost else self._last
             self._last = estimate.state
             self._start = with_undetermined_at_default(self.model, estimate)
@@ -228,13 +236,33 @@ class Tracker:
             self._pixels = np.where(attempt.inliers[:, None], attempt.measurement.pixels, projected)
             self._anchoring.learn(estimate)
             if not self._lost:
-                self._recovery.learn(attempt)
+                self._view.recovery.learn(attempt)
         elif known is not None and not self._anchoring.has_moved:
             self._last = replace(self._last, camera_from_object=known.pose)
         if lost:
             self.last_measured = self.reference.nothing_measured
         self._picture, self._lost = picture, lost
         self._n_lost = self._n_lost + 1 if lost else 0
+
+    def _change_of_view(
+        self, picture: Picture, attempt: Attempt, result: FrameResult, clock: StageClock
+    ) -> Change | None:
+        """Go on with another reference view if it shows more of what is seen, or may show a lost object."""
+        if result.estimate is None:
+            change = self._views.after_lost(self._n_lost)
+        else:
+            self._unfiltered = result.estimate.covariance - attempt.estimate.covariance
+            if result.recovered:  # what was only just found again is followed for a frame first
+                return None
+            left = result.unexplained_px
+            change = self._views.after_tracked(picture, attempt, result.estimate, left, clock)
+        if change is None:
+            return None
+        self._filter.change_points(self._views.point_change(change.view, self._unfiltered))
+        self._unfiltered = np.zeros_like(self._unfiltered)
+        self._views.active, self._anchoring.reference = change.view, change.view.reference
+        self._supported, self._pixels = change.supported, change.pixels
+        return change
 
     def _result(
         self, attempt: Attempt, why_not: str, how: str, known: KnownPose | None, clock: StageClock
@@ -244,14 +272,16 @@ class Tracker:
         if why_not and known is not None and not moved:
             return FrameResult.hidden(why_not, known, visible, count, times, total)
         aside = f"; {HAS_MOVED}" if moved else ""
+        if self._view.number:
+            aside += f"; by reference view {self._view.number}"
         if why_not:
             return FrameResult("lost", f"lost: {why_not}{aside}", None, np.nan, visible, count, times, total)
         residuals = attempt.estimate.residuals[attempt.inliers]
         rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
-        left = self._systematic.unexplained(attempt.estimate, attempt.inliers)
-        doubt = self._recovery.doubt(attempt)
+        left = self._view.systematic.unexplained(attempt.estimate, attempt.inliers)
+        doubt = self._view.recovery.doubt(attempt)
         alike_px = max(left.px, doubt)
-        estimate = self._systematic.added(attempt.estimate, attempt.inliers, alike_px, attempt.prior)
+        estimate = self._view.systematic.added(attempt.estimate, attempt.inliers, alike_px, attempt.prior)
         if doubt:
             aside += f"; {FEW_AGREE}: by {attempt.estimate.sigma_px:.1f} px"
         if left.is_failure:
@@ -268,6 +298,7 @@ class Tracker:
             recovered=how != FOLLOWED,
             unexplained_px=left.px,
             pose_from="points" if attempt.prior is None else "points and map",
+            view=self._view.number,
         )
 
     def _prepare(self, image: NDArray[np.uint8]) -> Picture:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import RegistrationError
 from morph_dslam.online.appearance import ReferenceAppearance
 from morph_dslam.online.attempt import Picture
-from morph_dslam.online.binding import DrawnSurface, View, bind_pixels, draw_view, view_of
+from morph_dslam.online.binding import DrawnSurface, View, bind_pixels, broadness, draw_view, view_of
 from morph_dslam.online.estimation import BoundPoints, Estimator, State
 from morph_dslam.online.features import interior, spread_corners
 from morph_dslam.online.measurement import (
@@ -33,6 +33,10 @@ class ReferenceView:
     Parameters
     ----------
     picture : the view. state : the object in it.
+    hidden : (h, w) where something else may be in front of the object; nothing is bound there.
+    surface : what of the model is drawn, if another view knows it already.
+    least_broadness : points do not count where the surface is seen flatter than in this view, by this factor
+        of its area or a smaller one.
 
     Attributes
     ----------
@@ -47,16 +51,29 @@ class ReferenceView:
         If the object shows too few corners.
     """
 
-    def __init__(self, estimator: Estimator, picture: Picture, state: State, options: TrackerOptions) -> None:
+    def __init__(
+        self,
+        estimator: Estimator,
+        picture: Picture,
+        state: State,
+        options: TrackerOptions,
+        hidden: NDArray[np.bool_] | None = None,
+        surface: DrawnSurface | None = None,
+        least_broadness: float = 0.0,
+    ) -> None:
         self._estimator, self._options, self.state = estimator, options, state
         model, camera = estimator.model, estimator.camera
-        self.surface = DrawnSurface.of(model)
+        self.surface = surface or DrawnSurface.of(model)
         drawn = self.surface.model
         view = view_of(drawn, camera, state)
         self.appearance = ReferenceAppearance(drawn, camera, picture.flat, view, self.surface.closed)
-        mask = interior(draw_view(view, drawn.triangles, camera).covered, options.measurement.patch_half + 2)
+        covered = draw_view(view, drawn.triangles, camera).covered
+        mask = interior(covered if hidden is None else covered & ~hidden, options.measurement.patch_half + 2)
         self.points = self._choose_points(picture, mask, view)
         self.pixels = camera.project(self.points.in_camera(state))
+        self._least_broadness = least_broadness * broadness(
+            view, drawn.triangles[self.points.surface.triangles]
+        )
         self.relocaliser = Relocaliser(estimator, drawn, picture.grey, mask, view)
         self.outline, self.all_points = None, self.points
         if options.use_outline:
@@ -87,6 +104,14 @@ class ReferenceView:
         camera, drawn = self._estimator.camera, self.surface.model
         return draw_view(view_of(drawn, camera, state), drawn.triangles, camera).depth
 
+    def projected(self, state: State) -> Array:
+        """Where the points (p, 2) are in the image in a state, pixels; NaN behind the camera."""
+        return self._estimator.camera.project(self.points.in_camera(state))
+
+    def rendered(self, state: State) -> NDArray[np.uint8]:
+        """This view as it should appear in a state, flattened (h, w)."""
+        return self.appearance.render(view_of(self.surface.model, self._estimator.camera, state)).image
+
     def measure(
         self, picture: Picture, state: State, followed: Measurement | None, clock: StageClock
     ) -> Measurement:
@@ -107,6 +132,9 @@ class ReferenceView:
             if picture.in_front is not None:
                 tolerance = DEPTH_TOLERANCE * float(np.median(positions[:, 2]))
                 visible &= visible_points(predicted, positions[:, 2], picture.in_front, tolerance)
+            if self._least_broadness.any():
+                seen = broadness(view, drawn.triangles[self.points.surface.triangles])
+                visible &= seen >= self._least_broadness
             guesses = predicted
             if followed is not None:
                 guesses = np.where(followed.valid[:, None], followed.pixels, predicted)

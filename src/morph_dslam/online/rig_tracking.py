@@ -117,7 +117,8 @@ class RigTracker:
     ) -> Tracker:
         part.camera.check_image(image, f"the reference frame of camera {number}")
         # What is one over the sequence, or walks, is found from all cameras together.
-        single = replace(self.options, per_sequence=(), random_walk=())
+        # The joint estimate ties lasting errors to the points of one view a camera, so these stay the same.
+        single = replace(self.options, per_sequence=(), random_walk=(), new_views=False)
         try:
             return Tracker(self.model, part.camera, image, state, single, in_sequence)
         except RegistrationError as error:

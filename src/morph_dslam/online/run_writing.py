@@ -86,6 +86,11 @@ def write_run(
         save_camera(folder / "camera.yaml", load_camera(inputs.camera))
     given = {"model": str(inputs.model), "camera": str(inputs.camera)} | inputs.named
     common = temporal_facts(run.model.parameters, tracker) | {
+        "new_reference_views": {
+            "allowed": tracker.new_views,
+            "made": sum(result.made_view for result in run.results),
+            "frames_compared_with_them": sum(result.view > 0 for result in run.results),
+        },
         "registration": placement.facts,
         "flags": list(placement.flags),
         "inputs": given,

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.model import ReducedModel
 from morph_dslam.online.estimation import Estimate, Prior, State
+from morph_dslam.online.filter_memory import Errors, Past, PointChange, quadratic
 from morph_dslam.online.linear_cost import LinearCost
 from morph_dslam.online.measurement_noise import Measured, PixelNoise, RigMeasured
 
@@ -91,8 +92,14 @@ class SequenceFilter(Generic[Frame]):
         self._walks = bool(walking)
         self._unknowns = len(estimator.model.parameters) + 6
         self._noise = PixelNoise(self.options.memory)
-        self._past: _Past | None = None
+        self._past: Past | None = None
         self._conflicts = 0
+
+    def change_points(self, change: PointChange) -> None:
+        """Go on with the points of another view; what those so far have put into the past stays in it."""
+        self._noise.change_points()
+        if self._past is not None:
+            self._past = self._past.with_points(change, self._kept)
 
     def fuse(self, measured: Frame, alone: Estimate, known: Prior | None = None) -> Estimate:
         """The estimate of a frame from its measurements and all frames before, with its covariance.
@@ -132,7 +139,7 @@ class SequenceFilter(Generic[Frame]):
         estimate: Estimate,
         measured: Frame,
         linear: LinearCost,
-        errors: _Errors,
+        errors: Errors,
         known: Prior | None,
         past: Prior | None = None,
     ) -> Estimate:
@@ -155,16 +162,18 @@ class SequenceFilter(Generic[Frame]):
     def _of_kept(self, matrix: Array) -> Array:
         return matrix[np.ix_(self._kept, self._kept)]
 
-    def _keep(self, estimate: Estimate, errors: _Errors) -> None:
+    def _keep(self, estimate: Estimate, errors: Errors) -> None:
         """Make the estimate's parameters that are one per sequence the past of the next frame."""
         grown = np.exp(1.0 / self.options.memory)
-        self._past = _Past(
+        self._past = Past(
             estimate.state.parameters[self._kept],
             grown * self._of_kept(errors.covariance) + self._step,
             np.sqrt(grown) * errors.by_point[:, :, self._kept],
             grown * self._of_kept(errors.by_frames) + self._step,
             np.sqrt(grown) * errors.by_cause[:, self._kept],
             grown * self._of_kept(errors.unseen),
+            {view: np.sqrt(grown) * rows[:, self._kept] for view, rows in errors.by_views.items()},
+            {} if self._past is None else self._past.left,
         )
 
     def _start(self, alone: Estimate) -> State:
@@ -175,7 +184,7 @@ class SequenceFilter(Generic[Frame]):
         parameters[self._kept[surer]] = self._past.mean[surer]
         return replace(alone.state, parameters=parameters)
 
-    def _prior(self, past: _Past, measured: Frame, errors: _Errors) -> Prior:
+    def _prior(self, past: Past, measured: Frame, errors: Errors) -> Prior:
         """The past as a term of the frame's cost, of the weight that makes the variance of both least.
 
         In the basis in which the frame's covariance is 1 and the past's p, with the covariance c of both, the
@@ -184,7 +193,7 @@ class SequenceFilter(Generic[Frame]):
         d, own = self._unknowns - 6, self._of_kept(errors.covariance)
         squared_px = np.trace(np.linalg.solve(self._of_kept(errors.inverse), own)) / len(self._kept)
         p, basis = scipy.linalg.eigh(past.covariance, own)
-        shared = _quadratic(past.by_point, measured.correlation, errors.by_point[:, :, self._kept])
+        shared = quadratic(past.by_point, measured.correlation, errors.by_point[:, :, self._kept])
         causes = min(len(past.by_cause), len(errors.by_cause))
         shared += past.by_cause[:causes].T @ errors.by_cause[:causes, self._kept]
         c = np.einsum("ik,ij,jk->k", basis, shared, basis)
@@ -195,13 +204,13 @@ class SequenceFilter(Generic[Frame]):
         information[np.ix_(self._kept, self._kept)] = root @ root.T
         return Prior(mean, information)
 
-    def _contradicts(self, past: _Past, estimate: Estimate) -> bool:
+    def _contradicts(self, past: Past, estimate: Estimate) -> bool:
         """Whether a frame by itself says something else than all those before."""
         apart = estimate.state.parameters[self._kept] - past.mean
         spread = self._of_kept(estimate.covariance) + past.covariance
         return float(apart @ np.linalg.solve(spread, apart)) > self.options.gate**2
 
-    def _is_far_surer(self, past: _Past, estimate: Estimate) -> bool:
+    def _is_far_surer(self, past: Past, estimate: Estimate) -> bool:
         """Whether the past knows far better than a frame by itself whatever both tell of."""
         shares = scipy.linalg.eigvalsh(past.covariance, self._of_kept(estimate.covariance))
         return float(shares.max()) < FAR_SURER**2
@@ -213,13 +222,14 @@ class SequenceFilter(Generic[Frame]):
         state: State,
         known: Prior | None,
         past: Prior | None = None,
-    ) -> _Errors:
+    ) -> Errors:
         """How the measurements' errors, and those of what is known otherwise, enter the estimate."""
         d, kept = self._unknowns - 6, self._kept
         common, frame = self._noise.common, self._noise.frame
         by_point = np.sqrt(common) * linear.scores
-        by_frames = frame * _quadratic(linear.scores, measured.correlation) + linear.of_depths
+        by_frames = frame * quadratic(linear.scores, measured.correlation) + linear.of_depths
         by_cause, unseen = np.zeros((0, self._unknowns)), np.zeros_like(linear.hessian)
+        by_views: dict[int, Array] = {}
         hessian = linear.hessian.copy()
         if known is not None:
             information, by_cause = known.terms(state)[1], known.lasting_scores
@@ -233,58 +243,17 @@ class SequenceFilter(Generic[Frame]):
             by_cause = _longer(by_cause, len(self._past.by_cause))
             by_cause[: len(self._past.by_cause), kept] += self._past.by_cause @ weight
             unseen[np.ix_(kept, kept)] += weight @ self._past.unseen @ weight
+            by_views = {view: rows @ weight for view, rows in self._past.by_views.items()}
         linear = replace(linear, hessian=hessian)
         inverse = linear.inverse
         by_point, by_frames, by_cause = by_point @ inverse, inverse @ by_frames @ inverse, by_cause @ inverse
         unseen = inverse @ unseen @ inverse + (common + frame) * linear.unseen
-        covariance = _quadratic(by_point, measured.correlation) + by_frames + by_cause.T @ by_cause + unseen
-        return _Errors(by_point, by_frames, by_cause, unseen, covariance, inverse)
-
-
-@dataclass(frozen=True)
-class _Past:
-    """What the frames so far said of the k parameters that are one per sequence.
-
-    Attributes
-    ----------
-    mean : (k,), SI. covariance : (k, k). by_point, by_frames, by_cause, unseen : as in `_Errors`, (p, 2, k),
-        (k, k), (c, k) and (k, k).
-    """
-
-    mean: Array
-    covariance: Array
-    by_point: Array
-    by_frames: Array
-    by_cause: Array
-    unseen: Array
-
-
-@dataclass(frozen=True)
-class _Errors:
-    """How errors enter an estimate.
-
-    Attributes
-    ----------
-    by_point : (p, 2, n) derivative by the part that stays with a point, in its standard deviations.
-    by_frames : (n, n) covariance from what is new in each frame.
-    by_cause : (c, n) derivative by what is the same in all frames of a known pose; see `Prior.lasting`.
-    unseen : (n, n) covariance of what nothing tells of. covariance : (n, n) from all of it.
-    inverse : (n, n) of the cost's Hessian.
-    """
-
-    by_point: Array
-    by_frames: Array
-    by_cause: Array
-    unseen: Array
-    covariance: Array
-    inverse: Array
-
-
-def _quadratic(scores: Array, correlation: Array, others: Array | None = None) -> Array:
-    """sum_ij K_ij W_i' V_j (n, n) of scores (p, 2, n), twice the same or two, and correlation K (p, p)."""
-    others = scores if others is None else others
-    spread = (correlation @ others.reshape(len(others), -1)).reshape(others.shape)
-    return np.tensordot(scores, spread, axes=([0, 1], [0, 1]))
+        covariance = quadratic(by_point, measured.correlation) + by_frames + by_cause.T @ by_cause + unseen
+        if past is not None and self._past is not None:
+            by_views = {view: rows @ inverse[kept] for view, rows in by_views.items()}
+            for view, rows in by_views.items():
+                covariance += rows.T @ self._past.left[view].covariance @ rows
+        return Errors(by_point, by_frames, by_cause, unseen, covariance, inverse, by_views)
 
 
 def _longer(rows: Array, count: int) -> Array:

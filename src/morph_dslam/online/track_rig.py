@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,8 @@ def track_rig(options: TrackOptions, others: Sequence[Path]) -> dict[str, Any]:
     """
     if options.placement is not None or options.refine_reference or options.use_depth:
         raise TrackingError("several cameras track a free object: leave out --place, --refine and --depth")
+    # Each camera keeps its one reference view; see `RigTracker`.
+    options = replace(options, tracker=replace(options.tracker, new_views=False))
     cameras = _cameras(options.camera, 1 + len(others))
     check_run_folder(options.output, options.overwrite)
     setup = load_setup(options.of_object)

@@ -42,6 +42,8 @@ class TrackerOptions:
         of the change, SI: a prior on them. None by default.
     start : where the search for a frame's state starts: from the previous state, or from where the last two
         lead at constant velocity.
+    new_views, max_views : whether frames in which the reference view shows too little of what is seen may
+        become reference views too, and how many are kept, the first one included.
     """
 
     n_points: int = 350
@@ -64,6 +66,8 @@ class TrackerOptions:
     per_sequence: tuple[str, ...] = ()
     random_walk: tuple[tuple[str, float], ...] = ()
     start: StartFrom = "previous"
+    new_views: bool = True
+    max_views: int = 12
     flow: FlowOptions = field(default_factory=FlowOptions)
     measurement: MeasurementOptions = field(default_factory=MeasurementOptions)
     outline: OutlineOptions = field(default_factory=OutlineOptions)

@@ -1,0 +1,87 @@
+"""Whether a frame is fit to be a reference view."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from morph_dslam.online.attempt import Picture
+from morph_dslam.online.estimation import Estimator
+from morph_dslam.online.flow import flatten
+from morph_dslam.online.frame_estimation import FrameEstimation
+from morph_dslam.online.frame_result import STAGES
+from morph_dslam.online.new_view import hidden_part, is_fit, sharpness
+from morph_dslam.online.reference_view import ReferenceView
+from morph_dslam.online.timing import StageClock
+from morph_dslam.online.tracker_options import TrackerOptions
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state
+
+OPTIONS, NOW = TrackerOptions(), sheet_state(0.1)
+
+
+def picture(image, **others):
+    grey = np.ascontiguousarray(image[:, :, 0])
+    return Picture(grey, flatten(grey, OPTIONS.flow.flatten_window), **others)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """The first view, and an attempt at the picture of a later frame."""
+    film = SheetFilm(bent_sheet_model(43, 31))
+    estimator = Estimator(film.model, CAMERA)
+    view = ReferenceView(estimator, picture(film.frame(sheet_state(0.0))), sheet_state(0.0), OPTIONS)
+    estimation = FrameEstimation(estimator, view, OPTIONS)
+
+    def attempt(image):
+        made = picture(image)
+        return made, estimation.correct(made, NOW, None, None, StageClock(STAGES))
+
+    return film, view, attempt
+
+
+def fit(view, made, attempt, unexplained_px=0.1, **changed):
+    estimate = replace(attempt.estimate, **changed)
+    return is_fit(made, replace(attempt, estimate=estimate), estimate, unexplained_px, view, OPTIONS)
+
+
+def test_a_sharp_frame_whose_state_is_known_is_fit(scene):
+    film, view, attempt = scene
+    made, tried = attempt(film.frame(NOW))
+    assert fit(view, made, tried)
+    assert fit(view, *attempt(film.frame(NOW, light=0.6)))
+    assert not fit(view, made, tried, unexplained_px=0.6)
+    assert not fit(view, made, tried, sigma_px=1.2)
+    assert not fit(view, made, tried, covariance=1e4 * np.eye(9) * np.trace(tried.estimate.covariance))
+    few = np.arange(len(tried.inliers)) % 2 == 0
+    assert not is_fit(made, replace(tried, inliers=tried.inliers & few), tried.estimate, 0.1, view, OPTIONS)
+
+
+def test_a_blurred_frame_is_not(scene):
+    film, view, attempt = scene
+    made, tried = attempt(film.frame(NOW))
+    streak = np.zeros((9, 9), np.float32)
+    streak[4] = 1.0 / 9.0
+    blurred = picture(cv2.filter2D(film.frame(NOW), -1, streak))
+    assert not fit(view, blurred, tried)
+    everywhere = np.ones(made.flat.shape, dtype=bool)
+    assert sharpness(blurred.flat, everywhere) < 0.8 * sharpness(made.flat, everywhere)
+
+
+def test_nothing_is_bound_around_points_that_disagree_or_behind_another_object(scene):
+    film, view, attempt = scene
+    hand = (250, 150, 90, 90)
+    made, tried = attempt(film.frame(NOW, occluder=hand))
+    inside = np.zeros(made.flat.shape, dtype=bool)
+    inside[155:235, 255:335] = True
+    hidden = hidden_part(made, tried, view)
+    assert hidden[inside].mean() > 0.8
+    assert hidden[300:400, 400:500].mean() < 0.1
+    depths = np.where(inside, np.float32(0.3), np.float32(np.inf))
+    assert hidden_part(replace(made, in_front=depths), tried, view)[inside].all()
+    new = ReferenceView(
+        Estimator(film.model, CAMERA), made, tried.estimate.state, OPTIONS, hidden, view.surface
+    )
+    places = np.rint(new.pixels).astype(int)
+    assert not hidden[places[:, 1], places[:, 0]].any()
