@@ -51,6 +51,17 @@ def plane_points(points: Array, thickness: float, rng: np.random.Generator) -> N
     return np.abs((points - centre) @ normal) <= thickness
 
 
+def largest_plane_normal(points: Array, seed: int = 0) -> Array | None:
+    """Unit normal (3,) of the plane that holds most of the map's points (n, 3); None if it holds few."""
+    usable = points[without_strays(points)]
+    thickness = PLANE_THICKNESS * usual_spacing(points)
+    on_plane = plane_points(usable, thickness, np.random.default_rng(seed))
+    if on_plane.sum() < max(PLANE_SHARE * len(usable), 3):
+        return None
+    flat = usable[on_plane]
+    return np.linalg.svd(flat - flat.mean(axis=0))[2][-1]
+
+
 def candidate_regions(points: Array, seed: int = 0) -> list[NDArray[np.int64]]:
     """Indices of the points of each region where an object may be.
 

@@ -3,24 +3,27 @@
 Regions of the map that stand out of its planes are tried in turn. In each the surface starts in many
 attitudes and sizes, is laid through the points by scaled robust ICP, and every result is scored by the
 keyframes: points that it explains count for it, points that it would hide against it. The best and the best
-other one are kept, and the best is refined by comparing the keyframes' images on it.
+other one are kept, and the best is refined by comparing the keyframes' images on it. Last, these are asked
+whether they show its outline there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
+from morph_dslam.online.mesh_registration.attitudes import attitudes
 from morph_dslam.online.mesh_registration.evidence import Evidence, gather_evidence
 from morph_dslam.online.mesh_registration.keyframe_adjustment import AdjustedKeyframes, KeyframeAdjustment
-from morph_dslam.online.mesh_registration.regions import candidate_regions
+from morph_dslam.online.mesh_registration.outline_fit import OutlineFit, outline_fit
+from morph_dslam.online.mesh_registration.regions import candidate_regions, largest_plane_normal
 from morph_dslam.online.mesh_registration.scaled_icp import Fit, fit_surface
 from morph_dslam.online.mesh_registration.scene import MapPoints, View, spread_views
 from morph_dslam.online.mesh_registration.similarity_of_path import similarity_of_path
@@ -32,6 +35,8 @@ Array = NDArray[np.float64]
 
 #: Sizes at which the surface starts, over that of the region.
 START_SIZES = (0.85, 1.1, 1.45)
+#: How far its middle starts behind that of the points, which lie on the filmed side; over their spread.
+START_BEHIND = (0.0, 0.6)
 #: Points used while searching; starts of a region that are followed to their end, scored by few keyframes,
 #: and refined and scored by more.
 MOST_POINTS, N_FOLLOWED, N_SCORED, N_REFINED = 120, 120, 40, 5
@@ -68,6 +73,7 @@ class MeshRegistration:
     rms_px : how far the keyframes' images of the surface agree; None if there was too little to compare.
     axis : about which the surface can be turned without a difference, so that this angle is not known.
     keyframes : those with a pose of their own about the object; None if there was too little to compare.
+    outline : how much of its outline the keyframes show where it is.
     """
 
     world_from_object: SimilarityTransform
@@ -78,11 +84,13 @@ class MeshRegistration:
     rms_px: float | None
     axis: Axis | None
     keyframes: AdjustedKeyframes | None = None
+    outline: OutlineFit = field(default_factory=OutlineFit)
 
     @property
     def ambiguous(self) -> bool:
         """Whether another place is nearly as good, or the images contradict this one."""
         contradicted = self.rms_px is not None and self.rms_px > POOR_AGREEMENT_PX
+        contradicted |= self.outline.contradicts
         return contradicted or self.runner_up > AMBIGUOUS * self.score
 
 
@@ -115,7 +123,7 @@ def register_mesh(
         If no place in the map explains enough points.
     """
     rough, surface = Surface.of_mesh(nodes, triangles, ROUGH_SAMPLES), Surface.of_mesh(nodes, triangles)
-    attitudes = _attitudes(surface.axis_of_revolution)
+    starts_in = attitudes(surface.axis_of_revolution, largest_plane_normal(points.positions))
 
     def judged(place: SimilarityTransform, asked: Sequence[View]) -> _Place:
         tolerance = TOLERANCE * surface.size * place.scale
@@ -128,19 +136,27 @@ def register_mesh(
     for region in tqdm(
         candidate_regions(points.positions), desc="registering", unit="region", disable=not progress
     ):
-        starts = [judged(place, few) for place in _searched(points[region], rough, attitudes, metric)]
+        starts = [judged(place, few) for place in _searched(points[region], rough, starts_in, metric)]
         for start in sorted(starts, key=lambda place: -place.evidence.score)[:N_REFINED]:
             places.append(judged(_refined(start.transform, points, surface, metric), more))
     candidates = _distinct(places, len(points), surface)
     aligner = TextureAlignment(nodes, triangles, camera, views, metric)
     found = _chosen(candidates, aligner, surface)
-    if found.rms_px is None:
-        return found
-    adjustment = KeyframeAdjustment(nodes, triangles, camera, points, views, surface.axis_of_revolution)
+    if found.rms_px is not None:
+        adjustment = KeyframeAdjustment(nodes, triangles, camera, points, views, surface.axis_of_revolution)
+        found = _adjusted(found, adjustment, nodes.mean(axis=0), metric)
+    outline = outline_fit(found.world_from_object, nodes, triangles, more, camera)
+    return replace(found, outline=outline)
+
+
+def _adjusted(
+    found: MeshRegistration, adjustment: KeyframeAdjustment, mean_node: Array, metric: bool
+) -> MeshRegistration:
+    """The registration with keyframes placed about the object, where there is enough to compare."""
     keyframes = adjustment.adjust(found.world_from_object)
     if keyframes is None:
         return found
-    placed, covariance = similarity_of_path(keyframes, found.world_from_object, nodes.mean(axis=0), metric)
+    placed, covariance = similarity_of_path(keyframes, found.world_from_object, mean_node, metric)
     return replace(found, world_from_object=placed, covariance=covariance, keyframes=keyframes)
 
 
@@ -154,16 +170,19 @@ def _refined(
 
 
 def _searched(
-    points: MapPoints, surface: Surface, attitudes: list[Array], metric: bool
+    points: MapPoints, surface: Surface, starts_in: list[Array], metric: bool
 ) -> list[SimilarityTransform]:
     """The best distinct fits to a region, before the keyframes have been asked."""
     some = points[np.random.default_rng(0).permutation(len(points))[:MOST_POINTS]]
     centre = np.median(points.positions, axis=0)
     spread = float(np.sqrt(np.mean(np.sum((points.positions - centre) ** 2, axis=1))))
+    away = centre - points.viewpoints.mean(axis=0)
+    away *= spread / np.linalg.norm(away)
     starts = []
     for scale in (1.0,) if metric else np.array(START_SIZES) * spread / surface.radius:
-        for rotation in attitudes:
-            start = SimilarityTransform(scale, rotation, centre - scale * rotation @ surface.centre)
+        for rotation, behind in product(starts_in, START_BEHIND):
+            place = centre + behind * away - scale * rotation @ surface.centre
+            start = SimilarityTransform(scale, rotation, place)
             starts.append(fit_surface(some, surface, start, COARSE * surface.size * scale, metric, False))
     fits = []
     for rough in _by_weight(starts)[:N_FOLLOWED]:
@@ -179,18 +198,6 @@ def _searched(
 
 def _by_weight(fits: list[Fit]) -> list[Fit]:
     return sorted(fits, key=lambda fit: -float(fit.weights.sum()))
-
-
-def _attitudes(axis: Axis | None) -> list[Array]:
-    """Rotations (3, 3) spread over all: those of the icosahedron, one for each direction of an axis."""
-    rotations = list(Rotation.create_group("I").as_matrix())
-    if axis is None:
-        return rotations
-    kept: list[Array] = []
-    for rotation in rotations:
-        if all(np.linalg.norm((rotation - other) @ axis.direction) > 0.1 for other in kept):
-            kept.append(rotation)
-    return kept
 
 
 def _same_place(a: SimilarityTransform, b: SimilarityTransform, surface: Surface) -> bool:
