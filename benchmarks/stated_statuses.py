@@ -101,6 +101,9 @@ def _in_map(nodes, world: SimilarityTransform, seed: int, objects, metric: bool 
     found = register_mesh(nodes, triangles, points, views, CAMERA, metric)
     off = (world.inverse @ found.world_from_object).apply(nodes) - wedge()[0]
     error = min(float(np.linalg.norm(off - place, axis=1).mean()) for place in objects)
+    if found.outline.contradicts:
+        said = f"the outline does not fit: {100 * found.outline.share:.0f} % of it"
+        return Outcome((said,), 1, 0, 1, largest_error=error)
     if found.ambiguous:
         return Outcome(("ambiguous",), 1, 0, 1, largest_error=error)
     return Outcome((f"scale {found.world_from_object.scale:.3f}",), 1, 1, 0, int(error > 5e-3), None, error)

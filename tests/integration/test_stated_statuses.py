@@ -1,5 +1,7 @@
 """What is not as it should be leads to a stated status, never to a confident wrong answer."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from morph_dslam.cli import main
 from morph_dslam.errors import RegistrationError
 from morph_dslam.io.calibration import save_camera
 from morph_dslam.model import save_model
+from morph_dslam.online.mesh_registration.register import register_mesh
 from morph_dslam.online.mesh_registration.scene import scene_of_map
 from morph_dslam.online.mesh_registration.unit_check import register_in_unit
 from morph_dslam.online.registration import register
@@ -105,6 +108,19 @@ def test_the_unit_of_a_metric_map_tells_that_of_the_mesh():
     points, views = scene_of_map(map_with((np.zeros(3),)))
     with pytest.raises(RegistrationError, match=r"one of its shape that is 0\.039\d* times as large"):
         register_in_unit(25.4 * nodes, triangles, points, views, CAMERA, metric=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stretch", [1.0, 1.1])
+def test_a_mesh_that_is_drawn_out_is_accused_by_its_outline(stretch):
+    """Its faces lie on those of the object in another size, where the images of them agree."""
+    nodes, triangles, _ = wedge()
+    points, views = scanned(replace(WORLD, scale=3.7), with_images=True)
+    found = register_mesh(nodes * [stretch, 1.0, 1.0], triangles, points, views, CAMERA)
+    right = abs(found.world_from_object.scale / 3.7 - 1.0) < 0.01
+    assert right == (stretch == 1.0)
+    assert found.outline.contradicts == (not right)
+    assert found.ambiguous == (not right)
 
 
 @pytest.mark.slow

@@ -67,14 +67,18 @@ def load_placement(path: Path, model: ReducedModel) -> Placement:
         pose = RigidTransform.from_matrix(np.array(keyframe["camera_from_object"], dtype=np.float64))
         frame, axis = int(keyframe["frame"]), content["axis_of_revolution"]
         facts = {key: content[key] for key in ("score", "runner_up_score", "rms_px", "map_units_per_metre")}
-        ambiguous = bool(content["ambiguous"])
+        ambiguous, outline_fits = bool(content["ambiguous"]), bool(content.get("outline_fits", True))
         place = PlaceInMap.from_content(content)
     except OSError as error:
         raise RegistrationError(f"cannot read the registration {path}: {error.strerror}") from error
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise RegistrationError(f"{path} is not a registration.json of `morph register` ({error})") from error
     open_angles: tuple[str, ...] = ()
-    flags = ["registration ambiguous: another place in the map is nearly as good"] if ambiguous else []
+    flags = []
+    if not outline_fits:
+        flags.append("registration doubtful: the keyframes show the object's outline elsewhere")
+    elif ambiguous:
+        flags.append("registration ambiguous: another place in the map is nearly as good")
     if axis is not None:
         model = turned_model(model, np.array(axis["direction"]))
         open_angles = (model.parameters[-1].name,)

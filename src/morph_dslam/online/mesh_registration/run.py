@@ -78,6 +78,8 @@ def _content(found: MeshRegistration, nodes: NDArray[np.float64]) -> dict[str, A
         "score": found.score,
         "runner_up_score": found.runner_up,
         "ambiguous": found.ambiguous,
+        "outline_share": found.outline.share if found.outline.count else None,
+        "outline_fits": not found.outline.contradicts,
         "n_explained": found.n_explained,
         "rms_px": found.rms_px,
         "covariance": None if found.covariance is None else found.covariance.tolist(),
@@ -107,7 +109,13 @@ def _keyframes(found: MeshRegistration, views: Sequence[View]) -> list[dict[str,
 def remarks(content: dict[str, Any]) -> list[str]:
     """What a reader of the registration must know."""
     lines = []
-    if content["ambiguous"]:
+    if not content.get("outline_fits", True):
+        lines.append(
+            f"the outline does not fit: the keyframes show only {100 * content['outline_share']:.0f} % of it "
+            "where it is; it may be the mesh of another object, and the size of the map's unit wrong. Look "
+            "at registration.jpg"
+        )
+    elif content["ambiguous"]:
         lines.append(
             "ambiguous: another place is nearly as good (see runner_up_score); look at registration.jpg, and "
             "give landmarks if it is wrong"
