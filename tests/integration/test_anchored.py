@@ -215,18 +215,18 @@ def test_an_interrupt_keeps_a_live_run(recording, monkeypatch, capsys):
     def interrupted(self, frame, picture):
         show(self, frame, picture)
         shown.append(frame.index)
-        if len(shown) == 3:
+        if len(shown) == 1:  # many more are to come, also where the machine is slow
             _thread.interrupt_main()
 
     monkeypatch.setattr(VideoSink, "show", interrupted)
     command = ["live", str(folder / "sequence" / "frames"), "--model", str(folder / "sheet.morph")]
     command += ["--camera", str(folder / "sequence" / "camera.yaml"), "--show", "displacement"]
     command += ["--place", str(folder / "registration.json"), "-o", str(folder / "stopped")]
-    assert main([*command, "--range", "20-"]) == 130
+    assert main(command) == 130
     assert "everything until then is kept" in capsys.readouterr().err
     frames = load_run(folder / "stopped").frames.tolist()
     assert frames == shown
-    assert 3 <= len(frames) < 39
+    assert 1 <= len(frames) < 39
     assert (folder / "stopped" / "augmented.mp4").is_file()
 
 

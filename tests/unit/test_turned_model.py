@@ -128,6 +128,9 @@ def test_a_registration_places_the_object_in_its_last_keyframe(tmp_path):
         "runner_up_score": 45.0,
         "rms_px": 0.1,
         "map_units_per_metre": 2.0,
+        "world_from_object": np.diag([2.0, 2.0, 2.0, 1.0]).tolist(),
+        "mean_node_m": [0.0, 0.0, 0.05],
+        "covariance": None,
         "ambiguous": True,
         "axis_of_revolution": {"point_m": [0.0, 0.0, 0.05], "direction": [0.0, 0.0, 1.0]},
         "keyframes": [
