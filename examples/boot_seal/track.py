@@ -19,10 +19,13 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+from comparison import write_comparison
 from numpy.typing import NDArray
 
 from morph_dslam.cli import run_and_report_errors
 from morph_dslam.errors import TrackingError
+from morph_dslam.evaluation.evaluate import evaluate_depth
+from morph_dslam.evaluation.statements import depth_line
 from morph_dslam.experiment import keep_sequence
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import load_model
@@ -79,11 +82,17 @@ def errors(run: Path, sequence: Path, model_file: Path) -> Errors:
     return Errors(frames[tracked], np.array(lever), np.array(side), np.array(nodes))
 
 
-def result_line(found: Errors, summary: dict, sequence: Path) -> str:
-    """The line that says how well it went, while the seal is deformed."""
+def deformed_frames(found: Errors, sequence: Path) -> NDArray[np.bool_]:
+    """Which of the tracked frames (f,) show the seal deformed; raises TrackingError if none does."""
     deformed = np.load(sequence / "truth.npz")["parameters"][found.frames, 0] > BEGUN
     if not deformed.any():
         raise TrackingError("no tracked frame shows the seal deformed: let the scene turn the lever")
+    return deformed
+
+
+def result_line(found: Errors, summary: dict, sequence: Path) -> str:
+    """The line that says how well it went, while the seal is deformed."""
+    deformed = deformed_frames(found, sequence)
     settled = deformed & (np.cumsum(deformed) > SETTLED_AFTER)
     side = np.degrees(np.abs(found.side[settled])).max() if settled.any() else np.nan
     distances = 1e3 * found.nodes[deformed]
@@ -136,8 +145,16 @@ def run(arguments: argparse.Namespace) -> None:
         "mean_error_mm": (1e3 * found.nodes.mean(axis=1)).tolist(),
     }
     (output / "run" / "errors.json").write_text(json.dumps(per_frame, indent=1) + "\n")
+    depth = evaluate_depth(output / "run", sequence / "depth.h5", base_frame=int(found.frames[0]))
+    deformed = deformed_frames(found, sequence)
+    angles = (np.degrees(angle[deformed]) for angle in (found.lever, found.side))
+    page = write_comparison(
+        output / "run", found.frames[deformed], 1e3 * found.nodes[deformed], *angles, depth
+    )
     print(f"video   {output / 'run' / 'augmented.mp4'}")
     print(f"picture {output / 'registration' / 'registration.jpg'}")
+    print(f"compare {page}")
+    print(depth_line(depth))
     print(line)
 
 
