@@ -145,7 +145,7 @@ def run(arguments: argparse.Namespace) -> None:
         "mean_error_mm": (1e3 * found.nodes.mean(axis=1)).tolist(),
     }
     (output / "run" / "errors.json").write_text(json.dumps(per_frame, indent=1) + "\n")
-    depth = evaluate_depth(output / "run", sequence / "depth.h5", base_frame=int(found.frames[0]))
+    depth = evaluate_depth(output / "run", sequence, base_frame=int(found.frames[0]))
     deformed = deformed_frames(found, sequence)
     angles = (np.degrees(angle[deformed]) for angle in (found.lever, found.side))
     page = write_comparison(

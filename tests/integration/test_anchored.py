@@ -2,6 +2,7 @@
 
 import _thread
 import json
+import signal
 from dataclasses import replace
 
 import cv2
@@ -216,7 +217,7 @@ def test_an_interrupt_keeps_a_live_run(recording, monkeypatch, capsys):
         show(self, frame, picture)
         shown.append(frame.index)
         if len(shown) == 1:  # many more are to come, also where the machine is slow
-            _thread.interrupt_main()
+            _thread.interrupt_main(signal.SIGTERM)  # shells make background jobs deaf to SIGINT
 
     monkeypatch.setattr(VideoSink, "show", interrupted)
     command = ["live", str(folder / "sequence" / "frames"), "--model", str(folder / "sheet.morph")]
