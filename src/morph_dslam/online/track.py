@@ -11,7 +11,6 @@ import numpy as np
 from tqdm import tqdm
 
 from morph_dslam.errors import SourceError, TrackingError
-from morph_dslam.online.aids.start import AidFiles
 from morph_dslam.online.attempt import Picture
 from morph_dslam.online.augmentation import write_video
 from morph_dslam.online.augmented_view import AugmentedView, DrawOptions
@@ -22,12 +21,11 @@ from morph_dslam.online.reference_refinement import (
     choose_keyframes,
     refine_reference,
 )
-from morph_dslam.online.registration import RegistrationOptions, bind_landmarks
+from morph_dslam.online.registration import bind_landmarks
 from morph_dslam.online.reregistration import Reregistration
 from morph_dslam.online.results import RunResults
 from morph_dslam.online.run_writing import RunInputs, check_run_folder, write_run
-from morph_dslam.online.tracker_options import StartFrom, TrackerOptions
-from morph_dslam.online.tracking_setup import ObjectOptions, PoseFrom, Setup, load_setup
+from morph_dslam.online.tracking_setup import ObjectOptions, Setup, load_setup
 from morph_dslam.sources import Frame, FrameSource, open_source
 from morph_dslam.sources.recorded import RecordedFrames
 
@@ -35,75 +33,32 @@ from morph_dslam.sources.recorded import RecordedFrames
 _INPUTS = ("frames", "landmarks", "placement")
 
 
-@dataclass(frozen=True)
-class TrackOptions:
-    """What to track, with what, and where the results go.
+@dataclass(frozen=True, kw_only=True)
+class TrackOptions(ObjectOptions):
+    """What to track, with what (see `ObjectOptions`), and where the results go.
 
     Attributes
     ----------
-    frames : video file or folder of images. model, camera : files.
-    landmarks : file of landmarks in the reference frame; or placement : registration.json of
-        `morph register`, whose last keyframe is the reference frame; or aids. map_path, pose : see
-        `ObjectOptions`.
+    frames : video file or folder of images. output : the run folder.
     reregister_at : frames in which to place the object anew, with landmarks there, or None for the aid.
-    output : the run folder. first, last : frame numbers to track, both included; all by default.
-    reference_frame : the frame that the landmarks belong to; the first one tracked by default.
+    first, last : frame numbers to track, both included; all by default.
+    reference_frame : the frame that the landmarks belong to; the first one tracked by default. With
+        ``placement`` it is the map's last keyframe.
     refine_reference : after tracking, refine the reference state over the whole sequence and track once more.
-    use_outline, use_depth : let the object's outline, and the recording's depth, count beside its texture.
-    inner : files of inner structures (`morph inner`), whose positions are written and drawn.
-    random_walk, start : see `ObjectOptions`; neither is used by default.
-    per_sequence : names of the parameters that are one over the whole sequence, beside those that the
-        placement leaves open.
     overlay : draw the augmented video, drawing : with what. overwrite : replace a run that is there already.
     """
 
     frames: Path
-    model: Path
-    camera: Path
     output: Path
-    landmarks: Path | None = None
-    placement: Path | None = None
-    aids: AidFiles = field(default_factory=AidFiles)
     reregister_at: tuple[tuple[int, Path | None], ...] = ()
-    map_path: Path | None = None
-    pose: PoseFrom = "map"
     first: int | None = None
     last: int | None = None
     reference_frame: int | None = None
     refine_reference: bool = False
-    use_outline: bool = False
-    use_depth: bool = False
-    inner: tuple[Path, ...] = ()
-    per_sequence: tuple[str, ...] = ()
-    random_walk: tuple[tuple[str, float], ...] = ()
-    start: StartFrom = "previous"
     overlay: bool = True
     drawing: DrawOptions = field(default_factory=DrawOptions)
     overwrite: bool = False
-    registration: RegistrationOptions = field(default_factory=RegistrationOptions)
     refinement: RefinementOptions = field(default_factory=RefinementOptions)
-    tracker: TrackerOptions = field(default_factory=TrackerOptions)
-
-    @property
-    def of_object(self) -> ObjectOptions:
-        """Those that live tracking has too."""
-        return ObjectOptions(
-            self.model,
-            self.camera,
-            self.landmarks,
-            self.placement,
-            self.aids,
-            self.map_path,
-            self.pose,
-            self.use_outline,
-            self.use_depth,
-            self.inner,
-            self.per_sequence,
-            self.random_walk,
-            self.start,
-            self.registration,
-            self.tracker,
-        )
 
 
 def track(options: TrackOptions) -> dict[str, Any]:
@@ -123,7 +78,7 @@ def track(options: TrackOptions) -> dict[str, Any]:
         the run folder holds a run already (TrackingError).
     """
     _check(options)
-    setup = load_setup(options.of_object)
+    setup = load_setup(options)
     if setup.placement is not None:
         frame = setup.placement.frame
         options = replace(

@@ -52,7 +52,7 @@ def track_objects(options: TrackOptions, others: Sequence[OtherObject]) -> dict[
     everything = [options, *(_for_other(options, other) for other in others)]
     for part in everything:
         check_run_folder(part.output, part.overwrite)
-    setups = [load_setup(part.of_object) for part in everything]
+    setups = [load_setup(part) for part in everything]
     source, begin = open_frames(options), find_begin(setups[0], options)
     objects = [_prepare(part, setup, begin) for part, setup in zip(everything, setups, strict=True)]
     trackers = {

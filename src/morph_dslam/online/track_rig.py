@@ -44,7 +44,7 @@ def track_rig(options: TrackOptions, others: Sequence[Path]) -> dict[str, Any]:
     options = replace(options, tracker=replace(options.tracker, new_views=False))
     cameras = _cameras(options.camera, 1 + len(others))
     check_run_folder(options.output, options.overwrite)
-    setup = load_setup(options.of_object)
+    setup = load_setup(options)
     sources = [open_frames(options), *(open_source(path, options.first, options.last) for path in others)]
     begin = find_begin(setup, options)
     references = [begin.picture, *(_frame(path, begin.frame) for path in others)]
