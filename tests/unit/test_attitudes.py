@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.online.mesh_registration.attitudes import TURNS, attitudes
-from morph_dslam.online.mesh_registration.regions import largest_plane_normal
+from morph_dslam.online.mesh_registration.regions import find_planes
 from morph_dslam.online.mesh_registration.surface import Axis
 
 NORMAL = np.array([2.0, -3.0, 6.0]) / 7.0
@@ -41,7 +41,13 @@ def test_largest_plane_is_found_among_clutter_and_none_where_there_is_none():
     basis = np.linalg.svd(NORMAL[None])[2][1:]
     table = rng.uniform(-1.0, 1.0, (400, 2)) @ basis + 0.002 * rng.normal(size=(400, 1)) * NORMAL
     clutter = rng.uniform(-1.0, 1.0, (150, 3))
-    found = largest_plane_normal(np.concatenate([table, clutter]))
+    points = np.concatenate([table, clutter])
+    planes = find_planes(points)
+    found = planes.largest_normal(points)
     assert found is not None
     assert abs(found @ NORMAL) > np.cos(np.radians(1.0))
-    assert largest_plane_normal(rng.normal(size=(400, 3))) is None
+    # What is taken out is the table, and of the clutter only what lies in it.
+    assert np.mean(np.isin(np.arange(400), planes.taken_out[0])) > 0.95
+    assert np.all(np.abs(points[planes.taken_out[0]] @ NORMAL) < 0.05)
+    cloud = rng.normal(size=(400, 3))
+    assert find_planes(cloud).largest_normal(cloud) is None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
@@ -51,18 +53,45 @@ def plane_points(points: Array, thickness: float, rng: np.random.Generator) -> N
     return np.abs((points - centre) @ normal) <= thickness
 
 
-def largest_plane_normal(points: Array, seed: int = 0) -> Array | None:
-    """Unit normal (3,) of the plane that holds most of the map's points (n, 3); None if it holds few."""
-    usable = points[without_strays(points)]
-    thickness = PLANE_THICKNESS * usual_spacing(points)
-    on_plane = plane_points(usable, thickness, np.random.default_rng(seed))
-    if on_plane.sum() < max(PLANE_SHARE * len(usable), 3):
-        return None
-    flat = usable[on_plane]
-    return np.linalg.svd(flat - flat.mean(axis=0))[2][-1]
+@dataclass(frozen=True)
+class Planes:
+    """What a map is made of that may be tables and walls.
+
+    Attributes
+    ----------
+    spacing : usual distance between points, the map's unit.
+    usable : (k,) indices of points that are no strays.
+    taken_out : indices of the points of each plane, in the order in which they were found; a point is in one.
+    """
+
+    spacing: float
+    usable: NDArray[np.int64]
+    taken_out: list[NDArray[np.int64]]
+
+    def largest_normal(self, points: Array) -> Array | None:
+        """Unit normal (3,) of the plane that holds most of the map's points (n, 3); None if there is none."""
+        if not self.taken_out:
+            return None
+        flat = points[self.taken_out[0]]
+        return np.linalg.svd(flat - flat.mean(axis=0))[2][-1]
 
 
-def candidate_regions(points: Array, seed: int = 0) -> list[NDArray[np.int64]]:
+def find_planes(points: Array, seed: int = 0) -> Planes:
+    """The planes of a map (n, 3), one after the other as long as one holds enough of the points."""
+    rng = np.random.default_rng(seed)
+    spacing = usual_spacing(points)
+    usable = np.flatnonzero(without_strays(points))
+    left, taken_out = usable, []
+    while len(taken_out) < MOST_PLANES and len(left) >= FEWEST_POINTS:
+        on_plane = plane_points(points[left], PLANE_THICKNESS * spacing, rng)
+        if on_plane.sum() < PLANE_SHARE * len(usable):
+            break
+        taken_out.append(left[on_plane])
+        left = left[~on_plane]
+    return Planes(spacing, usable, taken_out)
+
+
+def candidate_regions(points: Array, planes: Planes) -> list[NDArray[np.int64]]:
     """Indices of the points of each region where an object may be.
 
     The pieces that there are at first, and those left when one plane after the other is taken out, joined
@@ -71,28 +100,20 @@ def candidate_regions(points: Array, seed: int = 0) -> list[NDArray[np.int64]]:
 
     Parameters
     ----------
-    points : (n, 3) of the map.
+    points : (n, 3) of the map. planes : of the map, from `find_planes`.
     """
-    rng = np.random.default_rng(seed)
-    spacing = usual_spacing(points)
-    usable = np.flatnonzero(without_strays(points))
     regions: list[NDArray[np.int64]] = []
-    left = usable
-    for taken_out in range(MOST_PLANES + 1):
-        # A scene may have no plane to speak of, and the next one may be a face of the object: so the pieces
-        # count that are there before each plane is taken out.
+    left = planes.usable
+    # A scene may have no plane to speak of, and the next one may be a face of the object: so the pieces
+    # count that are there before each plane is taken out.
+    for plane in (np.empty(0, dtype=np.int64), *planes.taken_out):
+        left = np.setdiff1d(left, plane)
         for reach in JOINED_OVER:
-            for piece in _pieces(points, left, reach * spacing):
+            for piece in _pieces(points, left, reach * planes.spacing):
                 if not any(_alike(piece, other) for other in regions):
                     regions.append(piece)
-        if taken_out == MOST_PLANES or len(left) < FEWEST_POINTS:
-            break
-        on_plane = plane_points(points[left], PLANE_THICKNESS * spacing, rng)
-        if on_plane.sum() < PLANE_SHARE * len(usable):
-            break
-        left = left[~on_plane]
     regions.sort(key=len, reverse=True)
-    return [*regions, usable] if len(usable) >= FEWEST_POINTS else regions
+    return [*regions, planes.usable] if len(planes.usable) >= FEWEST_POINTS else regions
 
 
 def _alike(piece: NDArray[np.int64], other: NDArray[np.int64]) -> bool:

@@ -23,7 +23,7 @@ from morph_dslam.online.mesh_registration.attitudes import attitudes
 from morph_dslam.online.mesh_registration.evidence import Evidence, gather_evidence
 from morph_dslam.online.mesh_registration.keyframe_adjustment import AdjustedKeyframes, KeyframeAdjustment
 from morph_dslam.online.mesh_registration.outline_fit import OutlineFit, outline_fit
-from morph_dslam.online.mesh_registration.regions import candidate_regions, largest_plane_normal
+from morph_dslam.online.mesh_registration.regions import candidate_regions, find_planes
 from morph_dslam.online.mesh_registration.scaled_icp import Fit, fit_surface
 from morph_dslam.online.mesh_registration.scene import MapPoints, View, spread_views
 from morph_dslam.online.mesh_registration.similarity_of_path import similarity_of_path
@@ -123,7 +123,8 @@ def register_mesh(
         If no place in the map explains enough points.
     """
     rough, surface = Surface.of_mesh(nodes, triangles, ROUGH_SAMPLES), Surface.of_mesh(nodes, triangles)
-    starts_in = attitudes(surface.axis_of_revolution, largest_plane_normal(points.positions))
+    planes = find_planes(points.positions)
+    starts_in = attitudes(surface.axis_of_revolution, planes.largest_normal(points.positions))
 
     def judged(place: SimilarityTransform, asked: Sequence[View]) -> _Place:
         tolerance = TOLERANCE * surface.size * place.scale
@@ -134,7 +135,7 @@ def register_mesh(
     places: list[_Place] = []
     few, more = spread_views(views, FIRST_ASKED), spread_views(views, MOST_ASKED)
     for region in tqdm(
-        candidate_regions(points.positions), desc="registering", unit="region", disable=not progress
+        candidate_regions(points.positions, planes), desc="registering", unit="region", disable=not progress
     ):
         starts = [judged(place, few) for place in _searched(points[region], rough, starts_in, metric)]
         for start in sorted(starts, key=lambda place: -place.evidence.score)[:N_REFINED]:
