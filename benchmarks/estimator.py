@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.geometry import RigidTransform, cross_matrix, rotation_exp
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField, SurfacePoints
 from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
 from morph_dslam.online.estimation import BoundPoints, Estimator, State, moved
@@ -45,7 +45,7 @@ def smooth_model() -> ReducedModel:
 def left_jacobian(vector):
     """d exp(w) exp(-w0) / dw at w0 = ``vector`` (3,), the left Jacobian (3, 3) of the rotation group."""
     angle = max(float(np.linalg.norm(vector)), 1e-9)
-    cross = np.cross(np.eye(3), vector)
+    cross = cross_matrix(vector)
     squared = (angle - np.sin(angle)) / angle**3 * cross @ cross
     return np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * cross + squared
 

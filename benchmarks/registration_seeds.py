@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import RegistrationError
 from morph_dslam.experiment import keep
-from morph_dslam.geometry import RigidTransform
+from morph_dslam.geometry import RigidTransform, cross_matrix
 from morph_dslam.io.calibration import load_camera
 from morph_dslam.online.mesh_registration.run import run_registration
 from morph_dslam.online.slam.map_file import load_map
@@ -185,16 +185,10 @@ def _normalised_pose(found: RigidTransform, true: RigidTransform, covariance: Ar
     # An increment turns the axis by the cross product, and moves the middle by that and the translation.
     slopes = np.zeros((5, 6))
     slopes[:2, :3] = np.cross(axis, across)
-    slopes[2:, :3] = -skew(arm)
+    slopes[2:, :3] = -cross_matrix(arm)
     slopes[2:, 3:] = np.eye(3)
     errors = np.concatenate([across @ (axis - true.rotation[:, 2]), found.apply(middle) - true.apply(middle)])
     return errors / np.sqrt(np.einsum("ij,jk,ik->i", slopes, covariance, slopes))
-
-
-def skew(vector: Array) -> Array:
-    """The matrix (3, 3) of the cross product with a vector from the left."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def line(seed: int, found: Outcome) -> str:

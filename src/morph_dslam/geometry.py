@@ -65,6 +65,18 @@ def rotation_log(rotation):
     return vector * (2.0 / w if sine < 1e-10 * w else 2.0 * np.arctan2(sine, w) / sine)
 
 
+def cross_matrix(vectors: Array) -> Array:
+    """The matrices [v]x (..., 3, 3) of vectors (..., 3), with [v]x w = v x w.
+
+    A small turn e moves a turned point v by e x v, so the derivative by the turn is -[v]x.
+    """
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    result = np.zeros((*vectors.shape, 3))
+    result[..., 0, 1], result[..., 0, 2], result[..., 1, 2] = -z, y, -x
+    result[..., 1, 0], result[..., 2, 0], result[..., 2, 1] = z, -y, x
+    return result
+
+
 @dataclass(frozen=True)
 class RigidTransform:
     """A rotation (3, 3) followed by a translation (3,) in metres."""

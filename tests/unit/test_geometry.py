@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
+from morph_dslam.geometry import RigidTransform, cross_matrix, rotation_exp, rotation_log
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-8, 2e-7, 1e-3, 1.0, 3.0, np.pi, 7.0])
@@ -58,3 +58,11 @@ def test_from_matrix_copies_and_takes_both_shapes():
     matrix[:] = 0.0
     np.testing.assert_array_equal(transform.matrix, kept)
     np.testing.assert_array_equal(RigidTransform.identity().matrix, np.eye(4))
+
+
+def test_cross_matrix_times_a_vector_is_the_cross_product():
+    rng = np.random.default_rng(4)
+    one, other = rng.normal(size=(2, 5, 4, 3))
+    found = np.einsum("...ij,...j->...i", cross_matrix(one), other)
+    np.testing.assert_allclose(found, np.cross(one, other), atol=1e-15)
+    np.testing.assert_array_equal(cross_matrix(one[2, 1]), cross_matrix(one)[2, 1])

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.geometry import RigidTransform, cross_matrix, rotation_exp
 
 Array = NDArray[np.float64]
 
@@ -69,8 +69,8 @@ def jacobian(estimate: Estimate, free: NDArray[np.bool_]) -> Array:
         moved = pose.apply(points)
         by_point = camera.recorded_jacobian(moved)
         # A turn e about the board's origin moves a point by e x (R p).
-        turns = np.cross(np.eye(3)[None], (moved - pose.translation)[:, None])
-        by_pose = np.concatenate([np.einsum("nij,nkj->nik", by_point, turns), by_point], axis=2)
+        turns = -cross_matrix(moved - pose.translation)
+        by_pose = np.concatenate([by_point @ turns, by_point], axis=2)
         first = n_intrinsics + 6 * k
         result[k, :, :n_intrinsics] = _intrinsic_jacobian(camera, moved)
         result[k, :, first : first + 6] = by_pose.reshape(-1, 6)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.geometry import cross_matrix
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.reduced_model import von_mises
 from morph_dslam.online.estimation import Estimate
@@ -43,7 +44,7 @@ def position_std(model: ReducedModel, estimate: Estimate) -> Array:
     d = len(slopes)
     jacobian = np.empty((len(turned), 3, d + 6))
     jacobian[:, :, :d] = np.moveaxis(slopes @ rotation.T, 0, 2)
-    jacobian[:, :, d : d + 3] = np.cross(np.eye(3)[None], turned[:, None, :]).transpose(0, 2, 1)
+    jacobian[:, :, d : d + 3] = -cross_matrix(turned)
     jacobian[:, :, d + 3 :] = np.eye(3)
     variances = np.einsum("nij,jk,nik->n", jacobian, estimate.covariance, jacobian, optimize=True)
     return np.sqrt(np.maximum(variances, 0.0))

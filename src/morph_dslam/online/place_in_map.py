@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.geometry import RigidTransform
+from morph_dslam.geometry import RigidTransform, cross_matrix
 from morph_dslam.online.known_pose import KnownPose
 from morph_dslam.online.slam.pose import PoseEstimate
 from morph_dslam.similarity import SimilarityTransform
@@ -79,9 +79,3 @@ class PlaceInMap:
         values, vectors = np.linalg.eigh(self.covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         return KnownPose(pose, by_camera @ camera.covariance @ by_camera.T, self.slopes(pose) @ root)
-
-
-def cross_matrix(vector: Array) -> Array:
-    """The matrix [v]x (3, 3), with [v]x w = v x w."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

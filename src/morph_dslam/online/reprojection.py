@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from morph_dslam.geometry import cross_matrix
 from morph_dslam.model.separated import combine_modes
 
 #: Points nearer to the camera plane than this, in metres, or behind it cannot be seen.
@@ -148,7 +149,7 @@ def project_with_jacobian_numpy(functions, rotation, translation, rest, modes, i
     of_position[:, 1, 1], of_position[:, 1, 2] = fy / z, -fy * y / z**2
     of_unknowns = np.zeros((len(rest), 3, d + 6))
     of_unknowns[:, :, :d] = np.moveaxis(fields[1:] @ rotation.T, 0, 2)
-    of_unknowns[:, :, d : d + 3] = np.cross(np.eye(3)[None], turned[:, None, :]).transpose(0, 2, 1)
+    of_unknowns[:, :, d : d + 3] = -cross_matrix(turned)
     of_unknowns[:, :, d + 3 :] = np.eye(3)
     return pixels, of_position @ of_unknowns
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
-from morph_dslam.geometry import rotation_exp
+from morph_dslam.geometry import cross_matrix, rotation_exp
 from morph_dslam.io.calibration import load_camera
 from morph_dslam.model import load_model
 from morph_dslam.online.aids.board import FEWEST_CORNERS, FiducialBoard, load_board
@@ -181,5 +181,5 @@ def _moved(covariance: Array, arm: Array) -> Array:
     """The covariance (7, 7) about another point, ``arm`` (3,) from the first one, world."""
     slopes = np.eye(7)
     slopes[4:, 0] = arm
-    slopes[4:, 1:4] = np.cross(np.eye(3), arm).T
+    slopes[4:, 1:4] = -cross_matrix(arm)
     return slopes @ covariance @ slopes.T

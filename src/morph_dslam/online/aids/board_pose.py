@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
-from morph_dslam.geometry import RigidTransform
+from morph_dslam.geometry import RigidTransform, cross_matrix
 from morph_dslam.model import ReducedModel
 from morph_dslam.online.aids.board import FEWEST_CORNERS, FiducialBoard
-from morph_dslam.online.place_in_map import cross_matrix
 from morph_dslam.online.placement import Placement
 from morph_dslam.online.registration import solve_pnp
 from morph_dslam.online.state import State, moved
@@ -102,7 +101,7 @@ def _refined(
 def _linear(pose: RigidTransform, points: Array, pixels: Array, camera: PinholeCamera) -> tuple[Array, Array]:
     local = pose.apply(points)
     of_pose = np.zeros((len(points), 3, 6))
-    of_pose[:, :, :3] = np.cross(np.eye(3)[None], (local - pose.translation)[:, None]).transpose(0, 2, 1)
+    of_pose[:, :, :3] = -cross_matrix(local - pose.translation)
     of_pose[:, :, 3:] = np.eye(3)
     jacobian = camera.projection_jacobian(local) @ of_pose
     return (camera.project(local) - pixels).ravel(), jacobian.reshape(-1, 6)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.geometry import RigidTransform, rotation_log
+from morph_dslam.geometry import RigidTransform, cross_matrix, rotation_log
 from morph_dslam.online.mesh_registration.keyframe_adjustment import AdjustedKeyframes
 from morph_dslam.online.mesh_registration.scene import camera_from_object
 from morph_dslam.online.mesh_registration.texture_alignment import moved_similarity, similarity_jacobian
@@ -75,9 +75,8 @@ def _scatter(adjusted: AdjustedKeyframes, transform: SimilarityTransform, centre
 
 def _metric(pose: RigidTransform, centre: Array) -> Array:
     """What a pose's increment (6,) does to the sight at the object's distance and the camera's place."""
-    x, y, z = pose.translation
     result = np.zeros((6, 6))
     result[:3, :3] = float(np.linalg.norm(pose.apply(centre))) * np.eye(3)
-    result[3:, :3] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
+    result[3:, :3] = cross_matrix(pose.translation)
     result[3:, 3:] = np.eye(3)
     return result
