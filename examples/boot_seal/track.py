@@ -24,6 +24,8 @@ from numpy.typing import NDArray
 
 from morph_dslam.cli import run_and_report_errors
 from morph_dslam.errors import TrackingError
+from morph_dslam.evaluation.evaluate import evaluate_depth
+from morph_dslam.evaluation.statements import depth_line
 from morph_dslam.experiment import keep_sequence
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import load_model
@@ -143,12 +145,18 @@ def run(arguments: argparse.Namespace) -> None:
         "mean_error_mm": (1e3 * found.nodes.mean(axis=1)).tolist(),
     }
     (output / "run" / "errors.json").write_text(json.dumps(per_frame, indent=1) + "\n")
+    # Of a scene without a depth sensor the exact depths are there.
+    depths = sequence if (sequence / "depth.txt").is_file() else sequence / "depth.h5"
+    depth = evaluate_depth(output / "run", depths, base_frame=int(found.frames[0]))
     deformed = deformed_frames(found, sequence)
     angles = (np.degrees(angle[deformed]) for angle in (found.lever, found.side))
-    page = write_comparison(output / "run", found.frames[deformed], 1e3 * found.nodes[deformed], *angles)
+    page = write_comparison(
+        output / "run", found.frames[deformed], 1e3 * found.nodes[deformed], *angles, depth
+    )
     print(f"video   {output / 'run' / 'augmented.mp4'}")
     print(f"picture {output / 'registration' / 'registration.jpg'}")
     print(f"compare {page}")
+    print(depth_line(depth))
     print(line)
 
 

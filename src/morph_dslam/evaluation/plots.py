@@ -92,7 +92,7 @@ def _plot_by_frame(
     axes.set_ylim(bottom=0.0)
     axes.set_title(
         f"mean {values.mean():.2f} mm (dashed), median {np.median(values):.2f} mm, "
-        f"95th percentile {np.percentile(values, 95):.2f} mm; {title}",
+        f"95th percentile {np.percentile(values, 95):.2f} mm\n{title}",
         fontsize=10,
     )
     figure.savefig(path, dpi=DPI)
