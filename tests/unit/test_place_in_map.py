@@ -10,7 +10,7 @@ from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.online.anchor import Anchor, movable_points
+from morph_dslam.online.anchor import Anchor, points_on_object
 from morph_dslam.online.place_in_map import PlaceInMap
 from morph_dslam.online.slam.pose import PoseEstimate
 from morph_dslam.online.slam.rigid_map import GOOD, Keyframe, RigidMap
@@ -102,10 +102,11 @@ def sheet_map():
 
 def test_only_what_can_move_is_taken_out_of_the_scene():
     model, place, positions, x = sheet_map()
-    movable = movable_points(positions, place, model)
+    on_object, movable = points_on_object(positions, place, model)
     # The sheet is 514 mm large. What lies 30 mm off it is not on it; what moves by less than 2.6 mm does not
     # move: that is 39 mm from the end at two thirds of the largest turn. Samples are a few mm apart.
-    assert not movable[41:].any()
+    assert on_object[:41].all()
+    assert not on_object[41:].any()
     assert movable[:41][x[:41] > -0.165].all()
     assert not movable[:41][x[:41] < -0.177].any()
 
@@ -117,11 +118,13 @@ def test_an_anchor_keeps_the_scene_and_needs_to_know_how_well_the_place_is_known
     ids = rigid_map.add_points(positions, np.zeros((51, 2)), 0, GOOD)
     flat = np.full((240, 320), 128, dtype=np.uint8)
     rigid_map.add_keyframe(Keyframe(0, 0.0, flat, np.eye(4), ids, np.zeros((51, 2))))
-    expected = movable_points(positions, place, model)
+    expected = points_on_object(positions, place, model)[1]
     blind = PlaceInMap(place.world_from_object, place.centre, None)
     with pytest.raises(RegistrationError, match="does not say how well the object's place is known"):
-        Anchor(rigid_map, camera, blind, model)
+        Anchor(rigid_map, camera, {"sheet": (blind, model)})
     assert blind.pose_covariance(RigidTransform.identity()) is None
-    anchor = Anchor(rigid_map, camera, place, model)
+    with pytest.raises(RegistrationError, match="'sheet' and 'again' are registered in the same place"):
+        Anchor(rigid_map, camera, {"sheet": (place, model), "again": (place, model)})
+    anchor = Anchor(rigid_map, camera, {"sheet": (place, model)})
     assert (anchor.n_movable, anchor.n_scene) == (expected.sum(), (~expected).sum())
     np.testing.assert_array_equal(rigid_map.good, ids[~expected])

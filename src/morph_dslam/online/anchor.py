@@ -1,11 +1,14 @@
-"""Anchored objects: the camera is found in the frozen map of the scene, and with it the object's pose.
+"""Anchored objects: the camera is found in the frozen map of the scene, and with it the objects' poses.
 
 This is the paper's main case: camera_from_object = camera_from_world world_from_object, in metres by the
-scale of the registration. What of the object can move under the model is taken out of the map, so that a
+scale of the registration. What of an object can move under its model is taken out of the map, so that a
 deformation does not draw the camera along; what cannot stays with the scene.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,10 +32,14 @@ ON_SURFACE = 0.03
 N_SAMPLES = 10_000
 #: What moves by more than this part of the object's size over the parameter box is no part of the scene.
 MOVES = 0.005
+#: Two objects that share more than this part of one's movable points are in the same place.
+SHARED = 0.5
 
 
-def movable_points(positions: Array, place: PlaceInMap, model: ReducedModel) -> NDArray[np.bool_]:
-    """Which map points (n, 3) lie on the object where it can move under the model."""
+def points_on_object(
+    positions: Array, place: PlaceInMap, model: ReducedModel
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which map points (n, 3) lie on the object, and which of them (n,) where it can move under the model."""
     samples, size = _spread_over(model), float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
     field = model.restrict(samples)
     reach, undeformed = np.zeros(len(samples)), field.value(model.default)
@@ -40,7 +47,8 @@ def movable_points(positions: Array, place: PlaceInMap, model: ReducedModel) -> 
         reach = np.maximum(reach, np.linalg.norm(field.value(shape) - undeformed, axis=1))
     in_object = place.world_from_object.inverse.apply(positions)
     distances, nearest = KDTree(model.rest_positions(samples)).query(in_object)
-    return (distances < ON_SURFACE * size) & (reach[nearest] > MOVES * size)
+    on_object = distances < ON_SURFACE * size
+    return on_object, on_object & (reach[nearest] > MOVES * size)
 
 
 def _spread_over(model: ReducedModel) -> SurfacePoints:
@@ -53,40 +61,65 @@ def _spread_over(model: ReducedModel) -> SurfacePoints:
 
 
 class Anchor:
-    """Finds an anchored object's pose by finding the camera in the map.
+    """Finds the poses of anchored objects by finding the camera in the map, once a frame for all of them.
 
     Parameters
     ----------
-    rigid_map : of the scene with the undeformed object; what can move is taken out of it.
+    rigid_map : of the scene with the undeformed objects; what can move is taken out of it.
+    objects : by name, the place in the map and the model.
 
     Attributes
     ----------
-    n_scene, n_movable : map points that stay, on the object or not, and those on it that were taken out.
+    n_scene, n_movable : map points that stay, on an object or not, and those on one that were taken out.
 
     Raises
     ------
     RegistrationError
-        If nobody knows how far the place is to be trusted.
+        If nobody knows how far a place is to be trusted, or two objects are in the same place.
     """
 
     def __init__(
-        self, rigid_map: RigidMap, camera: PinholeCamera, place: PlaceInMap, model: ReducedModel
+        self,
+        rigid_map: RigidMap,
+        camera: PinholeCamera,
+        objects: Mapping[str, tuple[PlaceInMap, ReducedModel]],
     ) -> None:
-        if place.covariance is None:
+        if any(place.covariance is None for place, _ in objects.values()):
             raise RegistrationError(
                 "the registration does not say how well the object's place is known, because the keyframes "
                 "show too little texture on it: track it as a free object (--pose free)"
             )
-        self.place, good = place, rigid_map.good
-        movable = movable_points(rigid_map.positions[good], place, model)
-        self.n_movable, self.n_scene = int(movable.sum()), int((~movable).sum())
-        rigid_map.remove(good[movable])
+        self._places, good = {name: place for name, (place, _) in objects.items()}, rigid_map.good
+        positions = rigid_map.positions[good]
+        movable = {name: points_on_object(positions, *placed)[1] for name, placed in objects.items()}
+        _check_places(movable)
+        taken = np.logical_or.reduce(list(movable.values()))
+        self.n_movable, self.n_scene = int(taken.sum()), int((~taken).sum())
+        rigid_map.remove(good[taken])
         self.slam = Slam(camera)
         self.slam.use_map(rigid_map)
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the objects."""
+        return tuple(self._places)
+
     def locate(
         self, image: NDArray[np.uint8], index: int, timestamp: float
-    ) -> tuple[KnownPose | None, SlamFrame]:
-        """The object in a frame (h, w, 3) by the map, None where the camera is lost; and the camera."""
+    ) -> tuple[dict[str, KnownPose], SlamFrame]:
+        """The objects by name in a frame (h, w, 3), none where the camera is lost in the map; the camera."""
         frame = self.slam.process_frame(image, index, timestamp)
-        return (None if frame.pose is None else self.place.known_pose(frame.pose)), frame
+        if frame.pose is None:
+            return {}, frame
+        return {name: place.known_pose(frame.pose) for name, place in self._places.items()}, frame
+
+
+def _check_places(movable: Mapping[str, NDArray[np.bool_]]) -> None:
+    """Raise RegistrationError if two objects have taken the same points (n,) of the map."""
+    for (one, points), (other, others) in combinations(movable.items(), 2):
+        fewest = min(int(points.sum()), int(others.sum()))
+        if fewest and (points & others).sum() > SHARED * fewest:
+            raise RegistrationError(
+                f"'{one}' and '{other}' are registered in the same place of the map: register the second "
+                "one beside the first (morph register --beside)"
+            )

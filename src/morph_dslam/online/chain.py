@@ -29,9 +29,24 @@ class Located:
     why_lost: str = ""
     milliseconds: float = 0.0
 
+    def told_of(self, result: FrameResult) -> FrameResult:
+        """The result of an anchored object, with the time that finding the camera took, or why it failed."""
+        reason = result.reason
+        if self.known is None:
+            reason = f"{reason}; the camera is lost in the map: {self.why_lost}"
+        return replace(
+            result,
+            reason=reason,
+            timings_ms=result.timings_ms | {"locate": self.milliseconds},
+            total_ms=result.total_ms + self.milliseconds,
+        )
+
 
 class Chain:
-    """Both steps; without an anchor the object is free and the first one does nothing."""
+    """Both steps; without an anchor the object is free and the first one does nothing.
+
+    ``anchor`` is of this object alone.
+    """
 
     def __init__(self, camera: PinholeCamera, tracker: Tracker, anchor: Anchor | None = None) -> None:
         self._camera, self.tracker, self.anchor = camera, tracker, anchor
@@ -46,20 +61,10 @@ class Chain:
         if self.anchor is None:
             return Located()
         known, camera = self.anchor.locate(frame.image, frame.index, frame.timestamp)
-        return Located(known, camera.reason, camera.total_ms)
+        return Located(next(iter(known.values()), None), camera.reason, camera.total_ms)
 
     def track(self, frame: Frame, located: Located) -> FrameResult:
         """Find the object in a frame that `locate` has seen."""
         depth = frame.depth if self.tracker.options.use_depth else None
         result = self.tracker.process_frame(frame.image, located.known, depth)
-        if self.anchor is None:
-            return result
-        reason = result.reason
-        if located.known is None:
-            reason = f"{reason}; the camera is lost in the map: {located.why_lost}"
-        return replace(
-            result,
-            reason=reason,
-            timings_ms=result.timings_ms | {"locate": located.milliseconds},
-            total_ms=result.total_ms + located.milliseconds,
-        )
+        return result if self.anchor is None else located.told_of(result)

@@ -65,17 +65,21 @@ class PlaceInMap:
         slopes = self.slopes(pose)
         return slopes @ self.covariance @ slopes.T
 
+    def pose_in(self, camera_from_world: Array) -> RigidTransform:
+        """The object's pose in a camera of pose (4, 4) in the map, metres."""
+        placed = self.world_from_object
+        turn, shift = camera_from_world[:3, :3], camera_from_world[:3, 3]
+        return RigidTransform(turn @ placed.rotation, (turn @ placed.translation + shift) / placed.scale)
+
     def known_pose(self, camera: PoseEstimate) -> KnownPose:
         """The object's pose in a camera that was found in the map, metres; needs the covariance."""
         if self.covariance is None:
             raise ValueError("the place has no covariance")
-        placed = self.world_from_object
-        turn, shift = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
-        translation = (turn @ placed.translation + shift) / placed.scale
-        pose = RigidTransform(turn @ placed.rotation, translation)
+        pose = self.pose_in(camera.camera_from_world)
         # The camera's twist turns everything about the camera, and shifts it in the map's unit.
         by_camera = np.eye(6)
-        by_camera[3:, :3], by_camera[3:, 3:] = -cross_matrix(translation), np.eye(3) / placed.scale
+        by_camera[3:, :3] = -cross_matrix(pose.translation)
+        by_camera[3:, 3:] = np.eye(3) / self.world_from_object.scale
         values, vectors = np.linalg.eigh(self.covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         return KnownPose(pose, by_camera @ camera.covariance @ by_camera.T, self.slopes(pose) @ root)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import MapError, TrackingError
+from morph_dslam.geometry import RigidTransform, rotation_log
 from morph_dslam.io.calibration import load_camera
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel, load_model
@@ -33,6 +35,8 @@ from morph_dslam.units import to_si
 
 #: How an object's pose is found: by the map and its points, by the map alone, by its points alone.
 PoseFrom = Literal["map", "fixed", "free"]
+#: Keyframes are placed anew by the registration, but never by so much: rad, and share of the distance.
+OTHER_MAP_TURN, OTHER_MAP_SHIFT = 0.1, 0.1
 
 
 @dataclass(frozen=True)
@@ -130,11 +134,11 @@ class Setup:
             hold_pose=options.pose == "fixed",
         )
 
-    def new_chain(
+    def new_tracker(
         self, placement: Placement, reference: NDArray[np.uint8] | Picture, in_sequence: bool
-    ) -> Chain:
+    ) -> Tracker:
         """A tracker at its beginning; see `Tracker` for the arguments."""
-        tracker = Tracker(
+        return Tracker(
             placement.model,
             self.camera,
             reference,
@@ -143,21 +147,34 @@ class Setup:
             in_sequence,
             placement.covariance,
         )
-        anchor = None
-        if self.map_path is not None and placement.place is not None:
-            rigid_map = load_map(self.map_path, self.camera)
-            anchor = Anchor(rigid_map, self.camera, placement.place, placement.model)
-        return Chain(self.camera, tracker, anchor)
+
+    def new_chain(
+        self, placement: Placement, reference: NDArray[np.uint8] | Picture, in_sequence: bool
+    ) -> Chain:
+        """As `new_tracker`, with the camera in the map before it where the object is anchored."""
+        tracker = self.new_tracker(placement, reference, in_sequence)
+        return Chain(self.camera, tracker, self.new_anchor({self.model.name: placement}))
+
+    def new_anchor(self, placements: Mapping[str, Placement]) -> Anchor | None:
+        """The map with this object, and others by name, in it; None for a free object."""
+        if self.map_path is None:
+            return None
+        objects = {name: (p.place, p.model) for name, p in placements.items() if p.place is not None}
+        return Anchor(load_map(self.map_path, self.camera), self.camera, objects)
 
     def warm_up(self, placement: Placement, reference: NDArray[np.uint8] | Picture) -> None:
         """Compile the inner loops, so that the first frame takes no longer than the others."""
-        print("preparing: compiling the inner loops (half a minute the first time) ...", file=sys.stderr)
-        image = reference
-        if isinstance(image, Picture):
-            image = np.asarray(cv2.cvtColor(image.grey, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
-        chain = self.new_chain(placement, reference, True)
-        for number in range(2):
-            chain.process(Frame(number, float(number), image))
+        warm_up(self.new_chain(placement, reference, True).process, reference)
+
+
+def warm_up(process: Callable[[Frame], object], reference: NDArray[np.uint8] | Picture) -> None:
+    """Compile the inner loops of what processes frames, by the reference view."""
+    print("preparing: compiling the inner loops (half a minute the first time) ...", file=sys.stderr)
+    image = reference
+    if isinstance(image, Picture):
+        image = np.asarray(cv2.cvtColor(image.grey, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+    for number in range(2):
+        process(Frame(number, float(number), image))
 
 
 def _in_si(placement: Placement, name: str, value: float) -> float:
@@ -220,6 +237,19 @@ def _map_of(registration: Path, given: Path | None) -> Path | None:
 def _keyframe(path: Path, camera: PinholeCamera, placement: Placement) -> Picture:
     """The keyframe that the placement is for; its image is flattened, which is all that is needed of it."""
     for keyframe in load_map(path, camera).keyframes:
-        if keyframe.index == placement.frame:
+        if keyframe.index == placement.frame and placement.place is not None:
+            _check_pose(path, placement, placement.place.pose_in(keyframe.camera_from_world))
             return Picture(keyframe.flat, keyframe.flat)
     raise MapError(f"{path} is not the map of the registration: it has no keyframe {placement.frame}")
+
+
+def _check_pose(path: Path, placement: Placement, by_map: RigidTransform) -> None:
+    """Raise MapError if the map has the keyframe of the placement elsewhere than the registration."""
+    pose = placement.state.camera_from_object
+    turn = np.linalg.norm(rotation_log(by_map.rotation @ pose.rotation.T))
+    shift = np.linalg.norm(by_map.translation - pose.translation)
+    if turn > OTHER_MAP_TURN or shift > OTHER_MAP_SHIFT * np.linalg.norm(pose.translation):
+        raise MapError(
+            f"{path} is not the map of the registration: by the map the object is {1e3 * shift:.0f} mm and "
+            f"{np.degrees(turn):.0f} deg from where the registration has it in keyframe {placement.frame}"
+        )
