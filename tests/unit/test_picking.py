@@ -6,7 +6,7 @@ import pytest
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.render.picking import nearest_on_outline, pick_surface
+from morph_dslam.render.picking import nearest_on_outline, pick_surface, pick_surface_numpy
 from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 528.0, 527.0, 320.3, 239.1)
@@ -47,6 +47,18 @@ def test_pick_takes_the_nearer_of_two_sheets_and_survives_edge_on_and_hidden_tri
 def test_pick_without_any_triangle_in_front():
     picked = pick_surface(-np.eye(3), np.array([[0, 1, 2]]), np.array([[0.0, 0.0, 1.0]]))
     assert picked.triangles.tolist() == [-1]
+
+
+def test_compiled_and_plain_picking_agree_also_on_what_is_behind_and_beside():
+    rng = np.random.default_rng(5)
+    nodes = rng.normal((0.0, 0.0, 1.5), 1.0, (300, 3))  # some behind the camera
+    triangles = np.array([rng.choice(300, 3, replace=False) for _ in range(80)])
+    rays = rng.normal(size=(400, 3))
+    rays[:5] = np.nan
+    found, plain = pick_surface(nodes, triangles, rays), pick_surface_numpy(nodes, triangles, rays)
+    assert np.array_equal(found.triangles, plain.triangles)
+    assert 50 < np.count_nonzero(found.triangles >= 0) < 350
+    np.testing.assert_allclose(found.weights, plain.weights, atol=1e-9)
 
 
 @pytest.mark.parametrize("overshoot", [0.5, 4.0])
