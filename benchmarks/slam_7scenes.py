@@ -32,7 +32,7 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import MorphError
 from morph_dslam.evaluation.trajectory_error import absolute_error, match
 from morph_dslam.io.trajectory import load_trajectory
-from morph_dslam.online.slam.mapping_work import share_interpreter
+from morph_dslam.online.side_by_side import threads_side_by_side
 from morph_dslam.online.slam.output import trajectory_of
 from morph_dslam.online.slam.run import warm_up
 from morph_dslam.online.slam.slam import Slam
@@ -70,9 +70,9 @@ def localise(slam: Slam, frames: list[Frame]) -> str:
     )
 
 
+@threads_side_by_side()
 def follow_live(slam: Slam, recorded: list[Frame]) -> tuple[list[SlamFrame], str]:
     """The frames that are there in time, and what came of mapping beside them."""
-    share_interpreter()
     frames, while_mapping, start = [], [], time.perf_counter()
     while (newest := int((time.perf_counter() - start) * FPS)) < len(recorded):
         if frames and recorded[newest].index == frames[-1].index:

@@ -36,7 +36,7 @@ from tests.support.rendered_room import CAMERA, RoomFilm, closed_room, hand_held
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import MorphError
-from morph_dslam.online.slam.mapping_work import share_interpreter
+from morph_dslam.online.side_by_side import threads_side_by_side
 from morph_dslam.online.slam.run import warm_up
 from morph_dslam.online.slam.slam import Slam
 from morph_dslam.online.slam.slam_frame import SlamFrame
@@ -111,9 +111,9 @@ def _figures(times: list[float]) -> str:
     return f"{np.median(times):.1f}/{np.percentile(times, 95):.1f}"
 
 
+@threads_side_by_side()
 def waits() -> str:
     """What frames wait for the mapper, at the pace of a camera, in a round trip that closes a loop."""
-    share_interpreter()
     film = RoomFilm(seed=4, scene=closed_room, camera=SMALL_CAMERA, prints=4)
     places = round_trip(200)
     images = [film.frame(place) for place in tqdm(places, desc="rendering", unit="frame")]

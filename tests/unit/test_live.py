@@ -1,5 +1,7 @@
 """A live camera drops frames rather than falling behind; a recording never does. A fake sets the pace."""
 
+import gc
+import sys
 import threading
 
 import cv2
@@ -7,6 +9,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import SourceError
+from morph_dslam.online.side_by_side import threads_side_by_side
 from morph_dslam.sources import open_source, open_stream
 from morph_dslam.sources.frames import Frame
 from morph_dslam.sources.live import LiveCamera, PacedRecording
@@ -168,3 +171,23 @@ def test_webcams_that_cannot_be_opened():
         open_stream("webcam:0", 3, 4)
     with pytest.raises(SourceError, match="no folder of images and no video at webcam:x"):
         open_source("webcam:x")
+
+
+def test_threads_take_turns_quickly_only_while_they_track():
+    def settings():
+        return sys.getswitchinterval(), cv2.getNumThreads(), gc.get_freeze_count()
+
+    def interrupted():
+        with threads_side_by_side():
+            inside.append(settings())
+            raise KeyboardInterrupt
+
+    before, inside = settings(), []
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    interval, threads, frozen = inside[0]
+    # Fifty waits take less than a sixth of a frame of 30 a second.
+    assert 50 * interval < 1 / 180
+    assert threads == 1
+    assert frozen > 10_000
+    assert settings() == before

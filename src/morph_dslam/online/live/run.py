@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import csv
-import gc
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -92,8 +90,7 @@ def run_live(options: LiveOptions) -> dict[str, Any]:
         session = LiveSession(stream, chain, LivePicture(setup.camera, view), run, sinks)
         print(f"tracking {stream.name} (Ctrl-C ends it)", file=sys.stderr)
         try:
-            with _without_collections():
-                session.run(options.seconds)
+            session.run(options.seconds)
         finally:
             summary = _write(setup, begin, session, options) if len(run) else {}
     return summary
@@ -170,14 +167,3 @@ def write_latencies(path: Path, times: LiveTimes) -> None:
         writer.writerow(["frame", "captured_s", "latency_ms"])
         for frame, captured, latency in zip(times.frames, times.captured, times.latency, strict=True):
             writer.writerow([frame, f"{captured - times.captured[0]:.6f}", f"{1e3 * latency:.3f}"])
-
-
-@contextmanager
-def _without_collections() -> Iterator[None]:
-    """Spare the garbage collector what lives for the whole session: a full collection takes tens of ms."""
-    gc.collect()
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()

@@ -7,11 +7,9 @@ What is compiled, or OpenCV's, leaves the interpreter to the others.
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -24,12 +22,10 @@ from morph_dslam.online.augmented_view import AugmentedView, with_caption
 from morph_dslam.online.chain import Chain, Located
 from morph_dslam.online.frame_result import FrameResult
 from morph_dslam.online.results import RunResults
+from morph_dslam.online.side_by_side import threads_side_by_side
 from morph_dslam.sources import Frame
 from morph_dslam.sources.live import LiveStream
 from morph_dslam.sources.newest import Newest
-
-#: Seconds after which a thread that wants the interpreter gets it; Python's own 5 ms are a sixth of a frame.
-SWITCH_INTERVAL = 0.0005
 
 
 class Sink(Protocol):
@@ -119,7 +115,7 @@ class LiveSession:
 
         An interrupt ends it too; what was found until then is in `results` and `times`.
         """
-        with _quick_switches():
+        with threads_side_by_side():
             for thread in self._threads:
                 thread.start()
             try:
@@ -179,15 +175,3 @@ def _without_points(result: FrameResult) -> FrameResult:
     if result.estimate is None:
         return result
     return replace(result, estimate=replace(result.estimate, residuals=np.empty((0, 2))))
-
-
-@contextmanager
-def _quick_switches() -> Iterator[None]:
-    before, threads = sys.getswitchinterval(), cv2.getNumThreads()
-    sys.setswitchinterval(SWITCH_INTERVAL)
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(before)
-        cv2.setNumThreads(threads)

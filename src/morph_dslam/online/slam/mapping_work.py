@@ -8,35 +8,17 @@ none.
 
 from __future__ import annotations
 
-import gc
 import os
 import sys
 import threading
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 
-import cv2
-
 Work = Generator[None, None, None]
 
-#: How long a thread may keep the interpreter while another waits for it, seconds. Tracking gives it up some
-#: fifty times a frame, whenever compiled code runs, and may wait for so long each time; Python's own is 5 ms.
-SWITCH_INTERVAL = 1e-4
 #: By how much the thread's priority is lower, in steps of `nice`: with this it still gets a third of what
 #: another program gets. With far less it would be stopped for long while it holds the interpreter.
 STANDS_BACK = 5
-
-
-def share_interpreter() -> None:
-    """Let tracking and mapping run side by side; for the main program, before it tracks live.
-
-    The threads of this process then take turns quickly, and OpenCV begins no threads of its own. What exists
-    already is left out when Python looks for garbage: over all that has been imported that takes many
-    milliseconds, in which no thread goes on.
-    """
-    gc.freeze()
-    sys.setswitchinterval(SWITCH_INTERVAL)
-    cv2.setNumThreads(1)
 
 
 def do_all(work: Work) -> None:

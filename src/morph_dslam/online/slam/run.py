@@ -19,11 +19,11 @@ from morph_dslam.io.stereo_calibration import load_camera_or_pair
 from morph_dslam.io.trajectory import load_trajectory
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.online.flow import patch_correlation
+from morph_dslam.online.side_by_side import threads_side_by_side
 from morph_dslam.online.slam.bundle_adjustment import Observations, adjust
 from morph_dslam.online.slam.colmap_map import map_from_colmap
 from morph_dslam.online.slam.descriptors import least_distances, orientations
 from morph_dslam.online.slam.map_file import load_map
-from morph_dslam.online.slam.mapping_work import share_interpreter
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.slam.output import draw_frame, write_run
 from morph_dslam.online.slam.place_recognition import bit_counts
@@ -112,15 +112,14 @@ def _run(
         and source.has_registered_depth
     )
     is_live = isinstance(source, LiveCamera)
-    if is_live:
-        share_interpreter()
     slam, frames = Slam(camera, options.slam, with_depth, options.freeze_when_deforming, is_live), []
     known = _known_map(options, slam)
     if known is not None:
         slam.use_map(known, options.extend)
     n_before = source.dropped if isinstance(source, LiveCamera) else 0
     try:
-        _process(slam, source, options, frames)
+        with threads_side_by_side() if is_live else nullcontext():
+            _process(slam, source, options, frames)
     finally:
         dropped = {"n_dropped": source.dropped - n_before} if isinstance(source, LiveCamera) else {}
         summary = _finish(slam, frames, options, dropped) if frames else {}
