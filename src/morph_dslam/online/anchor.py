@@ -16,7 +16,8 @@ from scipy.spatial import KDTree
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
-from morph_dslam.model import ReducedModel, SurfacePoints
+from morph_dslam.model import ReducedModel
+from morph_dslam.model.surface_sampling import spread_over
 from morph_dslam.online.known_pose import KnownPose
 from morph_dslam.online.place_in_map import PlaceInMap
 from morph_dslam.online.registration import shape_starts
@@ -28,7 +29,7 @@ Array = NDArray[np.float64]
 
 #: A map point this near to the surface, over the object's size, lies on it: that is what maps are good for.
 ON_SURFACE = 0.03
-#: Points that stand for the surface.
+#: Points that stand for the surface, much closer together than `ON_SURFACE`.
 N_SAMPLES = 10_000
 #: What moves by more than this part of the object's size over the parameter box is no part of the scene.
 MOVES = 0.005
@@ -40,7 +41,8 @@ def points_on_object(
     positions: Array, place: PlaceInMap, model: ReducedModel
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which map points (n, 3) lie on the object, and which of them (n,) where it can move under the model."""
-    samples, size = _spread_over(model), float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
+    samples = spread_over(model.nodes, model.triangles, N_SAMPLES)
+    size = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
     field = model.restrict(samples)
     reach, undeformed = np.zeros(len(samples)), field.value(model.default)
     for shape in shape_starts(model):
@@ -49,15 +51,6 @@ def points_on_object(
     distances, nearest = KDTree(model.rest_positions(samples)).query(in_object)
     on_object = distances < ON_SURFACE * size
     return on_object, on_object & (reach[nearest] > MOVES * size)
-
-
-def _spread_over(model: ReducedModel) -> SurfacePoints:
-    """Points spread evenly over the surface, much closer together than `ON_SURFACE`."""
-    rng = np.random.default_rng(0)
-    a, b, c = (model.nodes[model.triangles[:, corner]] for corner in range(3))
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    chosen = rng.choice(len(areas), N_SAMPLES, p=areas / areas.sum())
-    return SurfacePoints(chosen, rng.dirichlet(np.ones(3), N_SAMPLES))
 
 
 class Anchor:

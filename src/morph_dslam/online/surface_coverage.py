@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.model import SurfacePoints
+from morph_dslam.model.surface_sampling import spread_over, triangle_normals
 from morph_dslam.online.binding import DrawnSurface, signed_areas
 from morph_dslam.online.estimation import BoundPoints, Estimator, State
 from morph_dslam.online.measurement import DEPTH_TOLERANCE
@@ -36,12 +37,11 @@ class SurfaceSamples:
 
     def __init__(self, estimator: Estimator, surface: DrawnSurface) -> None:
         model, self._camera, self._closed = estimator.model, estimator.camera, surface.closed
-        a, b, c = (model.nodes[model.triangles[:, corner]] for corner in range(3))
-        areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        chosen = np.random.default_rng(0).choice(len(areas), N_SAMPLES, p=areas / areas.sum())
+        chosen = spread_over(model.nodes, model.triangles, N_SAMPLES).triangles
         corners = SurfacePoints(np.repeat(chosen, 3), np.tile(np.eye(3), (N_SAMPLES, 1)))
         self._corners = BoundPoints.from_surface(model, corners)
-        self._areas = areas[chosen]
+        normals = triangle_normals(model.nodes, model.triangles[chosen])
+        self._areas = 0.5 * np.linalg.norm(normals, axis=1)
 
     def seen(self, state: State, depth: NDArray[np.float32]) -> Array:
         """What a view shows of each sample (k,), squared pixels a squared metre; 0 where it is hidden.

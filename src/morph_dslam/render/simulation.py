@@ -23,6 +23,7 @@ from morph_dslam.io.calibration import load_camera, parse_camera, save_camera
 from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
 from morph_dslam.model import ReducedModel, SurfacePoints, load_model
+from morph_dslam.model.surface_sampling import spread_over
 from morph_dslam.render.depth_sensor import sensor_depth
 from morph_dslam.render.environment import StaticScene
 from morph_dslam.render.motion import Motion, plan_motion
@@ -30,7 +31,7 @@ from morph_dslam.render.rasteriser import rasterise, visible_points
 from morph_dslam.render.scene_file import Scene, load_scene_file
 from morph_dslam.render.scene_renderer import SceneRenderer, in_disc, pixel_axes, supersampled
 from morph_dslam.render.sheet_points import is_sheet, landmark_nodes, regular_points
-from morph_dslam.render.solid_points import scattered_points, spread_nodes
+from morph_dslam.render.solid_points import spread_nodes
 
 Array = NDArray[np.float64]
 
@@ -159,6 +160,13 @@ def _write_landmarks(path: Path, world: _World) -> None:
     save_landmarks(path, landmarks)
 
 
+def _truth_points(model: ReducedModel) -> SurfacePoints:
+    """The surface points whose true positions are written: a grid on a sheet, spread over a solid."""
+    if is_sheet(model):
+        return regular_points(model, N_TRUTH_POINTS)
+    return spread_over(model.nodes, model.triangles, N_TRUTH_POINTS)
+
+
 def _truth_positions(world: _World, points: SurfacePoints) -> Array:
     """Positions (T, p, 3) of surface points in the camera frame in all frames, metres."""
     field, rest = world.model.restrict(points), world.model.rest_positions(points)
@@ -273,8 +281,7 @@ def simulate(scene_path: Path, output: Path, progress: bool = True) -> None:
     _prepare_folder(output)
     save_camera(output / "camera.yaml", world.camera)
     _write_landmarks(output / "landmarks.csv", world)
-    spread = regular_points if is_sheet(world.model) else scattered_points
-    truth = _truth_positions(world, spread(world.model, N_TRUTH_POINTS))
+    truth = _truth_positions(world, _truth_points(world.model))
     visible = _render_frames(world, renderer, output, truth, progress)
     _write_truth(output / "truth.npz", world, truth, visible)
     _write_lists(output, world)

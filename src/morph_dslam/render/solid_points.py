@@ -1,4 +1,4 @@
-"""Points and texture of a solid's surface: where a sheet has one rest plane, a solid has three.
+"""Texture and landmarks of a solid's surface: where a sheet has one rest plane, a solid has three.
 
 The print is laid on by box projection: each triangle takes the texture as seen along the axis that its rest
 normal is nearest to. Nodes where triangles of different axes meet are used once for each.
@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.model import ReducedModel, SurfacePoints
+from morph_dslam.model import ReducedModel
+from morph_dslam.model.surface_sampling import triangle_normals
 
 Array = NDArray[np.float64]
 
@@ -41,9 +42,7 @@ def surface_size(model: ReducedModel) -> float:
 
 def box_projection(model: ReducedModel, pixels: int) -> TexturedSurface:
     """Lay a square texture of ``pixels`` a side over the surface at rest, x or y to the right and z up."""
-    corners = model.nodes[model.triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    axis = np.abs(normals).argmax(axis=1)
+    axis = np.abs(triangle_normals(model.nodes, model.triangles)).argmax(axis=1)
     keys = 3 * model.triangles + axis[:, None]
     vertices, inverse = np.unique(keys.ravel(), return_inverse=True)
     nodes, axes = vertices // 3, vertices % 3
@@ -53,16 +52,6 @@ def box_projection(model: ReducedModel, pixels: int) -> TexturedSurface:
     up = np.where(axes == 2, fraction[:, 1], fraction[:, 2])
     coordinates = np.column_stack([right, 1.0 - up]) * pixels - 0.5
     return TexturedSurface(nodes, inverse.reshape(-1, 3), coordinates)
-
-
-def scattered_points(model: ReducedModel, count: int) -> SurfacePoints:
-    """``count`` points spread over the surface in proportion to its area, the same every time."""
-    corners = model.nodes[model.triangles]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    rng = np.random.default_rng(0)
-    places = (np.arange(count) + 0.5) / count * areas.sum()
-    triangles = np.searchsorted(np.cumsum(areas), places)
-    return SurfacePoints(triangles, rng.dirichlet(np.ones(3), count))
 
 
 def spread_nodes(model: ReducedModel, count: int = N_LANDMARKS) -> NDArray[np.int64]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from morph_dslam.geometry import rotation_exp
+from morph_dslam.model.surface_sampling import spread_over, triangle_normals
 
 Array = NDArray[np.float64]
 
@@ -51,14 +52,12 @@ class Surface:
             np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1
         )
         _, uses = np.unique(edges, axis=0, return_counts=True)
-        corners = nodes[triangles]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        areas = np.linalg.norm(normals, axis=1)
-        places = (np.arange(count) + 0.5) / count * areas.sum()
-        chosen = np.minimum(np.searchsorted(np.cumsum(areas), places), len(areas) - 1)
-        weights = np.random.default_rng(0).dirichlet(np.ones(3), count)
-        points = np.einsum("pc,pcx->px", weights, corners[chosen])
-        return cls(points, normals[chosen] / areas[chosen, None], closed=bool((uses == 2).all()))
+        samples = spread_over(nodes, triangles, count)
+        chosen = triangles[samples.triangles]
+        points = np.einsum("pc,pcx->px", samples.weights, nodes[chosen])
+        normals = triangle_normals(nodes, chosen)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        return cls(points, normals, closed=bool((uses == 2).all()))
 
     @cached_property
     def tree(self) -> KDTree:
