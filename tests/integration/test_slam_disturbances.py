@@ -54,17 +54,20 @@ def test_a_wrong_focal_length_is_found_out_on_a_plane():
     )
 
 
-def write_film(folder, images):
-    folder.mkdir()
+def command_on_film(folder, images, focal_length):
+    """`morph slam` on a film of the images, with a camera file that gives this focal length, pixels."""
+    (folder / "film").mkdir()
     for index, image in enumerate(images):
-        cv2.imwrite(str(folder / f"{index:04d}.png"), image)
+        cv2.imwrite(str(folder / "film" / f"{index:04d}.png"), image)
+    (folder / "camera.yaml").write_text(
+        f"width: 640\nheight: 480\nfx: {focal_length}\nfy: {focal_length}\ncx: 319.5\ncy: 239.5\n"
+    )
+    camera, run = str(folder / "camera.yaml"), str(folder / "run")
+    return ["slam", str(folder / "film"), "--camera", camera, "--no-video", "-o", run]
 
 
 def test_the_run_says_that_the_calibration_is_suspect(tmp_path, images, capsys):
-    write_film(tmp_path / "film", images)
-    (tmp_path / "camera.yaml").write_text("width: 640\nheight: 480\nfx: 446\nfy: 446\ncx: 319.5\ncy: 239.5\n")
-    command = ["slam", str(tmp_path / "film"), "--camera", str(tmp_path / "camera.yaml"), "--no-video"]
-    assert main([*command, "-o", str(tmp_path / "run")]) == 0
+    assert main(command_on_film(tmp_path, images, 446)) == 0
     assert "check the calibration" in capsys.readouterr().out
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["suspected_focal_factor"] == pytest.approx(525.0 / 446.0, rel=0.02)
@@ -129,14 +132,21 @@ def under_way(slam, images):
     raise AssertionError("the mapper was never at work")
 
 
-def test_a_reset_while_the_mapper_is_at_work_forgets_what_it_does(images, monkeypatch):
-    slam, may_go_on, insert = Slam(CAMERA, threaded=True), threading.Event(), Mapper.insert
+@pytest.fixture
+def may_go_on(monkeypatch):
+    """An event that the mapper waits for before it inserts a keyframe."""
+    event, insert = threading.Event(), Mapper.insert
 
     def held_up(mapper, tracked, view):
-        assert may_go_on.wait(timeout=60.0)
+        assert event.wait(timeout=60.0)
         yield from insert(mapper, tracked, view)
 
     monkeypatch.setattr(Mapper, "insert", held_up)
+    return event
+
+
+def test_a_reset_while_the_mapper_is_at_work_forgets_what_it_does(images, may_go_on):
+    slam = Slam(CAMERA, threaded=True)
     under_way(slam, images)
     slam.reset()
     may_go_on.set()
@@ -149,15 +159,9 @@ def test_a_reset_while_the_mapper_is_at_work_forgets_what_it_does(images, monkey
     assert len(slam.map.keyframes) > 2
 
 
-def test_freezing_waits_for_nobody_and_the_map_stays(images, monkeypatch):
+def test_freezing_waits_for_nobody_and_the_map_stays(images, may_go_on):
     """Freezing returns though the mapper's step cannot end before: with any waiting this would hang."""
-    slam, may_go_on, insert = Slam(CAMERA, threaded=True), threading.Event(), Mapper.insert
-
-    def held_up(mapper, tracked, view):
-        assert may_go_on.wait(timeout=60.0)
-        yield from insert(mapper, tracked, view)
-
-    monkeypatch.setattr(Mapper, "insert", held_up)
+    slam = Slam(CAMERA, threaded=True)
     after = under_way(slam, images)
     n_keyframes, positions = len(slam.map.keyframes), slam.map.positions.copy()
     slam.freeze()
@@ -174,8 +178,6 @@ def test_freezing_waits_for_nobody_and_the_map_stays(images, monkeypatch):
 
 @pytest.mark.parametrize("at", [3, 12, 20, 33])
 def test_an_interrupt_at_any_frame_keeps_what_was_mapped(tmp_path, images, monkeypatch, at):
-    write_film(tmp_path / "film", images)
-    (tmp_path / "camera.yaml").write_text("width: 640\nheight: 480\nfx: 525\nfy: 525\ncx: 319.5\ncy: 239.5\n")
     track = Slam.process_frame
 
     def interrupted(slam, image, index, *rest):
@@ -185,8 +187,7 @@ def test_an_interrupt_at_any_frame_keeps_what_was_mapped(tmp_path, images, monke
 
     monkeypatch.setattr(Slam, "process_frame", interrupted)
     run = tmp_path / "run"
-    command = ["slam", str(tmp_path / "film"), "--camera", str(tmp_path / "camera.yaml"), "--no-video"]
-    assert main([*command, "-o", str(run)]) == 130
+    assert main(command_on_film(tmp_path, images, 525)) == 130
     summary = json.loads((run / "summary.json").read_text())
     assert summary["n_frames"] == at
     assert (summary["n_tracked"] > 0) == (at > 10)
