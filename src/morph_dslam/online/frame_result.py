@@ -36,6 +36,10 @@ RECOVERED = "recovered from the reference view's features"
 UNEXPLAINED = "the model does not explain the images"
 #: Follows the reason of a frame in which few points agree, and less closely than usual.
 FEW_AGREE = "few points agree, and less closely than usual"
+#: Follows the reason of a frame as long as all frames look too much like the reference view to contradict it.
+UNCHECKED = "no other view has checked the reference state yet"
+#: Follows the reason of frames by which the reference state is worse known than it was stated.
+REFERENCE_WORSE = "the frames contradict the reference state"
 #: Follows the reason of frames in which an anchored object is away from its place.
 HAS_MOVED = "the object has moved from its place in the map"
 
@@ -53,6 +57,8 @@ class FrameResult:
     n_points, n_inliers : points that the object itself does not hide, and those that support the estimate.
     timings_ms : by stage, milliseconds. total_ms : the whole frame. recovered : found again after a loss.
     unexplained_px : what the model leaves of the residuals, see `systematic_errors`; NaN when lost.
+    reference_worse : by how much larger than stated the deviation of the reference state is, by all frames so
+        far; see `reference_misfit`.
     pose_from : "points", "points and map", "map" where it is hidden, or "" where there is no pose.
     known : the pose by the map, where that alone tells it.
     view : number of the reference view that the frame was compared with, 0 for the first.
@@ -69,6 +75,7 @@ class FrameResult:
     total_ms: float
     recovered: bool = False
     unexplained_px: float = float("nan")
+    reference_worse: float = 1.0
     pose_from: str = ""
     known: KnownPose | None = None
     view: int = 0

@@ -27,12 +27,15 @@ from morph_dslam.online.frame_result import (
     FOUND_AGAIN,
     HAS_MOVED,
     RECOVERED,
+    REFERENCE_WORSE,
     STAGES,
+    UNCHECKED,
     UNEXPLAINED,
     FrameResult,
 )
 from morph_dslam.online.known_pose import KnownPose
 from morph_dslam.online.measurement import Measurement
+from morph_dslam.online.reference_misfit import CLEARLY_WORSE
 from morph_dslam.online.reference_refinement import Keyframe
 from morph_dslam.online.reference_view import ReferenceView
 from morph_dslam.online.reference_views import Change, FollowedView, ReferenceViews
@@ -55,6 +58,7 @@ class Tracker:
         is looked for as after a loss.
     reference_covariance : (d + 6, d + 6) of ``state``; it enters that of every frame. None where nothing is
         known of the error of ``state``.
+    hidden : (h, w) where something else is in front of the object in the reference frame.
 
     Attributes
     ----------
@@ -79,12 +83,13 @@ class Tracker:
         options: TrackerOptions | None = None,
         in_sequence: bool = True,
         reference_covariance: Array | None = None,
+        hidden: NDArray[np.bool_] | None = None,
     ) -> None:
         self.model, self.camera, self.options = model, camera, options or TrackerOptions()
         self.estimator = Estimator(model, camera, self.options.estimation)
         self._undistortion = camera.undistortion_maps()
         picture = reference if isinstance(reference, Picture) else self._prepare(reference)
-        reference_view = ReferenceView(self.estimator, picture, state, self.options)
+        reference_view = ReferenceView(self.estimator, picture, state, self.options, hidden)
         self._views = ReferenceViews(self.estimator, reference_view, reference_covariance, self.options)
         self._anchoring = Anchoring(self.estimator, reference_view, self.options)
         self._filter = new_filter(self.estimator, self.options)
@@ -281,11 +286,16 @@ class Tracker:
         left = self._view.systematic.unexplained(attempt.estimate, attempt.inliers)
         doubt = self._view.recovery.doubt(attempt)
         alike_px = max(left.px, doubt)
-        estimate = self._view.systematic.added(attempt.estimate, attempt.inliers, alike_px, attempt.prior)
+        systematic = self._view.systematic
+        estimate = systematic.added(attempt.estimate, attempt.inliers, alike_px, attempt.prior, not doubt)
         if doubt:
             aside += f"; {FEW_AGREE}: by {attempt.estimate.sigma_px:.1f} px"
         if left.is_failure:
             aside += f"; {UNEXPLAINED}: {left.px:.1f} px are left"
+        if systematic.worse > CLEARLY_WORSE:
+            aside += f"; {REFERENCE_WORSE}: {systematic.worse:.1f} times what it was taken to be known to"
+        elif systematic.is_unchecked and attempt.prior is None:
+            aside += f"; {UNCHECKED}"
         return FrameResult(
             "tracked",
             how + aside,
@@ -297,6 +307,7 @@ class Tracker:
             total,
             recovered=how != FOLLOWED,
             unexplained_px=left.px,
+            reference_worse=systematic.worse,
             pose_from="points" if attempt.prior is None else "points and map",
             view=self._view.number,
         )

@@ -17,8 +17,9 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.online.binding import DrawnSurface
 from morph_dslam.online.confidence import largest_displacement, largest_von_mises
 from morph_dslam.online.estimation import State
-from morph_dslam.online.frame_result import HAS_MOVED, STAGES, UNEXPLAINED, FrameResult
+from morph_dslam.online.frame_result import HAS_MOVED, REFERENCE_WORSE, STAGES, UNEXPLAINED, FrameResult
 from morph_dslam.online.observability import UNTOLD_SHARE, one_value, statement, untold_in_run
+from morph_dslam.online.reference_misfit import CLEARLY_WORSE
 
 Array = NDArray[np.float64]
 FORMAT = "morph-dslam run"
@@ -220,6 +221,12 @@ def flags(run: RunResults) -> list[str]:
             f"{UNEXPLAINED} in {failed} of {len(run)} frames: up to {largest:.1f} px are left that "
             "neighbouring points have in common; it may be a model of something else, or too stiff, or "
             "a wrong camera file"
+        )
+    worse = max((result.reference_worse for result in run.results), default=1.0)
+    if worse > CLEARLY_WORSE:
+        found.append(
+            f"{REFERENCE_WORSE}: {worse:.1f} times what it was taken to be known to, and the deviations are "
+            "that much wider; check the landmarks and whether the object has the model's dimensions"
         )
     found += _at_bound(run)
     return found + _untold(run)

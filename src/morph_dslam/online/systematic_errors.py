@@ -4,7 +4,9 @@ The points were bound to the mesh in the reference view, so an error of the obje
 on the surface, and every frame's estimate with them. Let a pixel of the reference view move by J0 e where its
 state is off by e; the material point under a fixed pixel then moves so that its pixel moves by -J0 e, in
 another view by -M J0 e, with M the map between the images of the point's triangle. The frame's estimate takes
-this for motion, H^-1 J' W M J0 e, to first order. In the reference view itself that is e.
+this for motion, H^-1 J' W M J0 e, to first order. In the reference view itself that is e. What it cannot take
+up stays in the residuals; where they show more of it than the stated covariance of e explains,
+`ReferenceMisfit` says by how much that is too small.
 
 A model that cannot take the object's shape leaves residuals that are alike over parts of the surface much
 wider than the windows that are compared. Their covariance is measured from pairs of points whose windows do
@@ -23,8 +25,10 @@ from numpy.typing import NDArray
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.model import SurfacePoints
 from morph_dslam.online.estimation import BoundPoints, Estimate, Estimator, Prior, State
+from morph_dslam.online.reference_misfit import ReferenceMisfit
 from morph_dslam.online.reprojection import project_with_jacobian
 from morph_dslam.online.robust_covariance import EIGENVALUE_FLOOR
+from morph_dslam.online.state import moved
 
 Array = NDArray[np.float64]
 
@@ -35,6 +39,8 @@ ALIKE_SHARE, PAIR_SHARE = 0.75, 0.5
 UNEXPLAINED_PX = 0.5
 #: An estimate that takes up more of the model's error leaves too little to tell how large it is.
 LEAST_LEFT = 0.02
+#: A reference whose points' places deviate by more than this share of the object's size is known vaguely.
+VAGUE_SHARE = 0.003
 #: A triangle seen so much flatter in the reference view than in another says nothing of the motion there.
 LARGEST_STRETCH = 5.0
 
@@ -77,7 +83,10 @@ class SystematicErrors:
     ) -> None:
         self._estimator, self._points = estimator, points
         known = covariance is not None and np.isfinite(covariance).all()
-        self._covariance = covariance if known else None
+        self._root = _root(covariance, estimator.scale) if known and covariance is not None else None
+        self._misfit = ReferenceMisfit()
+        size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
+        self._is_vague = _spread(points, reference, self._root) > VAGUE_SHARE * size
         self._corners = _corners(estimator, points)
         self._jacobian = self._project(points, reference)[1]
         self._edges = _edges(estimator.camera, self._corners, reference)
@@ -93,13 +102,26 @@ class SystematicErrors:
         """What the model leaves of the residuals of the points ``used`` (p,)."""
         residuals = np.where(used[:, None], estimate.residuals[: len(used)], 0.0)
         total = float(np.sum(residuals**2)) / max(2 * int(used.sum()), 1)
-        pairs = self._pairs & used[:, None] & used[None]
-        count = int(pairs.sum())
-        common = float(np.sum(residuals * (pairs @ residuals))) / max(2 * count, 1)
+        common = _in_common(residuals[:, :, None], self._pairs_of(used))
         return Unexplained(float(np.sqrt(max(common, 0.0))), float(np.sqrt(total)))
 
+    @property
+    def worse(self) -> float:
+        """By how much larger than stated the reference's deviation is, as the frames so far show it."""
+        return float(np.sqrt(self._misfit.factor))
+
+    @property
+    def is_unchecked(self) -> bool:
+        """Whether the reference is known vaguely, and no frame so far could show if as well as stated."""
+        return self._is_vague and not self._misfit.is_told
+
     def added(
-        self, estimate: Estimate, used: NDArray[np.bool_], alike_px: float, prior: Prior | None = None
+        self,
+        estimate: Estimate,
+        used: NDArray[np.bool_],
+        alike_px: float,
+        prior: Prior | None = None,
+        learns: bool = True,
     ) -> Estimate:
         """The estimate with a covariance that holds both errors.
 
@@ -108,6 +130,7 @@ class SystematicErrors:
         used : (p,) the points that support it. prior : that it was found with.
         alike_px : standard deviation of a pixel coordinate that neighbours have in common in the residuals,
             as of `unexplained`.
+        learns : whether the residuals are the object's, so that they tell how well the reference is known.
         """
         _, jacobian = self._project(self._points, estimate.state)
         length = np.linalg.norm(estimate.residuals[: len(used)], axis=1)
@@ -118,29 +141,36 @@ class SystematicErrors:
         scores = weights[:, None, None] * jacobian
         hessian = np.tensordot(scores, jacobian, axes=([0, 1], [0, 1]))
         gain = self._inverse(hessian if prior is None else hessian + prior.terms(estimate.state)[1])
-        covariance = estimate.covariance.copy()
-        if self._covariance is not None:
-            moved = self._warps(estimate.state) @ self._jacobian
+        covariance, pairs = estimate.covariance.copy(), self._pairs_of(usable)
+        if self._root is not None:
+            moved = self._warps(estimate.state) @ (self._jacobian @ self._root)
             transfer = gain @ np.tensordot(scores, moved, axes=([0, 1], [0, 1]))
-            covariance += transfer @ self._covariance @ transfer.T
+            if learns:
+                residuals = np.where(usable[:, None], estimate.residuals[: len(used)], 0.0)
+                left = np.where(usable[:, None, None], moved - jacobian @ transfer, 0.0)
+                self._misfit.learn(_in_common(residuals[:, :, None], pairs), _in_common(left, pairs))
+            covariance += self._misfit.factor * transfer @ transfer.T
         spread = (self._alike @ scores.reshape(len(scores), -1)).reshape(scores.shape)
         of_model = gain @ np.tensordot(scores, spread, axes=([0, 1], [0, 1])) @ gain
-        share = self._share_left(jacobian, spread @ gain, of_model, usable)
+        share = self._share_left(jacobian, spread @ gain, of_model, pairs)
         covariance += alike_px**2 / share * of_model
         return replace(estimate, covariance=covariance)
 
-    def _share_left(self, jacobian: Array, spread: Array, of_model: Array, used: NDArray[np.bool_]) -> float:
+    def _pairs_of(self, used: NDArray[np.bool_]) -> Array:
+        """1 for pairs of points (p, p) that are compared, 0 for others."""
+        return (self._pairs & used[:, None] & used[None]).astype(float)
+
+    def _share_left(self, jacobian: Array, spread: Array, of_model: Array, pairs: Array) -> float:
         """How much of the variance of the model's error the estimate leaves in the residuals that show it.
 
         With G = J H^-1 J' W what the estimate takes up, it leaves (I - G) K (I - G)' of a covariance K; this
         is summed over the pairs of points that `unexplained` sums over.
         """
-        pairs = self._pairs & used[:, None] & used[None]
-        beside = np.tensordot(pairs.astype(float), jacobian, axes=(1, 0))
-        whole = 2.0 * float(self._alike[pairs].sum())
+        beside = np.tensordot(pairs, jacobian, axes=(1, 0))
+        whole = 2.0 * float(np.sum(self._alike * pairs))
         taken = 2.0 * float(np.sum(beside * spread))
         twice = float(np.sum(np.tensordot(jacobian, beside, axes=([0, 1], [0, 1])) * of_model))
-        return max((whole - taken + twice) / max(2 * int(pairs.sum()), 1), LEAST_LEFT)
+        return max((whole - taken + twice) / max(2.0 * float(pairs.sum()), 1.0), LEAST_LEFT)
 
     def _project(self, points: BoundPoints, state: State) -> tuple[Array, Array]:
         pose = state.camera_from_object
@@ -169,6 +199,26 @@ class SystematicErrors:
             warps = now @ (adjugate / size[:, None]).reshape(-1, 2, 2)
             usable = np.abs(warps).max(axis=(1, 2)) < LARGEST_STRETCH
         return np.where(usable[:, None, None], warps, 0.0)
+
+
+def _root(covariance: Array, scale: Array) -> Array:
+    """L (n, n) with L L' = ``covariance``, which may be singular; in unknowns divided by ``scale``."""
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+
+
+def _spread(points: BoundPoints, reference: State, root: Array | None) -> float:
+    """Root mean square deviation of the points in the reference view, metres; 0 where nothing is known."""
+    if root is None:
+        return 0.0
+    places = np.array([points.in_camera(moved(reference, step)) for step in root.T])
+    return float(np.sqrt(np.sum((places - points.in_camera(reference)) ** 2) / len(points)))
+
+
+def _in_common(rows: Array, pairs: Array) -> float:
+    """Mean product of what two points of a pair (p, p) have in (p, 2, k), a coordinate, summed over k."""
+    beside = (pairs @ rows.reshape(len(rows), -1)).reshape(rows.shape)
+    return float(np.sum(rows * beside)) / max(2.0 * float(pairs.sum()), 1.0)
 
 
 def _corners(estimator: Estimator, points: BoundPoints) -> BoundPoints:
