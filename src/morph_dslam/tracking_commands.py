@@ -45,7 +45,7 @@ def _track(arguments: argparse.Namespace) -> None:
     if not arguments.also:
         _say(options.output, track(options))
         return
-    others = [OtherObject(name, Path(model), Path(landmarks)) for name, model, landmarks in arguments.also]
+    others = [OtherObject(name, Path(model), Path(start)) for name, model, start in arguments.also]
     for folder, summary in track_objects(options, others).items():
         _say(folder, summary)
 
@@ -238,7 +238,8 @@ def add_tracking_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         nargs=3,
         action="append",
         default=[],
-        metavar=("NAME", "MODEL", "LANDMARKS"),
-        help="another free object in the same frames, its results in RUN/NAME; may be repeated",
+        metavar=("NAME", "MODEL", "START"),
+        help="another object in the same frames, its results in RUN/NAME; START is its file of landmarks, or "
+        "its registration.json in the same map; may be repeated",
     )
     track.add_argument("--no-video", action="store_true", help="do not draw the augmented video")

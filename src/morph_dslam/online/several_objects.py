@@ -27,6 +27,12 @@ from morph_dslam.sources import Frame
 MARGIN_PX = 5
 
 
+def widened(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What an object hides: its depth (h, w), infinite where it is not, and that of a margin around it."""
+    square = np.ones((2 * MARGIN_PX + 1,) * 2, np.uint8)
+    return np.asarray(cv2.erode(depth, square), dtype=np.float32)
+
+
 class ObjectTracker:
     """Follows several objects at once.
 
@@ -77,8 +83,7 @@ class ObjectTracker:
         """Depth (h, w) of an object and its margin; None if nobody knows whether it is there."""
         if name in self._last and self._last[name].estimate is None:
             return None
-        square = np.ones((2 * MARGIN_PX + 1,) * 2, np.uint8)
-        return np.asarray(cv2.erode(self.trackers[name].reference.depth(state), square), dtype=np.float32)
+        return widened(self.trackers[name].reference.depth(state))
 
 
 class ObjectsChain:

@@ -79,11 +79,7 @@ def track(options: TrackOptions) -> dict[str, Any]:
     """
     _check(options)
     setup = load_setup(options)
-    if setup.placement is not None:
-        frame = setup.placement.frame
-        options = replace(
-            options, reference_frame=frame, first=frame if options.first is None else options.first
-        )
+    options = with_reference(options, setup)
     if options.overlay:
         AugmentedView(setup.model, setup.camera, options.drawing)  # says so now if it cannot be drawn
     source = open_frames(options)
@@ -102,6 +98,14 @@ def track(options: TrackOptions) -> dict[str, Any]:
         placement = replace(placement, flags=(*placement.flags, *again.notes))
         summary = write_results(setup, placement, source, options, run) if len(run) else {}
     return summary
+
+
+def with_reference(options: TrackOptions, setup: Setup) -> TrackOptions:
+    """The options with the reference frame that a registration brings; tracking begins there by default."""
+    if setup.placement is None:
+        return options
+    frame = setup.placement.frame
+    return replace(options, reference_frame=frame, first=frame if options.first is None else options.first)
 
 
 def open_frames(options: TrackOptions) -> FrameSource:

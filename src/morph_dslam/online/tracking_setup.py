@@ -135,7 +135,11 @@ class Setup:
         )
 
     def new_tracker(
-        self, placement: Placement, reference: NDArray[np.uint8] | Picture, in_sequence: bool
+        self,
+        placement: Placement,
+        reference: NDArray[np.uint8] | Picture,
+        in_sequence: bool,
+        hidden: NDArray[np.bool_] | None = None,
     ) -> Tracker:
         """A tracker at its beginning; see `Tracker` for the arguments."""
         return Tracker(
@@ -146,6 +150,7 @@ class Setup:
             self.tracker_options(placement),
             in_sequence,
             placement.covariance,
+            hidden,
         )
 
     def new_chain(
