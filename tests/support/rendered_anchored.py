@@ -85,13 +85,11 @@ def make_anchored_recording(folder):
     return truth
 
 
-def write_registration(path, slam, frames, truth):
+def write_registration(path, slam, frames, truth, centre=(0.0, 0.0, 0.0), map_name=None):
     """A registration that is as good as the camera's path in the map."""
     path_in_map = trajectory_of(slam, frames)
     seen = [frame.index for frame in frames if frame.pose is not None]
-    # The sheet's own frame is the world's: camera_from_object is camera_from_world.
-    centres = [-pose[:3, :3].T @ pose[:3, 3] for pose in truth["camera_from_object"][seen]]
-    placed = fit_similarity(np.array(centres), path_in_map.positions)
+    placed = _similarity(path_in_map.world_from_camera, truth["camera_from_object"][seen], np.array(centre))
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = placed.scale * placed.rotation, placed.translation
     size = 0.5 * placed.scale
@@ -99,7 +97,7 @@ def write_registration(path, slam, frames, truth):
     content = {
         "world_from_object": matrix.tolist(),
         "map_units_per_metre": placed.scale,
-        "mean_node_m": [0.0, 0.0, 0.0],
+        "mean_node_m": list(centre),
         "covariance": np.diag(spread**2).tolist(),
         "score": 100.0,
         "runner_up_score": 10.0,
@@ -114,4 +112,18 @@ def write_registration(path, slam, frames, truth):
         moved = keyframe.camera_from_world[:3, :3] @ placed.translation + keyframe.camera_from_world[:3, 3]
         pose[:3, 3] = moved / placed.scale
         content["keyframes"].append({"frame": keyframe.index, "camera_from_object": pose.tolist()})
+    if map_name is not None:
+        content["map"] = map_name
     path.write_text(json.dumps(content))
+
+
+def _similarity(map_from_camera, camera_from_object, centre):
+    """Map from object: points about the object where each camera has them, at the scale of the path."""
+    centres = np.array([-pose[:3, :3].T @ pose[:3, 3] for pose in camera_from_object])
+    scale = fit_similarity(centres, map_from_camera[:, :3, 3]).scale
+    points = centre + np.random.default_rng(0).uniform(-0.2, 0.2, (50, 3))
+    there = [
+        camera[:3, 3] + scale * (points @ pose[:3, :3].T + pose[:3, 3]) @ camera[:3, :3].T
+        for camera, pose in zip(map_from_camera, camera_from_object, strict=True)
+    ]
+    return fit_similarity(np.tile(points, (len(there), 1)), np.concatenate(there))

@@ -181,6 +181,9 @@ def _new_tracker(part: _Object, hidden: NDArray[np.bool_] | None = None) -> Trac
 
 def _new_chain(objects: Sequence[_Object]) -> ObjectsChain:
     """All objects at their beginning; nothing is bound where one is before another in the reference frame."""
+    anchored = [part for part in objects if part.setup.map_path is not None]
+    placements = {part.name: part.placement for part in anchored}
+    anchor = anchored[0].setup.new_anchor(placements) if anchored else None
     alone = [_new_tracker(part) for part in objects]
     drawn = [tracker.reference.depth(tracker.state) for tracker in alone]
     trackers = {}
@@ -192,7 +195,4 @@ def _new_chain(objects: Sequence[_Object]) -> ObjectsChain:
         ]
         hidden = np.minimum.reduce(others) < own if others else np.zeros(own.shape, dtype=bool)
         trackers[part.name] = _new_tracker(part, hidden) if hidden.any() else tracker
-    anchored = [part for part in objects if part.setup.map_path is not None]
-    placements = {part.name: part.placement for part in anchored}
-    anchor = anchored[0].setup.new_anchor(placements) if anchored else None
     return ObjectsChain(objects[0].setup.camera, trackers, anchor)

@@ -1,0 +1,159 @@
+"""Several anchored objects in one map, and an anchored object before several cameras, against exact truth."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from morph_dslam.cli import main
+from morph_dslam.evaluation.run_folder import load_run
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
+from morph_dslam.model import load_model
+from morph_dslam.online.frame_result import STAGES
+from tests.support.rendered_anchored_rig import FRAMES, RIG, SCAN, make_rig_recording
+
+#: What the map made from the scan is off by at the objects, and the registrations with it, metres.
+MAP_ERROR = 1.6e-3
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("anchored")
+    return folder, make_rig_recording(folder)
+
+
+def command(folder, output, *more, first="sheet", camera="camera.yaml"):
+    start = [] if first is None else ["--place", str(folder / first / "registration.json")]
+    arguments = [str(folder / "front"), "--camera", str(folder / camera), *start]
+    arguments += ["--model", str(folder / f"{first or 'wedge'}.morph"), "--range", f"{SCAN - 1}-{FRAMES - 1}"]
+    return ["track", *arguments, "-o", str(output), "--no-video", *map(str, more)]
+
+
+def also(folder, name, start=None):
+    start = start or folder / name / "registration.json"
+    return ["--also", name, folder / f"{name}.morph", start]
+
+
+def exact_nodes(folder, truth, name, frame):
+    model, of_object = load_model(folder / f"{name}.morph"), truth[name]
+    pose = RigidTransform.from_matrix(of_object["camera_from_object"][frame])
+    return pose.apply(model.positions(of_object["parameters"][frame]))
+
+
+def errors(folder, truth, name, run_folder):
+    """Mean distance of all nodes from the truth in each frame, metres."""
+    run = load_run(run_folder)
+    assert set(run.status) == {"tracked"}
+    return np.array(
+        [
+            np.linalg.norm(run.camera_points(row) - exact_nodes(folder, truth, name, frame), axis=1).mean()
+            for row, frame in enumerate(run.frames)
+        ]
+    )
+
+
+def column(run_folder, name):
+    with h5py.File(run_folder / "result.h5") as file:
+        values = file[name]
+        return values.asstr()[()] if values.dtype.kind == "O" else values[:]
+
+
+def test_two_objects_are_tracked_in_one_map(recording, tmp_path, capsys):
+    folder, truth = recording
+    run = tmp_path / "run"
+    assert main(command(folder, run, *also(folder, "wedge"))) == 0
+    assert capsys.readouterr().out.count(f"tracked={FRAMES - SCAN + 1}/{FRAMES - SCAN + 1}") == 2
+    for name, output in (("sheet", run), ("wedge", run / "wedge")):
+        assert errors(folder, truth, name, output).max() < MAP_ERROR
+        assert set(column(output, "pose_from")) == {"points and map"}
+    expected = {name: truth[name]["parameters"][SCAN - 1 :] for name in truth}
+    np.testing.assert_allclose(load_run(run).parameters[:, 0], expected["sheet"][:, 0], atol=0.3e-3)
+    np.testing.assert_allclose(load_run(run / "wedge").parameters, expected["wedge"], atol=0.5e-3)
+    # The camera was found once a frame, for both.
+    np.testing.assert_array_equal(locate_ms(run), locate_ms(run / "wedge"))
+    assert (locate_ms(run) > 0.0).all()
+    # The wedge hides a part of the sheet in the reference view already: nothing of the sheet is bound there.
+    assert (column(run, "n_inliers") > 0.9 * column(run, "n_points")).all()
+
+
+def locate_ms(run_folder):
+    return column(run_folder, "timings_ms")[:, STAGES.index("locate")]
+
+
+@pytest.fixture(scope="module")
+def landmarks(recording):
+    """Of the wedge, in the first frame tracked."""
+    folder, truth = recording
+    nodes = load_model(folder / "wedge.morph").nodes
+    pixels = RIG[0].camera.project(exact_nodes(folder, truth, "wedge", SCAN - 1))
+    chosen = np.random.default_rng(0).choice(len(nodes), 30, replace=False)
+    save_landmarks(folder / "wedge.csv", Landmarks(nodes[chosen], pixels[chosen]))
+    return folder / "wedge.csv"
+
+
+@pytest.mark.parametrize("anchored_first", [True, False])
+def test_a_free_object_beside_an_anchored_one(recording, landmarks, tmp_path, anchored_first):
+    folder, truth = recording
+    run, reference = tmp_path / "run", ["--reference-frame", SCAN - 1]
+    if anchored_first:
+        arguments = command(folder, run, *also(folder, "wedge", landmarks), *reference)
+        outputs = {"sheet": run, "wedge": run / "wedge"}
+    else:
+        more = ["--landmarks", landmarks, *also(folder, "sheet"), *reference]
+        arguments = command(folder, run, *more, first=None)
+        outputs = {"sheet": run / "sheet", "wedge": run}
+    assert main(arguments) == 0
+    assert errors(folder, truth, "sheet", outputs["sheet"]).max() < MAP_ERROR
+    assert errors(folder, truth, "wedge", outputs["wedge"]).max() < 0.5e-3
+    assert set(column(outputs["sheet"], "pose_from")) == {"points and map"}
+    assert set(column(outputs["wedge"], "pose_from")) == {"points"}
+
+
+def changed(path, target, **changes):
+    """A registration with other content, whose map is found in its old place."""
+    content = json.loads(path.read_text())
+    content["map"] = str((path.parent / content["map"]).resolve())
+    target.write_text(json.dumps(content | changes))
+    return target
+
+
+def test_registrations_of_different_maps_are_refused(recording, tmp_path, capsys):
+    folder, _ = recording
+    other = tmp_path / "other.h5"
+    other.write_bytes((folder / "map.h5").read_bytes())
+    start = changed(folder / "wedge" / "registration.json", tmp_path / "wedge.json", map=str(other))
+    assert main(command(folder, tmp_path / "run", *also(folder, "wedge", start))) == 2
+    assert "the objects are anchored in different maps" in capsys.readouterr().err
+
+
+def test_a_registration_that_has_the_object_elsewhere_is_refused(recording, tmp_path, capsys):
+    folder, _ = recording
+    path = folder / "wedge" / "registration.json"
+    matrix = np.array(json.loads(path.read_text())["world_from_object"])
+    matrix[0, 3] += 0.5
+    start = changed(path, tmp_path / "wedge.json", world_from_object=matrix.tolist())
+    assert main(command(folder, tmp_path / "run", *also(folder, "wedge", start))) == 2
+    assert "is not the map of the registration: by the map the object is" in capsys.readouterr().err
+
+
+def test_objects_in_the_same_place_are_refused(recording, tmp_path, capsys):
+    folder, _ = recording
+    twice = ["--also", "twin", folder / "sheet.morph", folder / "sheet" / "registration.json"]
+    assert main(command(folder, tmp_path / "run", *twice)) == 2
+    assert "are registered in the same place of the map" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--reference-frame", "30"], "brings its own reference frame"),
+        (["--refine"], "leave out --refine and --reregister-at"),
+        (["--reregister-at", "40=wedge.csv"], "leave out --refine and --reregister-at"),
+    ],
+)
+def test_what_does_not_fit_several_objects_is_refused(recording, tmp_path, capsys, more, message):
+    folder, _ = recording
+    assert main(command(folder, tmp_path / "run", *also(folder, "wedge"), *more)) == 2
+    assert message in capsys.readouterr().err
