@@ -9,32 +9,30 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from morph_dslam.render.rasteriser import EDGE_TOLERANCE, rasterise
+from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
+from morph_dslam.render.triangle_pixels import (
+    is_inside,
+    load_triangle,
+    pixel_window,
+    weight_steps,
+    weights_at,
+)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw_triangle(u, v, q, x, y, texture, image, depth):
-    """Draw one triangle: corners' pixels u, v, inverse depths q and texture coordinates x, y, all (3,)."""
-    height, width = depth.shape
+def _draw_triangle(area, u, v, q, x, y, texture, image, depth):
+    """Draw one triangle: twice its area, and its corners' pixels u, v, inverse depths q and texture
+    coordinates x, y, all (3,)."""
     last_row, last_column = texture.shape[0] - 1, texture.shape[1] - 1
-    area = (u[1] - u[0]) * (v[2] - v[0]) - (u[2] - u[0]) * (v[1] - v[0])
-    if not abs(area) > 1e-12:  # degenerate, or a corner is NaN
-        return
-    # Clamp before the conversion: a corner just in front of the camera lies far outside any integer.
-    left = int(np.ceil(max(min(u[0], u[1], u[2]), 0.0)))
-    right = int(np.floor(min(max(u[0], u[1], u[2]), width - 1.0)))
-    top = int(np.ceil(max(min(v[0], v[1], v[2]), 0.0)))
-    bottom = int(np.floor(min(max(v[0], v[1], v[2]), height - 1.0)))
-    b0_step, b1_step = (v[1] - v[2]) / area, (v[2] - v[0]) / area
+    left, right, top, bottom = pixel_window(u, v, *depth.shape)
+    step0, step1 = weight_steps(v, area)
     for row in range(top, bottom + 1):
-        b0_row = ((u[1] - left) * (v[2] - row) - (u[2] - left) * (v[1] - row)) / area
-        b1_row = ((u[2] - left) * (v[0] - row) - (u[0] - left) * (v[2] - row)) / area
+        first0, first1 = weights_at(u, v, area, left, row)
         for column in range(left, right + 1):
-            b0 = b0_row + (column - left) * b0_step
-            b1 = b1_row + (column - left) * b1_step
+            b0, b1 = first0 + (column - left) * step0, first1 + (column - left) * step1
             b2 = 1.0 - b0 - b1
-            if b0 < -EDGE_TOLERANCE or b1 < -EDGE_TOLERANCE or b2 < -EDGE_TOLERANCE:
+            if not is_inside(b0, b1, b2):
                 continue
             w0, w1, w2 = b0 * q[0], b1 * q[1], b2 * q[2]
             z = 1.0 / (w0 + w1 + w2)
@@ -63,20 +61,13 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
     """
     u, v, q, x, y = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for t in range(triangles.shape[0]):
-        in_front = True
-        for corner in range(3):
-            node = triangles[t, corner]
-            in_front &= depths[node] > 0.0 and np.isfinite(pixels[node, 0] + pixels[node, 1])
-            u[corner], v[corner] = pixels[node, 0], pixels[node, 1]
-        if not in_front:
-            continue
-        if closed and (u[1] - u[0]) * (v[2] - v[0]) - (u[2] - u[0]) * (v[1] - v[0]) >= 0.0:
+        area = load_triangle(pixels, depths, triangles, t, closed, u, v, q)
+        if area == 0.0:
             continue
         for corner in range(3):
             node = triangles[t, corner]
-            q[corner] = 1.0 / depths[node]
             x[corner], y[corner] = coordinates[node, 0], coordinates[node, 1]
-        _draw_triangle(u, v, q, x, y, texture, image, depth)
+        _draw_triangle(area, u, v, q, x, y, texture, image, depth)
 
 
 def draw_textured_numpy(pixels, depths, triangles, coordinates, texture, closed, image, depth):

@@ -1,9 +1,9 @@
 """The rasteriser: a z-buffer that says which triangle each pixel sees, where on it, and how far away.
 
-Edge functions decide coverage (Pineda 1988); inverse depth is linear in the image, so it both decides
-visibility and turns image-plane weights into perspective-correct barycentric weights. Pixel (0, 0) is the
-centre of the first pixel. Both faces of a triangle are drawn, unless the surface is said to be closed: of a
-closed surface nothing but the faces turned to the camera can be seen from outside.
+Inverse depth is linear in the image, so it both decides visibility and turns image-plane weights into
+perspective-correct barycentric weights. Pixel (0, 0) is the centre of the first pixel. Both faces of a
+triangle are drawn, unless the surface is said to be closed: of a closed surface nothing but the faces turned
+to the camera can be seen from outside.
 """
 
 from __future__ import annotations
@@ -14,10 +14,17 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from morph_dslam.render.triangle_pixels import (
+    EDGE_TOLERANCE,
+    LEAST_AREA,
+    is_inside,
+    load_triangle,
+    pixel_window,
+    weight_steps,
+    weights_at,
+)
 
-#: Barycentric slack that keeps a pixel centre lying on a shared edge from falling between both triangles.
-EDGE_TOLERANCE = 1e-9
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -41,56 +48,36 @@ class Buffers:
         return self.triangle_ids >= 0
 
 
-@njit(cache=True, nogil=True)
-def _fill_triangle(triangle_id, u, v, inverse_depth, triangle_ids, weights, depth):
-    """Draw one triangle, given by its corners' pixels ``u``, ``v`` (3,) and inverse depths (3,)."""
-    height, width = depth.shape
-    area = (u[1] - u[0]) * (v[2] - v[0]) - (u[2] - u[0]) * (v[1] - v[0])
-    if not abs(area) > 1e-12:  # degenerate, or a corner is NaN
-        return
-    # Clamp before the conversion: a corner just in front of the camera lies far outside any integer.
-    left = int(np.ceil(max(min(u[0], u[1], u[2]), 0.0)))
-    right = int(np.floor(min(max(u[0], u[1], u[2]), width - 1.0)))
-    top = int(np.ceil(max(min(v[0], v[1], v[2]), 0.0)))
-    bottom = int(np.floor(min(max(v[0], v[1], v[2]), height - 1.0)))
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill_triangle(triangle_id, area, u, v, q, triangle_ids, weights, depth):
+    """Draw one triangle: twice its area, and its corners' pixels u, v and inverse depths q, all (3,)."""
+    left, right, top, bottom = pixel_window(u, v, *depth.shape)
     if left > right or top > bottom:  # it lies between the centres of pixels
         return
-    b0_step, b1_step = (v[1] - v[2]) / area, (v[2] - v[0]) / area
-    q0, q1, q2 = inverse_depth[0], inverse_depth[1], inverse_depth[2]
+    step0, step1 = weight_steps(v, area)
     for row in range(top, bottom + 1):
-        b0_row = ((u[1] - left) * (v[2] - row) - (u[2] - left) * (v[1] - row)) / area
-        b1_row = ((u[2] - left) * (v[0] - row) - (u[0] - left) * (v[2] - row)) / area
+        first0, first1 = weights_at(u, v, area, left, row)
         for column in range(left, right + 1):
-            b0 = b0_row + (column - left) * b0_step
-            b1 = b1_row + (column - left) * b1_step
+            b0, b1 = first0 + (column - left) * step0, first1 + (column - left) * step1
             b2 = 1.0 - b0 - b1
-            if b0 < -EDGE_TOLERANCE or b1 < -EDGE_TOLERANCE or b2 < -EDGE_TOLERANCE:
+            if not is_inside(b0, b1, b2):
                 continue
-            z = 1.0 / (b0 * q0 + b1 * q1 + b2 * q2)
+            z = 1.0 / (b0 * q[0] + b1 * q[1] + b2 * q[2])
             if z < depth[row, column]:
                 depth[row, column] = z
                 triangle_ids[row, column] = triangle_id
-                weights[row, column, 0] = b0 * q0 * z
-                weights[row, column, 1] = b1 * q1 * z
-                weights[row, column, 2] = b2 * q2 * z
+                weights[row, column, 0] = b0 * q[0] * z
+                weights[row, column, 1] = b1 * q[1] * z
+                weights[row, column, 2] = b2 * q[2] * z
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _fill_triangles(pixels, depths, triangles, closed, triangle_ids, weights, depth):
-    u, v, inverse_depth = np.empty(3), np.empty(3), np.empty(3)
+    u, v, q = np.empty(3), np.empty(3), np.empty(3)
     for t in range(triangles.shape[0]):
-        in_front = True
-        for corner in range(3):
-            node = triangles[t, corner]
-            in_front &= depths[node] > 0.0 and np.isfinite(pixels[node, 0] + pixels[node, 1])
-            u[corner], v[corner] = pixels[node, 0], pixels[node, 1]
-        if not in_front:
-            continue
-        if closed and (u[1] - u[0]) * (v[2] - v[0]) - (u[2] - u[0]) * (v[1] - v[0]) >= 0.0:
-            continue
-        for corner in range(3):
-            inverse_depth[corner] = 1.0 / depths[triangles[t, corner]]
-        _fill_triangle(t, u, v, inverse_depth, triangle_ids, weights, depth)
+        area = load_triangle(pixels, depths, triangles, t, closed, u, v, q)
+        if area != 0.0:
+            _fill_triangle(t, area, u, v, q, triangle_ids, weights, depth)
 
 
 def _empty_buffers(height: int, width: int) -> Buffers:
@@ -159,7 +146,7 @@ def rasterise_numpy(
             continue
         system = np.vstack([corners.T, np.ones(3)])
         area = np.linalg.det(system)
-        if abs(area) < 1e-12 or (closed and area >= 0.0):
+        if not abs(area) > LEAST_AREA or (closed and area >= 0.0):
             continue
         low = np.ceil(np.maximum(corners.min(axis=0), 0)).astype(int)
         high = np.floor(np.minimum(corners.max(axis=0), [width - 1, height - 1])).astype(int)
