@@ -6,11 +6,15 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
+from morph_dslam.errors import RegistrationError
+
 
 def _register(arguments: argparse.Namespace) -> None:
     from morph_dslam.online.aids.board_in_map import register_by_board
     from morph_dslam.online.mesh_registration.run import registration_line, remarks, run_registration
 
+    if arguments.board is not None and arguments.beside:
+        raise RegistrationError("a board says where the object is: leave out --beside")
     if arguments.board is not None:
         content = register_by_board(
             arguments.map, arguments.model, arguments.camera, arguments.board, arguments.output
@@ -18,7 +22,9 @@ def _register(arguments: argparse.Namespace) -> None:
         print(f"wrote {arguments.output / 'registration.json'}")
         print(registration_line(content))
         return
-    content = run_registration(arguments.map, arguments.model, arguments.camera, arguments.output)
+    content = run_registration(
+        arguments.map, arguments.model, arguments.camera, arguments.output, arguments.beside
+    )
     for remark in remarks(content):
         print(f"note: {remark}")
     print(f"wrote {arguments.output / 'registration.json'} and registration.jpg")
@@ -55,6 +61,14 @@ def add_registration_commands(add: Callable[..., argparse.ArgumentParser]) -> No
         type=Path,
         metavar="TOML",
         help="place the object, and find the map's unit, by a board that stands in the scene",
+    )
+    register.add_argument(
+        "--beside",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="JSON",
+        help="registration.json of another object in this map, to which its points are left; may be repeated",
     )
     board = add("board", _board, "nothing was written", "print a board of markers that places an object")
     board.add_argument("board", type=Path, help="board file (docs/registration-aids.md)")

@@ -157,6 +157,7 @@ def register_by_board(
     content = {
         "from": "board",
         "map": str(map_path.resolve()),
+        "model": str(model_path.resolve()),
         "world_from_object": matrix.tolist(),
         "map_units_per_metre": placed.scale,
         "mean_node_m": nodes.mean(axis=0).tolist(),

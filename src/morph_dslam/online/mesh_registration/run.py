@@ -16,6 +16,7 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.io.calibration import load_camera
 from morph_dslam.model import ReducedModel, load_model
+from morph_dslam.online.mesh_registration.beside import left_by_others
 from morph_dslam.online.mesh_registration.register import MeshRegistration
 from morph_dslam.online.mesh_registration.scene import (
     View,
@@ -31,13 +32,15 @@ from morph_dslam.render.shading import lambert, vertex_normals
 N_PICTURES = 3
 
 
-def run_registration(map_path: Path, model_path: Path, camera_path: Path, output: Path) -> dict[str, Any]:
+def run_registration(
+    map_path: Path, model_path: Path, camera_path: Path, output: Path, beside: Sequence[Path] = ()
+) -> dict[str, Any]:
     """Find a model's undeformed object in a map; writes ``registration.json`` and ``registration.jpg``.
 
     Parameters
     ----------
     map_path : the map.h5 of `morph slam`. model_path : a model file. camera_path : the camera of the map.
-    output : the folder to write.
+    output : the folder to write. beside : registrations of other objects, whose points are left to them.
 
     Returns
     -------
@@ -46,13 +49,14 @@ def run_registration(map_path: Path, model_path: Path, camera_path: Path, output
     Raises
     ------
     RegistrationError
-        If the object is not found, or the folder cannot be written.
+        If the object is not found, a file of ``beside`` is not one of this map, or the folder cannot be
+        written.
     MapError, ModelFileError, CameraError
         If an input cannot be read.
     """
     camera, model = load_camera(camera_path), load_model(model_path)
     rigid_map = load_map(map_path, camera)
-    points, views = scene_of_map(rigid_map)
+    points, views = left_by_others(*scene_of_map(rigid_map), beside, map_path)
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -61,7 +65,7 @@ def run_registration(map_path: Path, model_path: Path, camera_path: Path, output
     metric = rigid_map.is_metric
     found = register_in_unit(nodes, model.triangles, points, views, camera, metric, progress=True)
     content = _content(found, nodes) | {"keyframes": _keyframes(found, views)}
-    content["map"] = os.path.relpath(map_path, output)
+    content["map"], content["model"] = (os.path.relpath(path, output) for path in (map_path, model_path))
     (output / "registration.json").write_text(json.dumps(content, indent=2) + "\n")
     cv2.imwrite(str(output / "registration.jpg"), draw_registration(found, model, views, camera))
     return content
