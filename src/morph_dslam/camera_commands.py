@@ -55,6 +55,11 @@ def _calibrate(arguments: argparse.Namespace) -> None:
 
 def add_camera_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
     """Add both commands; ``add(name, action, kept, text)`` makes the parser of one."""
+    _add_slam(add)
+    _add_calibrate(add)
+
+
+def _add_slam(add: Callable[..., argparse.ArgumentParser]) -> None:
     slam = add(
         "slam",
         _slam,
@@ -106,6 +111,9 @@ def add_camera_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
     slam.add_argument("--no-depth", action="store_true", help="leave the depth images of the recording aside")
     slam.add_argument("--overwrite", action="store_true", help="replace a run that is in the run folder")
     slam.add_argument("--no-video", action="store_true", help="do not draw the video with tracked points")
+
+
+def _add_calibrate(add: Callable[..., argparse.ArgumentParser]) -> None:
     calibrate = add(
         "calibrate",
         _calibrate,

@@ -25,6 +25,13 @@ class SimilarityTransform:
         return cls(1.0, np.eye(3), np.zeros(3))
 
     @property
+    def matrix(self) -> Array:
+        """The homogeneous matrix (4, 4), with the scale in its upper left block."""
+        result = np.eye(4)
+        result[:3, :3], result[:3, 3] = self.scale * self.rotation, self.translation
+        return result
+
+    @property
     def inverse(self) -> SimilarityTransform:
         rotation = self.rotation.T
         return SimilarityTransform(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)

@@ -182,6 +182,9 @@ def test_a_board_in_a_map_tells_the_unit_and_the_place(tmp_path, scene):
     truth = pose @ RigidTransform(turn, np.array([0.020, -0.040, -0.015]))
     assert mean_distance(scene.model, placed.state, State(scene.model.default, truth)) < 1.5
     assert placed.covariance is not None
+    # The folder may be moved as a whole.
+    content = json.loads((tmp_path / "place" / "registration.json").read_text())
+    assert (content["map"], content["model"]) == ("../map.h5", "../sheet.morph")
 
 
 def print_on_sheet(scene):

@@ -90,12 +90,10 @@ def write_registration(path, slam, frames, truth, centre=(0.0, 0.0, 0.0), map_na
     path_in_map = trajectory_of(slam, frames)
     seen = [frame.index for frame in frames if frame.pose is not None]
     placed = _similarity(path_in_map.world_from_camera, truth["camera_from_object"][seen], np.array(centre))
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = placed.scale * placed.rotation, placed.translation
     size = 0.5 * placed.scale
     spread = np.array([1e-3, *[1e-3] * 3, *[1e-3 * size] * 3])
     content = {
-        "world_from_object": matrix.tolist(),
+        "world_from_object": placed.matrix.tolist(),
         "map_units_per_metre": placed.scale,
         "mean_node_m": list(centre),
         "covariance": np.diag(spread**2).tolist(),

@@ -58,6 +58,8 @@ def test_composition_inverse_and_poses():
     )
     np.testing.assert_allclose(KNOWN.inverse.apply(KNOWN.apply(points())), points(), atol=1e-12)
     np.testing.assert_array_equal(SimilarityTransform.identity().apply(points()), points())
+    np.testing.assert_allclose((KNOWN @ other).matrix, KNOWN.matrix @ other.matrix, atol=1e-12)
+    np.testing.assert_allclose(KNOWN.inverse.matrix, np.linalg.inv(KNOWN.matrix), atol=1e-12)
     # A camera's centre moves as a point; its axes turn.
     pose = RigidTransform(other.rotation, other.translation)
     moved = KNOWN.apply_to_pose(pose)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
-from morph_dslam.geometry import cross_matrix, rotation_exp
+from morph_dslam.geometry import RigidTransform, cross_matrix, rotation_exp
 from morph_dslam.io.calibration import load_camera
 from morph_dslam.model import load_model
 from morph_dslam.online.aids.board import FEWEST_CORNERS, FiducialBoard, load_board
@@ -145,22 +146,28 @@ def register_by_board(
             f"the map is metric, but a metre of the board is {found.world_from_board.scale:.3g} m in it: "
             "measure the print, and mend the board file or the depth camera's calibration"
         )
+    mean_node = model.positions(model.default).mean(axis=0)
+    content = _content(found, on_board, mean_node, views)
+    content["map"], content["model"] = (os.path.relpath(path, output) for path in (map_path, model_path))
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        (output / "registration.json").write_text(json.dumps(content, indent=2) + "\n")
+    except OSError as error:
+        raise RegistrationError(f"cannot write the registration to {output}: {error.strerror}") from error
+    return content
+
+
+def _content(
+    found: BoardInMap, on_board: RigidTransform, mean_node: Array, views: Sequence[View]
+) -> dict[str, Any]:
+    """What a registration says of an object at ``on_board``, board from object, with this mean node (3,)."""
     placed = found.world_from_board @ SimilarityTransform(1.0, on_board.rotation, on_board.translation)
-    nodes = model.positions(model.default)
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = placed.scale * placed.rotation, placed.translation
-    keyframes = [
-        {"frame": view.frame, "camera_from_object": camera_from_object(view, placed).matrix.tolist()}
-        for view in views
-    ]
-    arm = placed.apply(nodes.mean(axis=0)) - found.world_from_board.apply(found.centre)
-    content = {
+    arm = placed.apply(mean_node) - found.world_from_board.apply(found.centre)
+    return {
         "from": "board",
-        "map": str(map_path.resolve()),
-        "model": str(model_path.resolve()),
-        "world_from_object": matrix.tolist(),
+        "world_from_object": placed.matrix.tolist(),
         "map_units_per_metre": placed.scale,
-        "mean_node_m": nodes.mean(axis=0).tolist(),
+        "mean_node_m": mean_node.tolist(),
         "score": float(found.n_views),
         "runner_up_score": 0.0,
         "ambiguous": False,
@@ -168,14 +175,11 @@ def register_by_board(
         "rms_px": found.rms_px,
         "covariance": _moved(found.covariance, arm).tolist(),
         "axis_of_revolution": None,
-        "keyframes": keyframes,
+        "keyframes": [
+            {"frame": view.frame, "camera_from_object": camera_from_object(view, placed).matrix.tolist()}
+            for view in views
+        ],
     }
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-        (output / "registration.json").write_text(json.dumps(content, indent=2) + "\n")
-    except OSError as error:
-        raise RegistrationError(f"cannot write the registration to {output}: {error.strerror}") from error
-    return content
 
 
 def _moved(covariance: Array, arm: Array) -> Array:
