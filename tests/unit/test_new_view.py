@@ -11,8 +11,9 @@ from morph_dslam.online.estimation import Estimator
 from morph_dslam.online.flow import flatten
 from morph_dslam.online.frame_estimation import FrameEstimation
 from morph_dslam.online.frame_result import STAGES
-from morph_dslam.online.new_view import hidden_part, is_fit, sharpness
+from morph_dslam.online.new_view import is_known_well, is_sharp, seen_part, sharpness, surface_spread
 from morph_dslam.online.reference_view import ReferenceView
+from morph_dslam.online.surface_coverage import SurfaceSamples
 from morph_dslam.online.timing import StageClock
 from morph_dslam.online.tracker_options import TrackerOptions
 from tests.support.bent_sheet import bent_sheet_model
@@ -41,9 +42,11 @@ def scene():
     return film, view, attempt
 
 
-def fit(view, made, attempt, unexplained_px=0.1, **changed):
+def fit(view, made, attempt, unexplained_px=0.1, spread=0.01, **changed):
     estimate = replace(attempt.estimate, **changed)
-    return is_fit(made, replace(attempt, estimate=estimate), estimate, unexplained_px, view, OPTIONS)
+    attempt, half = replace(attempt, estimate=estimate), OPTIONS.measurement.patch_half
+    known = is_known_well(attempt, spread, unexplained_px, OPTIONS)
+    return known and is_sharp(made, attempt, view.rendered(estimate.state), half)
 
 
 def test_a_sharp_frame_whose_state_is_known_is_fit(scene):
@@ -53,9 +56,24 @@ def test_a_sharp_frame_whose_state_is_known_is_fit(scene):
     assert fit(view, *attempt(film.frame(NOW, light=0.6)))
     assert not fit(view, made, tried, unexplained_px=0.6)
     assert not fit(view, made, tried, sigma_px=1.2)
-    assert not fit(view, made, tried, covariance=1e4 * np.eye(9) * np.trace(tried.estimate.covariance))
+    assert not fit(view, made, tried, spread=0.051)
     few = np.arange(len(tried.inliers)) % 2 == 0
-    assert not is_fit(made, replace(tried, inliers=tried.inliers & few), tried.estimate, 0.1, view, OPTIONS)
+    assert not is_known_well(replace(tried, inliers=tried.inliers & few), 0.01, 0.1, OPTIONS)
+
+
+def test_the_spread_of_the_surface_is_that_of_its_place(scene):
+    """A shift is the same everywhere; a turn moves each point by its distance from the axis."""
+    film, view, attempt = scene
+    _, tried = attempt(film.frame(NOW))
+    samples = SurfaceSamples(Estimator(film.model, CAMERA), view.surface)
+    covariance = np.diag([0.0] * 6 + [1e-6, 4e-6, 4e-6])
+    assert surface_spread(samples, replace(tried.estimate, covariance=covariance)) == pytest.approx(3e-3)
+    covariance = np.diag([0.0] * 3 + [0.0, 0.0, 0.01**2] + [0.0] * 3)
+    turned = surface_spread(samples, replace(tried.estimate, covariance=covariance))
+    # Nodes stand for equal areas, but for those on the rim.
+    pose = tried.estimate.state.camera_from_object
+    nodes = film.model.positions(tried.estimate.state.parameters) @ pose.rotation.T
+    assert turned == pytest.approx(0.01 * np.sqrt(np.mean(np.sum(nodes[:, :2] ** 2, axis=1))), rel=0.05)
 
 
 def test_a_blurred_frame_is_not(scene):
@@ -75,13 +93,16 @@ def test_nothing_is_bound_around_points_that_disagree_or_behind_another_object(s
     made, tried = attempt(film.frame(NOW, occluder=hand))
     inside = np.zeros(made.flat.shape, dtype=bool)
     inside[155:235, 255:335] = True
-    hidden = hidden_part(made, tried, view)
+    should_be = view.rendered(tried.estimate.state)
+    covered = np.isfinite(should_be.depth)
+    seen = seen_part(made, tried, should_be, view)
+    hidden = covered & ~seen
     assert hidden[inside].mean() > 0.8
     assert hidden[300:400, 400:500].mean() < 0.1
     depths = np.where(inside, np.float32(0.3), np.float32(np.inf))
-    assert hidden_part(replace(made, in_front=depths), tried, view)[inside].all()
+    assert not seen_part(replace(made, in_front=depths), tried, should_be, view)[inside].any()
     new = ReferenceView(
-        Estimator(film.model, CAMERA), made, tried.estimate.state, OPTIONS, hidden, view.surface
+        Estimator(film.model, CAMERA), made, tried.estimate.state, OPTIONS, seen, view.surface
     )
     places = np.rint(new.pixels).astype(int)
-    assert not hidden[places[:, 1], places[:, 0]].any()
+    assert seen[places[:, 1], places[:, 0]].all()

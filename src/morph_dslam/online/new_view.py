@@ -10,10 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.online.appearance import Rendering
 from morph_dslam.online.attempt import Attempt, Picture
 from morph_dslam.online.confidence import position_std
 from morph_dslam.online.estimation import Estimate
 from morph_dslam.online.reference_view import ReferenceView
+from morph_dslam.online.surface_coverage import SurfaceSamples
 from morph_dslam.online.systematic_errors import UNEXPLAINED_PX
 from morph_dslam.online.tracker_options import TrackerOptions
 
@@ -27,26 +29,21 @@ LARGEST_SPREAD = 0.05
 LEAST_SHARPNESS = 0.8
 #: Around points that disagree something else may be in front of the object; so far, pixels, nothing is bound.
 KEEP_OFF_PX = 12
+#: How far the filters look that measure sharpness, pixels.
+REACH_PX = 8
 
 
-def surface_spread(view: ReferenceView, stated: Estimate) -> float:
-    """Root mean square standard deviation of the position of the surface's nodes, metres."""
-    return float(np.sqrt(np.mean(position_std(view.surface.model, stated) ** 2)))
+def surface_spread(samples: SurfaceSamples, stated: Estimate) -> float:
+    """Root mean square standard deviation of the surface's position, metres."""
+    return float(np.sqrt(np.mean(position_std(samples.model, stated) ** 2)))
 
 
-def is_fit(
-    picture: Picture,
-    attempt: Attempt,
-    stated: Estimate,
-    unexplained_px: float,
-    view: ReferenceView,
-    options: TrackerOptions,
-) -> bool:
-    """Whether a frame can be a reference view.
+def is_known_well(attempt: Attempt, spread: float, unexplained_px: float, options: TrackerOptions) -> bool:
+    """Whether the state in a frame is known well enough for a reference view.
 
     Parameters
     ----------
-    attempt : made against ``view``. stated : its estimate with all errors in its covariance.
+    spread : see `surface_spread`, of the estimate with all errors, as a share of the object's size.
     unexplained_px : what the model leaves of the residuals.
     """
     agreeing, visible = int(attempt.inliers.sum()), int(attempt.measurement.visible.sum())
@@ -54,30 +51,56 @@ def is_fit(
         return False
     if not attempt.estimate.sigma_px < LARGEST_SIGMA_PX or not unexplained_px < UNEXPLAINED_PX:
         return False
-    nodes = view.surface.model.nodes
-    if not surface_spread(view, stated) < LARGEST_SPREAD * np.linalg.norm(np.ptp(nodes, axis=0)):
-        return False
-    around = _around(picture, attempt.measurement.pixels[attempt.inliers], options.measurement.patch_half)
-    should_be = view.rendered(stated.state)
-    return sharpness(picture.flat, around) > LEAST_SHARPNESS * sharpness(should_be, around)
+    return spread < LARGEST_SPREAD
 
 
-def hidden_part(picture: Picture, attempt: Attempt, view: ReferenceView) -> NDArray[np.bool_]:
-    """Pixels (h, w) where something else may be before the object; the attempt was made against ``view``."""
-    state, disagree = attempt.estimate.state, attempt.measurement.visible & ~attempt.inliers
-    hidden = _around(picture, view.projected(state)[disagree], KEEP_OFF_PX)
+def is_sharp(picture: Picture, attempt: Attempt, should_be: Rendering, half: int) -> bool:
+    """Whether a frame is as sharp as the view that it was compared with.
+
+    Parameters
+    ----------
+    should_be : that view in the state of the attempt. half : of the side of the squares about points in which
+        sharpness is compared, pixels.
+    """
+    around = _around(picture, attempt.measurement.pixels[attempt.inliers], half)
+    return sharpness(picture.flat, around) > LEAST_SHARPNESS * sharpness(should_be.image, around)
+
+
+def seen_part(
+    picture: Picture, attempt: Attempt, should_be: Rendering, view: ReferenceView
+) -> NDArray[np.bool_]:
+    """Pixels (h, w) that show the object, and where nothing else may be before it.
+
+    Parameters
+    ----------
+    attempt : made against ``view``. should_be : that view in the state of the attempt.
+    """
+    disagree = attempt.measurement.visible & ~attempt.inliers
+    seen = np.isfinite(should_be.depth)
+    seen &= ~_around(picture, view.projected(attempt.estimate.state)[disagree], KEEP_OFF_PX)
     if picture.in_front is not None:
-        hidden |= picture.in_front < view.depth(state)
-    return hidden
+        seen &= picture.in_front >= should_be.depth
+    return seen
 
 
 def sharpness(flat: NDArray[np.uint8], where: NDArray[np.bool_]) -> float:
     """Squared slope of an image (h, w) over its variance ``where`` (h, w): blur lowers it, light does not."""
-    smooth = cv2.GaussianBlur(flat, (0, 0), 1.0).astype(np.float32)
-    x, y = (cv2.Sobel(smooth, cv2.CV_32F, *order) / 8.0 for order in ((1, 0), (0, 1)))
     if not where.any():
         return 0.0
+    flat, where = _cut_out(flat, where)
+    smooth = cv2.GaussianBlur(flat, (0, 0), 1.0).astype(np.float32)
+    x, y = (cv2.Sobel(smooth, cv2.CV_32F, *order) / 8.0 for order in ((1, 0), (0, 1)))
     return float(np.mean((x**2 + y**2)[where]) / max(float(np.var(smooth[where])), 1e-6))
+
+
+def _cut_out(
+    flat: NDArray[np.uint8], where: NDArray[np.bool_]
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """The part of both (h, w) that holds all of ``where``, with as much around it as filters reach."""
+    left, top, width, height = cv2.boundingRect(where.astype(np.uint8))
+    rows = slice(max(top - REACH_PX, 0), top + height + REACH_PX)
+    columns = slice(max(left - REACH_PX, 0), left + width + REACH_PX)
+    return np.ascontiguousarray(flat[rows, columns]), where[rows, columns]
 
 
 def _around(picture: Picture, pixels: Array, half: int) -> NDArray[np.bool_]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import RegistrationError
-from morph_dslam.online.appearance import ReferenceAppearance
+from morph_dslam.online.appearance import ReferenceAppearance, Rendering
 from morph_dslam.online.attempt import Picture
 from morph_dslam.online.binding import DrawnSurface, View, bind_pixels, broadness, draw_view, view_of
 from morph_dslam.online.estimation import BoundPoints, Estimator, State
@@ -33,7 +35,7 @@ class ReferenceView:
     Parameters
     ----------
     picture : the view. state : the object in it.
-    hidden : (h, w) where something else may be in front of the object; nothing is bound there.
+    seen : (h, w) where the object is seen; None where it is all that it covers. Nothing is bound elsewhere.
     surface : what of the model is drawn, if another view knows it already.
     least_broadness : points do not count where the surface is seen flatter than in this view, by this factor
         of its area or a smaller one.
@@ -43,7 +45,6 @@ class ReferenceView:
     surface : what of the model is drawn. points : p of them, bound in the view. pixels : (p, 2) there.
     outline : the object's rim, None where it is not used. all_points : with those of the outline.
     correlation : of the errors of all points' measurements.
-    relocaliser : finds the object by the view's features.
 
     Raises
     ------
@@ -57,7 +58,7 @@ class ReferenceView:
         picture: Picture,
         state: State,
         options: TrackerOptions,
-        hidden: NDArray[np.bool_] | None = None,
+        seen: NDArray[np.bool_] | None = None,
         surface: DrawnSurface | None = None,
         least_broadness: float = 0.0,
     ) -> None:
@@ -67,20 +68,30 @@ class ReferenceView:
         drawn = self.surface.model
         view = view_of(drawn, camera, state)
         self.appearance = ReferenceAppearance(drawn, camera, picture.flat, view, self.surface.closed)
-        covered = draw_view(view, drawn.triangles, camera).covered
-        mask = interior(covered if hidden is None else covered & ~hidden, options.measurement.patch_half + 2)
+        if seen is None:
+            seen = draw_view(view, drawn.triangles, camera).covered
+        mask = interior(seen, options.measurement.patch_half + 2)
         self.points = self._choose_points(picture, mask, view)
         self.pixels = camera.project(self.points.in_camera(state))
         self._least_broadness = least_broadness * broadness(
             view, drawn.triangles[self.points.surface.triangles]
         )
-        self.relocaliser = Relocaliser(estimator, drawn, picture.grey, mask, view)
+        self._grey, self._mask, self._view = picture.grey, mask, view
         self.outline, self.all_points = None, self.points
         if options.use_outline:
             self.outline = Outline(model, camera, picture.grey, state, options.outline)
             self.all_points = self.points.joined(self.outline.points)
         places = camera.project(self.all_points.in_camera(state))
         self.correlation = window_correlation(places, options.flow.window)
+
+    def take_features(self) -> None:
+        """Take the features that a lost object is looked for by, unless that was done already."""
+        _ = self.relocaliser
+
+    @cached_property
+    def relocaliser(self) -> Relocaliser:
+        """Finds the object by the view's features; these are taken when it is first asked for."""
+        return Relocaliser(self._estimator, self.surface.model, self._grey, self._mask, self._view)
 
     @property
     def redundancy(self) -> float:
@@ -108,9 +119,9 @@ class ReferenceView:
         """Where the points (p, 2) are in the image in a state, pixels; NaN behind the camera."""
         return self._estimator.camera.project(self.points.in_camera(state))
 
-    def rendered(self, state: State) -> NDArray[np.uint8]:
-        """This view as it should appear in a state, flattened (h, w)."""
-        return self.appearance.render(view_of(self.surface.model, self._estimator.camera, state)).image
+    def rendered(self, state: State) -> Rendering:
+        """This view as it should appear in a state, flattened."""
+        return self.appearance.render(view_of(self.surface.model, self._estimator.camera, state))
 
     def measure(
         self, picture: Picture, state: State, followed: Measurement | None, clock: StageClock

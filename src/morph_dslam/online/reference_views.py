@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import RegistrationError
 from morph_dslam.online.attempt import Attempt, Picture, refusal
-from morph_dslam.online.estimation import Estimate, Estimator
+from morph_dslam.online.estimation import Estimate, Estimator, State
 from morph_dslam.online.filter_memory import PointChange
 from morph_dslam.online.frame_estimation import FrameEstimation
-from morph_dslam.online.new_view import hidden_part, is_fit, surface_spread
+from morph_dslam.online.new_view import is_known_well, is_sharp, seen_part, surface_spread
 from morph_dslam.online.recovery import Recovery
 from morph_dslam.online.reference_view import ReferenceView
 from morph_dslam.online.surface_coverage import SurfaceSamples, choose_view, covered_share
@@ -80,13 +80,28 @@ class Change:
     Attributes
     ----------
     supported : (p,) which of its points to follow from this frame on. pixels : (p, 2) where they are.
-    is_new : whether the frame has become that view.
+    is_new : whether it was followed never before.
     """
 
     view: FollowedView
     supported: NDArray[np.bool_]
     pixels: Array
     is_new: bool = False
+
+
+@dataclass(frozen=True)
+class _BegunView:
+    """A view that the last frame became, not yet followed: together that would hold up one frame for long.
+
+    Attributes
+    ----------
+    covariance : (d + 6, d + 6) of its state. error : as in `FollowedView`. seen : of `SurfaceSamples` in it.
+    """
+
+    reference: ReferenceView
+    covariance: Array
+    error: float
+    seen: Array
 
 
 class ReferenceViews:
@@ -109,12 +124,15 @@ class ReferenceViews:
         options: TrackerOptions,
     ) -> None:
         self._estimator, self._options = estimator, options
+        self._size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
         self._samples = SurfaceSamples(estimator, reference.surface)
         self.active = FollowedView.of(reference, covariance, estimator, options)
         seen = self._samples.seen(reference.state, reference.depth(reference.state))
         self._kept, self._seen = [self.active], [seen]
         self._n_made, self._n_frames, self._pause = 0, 0, 0
         self._followed = self.active
+        self._begun: _BegunView | None = None
+        self.active.reference.take_features()
 
     def point_change(self, taken: FollowedView, besides: Array) -> PointChange:
         """What the filter must know when ``taken`` is gone over to; ``besides``: see `PointChange`."""
@@ -135,11 +153,15 @@ class ReferenceViews:
 
         Parameters
         ----------
-        attempt : made against the active view. stated, unexplained_px : see `new_view.is_fit`.
+        attempt : made against the active view. stated : its estimate with all errors in its
+            covariance. unexplained_px : see `new_view.is_known_well`.
         """
         self._n_frames, self._pause = self._n_frames + 1, max(self._pause - 1, 0)
-        if not self._options.new_views or self._n_frames % CHECK_EVERY:
+        if not self._options.new_views:
             return None
+        if self._begun is not None or self._n_frames % CHECK_EVERY:
+            with clock.stage("views"):
+                return self._gone_on(stated.state)
         with clock.stage("views"):
             assert attempt.measurement.depth is not None
             now = self._samples.seen(stated.state, attempt.measurement.depth)
@@ -153,7 +175,8 @@ class ReferenceViews:
                 return change
             shares[chosen] = 0.0
         with clock.stage("views"):
-            return self._made(picture, attempt, stated, unexplained_px, now)
+            self._begun = self._begin(picture, attempt, stated, unexplained_px, now)
+        return None
 
     def after_lost(self, n_lost: int) -> Change | None:
         """The view to look for the object with next: that which was followed last and another in turn.
@@ -180,34 +203,45 @@ class ReferenceViews:
         places = view.reference.projected(found.estimate.state)
         return Change(view, found.inliers, np.where(found.inliers[:, None], found.measurement.pixels, places))
 
-    def _made(
+    def _begin(
         self, picture: Picture, attempt: Attempt, stated: Estimate, unexplained_px: float, now: Array
-    ) -> Change | None:
-        """A change to a view made from the frame, if it is fit for one."""
+    ) -> _BegunView | None:
+        """A view made from the frame, if it is fit for one."""
         old = self.active.reference
-        if self._pause or not is_fit(picture, attempt, stated, unexplained_px, old, self._options):
+        if self._pause:
             return None
-        hidden = hidden_part(picture, attempt, old)
+        spread = surface_spread(self._samples, stated)
+        estimator, options, surface = self._estimator, self._options, old.surface
+        if not is_known_well(attempt, spread / self._size, unexplained_px, options):
+            return None
+        should_be = old.rendered(stated.state)
+        if not is_sharp(picture, attempt, should_be, options.measurement.patch_half):
+            return None
+        seen = seen_part(picture, attempt, should_be, old)
         try:
-            made = ReferenceView(
-                self._estimator,
-                picture,
-                stated.state,
-                self._options,
-                hidden,
-                old.surface,
-                LEAST_BROADNESS,
-            )
+            made = ReferenceView(estimator, picture, stated.state, options, seen, surface, LEAST_BROADNESS)
         except RegistrationError:
             self._pause = PAUSE
             return None
+        return _BegunView(made, stated.covariance, spread, now)
+
+    def _gone_on(self, state: State) -> Change | None:
+        """A change to the view that was begun, the object being in ``state`` by now.
+
+        The features, which only a lost object is looked for by, are taken in the frame after that.
+        """
+        begun, self._begun = self._begun, None
+        if begun is None:
+            self.active.reference.take_features()
+            return None
         self._n_made += 1
         view = FollowedView.of(
-            made, stated.covariance, self._estimator, self._options, self._n_made, surface_spread(old, stated)
+            begun.reference, begun.covariance, self._estimator, self._options, self._n_made, begun.error
         )
         self._kept.append(view)
-        self._seen.append(now)
+        self._seen.append(begun.seen)
         if len(self._kept) > self._options.max_views:
             # The first view is what takes away the errors of all others.
             del self._kept[1], self._seen[1]
-        return Change(view, np.ones(len(made.points), dtype=bool), made.pixels, is_new=True)
+        places = begun.reference.projected(state)
+        return Change(view, np.ones(len(places), dtype=bool), places, is_new=True)

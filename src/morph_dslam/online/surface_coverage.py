@@ -8,6 +8,7 @@ a frame where it shows the same side of the surface, and not much smaller.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,11 +34,27 @@ BACK_SHARE = 0.75
 
 
 class SurfaceSamples:
-    """Triangles spread over the undeformed surface, as many as their area asks for."""
+    """Triangles spread over the undeformed surface, as many as their area asks for.
+
+    Attributes
+    ----------
+    model : at a point of each of them alone, without triangles.
+    """
 
     def __init__(self, estimator: Estimator, surface: DrawnSurface) -> None:
         model, self._camera, self._closed = estimator.model, estimator.camera, surface.closed
-        chosen = spread_over(model.nodes, model.triangles, N_SAMPLES).triangles
+        points = spread_over(model.nodes, model.triangles, N_SAMPLES)
+        self.model = replace(
+            model,
+            nodes=model.rest_positions(points),
+            triangles=np.empty((0, 3), dtype=np.int64),
+            displacement=model.restrict(points),
+            stresses={},
+            cells={},
+            strain=None,
+            reactions={},
+        )
+        chosen = points.triangles
         corners = SurfacePoints(np.repeat(chosen, 3), np.tile(np.eye(3), (N_SAMPLES, 1)))
         self._corners = BoundPoints.from_surface(model, corners)
         normals = triangle_normals(model.nodes, model.triangles[chosen])

@@ -225,7 +225,11 @@ def _in_common(rows: Array, pairs: Array) -> float:
 def _corners(estimator: Estimator, points: BoundPoints) -> BoundPoints:
     """The three corners of each point's triangle, (3 p) points."""
     surface = SurfacePoints(np.repeat(points.surface.triangles, 3), np.tile(np.eye(3), (len(points), 1)))
-    return BoundPoints.from_surface(estimator.model, surface)
+    model = estimator.model
+    nodes = model.triangles[points.surface.triangles].ravel()
+    return BoundPoints(
+        surface, model.nodes[nodes], model.displacement.with_modes(model.displacement.modes[:, nodes])
+    )
 
 
 def _edges(camera: PinholeCamera, corners: BoundPoints, state: State) -> Array:
