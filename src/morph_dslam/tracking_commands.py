@@ -231,7 +231,8 @@ def add_tracking_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         default=[],
         dest="other_cameras",
         metavar="FRAMES",
-        help="what the next camera of the rig saw; with --camera camchain.yaml#cam0; may be repeated",
+        help="what the next camera of the rig saw; with --camera camchain.yaml#cam0, also the camera of a map; "
+        "may be repeated",
     )
     track.add_argument(
         "--also",

@@ -1,7 +1,9 @@
 """Several anchored objects in one map, and an anchored object before several cameras, against exact truth."""
 
 import json
+from dataclasses import replace
 
+import cv2
 import h5py
 import numpy as np
 import pytest
@@ -11,7 +13,10 @@ from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.model import load_model
-from morph_dslam.online.frame_result import STAGES
+from morph_dslam.online.frame_result import HAS_MOVED, STAGES
+from morph_dslam.online.rig_tracking import RigTracker
+from morph_dslam.online.tracking_setup import ObjectOptions, load_setup
+from morph_dslam.sources import open_source
 from tests.support.rendered_anchored_rig import FRAMES, RIG, SCAN, make_rig_recording
 
 #: What the map made from the scan is off by at the objects, and the registrations with it, metres.
@@ -157,3 +162,120 @@ def test_what_does_not_fit_several_objects_is_refused(recording, tmp_path, capsy
     folder, _ = recording
     assert main(command(folder, tmp_path / "run", *also(folder, "wedge"), *more)) == 2
     assert message in capsys.readouterr().err
+
+
+def with_both(folder, output, *more, first="wedge", front=None, aside=None):
+    arguments = command(folder, output, *more, first=first, camera="camchain.yaml#cam0")
+    arguments[1] = str(front or folder / "front")
+    return [*arguments, "--with", str(aside or folder / "aside")]
+
+
+def test_an_anchored_object_before_two_cameras(recording, tmp_path, capsys):
+    folder, truth = recording
+    assert main(with_both(folder, tmp_path / "run")) == 0
+    assert f"tracked={FRAMES - SCAN + 1}/{FRAMES - SCAN + 1}" in capsys.readouterr().out
+    assert errors(folder, truth, "wedge", tmp_path / "run").max() < 1.1e-3
+    assert set(column(tmp_path / "run", "pose_from")) == {"points and map"}
+    assert (locate_ms(tmp_path / "run") > 0.0).all()
+    found, expected = load_run(tmp_path / "run").parameters, truth["wedge"]["parameters"][SCAN - 1 :]
+    np.testing.assert_allclose(found, expected, atol=0.4e-3)
+
+
+def covered(folder, truth, target, number, frames):
+    """A camera's recording in which something lies on all that it sees of the wedge in some frames."""
+    target.mkdir()
+    for path in sorted((folder / ("front", "aside")[number]).iterdir()):
+        image, frame = cv2.imread(str(path)), int(path.stem)
+        if frame in frames:
+            nodes = RIG[number].camera_from_rig.apply(exact_nodes(folder, truth, "wedge", frame))
+            outline = cv2.convexHull(np.rint(RIG[number].camera.project(nodes)).astype(np.int32))
+            cv2.drawContours(image, [outline], -1, (110, 110, 110), thickness=16)
+            cv2.fillConvexPoly(image, outline, (110, 110, 110))
+        cv2.imwrite(str(target / path.name), image)
+    return target
+
+
+def test_what_one_camera_does_not_see_the_other_tells_and_else_it_is_hidden(recording, tmp_path):
+    folder, truth = recording
+    front = covered(folder, truth, tmp_path / "front", 0, range(SCAN + 2, FRAMES))
+    aside = covered(folder, truth, tmp_path / "aside", 1, range(SCAN + 7, FRAMES))
+    assert main(with_both(folder, tmp_path / "run", front=front, aside=aside)) == 0
+    run = load_run(tmp_path / "run")
+    pose_from, reasons = (column(tmp_path / "run", name) for name in ("pose_from", "reason"))
+    exact = truth["wedge"]["camera_from_object"][run.frames]
+    apart = np.linalg.norm(run.camera_from_object[:, :3, 3] - exact[:, :3, 3], axis=1)
+    assert apart.max() < MAP_ERROR
+    for row, frame in enumerate(run.frames):
+        is_hidden = frame >= SCAN + 7
+        assert (run.status[row], pose_from[row]) == (
+            ("hidden", "map") if is_hidden else ("tracked", "points and map")
+        )
+        assert ("camera 0: hidden" in reasons[row]) == (frame >= SCAN + 2)
+        if not is_hidden:
+            true = truth["wedge"]["parameters"][frame]
+            np.testing.assert_allclose(run.parameters[row], true, atol=0.4e-3)
+
+
+def test_an_object_moved_before_two_cameras_is_followed_by_its_points(recording):
+    """The map's pose is shifted, as if the object had been pushed by 20 mm."""
+    folder, truth = recording
+    options = ObjectOptions(
+        folder / "wedge.morph",
+        folder / "camera.yaml",
+        placement=folder / "wedge" / "registration.json",
+    )
+    setup = load_setup(options)
+    placement = setup.placement
+    chain = setup.new_chain(placement, setup.reference, in_sequence=False)
+    sources = [open_source(folder / name, SCAN - 1, SCAN + 5) for name in ("front", "aside")]
+    beside = next(iter(open_source(folder / "aside", placement.frame, placement.frame))).image
+    rig = RigTracker(placement.model, RIG, [setup.reference, beside], placement.state, in_sequence=False)
+    results = []
+    for front, aside in zip(*sources, strict=True):
+        known = chain.locate(front).known
+        if front.index >= SCAN + 1:
+            pose = known.pose
+            there = RigidTransform(pose.rotation, pose.translation + pose.rotation @ [0.02, 0.0, 0.0])
+            known = replace(known, pose=there)
+        results.append(rig.process_frame([front.image, aside.image], known))
+        exact = truth["wedge"]["camera_from_object"][front.index][:3, 3]
+        assert np.linalg.norm(results[-1].pose.translation - exact) < MAP_ERROR
+    assert [result.pose_from for result in results] == ["points and map"] * 2 + ["points"] * 5
+    # Three frames on end make it sure.
+    assert [HAS_MOVED in result.reason for result in results] == [False] * 4 + [True] * 3
+
+
+def renumbered(source, target, shift, last=FRAMES):
+    target.mkdir()
+    for path in sorted(source.iterdir()):
+        if int(path.stem) < last:
+            (target / f"{int(path.stem) + shift:06}.png").symlink_to(path)
+    return target
+
+
+def test_recordings_that_do_not_go_together_are_refused(recording, tmp_path, capsys):
+    folder, _ = recording
+    later = renumbered(folder / "front", tmp_path / "later", 1)
+    assert main(with_both(folder, tmp_path / "run", front=later)) == 2
+    assert "is not the map's keyframe" in capsys.readouterr().err
+    beside = renumbered(folder / "aside", tmp_path / "beside", 20)
+    assert main(with_both(folder, tmp_path / "run", aside=beside)) == 2
+    assert f"frame {SCAN - 1} is not in" in capsys.readouterr().err
+    unknown = with_both(folder, tmp_path / "run")
+    unknown[unknown.index("--camera") + 1] = str(folder / "camchain.yaml#cam7")
+    assert main(unknown) == 2
+    assert "give the first camera of a Kalibr camchain" in capsys.readouterr().err
+    assert main(with_both(folder, tmp_path / "run", "--depth")) == 2
+    assert "leave out --refine, --reregister-at and --depth" in capsys.readouterr().err
+
+
+def test_a_shorter_recording_ends_the_run_and_is_named(recording, tmp_path, capsys):
+    folder, _ = recording
+    front = renumbered(folder / "front", tmp_path / "front", 0, last=SCAN + 5)
+    short = renumbered(folder / "aside", tmp_path / "short", 0, last=SCAN + 2)
+    arguments = with_both(folder, tmp_path / "run", front=front, aside=short)
+    assert main(arguments) == 2
+    assert f"frame {FRAMES - 1} is not in" in capsys.readouterr().err
+    row = arguments.index("--range")
+    assert main(arguments[:row] + arguments[row + 2 :]) == 0
+    assert "frames: 9 were tracked, to the end of the shortest recording" in capsys.readouterr().out

@@ -139,7 +139,11 @@ def test_command_tracks_with_both_cameras(model, recording, tmp_path, capsys):
     [
         (["--with", "aside", "--with", "aside"], "camchain.yaml#cam0", "has 2 cameras, but there are 3"),
         (["--with", "aside"], "camchain.yaml#cam1", "give the first camera of a Kalibr camchain"),
-        (["--with", "aside", "--depth"], "camchain.yaml#cam0", "leave out --place, --refine and --depth"),
+        (
+            ["--with", "aside", "--depth"],
+            "camchain.yaml#cam0",
+            "leave out --refine, --reregister-at and --depth",
+        ),
     ],
 )
 def test_what_does_not_fit_a_rig_is_refused(recording, tmp_path, capsys, more, camera, message):

@@ -18,6 +18,7 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
 from morph_dslam.online.estimation import Estimate, EstimationOptions, Estimator, Prior, State
+from morph_dslam.online.known_pose import KnownPose
 from morph_dslam.online.levenberg_marquardt import minimise
 from morph_dslam.online.linear_cost import LinearCost
 from morph_dslam.online.measurement_noise import RigMeasured
@@ -35,6 +36,14 @@ class RigCamera:
     def seen(self, state: State) -> State:
         """The state in this camera's frame of a state in the rig's."""
         return replace(state, camera_from_object=self.camera_from_rig @ state.camera_from_object)
+
+    def seen_pose(self, known: KnownPose) -> KnownPose:
+        """The pose in this camera of what the map tells of that in the rig's; the rig itself is exact."""
+        rotation = self.camera_from_rig.rotation
+        turn = np.asarray(scipy.linalg.block_diag(rotation, rotation))
+        return KnownPose(
+            self.camera_from_rig @ known.pose, turn @ known.from_camera @ turn.T, turn @ known.lasting
+        )
 
     def in_rig(self, state: State) -> State:
         """The inverse of `seen`."""

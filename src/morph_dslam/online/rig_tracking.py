@@ -1,7 +1,8 @@
 """Tracking one object with several synchronised cameras.
 
 Each camera follows the object by itself, and one state is estimated from what all of them measured. A camera
-that has lost the object goes on from what the others know, and finds it again there.
+that has lost the object goes on from what the others know, and finds it again there. Where a map tells the
+object's pose in the rig, it counts once in the state of all, as it does in each camera's own.
 """
 
 from __future__ import annotations
@@ -14,8 +15,11 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import RegistrationError
 from morph_dslam.model import ReducedModel
-from morph_dslam.online.estimation import Estimate, State
-from morph_dslam.online.frame_result import FOLLOWED, STAGES, FrameResult
+from morph_dslam.online.anchoring import FIRST_SIGMA_PX, HELD, LEAST_SIGMA_PX
+from morph_dslam.online.attempt import Picture
+from morph_dslam.online.estimation import Estimate, Prior, State
+from morph_dslam.online.frame_result import FOLLOWED, HAS_MOVED, STAGES, FrameResult
+from morph_dslam.online.known_pose import KnownPose
 from morph_dslam.online.measurement_noise import RigMeasured
 from morph_dslam.online.pipeline import Tracker
 from morph_dslam.online.rig import RigCamera, RigEstimator
@@ -34,7 +38,7 @@ class RigTracker:
 
     Parameters
     ----------
-    cameras : of the rig. references : by camera, the reference frame (h, w, 3) uint8, of one instant.
+    cameras : of the rig. references : by camera, the reference frame, of one instant; see `Tracker`.
     state : of the object in them, its pose in the rig's frame (the first camera's).
 
     Raises
@@ -47,7 +51,7 @@ class RigTracker:
         self,
         model: ReducedModel,
         cameras: Sequence[RigCamera],
-        references: Sequence[Image],
+        references: Sequence[Image | Picture],
         state: State,
         options: TrackerOptions | None = None,
         in_sequence: bool = True,
@@ -59,31 +63,53 @@ class RigTracker:
         ]
         self.estimator = RigEstimator(model, self.cameras, self.options.estimation)
         self._filter = new_filter(self.estimator, self.options)
+        self._sigma_px = FIRST_SIGMA_PX
 
-    def process_frame(self, images: Sequence[Image]) -> FrameResult:
-        """Find the object in the next frames (h, w, 3) uint8 of all cameras, in their order."""
-        results = [tracker.process_frame(image) for tracker, image in zip(self.trackers, images, strict=True)]
-        clock = StageClock(STAGES)
+    def process_frame(self, images: Sequence[Image], known: KnownPose | None = None) -> FrameResult:
+        """Find the object in the next frames (h, w, 3) uint8 of all cameras, in their order.
+
+        ``known`` is an anchored object's pose in the rig's frame by the map; see `Tracker.process_frame`.
+        """
+        results = [
+            tracker.process_frame(image, None if known is None else part.seen_pose(known))
+            for tracker, part, image in zip(self.trackers, self.cameras, images, strict=True)
+        ]
+        clock, has_moved = StageClock(STAGES), any(HAS_MOVED in result.reason for result in results)
+        prior = None if known is None or has_moved else self._prior(known, results)
         with clock.stage("fuse"):
-            estimate, measured, why_not = self._together(results)
+            estimate, measured, why_not = self._together(results, prior)
         n_points = sum(result.n_points for result in results)
         times = {stage: sum(r.timings_ms[stage] for r in results) for stage in STAGES}
         times["fuse"] += clock.milliseconds["fuse"]
         total = sum(result.total_ms for result in results) + clock.total
+        if estimate is None and known is not None and not has_moved:
+            why = why_not.removeprefix("lost: ")
+            return FrameResult.hidden(why, known, n_points, 0, times, total)
         if estimate is None:
             return FrameResult("lost", why_not, None, np.nan, n_points, 0, times, total)
         for tracker, part in zip(self.trackers, self.cameras, strict=True):
             tracker.continue_from(part.seen(estimate.state))
         used = measured.weights > 0.0
         rms = float(np.sqrt(np.mean(np.sum(estimate.residuals[used] ** 2, axis=1))))
-        reason = "; ".join(_reasons(results, measured)) or FOLLOWED
+        aside = [HAS_MOVED] if has_moved else []
+        reason = "; ".join([*_reasons(results, measured), *aside]) or FOLLOWED
         recovered = all(result.recovered or result.estimate is None for result in results)
         return FrameResult(
             "tracked", reason, estimate, rms, n_points, int(used.sum()), times, total, recovered,
-            pose_from="points",
+            pose_from="points" if prior is None else "points and map",
         )  # fmt: skip
 
-    def _together(self, results: list[FrameResult]) -> tuple[Estimate | None, RigMeasured, str]:
+    def _prior(self, known: KnownPose, results: list[FrameResult]) -> Prior | None:
+        """What the map tells of the pose; None if the points of a camera show the object elsewhere."""
+        if any(result.pose_from == "points" for result in results):
+            return None
+        redundancy = np.mean([tracker.reference.redundancy for tracker in self.trackers])
+        squared_px = float(redundancy) * self._sigma_px**2
+        return known.prior(len(self.model.parameters), squared_px, HELD if self.options.hold_pose else 1.0)
+
+    def _together(
+        self, results: list[FrameResult], prior: Prior | None
+    ) -> tuple[Estimate | None, RigMeasured, str]:
         """The estimate from all cameras, what it was made from, and why there is none."""
         measured = RigMeasured(tuple(tracker.last_measured for tracker in self.trackers))
         counts = [0 if result.estimate is None else result.n_inliers for result in results]
@@ -91,12 +117,15 @@ class RigTracker:
         seen = results[best].estimate
         if seen is None:
             return None, measured, "; ".join(_reasons(results, measured))
-        estimate = self.estimator.fit(measured, self.cameras[best].in_rig(seen.state))
+        estimate = self.estimator.fit(measured, self.cameras[best].in_rig(seen.state), prior)
         measured = self._agreeing(measured, estimate)
-        if (measured.weights > 0.0).sum() < self.options.least_inliers:
+        needed = self.options.least_inliers if prior is None else self.options.least_anchored
+        if (measured.weights > 0.0).sum() < needed:
             return None, measured, "lost: the cameras contradict each other: is their calibration right?"
-        estimate = self.estimator.fit(measured, estimate.state)
-        return self._filter.fuse(measured, estimate), measured, ""
+        estimate = self.estimator.fit(measured, estimate.state, prior)
+        if np.isfinite(estimate.sigma_px):
+            self._sigma_px = max(estimate.sigma_px, LEAST_SIGMA_PX)
+        return self._filter.fuse(measured, estimate, prior), measured, ""
 
     def _agreeing(self, measured: RigMeasured, estimate: Estimate) -> RigMeasured:
         """Without points that are far from the estimate, and without cameras of which most are."""
@@ -113,9 +142,10 @@ class RigTracker:
         return RigMeasured(tuple(kept))
 
     def _new_tracker(
-        self, number: int, part: RigCamera, image: Image, state: State, in_sequence: bool
+        self, number: int, part: RigCamera, image: Image | Picture, state: State, in_sequence: bool
     ) -> Tracker:
-        part.camera.check_image(image, f"the reference frame of camera {number}")
+        picture = image.grey if isinstance(image, Picture) else image
+        part.camera.check_image(picture, f"the reference frame of camera {number}")
         # What is one over the sequence, or walks, is found from all cameras together.
         # The joint estimate ties lasting errors to the points of one view a camera, so these stay the same.
         single = replace(self.options, per_sequence=(), random_walk=(), new_views=False)
@@ -129,7 +159,9 @@ def _reasons(results: list[FrameResult], measured: RigMeasured) -> list[str]:
     """What is to be said of the cameras that do not count."""
     said = []
     for number, (result, view) in enumerate(zip(results, measured.views, strict=True)):
-        if result.estimate is None:
+        if result.status == "hidden":  # what the map knows then is said once, of all cameras
+            said.append(f"camera {number}: {result.reason.split(';')[0]}")
+        elif result.estimate is None:
             said.append(f"camera {number}: {result.reason}")
         elif not view.weights.any():
             said.append(f"camera {number} contradicts the others and does not count")

@@ -1,4 +1,7 @@
-"""`morph track --with`: one free object seen by several synchronised cameras."""
+"""`morph track --with`: one object, free or anchored, seen by several synchronised cameras.
+
+An anchored object's map is the first camera's: it is found there in every frame, and the others by the rig.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +10,26 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
+from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import CameraError, SourceError, TrackingError
 from morph_dslam.io.stereo_calibration import load_rig
+from morph_dslam.online.attempt import Picture
+from morph_dslam.online.chain import Chain
 from morph_dslam.online.results import RunResults
 from morph_dslam.online.rig import RigCamera
 from morph_dslam.online.rig_tracking import RigTracker
 from morph_dslam.online.run_writing import check_run_folder
-from morph_dslam.online.track import TrackOptions, find_begin, open_frames, write_results
+from morph_dslam.online.slam.frame_images import FrameImages
+from morph_dslam.online.slam.options import SlamOptions
+from morph_dslam.online.track import TrackOptions, find_begin, open_frames, with_reference, write_results
 from morph_dslam.online.tracking_setup import load_setup
 from morph_dslam.sources import Frame, FrameSource, open_source
+
+#: Correlation of two flattened images that are the same but for the compression.
+SAME_IMAGE = 0.8
 
 
 def track_rig(options: TrackOptions, others: Sequence[Path]) -> dict[str, Any]:
@@ -36,34 +48,72 @@ def track_rig(options: TrackOptions, others: Sequence[Path]) -> dict[str, Any]:
     ------
     MorphError
         As `track` does; CameraError if the camchain has not one camera for each recording; TrackingError if
-        the object is not a free one, or depth is to be used.
+        depth is to be used, or the map is not of this recording, so that the other cameras' reference
+        frames are not known.
     """
-    if options.placement is not None or options.refine_reference or options.use_depth:
-        raise TrackingError("several cameras track a free object: leave out --place, --refine and --depth")
+    _check(options)
     # Each camera keeps its one reference view; see `RigTracker`.
     options = replace(options, tracker=replace(options.tracker, new_views=False))
     cameras = _cameras(options.camera, 1 + len(others))
     check_run_folder(options.output, options.overwrite)
     setup = load_setup(options)
+    options = with_reference(options, setup)
     sources = [open_frames(options), *(open_source(path, options.first, options.last) for path in others)]
     begin = find_begin(setup, options)
-    references = [begin.picture, *(_frame(path, begin.frame) for path in others)]
+    if setup.reference is not None:
+        _check_scan(setup.camera, setup.reference, options.frames, begin.frame)
+    references = [begin.picture, *(_frame(path, begin.frame).image for path in others)]
     placement = setup.placed(begin.picture)
     setup.warm_up(placement, begin.picture)
     tracked_with = setup.tracker_options(placement)
     tracker = RigTracker(
         placement.model, cameras, references, placement.state, tracked_with, begin.in_sequence
     )
+    first = setup.new_chain(placement, begin.picture, begin.in_sequence)
     run = RunResults(placement.model, begin.frame, per_sequence=tracked_with.per_sequence)
     try:
-        for frames in tqdm(_together(sources), total=len(sources[0]), desc="tracking", unit="frame"):
-            for number, (frame, part) in enumerate(zip(frames, cameras, strict=True)):
-                part.camera.check_image(frame.image, f"frame {frame.index} of camera {number}")
-            result = tracker.process_frame([frame.image for frame in frames])
-            run.add(frames[0].index, frames[0].timestamp, result)
+        _follow(sources, first, tracker, run)
     finally:
+        placement = replace(placement, flags=(*placement.flags, *_unequal(sources, len(run))))
         summary = write_results(setup, placement, sources[0], options, run) if len(run) else {}
     return summary
+
+
+def _follow(sources: Sequence[FrameSource], first: Chain, tracker: RigTracker, run: RunResults) -> None:
+    """Track all frames into ``run``; ``first`` finds the first camera in the map, where there is one."""
+    for frames in tqdm(_together(sources), total=len(sources[0]), desc="tracking", unit="frame"):
+        for number, (frame, part) in enumerate(zip(frames, tracker.cameras, strict=True)):
+            part.camera.check_image(frame.image, f"frame {frame.index} of camera {number}")
+        located = first.locate(frames[0])
+        result = tracker.process_frame([frame.image for frame in frames], located.known)
+        result = result if first.anchor is None else located.told_of(result)
+        run.add(frames[0].index, frames[0].timestamp, result)
+
+
+def _check(options: TrackOptions) -> None:
+    if options.refine_reference or options.reregister_at or options.use_depth:
+        raise TrackingError(
+            "several cameras track an object from where it starts, without depth: leave out --refine, "
+            "--reregister-at and --depth"
+        )
+    if options.placement is not None and options.reference_frame is not None:
+        raise TrackingError(
+            "a registration in a map brings its own reference frame: leave out --reference-frame"
+        )
+
+
+def _check_scan(camera: PinholeCamera, keyframe: Picture, frames: Path, number: int) -> None:
+    """Raise TrackingError unless a frame is the map's keyframe of the same number.
+
+    The other cameras' reference frames are those of that number, in which the object is undeformed.
+    """
+    view = FrameImages(camera, SlamOptions()).prepare(_frame(frames, number).image, number, 0.0)
+    if np.corrcoef(view.flat.ravel(), keyframe.flat.ravel())[0, 1] < SAME_IMAGE:
+        raise TrackingError(
+            f"frame {number} of {frames} is not the map's keyframe {number}, so it is not known when the "
+            "other cameras saw the undeformed object: film the scan and the deformation with all cameras in "
+            "one recording"
+        )
 
 
 def _cameras(path: Path, count: int) -> list[RigCamera]:
@@ -80,10 +130,21 @@ def _cameras(path: Path, count: int) -> list[RigCamera]:
     return cameras
 
 
-def _frame(path: Path, number: int):
+def _frame(path: Path, number: int) -> Frame:
     for frame in open_source(path, number, number):
-        return frame.image
+        return frame
     raise SourceError(f"{path} holds no frame {number} to take as the reference")
+
+
+def _unequal(sources: Sequence[FrameSource], tracked: int) -> list[str]:
+    """What a reader must know if not all recordings are as long."""
+    counts = [len(source) for source in sources]
+    if len(set(counts)) == 1:
+        return []
+    return [
+        f"the cameras recorded {', '.join(map(str, counts))} frames: {tracked} were tracked, to the end of "
+        "the shortest recording"
+    ]
 
 
 def _together(sources: Sequence[FrameSource]) -> Iterator[tuple[Frame, ...]]:
