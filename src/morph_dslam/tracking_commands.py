@@ -231,7 +231,7 @@ def add_tracking_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         default=[],
         dest="other_cameras",
         metavar="FRAMES",
-        help="what the next camera of the rig saw; with --camera camchain.yaml#cam0, also the camera of a map; "
+        help="what the next camera of the rig saw; with --camera camchain.yaml#cam0, which a map is of too; "
         "may be repeated",
     )
     track.add_argument(

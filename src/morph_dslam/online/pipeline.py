@@ -58,7 +58,7 @@ class Tracker:
         is looked for as after a loss.
     reference_covariance : (d + 6, d + 6) of ``state``; it enters that of every frame. None where nothing is
         known of the error of ``state``.
-    hidden : (h, w) where something else is in front of the object in the reference frame.
+    seen : (h, w) where the object is seen in the reference frame; all that it covers by default.
 
     Attributes
     ----------
@@ -83,13 +83,13 @@ class Tracker:
         options: TrackerOptions | None = None,
         in_sequence: bool = True,
         reference_covariance: Array | None = None,
-        hidden: NDArray[np.bool_] | None = None,
+        seen: NDArray[np.bool_] | None = None,
     ) -> None:
         self.model, self.camera, self.options = model, camera, options or TrackerOptions()
         self.estimator = Estimator(model, camera, self.options.estimation)
         self._undistortion = camera.undistortion_maps()
         picture = reference if isinstance(reference, Picture) else self._prepare(reference)
-        reference_view = ReferenceView(self.estimator, picture, state, self.options, hidden)
+        reference_view = ReferenceView(self.estimator, picture, state, self.options, seen)
         self._views = ReferenceViews(self.estimator, reference_view, reference_covariance, self.options)
         self._anchoring = Anchoring(self.estimator, reference_view, self.options)
         self._filter = new_filter(self.estimator, self.options)

@@ -175,8 +175,8 @@ def _prepare(everything: Sequence[TrackOptions], setups: Sequence[Setup]) -> lis
     return objects
 
 
-def _new_tracker(part: _Object, hidden: NDArray[np.bool_] | None = None) -> Tracker:
-    return part.setup.new_tracker(part.placement, part.begin.picture, part.begin.in_sequence, hidden)
+def _new_tracker(part: _Object, seen: NDArray[np.bool_] | None = None) -> Tracker:
+    return part.setup.new_tracker(part.placement, part.begin.picture, part.begin.in_sequence, seen)
 
 
 def _new_chain(objects: Sequence[_Object]) -> ObjectsChain:
@@ -193,6 +193,6 @@ def _new_chain(objects: Sequence[_Object]) -> ObjectsChain:
             for depth, other in zip(drawn, objects, strict=True)
             if other is not part and other.begin.frame == part.begin.frame
         ]
-        hidden = np.minimum.reduce(others) < own if others else np.zeros(own.shape, dtype=bool)
-        trackers[part.name] = _new_tracker(part, hidden) if hidden.any() else tracker
+        seen = np.isfinite(own) & (own <= np.minimum.reduce([own, *others]))
+        trackers[part.name] = tracker if np.array_equal(seen, np.isfinite(own)) else _new_tracker(part, seen)
     return ObjectsChain(objects[0].setup.camera, trackers, anchor)

@@ -139,7 +139,7 @@ class Setup:
         placement: Placement,
         reference: NDArray[np.uint8] | Picture,
         in_sequence: bool,
-        hidden: NDArray[np.bool_] | None = None,
+        seen: NDArray[np.bool_] | None = None,
     ) -> Tracker:
         """A tracker at its beginning; see `Tracker` for the arguments."""
         return Tracker(
@@ -150,7 +150,7 @@ class Setup:
             self.tracker_options(placement),
             in_sequence,
             placement.covariance,
-            hidden,
+            seen,
         )
 
     def new_chain(
