@@ -10,6 +10,7 @@ from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.stereo_calibration import load_rig
 from morph_dslam.model import SurfacePoints
 from morph_dslam.online.estimation import BoundPoints, Estimator, Prior, State, moved
+from morph_dslam.online.known_pose import KnownPose
 from morph_dslam.online.measurement_noise import Measured, RigMeasured
 from morph_dslam.online.rig import RigCamera, RigEstimator
 from morph_dslam.online.sequence_filter import SequenceFilter
@@ -45,6 +46,24 @@ def seen_by(part, points, rng, sigma=SIGMA):
     pixels = pixels + sigma * rng.standard_normal(pixels.shape)
     count = len(points)
     return Measured(points, pixels, np.ones(count), np.zeros((count, 2)), np.eye(count))
+
+
+def test_a_pose_known_in_the_rig_is_known_as_well_in_each_camera():
+    """How errors in the rig's frame appear in a camera's is found by making them."""
+    rng = np.random.default_rng(4)
+    root, lasting = rng.normal(size=(6, 6)) * 1e-3, rng.normal(size=(6, 2)) * 1e-3
+    pose = TRUTH.camera_from_object
+    seen = ASIDE.seen_pose(KnownPose(pose, root @ root.T, lasting))
+    np.testing.assert_allclose(seen.pose.matrix, ASIDE.seen(TRUTH).camera_from_object.matrix, atol=1e-12)
+
+    def in_camera(error):
+        wrong = moved(TRUTH, np.concatenate([np.zeros(3), error]))
+        return seen.away(ASIDE.seen(wrong).camera_from_object)
+
+    made = np.column_stack([in_camera(error) for error in root.T])
+    np.testing.assert_allclose(seen.from_camera, made @ made.T, atol=1e-12)
+    made = np.column_stack([in_camera(error) for error in lasting.T])
+    np.testing.assert_allclose(seen.lasting, made, atol=1e-12)
 
 
 def test_gradient_and_cost_are_those_of_all_cameras():
