@@ -9,16 +9,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from morph_dslam.errors import RegistrationError
+from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import ReducedModel
 from morph_dslam.online.estimation import State
+from morph_dslam.online.known_pose import KnownPose
 from morph_dslam.online.pipeline import Tracker
 from morph_dslam.online.placement import Placement
 from morph_dslam.online.registration import register
-from morph_dslam.online.results import RunResults, flags
-from tests.support.staged_scenes import Scene, aside, confidently_wrong, mean_error
+from morph_dslam.online.results import RunResults
+from morph_dslam.online.run_flags import flags
+from tests.support.staged_scenes import Scene, is_beyond, is_doubted, mean_error
 
 #: Frames of a recording at 30 a second that show one unit of a scene's time.
 FRAMES = 120
+#: Flags of a placement that say it may be wrong.
+DOUBTFUL = ("ambiguous", "poor", "underdetermined", "at a bound")
+#: Errors of a pose in a map: of the registration, which last, and of the camera; rad and metres.
+LASTING, FROM_CAMERA = np.repeat([8e-4, 3e-4], 3), np.repeat([3e-4, 1e-4], 3)
 
 
 @dataclass(frozen=True)
@@ -28,8 +35,9 @@ class Outcome:
     Attributes
     ----------
     said : the error, or the flags of the run and the reasons of lost frames. n_frames : of the recording.
-    n_tracked, n_lost : of them. n_wrong : confidently wrong. back_after : frames after the object could be
-        seen whole again until it was tracked; None if it never was.
+    n_tracked, n_lost : of them. n_beyond : off beyond what they state. n_wrong : those of them of which
+        neither the frame's reason nor a flag of the placement says that they are not to be relied on.
+    back_after : frames after the object could be seen whole again until it was tracked; None if it never was.
     largest_error : of a tracked frame, metres; NaN without one. statuses : of the frames.
     """
 
@@ -37,6 +45,7 @@ class Outcome:
     n_frames: int = 0
     n_tracked: int = 0
     n_lost: int = 0
+    n_beyond: int = 0
     n_wrong: int = 0
     back_after: int | None = None
     largest_error: float = float("nan")
@@ -45,11 +54,20 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Shown:
-    """One frame: the true state of the object, None if it is absent; others like it; how much is covered."""
+    """One frame.
+
+    Attributes
+    ----------
+    state : the true one of the object, None if it is absent. others : of more like it. cover, thing,
+    strangers : see `Stage.frame`. place : where the map has the object.
+    """
 
     state: State | None
     others: tuple[State, ...] = ()
     cover: float = 0.0
+    thing: tuple[float, float, float, float] | None = None
+    strangers: tuple[State, ...] = ()
+    place: RigidTransform | None = None
 
 
 def landmarks(scene: Scene, model: ReducedModel, count: int = 16, seed: int = 0, click_px: float = 0.3):
@@ -77,8 +95,43 @@ def placed_by_landmarks(scene: Scene, model: ReducedModel, seed: int) -> Placeme
     return Placement(model, None, found.state, {}, found.flags, covariance=found.covariance)
 
 
+class InMap:
+    """An object's place in a map, off by errors of a usual size, which are stated.
+
+    Parameters
+    ----------
+    seed : of the errors. model : undeformed in the map.
+    """
+
+    def __init__(self, scene: Scene, model: ReducedModel, seed: int) -> None:
+        self._scene, self._model, self._rng = scene, model, np.random.default_rng(seed)
+        self._off = LASTING * self._rng.standard_normal(6)
+
+    def placement(self) -> Placement:
+        """In the scene's first frame, as a keyframe of the map has it."""
+        model, truth = self._model, self._scene.state(0.0).camera_from_object
+        covariance = np.zeros((len(model.parameters) + 6,) * 2)
+        covariance[-6:, -6:] = np.diag(LASTING**2)
+        state = State(model.default, _off_by(truth, self._off))
+        return Placement(model, None, state, {}, (), covariance=covariance)
+
+    def known(self, place: RigidTransform) -> KnownPose:
+        """Where the map has the object in a frame whose camera sees it at ``place``."""
+        error = self._off + FROM_CAMERA * self._rng.standard_normal(6)
+        return KnownPose(_off_by(place, error), np.diag(FROM_CAMERA**2), np.diag(LASTING))
+
+
+def _off_by(pose: RigidTransform, error) -> RigidTransform:
+    return RigidTransform(rotation_exp(error[:3]) @ pose.rotation, pose.translation + error[3:])
+
+
 def run_case(
-    scene: Scene, placement: Placement, shown: Iterable[Shown], back_at: int | None = None, **options
+    scene: Scene,
+    placement: Placement,
+    shown: Iterable[Shown],
+    back_at: int | None = None,
+    in_map: InMap | None = None,
+    **options,
 ) -> Outcome:
     """Track what is shown from the scene's first frame, in which the object is where ``placement`` says."""
     reference = scene.stage.frame([scene.state(0.0)])
@@ -90,18 +143,23 @@ def run_case(
         reference_covariance=placement.covariance,
         **options,
     )
-    run, wrong, errors, back = RunResults(placement.model, 0), 0, [np.nan], None
+    run, errors, back = RunResults(placement.model, 0), [np.nan], None
+    doubtful = any(word in flag for flag in placement.flags for word in DOUBTFUL)
+    beyond = wrong = 0
     for number, view in enumerate(shown):
         states = [*view.others, *([] if view.state is None else [view.state])]
-        result = tracker.process_frame(scene.stage.frame(states, cover=view.cover))
+        image = scene.stage.frame(states, view.cover, strangers=view.strangers, thing=view.thing)
+        known = None if in_map is None or view.place is None else in_map.known(view.place)
+        result = tracker.process_frame(image, known)
         run.add(number, number / 30.0, result)
         if result.status != "tracked":
             continue
+        off = view.state is None or is_beyond(placement.model, result, scene.model, view.state)
+        beyond += off
+        wrong += off and not doubtful and not is_doubted(result)
         if view.state is None:
-            wrong += 1  # there is nothing to track
             continue
         errors.append(mean_error(placement.model, result.estimate, scene.model, view.state))
-        wrong += confidently_wrong(placement.model, result, scene.model, view.state)
         if back is None and back_at is not None and number >= back_at:
             back = number - back_at
     reasons = Counter(_gist(r.reason) for r in run.results if r.status != "tracked")
@@ -110,6 +168,7 @@ def run_case(
         len(run),
         int(run.tracked.sum()),
         int((~run.tracked).sum()),
+        beyond,
         wrong,
         back,
         float(np.nanmax(errors)) if len(errors) > 1 else np.nan,
@@ -128,43 +187,6 @@ def stated(case: Callable[[], Outcome]) -> Outcome:
         return case()
     except RegistrationError as error:
         return Outcome((f"error: {error}",))
-
-
-def moving(scene: Scene, n: int, start: float = 0.0, **changes) -> list[Shown]:
-    """The object alone over ``n`` frames."""
-    return [Shown(scene.state(start + k / FRAMES), **changes) for k in range(1, n + 1)]
-
-
-def covered(scene: Scene, n_before: int = 6, n_covered: int = 60, n_after: int = 30, n_edge: int = 8):
-    """An arm is put over all of the picture, stays for ``n_covered`` frames, and is drawn back again.
-
-    Returns
-    -------
-    The frames, and the number of the first one that is free again.
-    """
-    shares = [0.0] * n_before + list(np.linspace(0.0, 1.0, n_edge)) + [1.0] * n_covered
-    shares += list(np.linspace(1.0, 0.0, n_edge)) + [0.0] * n_after
-    frames = [replace(s, cover=c) for s, c in zip(moving(scene, len(shares)), shares, strict=True)]
-    return frames, len(shares) - n_after
-
-
-def passing(scene: Scene, n: int = 60, nearer: float = 0.0, depth: float = 0.0) -> list[Shown]:
-    """Another one like it comes in from the right after 10 frames, to just beside the object, and goes again.
-
-    ``nearer`` is the part of the distance by which it comes over the object; ``depth`` metres in front of it.
-    """
-    frames = []
-    for k, view in enumerate(moving(scene, n)):
-        way = abs(np.clip((k - 10) / (n - 10), 0.0, 1.0) - 0.5) * 2.0
-        step = scene.beside * (1.0 - nearer + 3.0 * way)
-        other = replace_shape(view.state, scene.state(0.9 - k / FRAMES))
-        frames.append(replace(view, others=(aside(other, [step, 0.0, -depth]),) if k >= 10 else ()))
-    return frames
-
-
-def replace_shape(place: State, shape: State) -> State:
-    """The state ``place`` with the parameters of ``shape``."""
-    return State(shape.parameters, place.camera_from_object)
 
 
 def in_unit(model: ReducedModel, factor: float) -> ReducedModel:

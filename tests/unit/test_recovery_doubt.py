@@ -1,4 +1,4 @@
-"""When the few points that agree may be off together: against the spread of frames in which they were not."""
+"""When points that agree may be off together, or agree by chance: against what is usual in other frames."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -6,17 +6,21 @@ from typing import Any
 import numpy as np
 import pytest
 
+from morph_dslam.online.attempt import refusal
 from morph_dslam.online.recovery import Recovery
+from morph_dslam.online.tracker_options import TrackerOptions
 
 
-def attempt(share, sigma_px, prior=None) -> Any:
-    inliers = np.arange(200) < 200 * share
-    return SimpleNamespace(inliers=inliers, estimate=SimpleNamespace(sigma_px=sigma_px), prior=prior)
+def attempt(share, sigma_px, prior=None, visible=1.0) -> Any:
+    inliers, seen = np.arange(200) < 200 * share, np.arange(200) < 200 * visible
+    measurement = SimpleNamespace(visible=seen, valid=inliers)
+    estimate = SimpleNamespace(sigma_px=sigma_px)
+    return SimpleNamespace(inliers=inliers, estimate=estimate, prior=prior, measurement=measurement)
 
 
 def new() -> Recovery:
     anything: Any = None
-    return Recovery(anything, anything, anything, anything, anything)
+    return Recovery(anything, anything, anything, anything, TrackerOptions())
 
 
 @pytest.fixture
@@ -31,14 +35,35 @@ def test_a_frame_before_anything_was_followed_is_not_doubted():
     assert new().doubt(attempt(0.2, 2.0)) == 0.0
 
 
-@pytest.mark.parametrize(("share", "sigma_px"), [(0.6, 2.0), (0.3, 0.44)])
-def test_most_points_or_close_ones_are_not_doubted(recovery, share, sigma_px):
-    assert recovery.doubt(attempt(share, sigma_px)) == 0.0
+@pytest.mark.parametrize(
+    ("share", "sigma_px", "visible"), [(0.8, 2.0, 1.0), (0.6, 2.0, 0.7), (0.3, 0.44, 1.0)]
+)
+def test_most_points_or_close_ones_are_not_doubted(recovery, share, sigma_px, visible):
+    assert recovery.doubt(attempt(share, sigma_px, visible=visible)) == 0.0
+
+
+def test_points_beside_something_that_hides_others_are_doubted(recovery):
+    assert recovery.doubt(attempt(0.6, 0.5)) == pytest.approx(0.4)
+    assert recovery.doubt(attempt(0.6, 0.5, visible=0.7)) == 0.0  # the others are hidden by the object itself
+
+
+def test_what_is_usual_is_not_learnt_beside_something_that_hides_others(recovery):
+    for _ in range(100):
+        recovery.learn(attempt(0.6, 2.0))
+    assert recovery.doubt(attempt(0.6, 0.5)) == pytest.approx(0.4)
 
 
 def test_few_points_that_agree_less_closely_are_doubted_by_what_is_unusual(recovery):
     assert recovery.doubt(attempt(0.3, 0.5)) == pytest.approx(0.4)  # 0.5² = 0.3² + 0.4²
 
 
-def test_a_pose_from_the_map_is_judged_by_other_limits(recovery):
-    assert recovery.doubt(attempt(0.3, 2.0, prior=object())) == 0.0
+def test_with_a_pose_from_the_map_fewer_points_will_do(recovery):
+    assert recovery.doubt(attempt(0.4, 2.0, prior=object())) == 0.0
+    assert recovery.doubt(attempt(0.2, 0.5, prior=object())) == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(
+    ("share", "sigma_px", "believed"), [(0.4, 0.9, True), (0.4, 2.5, False), (0.6, 2.5, True)]
+)
+def test_few_points_that_do_not_agree_closely_agree_by_chance(share, sigma_px, believed):
+    assert (refusal(attempt(share, sigma_px), TrackerOptions()) == "") == believed

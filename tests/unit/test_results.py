@@ -15,7 +15,8 @@ from morph_dslam.online.binding import view_of
 from morph_dslam.online.estimation import BoundPoints, Estimate, State
 from morph_dslam.online.frame_result import STAGES, FrameResult
 from morph_dslam.online.measurement import visible_surface
-from morph_dslam.online.results import RunResults, flags, summarise
+from morph_dslam.online.results import RunResults, summarise
+from morph_dslam.online.run_flags import flags
 from tests.support.bent_sheet import PARAMETERS, bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)

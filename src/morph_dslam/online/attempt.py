@@ -13,6 +13,9 @@ from morph_dslam.online.measurement import Measurement
 from morph_dslam.online.outline import OutlineMeasurement
 from morph_dslam.online.tracker_options import TrackerOptions
 
+#: Where less than this share of all points agree, they must agree closely.
+MOST_AGREE = 0.5
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -52,20 +55,21 @@ class Attempt:
 def refusal(attempt: Attempt, options: TrackerOptions) -> str:
     """Why an attempt is not to be believed; empty when it is.
 
-    With a pose from the map the parameters alone are left to be found, which few points can tell. They must
-    agree closely then, and be most of those that were found: what looks alike by chance does neither.
+    What covers an object may look like it by chance in places, but these do not agree closely. With a pose
+    from the map the parameters alone are left to be found, which few points can tell. They must agree closely
+    then, and be most of those that were found: what looks alike by chance does neither.
     """
     measurement, count = attempt.measurement, int(attempt.inliers.sum())
     needed = min(options.least_inliers, int(np.ceil(options.least_share * len(attempt.inliers))))
+    visible, spread = int(measurement.visible.sum()), attempt.estimate.sigma_px
     if count >= needed:
-        return ""
-    visible = int(measurement.visible.sum())
+        by_chance = count < MOST_AGREE * len(attempt.inliers) and spread > options.few_sigma_px
+        return f"{count} of {visible} points agree, but only by {spread:.1f} px" if by_chance else ""
     if attempt.prior is None:
         return f"{count} of {visible} points agree, at least {needed} needed"
     if count < options.least_anchored:
         return f"{count} of {visible} points agree, at least {options.least_anchored} needed"
     found = int(measurement.valid.sum())
-    close = attempt.estimate.sigma_px < options.anchored_sigma_px
-    if close and count >= options.anchored_share * found:
+    if spread < options.few_sigma_px and count >= options.anchored_share * found:
         return ""
-    return f"of {found} points found only {count} agree on a shape, by {attempt.estimate.sigma_px:.1f} px"
+    return f"of {found} points found only {count} agree on a shape, by {spread:.1f} px"

@@ -40,6 +40,8 @@ FEW_AGREE = "few points agree, and less closely than usual"
 UNCHECKED = "no other view has checked the reference state yet"
 #: Follows the reason of frames by which the reference state is worse known than it was stated.
 REFERENCE_WORSE = "the frames contradict the reference state"
+#: Follows the reason of frames in which the object cannot be told from another one with its print.
+MAY_BE_ANOTHER = "it may be another one like it"
 #: Follows the reason of frames in which an anchored object is away from its place.
 HAS_MOVED = "the object has moved from its place in the map"
 

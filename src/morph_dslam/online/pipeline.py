@@ -34,6 +34,7 @@ from morph_dslam.online.frame_result import (
     FrameResult,
 )
 from morph_dslam.online.known_pose import KnownPose
+from morph_dslam.online.look_alikes import LookAlikes
 from morph_dslam.online.measurement import Measurement
 from morph_dslam.online.reference_misfit import CLEARLY_WORSE
 from morph_dslam.online.reference_refinement import Keyframe
@@ -100,6 +101,7 @@ class Tracker:
         self._supported = np.ones(len(reference_view.points), dtype=bool)
         self._last, self._velocity_base, self._start = state, state, state
         self._lost, self._n_lost = not in_sequence, 0
+        self._look_alikes = LookAlikes(float(np.linalg.norm(np.ptp(model.nodes, axis=0))))
 
     def process_frame(
         self,
@@ -131,6 +133,11 @@ class Tracker:
         if why_not and self._is_to_be_looked_for(known):
             found, why_not = self._view.recovery.recover(picture, self._last.parameters, why_not, clock)
             attempt, how = (attempt, how) if found is None else (found, RECOVERED)
+        if why_not:
+            self._look_alikes.note_lost(why_not)
+        else:
+            recovery, points = self._view.recovery, self.reference.points
+            why_not = self._look_alikes.refusal(picture, attempt, points, how == RECOVERED, recovery, clock)
         if not why_not:
             with clock.stage("outline"):
                 attempt = self._view.estimation.fit_outline(picture, attempt)
@@ -284,12 +291,15 @@ class Tracker:
         residuals = attempt.estimate.residuals[attempt.inliers]
         rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
         left = self._view.systematic.unexplained(attempt.estimate, attempt.inliers)
-        doubt = self._view.recovery.doubt(attempt)
+        recovery = self._view.recovery
+        doubt, whole = recovery.doubt(attempt), not recovery.partly_hidden(attempt)
         alike_px = max(left.px, doubt)
         systematic = self._view.systematic
-        estimate = systematic.added(attempt.estimate, attempt.inliers, alike_px, attempt.prior, not doubt)
+        estimate = systematic.added(attempt.estimate, attempt.inliers, alike_px, attempt.prior, whole)
         if doubt:
             aside += f"; {FEW_AGREE}: by {attempt.estimate.sigma_px:.1f} px"
+        if self._look_alikes.doubt:
+            aside += f"; {self._look_alikes.doubt}"
         if left.is_failure:
             aside += f"; {UNEXPLAINED}: {left.px:.1f} px are left"
         if systematic.worse > CLEARLY_WORSE:

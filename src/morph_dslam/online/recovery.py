@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.model import ReducedModel
-from morph_dslam.online.attempt import Attempt, Picture, refusal
+from morph_dslam.online.attempt import MOST_AGREE, Attempt, Picture, refusal
 from morph_dslam.online.frame_estimation import FrameEstimation
 from morph_dslam.online.reference_view import ReferenceView
 from morph_dslam.online.registration import shape_starts, solve_pnp
@@ -17,10 +17,14 @@ from morph_dslam.online.tracker_options import TrackerOptions
 
 Array = NDArray[np.float64]
 
-#: An object that is found anew is believed if this share of its points agree, or if they agree as closely as
-#: this, pixels, or as so many times the usual spread of their residuals: what looks alike by chance does not,
-#: nor do windows that see the rim of what is before the object.
-MOST_AGREE, CLOSE_PX, CLOSE_TO_USUAL = 0.5, 0.25, 1.5
+#: An object that is found anew is believed if half of its points agree, or if they agree as closely as this,
+#: pixels, or as so many times the usual spread of their residuals: what looks alike by chance does not, nor
+#: do windows that see the rim of what is before the object.
+CLOSE_PX, CLOSE_TO_USUAL = 0.25, 1.5
+#: Something is before the object where less than this share of the points that it does not hide itself agree.
+UNHIDDEN = 0.75
+#: Is said where another one like it is seen too.
+TWO_PLACES = "it could be in two places"
 #: At most about so many shapes are tried, lest a mirrored one that fits nearly as well is taken.
 MOST_SHAPES = 27
 #: Share of the latest frame in the usual spread.
@@ -49,15 +53,23 @@ class Recovery:
             return
         if np.isnan(self._usual_px):
             self._usual_px = spread
+        if self.partly_hidden(attempt):
+            return
         self._usual_px += LEARNING_RATE * (spread - self._usual_px)
 
     def doubt(self, attempt: Attempt) -> float:
-        """By how much, pixels, the few points that agree may be off together; 0 where nothing is doubtful.
+        """By how much, pixels, the points that agree may be off together; 0 where nothing is doubtful.
 
-        Where less than half of the points agree, and not as closely as usual, something else is in the
-        windows of many: what their residuals have more than usual is no noise that averages out.
+        Where something hides part of the object, or less than half of the points agree, and those not as
+        closely as usual, something else is in the windows of many: what their residuals have more than usual
+        is no noise that averages out.
         """
-        if attempt.prior is not None or self._most_agree(attempt) or np.isnan(self._usual_px):
+        if np.isnan(self._usual_px):
+            return 0.0
+        if attempt.prior is not None:  # the pose is known, so that fewer points tell as much
+            if attempt.inliers.sum() >= self._options.least_share * len(attempt.inliers):
+                return 0.0
+        elif self.most_agree(attempt) and not self.partly_hidden(attempt):
             return 0.0
         spread = attempt.estimate.sigma_px
         if spread < CLOSE_TO_USUAL * self._usual_px:
@@ -70,13 +82,18 @@ class Recovery:
         if why_not or attempt.prior is not None:
             return why_not
         count = int(attempt.inliers.sum())
-        if self._most_agree(attempt) or self._agrees_closely(attempt):
+        if self.most_agree(attempt) or self._agrees_closely(attempt):
             return ""
         visible = int(attempt.measurement.visible.sum())
         return f"{count} of {visible} points agree, but only by {attempt.estimate.sigma_px:.1f} px"
 
-    def _most_agree(self, attempt: Attempt) -> bool:
+    def most_agree(self, attempt: Attempt) -> bool:
+        """Whether half of all points agree."""
         return int(attempt.inliers.sum()) >= MOST_AGREE * len(attempt.inliers)
+
+    def partly_hidden(self, attempt: Attempt) -> bool:
+        """Whether something else seems to be before the object."""
+        return int(attempt.inliers.sum()) < UNHIDDEN * int(attempt.measurement.visible.sum())
 
     def _agrees_closely(self, attempt: Attempt) -> bool:
         usual = np.nan_to_num(self._usual_px)  # 0 where it was never followed yet
@@ -97,14 +114,19 @@ class Recovery:
             return None, f"{why_lost}; only {matches} features of the reference view were found again"
         if found is None:
             return None, why_lost
+        other = self.another(picture, found, clock)
+        if other is not None:
+            counts = f"{int(found.inliers.sum())} and {int(other.inliers.sum())} points agree"
+            return None, f"{why_lost}; {TWO_PLACES}, where {counts}"
+        return found, ""
+
+    def another(self, picture: Picture, found: Attempt, clock: StageClock) -> Attempt | None:
+        """Another one like the object that was found, elsewhere in the frame; None if there is none."""
         with clock.stage("recover"):
             covered = self._reference.covered(found.estimate.state)
             elsewhere = np.where(covered, 0, 255).astype(np.uint8)
-        other, _ = self._find(picture, shapes, elsewhere, clock)
-        if other is not None and self._apart(found, other):
-            counts = f"{int(found.inliers.sum())} and {int(other.inliers.sum())} points agree"
-            return None, f"{why_lost}; it could be in two places, where {counts}"
-        return found, ""
+        other, _ = self._find(picture, self._shapes(found.estimate.state.parameters), elsewhere, clock)
+        return other if other is not None and self._apart(found, other) else None
 
     def _find(
         self, picture: Picture, shapes: list[Array], mask: NDArray[np.uint8] | None, clock: StageClock

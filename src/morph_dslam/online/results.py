@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,9 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.online.binding import DrawnSurface
 from morph_dslam.online.confidence import largest_displacement, largest_von_mises
 from morph_dslam.online.estimation import State
-from morph_dslam.online.frame_result import HAS_MOVED, REFERENCE_WORSE, STAGES, UNEXPLAINED, FrameResult
-from morph_dslam.online.observability import UNTOLD_SHARE, one_value, statement, untold_in_run
-from morph_dslam.online.reference_misfit import CLEARLY_WORSE
+from morph_dslam.online.frame_result import STAGES, FrameResult
+from morph_dslam.online.observability import one_value
+from morph_dslam.online.run_flags import flags
 
 Array = NDArray[np.float64]
 FORMAT = "morph-dslam run"
@@ -207,61 +206,6 @@ def summarise(run: RunResults) -> dict[str, Any]:
     return summary | {"flags": flags(run)}
 
 
-def flags(run: RunResults) -> list[str]:
-    """What a reader of the results must know."""
-    found = []
-    lost = Counter(result.status for result in run.results)["lost"]
-    if lost:
-        found.append(f"{lost} of {len(run)} frames were lost; their reasons are in frames.csv")
-    found += _flags_of_place(run)
-    failed = sum(UNEXPLAINED in result.reason for result in run.results)
-    if failed:
-        largest = float(np.nanmax(run.unexplained_px()))
-        found.append(
-            f"{UNEXPLAINED} in {failed} of {len(run)} frames: up to {largest:.1f} px are left that "
-            "neighbouring points have in common; it may be a model of something else, or too stiff, or "
-            "a wrong camera file"
-        )
-    worse = max((result.reference_worse for result in run.results), default=1.0)
-    if worse > CLEARLY_WORSE:
-        found.append(
-            f"{REFERENCE_WORSE}: {worse:.1f} times what it was taken to be known to, and the deviations are "
-            "that much wider; check the landmarks and whether the object has the model's dimensions"
-        )
-    found += _at_bound(run)
-    return found + _untold(run)
-
-
-def _at_bound(run: RunResults) -> list[str]:
-    """Parameters that the images put to an end of their range."""
-    found = []
-    with np.errstate(invalid="ignore"):
-        determined = run.parameter_std() < UNTOLD_SHARE * (run.model.upper - run.model.lower)
-    for k, parameter in enumerate(run.model.parameters):
-        count = int((run.at_bound()[:, k] & determined[:, k]).sum())
-        if count:
-            found.append(
-                f"parameter '{parameter.name}' is at a bound of the model's range in {count} frames: "
-                "the object may be outside what the model covers"
-            )
-    return found
-
-
-def _untold(run: RunResults) -> list[str]:
-    """What the images do not tell; of what is one per sequence, only after the last frame."""
-    parameters, estimates = run.model.parameters, [r.estimate for r in run.results if r.estimate]
-    constant = {k for k, p in enumerate(parameters) if p.name in run.per_sequence}
-    found = [
-        statement(parameters, part, f"in {count} frames")
-        for indices, (count, part) in untold_in_run(parameters, estimates).items()
-        if not constant.issuperset(indices)
-    ]
-    for indices, (_, part) in untold_in_run(parameters, estimates[-1:]).items():
-        if constant.issuperset(indices):
-            found.append(statement(parameters, part, "of the whole sequence"))
-    return found
-
-
 def values_over_the_sequence(run: RunResults) -> list[dict[str, object]]:
     """Value, standard deviation and 95 % interval of each parameter that is one over the sequence."""
     last = next((r.estimate for r in reversed(run.results) if r.estimate), None)
@@ -272,23 +216,6 @@ def values_over_the_sequence(run: RunResults) -> list[dict[str, object]]:
         for k, parameter in enumerate(run.model.parameters)
         if parameter.name in run.per_sequence
     ]
-
-
-def _flags_of_place(run: RunResults) -> list[str]:
-    """What a reader must know of an anchored object."""
-    found, hidden = [], int(run.hidden.sum())
-    if hidden:
-        found.append(
-            f"the object was hidden in {hidden} of {len(run)} frames: its pose there is the map's, its "
-            "parameters are not known"
-        )
-    moved = [frame for frame, r in zip(run.frames, run.results, strict=True) if HAS_MOVED in r.reason]
-    if moved:
-        found.append(
-            f"{HAS_MOVED} in {len(moved)} frames, first in frame {moved[0]}: there its points alone tell "
-            "its pose; register it again to use the map"
-        )
-    return found
 
 
 def write_summary(path: Path, run: RunResults, extra: dict[str, Any]) -> dict[str, Any]:

@@ -29,8 +29,9 @@ class TrackerOptions:
     search_above_px, searches : where the residuals' spread exceeds this, so many other shapes are tried in
         the frame as starts, in turn, lest the estimate stay in a local minimum.
     least_inliers, least_share : points that must support it, as a number or a share of all, if that is fewer.
-    least_anchored, anchored_share, anchored_sigma_px : where the map tells the pose, fewer points will do: at
-        least this many, if they are this share of the points found and their residuals spread less than this.
+    few_sigma_px : where less than half of all points support it, their residuals must spread less than this.
+    least_anchored, anchored_share : where the map tells the pose, fewer points will do: at least this many,
+        if they are this share of the points found and agree as closely as few must.
     hold_pose : take the pose from the map as exact, and estimate the parameters only.
     moved_share, moved_sigmas, moved_patience : an anchored object has moved when its points show it farther
         off than this share of its size, and than so many standard deviations, in so many frames on end.
@@ -51,9 +52,9 @@ class TrackerOptions:
     inlier_px: tuple[float, float] = (2.0, 8.0)
     least_inliers: int = 30
     least_share: float = 0.3
+    few_sigma_px: float = 1.0
     least_anchored: int = 12
     anchored_share: float = 0.7
-    anchored_sigma_px: float = 1.0
     hold_pose: bool = False
     moved_share: float = 0.02
     moved_sigmas: float = 5.0
