@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import ModelFileError, RegistrationError
+from morph_dslam.evaluation.model_summary import summarise_model
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField, load_model, save_model
 from morph_dslam.model.basis_functions import chebyshev_basis, fourier_basis
 from morph_dslam.model.functions import ParameterFunctions
@@ -83,6 +84,13 @@ def test_a_turned_model_is_kept_in_a_file(tmp_path):
     assert [parameter.name for parameter in loaded.parameters] == ["load", "turn"]
     np.testing.assert_allclose(loaded.positions(mu), turned.positions(mu), atol=1e-8)
     assert loaded.displacement.n_floats == turned.displacement.n_floats
+
+
+def test_a_turned_model_is_described_as_any_other():
+    turned = turned_model(bent_tube(), AXIS)
+    rows = {row[0]: row[1:] for row in summarise_model(turned)["fields"].rows}
+    assert rows["displacement"][:2] == [str(turned.displacement.n_modes), "products"]
+    assert rows["Cauchy stress"][1] == "products"
 
 
 def test_a_block_cannot_be_turned():

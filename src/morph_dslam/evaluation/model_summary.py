@@ -13,6 +13,7 @@ from morph_dslam.evaluation.field_names import field_title
 from morph_dslam.evaluation.report import Table
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.model.functions import ParameterFunctions
+from morph_dslam.model.product_functions import ProductFunctions
 from morph_dslam.model.stacked_functions import StackedFunctions
 from morph_dslam.model.tensor_functions import CPFunctions, TensorTrainFunctions, TuckerFunctions
 
@@ -26,6 +27,7 @@ _FORMATS = {
     TuckerFunctions: "Tucker",
     TensorTrainFunctions: "tensor train",
     StackedFunctions: "by component",
+    ProductFunctions: "products",
 }
 #: Long lists of the reduction, which the build's report draws.
 _DRAWN = ("singular_values", "cross_validation")
