@@ -179,6 +179,11 @@ def test_an_anchored_object_before_two_cameras(recording, tmp_path, capsys):
     assert (locate_ms(tmp_path / "run") > 0.0).all()
     found, expected = load_run(tmp_path / "run").parameters, truth["wedge"]["parameters"][SCAN - 1 :]
     np.testing.assert_allclose(found, expected, atol=0.4e-3)
+    # What is the same in all frames, from the map and the registration, is in the deviations.
+    assert (np.abs(found - expected) < 3.0 * column(tmp_path / "run", "parameter_std") + 0.02e-3).all()
+    exact = truth["wedge"]["camera_from_object"][SCAN - 1 :, :3, 3]
+    apart = np.abs(load_run(tmp_path / "run").camera_from_object[:, :3, 3] - exact)
+    assert (apart < 3.0 * column(tmp_path / "run", "pose_std")[:, 3:]).all()
 
 
 def covered(folder, truth, target, number, frames):

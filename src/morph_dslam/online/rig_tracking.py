@@ -23,6 +23,7 @@ from morph_dslam.online.known_pose import KnownPose
 from morph_dslam.online.measurement_noise import RigMeasured
 from morph_dslam.online.pipeline import Tracker
 from morph_dslam.online.rig import RigCamera, RigEstimator
+from morph_dslam.online.rig_reference import RigReference
 from morph_dslam.online.temporal import new_filter
 from morph_dslam.online.timing import StageClock
 from morph_dslam.online.tracker_options import TrackerOptions
@@ -40,6 +41,7 @@ class RigTracker:
     ----------
     cameras : of the rig. references : by camera, the reference frame, of one instant; see `Tracker`.
     state : of the object in them, its pose in the rig's frame (the first camera's).
+    reference_covariance : (d + 6, d + 6) of ``state``; None where nothing is known of its error.
 
     Raises
     ------
@@ -55,6 +57,7 @@ class RigTracker:
         state: State,
         options: TrackerOptions | None = None,
         in_sequence: bool = True,
+        reference_covariance: NDArray[np.float64] | None = None,
     ) -> None:
         self.model, self.cameras, self.options = model, tuple(cameras), options or TrackerOptions()
         self.trackers = [
@@ -63,6 +66,7 @@ class RigTracker:
         ]
         self.estimator = RigEstimator(model, self.cameras, self.options.estimation)
         self._filter = new_filter(self.estimator, self.options)
+        self._reference = RigReference(self.trackers, self.cameras, reference_covariance)
         self._sigma_px = FIRST_SIGMA_PX
 
     def process_frame(self, images: Sequence[Image], known: KnownPose | None = None) -> FrameResult:
@@ -125,7 +129,8 @@ class RigTracker:
         estimate = self.estimator.fit(measured, estimate.state, prior)
         if np.isfinite(estimate.sigma_px):
             self._sigma_px = max(estimate.sigma_px, LEAST_SIGMA_PX)
-        return self._filter.fuse(measured, estimate, prior), measured, ""
+        estimate = self._filter.fuse(measured, estimate, prior)
+        return self._reference.added(estimate, measured, prior), measured, ""
 
     def _agreeing(self, measured: RigMeasured, estimate: Estimate) -> RigMeasured:
         """Without points that are far from the estimate, and without cameras of which most are."""

@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.model import SurfacePoints
+from morph_dslam.online.dimension_check import DimensionCheck
 from morph_dslam.online.estimation import BoundPoints, Estimate, Estimator, Prior, State
 from morph_dslam.online.reference_misfit import ReferenceMisfit
 from morph_dslam.online.reprojection import project_with_jacobian
 from morph_dslam.online.robust_covariance import EIGENVALUE_FLOOR
-from morph_dslam.online.state import moved
 
 Array = NDArray[np.float64]
 
@@ -39,8 +39,6 @@ ALIKE_SHARE, PAIR_SHARE = 0.75, 0.5
 UNEXPLAINED_PX = 0.5
 #: An estimate that takes up more of the model's error leaves too little to tell how large it is.
 LEAST_LEFT = 0.02
-#: A reference whose points' places deviate by more than this share of the object's size is known vaguely.
-VAGUE_SHARE = 0.003
 #: A triangle seen so much flatter in the reference view than in another says nothing of the motion there.
 LARGEST_STRETCH = 5.0
 
@@ -85,10 +83,9 @@ class SystematicErrors:
         known = covariance is not None and np.isfinite(covariance).all()
         self._root = _root(covariance, estimator.scale) if known and covariance is not None else None
         self._misfit = ReferenceMisfit()
-        size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
-        self._is_vague = _spread(points, reference, self._root) > VAGUE_SHARE * size
         self._corners = _corners(estimator, points)
         self._jacobian = self._project(points, reference)[1]
+        self._dimensions = DimensionCheck(points, reference, self._jacobian, estimator.scale)
         self._edges = _edges(estimator.camera, self._corners, reference)
         places = self._project(points, reference)[0]
         # Coordinate by coordinate: sums over an axis of two cost numpy most of the time that a view takes.
@@ -103,7 +100,7 @@ class SystematicErrors:
         """What the model leaves of the residuals of the points ``used`` (p,)."""
         residuals = np.where(used[:, None], estimate.residuals[: len(used)], 0.0)
         total = float(np.sum(residuals**2)) / max(2 * int(used.sum()), 1)
-        common = _in_common(residuals[:, :, None], self._pairs_of(used))
+        common = float(_in_common(residuals[:, :, None], self._pairs_of(used))[0, 0])
         return Unexplained(float(np.sqrt(max(common, 0.0))), float(np.sqrt(total)))
 
     @property
@@ -113,8 +110,8 @@ class SystematicErrors:
 
     @property
     def is_unchecked(self) -> bool:
-        """Whether the reference is known vaguely, and no frame so far could show if as well as stated."""
-        return self._is_vague and not self._misfit.is_told
+        """Whether no frame so far could have shown that the object has not got the model's dimensions."""
+        return self._root is not None and not self._dimensions.is_done
 
     def added(
         self,
@@ -133,29 +130,52 @@ class SystematicErrors:
             as of `unexplained`.
         learns : whether the residuals are the object's, so that they tell how well the reference is known.
         """
+        usable, jacobian, scores = self._scores(estimate, used)
+        hessian = np.tensordot(scores, jacobian, axes=([0, 1], [0, 1]))
+        if prior is not None:
+            hessian = hessian + prior.terms(estimate.state)[1]
+        gain = inverse_of_seen(hessian, self._estimator.scale)
+        covariance, pairs = estimate.covariance.copy(), self._pairs_of(usable)
+        if self._root is not None:
+            warps = self._warps(estimate.state)
+            moved = warps @ (self._jacobian @ self._root)
+            transfer = gain @ np.tensordot(scores, moved, axes=([0, 1], [0, 1]))
+            if learns:
+                residuals = np.where(usable[:, None], estimate.residuals[: len(used)], 0.0)
+                left = np.where(usable[:, None, None], moved - jacobian @ transfer, 0.0)
+                shown, expected = (np.trace(_in_common(x, pairs)) for x in (residuals[:, :, None], left))
+                self._misfit.learn(float(shown), float(expected))
+                stretched = self._dimensions.moved(estimate.state, jacobian, warps)
+                taken = gain @ np.tensordot(scores, stretched, axes=([0, 1], [0, 1]))
+                left = np.where(usable[:, None, None], stretched - jacobian @ taken, 0.0)
+                self._dimensions.learn(_in_common(left, pairs))
+            covariance += self._misfit.factor * transfer @ transfer.T
+        spread = (self._alike @ scores.reshape(len(scores), -1)).reshape(scores.shape)
+        together = np.asarray(np.tensordot(scores, spread, axes=([0, 1], [0, 1])), dtype=np.float64)
+        of_model = gain @ together @ gain
+        share = self._share_left(jacobian, spread @ gain, of_model, pairs)
+        covariance += alike_px**2 / share * of_model
+        return replace(estimate, covariance=covariance)
+
+    def pushed(self, estimate: Estimate, used: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """How the points ``used`` (p,) determine the estimate, and how the reference's error enters by them.
+
+        Both (d + 6, d + 6): J' W J, and J' W M J0, the gradient by an error of the reference state.
+        """
+        _, jacobian, scores = self._scores(estimate, used)
+        carried = self._warps(estimate.state) @ self._jacobian
+        hessian, push = (np.tensordot(scores, rows, axes=([0, 1], [0, 1])) for rows in (jacobian, carried))
+        return hessian, push
+
+    def _scores(self, estimate: Estimate, used: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], Array, Array]:
+        """Which points (p,) count, their pixels' derivatives (p, 2, d + 6), and these times the weights."""
         _, jacobian = self._project(self._points, estimate.state)
         length = np.linalg.norm(estimate.residuals[: len(used)], axis=1)
         usable = used & np.isfinite(length) & np.isfinite(jacobian).all(axis=(1, 2))
         huber = self._estimator.options.huber_px
         weights = np.where(usable, np.minimum(1.0, huber / np.maximum(length, 1e-300)), 0.0)
         jacobian = np.where(usable[:, None, None], jacobian, 0.0)
-        scores = weights[:, None, None] * jacobian
-        hessian = np.tensordot(scores, jacobian, axes=([0, 1], [0, 1]))
-        gain = self._inverse(hessian if prior is None else hessian + prior.terms(estimate.state)[1])
-        covariance, pairs = estimate.covariance.copy(), self._pairs_of(usable)
-        if self._root is not None:
-            moved = self._warps(estimate.state) @ (self._jacobian @ self._root)
-            transfer = gain @ np.tensordot(scores, moved, axes=([0, 1], [0, 1]))
-            if learns:
-                residuals = np.where(usable[:, None], estimate.residuals[: len(used)], 0.0)
-                left = np.where(usable[:, None, None], moved - jacobian @ transfer, 0.0)
-                self._misfit.learn(_in_common(residuals[:, :, None], pairs), _in_common(left, pairs))
-            covariance += self._misfit.factor * transfer @ transfer.T
-        spread = (self._alike @ scores.reshape(len(scores), -1)).reshape(scores.shape)
-        of_model = gain @ np.tensordot(scores, spread, axes=([0, 1], [0, 1])) @ gain
-        share = self._share_left(jacobian, spread @ gain, of_model, pairs)
-        covariance += alike_px**2 / share * of_model
-        return replace(estimate, covariance=covariance)
+        return usable, jacobian, weights[:, None, None] * jacobian
 
     def _pairs_of(self, used: NDArray[np.bool_]) -> Array:
         """1 for pairs of points (p, p) that are compared, 0 for others."""
@@ -181,14 +201,6 @@ class SystematicErrors:
             functions, pose.rotation, pose.translation, points.rest, points.field.modes, intrinsics
         )
 
-    def _inverse(self, hessian: Array) -> Array:
-        """H^-1; nothing moves along what neither the images nor the prior determine."""
-        scale = self._estimator.scale
-        values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
-        seen = values > max(values[-1], 1e-30) * EIGENVALUE_FLOOR
-        inverse = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T
-        return inverse * np.outer(scale, scale)
-
     def _warps(self, state: State) -> Array:
         """How pixels (p, 2, 2) move in a view where they move by one in the reference view."""
         before, now = self._edges, _edges(self._estimator.camera, self._corners, state)
@@ -202,24 +214,25 @@ class SystematicErrors:
         return np.where(usable[:, None, None], warps, 0.0)
 
 
+def inverse_of_seen(hessian: Array, scale: Array) -> Array:
+    """H^-1 (n, n); nothing moves along what neither the images nor a prior determine."""
+    values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
+    seen = values > max(values[-1], 1e-30) * EIGENVALUE_FLOOR
+    inverse = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T
+    return np.asarray(inverse * np.outer(scale, scale), dtype=np.float64)
+
+
 def _root(covariance: Array, scale: Array) -> Array:
     """L (n, n) with L L' = ``covariance``, which may be singular; in unknowns divided by ``scale``."""
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     return scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-def _spread(points: BoundPoints, reference: State, root: Array | None) -> float:
-    """Root mean square deviation of the points in the reference view, metres; 0 where nothing is known."""
-    if root is None:
-        return 0.0
-    places = np.array([points.in_camera(moved(reference, step)) for step in root.T])
-    return float(np.sqrt(np.sum((places - points.in_camera(reference)) ** 2) / len(points)))
-
-
-def _in_common(rows: Array, pairs: Array) -> float:
-    """Mean product of what two points of a pair (p, p) have in (p, 2, k), a coordinate, summed over k."""
+def _in_common(rows: Array, pairs: Array) -> Array:
+    """Mean products (k, k), a coordinate, of what the two points of a pair (p, p) have in (p, 2, k)."""
     beside = (pairs @ rows.reshape(len(rows), -1)).reshape(rows.shape)
-    return float(np.sum(rows * beside)) / max(2.0 * float(pairs.sum()), 1.0)
+    found = np.tensordot(rows, beside, axes=([0, 1], [0, 1])) / max(2.0 * float(pairs.sum()), 1.0)
+    return np.asarray(found, dtype=np.float64)
 
 
 def _corners(estimator: Estimator, points: BoundPoints) -> BoundPoints:

@@ -67,7 +67,13 @@ def track_rig(options: TrackOptions, others: Sequence[Path]) -> dict[str, Any]:
     setup.warm_up(placement, begin.picture)
     tracked_with = setup.tracker_options(placement)
     tracker = RigTracker(
-        placement.model, cameras, references, placement.state, tracked_with, begin.in_sequence
+        placement.model,
+        cameras,
+        references,
+        placement.state,
+        tracked_with,
+        begin.in_sequence,
+        placement.covariance,
     )
     first = setup.new_chain(placement, begin.picture, begin.in_sequence)
     run = RunResults(placement.model, begin.frame, per_sequence=tracked_with.per_sequence)
