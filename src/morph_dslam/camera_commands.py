@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from morph_dslam.command_arguments import frame_range
+from morph_dslam.command_arguments import frame_number, frame_range
 
 
 def _slam(arguments: argparse.Namespace) -> None:
@@ -101,7 +101,10 @@ def _add_slam(add: Callable[..., argparse.ArgumentParser]) -> None:
         help="with --map or --trajectory: let the map grow, instead of keeping it as it is",
     )
     slam.add_argument(
-        "--freeze-at", type=int, metavar="N", help="from this frame on keep the map and only find the camera"
+        "--freeze-at",
+        type=frame_number,
+        metavar="N",
+        help="from this frame on keep the map and only find the camera",
     )
     slam.add_argument(
         "--freeze-when-deforming",

@@ -16,7 +16,8 @@ from pathlib import Path
 
 from morph_dslam import __version__
 from morph_dslam.camera_commands import add_camera_commands
-from morph_dslam.errors import EvaluationError, MorphError
+from morph_dslam.command_arguments import positive_integer
+from morph_dslam.errors import EvaluationError, MorphError, StudyError
 from morph_dslam.inner_commands import add_inner_commands
 from morph_dslam.live_commands import add_live_commands
 from morph_dslam.registration_commands import add_registration_commands
@@ -33,6 +34,8 @@ def _build(arguments: argparse.Namespace) -> None:
     from morph_dslam.offline.report.reference_curve import read_reference_curve
     from morph_dslam.offline.stability import stability_warnings
 
+    if arguments.output.is_dir():
+        raise StudyError(f"{arguments.output} is a folder: give the name of the model file to write")
     reference = None if arguments.reference_curve is None else read_reference_curve(arguments.reference_curve)
     if arguments.scheduler is None:
         cluster = nullcontext()
@@ -68,7 +71,16 @@ def _info(arguments: argparse.Namespace) -> None:
             print(f"  {line}")
 
 
+def _check_evaluation(arguments: argparse.Namespace) -> None:
+    """Refuse options that would have no effect."""
+    if arguments.depth is None and (arguments.base_frame, arguments.depth_per_metre) != (None, None):
+        raise EvaluationError("--base-frame and --depth-per-metre go with --depth: leave them out")
+    if arguments.points is None and arguments.bind_frame is not None:
+        raise EvaluationError("--bind-frame goes with --points: leave it out")
+
+
 def _evaluate(arguments: argparse.Namespace) -> None:
+    _check_evaluation(arguments)
     if arguments.trajectory is not None:
         from morph_dslam.evaluation.trajectory_report import evaluate_trajectory, trajectory_line
 
@@ -138,7 +150,9 @@ def _add_offline_commands(commands: argparse._SubParsersAction) -> None:
         "-o", "--output", type=Path, required=True, metavar="MODEL", help="model file to write"
     )
     where = build.add_mutually_exclusive_group()
-    where.add_argument("--workers", type=int, metavar="N", help="processes to solve in (default: one a core)")
+    where.add_argument(
+        "--workers", type=positive_integer, metavar="N", help="processes to solve in (default: one a core)"
+    )
     where.add_argument(
         "--scheduler",
         metavar="ADDRESS",

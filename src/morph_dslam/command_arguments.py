@@ -20,6 +20,31 @@ def frame_range(text: str) -> tuple[int | None, int | None]:
     return numbers
 
 
+def positive_number(text: str) -> float:
+    """A number above zero, not infinite."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number above zero")
+    return value
+
+
+def positive_integer(text: str) -> int:
+    """A whole number above zero."""
+    if not text.isdecimal() or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number above zero")
+    return int(text)
+
+
+def frame_number(text: str) -> int:
+    """A frame number, from zero on."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"'{text}' is not a frame number")
+    return int(text)
+
+
 def named_value(text: str) -> tuple[str, float]:
     """A name and a positive number, "NAME=VALUE"."""
     name, _, number = text.partition("=")

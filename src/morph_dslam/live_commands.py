@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 
-from morph_dslam.command_arguments import frame_range
+from morph_dslam.command_arguments import frame_range, positive_number
 from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.tracking_commands import add_object_arguments, drawing, object_arguments
 
@@ -60,7 +60,9 @@ def add_live_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         metavar="PORT",
         help="show the pictures to browsers on this computer (0: any port)",
     )
-    live.add_argument("--seconds", type=float, metavar="S", help="how long (default: until it ends)")
+    live.add_argument(
+        "--seconds", type=positive_number, metavar="S", help="how long (default: until it ends)"
+    )
     live.add_argument(
         "--range",
         type=frame_range,

@@ -95,6 +95,8 @@ def calibrate(
     SourceError
         If an image or a video cannot be read.
     """
+    if output.suffix not in (".yaml", ".yml"):
+        raise CameraError(f"cannot write {output}: a camera file has the ending .yaml")
     if not output.parent.is_dir():
         raise CameraError(f"cannot write {output}: there is no folder {output.parent}")
     picture = picture_path(output)

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from morph_dslam.errors import EvaluationError
 from morph_dslam.evaluation.model_summary import flatten, summarise_model
 from morph_dslam.evaluation.report import Link, Picture, Section, Table, Text, write_report
 from morph_dslam.evaluation.run_folder import Run
@@ -86,9 +87,21 @@ def _lost_section(run: Run) -> Section:
     )
 
 
+def _summary(path: Path) -> dict[str, Any]:
+    """The content of a run's summary, none where there is no file; raises EvaluationError if damaged."""
+    if not path.is_file():
+        return {}
+    try:
+        content = json.loads(path.read_text())
+    except ValueError as error:
+        raise EvaluationError(f"{path} is damaged ({error}): restore it, or track again") from error
+    if not isinstance(content, dict):
+        raise EvaluationError(f"{path} is not the summary of a run: restore it, or track again")
+    return content
+
+
 def _tracking_sections(run: Run) -> list[Section]:
-    path = run.folder / "summary.json"
-    summary = json.loads(path.read_text()) if path.is_file() else {}
+    summary = _summary(run.folder / "summary.json")
     flags = [Text(str(flag), warning=True) for flag in summary.pop("flags", [])]
     background = {key: summary.pop(key) for key in ("inputs", "settings", "versions") if key in summary}
     facts = flatten({key: value for key, value in summary.items() if key not in _SHOWN_ABOVE})
@@ -100,7 +113,13 @@ def _tracking_sections(run: Run) -> list[Section]:
 
 
 def write_run_report(run: Run, figures: Mapping[str, Any]) -> Path:
-    """Write ``report.html`` into a run folder; ``figures`` are those of ``evaluation.json``."""
+    """Write ``report.html`` into a run folder; ``figures`` are those of ``evaluation.json``.
+
+    Raises
+    ------
+    EvaluationError
+        If the run's summary is damaged.
+    """
     tracking, settings = _tracking_sections(run)
     sections = [
         _error_section(run, figures),

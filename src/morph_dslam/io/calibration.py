@@ -25,15 +25,18 @@ from morph_dslam.io.colmap import read_cameras
 from morph_dslam.io.opencv_yaml import read_opencv_yaml
 from morph_dslam.lens import LensModel
 
+#: No focal length or principal point is meant by what is larger, pixels.
+LARGEST_PX = 1e7
+
 
 class _CameraFile(BaseModel):
     model_config = ConfigDict(extra="forbid")
     width: int = Field(gt=0)
     height: int = Field(gt=0)
-    fx: float = Field(gt=0, allow_inf_nan=False)
-    fy: float = Field(gt=0, allow_inf_nan=False)
-    cx: float = Field(allow_inf_nan=False)
-    cy: float = Field(allow_inf_nan=False)
+    fx: float = Field(gt=0, lt=LARGEST_PX)
+    fy: float = Field(gt=0, lt=LARGEST_PX)
+    cx: float = Field(gt=-LARGEST_PX, lt=LARGEST_PX)
+    cy: float = Field(gt=-LARGEST_PX, lt=LARGEST_PX)
     distortion: list[FiniteFloat] = []
     lens: str = "radial-tangential"
 

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from morph_dslam.errors import RegistrationError
 
 Array = NDArray[np.float64]
+#: No millimetres or pixels are meant by what is larger.
+LARGEST = 1e7
 HEADER = ("x_mm", "y_mm", "z_mm", "u_px", "v_px")
 
 
@@ -34,7 +36,7 @@ def load_landmarks(path: Path) -> Landmarks:
     Raises
     ------
     RegistrationError
-        If the file is missing, has another header, or a value is not a finite number.
+        If the file is missing, has another header, or a value is no number, or one that cannot be meant.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
@@ -55,7 +57,7 @@ def _values(path: Path, number: int, row: list[str]) -> list[float]:
         values = [float(cell) for cell in row]
     except ValueError:
         values = []
-    if len(values) != len(HEADER) or not np.isfinite(values).all():
+    if len(values) != len(HEADER) or not (np.abs(values) < LARGEST).all():
         raise RegistrationError(
             f"{path}: landmark {number} is '{','.join(row)}'; give {len(HEADER)} numbers: {','.join(HEADER)}"
         )

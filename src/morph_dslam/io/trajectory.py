@@ -16,6 +16,8 @@ from morph_dslam.geometry import RigidTransform
 
 Array = NDArray[np.float64]
 
+#: Larger values are not meant: timestamps in nanoseconds are smaller.
+LARGEST = 1e20
 #: Quaternions and matrices are written with few digits; more than this off, they are no rotations.
 ROTATION_TOLERANCE = 0.02
 
@@ -153,8 +155,8 @@ def _numbers(words: list[str], where: str) -> Array:
         values = np.array([float(word) for word in words])
     except ValueError as error:
         raise TrajectoryError(f"{where}: {error}") from error
-    if not np.isfinite(values).all():
-        raise TrajectoryError(f"{where} holds a value that is not finite")
+    if not (np.abs(values) < LARGEST).all():
+        raise TrajectoryError(f"{where} holds a value that is not finite, or larger than {LARGEST:g}")
     return values
 
 

@@ -6,6 +6,7 @@ nothing to the mechanics: a stiff inclusion belongs into the solid's own mesh.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -88,11 +89,22 @@ class InnerStructure:
 
 
 def save_inner_structure(path: Path, structure: InnerStructure) -> None:
-    """Write a file that `load_inner_structure` reads."""
-    with h5py.File(path, "w") as file:
-        file.attrs.update({"format": FORMAT, "version": VERSION, "name": structure.name})
-        file["rest"], file["triangles"] = structure.rest, structure.triangles
-        file["corners"], file["weights"] = structure.points.corners, structure.points.weights
+    """Write a file that `load_inner_structure` reads.
+
+    Raises
+    ------
+    ModelFileError
+        If it cannot be written.
+    """
+    try:
+        with h5py.File(path, "w") as file:
+            file.attrs.update({"format": FORMAT, "version": VERSION, "name": structure.name})
+            file["rest"], file["triangles"] = structure.rest, structure.triangles
+            file["corners"], file["weights"] = structure.points.corners, structure.points.weights
+    except OSError as error:
+        # The library's own message is of several lines.
+        reason = os.strerror(error.errno) if error.errno else "is the disk full?"
+        raise ModelFileError(f"cannot write the inner structure {path}: {reason}") from error
 
 
 def load_inner_structure(path: Path) -> InnerStructure:

@@ -34,12 +34,15 @@ class PlaceInMap:
     @classmethod
     def from_content(cls, content: dict[str, Any]) -> PlaceInMap:
         """From the content of a registration.json; raises KeyError, TypeError or ValueError if it is none."""
-        matrix = np.array(content["world_from_object"], dtype=np.float64)
-        scale, covariance = float(content["map_units_per_metre"]), content["covariance"]
+        matrix, scale = (
+            numbers_of(content["world_from_object"], (4, 4)),
+            float(content["map_units_per_metre"]),
+        )
+        covariance = content["covariance"]
         return cls(
             SimilarityTransform(scale, matrix[:3, :3] / scale, matrix[:3, 3]),
-            np.array(content["mean_node_m"], dtype=np.float64),
-            None if covariance is None else np.array(covariance, dtype=np.float64),
+            numbers_of(content["mean_node_m"], (3,)),
+            None if covariance is None else numbers_of(covariance, (7, 7)),
         )
 
     def slopes(self, pose: RigidTransform) -> Array:
@@ -83,3 +86,11 @@ class PlaceInMap:
         values, vectors = np.linalg.eigh(self.covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         return KnownPose(pose, by_camera @ camera.covariance @ by_camera.T, self.slopes(pose) @ root)
+
+
+def numbers_of(values: Any, shape: tuple[int, ...]) -> Array:
+    """An array of a registration.json; raises ValueError if it has another shape, or is not finite."""
+    array = np.array(values, dtype=np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"an array of shape {shape} was expected")
+    return array

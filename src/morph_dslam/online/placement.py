@@ -18,7 +18,7 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.model.turned_model import turned_model
 from morph_dslam.online.depth_residuals import DepthOptions
 from morph_dslam.online.estimation import Estimator, State
-from morph_dslam.online.place_in_map import PlaceInMap
+from morph_dslam.online.place_in_map import PlaceInMap, numbers_of
 from morph_dslam.online.reference_depth import refine_by_depth
 from morph_dslam.online.registration import RegistrationOptions, bind_landmarks, register
 
@@ -64,8 +64,11 @@ def load_placement(path: Path, model: ReducedModel) -> Placement:
     try:
         content = json.loads(path.read_text())
         keyframe = max(content["keyframes"], key=lambda entry: entry["frame"])
-        pose = RigidTransform.from_matrix(np.array(keyframe["camera_from_object"], dtype=np.float64))
+        pose = RigidTransform.from_matrix(numbers_of(keyframe["camera_from_object"], (4, 4)))
+        own = keyframe.get("covariance")  # of a keyframe whose pose was adjusted by itself
+        own = None if own is None else numbers_of(own, (6, 6))
         frame, axis = int(keyframe["frame"]), content["axis_of_revolution"]
+        axis = None if axis is None else numbers_of(axis["direction"], (3,))
         facts = {key: content[key] for key in ("score", "runner_up_score", "rms_px", "map_units_per_metre")}
         ambiguous, outline_fits = bool(content["ambiguous"]), bool(content.get("outline_fits", True))
         place = PlaceInMap.from_content(content)
@@ -80,15 +83,14 @@ def load_placement(path: Path, model: ReducedModel) -> Placement:
     elif ambiguous:
         flags.append("registration ambiguous: another place in the map is nearly as good")
     if axis is not None:
-        model = turned_model(model, np.array(axis["direction"]))
+        model = turned_model(model, axis)
         open_angles = (model.parameters[-1].name,)
         flags.append(
             f"the angle about the object's axis cannot be seen before it deforms: it is the parameter "
             f"'{open_angles[0]}'"
         )
     state = State(model.default, pose)
-    own = keyframe.get("covariance")  # of a keyframe whose pose was adjusted by itself
-    of_pose = place.pose_covariance(pose) if own is None else np.array(own, dtype=np.float64)
+    of_pose = place.pose_covariance(pose) if own is None else own
     covariance = None if of_pose is None else _of_state(of_pose, len(model.parameters))
     facts = {"from": "map", **facts}
     return Placement(model, frame, state, facts, tuple(flags), open_angles, covariance, place)

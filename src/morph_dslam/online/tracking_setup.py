@@ -205,6 +205,8 @@ def load_setup(options: ObjectOptions) -> Setup:
         )
     if options.placement is None and options.map_path is not None:
         raise TrackingError("a map needs the object's place in it: --place registration.json")
+    if options.placement is None and options.pose == "fixed":
+        raise TrackingError("a pose is held fixed by a map: give the object's place in it, --place")
     model, camera = load_model(options.model), load_camera(options.camera)
     if options.use_outline and not len(rim(model.triangles)):
         raise TrackingError(

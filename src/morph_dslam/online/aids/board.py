@@ -14,17 +14,16 @@ from typing import Annotated, Any, Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.io.toml_file import read_toml
+from morph_dslam.online.aids.aid_file import Section, Vector, read_aid
 from morph_dslam.online.aids.marker_edges import refined_corners
 
 Array = NDArray[np.float64]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 #: Names of the dictionaries of markers, as in OpenCV without its prefix, in lower case.
 DICTIONARIES = tuple(
@@ -33,20 +32,18 @@ DICTIONARIES = tuple(
 #: Fewer corners are not believed: one marker has four.
 FEWEST_CORNERS = 4
 DOTS_PER_INCH = 300
+#: A side of a print is at most so long, metres: beyond it the unit was mistaken.
+LARGEST_SIDE = 10.0
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-
-class Place(_Section):
+class Place(Section):
     """Where the undeformed object's frame is on the board: origin, and turn about x, then y, then z."""
 
     position_mm: Vector
     rotation_deg: Vector = (0.0, 0.0, 0.0)
 
 
-class BoardFile(_Section):
+class BoardFile(Section):
     """A board file.
 
     A "grid" has ``columns`` x ``rows`` markers of ``marker_mm``, ``gap_mm`` apart; a "charuco" board has so
@@ -72,6 +69,11 @@ class BoardFile(_Section):
             raise ValueError("a charuco board needs square_mm, larger than marker_mm")
         if self.kind == "charuco" and min(self.columns, self.rows) < 3:
             raise ValueError("a charuco board needs 3 x 3 squares at least")
+        pitch = self.marker_mm + (self.gap_mm or 0.0) if self.kind == "grid" else self.square_mm or 0.0
+        if 1e-3 * pitch * max(self.columns, self.rows) > LARGEST_SIDE:
+            raise ValueError(
+                f"the board would be more than {LARGEST_SIDE:g} m long; sizes are in millimetres"
+            )
         return self
 
 
@@ -148,16 +150,10 @@ def load_board(path: Path) -> FiducialBoard:
     RegistrationError
         If it is missing, no TOML, or says something impossible.
     """
-    content = read_toml(path, "board file", RegistrationError)
+    description = read_aid(path, "board file", BoardFile)
+    board = FiducialBoard(description)
     try:
-        description = BoardFile.model_validate(content)
-        board = FiducialBoard(description)
         _ = board._board
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        message = first["msg"].removeprefix("Value error, ")
-        raise RegistrationError(f"{path}: {where}: {message}" if where else f"{path}: {message}") from error
     except cv2.error as error:
         raise RegistrationError(
             f"{path}: the dictionary '{description.dictionary}' has too few markers for "
@@ -191,6 +187,8 @@ def print_board(board: FiducialBoard, path: Path) -> None:
     line = margin + height + 0.01
     axes.plot([margin, margin + length], [line, line], "k|-", linewidth=0.6, markersize=8)
     axes.text(margin + length + 0.003, line, f"{1e3 * length:.0f} mm", fontsize=8, va="center")
+    if path.suffix.lower() not in (".png", ".pdf"):
+        raise RegistrationError(f"cannot write the board to {path}: give it the ending .png or .pdf")
     try:
         figure.savefig(path, dpi=DOTS_PER_INCH)
     except (OSError, ValueError) as error:

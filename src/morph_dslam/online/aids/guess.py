@@ -14,14 +14,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, FiniteFloat, ValidationError
+from pydantic import Field, FiniteFloat
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.io.toml_file import read_toml
 from morph_dslam.model import ReducedModel, SurfacePoints
+from morph_dslam.online.aids.aid_file import Section, Vector, read_aid
 from morph_dslam.online.binding import DrawnSurface, draw_view, view_of
 from morph_dslam.online.estimation import Estimate, EstimationOptions, Estimator
 from morph_dslam.online.placement import Placement
@@ -30,7 +30,6 @@ from morph_dslam.online.state import BoundPoints, State
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
-Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 #: Points of the outline, and how far to either side of it edges are searched in turn, pixels.
 N_POINTS, REACHES, LAST_REACHES = 160, (24, 16, 12, 8, 6, 4), (3, 2, 2)
@@ -47,20 +46,18 @@ N_INDEPENDENT = 6
 GUESS_SHARE = 0.05
 
 
-class Pose(BaseModel):
+class Pose(Section):
     """The object in the camera's frame (x right, y down, z ahead): origin; turn about x, then y, then z."""
 
-    model_config = ConfigDict(extra="forbid")
     position_mm: Vector
     rotation_deg: Vector
 
 
-class GuessFile(BaseModel):
+class GuessFile(Section):
     """A guess: the pose, and values of any of the model's parameters in the units in which it shows them."""
 
-    model_config = ConfigDict(extra="forbid")
     pose: Pose
-    parameters: dict[str, FiniteFloat] = {}
+    parameters: dict[str, FiniteFloat] = Field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -115,12 +112,7 @@ class GuessStart:
 
 def load_guess(path: Path) -> GuessStart:
     """Read a guess; raises RegistrationError if the file is missing or malformed."""
-    content = read_toml(path, "guess", RegistrationError)
-    try:
-        return GuessStart(GuessFile.model_validate(content))
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise RegistrationError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+    return GuessStart(read_aid(path, "guess", GuessFile))
 
 
 class _OutlineSearch:

@@ -8,13 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, FiniteFloat, ValidationError, model_validator
+from pydantic import model_validator
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.io.landmarks import Landmarks
-from morph_dslam.io.toml_file import read_toml
 from morph_dslam.model import ReducedModel
+from morph_dslam.online.aids.aid_file import Section, Vector, read_aid
 from morph_dslam.online.binding import nearest_surface_points
 from morph_dslam.online.estimation import Estimator
 from morph_dslam.online.placement import Placement, place_by_landmarks
@@ -26,7 +26,6 @@ from morph_dslam.sources.images import read_image
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
-Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 N_FEATURES, RATIO = 3000, 0.8
 MATCHING = RelocalisationOptions(pnp_px=6.0, least_matches=15)
@@ -36,20 +35,18 @@ N_SHAPES, N_LANDMARKS, LANDMARK_PX = 9, 60, 0.3
 AMBIGUOUS = 0.5
 
 
-class Rectangle(BaseModel):
+class Rectangle(Section):
     """Where the picture is on the undeformed object: its upper left corner, and its whole edges."""
 
-    model_config = ConfigDict(extra="forbid")
     corner_mm: Vector
     right_mm: Vector
     down_mm: Vector
 
 
-class PictureFile(BaseModel):
+class PictureFile(Section):
     """A picture file: an image, and a rectangle of the object, or ``coordinates``: an .npy array (n, 2) with
     the picture's pixel of each node of the model, NaN where it has none."""
 
-    model_config = ConfigDict(extra="forbid")
     image: str
     rectangle: Rectangle | None = None
     coordinates: str | None = None
@@ -129,13 +126,7 @@ def load_picture(path: Path) -> PictureStart:
     RegistrationError, SourceError
         If one of them is missing or malformed.
     """
-    content = read_toml(path, "picture file", RegistrationError)
-    try:
-        described = PictureFile.model_validate(content)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where, message = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
-        raise RegistrationError(f"{path}: {where}: {message}" if where else f"{path}: {message}") from error
+    described = read_aid(path, "picture file", PictureFile)
     image = read_image(path.parent / described.image, "picture of the print")
     grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
     if described.rectangle is not None:

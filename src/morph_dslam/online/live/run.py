@@ -72,8 +72,10 @@ def run_live(options: LiveOptions) -> dict[str, Any]:
     ------
     MorphError
         If an input cannot be used (ModelFileError, CameraError, SourceError, RegistrationError, MapError), or
-        the run folder holds a run, or the port is taken (TrackingError).
+        the run folder holds a run, depth images are to be used, or the port is taken (TrackingError).
     """
+    if options.of_object.use_depth:
+        raise TrackingError("live tracking takes no depth images: leave out --depth, or use `morph track`")
     setup = load_setup(options.of_object)
     AugmentedView(setup.model, setup.camera, options.drawing)  # says so now if it cannot be drawn
     check_run_folder(options.output, options.overwrite)

@@ -94,6 +94,11 @@ def run_slam(options: SlamRunOptions) -> dict[str, Any]:
         raise MapError("--extend needs the map that is to grow: --map run/map.h5")
     if options.map_path is not None and options.trajectory is not None:
         raise MapError("a map comes either from --map or from --trajectory, not from both")
+    needs_images = options.trajectory is not None or (
+        options.map_path is not None and options.map_path.is_dir()
+    )
+    if options.images is not None and not needs_images:
+        raise MapError("--images says what a COLMAP model (--map MODEL) or poses (--trajectory) are of")
     camera = load_camera_or_pair(options.camera)
     source = open_stream(options.source, options.first, options.last)
     with source if isinstance(source, LiveCamera) else nullcontext():

@@ -1,0 +1,204 @@
+"""What a user gets wrong at the command line: one message that says what to mend, and status 2."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from morph_dslam import cli
+from morph_dslam.errors import EvaluationError, MorphError, RegistrationError
+from morph_dslam.evaluation.run_folder import load_run
+from morph_dslam.evaluation.run_report import write_run_report
+from morph_dslam.io.calibration import load_camera
+from morph_dslam.io.landmarks import load_landmarks
+from morph_dslam.io.trajectory import load_trajectory
+from morph_dslam.model import save_model
+from morph_dslam.online.aids.board import load_board
+from morph_dslam.online.placement import load_placement
+from morph_dslam.online.reregistration import Reregistration
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.block_study import write_study
+from tests.support.run_folders import write_run
+from tests.support.small_models import block_model
+
+BOARD = """
+kind = "grid"
+dictionary = "apriltag_36h11"
+columns = 4
+rows = 3
+marker_mm = 30
+gap_mm = 9
+"""
+STL = "solid t\n{}endsolid t\n".format(
+    "".join(
+        "facet normal 0 0 0\nouter loop\n"
+        + "".join("vertex {} {} {}\n".format(*corner) for corner in corners)
+        + "endloop\nendfacet\n"
+        for corners in (
+            [(40, 40, 40), (50, 60, 40), (60, 40, 40)],
+            [(40, 40, 40), (60, 40, 40), (50, 50, 60)],
+            [(60, 40, 40), (50, 60, 40), (50, 50, 60)],
+            [(50, 60, 40), (40, 40, 40), (50, 50, 60)],
+        )
+    )
+)
+CAMERA = "width: 640\nheight: 480\nfx: 528\nfy: 528\ncx: 319.5\ncy: 239.5\n"
+
+
+def message_of(capsys, *arguments):
+    """The one line with which a command refuses its arguments."""
+    status = cli.main([str(argument) for argument in arguments])
+    lines = capsys.readouterr().err.splitlines()
+    assert status == 2
+    assert len(lines) == 1
+    return lines[0]
+
+
+def refused_by_parser(capsys, *arguments):
+    with pytest.raises(SystemExit) as caught:
+        cli.main([str(argument) for argument in arguments])
+    assert caught.value.code == 2
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "file").write_text("hello\n")
+    (tmp_path / "camera.yaml").write_text(CAMERA)
+    (tmp_path / "board.toml").write_text(BOARD)
+    (tmp_path / "tumour.stl").write_text(STL)
+    save_model(tmp_path / "block.morph", block_model("tucker"))
+    save_model(tmp_path / "sheet.morph", bent_sheet_model(7, 5))
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", ["", "file/t.h5", "absent/t.h5"])
+def test_an_inner_structure_that_cannot_be_written(folder, capsys, name):
+    command = ["inner", folder / "tumour.stl", "--model", folder / "block.morph", "--unit", "mm"]
+    assert cli.main([str(argument) for argument in [*command, "-o", folder / "tumour.h5"]]) == 0
+    capsys.readouterr()
+    assert "cannot write the inner structure" in message_of(capsys, *command, "-o", folder / name)
+
+
+@pytest.mark.parametrize("name", ["board", "board.jpg", "", "absent/board.png", "file/board.pdf"])
+def test_a_board_that_cannot_be_written(folder, capsys, name):
+    before = sorted(folder.parent.iterdir())
+    assert "cannot write the board to" in message_of(
+        capsys, "board", folder / "board.toml", "-o", folder / name
+    )
+    assert sorted(folder.parent.iterdir()) == before
+
+
+def test_a_board_in_the_wrong_unit(folder, capsys):
+    (folder / "board.toml").write_text(BOARD.replace("30", "3e9"))
+    assert "sizes are in millimetres" in message_of(
+        capsys, "board", folder / "board.toml", "-o", folder / "board.png"
+    )
+    (folder / "board.toml").write_text(BOARD + "[object]\nposition_mm = [1e300, 0, 0]\n")
+    with pytest.raises(RegistrationError, match="position_mm"):
+        load_board(folder / "board.toml")
+
+
+def test_a_model_file_is_no_folder_and_workers_are_counted(folder, capsys):
+    study = write_study(folder)
+    assert "give the name of the model file" in message_of(capsys, "build", study, "-o", folder)
+    for workers in ("0", "-1", "two"):
+        said = refused_by_parser(capsys, "build", study, "-o", folder / "b.morph", f"--workers={workers}")
+        assert "is not a whole number above zero" in said
+
+
+def test_a_calibration_is_written_where_it_can_be_read(folder, capsys):
+    command = ["calibrate", folder, "--board", "9x6", "--square", "25 mm", "-o"]
+    assert "has the ending .yaml" in message_of(capsys, *command, folder / "camera.png")
+
+
+@pytest.mark.parametrize("seconds", ["-1", "0", "nan", "inf", "soon"])
+def test_a_length_of_time_is_above_zero(capsys, seconds):
+    command = ["live", "webcam:0", "--model", "m", "--camera", "c", "--landmarks", "l", "-o", "r"]
+    assert "is not a number above zero" in refused_by_parser(capsys, *command, f"--seconds={seconds}")
+
+
+def test_options_without_effect_are_refused(folder, capsys):
+    of_object = ["--model", folder / "sheet.morph", "--camera", folder / "camera.yaml", "--landmarks", "l"]
+    output = ["-o", folder / "run"]
+    said = message_of(capsys, "live", "webcam:0", *of_object, *output, "--depth")
+    assert "live tracking takes no depth images" in said
+    said = message_of(capsys, "track", folder, *of_object, *output, "--pose", "fixed")
+    assert "a pose is held fixed by a map" in said
+    slam = ["slam", folder, "--camera", folder / "camera.yaml", *output]
+    assert "--images says what" in message_of(capsys, *slam, "--images", folder)
+    assert "is not a frame number" in refused_by_parser(capsys, *slam, "--freeze-at=-1")
+    said = message_of(capsys, "evaluate", folder, "--points", "truth.npz", "--base-frame", 0)
+    assert "go with --depth" in said
+    said = message_of(capsys, "evaluate", folder, "--trajectory", "truth.txt", "--bind-frame", 0)
+    assert "goes with --points" in said
+
+
+@pytest.mark.parametrize(
+    ("load", "name", "text"),
+    [
+        (load_camera, "camera.yaml", CAMERA.replace("fx: 528", "fx: 1e300")),
+        (load_camera, "camera.yaml", CAMERA.replace("239.5", "-1e300")),
+        (load_landmarks, "landmarks.csv", "x_mm,y_mm,z_mm,u_px,v_px\n1,2,3,4,1e300\n"),
+        (load_trajectory, "poses.txt", "0 0 0 1e300 0 0 0 1\n"),
+    ],
+)
+def test_numbers_that_cannot_be_meant(tmp_path, load, name, text):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(MorphError, match=name):
+        load(tmp_path / name)
+
+
+def test_frames_to_place_the_object_anew_in_that_cannot_be(tmp_path):
+    setup, placement = SimpleNamespace(aid=object()), SimpleNamespace()
+    with pytest.raises(RegistrationError, match=r"absent\.csv"):
+        Reregistration(setup, placement, [(7, tmp_path / "absent.csv")])
+    assert Reregistration(setup, placement, [(7, None)]).notes == [
+        "not placed anew in frame 7: it was not tracked"
+    ]
+
+
+def test_a_damaged_summary_is_named(tmp_path):
+    write_run(tmp_path)
+    run = load_run(tmp_path)
+    for text in ("", "[]", '{"flags": ['):
+        (tmp_path / "summary.json").write_text(text)
+        with pytest.raises(EvaluationError, match=r"summary\.json"):
+            write_run_report(run, {})
+
+
+REGISTRATION = {
+    "world_from_object": np.eye(4).tolist(),
+    "map_units_per_metre": 1.0,
+    "mean_node_m": [0.0, 0.0, 0.0],
+    "score": 1.0,
+    "runner_up_score": 0.0,
+    "ambiguous": False,
+    "rms_px": 0.1,
+    "covariance": np.eye(7).tolist(),
+    "axis_of_revolution": None,
+    "keyframes": [{"frame": 3, "camera_from_object": np.eye(4).tolist(), "covariance": None}],
+}
+
+
+def test_a_registration_with_parts_of_another_shape(tmp_path):
+    path, model = tmp_path / "registration.json", bent_sheet_model(7, 5)
+    path.write_text(json.dumps(REGISTRATION))
+    assert load_placement(path, model).frame == 3
+    keyframe = REGISTRATION["keyframes"][0]
+    for wrong in (
+        {"world_from_object": [1, 2]},
+        {"mean_node_m": [1, 2]},
+        {"mean_node_m": -3},
+        {"covariance": np.eye(6).tolist()},
+        {"covariance": (np.eye(7) * np.nan).tolist()},
+        {"axis_of_revolution": "z"},
+        {"axis_of_revolution": {"direction": [0, 1]}},
+        {"keyframes": []},
+        {"keyframes": [keyframe | {"camera_from_object": [[1.0]]}]},
+        {"keyframes": [keyframe | {"covariance": [[1.0]]}]},
+    ):
+        path.write_text(json.dumps(REGISTRATION | wrong))
+        with pytest.raises(RegistrationError, match="is not a registration"):
+            load_placement(path, model)
