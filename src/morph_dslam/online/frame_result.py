@@ -36,8 +36,8 @@ RECOVERED = "recovered from the reference view's features"
 UNEXPLAINED = "the model does not explain the images"
 #: Follows the reason of a frame in which few points agree, and less closely than usual.
 FEW_AGREE = "few points agree, and less closely than usual"
-#: Follows the reason of a frame as long as all frames look too much like the reference view to contradict it.
-UNCHECKED = "no other view has checked the reference state yet"
+#: Follows the reason of a frame as long as all frames look too much like the reference view to tell.
+UNCHECKED = "no view so far could show whether the object has the model's dimensions"
 #: Follows the reason of frames by which the reference state is worse known than it was stated.
 REFERENCE_WORSE = "the frames contradict the reference state"
 #: Follows the reason of frames in which the object cannot be told from another one with its print.

@@ -101,6 +101,7 @@ class Tracker:
         self._supported = np.ones(len(reference_view.points), dtype=bool)
         self._last, self._velocity_base, self._start = state, state, state
         self._lost, self._n_lost = not in_sequence, 0
+        self._unchecked = True
         self._look_alikes = LookAlikes(float(np.linalg.norm(np.ptp(model.nodes, axis=0))))
 
     def process_frame(
@@ -304,7 +305,8 @@ class Tracker:
             aside += f"; {UNEXPLAINED}: {left.px:.1f} px are left"
         if systematic.worse > CLEARLY_WORSE:
             aside += f"; {REFERENCE_WORSE}: {systematic.worse:.1f} times what it was taken to be known to"
-        elif systematic.is_unchecked and attempt.prior is None:
+        self._unchecked &= systematic.is_unchecked
+        if self._unchecked and attempt.prior is None:
             aside += f"; {UNCHECKED}"
         return FrameResult(
             "tracked",

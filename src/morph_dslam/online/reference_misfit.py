@@ -45,8 +45,3 @@ class ReferenceMisfit:
         """Of the variance; one where the frames show no more than was stated."""
         one = FLOOR_PX**4
         return max((self._product + one) / (self._square + one), 1.0)
-
-    @property
-    def is_told(self) -> bool:
-        """Whether frames have told more of the factor than was taken for granted."""
-        return self._square > FLOOR_PX**4

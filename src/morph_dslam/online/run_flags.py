@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from morph_dslam.online.frame_result import HAS_MOVED, MAY_BE_ANOTHER, REFERENCE_WORSE, UNEXPLAINED
+from morph_dslam.online.frame_result import HAS_MOVED, MAY_BE_ANOTHER, REFERENCE_WORSE, UNCHECKED, UNEXPLAINED
 from morph_dslam.online.observability import UNTOLD_SHARE, statement, untold_in_run
 from morph_dslam.online.reference_misfit import CLEARLY_WORSE
 
@@ -38,6 +38,12 @@ def flags(run: RunResults) -> list[str]:
         found.append(
             f"{REFERENCE_WORSE}: {worse:.1f} times what it was taken to be known to, and the deviations are "
             "that much wider; check the landmarks and whether the object has the model's dimensions"
+        )
+    last = next((result for result in reversed(run.results) if result.estimate), None)
+    if last is not None and UNCHECKED in last.reason:
+        found.append(
+            f"{UNCHECKED}: if it is 2 % longer along one axis, it may be as much farther off; let it turn or "
+            "bend more, or measure it"
         )
     found += _at_bound(run)
     return found + _untold(run)
