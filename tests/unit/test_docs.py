@@ -1,5 +1,6 @@
 """The programs in the documentation do what it says."""
 
+import argparse
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
+from morph_dslam import cli
 from morph_dslam.model import SeparatedField, load_model, save_model
 from morph_dslam.model.basis_functions import chebyshev_basis
 from morph_dslam.model.tensor_functions import TuckerFunctions
@@ -16,6 +18,10 @@ from tests.support.function_formats import FORMATS
 from tests.support.small_models import block_model
 
 DOCS = Path(__file__).parents[2] / "docs"
+PAGES = [
+    *DOCS.glob("*.md"),
+    *(DOCS.parent / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG")),
+]
 
 
 def documented_readers():
@@ -91,7 +97,43 @@ def test_the_programs_for_solids_pull_a_block_as_far_as_its_law_says(tmp_path, m
     np.testing.assert_allclose(names["force"], [0.0, 0.0, -0.3e6 * 0.02**2], atol=1e-6)
 
 
+def anchor(heading: str) -> str:
+    """The name under which a page's heading is linked to."""
+    return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
+
+
 def test_links_between_documents_lead_somewhere():
-    for page in [*DOCS.glob("*.md"), DOCS.parent / "README.md", DOCS.parent / "CONTRIBUTING.md"]:
-        for target in re.findall(r"\]\(([\w./-]+\.\w+)\)", page.read_text()):
-            assert (page.parent / target).exists(), f"{page.name}: {target}"
+    for page in PAGES:
+        for name, fragment in re.findall(r"\]\(([\w./-]*)(?:#([\w-]+))?\)", page.read_text()):
+            target = page.parent / name if name else page
+            assert target.exists(), f"{page.name}: {name}"
+            if fragment:
+                headings = re.findall(r"^#+ (.*)$", target.read_text(), flags=re.MULTILINE)
+                assert fragment in map(anchor, headings), f"{page.name}: {name}#{fragment}"
+
+
+def test_commands_in_documents_have_these_options():
+    """What the pages tell to type after `morph` is known to the command line; a # begins a remark."""
+    (commands,) = (a for a in cli._parser()._actions if isinstance(a, argparse._SubParsersAction))
+    n_options = 0
+    for page in PAGES:
+        text = re.sub(r"\\\n\s*", " ", page.read_text())
+        for name, rest in re.findall(r"(?:^|`)morph ([a-z]+)\b([^`\n#]*)", text, flags=re.MULTILINE):
+            assert name in commands.choices, f"{page.name}: morph {name}"
+            known = {option for a in commands.choices[name]._actions for option in a.option_strings}
+            used = set(re.findall(r"(?<![\w-])--[a-z][\w-]*", rest))
+            assert used <= known, f"{page.name}: morph {name} {used - known}"
+            n_options += len(used)
+    assert n_options > 30
+
+
+def test_programs_and_files_in_documents_exist():
+    n_files = 0
+    for page in PAGES:
+        for name in re.findall(
+            r"(?<![\w/.])(?:examples|benchmarks|tests|docs)/[\w/-]+\.\w+", page.read_text()
+        ):
+            if "output/" not in name and "/NAME/" not in name:
+                assert (DOCS.parent / name).exists(), f"{page.name}: {name}"
+                n_files += 1
+    assert n_files > 50
