@@ -139,9 +139,6 @@ def anchored_cases(scene: Scene, seed: int) -> Iterator[Case]:
     yield "in a map: right", lambda: run(moving(scene, 80))
     for name, other in scene.others.items():
         yield f"in a map: wrong model: {name}", lambda other=other: run(moving(scene, 80), other)
-    for percent in (-10, -4, 4, 10):
-        other = drawn_out(scene.model, 1.0 + 0.01 * percent * np.array([1.0, 0.0, 0.0]))
-        yield f"in a map: size: x {percent:+} %", lambda other=other: run(moving(scene, 80), other)
     yield "in a map: absent", lambda: run([Shown(None)] * 20)
     for name, (shown, free) in (
         ("covered 2 s by an arm", covered(scene)),
@@ -166,7 +163,8 @@ def map_cases(seed: int, quick: bool) -> Iterator[Case]:
     yield "map: right", lambda: _in_map(nodes, world, seed, (np.zeros(3),))
     stretches = [[1.1, 1.0, 1.0], [1.0, 1.0, 1.5]]
     if not quick:
-        stretches += [[0.9, 1.0, 1.0], [1.0, 1.1, 1.0], [1.0, 0.85, 1.0], [1.0, 1.0, 0.8], [1.2, 1.2, 1.0]]
+        stretches += [[0.96, 1.0, 1.0], [1.04, 1.0, 1.0], [0.9, 1.0, 1.0], [1.0, 1.1, 1.0]]
+        stretches += [[1.0, 0.85, 1.0], [1.0, 1.0, 0.8], [1.2, 1.2, 1.0]]
     for stretch in stretches:
         name = f"map: wrong model, {' x '.join(f'{s:g}' for s in stretch)}"
         yield name, lambda stretch=stretch: _in_map(nodes * stretch, world, seed, (np.zeros(3),))

@@ -83,6 +83,14 @@ def test_a_mesh_in_another_unit_than_the_landmarks_is_named(name, factor):
         register(in_unit(scene.model, factor), scene.stage.camera, points, pixels)
 
 
+def test_landmarks_all_over_a_sheet_are_named_where_its_mesh_is_in_a_unit_somewhat_too_large(sheet):
+    """They lie on a part of the larger sheet, and fit by a bend of it, so that nothing else would say so."""
+    points, pixels = landmarks(sheet, sheet.model)
+    found = register(in_unit(sheet.model, 2.54), sheet.stage.camera, points, pixels)
+    assert any("they fit if its mesh is multiplied by 0.3937: one in centimetres" in f for f in found.flags)
+    assert not any("multiplied" in f for f in register(sheet.model, sheet.stage.camera, points, pixels).flags)
+
+
 def test_one_camera_cannot_tell_the_size_but_an_absurd_one_is_flagged(sheet):
     """Mesh and landmarks in the same wrong unit fit perfectly, at a distance as wrong as the size."""
     points, pixels = landmarks(sheet, sheet.model, click_px=0.0)

@@ -23,7 +23,7 @@ from tests.support.staged_scenes import Scene, is_beyond, is_doubted, mean_error
 #: Frames of a recording at 30 a second that show one unit of a scene's time.
 FRAMES = 120
 #: Flags of a placement that say it may be wrong.
-DOUBTFUL = ("ambiguous", "poor", "underdetermined", "at a bound")
+DOUBTFUL = ("ambiguous", "poor", "doubtful", "underdetermined", "at a bound")
 #: Errors of a pose in a map: of the registration, which last, and of the camera; rad and metres.
 LASTING, FROM_CAMERA = np.repeat([8e-4, 3e-4], 3), np.repeat([3e-4, 1e-4], 3)
 

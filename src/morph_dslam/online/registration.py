@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import permutations, product
+from itertools import product
 
 import cv2
 import numpy as np
@@ -21,6 +21,7 @@ from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import ReducedModel
 from morph_dslam.online.binding import nearest_surface_points
 from morph_dslam.online.estimation import BoundPoints, Estimate, EstimationOptions, Estimator, State
+from morph_dslam.online.landmark_units import extent, flag_of_unit, unit_hint
 
 Array = NDArray[np.float64]
 
@@ -28,8 +29,6 @@ Array = NDArray[np.float64]
 POOR_FIT = 2.0
 #: Objects of another size, metres, are flagged: a mesh in millimetres that was taken for metres is such.
 SIZES = (0.005, 10.0)
-#: Units that meshes come in, metres.
-UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 1e-3, "inches": 0.0254}
 
 
 @dataclass(frozen=True)
@@ -124,6 +123,7 @@ def register(
     _check_residual(best, rms, options.residual_share * float(np.hypot(camera.width, camera.height)))
     states = tuple(estimate.state for estimate in alternatives)
     flags = _flags(model, best, alternatives, len(bound), options.click_px)
+    flags += flag_of_unit(model, points, options.surface_share)
     return Registration(best, states, rms, flags, options.click_px)
 
 
@@ -134,7 +134,7 @@ def bind_landmarks(model: ReducedModel, points: Array, options: RegistrationOpti
             f"{len(points)} landmarks are too few to place the object: give at least 4, better "
             f"{(len(model.parameters) + 6) // 2 + 3} or more spread over it"
         )
-    size, spread = _extent(model.nodes), _extent(points)
+    size, spread = extent(model.nodes), extent(points)
     surface, distances = nearest_surface_points(model.nodes, model.triangles, points)
     limit = options.surface_share * size
     worst = int(distances.argmax())
@@ -145,35 +145,14 @@ def bind_landmarks(model: ReducedModel, points: Array, options: RegistrationOpti
         raise RegistrationError(
             f"landmark {worst + 1} at ({x:g}, {y:g}, {z:g}) mm is {1e3 * distances[worst]:.1f} mm off the "
             f"object, at most {1e3 * limit:.1f} mm are allowed: landmarks are points of the "
-            f"undeformed object ({ranges} mm){_unit_hint(model, points, options)}"
+            f"undeformed object ({ranges} mm){unit_hint(model, points, options.surface_share)}"
         )
     if spread < options.spread_share * size:
         raise RegistrationError(
             f"the landmarks are {1e3 * spread:.3g} mm apart on an object of {1e3 * size:.3g} mm: spread them "
-            f"over all that is seen of it{_unit_hint(model, points, options)}"
+            f"over all that is seen of it{unit_hint(model, points, options.surface_share)}"
         )
     return BoundPoints.from_surface(model, surface)
-
-
-def _unit_hint(model: ReducedModel, points: Array, options: RegistrationOptions) -> str:
-    """What to say where the landmarks would lie on the object if its mesh were in another unit."""
-    size = _extent(model.nodes)
-    best, hint = 0.2 * size, ""  # landmarks that shrink to a point lie anywhere
-    for (meant, a), (taken, b) in permutations(UNITS.items(), 2):
-        scaled = points * (b / a)
-        _, distances = nearest_surface_points(model.nodes, model.triangles, scaled)
-        if distances.max() <= options.surface_share * size and _extent(scaled) > best:
-            best = _extent(scaled)
-            hint = (
-                f"; they fit if its mesh is multiplied by {a / b:.4g}: one in {meant} was taken for one in "
-                f"{taken}, perhaps, so mend its unit in the study"
-            )
-    return hint
-
-
-def _extent(points: Array) -> float:
-    """Length of the diagonal of the box around points (n, 3)."""
-    return float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
 def _check_pixels(camera: PinholeCamera, pixels: Array) -> None:
@@ -250,7 +229,7 @@ def _distinct_minima(
     model: ReducedModel, found: list[Estimate], options: RegistrationOptions
 ) -> tuple[Estimate, tuple[Estimate, ...]]:
     """The best minimum and the different ones that landmarks of the stated accuracy cannot exclude."""
-    limit = options.distinct_share * _extent(model.nodes)
+    limit = options.distinct_share * extent(model.nodes)
     best = found[0]
     freedom = max(2 * len(best.residuals) - len(best.covariance), 1)
     variance = max(options.click_px**2, 2.0 * best.cost / freedom)
@@ -296,7 +275,7 @@ def _flags(
             f"registration poor: the landmarks fit to {best.sigma_px:.1f} px, carefully set ones to "
             f"{click_px:g} px; check them, the camera file, and whether this is the model of this object"
         )
-    size = _extent(model.nodes)
+    size = extent(model.nodes)
     if not SIZES[0] < size < SIZES[1]:
         flags.append(
             f"the model is {size:.3g} m across: if that is not so, the unit of its mesh is wrong; one camera "
