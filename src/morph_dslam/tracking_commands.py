@@ -208,7 +208,8 @@ def add_tracking_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         "--reference-frame",
         type=int,
         metavar="N",
-        help="frame that the landmarks, or another aid, belong to (default: the first one tracked)",
+        help="frame that the landmarks, or another aid, belong to (default: the first one tracked); with "
+        "--place and --with: one in which the object is undeformed",
     )
     track.add_argument(
         "--reregister-at",

@@ -262,7 +262,7 @@ def test_recordings_that_do_not_go_together_are_refused(recording, tmp_path, cap
     folder, _ = recording
     later = renumbered(folder / "front", tmp_path / "later", 1)
     assert main(with_both(folder, tmp_path / "run", front=later)) == 2
-    assert "is not the map's keyframe" in capsys.readouterr().err
+    assert "does not show the map's keyframe" in capsys.readouterr().err
     beside = renumbered(folder / "aside", tmp_path / "beside", 20)
     assert main(with_both(folder, tmp_path / "run", aside=beside)) == 2
     assert f"frame {SCAN - 1} is not in" in capsys.readouterr().err
@@ -272,6 +272,25 @@ def test_recordings_that_do_not_go_together_are_refused(recording, tmp_path, cap
     assert "give the first camera of a Kalibr camchain" in capsys.readouterr().err
     assert main(with_both(folder, tmp_path / "run", "--depth")) == 2
     assert "leave out --refine, --reregister-at and --depth" in capsys.readouterr().err
+
+
+def test_another_recording_than_the_scan_begins_with_an_undeformed_frame(recording, tmp_path, capsys):
+    folder, truth = recording
+    front, aside = (renumbered(folder / name, tmp_path / name, 100) for name in ("front", "aside"))
+    arguments = with_both(folder, tmp_path / "run", front=front, aside=aside)
+    arguments[arguments.index("--range") + 1] = f"{SCAN + 99}-{FRAMES + 99}"
+    assert main(arguments) == 2
+    assert "name a frame of these recordings in which it is undeformed" in capsys.readouterr().err
+    assert main([*arguments, "--reference-frame", f"{SCAN + 97}"]) == 0
+    run = load_run(tmp_path / "run")
+    assert run.frames[0] == SCAN + 99
+    assert set(run.status) == {"tracked"}
+    expected = truth["wedge"]["parameters"][run.frames - 100]
+    np.testing.assert_allclose(run.parameters, expected, atol=0.5e-3)
+    exact = truth["wedge"]["camera_from_object"][run.frames - 100, :3, 3]
+    apart = np.abs(run.camera_from_object[:, :3, 3] - exact)
+    assert apart.max() < MAP_ERROR
+    assert (apart < 3.0 * column(tmp_path / "run", "pose_std")[:, 3:]).all()
 
 
 def test_a_shorter_recording_ends_the_run_and_is_named(recording, tmp_path, capsys):

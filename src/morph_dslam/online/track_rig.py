@@ -14,10 +14,11 @@ import numpy as np
 from tqdm import tqdm
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.errors import CameraError, SourceError, TrackingError
+from morph_dslam.errors import CameraError, RegistrationError, SourceError, TrackingError
 from morph_dslam.io.stereo_calibration import load_rig
 from morph_dslam.online.attempt import Picture
 from morph_dslam.online.chain import Chain
+from morph_dslam.online.estimation import State
 from morph_dslam.online.results import RunResults
 from morph_dslam.online.rig import RigCamera
 from morph_dslam.online.rig_tracking import RigTracker
@@ -25,7 +26,7 @@ from morph_dslam.online.run_writing import check_run_folder
 from morph_dslam.online.slam.frame_images import FrameImages
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.track import TrackOptions, find_begin, open_frames, with_reference, write_results
-from morph_dslam.online.tracking_setup import load_setup
+from morph_dslam.online.tracking_setup import Setup, load_setup
 from morph_dslam.sources import Frame, FrameSource, open_source
 
 #: Correlation of two flattened images that are the same but for the compression.
@@ -37,7 +38,9 @@ def track_rig(options: TrackOptions, others: Sequence[Path]) -> dict[str, Any]:
 
     Parameters
     ----------
-    options : ``frames``, ``landmarks`` and the run folder are of the first camera; ``camera`` is a camchain.
+    options : ``frames``, ``landmarks``, the map and the run folder are of the first camera; ``camera`` is a
+        camchain. ``reference_frame`` is one in which an anchored object is undeformed, if the scan is not in
+        these recordings.
     others : recordings of the other cameras, in the order of the camchain, with the same frame numbers.
 
     Returns
@@ -56,8 +59,7 @@ def track_rig(options: TrackOptions, others: Sequence[Path]) -> dict[str, Any]:
     options = replace(options, tracker=replace(options.tracker, new_views=False))
     cameras = _cameras(options.camera, 1 + len(others))
     check_run_folder(options.output, options.overwrite)
-    setup = load_setup(options)
-    options = with_reference(options, setup)
+    setup, options = _with_reference(load_setup(options), options)
     sources = [open_frames(options), *(open_source(path, options.first, options.last) for path in others)]
     begin = find_begin(setup, options)
     if setup.reference is not None:
@@ -102,10 +104,31 @@ def _check(options: TrackOptions) -> None:
             "several cameras track an object from where it starts, without depth: leave out --refine, "
             "--reregister-at and --depth"
         )
-    if options.placement is not None and options.reference_frame is not None:
+
+
+def _with_reference(setup: Setup, options: TrackOptions) -> tuple[Setup, TrackOptions]:
+    """As `with_reference`; a frame that is wished instead of the map's keyframe is where the map has it."""
+    number, placement = options.reference_frame, setup.placement
+    if number is None or placement is None:
+        return setup, with_reference(options, setup)
+    if setup.reference is None or placement.place is None:
         raise TrackingError(
-            "a registration in a map brings its own reference frame: leave out --reference-frame"
+            "without its map a registration brings its own reference frame: leave out --reference-frame"
         )
+    frame = _frame(options.frames, number)
+    located = setup.new_chain(placement, setup.reference, False).locate(frame)
+    if located.known is None:
+        raise RegistrationError(
+            f"the camera is not found in the map in frame {number} of {options.frames} ({located.why_lost}): "
+            "take another --reference-frame"
+        )
+    d = len(placement.model.parameters)
+    covariance = np.zeros((d + 6, d + 6))
+    covariance[d:, d:] = located.known.covariance
+    state = State(placement.model.default, located.known.pose)
+    placed = replace(placement, frame=number, state=state, covariance=covariance)
+    setup = replace(setup, placement=placed, reference=None)
+    return setup, with_reference(options, setup)
 
 
 def _check_scan(camera: PinholeCamera, keyframe: Picture, frames: Path, number: int) -> None:
@@ -113,12 +136,16 @@ def _check_scan(camera: PinholeCamera, keyframe: Picture, frames: Path, number: 
 
     The other cameras' reference frames are those of that number, in which the object is undeformed.
     """
-    view = FrameImages(camera, SlamOptions()).prepare(_frame(frames, number).image, number, 0.0)
-    if np.corrcoef(view.flat.ravel(), keyframe.flat.ravel())[0, 1] < SAME_IMAGE:
+    try:
+        view = FrameImages(camera, SlamOptions()).prepare(_frame(frames, number).image, number, 0.0)
+        is_keyframe = np.corrcoef(view.flat.ravel(), keyframe.flat.ravel())[0, 1] > SAME_IMAGE
+    except SourceError:
+        is_keyframe = False
+    if not is_keyframe:
         raise TrackingError(
-            f"frame {number} of {frames} is not the map's keyframe {number}, so it is not known when the "
-            "other cameras saw the undeformed object: film the scan and the deformation with all cameras in "
-            "one recording"
+            f"{frames} does not show the map's keyframe {number}, so it is not known when the other cameras "
+            "saw the undeformed object: name a frame of these recordings in which it is undeformed, "
+            "--reference-frame"
         )
 
 
