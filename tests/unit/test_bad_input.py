@@ -1,8 +1,11 @@
 """What a user gets wrong at the command line: one message that says what to mend, and status 2."""
 
 import json
+import subprocess
+import sys
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -119,6 +122,24 @@ def test_a_length_of_time_is_above_zero(capsys, seconds):
     assert "is not a number above zero" in refused_by_parser(capsys, *command, f"--seconds={seconds}")
 
 
+def test_nothing_but_our_message_is_printed_of_a_damaged_video(folder):
+    """OpenCV and FFmpeg write to the process's own stderr, so it takes a process of its own."""
+    writer = cv2.VideoWriter(str(folder / "film.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 30, (64, 48))
+    for value in range(20):
+        writer.write(np.full((48, 64, 3), 10 * value, np.uint8))
+    writer.release()
+    whole = (folder / "film.mp4").read_bytes()
+    (folder / "film.mp4").write_bytes(whole[: len(whole) // 2])
+    arguments = ["calibrate", str(folder / "film.mp4"), "--board", "9x6", "--square", "25 mm", "-o"]
+    program = (
+        f"from morph_dslam.cli import main; raise SystemExit(main({[*arguments, str(folder / 'c.yaml')]}))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert "cannot be opened as a video" in line
+
+
 def test_options_without_effect_are_refused(folder, capsys):
     of_object = ["--model", folder / "sheet.morph", "--camera", folder / "camera.yaml", "--landmarks", "l"]
     output = ["-o", folder / "run"]
@@ -189,6 +210,9 @@ def test_a_registration_with_parts_of_another_shape(tmp_path):
     keyframe = REGISTRATION["keyframes"][0]
     for wrong in (
         {"world_from_object": [1, 2]},
+        {"world_from_object": np.diag([1.0, 1.0, 1.1, 1.0]).tolist()},
+        {"world_from_object": np.diag([1e300, 1.0, 1.0, 1.0]).tolist()},
+        {"map_units_per_metre": 0.0},
         {"mean_node_m": [1, 2]},
         {"mean_node_m": -3},
         {"covariance": np.eye(6).tolist()},

@@ -15,6 +15,7 @@ from morph_dslam.evaluation.model_summary import flatten, summarise_model
 from morph_dslam.evaluation.report import Link, Picture, Section, Table, Text, write_report
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.evaluation.statements import remarks
+from morph_dslam.sources.capture import open_capture
 
 VIDEO = "augmented.mp4"
 N_FRAMES_SHOWN = 4
@@ -30,7 +31,7 @@ _CAPTIONS = {
 
 def sample_video(path: Path, count: int) -> list[tuple[int, bytes]]:
     """Up to ``count`` frames spread over a video, as (0-based position, JPEG); none if it cannot be read."""
-    capture = cv2.VideoCapture(str(path))
+    capture = open_capture(str(path))
     total = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
     wanted = (
         set(np.linspace(0, total - 1, count + 2).round().astype(int)[1:-1].tolist()) if total > 0 else set()

@@ -15,6 +15,9 @@ from morph_dslam.similarity import SimilarityTransform
 
 Array = NDArray[np.float64]
 
+#: No number of a registration is meant to be larger.
+LARGEST = 1e20
+
 
 @dataclass(frozen=True)
 class PlaceInMap:
@@ -34,11 +37,10 @@ class PlaceInMap:
     @classmethod
     def from_content(cls, content: dict[str, Any]) -> PlaceInMap:
         """From the content of a registration.json; raises KeyError, TypeError or ValueError if it is none."""
-        matrix, scale = (
-            numbers_of(content["world_from_object"], (4, 4)),
-            float(content["map_units_per_metre"]),
-        )
-        covariance = content["covariance"]
+        matrix = numbers_of(content["world_from_object"], (4, 4))
+        scale, covariance = float(content["map_units_per_metre"]), content["covariance"]
+        if not scale > 0.0 or not np.allclose(matrix[:3, :3] @ matrix[:3, :3].T / scale**2, np.eye(3)):
+            raise ValueError("world_from_object is no rotation scaled by map_units_per_metre")
         return cls(
             SimilarityTransform(scale, matrix[:3, :3] / scale, matrix[:3, 3]),
             numbers_of(content["mean_node_m"], (3,)),
@@ -89,8 +91,8 @@ class PlaceInMap:
 
 
 def numbers_of(values: Any, shape: tuple[int, ...]) -> Array:
-    """An array of a registration.json; raises ValueError if it has another shape, or is not finite."""
+    """An array of a registration.json; raises ValueError if its shape is another, or a number absurd."""
     array = np.array(values, dtype=np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
+    if array.shape != shape or not (np.abs(array) < LARGEST).all():
         raise ValueError(f"an array of shape {shape} was expected")
     return array

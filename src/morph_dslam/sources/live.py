@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SourceError
+from morph_dslam.sources.capture import open_capture
 from morph_dslam.sources.frames import Frame, FrameStream
 from morph_dslam.sources.newest import Newest
 
@@ -35,7 +36,7 @@ def open_webcam(device: int) -> LiveCamera:
     SourceError
         If there is none, or another program holds it.
     """
-    capture = cv2.VideoCapture(device)
+    capture = open_capture(device)
     if not capture.isOpened():
         raise SourceError(
             f"webcam {device} cannot be opened: check that it is plugged in, that no other program uses it, "

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from morph_dslam.errors import SourceError
+from morph_dslam.sources.capture import open_capture
 from morph_dslam.sources.folder import ASSUMED_FPS
 from morph_dslam.sources.frames import Frame, check_range
 
@@ -17,7 +18,7 @@ LENGTH_TOLERANCE = 1
 
 
 def _open(path: Path) -> cv2.VideoCapture:
-    capture = cv2.VideoCapture(str(path))
+    capture = open_capture(str(path))
     if not capture.isOpened():
         raise SourceError(
             f"{path} cannot be opened as a video: it is damaged, cut short before its index, or of a kind "
