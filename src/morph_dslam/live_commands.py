@@ -24,6 +24,7 @@ def _live(arguments: argparse.Namespace) -> None:
             drawing=drawing(arguments),
             first=first,
             last=last,
+            reregister_at=tuple(arguments.reregister_at),
             serve=arguments.serve,
             record=not arguments.no_video,
             seconds=arguments.seconds,

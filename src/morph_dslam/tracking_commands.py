@@ -180,6 +180,15 @@ def add_object_arguments(command: argparse.ArgumentParser) -> None:
         help="where the search for a frame's state starts (default: %(default)s state)",
     )
     command.add_argument(
+        "--reregister-at",
+        type=frame_and_file,
+        action="append",
+        default=[],
+        metavar="N[=FILE]",
+        help="place the object anew in frame N, by landmarks there or by the board, picture or guess that "
+        "the run starts from; may be repeated",
+    )
+    command.add_argument(
         "--show",
         choices=("stress", "strain", "displacement"),
         help="what colours the object: von Mises stress (the default), equivalent strain, displacement",
@@ -210,15 +219,6 @@ def add_tracking_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         metavar="N",
         help="frame that the landmarks, or another aid, belong to (default: the first one tracked); with "
         "--place and --with: one in which the object is undeformed",
-    )
-    track.add_argument(
-        "--reregister-at",
-        type=frame_and_file,
-        action="append",
-        default=[],
-        metavar="N[=FILE]",
-        help="place the object anew in frame N, by landmarks there or by the board, picture or guess that "
-        "the run starts from; may be repeated",
     )
     track.add_argument(
         "--refine",

@@ -18,14 +18,17 @@ from morph_dslam.online.aids.board import FiducialBoard, load_board
 from morph_dslam.online.aids.board_pose import BoardStart, locate_board
 from morph_dslam.online.aids.guess import GuessFile, GuessStart
 from morph_dslam.online.aids.picture import PictureStart, load_picture
+from morph_dslam.online.aids.start import AidFiles
 from morph_dslam.online.estimation import Estimator
 from morph_dslam.online.flow import flatten
+from morph_dslam.online.live.run import LiveOptions, run_live
 from morph_dslam.online.placement import load_placement
 from morph_dslam.online.relocalisation import RelocalisationOptions, state_from_matches
 from morph_dslam.online.slam.map_file import save_map
 from morph_dslam.online.slam.rigid_map import GOOD, Keyframe, RigidMap
 from morph_dslam.online.state import BoundPoints, State
 from morph_dslam.online.track import TrackOptions, track
+from morph_dslam.online.tracking_setup import ObjectOptions
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
 from morph_dslam.similarity import SimilarityTransform
@@ -313,6 +316,25 @@ def test_a_run_starts_from_a_picture_and_is_placed_anew(recording, scene, tmp_pa
     assert summary["registration"]["from"] == "picture"
     assert "placed anew in frame 7" in summary["flags"]
     assert any(flag.startswith("not placed anew in frame 5") for flag in summary["flags"])
+
+
+def test_a_live_run_is_placed_anew_in_the_frame_or_the_next_that_is_not_dropped(recording, scene, tmp_path):
+    of_object = ObjectOptions(
+        recording / "sheet.morph",
+        recording / "camera.yaml",
+        aids=AidFiles(picture=recording / "picture.toml"),
+    )
+    live = LiveOptions(
+        str(recording / "frames"), tmp_path / "run", of_object, reregister_at=((7, None),), record=False
+    )
+    flags = run_live(live)["flags"]
+    placed = [int(flag.split()[-1]) for flag in flags if flag.startswith("placed anew in frame")]
+    assert len(placed) == 1
+    assert 7 <= placed[0] <= 11
+    run, truth = load_run(tmp_path / "run"), state_of(scene, 11)
+    assert (run.frames[-1], run.status[-1]) == (11, "tracked")
+    expected = truth.camera_from_object.apply(scene.model.positions(truth.parameters))
+    assert 1e3 * np.linalg.norm(run.camera_points(len(run.frames) - 1) - expected, axis=1).mean() < 4.0
 
 
 def test_landmarks_of_another_frame_place_the_object_anew(recording, scene, tmp_path):

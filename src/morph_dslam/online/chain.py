@@ -51,6 +51,10 @@ class Chain:
     def __init__(self, camera: PinholeCamera, tracker: Tracker, anchor: Anchor | None = None) -> None:
         self._camera, self.tracker, self.anchor = camera, tracker, anchor
 
+    def with_tracker(self, tracker: Tracker) -> Chain:
+        """The same with another tracker; the camera stays where it was found."""
+        return Chain(self._camera, tracker, self.anchor)
+
     def process(self, frame: Frame) -> FrameResult:
         """Both steps for the next frame; raises CameraError if it has not the camera's size."""
         return self.track(frame, self.locate(frame))

@@ -27,6 +27,7 @@ class Reregistration:
     Parameters
     ----------
     at : frames in which to place the object anew, and the landmarks there; None for the run's own aid.
+    begin : the reference frame; frames before it are not waited for.
 
     Raises
     ------
@@ -36,13 +37,16 @@ class Reregistration:
         If a file of landmarks cannot be read.
     """
 
-    def __init__(self, setup: Setup, placement: Placement, at: Sequence[tuple[int, Path | None]]) -> None:
+    def __init__(
+        self, setup: Setup, placement: Placement, at: Sequence[tuple[int, Path | None]], begin: int = 0
+    ) -> None:
         if setup.aid is None and any(landmarks is None for _, landmarks in at):
             raise TrackingError(
                 "to place the object anew give landmarks of that frame (--reregister-at N=FILE), or start "
                 "from a board, a picture or a guess, which are looked for there again"
             )
         self._setup, self._placement, self._n_lost = setup, placement, 0
+        self._before = begin
         self._at = {frame: None if path is None else load_landmarks(path) for frame, path in at}
         self._notes: list[str] = []
 
@@ -53,20 +57,28 @@ class Reregistration:
 
     def chain(self, frame: Frame, chain: Chain) -> Chain:
         """The chain that processes the frame: the one so far, or a new one whose reference is this frame."""
-        wanted = frame.index in self._at
+        due = self._due(frame.index)
         after_loss = self._setup.aid is not None and self._n_lost > 0 and self._n_lost % LONG_LOSS == 0
-        if not wanted and not after_loss:
+        if not due and not after_loss:
             return chain
-        landmarks = self._at.pop(frame.index, None)
+        given = [self._at.pop(n) for n in due]
         try:
-            placed = self._placed(frame, landmarks)
+            placed = self._placed(frame, next((found for found in given if found is not None), None))
+            tracker = self._setup.new_tracker(placed, frame.image, True)
         except RegistrationError as error:
-            if wanted:
+            if due:
                 self._notes.append(f"not placed anew in frame {frame.index}: {error}")
             return chain
         self._notes += [f"placed anew in frame {frame.index}", *placed.flags]
         self._n_lost = 0
-        return self._setup.new_chain(placed, frame.image, True)
+        return chain.with_tracker(tracker)
+
+    def _due(self, frame: int) -> list[int]:
+        """The numbers for which this frame is the one; the aid may be late where live frames were dropped."""
+        before, self._before = self._before, frame
+        return [
+            n for n, landmarks in self._at.items() if n == frame or (landmarks is None and before < n < frame)
+        ]
 
     def take_in(self, result: FrameResult) -> None:
         """Count the frames that are lost on end."""

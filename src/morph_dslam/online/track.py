@@ -85,7 +85,7 @@ def track(options: TrackOptions) -> dict[str, Any]:
     source = open_frames(options)
     begin = find_begin(setup, options)
     placement = setup.placed(begin.picture, begin.depth)
-    again = Reregistration(setup, placement, options.reregister_at)
+    again = Reregistration(setup, placement, options.reregister_at, begin.frame)
     setup.warm_up(placement, begin.picture)
     run = RunResults(placement.model, begin.frame, per_sequence=setup.tracker_options(placement).per_sequence)
     try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import sys
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from morph_dslam.online.augmented_view import AugmentedView, DrawOptions
 from morph_dslam.online.live.session import LivePicture, LiveSession, LiveTimes, Sink
 from morph_dslam.online.live.sinks import BrowserSink, VideoSink
 from morph_dslam.online.placement import Placement
+from morph_dslam.online.reregistration import Reregistration
 from morph_dslam.online.results import RunResults
 from morph_dslam.online.run_writing import RunInputs, check_run_folder, write_run
 from morph_dslam.online.tracking_setup import ObjectOptions, Setup, load_setup
@@ -35,6 +36,7 @@ class LiveOptions:
     source : `webcam:0`, or a recording that plays at its own pace. output : the run folder.
     of_object : what is tracked and with what. drawing : what is drawn.
     first, last : frame numbers of a recording to play, both included; all by default.
+    reregister_at : see `TrackOptions`; by the aid it may be a later frame, where that one was dropped.
     serve : port on this computer at which browsers see the pictures; None for none, 0 for any.
     record : write the pictures into a video. seconds : how long; until the stream ends by default.
     overwrite : replace a run that is there already.
@@ -46,6 +48,7 @@ class LiveOptions:
     drawing: DrawOptions = field(default_factory=DrawOptions)
     first: int | None = None
     last: int | None = None
+    reregister_at: tuple[tuple[int, Path | None], ...] = ()
     serve: int | None = None
     record: bool = True
     seconds: float | None = None
@@ -82,6 +85,7 @@ def run_live(options: LiveOptions) -> dict[str, Any]:
     with ExitStack() as stack:
         stream = stack.enter_context(open_live(options.source, options.first, options.last))
         begin = _begin(setup, stream, options)
+        again = Reregistration(setup, begin.placement, options.reregister_at, begin.frame)
         setup.warm_up(begin.placement, begin.picture)
         model = begin.placement.model
         view = AugmentedView(model, setup.camera, options.drawing, setup.carried(model))
@@ -89,11 +93,13 @@ def run_live(options: LiveOptions) -> dict[str, Any]:
         chain = setup.new_chain(begin.placement, begin.picture, in_sequence=False)
         kept = setup.tracker_options(begin.placement).per_sequence
         run = RunResults(model, begin.frame, per_sequence=kept)
-        session = LiveSession(stream, chain, LivePicture(setup.camera, view), run, sinks)
+        session = LiveSession(stream, chain, LivePicture(setup.camera, view), run, sinks, again)
         print(f"tracking {stream.name} (Ctrl-C ends it)", file=sys.stderr)
         try:
             session.run(options.seconds)
         finally:
+            flags = (*begin.placement.flags, *again.notes)
+            begin = replace(begin, placement=replace(begin.placement, flags=flags))
             summary = _write(setup, begin, session, options) if len(run) else {}
     return summary
 

@@ -21,6 +21,7 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.online.augmented_view import AugmentedView, with_caption
 from morph_dslam.online.chain import Chain, Located
 from morph_dslam.online.frame_result import FrameResult
+from morph_dslam.online.reregistration import Reregistration
 from morph_dslam.online.results import RunResults
 from morph_dslam.online.side_by_side import threads_side_by_side
 from morph_dslam.sources import Frame
@@ -83,6 +84,7 @@ class LiveSession:
     Parameters
     ----------
     run : gets the results, without the residuals of single points: sessions are long.
+    again : decides when the object is placed anew; it never is by default.
     sinks : get the pictures, after the latency has been taken.
     """
 
@@ -93,8 +95,10 @@ class LiveSession:
         picture: LivePicture,
         run: RunResults,
         sinks: Sequence[Sink] = (),
+        again: Reregistration | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        self._again = again
         self._stream, self._chain, self._picture, self._clock = stream, chain, picture, clock
         self._sinks, self.results, self.times = sinks, run, LiveTimes()
         self._located: Newest[tuple[Frame, Located]] = Newest()
@@ -156,7 +160,12 @@ class LiveSession:
     def _track(self) -> None:
         while (item := self._located.take()) is not None:
             frame, located = item
-            self._tracked.put((frame, self._chain.track(frame, located)))
+            if self._again is not None:
+                self._chain = self._again.chain(frame, self._chain)
+            result = self._chain.track(frame, located)
+            if self._again is not None:
+                self._again.take_in(result)
+            self._tracked.put((frame, result))
 
     def _draw(self) -> None:
         while (item := self._tracked.take()) is not None:
