@@ -86,6 +86,7 @@ class RigidTransform:
 
     @classmethod
     def identity(cls) -> RigidTransform:
+        """The transform that moves nothing."""
         return cls(np.eye(3), np.zeros(3))
 
     @classmethod
@@ -102,6 +103,7 @@ class RigidTransform:
 
     @property
     def inverse(self) -> RigidTransform:
+        """b_from_a of a_from_b."""
         return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
 
     def __matmul__(self, other: RigidTransform) -> RigidTransform:

@@ -22,6 +22,7 @@ class SimilarityTransform:
 
     @classmethod
     def identity(cls) -> SimilarityTransform:
+        """The transform that moves nothing."""
         return cls(1.0, np.eye(3), np.zeros(3))
 
     @property
@@ -33,6 +34,7 @@ class SimilarityTransform:
 
     @property
     def inverse(self) -> SimilarityTransform:
+        """b_from_a of a_from_b."""
         rotation = self.rotation.T
         return SimilarityTransform(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 

@@ -201,6 +201,7 @@ def test_a_path_from_a_table_of_states_and_from_a_tracked_run(tmp_path):
     [
         ({"vary": ["bend=0:1:3"]}, "no parameter 'bend'; it has stretch, slide"),
         ({"vary": ["slide=0:11:3"]}, "--vary slide=0:11:3: 11 is outside the range of slide, -10 to 10 mm"),
+        ({"vary": ["slide=0:1:3"], "at": ["slide=1"]}, "'slide' is both varied and fixed"),
         ({"vary": ["slide=0:10"]}, "--vary slide=0:10 is not a parameter and its values, such as"),
         ({"vary": ["slide=0:nan:3"]}, "nan is outside the range"),
         ({"vary": ["slide=0:1:0"]}, "is not a parameter and its values"),

@@ -34,7 +34,16 @@ class StateChoice:
     at: Sequence[str] = ()
 
     def states(self, model: ReducedModel) -> NDArray[np.float64]:
-        """The states (s, d), SI; with neither ranges nor a path, a tour of all parameters."""
+        """The states (s, d), SI; with neither ranges nor a path, a tour of all parameters.
+
+        Raises
+        ------
+        ExportError
+            If the choices contradict each other, or do not fit the model.
+        """
+        twice = {text.partition("=")[0] for text in self.vary} & {text.partition("=")[0] for text in self.at}
+        if twice:
+            raise ExportError(f"'{min(twice)}' is both varied and fixed: leave out its --vary or its --at")
         if self.path is not None and self.vary:
             raise ExportError("--path and --vary both choose the states: give one of them")
         base = fixed_values(model, self.at)

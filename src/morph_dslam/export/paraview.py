@@ -65,7 +65,7 @@ def _cells(model: ReducedModel) -> list[tuple[str, ArrayLike] | meshio.CellBlock
 
 
 def write_vtu_series(folder: Path, stem: str, model: ReducedModel, states: Array) -> Path:
-    """One ``stem_0000.vtu`` a state, ``stem.pvd`` to open them all, and ``states.csv``; returns the .pvd."""
+    """One ``stem_0000.vtu`` a state (s, d), ``stem.pvd`` to open all, ``states.csv``; returns the .pvd."""
     root = ElementTree.Element("VTKFile", type="Collection", version="0.1")
     collection = ElementTree.SubElement(root, "Collection")
     cells, places = _cells(model), []
@@ -91,7 +91,7 @@ class _SeriesWriter(TimeSeriesWriter):
 
 
 def write_xdmf_series(folder: Path, stem: str, model: ReducedModel, states: Array) -> Path:
-    """``stem.xdmf`` with its data in ``stem.h5``, the mesh once, and ``states.csv``; returns the .xdmf."""
+    """``stem.xdmf``, its data of states (s, d) in ``stem.h5``, and ``states.csv``; returns the .xdmf."""
     series = folder / f"{stem}.xdmf"
     with _SeriesWriter(series) as writer:
         writer.write_points_cells(model.nodes, _cells(model))

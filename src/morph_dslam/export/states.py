@@ -173,7 +173,7 @@ def _number(parameter: Parameter, text: str, where: str) -> float:
 def write_table(
     path: Path, model: ReducedModel, states: Array, places: Sequence[dict[str, str | int]]
 ) -> None:
-    """The parameters of each state as CSV, after the columns that say where it is.
+    """The parameters of each state (s, d, SI) as CSV, after the columns that say where it is.
 
     The layout is that of tables of external solutions, so that a study can be made from an export.
     """

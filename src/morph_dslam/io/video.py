@@ -58,6 +58,11 @@ class VideoWriter:
         """Append a frame (h, w, 3) uint8, blue, green, red, of the size given at the start.
 
         OpenCV drops frames of another size without a word, so the size is checked here.
+
+        Raises
+        ------
+        RuntimeError, ValueError
+            If the video is not open, or the frame's size is another.
         """
         if self._writer is None:
             raise RuntimeError("the video is not open: write inside its with block")

@@ -101,7 +101,7 @@ class AugmentedView:
         return View(nodes, self._camera.project(nodes))
 
     def values(self, state: State) -> Array:
-        """The field at the drawn nodes, in the unit of `label`; for a sheet on the side that is seen."""
+        """The field (n,) at the drawn nodes, in the unit of `label`; for a sheet on the side that is seen."""
         return self._values(state.parameters, self._displacement.value(state.parameters), self.view(state))
 
     def _values(self, parameters: Array, displacement: Array, view: View | None) -> Array:

@@ -81,7 +81,7 @@ def view_of(model: ReducedModel, camera: PinholeCamera, state: State) -> View:
 
 
 def draw_view(view: View, triangles: NDArray[np.int64], camera: PinholeCamera) -> Buffers:
-    """The z-buffer of the whole image."""
+    """The z-buffer of the whole image, depths in metres; triangles (m, 3)."""
     return rasterise(view.pixels, view.nodes[:, 2], triangles, camera.height, camera.width)
 
 

@@ -114,7 +114,17 @@ class Estimator:
         prior: Prior | None = None,
         depths: PointDepths | None = None,
     ) -> tuple[float, Array, Array, Array]:
-        """Cost, Hessian, gradient and residuals of pixels at a state; see `reprojection.linearise`."""
+        """Cost, Hessian, gradient and residuals of pixels at a state; see `reprojection.linearise`.
+
+        Parameters
+        ----------
+        points : p of them. pixels : (p, 2). weights : (p,).
+        normals : (p, 2), zero but for points on an outline.
+
+        Returns
+        -------
+        Cost in squared pixels, Hessian (d + 6, d + 6), gradient (d + 6,), residuals (p, 2).
+        """
         pose = state.camera_from_object
         normals = np.zeros_like(pixels) if normals is None else normals
         cost, hessian, gradient, residuals = self._linearise(
@@ -178,7 +188,7 @@ class Estimator:
     def estimate_from(
         self, points: BoundPoints, pixels: Array, weights: Array, starts: Sequence[State]
     ) -> list[Estimate]:
-        """Minimise from several starts; the estimates in order of their cost."""
+        """Minimise, as `estimate` does, from several starts; the estimates in order of their cost."""
         found = [self.estimate(points, pixels, weights, start) for start in starts]
         return sorted(found, key=lambda estimate: estimate.cost)
 

@@ -54,7 +54,13 @@ def detect_orb(
 def match_descriptors(
     first: NDArray[np.uint8], second: NDArray[np.uint8], ratio: float = 0.85
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of descriptors that match one another: nearest both ways and clearly nearer than the second."""
+    """Rows (k,) of descriptors that match one another: nearest both ways, clearly nearer than the second.
+
+    Parameters
+    ----------
+    first, second : (n, 32) and (m, 32) binary descriptors.
+    ratio : of the distances to the two nearest, at most.
+    """
     if len(first) < 2 or len(second) < 2:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     matcher = cv2.BFMatcher(cv2.NORM_HAMMING)

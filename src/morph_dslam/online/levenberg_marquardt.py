@@ -45,6 +45,7 @@ class Box:
 
     @classmethod
     def of(cls, model: ReducedModel) -> Box:
+        """The box of a model's parameters; rotations are of the size of a radian, shifts of the object's."""
         size = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
         half_ranges = 0.5 * (model.upper - model.lower)
         return cls(model.lower, model.upper, np.concatenate([half_ranges, np.ones(3), np.full(3, size)]))

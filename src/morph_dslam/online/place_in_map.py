@@ -77,7 +77,7 @@ class PlaceInMap:
         return RigidTransform(turn @ placed.rotation, (turn @ placed.translation + shift) / placed.scale)
 
     def known_pose(self, camera: PoseEstimate) -> KnownPose:
-        """The object's pose in a camera that was found in the map, metres; needs the covariance."""
+        """The object's pose in a camera found in the map, metres; ValueError without a covariance."""
         if self.covariance is None:
             raise ValueError("the place has no covariance")
         pose = self.pose_in(camera.camera_from_world)

@@ -38,6 +38,7 @@ class BoundPoints:
 
     @classmethod
     def from_surface(cls, model: ReducedModel, surface: SurfacePoints) -> BoundPoints:
+        """Points of a model's surface."""
         return cls(surface, model.rest_positions(surface), model.restrict(surface))
 
     def __len__(self) -> int:

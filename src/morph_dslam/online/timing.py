@@ -21,6 +21,7 @@ class StageClock:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
+        """Adds the time that its block takes to the stage's."""
         start = perf_counter()
         try:
             yield
@@ -36,4 +37,5 @@ class WaitClock:
 
     @property
     def milliseconds(self) -> float:
+        """How long so far."""
         return 1e3 * max(perf_counter() - self._start - (thread_time() - self._ran), 0.0)

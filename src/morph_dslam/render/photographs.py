@@ -53,7 +53,7 @@ def find_photograph(name: str, folder: Path) -> Path:
 
 
 def resize_to_fill(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
-    """The largest centred part of an image with these proportions, resized.
+    """The largest centred part of an image (h, w, ...) with these proportions, resized, (height, width, ...).
 
     A finer image would alias, so it is averaged down; a coarser one is smoothed up.
     """
@@ -66,7 +66,7 @@ def resize_to_fill(image: NDArray[np.uint8], width: int, height: int) -> NDArray
 
 
 def crop_to_aspect(image: NDArray[np.uint8], aspect: float) -> NDArray[np.uint8]:
-    """The largest centred part of an image with this width-to-height ratio."""
+    """The largest centred part (k, l, ...) of an image (h, w, ...) with this width-to-height ratio."""
     height, width = image.shape[:2]
     kept_width, kept_height = min(width, round(height * aspect)), min(height, round(width / aspect))
     left, top = (width - kept_width) // 2, (height - kept_height) // 2

@@ -141,6 +141,8 @@ class DepthSensor(_Section):
 
 
 class OccluderKeyFrame(_Section):
+    """Where the disc is in one frame."""
+
     frame: FrameNumber
     centre_px: tuple[FiniteFloat, FiniteFloat]
 

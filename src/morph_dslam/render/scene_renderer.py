@@ -64,12 +64,12 @@ def prepare_background(background: Background, folder: Path, camera: PinholeCame
 
 
 def blur(image: NDArray, sigma: float) -> Image:
-    """Gaussian blur with this standard deviation in pixels."""
+    """Gaussian blur of an image (h, w, ...) with this standard deviation in pixels."""
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), dtype=np.uint8) if sigma > 0.0 else image
 
 
 def in_disc(columns: NDArray, rows: NDArray, centre: Array, radius: float) -> NDArray[np.bool_]:
-    """Which pixels lie in a disc; ``columns`` and ``rows`` broadcast against each other."""
+    """Which pixels lie in a disc about ``centre`` (2,); columns and rows broadcast to (h, w)."""
     return (columns - centre[0]) ** 2 + (rows - centre[1]) ** 2 <= radius**2
 
 

@@ -69,7 +69,7 @@ def regular_points(model: ReducedModel, count: int) -> SurfacePoints:
 
 
 def landmark_nodes(model: ReducedModel) -> NDArray[np.int64]:
-    """Mesh nodes nearest to the sheet's four corners, edge points and inner points, corners first."""
+    """Mesh nodes (k,) nearest to the sheet's four corners, edge points and inner points, corners first."""
     low, high = sheet_bounds(model)
     edge = [(0, 0), (1, 0), (1, 1), (0, 1), (0.5, 0), (1, 0.5), (0.5, 1), (0, 0.5)]
     inner = [(0.5, 0.5), (0.25, 0.25), (0.75, 0.25), (0.75, 0.75), (0.25, 0.75)]

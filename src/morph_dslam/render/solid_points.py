@@ -55,7 +55,7 @@ def box_projection(model: ReducedModel, pixels: int) -> TexturedSurface:
 
 
 def spread_nodes(model: ReducedModel, count: int = N_LANDMARKS) -> NDArray[np.int64]:
-    """Surface nodes each as far as possible from those before it, from the lowest corner on."""
+    """Surface nodes (k,), each as far as possible from those before it, from the lowest corner on."""
     candidates = np.unique(model.triangles)
     places = model.nodes[candidates]
     chosen = [int(places.sum(axis=1).argmin())]

@@ -14,7 +14,13 @@ ASSUMED_FPS = 30.0
 
 
 def numbered_images(folder: Path) -> dict[int, Path]:
-    """The images of a folder by the last number in their names, in its order."""
+    """The images of a folder by the last number in their names, in its order.
+
+    Raises
+    ------
+    SourceError
+        If a name has no number, two have the same, or there is no image.
+    """
     images: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() not in SUFFIXES:

@@ -36,6 +36,7 @@ class VideoSink:
         self._written = 0
 
     def show(self, frame: Frame, picture: NDArray[np.uint8]) -> None:
+        """Write the picture (h, w, 3) as often as its time asks for."""
         self._start = frame.timestamp if self._start is None else self._start
         due = 1 + round((frame.timestamp - self._start) * self._fps)
         missing = due - self._written
@@ -84,6 +85,7 @@ class BrowserSink:
         self._server.server_close()
 
     def show(self, frame: Frame, picture: NDArray[np.uint8]) -> None:
+        """Hand the picture (h, w, 3) to all who look."""
         if not self._lookers:
             return
         _, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])

@@ -108,7 +108,7 @@ def least_distances(
 
 
 def match_points(distances: NDArray[np.uint16], ratio: float, most: int) -> tuple[Indices, Indices]:
-    """Rows and columns that are nearest to each other, nearer than ``most`` bits.
+    """Rows and columns (k,) of distances (n, m) that are nearest to each other, nearer than ``most`` bits.
 
     Either's second best has to be further away by 1 / ``ratio``.
     """

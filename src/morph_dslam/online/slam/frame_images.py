@@ -43,6 +43,11 @@ class FrameImages:
     Attributes
     ----------
     camera : of the undistorted images. baseline_px : of the depth (`RigidMap`), 0 without depth.
+
+    Raises
+    ------
+    CameraError
+        If a stereo pair is to have depth images too, or cannot be rectified.
     """
 
     def __init__(

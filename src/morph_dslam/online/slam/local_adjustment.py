@@ -98,7 +98,7 @@ def gather(
     iterations: int,
     hold_poses: bool = False,
 ) -> MapProblem:
-    """The problem of ``free`` keyframes and their points, held by ``fixed`` ones.
+    """The problem of ``free`` keyframes (numbers) and their points, held by ``fixed`` ones; intrinsics (4,).
 
     Where nothing else is held, the oldest free one is; with ``hold_poses`` all are, and only points move.
     """

@@ -47,6 +47,7 @@ class PassingViews:
         self._views = views or []
 
     def copy(self) -> PassingViews:
+        """The same views, to which others can be added apart."""
         return PassingViews(self._views)
 
     def note(self, keyframe: int, at: Array, camera_from_world: Array, ids: Indices, pixels: Array) -> None:

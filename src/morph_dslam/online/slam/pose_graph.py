@@ -46,6 +46,7 @@ class Similarities:
 
     @property
     def inverse(self) -> Similarities:
+        """The transforms the other way round."""
         rotations = self.rotations.transpose(0, 2, 1)
         turned = np.einsum("nij,nj->ni", rotations, self.translations)
         return Similarities(1.0 / self.scales, rotations, -turned / self.scales[:, None])

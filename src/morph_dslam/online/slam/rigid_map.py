@@ -105,6 +105,7 @@ class Followed:
         return self if np.isfinite(self.right).any() else Followed(self.ids, self.pixels, unmeasured)
 
     def joined(self, other: Followed) -> Followed:
+        """These points and others."""
         return Followed(
             np.concatenate([self.ids, other.ids]),
             np.concatenate([self.pixels, other.pixels]),

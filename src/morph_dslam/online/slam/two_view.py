@@ -39,6 +39,7 @@ class TwoViewHypothesis:
 
     @property
     def good(self) -> NDArray[np.bool_]:
+        """Matches (n,) that have a point."""
         return np.isfinite(self.points[:, 0])
 
 

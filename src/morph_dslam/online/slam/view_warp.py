@@ -72,9 +72,10 @@ class WarpedViews:
         self._views: dict[int, tuple[Array, Image]] = {}
 
     def view(self, number: int, keyframe: Keyframe, pose: Array, depth: float) -> tuple[Image, Array | None]:
-        """The image to look for patches of, and the homography from the keyframe's pixels to its pixels.
+        """The image (h, w) to look for patches of, and the homography (3, 3) from the keyframe's pixels.
 
-        That is None where the keyframe itself will do.
+        That is None where the keyframe itself will do. ``pose`` (4, 4) is camera from world, ``depth`` that
+        of the points before the keyframe, in the map's unit.
         """
         now = plane_homography(keyframe.camera_from_world, pose, depth, self._intrinsics)
         centre = self._intrinsics[2:]
