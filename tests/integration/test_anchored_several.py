@@ -83,6 +83,18 @@ def test_two_objects_are_tracked_in_one_map(recording, tmp_path, capsys):
     assert (column(run, "n_inliers") > 0.9 * column(run, "n_points")).all()
 
 
+@pytest.mark.slow
+def test_an_object_that_is_registered_beside_another_one_is_tracked_with_it(recording, tmp_path):
+    folder, truth = recording
+    register = ["register", folder / "map.h5", "--model", folder / "wedge.morph", "--camera"]
+    register += [folder / "camera.yaml", "--beside", folder / "sheet" / "registration.json", "-o", tmp_path]
+    assert main([str(word) for word in register]) == 0
+    start = also(folder, "wedge", tmp_path / "registration.json")
+    assert main(command(folder, tmp_path / "run", *start)) == 0
+    assert errors(folder, truth, "sheet", tmp_path / "run").max() < MAP_ERROR
+    assert errors(folder, truth, "wedge", tmp_path / "run" / "wedge").max() < 0.7e-3
+
+
 def locate_ms(run_folder):
     return column(run_folder, "timings_ms")[:, STAGES.index("locate")]
 

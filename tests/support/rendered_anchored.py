@@ -85,7 +85,7 @@ def make_anchored_recording(folder):
     return truth
 
 
-def write_registration(path, slam, frames, truth, centre=(0.0, 0.0, 0.0), map_name=None):
+def write_registration(path, slam, frames, truth, centre=(0.0, 0.0, 0.0), names=None):
     """A registration that is as good as the camera's path in the map."""
     path_in_map = trajectory_of(slam, frames)
     seen = [frame.index for frame in frames if frame.pose is not None]
@@ -110,9 +110,7 @@ def write_registration(path, slam, frames, truth, centre=(0.0, 0.0, 0.0), map_na
         moved = keyframe.camera_from_world[:3, :3] @ placed.translation + keyframe.camera_from_world[:3, 3]
         pose[:3, 3] = moved / placed.scale
         content["keyframes"].append({"frame": keyframe.index, "camera_from_object": pose.tolist()})
-    if map_name is not None:
-        content["map"] = map_name
-    path.write_text(json.dumps(content))
+    path.write_text(json.dumps(content | (names or {})))
 
 
 def _similarity(map_from_camera, camera_from_object, centre):

@@ -219,4 +219,5 @@ def _scan(folder, models, truth):
     for name, model in models.items():
         (folder / name).mkdir()
         path = folder / name / "registration.json"
-        write_registration(path, slam, frames, truth[name], model.nodes.mean(axis=0), "../map.h5")
+        names = {"map": "../map.h5", "model": f"../{name}.morph"}
+        write_registration(path, slam, frames, truth[name], model.nodes.mean(axis=0), names)
