@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from morph_dslam import cli
-from morph_dslam.errors import EvaluationError, MorphError, RegistrationError
+from morph_dslam.errors import EvaluationError, MorphError, RegistrationError, TrackingError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.evaluation.run_report import write_run_report
 from morph_dslam.io.calibration import load_camera
@@ -18,6 +18,7 @@ from morph_dslam.io.landmarks import load_landmarks
 from morph_dslam.io.trajectory import load_trajectory
 from morph_dslam.model import save_model
 from morph_dslam.online.aids.board import load_board
+from morph_dslam.online.output_folders import check_run_folder, write_registration
 from morph_dslam.online.placement import load_placement
 from morph_dslam.online.reregistration import Reregistration
 from tests.support.bent_sheet import bent_sheet_model
@@ -226,3 +227,27 @@ def test_a_registration_with_parts_of_another_shape(tmp_path):
         path.write_text(json.dumps(REGISTRATION | wrong))
         with pytest.raises(RegistrationError, match="is not a registration"):
             load_placement(path, model)
+
+
+def test_a_folder_that_holds_a_run_or_cannot_be_made(tmp_path):
+    (tmp_path / "file").write_text("")
+    check_run_folder(tmp_path / "a" / "run", overwrite=False)
+    assert (tmp_path / "a" / "run").is_dir()
+    for sign in ("result.h5", "trajectory.txt"):
+        (tmp_path / "a" / "run" / sign).write_text("")
+        with pytest.raises(TrackingError, match="holds a run already"):
+            check_run_folder(tmp_path / "a" / "run", False, sign)
+        check_run_folder(tmp_path / "a" / "run", True, sign)
+    for name in ("file", "file/run"):
+        with pytest.raises(TrackingError, match="cannot write the run to"):
+            check_run_folder(tmp_path / name, overwrite=True)
+
+
+def test_a_registration_names_its_files_relative_to_itself(tmp_path):
+    (tmp_path / "place").mkdir()
+    files = tmp_path / "scan" / "map.h5", tmp_path / "seal.morph"
+    written = write_registration(tmp_path / "place", {"score": 1.0}, *files)
+    assert written == {"score": 1.0, "map": "../scan/map.h5", "model": "../seal.morph"}
+    assert json.loads((tmp_path / "place" / "registration.json").read_text()) == written
+    with pytest.raises(RegistrationError, match="cannot write the registration"):
+        write_registration(tmp_path / "absent", {}, *files)

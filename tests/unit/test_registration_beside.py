@@ -28,10 +28,8 @@ def write_registration(folder, place, **changes):
     """The registration of a wedge, with its model and an empty map beside it."""
     model = bending_wedge()
     save_model(folder / "wedge.morph", model)
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = place.scale * place.rotation, place.translation
     content = {
-        "world_from_object": matrix.tolist(),
+        "world_from_object": place.matrix.tolist(),
         "map_units_per_metre": place.scale,
         "mean_node_m": model.nodes.mean(axis=0).tolist(),
         "covariance": None,

@@ -14,7 +14,6 @@ import numba
 import numpy as np
 
 from morph_dslam import __version__
-from morph_dslam.errors import TrackingError
 from morph_dslam.io.calibration import load_camera, save_camera
 from morph_dslam.model import save_model
 from morph_dslam.model.inner_structure import CarriedStructure
@@ -38,24 +37,6 @@ class RunInputs:
     model: Path
     camera: Path
     named: dict[str, str]
-
-
-def check_run_folder(folder: Path, overwrite: bool) -> None:
-    """Make the run folder.
-
-    Raises
-    ------
-    TrackingError
-        If it cannot be made, or holds a run already that is not to be overwritten.
-    """
-    if (folder / "result.h5").exists() and not overwrite:
-        raise TrackingError(
-            f"{folder} holds a run already: choose another folder, or allow it to be overwritten"
-        )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise TrackingError(f"cannot make the run folder {folder}: {error.strerror}") from error
 
 
 def write_run(

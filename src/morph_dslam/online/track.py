@@ -14,6 +14,7 @@ from morph_dslam.errors import SourceError, TrackingError
 from morph_dslam.online.attempt import Picture
 from morph_dslam.online.augmentation import write_video
 from morph_dslam.online.augmented_view import AugmentedView, DrawOptions
+from morph_dslam.online.output_folders import check_run_folder
 from morph_dslam.online.placement import Placement
 from morph_dslam.online.reference_refinement import (
     Keyframe,
@@ -24,7 +25,7 @@ from morph_dslam.online.reference_refinement import (
 from morph_dslam.online.registration import bind_landmarks
 from morph_dslam.online.reregistration import Reregistration
 from morph_dslam.online.results import RunResults
-from morph_dslam.online.run_writing import RunInputs, check_run_folder, write_run
+from morph_dslam.online.run_writing import RunInputs, write_run
 from morph_dslam.online.tracking_setup import ObjectOptions, Setup, load_setup
 from morph_dslam.sources import Frame, FrameSource, open_source
 from morph_dslam.sources.recorded import RecordedFrames

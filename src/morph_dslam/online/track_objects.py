@@ -16,10 +16,10 @@ from tqdm import tqdm
 
 from morph_dslam.errors import TrackingError
 from morph_dslam.online.aids.start import AidFiles
+from morph_dslam.online.output_folders import check_run_folder
 from morph_dslam.online.pipeline import Tracker
 from morph_dslam.online.placement import Placement
 from morph_dslam.online.results import RunResults
-from morph_dslam.online.run_writing import check_run_folder
 from morph_dslam.online.several_objects import ObjectsChain, widened
 from morph_dslam.online.track import (
     Begin,

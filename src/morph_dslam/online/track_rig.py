@@ -19,10 +19,10 @@ from morph_dslam.io.stereo_calibration import load_rig
 from morph_dslam.online.attempt import Picture
 from morph_dslam.online.chain import Chain
 from morph_dslam.online.estimation import State
+from morph_dslam.online.output_folders import check_run_folder
 from morph_dslam.online.results import RunResults
 from morph_dslam.online.rig import RigCamera
 from morph_dslam.online.rig_tracking import RigTracker
-from morph_dslam.online.run_writing import check_run_folder
 from morph_dslam.online.slam.frame_images import FrameImages
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.track import TrackOptions, find_begin, open_frames, with_reference, write_results

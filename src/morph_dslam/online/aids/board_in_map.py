@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +20,7 @@ from morph_dslam.model import load_model
 from morph_dslam.online.aids.board import FEWEST_CORNERS, FiducialBoard, load_board
 from morph_dslam.online.aids.board_pose import LEAST_CORNER_PX, locate_board
 from morph_dslam.online.mesh_registration.scene import View, camera_from_object, scene_of_map
+from morph_dslam.online.output_folders import make_folder, write_registration
 from morph_dslam.online.slam.map_file import load_map
 from morph_dslam.similarity import SimilarityTransform
 
@@ -147,14 +146,8 @@ def register_by_board(
             "measure the print, and mend the board file or the depth camera's calibration"
         )
     mean_node = model.positions(model.default).mean(axis=0)
-    content = _content(found, on_board, mean_node, views)
-    content["map"], content["model"] = (os.path.relpath(path, output) for path in (map_path, model_path))
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-        (output / "registration.json").write_text(json.dumps(content, indent=2) + "\n")
-    except OSError as error:
-        raise RegistrationError(f"cannot write the registration to {output}: {error.strerror}") from error
-    return content
+    make_folder(output, "the registration", RegistrationError)
+    return write_registration(output, _content(found, on_board, mean_node, views), map_path, model_path)
 
 
 def _content(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -25,6 +23,7 @@ from morph_dslam.online.mesh_registration.scene import (
     spread_views,
 )
 from morph_dslam.online.mesh_registration.unit_check import register_in_unit
+from morph_dslam.online.output_folders import make_folder, write_registration
 from morph_dslam.online.slam.map_file import load_map
 from morph_dslam.render.overlay import draw_overlay
 from morph_dslam.render.shading import lambert, vertex_normals
@@ -57,27 +56,20 @@ def run_registration(
     camera, model = load_camera(camera_path), load_model(model_path)
     rigid_map = load_map(map_path, camera)
     points, views = left_by_others(*scene_of_map(rigid_map), beside, map_path)
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RegistrationError(f"cannot write the registration to {output}: {error.strerror}") from error
+    make_folder(output, "the registration", RegistrationError)
     nodes = model.positions(model.default)
     metric = rigid_map.is_metric
     found = register_in_unit(nodes, model.triangles, points, views, camera, metric, progress=True)
     content = _content(found, nodes) | {"keyframes": _keyframes(found, views)}
-    content["map"], content["model"] = (os.path.relpath(path, output) for path in (map_path, model_path))
-    (output / "registration.json").write_text(json.dumps(content, indent=2) + "\n")
+    content = write_registration(output, content, map_path, model_path)
     cv2.imwrite(str(output / "registration.jpg"), draw_registration(found, model, views, camera))
     return content
 
 
 def _content(found: MeshRegistration, nodes: NDArray[np.float64]) -> dict[str, Any]:
-    similarity = found.world_from_object
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = similarity.scale * similarity.rotation, similarity.translation
     content: dict[str, Any] = {
-        "world_from_object": matrix.tolist(),
-        "map_units_per_metre": similarity.scale,
+        "world_from_object": found.world_from_object.matrix.tolist(),
+        "map_units_per_metre": found.world_from_object.scale,
         "mean_node_m": nodes.mean(axis=0).tolist(),
         "score": found.score,
         "runner_up_score": found.runner_up,

@@ -13,12 +13,13 @@ import numpy as np
 from tqdm import tqdm
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.errors import MapError, TrackingError
+from morph_dslam.errors import MapError
 from morph_dslam.io.colmap_model import read_colmap_model
 from morph_dslam.io.stereo_calibration import load_camera_or_pair
 from morph_dslam.io.trajectory import load_trajectory
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.online.flow import patch_correlation
+from morph_dslam.online.output_folders import check_run_folder
 from morph_dslam.online.side_by_side import threads_side_by_side
 from morph_dslam.online.slam.bundle_adjustment import Observations, adjust
 from morph_dslam.online.slam.colmap_map import map_from_colmap
@@ -102,7 +103,7 @@ def run_slam(options: SlamRunOptions) -> dict[str, Any]:
     camera = load_camera_or_pair(options.camera)
     source = open_stream(options.source, options.first, options.last)
     with source if isinstance(source, LiveCamera) else nullcontext():
-        _prepare_folder(options)
+        check_run_folder(options.output, options.overwrite, "trajectory.txt")
         warm_up()
         return _run(options, camera, source)
 
@@ -164,17 +165,6 @@ def _finish(
     slam.refine_map()
     inputs = {"source": str(options.source), "camera": str(options.camera)}
     return write_run(options.output, slam, frames, {"inputs": inputs} | extra)
-
-
-def _prepare_folder(options: SlamRunOptions) -> None:
-    if (options.output / "trajectory.txt").exists() and not options.overwrite:
-        raise TrackingError(
-            f"{options.output} holds a run already: choose another folder, or allow it to be overwritten"
-        )
-    try:
-        options.output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise TrackingError(f"cannot make the run folder {options.output}: {error.strerror}") from error
 
 
 def warm_up() -> None:
