@@ -3,7 +3,6 @@
 import cv2
 import numpy as np
 import pytest
-import yaml
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.cli import main
@@ -16,6 +15,7 @@ from morph_dslam.online.pipeline import Tracker
 from morph_dslam.online.rig import RigCamera
 from morph_dslam.online.rig_tracking import RigTracker
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.camchain import write_camchain
 from tests.support.rendered_sequence import SheetFilm, mean_error, sheet_state
 
 #: Two cameras of wide lenses, so that one by itself tells little along its sight line; 0.4 m apart.
@@ -98,18 +98,7 @@ def recording(model, tmp_path_factory):
         for name, image in zip(("front", "aside"), images(films, time), strict=True):
             (folder / name).mkdir(exist_ok=True)
             cv2.imwrite(str(folder / name / f"{number:03d}.png"), image)
-    chain = {
-        f"cam{number}": {
-            "camera_model": "pinhole",
-            "intrinsics": part.camera.intrinsics.tolist(),
-            "distortion_model": "none",
-            "distortion_coeffs": [],
-            "resolution": [part.camera.width, part.camera.height],
-        }
-        for number, part in enumerate(RIG)
-    }
-    chain["cam1"]["T_cn_cnm1"] = ASIDE.camera_from_rig.matrix.tolist()
-    (folder / "camchain.yaml").write_text(yaml.safe_dump(chain))
+    write_camchain(folder / "camchain.yaml", RIG)
     save_model(folder / "sheet.morph", model)
     state, nodes = sheet_state(0.0), np.random.default_rng(0).choice(len(model.nodes), 24, replace=False)
     positions = state.camera_from_object.apply(model.positions(state.parameters))[nodes]

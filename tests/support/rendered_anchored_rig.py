@@ -11,7 +11,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
@@ -26,6 +25,7 @@ from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.scene_file import Scene, load_scene_file
 from morph_dslam.render.scene_renderer import SceneRenderer, supersampled
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.camchain import write_camchain
 from tests.support.rendered_anchored import write_registration
 from tests.support.staged_scenes import bending_wedge
 
@@ -150,7 +150,7 @@ def make_rig_recording(folder: Path) -> dict[str, dict[str, np.ndarray]]:
         for name, part in parts.items()
     }
     save_camera(folder / "camera.yaml", _CAMERA)
-    (folder / "camchain.yaml").write_text(yaml.safe_dump(_camchain()))
+    write_camchain(folder / "camchain.yaml", RIG)
     _scan(folder, models, truth)
     return truth
 
@@ -191,21 +191,6 @@ def _film(folder, parts, part, frames):
 def _depth(camera, nodes, model):
     pixels = camera.project(nodes)
     return rasterise(pixels, nodes[:, 2], model.triangles, camera.height, camera.width).depth
-
-
-def _camchain():
-    chain = {
-        f"cam{number}": {
-            "camera_model": "pinhole",
-            "intrinsics": part.camera.intrinsics.tolist(),
-            "distortion_model": "none",
-            "distortion_coeffs": [],
-            "resolution": [part.camera.width, part.camera.height],
-        }
-        for number, part in enumerate(RIG)
-    }
-    chain["cam1"]["T_cn_cnm1"] = RIG[1].camera_from_rig.matrix.tolist()
-    return chain
 
 
 def _scan(folder, models, truth):
