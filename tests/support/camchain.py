@@ -4,7 +4,7 @@ import yaml
 
 
 def write_camchain(path, rig):
-    """Write the file of two cameras (`RigCamera`) without distortion, the first of which has the rig's pose."""
+    """Write the file of two cameras (`RigCamera`) without distortion; the first has the rig's pose."""
     chain = {
         f"cam{number}": {
             "camera_model": "pinhole",
