@@ -204,8 +204,10 @@ def _by_weight(fits: list[Fit]) -> list[Fit]:
 def _same_place(a: SimilarityTransform, b: SimilarityTransform, surface: Surface) -> bool:
     """Whether two similarities lay the surface, as a set of points, in the same place."""
     between = b.inverse @ a
+    if not abs(np.log(between.scale)) < 0.1:
+        return False
     distances, _ = surface.tree.query(between.apply(surface.points[::20]))
-    return abs(np.log(between.scale)) < 0.1 and float(distances.mean()) < SAME_PLACE * surface.size
+    return float(distances.mean()) < SAME_PLACE * surface.size
 
 
 def _distinct(places: list[_Place], n_points: int, surface: Surface) -> list[_Place]:

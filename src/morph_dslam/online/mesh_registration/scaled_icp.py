@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.geometry import rotation_exp
@@ -59,16 +60,7 @@ def fit_surface(
         normals = surface.normals[nearest] @ transform.rotation.T
         centre = transform.apply(surface.centre)
         gaps = points.positions - centre - arms
-        residuals = np.einsum("px,px->p", gaps, normals)
-        squares = residuals**2 if to_planes else np.einsum("px,px->p", gaps, gaps)
-        weights = np.clip(1.0 - squares / width**2, 0.0, None) ** 2
-        if to_planes:
-            rows, measured, counted = _rows(arms, normals), residuals, weights
-        else:
-            axes = [np.tile(axis, (len(arms), 1)) for axis in np.eye(3)]
-            rows = np.concatenate([_rows(arms, axis) for axis in axes])
-            measured, counted = gaps.T.ravel(), np.tile(weights, 3)
-        matrix, right = (rows * counted[:, None]).T @ rows, rows.T @ (counted * measured)
+        matrix, right, weights = normal_equations(gaps, arms, normals, width, to_planes)
         size = surface.radius * transform.scale
         prior = PRIOR * max(weights.sum(), 1.0) * np.array([size**2] * 4 + [1.0] * 3)
         if metric:
@@ -79,6 +71,55 @@ def fit_surface(
         translation = centre + step[4:] - scale * rotation @ surface.centre
         transform = SimilarityTransform(scale, rotation, translation)
     return Fit(transform, weights)
+
+
+@njit(cache=True, nogil=True)
+def normal_equations(gaps, arms, normals, width, to_planes):
+    """Gauss-Newton's matrix (7, 7) and right side (7,), and Tukey's weights (n,) of the points.
+
+    Parameters
+    ----------
+    gaps : (n, 3) from the surface to the points. arms : (n, 3) from its centre to its points.
+    normals : (n, 3) there. width : gaps as large do not count. to_planes : as in `fit_surface`.
+    """
+    matrix, right, weights = np.zeros((7, 7)), np.zeros(7), np.zeros(len(gaps))
+    row, axes = np.empty(7), np.eye(3)
+    for p in range(len(gaps)):
+        g, a = gaps[p], arms[p]
+        along = g[0] * normals[p, 0] + g[1] * normals[p, 1] + g[2] * normals[p, 2]
+        square = along**2 if to_planes else g[0] ** 2 + g[1] ** 2 + g[2] ** 2
+        if square >= width**2:
+            continue
+        weights[p] = (1.0 - square / width**2) ** 2
+        for direction in range(1 if to_planes else 3):
+            d = normals[p] if to_planes else axes[direction]
+            row[0] = a[0] * d[0] + a[1] * d[1] + a[2] * d[2]
+            row[1] = a[1] * d[2] - a[2] * d[1]
+            row[2] = a[2] * d[0] - a[0] * d[2]
+            row[3] = a[0] * d[1] - a[1] * d[0]
+            row[4:] = d
+            measured = along if to_planes else g[direction]
+            for i in range(7):
+                right[i] += weights[p] * row[i] * measured
+                for j in range(7):
+                    matrix[i, j] += weights[p] * row[i] * row[j]
+    return matrix, right, weights
+
+
+def normal_equations_numpy(
+    gaps: Array, arms: Array, normals: Array, width: float, to_planes: bool
+) -> tuple[Array, Array, Array]:
+    """The plain twin of `normal_equations`."""
+    residuals = np.einsum("px,px->p", gaps, normals)
+    squares = residuals**2 if to_planes else np.einsum("px,px->p", gaps, gaps)
+    weights = np.clip(1.0 - squares / width**2, 0.0, None) ** 2
+    if to_planes:
+        rows, measured, counted = _rows(arms, normals), residuals, weights
+    else:
+        axes = [np.tile(axis, (len(arms), 1)) for axis in np.eye(3)]
+        rows = np.concatenate([_rows(arms, axis) for axis in axes])
+        measured, counted = gaps.T.ravel(), np.tile(weights, 3)
+    return (rows * counted[:, None]).T @ rows, rows.T @ (counted * measured), weights
 
 
 def _rows(arms: Array, directions: Array) -> Array:
