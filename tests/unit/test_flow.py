@@ -14,8 +14,9 @@ from morph_dslam.online.flow import (
     FlowOptions,
     flatten,
     follow,
+    patch_agreement,
+    patch_agreement_numpy,
     patch_correlation,
-    patch_correlation_numpy,
 )
 from morph_dslam.online.textured_view import draw_textured, draw_textured_numpy
 from tests.support.bent_sheet import bent_sheet_model
@@ -57,14 +58,53 @@ def test_following_no_points_is_allowed(image):
     assert ok.shape == (0,)
 
 
-def test_compiled_and_plain_correlation_agree(image):
+def test_compiled_and_plain_agreement_agree(image):
     rng = np.random.default_rng(0)
     first = rng.uniform([-5, -5], [645, 485], (80, 2))
     second = first + rng.uniform(-2, 2, first.shape)
     other = shifted(image, 1.0, 0.5)
-    compiled = patch_correlation(image, other, first, second, 7)
-    plain = patch_correlation_numpy(image, other, first, second, 7)
-    np.testing.assert_allclose(compiled, plain, atol=1e-6)
+    compiled = patch_agreement(image, other, first, second, 7)
+    plain = patch_agreement_numpy(image, other, first, second, 7)
+    for one, twin in zip(compiled, plain, strict=True):
+        np.testing.assert_allclose(one, twin, atol=1e-6)
+    # Blank paper, and what leaves the image, tells no place.
+    assert np.isinf(compiled[1][compiled[0] == -1.0]).all()
+
+
+def test_the_spread_of_a_patch_is_how_far_off_points_are_found(image):
+    """Points are followed into images with more and more noise; in each the errors are as told."""
+    flat = flatten(image, 31)
+    points = spread_corners(flat, np.pad(np.full((400, 560), 255, np.uint8), 40), 300)
+    errors, told, half = [], [], OPTIONS.window // 2
+    for noise in (2.0, 8.0, 16.0):
+        rng = np.random.default_rng(int(noise))
+        noisy = np.clip(image + noise * rng.standard_normal(image.shape), 0, 255).astype(np.uint8)
+        target = flatten(noisy, 31)
+        found, ok = follow(flat, target, points, points, OPTIONS)
+        close = ok & (np.linalg.norm(found - points, axis=1) < 2.0)
+        errors.append(np.sqrt(np.mean((found - points)[close] ** 2)))
+        spread = patch_agreement(flat, target, points[close], found[close], half)[1]
+        told.append(np.sqrt(np.mean(spread**2)))
+    assert errors[2] > 4.0 * errors[0]
+    np.testing.assert_allclose(told, errors, rtol=0.25)
+
+
+def test_a_window_that_is_covered_in_part_is_told_by_its_spread(image):
+    """A disc moves over the image: its rim shifts what is found in the windows that straddle it."""
+    flat = flatten(image, 31)
+    points = spread_corners(flat, np.pad(np.full((400, 560), 255, np.uint8), 40), 300)
+    covered = image.copy()
+    cv2.circle(covered, (320, 240), 90, 150, -1, cv2.LINE_AA)
+    target = flatten(covered, 31)
+    found, ok = follow(flat, target, points, points, OPTIONS)
+    correlation, spread = patch_agreement(flat, target, points, found, 7)
+    far = np.linalg.norm(points - [320.0, 240.0], axis=1)
+    off = np.linalg.norm(found - points, axis=1)
+    passed = ok & (correlation > 0.6)
+    rim, free = passed & (far < 100.0), passed & (far > 130.0)
+    assert rim.sum() > 5
+    assert np.median(off[rim]) > 5.0 * np.median(off[free])
+    assert np.median(spread[rim]) > 5.0 * np.median(spread[free])
 
 
 def test_correlation_ignores_gain_and_offset_and_sees_difference(image):

@@ -8,7 +8,7 @@ from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
 from morph_dslam.online.estimation import BoundPoints, Estimator, Prior, State, moved
 from morph_dslam.online.known_pose import KnownPose
-from morph_dslam.online.measurement_noise import Measured, window_correlation
+from morph_dslam.online.measurement_noise import Measured, window_correlation, window_correlation_numpy
 from morph_dslam.online.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model
 
@@ -211,6 +211,31 @@ def test_windows_correlate_by_what_they_share():
     pixels = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 5.0], [30.0, 0.0]])
     expected = np.array([1.0, 6 / 10, 6 / 10 * 5 / 10, 0.0])
     np.testing.assert_allclose(window_correlation(pixels, 10)[0], expected)
+    many = np.random.default_rng(0).uniform(0.0, 60.0, (40, 2))
+    many[3] = np.nan
+    compiled = window_correlation(many, 17)
+    np.testing.assert_allclose(compiled, window_correlation_numpy(many, 17), atol=1e-12)
+    np.testing.assert_array_equal(compiled[3], np.eye(40)[3])
+
+
+def test_points_measured_less_exactly_count_by_their_weights():
+    """Two kinds of points, one ten times as exact: the deviations of a weighted estimate are its errors'."""
+    points, state = bound(150), truth(3)
+    rng, sigma = np.random.default_rng(5), np.where(np.arange(150) % 2, 0.1, 1.0)
+    weights, pixels = 0.1**2 / sigma**2, CAMERA.project(points.in_camera(state))
+    found, stated, alike = [], [], []
+    for _ in range(60):
+        seen = pixels + sigma[:, None] * rng.standard_normal((150, 2))
+        alone = ESTIMATOR.estimate(points, seen, weights, state)
+        measured = Measured(points, seen, weights, np.zeros_like(seen), np.eye(150))
+        estimate = SequenceFilter(ESTIMATOR, []).fuse(measured, alone)
+        found.append(estimate.state.parameters)
+        stated.append(estimate.parameter_std)
+        alike.append(ESTIMATOR.estimate(points, seen, np.ones(150), state).state.parameters)
+        assert alone.sigma_px == pytest.approx(0.1, rel=0.3)
+    spread = np.std(found, axis=0)
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(stated), axis=0)), spread, rtol=0.3)
+    assert (spread < 0.35 * np.std(alike, axis=0)).all()
 
 
 def test_parameter_that_nothing_tells_has_a_large_deviation():

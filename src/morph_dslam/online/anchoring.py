@@ -14,6 +14,7 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.online.attempt import Attempt
 from morph_dslam.online.estimation import Estimate, Estimator, Prior, moved
 from morph_dslam.online.known_pose import KnownPose
+from morph_dslam.online.measurement_noise import Measured
 from morph_dslam.online.reference_view import ReferenceView
 from morph_dslam.online.robust_covariance import EIGENVALUE_FLOOR
 from morph_dslam.online.tracker_options import TrackerOptions
@@ -39,15 +40,14 @@ class Anchoring:
         self._estimator, self.reference, self._options = estimator, reference, options
         self._d = len(estimator.model.parameters)
         self._size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
-        self._sigma_px, self._n_other = FIRST_SIGMA_PX, 0
+        self._squared_px, self._n_other = reference.redundancy * FIRST_SIGMA_PX**2, 0
         self.has_moved = False
 
     def prior(self, known: KnownPose | None) -> Prior | None:
         """What the map tells of the pose; None if the camera is lost or the object has moved."""
         if known is None or self.has_moved:
             return None
-        squared_px = self.reference.redundancy * self._sigma_px**2
-        return known.prior(self._d, squared_px, HELD if self._options.hold_pose else 1.0)
+        return known.prior(self._d, self._squared_px, HELD if self._options.hold_pose else 1.0)
 
     def contradicts(self, known: KnownPose, attempt: Attempt) -> bool:
         """Whether the points of a believable attempt show the object elsewhere than in the map.
@@ -69,7 +69,7 @@ class Anchoring:
         What the points do not tell at all stays as the attempt has it, with a very large variance.
         """
         estimate, points = attempt.estimate, self.reference.points
-        weights = attempt.inliers.astype(float)
+        weights = attempt.weights
         _, hessian, gradient, _ = self._estimator.evaluate(
             points, attempt.measurement.pixels, weights, estimate.state
         )
@@ -88,7 +88,7 @@ class Anchoring:
         if self._n_other >= self._options.moved_patience:
             self.has_moved, self._n_other = elsewhere, 0
 
-    def learn(self, estimate: Estimate) -> None:
-        """Take in how well the points of an accepted frame agree."""
+    def learn(self, estimate: Estimate, measured: Measured) -> None:
+        """Take in how well the points of an accepted frame agree, and how many count as one."""
         if np.isfinite(estimate.sigma_px):
-            self._sigma_px = max(estimate.sigma_px, LEAST_SIGMA_PX)
+            self._squared_px = measured.redundancy * max(estimate.sigma_px, LEAST_SIGMA_PX) ** 2

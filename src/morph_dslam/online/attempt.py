@@ -16,6 +16,8 @@ from morph_dslam.online.tracker_options import TrackerOptions
 #: Where less than this share of all points agree, they must agree closely.
 MOST_AGREE = 0.5
 
+Array = NDArray[np.float64]
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -40,6 +42,7 @@ class Attempt:
 
     Attributes
     ----------
+    weights : (p,) that the measurements counted with, zero for those that do not support it.
     prior : what was known of the pose from the map when it was made; None if nothing was.
     depths : of the points that support it, where a depth camera saw them.
     """
@@ -47,6 +50,7 @@ class Attempt:
     estimate: Estimate
     inliers: NDArray[np.bool_]
     measurement: Measurement
+    weights: Array
     prior: Prior | None = None
     outline: OutlineMeasurement | None = None
     depths: PointDepths | None = None

@@ -63,17 +63,27 @@ def follow(
 
 
 @njit(cache=True, nogil=True)
-def _sample(image, x, y):
+def _patch(image, x, y, patch):
+    """Fill a patch (n, n) with the image about it, its first pixel at (x, y), bilinearly."""
     x0, y0 = int(x), int(y)
     right, down = x - x0, y - y0
-    above = (1.0 - right) * image[y0, x0] + right * image[y0, x0 + 1]
-    below = (1.0 - right) * image[y0 + 1, x0] + right * image[y0 + 1, x0 + 1]
-    return (1.0 - down) * above + down * below
+    a, b = (1.0 - right) * (1.0 - down), right * (1.0 - down)
+    c, d = (1.0 - right) * down, right * down
+    for row in range(patch.shape[0]):
+        for column in range(patch.shape[1]):
+            u, v = x0 + column, y0 + row
+            patch[row, column] = (
+                a * image[v, u] + b * image[v, u + 1] + c * image[v + 1, u] + d * image[v + 1, u + 1]
+            )
 
 
 @njit(cache=True, nogil=True)
-def patch_correlation(first, second, first_points, second_points, half):
-    """Normalised cross-correlation of square patches of two images, compiled.
+def patch_agreement(first, second, first_points, second_points, half):
+    """How alike square patches of two images are, and how exactly that tells their places, compiled.
+
+    What is left of the difference of the patches acts on Lucas and Kanade's least squares like noise: with
+    its mean square s and the sum G of the outer products of the first patch's slopes, the covariance of the
+    place is s G^-1 (Foerstner, Image matching, 1993).
 
     Parameters
     ----------
@@ -82,41 +92,59 @@ def patch_correlation(first, second, first_points, second_points, half):
 
     Returns
     -------
-    (p,) in [-1, 1]; -1 where a patch leaves its image, 0 where one has no contrast.
+    correlation : (p,) normalised, in [-1, 1]; -1 where a patch leaves its image, 0 where one has no contrast.
+    spread : (p,) standard deviation of a coordinate by s G^-1, pixels; infinite where it is not determined.
     """
     height, width = first.shape
-    result = np.empty(len(first_points))
-    count = float((2 * half + 1) ** 2)
+    correlation, spread = np.full(len(first_points), -1.0), np.full(len(first_points), np.inf)
+    size, count = 2 * half + 1, float((2 * half + 1) ** 2)
+    a, b = np.empty((size, size)), np.empty((size, size))
     for j in range(len(first_points)):
         x, y = first_points[j, 0] - half, first_points[j, 1] - half
         u, v = second_points[j, 0] - half, second_points[j, 1] - half
         inside = min(x, y, u, v) >= 0.0
         inside &= max(x, u) + 2 * half < width - 1 and max(y, v) + 2 * half < height - 1
         if not inside:
-            result[j] = -1.0
             continue
-        sum_a = sum_b = sum_aa = sum_bb = sum_ab = 0.0
-        for row in range(2 * half + 1):
-            for column in range(2 * half + 1):
-                a = _sample(first, x + column, y + row)
-                b = _sample(second, u + column, v + row)
-                sum_a += a
-                sum_b += b
-                sum_aa += a * a
-                sum_bb += b * b
-                sum_ab += a * b
-        variance = (sum_aa - sum_a * sum_a / count) * (sum_bb - sum_b * sum_b / count)
-        covariance = sum_ab - sum_a * sum_b / count
-        result[j] = covariance / np.sqrt(variance) if variance > 1e-6 else 0.0
-    return result
+        _patch(first, x, y, a)
+        _patch(second, u, v, b)
+        mean_a, mean_b = a.mean(), b.mean()
+        aa = bb = ab = 0.0
+        for row in range(size):
+            for column in range(size):
+                p, q = a[row, column] - mean_a, b[row, column] - mean_b
+                aa += p * p
+                bb += q * q
+                ab += p * q
+        correlation[j] = ab / np.sqrt(aa * bb) if aa * bb > 1e-6 else 0.0
+        xx = xy = yy = 0.0
+        for row in range(1, size - 1):
+            for column in range(1, size - 1):
+                right = 0.5 * (a[row, column + 1] - a[row, column - 1])
+                down = 0.5 * (a[row + 1, column] - a[row - 1, column])
+                xx += right * right
+                xy += right * down
+                yy += down * down
+        determinant = xx * yy - xy * xy
+        if determinant > 1e-6:
+            left = max(aa + bb - 2.0 * ab, 0.0) / count
+            spread[j] = np.sqrt(0.5 * left * (xx + yy) / determinant)
+    return correlation, spread
 
 
-def patch_correlation_numpy(first, second, first_points, second_points, half):
-    """The plain twin of `patch_correlation`, on scipy's bilinear sampling."""
+def patch_correlation(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], first_points: Array, second_points: Array, half: int
+) -> Array:
+    """The correlation (p,) alone, of `patch_agreement`."""
+    return np.asarray(patch_agreement(first, second, first_points, second_points, half)[0])
+
+
+def patch_agreement_numpy(first, second, first_points, second_points, half):
+    """The plain twin of `patch_agreement`, on scipy's bilinear sampling."""
     from scipy.ndimage import map_coordinates
 
-    offsets = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
-    result = np.full(len(first_points), -1.0)
+    offsets, size = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1), 2 * half + 1
+    correlation, spread = np.full(len(first_points), -1.0), np.full(len(first_points), np.inf)
     limit = np.array(first.shape[::-1]) - 1.0
     for j, centres in enumerate(zip(first_points, second_points, strict=True)):
         if any((c - half < 0).any() or (c + half >= limit).any() for c in centres):
@@ -127,5 +155,9 @@ def patch_correlation_numpy(first, second, first_points, second_points, half):
         )
         a, b = a - a.mean(), b - b.mean()
         norm = np.sqrt((a @ a) * (b @ b))
-        result[j] = a @ b / norm if norm > 1e-3 else 0.0
-    return result
+        correlation[j] = a @ b / norm if norm > 1e-3 else 0.0
+        down, right = (slope[1:-1, 1:-1].ravel() for slope in np.gradient(a.reshape(size, size)))
+        slopes = np.array([[right @ right, right @ down], [right @ down, down @ down]])
+        if np.linalg.det(slopes) > 1e-6:
+            spread[j] = np.sqrt(0.5 * np.mean((a - b) ** 2) * np.trace(np.linalg.inv(slopes)))
+    return correlation, spread

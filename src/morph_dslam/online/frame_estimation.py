@@ -11,7 +11,8 @@ from morph_dslam.online.attempt import Attempt, Picture
 from morph_dslam.online.depth_residuals import PointDepths
 from morph_dslam.online.estimation import Estimate, Estimator, Prior, State
 from morph_dslam.online.measurement import Measurement
-from morph_dslam.online.measurement_noise import Measured
+from morph_dslam.online.measurement_noise import Measured, window_correlation
+from morph_dslam.online.point_noise import PointNoise
 from morph_dslam.online.reference_view import ReferenceView
 from morph_dslam.online.shape_search import ShapeSearch
 from morph_dslam.online.timing import StageClock
@@ -28,6 +29,7 @@ class FrameEstimation:
 
     def __init__(self, estimator: Estimator, reference: ReferenceView, options: TrackerOptions) -> None:
         self._estimator, self._reference, self._options = estimator, reference, options
+        self._noise = PointNoise()
         self._search = ShapeSearch(estimator.model, options.searches)
         brief = replace(options.estimation, max_iterations=10, tolerance=1e-3)
         self._scout = Estimator(estimator.model, estimator.camera, brief)
@@ -65,14 +67,20 @@ class FrameEstimation:
                 break
             start, used = estimate.state, agreeing
         assert estimate is not None
-        return Attempt(estimate, used, measurement, prior)
+        return Attempt(estimate, used, measurement, self._noise.weights(measurement.spread, used), prior)
 
     def _estimate(
         self, measurement: Measurement, used: NDArray[np.bool_], start: State, prior: Prior | None
     ) -> Estimate:
+        weights = self._noise.weights(measurement.spread, used)
         return self._estimator.estimate(
-            self._reference.points, measurement.pixels, used.astype(float), start, prior=prior
+            self._reference.points, measurement.pixels, weights, start, prior=prior
         )
+
+    def learn(self, attempt: Attempt) -> None:
+        """Take in how well the points agreed in a frame that is believed."""
+        residuals = attempt.estimate.residuals[: len(attempt.inliers)]
+        self._noise.learn(attempt.measurement.spread, residuals, attempt.inliers)
 
     def search_other_shapes(self, attempt: Attempt) -> Attempt:
         """The attempt, or a clearly better explanation of its measurements reached from another shape."""
@@ -83,7 +91,7 @@ class FrameEstimation:
     def best_of(self, attempt: Attempt, starts: list[State]) -> Attempt:
         """The attempt, or a clearly better explanation of its measurements reached from one of the starts."""
         measurement, estimate, prior = attempt.measurement, attempt.estimate, attempt.prior
-        points, weights = self._reference.points, measurement.valid.astype(float)
+        points, weights = self._reference.points, self._noise.weights(measurement.spread, measurement.valid)
         cost = self._estimator.evaluate(points, measurement.pixels, weights, estimate.state, prior=prior)[0]
         found = [
             self._scout.estimate(points, measurement.pixels, weights, start, prior=prior) for start in starts
@@ -105,7 +113,7 @@ class FrameEstimation:
             estimate = estimator.estimate(
                 self._reference.all_points,
                 np.concatenate([attempt.measurement.pixels, seen.pixels]),
-                np.concatenate([attempt.inliers, options.weight * seen.valid]).astype(float),
+                np.concatenate([attempt.weights, np.where(seen.valid, options.weight, 0.0)]),
                 estimate.state,
                 np.concatenate([np.zeros((count, 2)), seen.normals]),
                 attempt.prior,
@@ -137,10 +145,10 @@ class FrameEstimation:
 
     def measured(self, attempt: Attempt) -> Measured:
         """All that an attempt was made from, the outline's points after the others."""
-        pixels, weights = attempt.measurement.pixels, np.where(attempt.inliers, 1.0, 0.0)
+        pixels, weights = attempt.measurement.pixels, attempt.weights
         normals, seen = np.zeros_like(pixels), attempt.outline
         if seen is not None:
             pixels, normals = np.concatenate([pixels, seen.pixels]), np.concatenate([normals, seen.normals])
             weights = np.concatenate([weights, np.where(seen.valid, self._options.outline.weight, 0.0)])
-        view = self._reference
-        return Measured(view.all_points, pixels, weights, normals, view.correlation, attempt.depths)
+        correlation = window_correlation(pixels, self._options.flow.window)
+        return Measured(self._reference.all_points, pixels, weights, normals, correlation, attempt.depths)

@@ -24,8 +24,9 @@ class LinearCost:
 
     Attributes
     ----------
-    scores : (p, 2, n) by which an error of a pixel enters the gradient. of_depths : (n, n), covariance of the
-        gradient from errors of depths. hessian : (n, n). scale : (n,) of the unknowns.
+    scores : (p, 2, n) by which an error of a pixel enters the gradient, in units of what a point of weight 1
+        is off by. of_depths : (n, n), covariance of the gradient from errors of depths. hessian : (n, n).
+    scale : (n,) of the unknowns.
     """
 
     scores: Array
@@ -56,8 +57,9 @@ class LinearCost:
         used = (measured.weights > 0.0) & np.isfinite(length)
         jacobian[~used] = 0.0
         factor = np.minimum(1.0, huber_px / np.maximum(np.where(used, length, 0.0), 1e-300))
-        scores = (measured.weights * factor)[:, None, None] * jacobian
-        hessian = np.tensordot(scores, jacobian, axes=([0, 1], [0, 1]))
+        exactness = np.sqrt(measured.weights)[:, None, None]
+        scores = exactness * factor[:, None, None] * jacobian
+        hessian = np.tensordot(scores, exactness * jacobian, axes=([0, 1], [0, 1]))
         of_depths = np.zeros_like(hessian)
         if measured.depths is not None:
             _, part, _, far = measured.depths.terms(points, state)

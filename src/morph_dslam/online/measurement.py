@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from morph_dslam.model import SurfacePoints
 from morph_dslam.online.appearance import ReferenceAppearance, Rendering
 from morph_dslam.online.binding import View, facing
-from morph_dslam.online.flow import FlowOptions, follow, patch_correlation
+from morph_dslam.online.flow import FlowOptions, follow, patch_agreement
 from morph_dslam.render.rasteriser import visible_points
 
 Array = NDArray[np.float64]
@@ -45,12 +45,14 @@ class Measurement:
     ----------
     pixels : (p, 2) where they were found. valid : (p,) which to believe.
     visible : (p,) which no other part of the object hides.
+    spread : (p,) how exactly by what the patches differ, pixels, up to a factor; see `patch_agreement`.
     depth : (h, w) metres, of the object as it was drawn for the comparison; None where it was not.
     """
 
     pixels: Array
     valid: NDArray[np.bool_]
     visible: NDArray[np.bool_]
+    spread: Array
     depth: NDArray[np.float32] | None = None
 
 
@@ -95,8 +97,11 @@ def compare_with_rendering(
     near = replace(flow, levels=min(flow.levels, CORRECTION_LEVELS))
     found, ok = follow(rendering.image, frame, predicted[rows], guesses[rows], near)
     correction = np.linalg.norm(found - predicted[rows], axis=1)
-    correlation = patch_correlation(rendering.image, frame, predicted[rows], found, options.patch_half)
+    correlation, exactness = patch_agreement(
+        rendering.image, frame, predicted[rows], found, options.patch_half
+    )
     ok &= (correction < options.largest_correction_px) & (correlation > options.least_correlation)
     pixels, valid = predicted.copy(), np.zeros(len(predicted), dtype=bool)
-    pixels[rows], valid[rows] = found, ok
-    return Measurement(pixels, valid, visible, rendering.depth)
+    spread = np.full(len(predicted), np.inf)
+    pixels[rows], valid[rows], spread[rows] = found, ok, exactness
+    return Measurement(pixels, valid, visible, spread, rendering.depth)

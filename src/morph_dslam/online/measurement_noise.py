@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 import scipy.linalg
+from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.online.depth_residuals import PointDepths
@@ -21,7 +22,7 @@ class Measured:
 
     Attributes
     ----------
-    points : p of them. pixels : (p, 2) as measured. weights : (p,).
+    points : p of them. pixels : (p, 2) as measured. weights : (p,), inverse variances up to a factor.
     normals : (p, 2), zero for points that count in both directions; see `reprojection.linearise`.
     correlation : (p, p) of the errors of the points' measurements. depths : where a depth camera saw them.
     """
@@ -37,6 +38,12 @@ class Measured:
     def numbers(self) -> NDArray[np.int64]:
         """How many numbers each point (p,) gives: one on an outline, two otherwise."""
         return np.where((self.normals != 0.0).any(axis=1), 1, 2)
+
+    @property
+    def redundancy(self) -> float:
+        """How many of the points count as one, because their windows overlap."""
+        exactness = np.sqrt(self.weights)
+        return float(exactness @ self.correlation @ exactness) / max(float(self.weights.sum()), 1e-300)
 
 
 @dataclass(frozen=True)
@@ -61,19 +68,32 @@ class RigMeasured:
         return np.asarray(scipy.linalg.block_diag(*(view.correlation for view in self.views)))
 
 
-def window_correlation(pixels: Array, window: int) -> Array:
+@njit(cache=True, nogil=True)
+def window_correlation(pixels, window):
     """Correlation (p, p) of measurements at ``pixels`` (p, 2): the share of their windows that is the same.
 
-    ``window`` is the side of the square that is compared, in pixels.
+    ``window`` is the side of the square that is compared, in pixels. Points at NaN have no window.
     """
+    result = np.eye(len(pixels))
+    for i in range(len(pixels)):
+        for j in range(i):
+            right, down = abs(pixels[i, 0] - pixels[j, 0]), abs(pixels[i, 1] - pixels[j, 1])
+            if right < window and down < window:
+                result[i, j] = result[j, i] = (1.0 - right / window) * (1.0 - down / window)
+    return result
+
+
+def window_correlation_numpy(pixels: Array, window: int) -> Array:
+    """The plain twin of `window_correlation`."""
     overlap = np.ones((len(pixels), len(pixels)))
     for column in pixels.T:
-        overlap *= np.maximum(0.0, 1.0 - np.abs(column[:, None] - column[None]) / window)
+        overlap *= np.fmax(0.0, 1.0 - np.abs(column[:, None] - column[None]) / window)
+    np.fill_diagonal(overlap, 1.0)
     return overlap
 
 
 class PixelNoise:
-    """The variance of a pixel coordinate: its part that stays with the point, and its part in one frame."""
+    """The variance of a coordinate of a point of weight 1: what stays with the point, and what is new."""
 
     def __init__(self, memory: float) -> None:
         self._fade, self._count, self._product = np.exp(-1.0 / memory), 0.0, 0.0
@@ -88,8 +108,9 @@ class PixelNoise:
         """Learn from the residuals (p, 2) of a frame; those of the frame before tell what stays."""
         used = (measured.weights > 0.0) & np.isfinite(residuals).all(axis=1)
         numbers = measured.numbers[used].sum()
-        residuals = np.where(used[:, None], residuals, np.nan)
-        total = np.nansum(measured.weights[:, None] * residuals**2) / max(numbers - unknowns, 1)
+        # In what a point of weight 1 is off by.
+        residuals = np.where(used[:, None], np.sqrt(measured.weights)[:, None] * residuals, np.nan)
+        total = np.nansum(residuals**2) / max(numbers - unknowns, 1)
         if self._before is not None:
             products = residuals * self._before
             pairs = np.isfinite(products)

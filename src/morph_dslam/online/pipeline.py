@@ -195,7 +195,7 @@ class Tracker:
         )
         pixels, valid = guesses, np.zeros(len(guesses), dtype=bool)
         pixels[rows], valid[rows] = found, ok
-        return Measurement(pixels, valid, self._supported)
+        return Measurement(pixels, valid, self._supported, np.ones(len(pixels)))
 
     def _expected_motion(self, prior: Prior | None) -> Array:
         """Image motion (p, 2) as the map has it, or at the velocity of two frames; only a first guess."""
@@ -247,7 +247,8 @@ class Tracker:
             self._supported = attempt.inliers
             projected = self.camera.project(self.reference.points.in_camera(self._last))
             self._pixels = np.where(attempt.inliers[:, None], attempt.measurement.pixels, projected)
-            self._anchoring.learn(estimate)
+            self._anchoring.learn(estimate, self.last_measured)
+            self._view.estimation.learn(attempt)
             if not self._lost:
                 self._view.recovery.learn(attempt)
         elif known is not None and not self._anchoring.has_moved:
@@ -296,7 +297,7 @@ class Tracker:
         doubt, whole = recovery.doubt(attempt), not recovery.partly_hidden(attempt)
         alike_px = max(left.px, doubt)
         systematic = self._view.systematic
-        estimate = systematic.added(attempt.estimate, attempt.inliers, alike_px, attempt.prior, whole)
+        estimate = systematic.added(attempt.estimate, attempt.weights, alike_px, attempt.prior, whole)
         if doubt:
             aside += f"; {FEW_AGREE}: by {attempt.estimate.sigma_px:.1f} px"
         if self._look_alikes.doubt:

@@ -64,7 +64,7 @@ class RigReference:
             rows = estimate.residuals[first : first + count]
             first += len(view.weights)
             seen = replace(estimate, state=part.seen(estimate.state), residuals=rows)
-            own, pushed = systematic.pushed(seen, view.weights[:count] > 0.0)
+            own, pushed = systematic.pushed(seen, view.weights[:count])
             hessian += chain.T @ own @ chain
             push += chain.T @ pushed @ chain
         transfer = inverse_of_seen(hessian, self._scale) @ push

@@ -21,15 +21,16 @@ def huber_covariance(hessian, residuals, weights, numbers, huber_px, scale):
 
     Parameters
     ----------
-    hessian : (k, k) of the Huber cost. residuals : (p, 2), pixels. weights : (p,), positive.
+    hessian : (k, k) of the Huber cost. residuals : (p, 2), pixels. weights : (p,), positive,
+        inverse variances up to a factor.
     numbers : (p,) how many numbers each point gives: 1 along an outline's normal, else 2.
     huber_px : residual length where the cost turns linear.
     scale : (k,) of the unknowns: directions are compared in unknowns divided by it.
 
     Returns
     -------
-    sigma_px : robust standard deviation of a coordinate. covariance : (k, k); infinite where there are no
-        more numbers than unknowns, very large in directions that the residuals do not see.
+    sigma_px : robust standard deviation of a coordinate of a point of weight 1. covariance : (k, k); infinite
+        where there are no more numbers than unknowns, very large in directions that the residuals do not see.
     """
     size, count = len(hessian), numbers.sum()
     freedom = count - size
@@ -46,7 +47,7 @@ def huber_covariance(hessian, residuals, weights, numbers, huber_px, scale):
     # The length of a Gaussian pair has the median 1.1774 sigma (Rayleigh).
     sigma = np.inf
     if is_pair.any():
-        sigma = np.median(length[is_pair]) / 1.1774 * np.sqrt(count / freedom)
+        sigma = np.median((np.sqrt(weights) * length)[is_pair]) / 1.1774 * np.sqrt(count / freedom)
     mean_slope = max(slopes / len(numbers), 1e-3)
     variance = psi_squared / freedom * (factors / len(numbers)) / mean_slope**2
     values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
@@ -70,7 +71,7 @@ def huber_covariance_numpy(
         return float("inf"), np.full((size, size), np.inf)
     length = np.linalg.norm(residuals, axis=1)
     # The length of a Gaussian pair has the median 1.1774 sigma (Rayleigh).
-    pairs = length[numbers == 2]
+    pairs = (np.sqrt(weights) * length)[numbers == 2]
     sigma = float(np.median(pairs) / 1.1774 * np.sqrt(count / freedom)) if len(pairs) else float("inf")
     factor = np.minimum(1.0, huber_px / np.maximum(length, 1e-300))
     psi_squared = float(np.sum(weights * (factor * length) ** 2)) / freedom

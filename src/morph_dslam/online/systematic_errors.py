@@ -116,7 +116,7 @@ class SystematicErrors:
     def added(
         self,
         estimate: Estimate,
-        used: NDArray[np.bool_],
+        weights: Array,
         alike_px: float,
         prior: Prior | None = None,
         learns: bool = True,
@@ -125,12 +125,12 @@ class SystematicErrors:
 
         Parameters
         ----------
-        used : (p,) the points that support it. prior : that it was found with.
+        weights : (p,) of the points, zero for those that do not support it. prior : that it was found with.
         alike_px : standard deviation of a pixel coordinate that neighbours have in common in the residuals,
             as of `unexplained`.
         learns : whether the residuals are the object's, so that they tell how well the reference is known.
         """
-        usable, jacobian, scores = self._scores(estimate, used)
+        usable, jacobian, scores = self._scores(estimate, weights)
         hessian = np.tensordot(scores, jacobian, axes=([0, 1], [0, 1]))
         if prior is not None:
             hessian = hessian + prior.terms(estimate.state)[1]
@@ -141,7 +141,7 @@ class SystematicErrors:
             moved = warps @ (self._jacobian @ self._root)
             transfer = gain @ np.tensordot(scores, moved, axes=([0, 1], [0, 1]))
             if learns:
-                residuals = np.where(usable[:, None], estimate.residuals[: len(used)], 0.0)
+                residuals = np.where(usable[:, None], estimate.residuals[: len(weights)], 0.0)
                 left = np.where(usable[:, None, None], moved - jacobian @ transfer, 0.0)
                 shown, expected = (np.trace(_in_common(x, pairs)) for x in (residuals[:, :, None], left))
                 self._misfit.learn(float(shown), float(expected))
@@ -157,23 +157,23 @@ class SystematicErrors:
         covariance += alike_px**2 / share * of_model
         return replace(estimate, covariance=covariance)
 
-    def pushed(self, estimate: Estimate, used: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """How the points ``used`` (p,) determine the estimate, and how the reference's error enters by them.
+    def pushed(self, estimate: Estimate, weights: Array) -> tuple[Array, Array]:
+        """How points of these ``weights`` (p,) determine the estimate, and how the reference's error enters.
 
         Both (d + 6, d + 6): J' W J, and J' W M J0, the gradient by an error of the reference state.
         """
-        _, jacobian, scores = self._scores(estimate, used)
+        _, jacobian, scores = self._scores(estimate, weights)
         carried = self._warps(estimate.state) @ self._jacobian
         hessian, push = (np.tensordot(scores, rows, axes=([0, 1], [0, 1])) for rows in (jacobian, carried))
         return hessian, push
 
-    def _scores(self, estimate: Estimate, used: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], Array, Array]:
+    def _scores(self, estimate: Estimate, weights: Array) -> tuple[NDArray[np.bool_], Array, Array]:
         """Which points (p,) count, their pixels' derivatives (p, 2, d + 6), and these times the weights."""
         _, jacobian = self._project(self._points, estimate.state)
-        length = np.linalg.norm(estimate.residuals[: len(used)], axis=1)
-        usable = used & np.isfinite(length) & np.isfinite(jacobian).all(axis=(1, 2))
+        length = np.linalg.norm(estimate.residuals[: len(weights)], axis=1)
+        usable = (weights > 0.0) & np.isfinite(length) & np.isfinite(jacobian).all(axis=(1, 2))
         huber = self._estimator.options.huber_px
-        weights = np.where(usable, np.minimum(1.0, huber / np.maximum(length, 1e-300)), 0.0)
+        weights = np.where(usable, weights * np.minimum(1.0, huber / np.maximum(length, 1e-300)), 0.0)
         jacobian = np.where(usable[:, None, None], jacobian, 0.0)
         return usable, jacobian, weights[:, None, None] * jacobian
 

@@ -1,0 +1,59 @@
+"""Weights of points by how exactly each is measured, against residuals drawn with known variances."""
+
+import numpy as np
+import pytest
+
+from morph_dslam.online.point_noise import LEAST_SPREAD_PX, PointNoise
+
+
+def learnt(factor, common_px, frames=60, count=300, seed=0):
+    """Spreads (count,) and noise learnt from residuals of variance factor * spread² + common_px²."""
+    rng, noise = np.random.default_rng(seed), PointNoise()
+    spread = np.exp(rng.uniform(np.log(0.02), np.log(0.3), count))
+    deviation = np.sqrt(factor * spread**2 + common_px**2)
+    for _ in range(frames):
+        residuals = deviation[:, None] * rng.standard_normal((count, 2))
+        noise.learn(spread, residuals, np.ones(count, dtype=bool))
+    return spread, deviation, noise
+
+
+@pytest.mark.parametrize(("factor", "common_px"), [(3.0, 0.1), (1.0, 0.05), (3.0, 0.2)])
+def test_weights_are_inverse_variances(factor, common_px):
+    spread, deviation, noise = learnt(factor, common_px)
+    weights = noise.weights(spread, np.ones(len(spread), dtype=bool))
+    assert np.median(weights) == pytest.approx(1.0, rel=0.02)
+    ratio = weights * deviation**2
+    assert ratio.max() / ratio.min() < 1.6
+    assert weights.max() / weights.min() > 1.6
+
+
+def test_points_count_alike_where_patches_do_not_tell():
+    """Before anything was learnt, and where what the model leaves is much larger than what patches tell."""
+    used = np.arange(300) % 3 > 0
+    np.testing.assert_array_equal(PointNoise().weights(np.full(300, 0.1), used), used.astype(float))
+    spread, _, noise = learnt(1.0, 2.0)
+    weights = noise.weights(spread, used)
+    assert weights[used].min() > 0.8 * weights[used].max()
+    np.testing.assert_array_equal(weights[~used], 0.0)
+
+
+def test_what_the_model_leaves_is_no_noise_of_the_patches():
+    """Residuals a hundred times as large as the patches explain: they may grow with the spread by chance."""
+    spread, _, noise = learnt(100.0**2, 0.5)
+    weights = noise.weights(spread, np.ones(300, dtype=bool))
+    assert weights.min() > 0.9 * weights.max()
+
+
+def test_nothing_is_taken_to_be_exact():
+    _, _, noise = learnt(3.0, 0.0)
+    assert noise.common >= LEAST_SPREAD_PX**2
+    weights = noise.weights(np.array([1e-6, 0.02]), np.ones(2, dtype=bool))
+    assert weights.max() / weights.min() <= 2.0
+
+
+def test_few_or_equal_points_teach_nothing():
+    noise, few = PointNoise(), np.arange(300) < 10
+    spread = np.linspace(0.02, 0.3, 300)
+    noise.learn(spread, np.ones((300, 2)), few)
+    noise.learn(np.full(300, 0.1), np.ones((300, 2)), np.ones(300, dtype=bool))
+    assert np.isinf(noise.common)
