@@ -22,21 +22,17 @@ from morph_dslam.online.attempt import Attempt, Picture, refusal
 from morph_dslam.online.estimation import Estimator, Prior, State
 from morph_dslam.online.flow import flatten, follow
 from morph_dslam.online.frame_result import (
-    FEW_AGREE,
     FOLLOWED,
     FOUND_AGAIN,
     HAS_MOVED,
     RECOVERED,
-    REFERENCE_WORSE,
     STAGES,
-    UNCHECKED,
-    UNEXPLAINED,
     FrameResult,
 )
+from morph_dslam.online.frame_statement import FrameStatements, missed
 from morph_dslam.online.known_pose import KnownPose
 from morph_dslam.online.look_alikes import LookAlikes
 from morph_dslam.online.measurement import Measurement
-from morph_dslam.online.reference_misfit import CLEARLY_WORSE
 from morph_dslam.online.reference_refinement import Keyframe
 from morph_dslam.online.reference_view import ReferenceView
 from morph_dslam.online.reference_views import Change, FollowedView, ReferenceViews
@@ -101,7 +97,7 @@ class Tracker:
         self._supported = np.ones(len(reference_view.points), dtype=bool)
         self._last, self._velocity_base, self._start = state, state, state
         self._lost, self._n_lost = not in_sequence, 0
-        self._unchecked = True
+        self._statements = FrameStatements()
         self._look_alikes = LookAlikes(float(np.linalg.norm(np.ptp(model.nodes, axis=0))))
 
     def process_frame(
@@ -281,49 +277,13 @@ class Tracker:
     def _result(
         self, attempt: Attempt, why_not: str, how: str, known: KnownPose | None, clock: StageClock
     ) -> FrameResult:
-        visible, count = int(attempt.measurement.visible.sum()), int(attempt.inliers.sum())
-        times, total, moved = clock.milliseconds, clock.total, self._anchoring.has_moved
-        if why_not and known is not None and not moved:
-            return FrameResult.hidden(why_not, known, visible, count, times, total)
-        aside = f"; {HAS_MOVED}" if moved else ""
+        has_moved = self._anchoring.has_moved
+        aside = f"; {HAS_MOVED}" if has_moved else ""
         if self._view.number:
             aside += f"; by reference view {self._view.number}"
         if why_not:
-            return FrameResult("lost", f"lost: {why_not}{aside}", None, np.nan, visible, count, times, total)
-        residuals = attempt.estimate.residuals[attempt.inliers]
-        rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
-        left = self._view.systematic.unexplained(attempt.estimate, attempt.inliers)
-        recovery = self._view.recovery
-        doubt, whole = recovery.doubt(attempt), not recovery.partly_hidden(attempt)
-        alike_px = max(left.px, doubt)
-        systematic = self._view.systematic
-        estimate = systematic.added(attempt.estimate, attempt.weights, alike_px, attempt.prior, whole)
-        if doubt:
-            aside += f"; {FEW_AGREE}: by {attempt.estimate.sigma_px:.1f} px"
-        if self._look_alikes.doubt:
-            aside += f"; {self._look_alikes.doubt}"
-        if left.is_failure:
-            aside += f"; {UNEXPLAINED}: {left.px:.1f} px are left"
-        if systematic.worse > CLEARLY_WORSE:
-            aside += f"; {REFERENCE_WORSE}: {systematic.worse:.1f} times what it was taken to be known to"
-        self._unchecked &= systematic.is_unchecked
-        if self._unchecked and attempt.prior is None:
-            aside += f"; {UNCHECKED}"
-        return FrameResult(
-            "tracked",
-            how + aside,
-            estimate,
-            rms,
-            visible,
-            count,
-            times,
-            total,
-            recovered=how != FOLLOWED,
-            unexplained_px=left.px,
-            reference_worse=systematic.worse,
-            pose_from="points" if attempt.prior is None else "points and map",
-            view=self._view.number,
-        )
+            return missed(attempt, why_not, aside, None if has_moved else known, clock)
+        return self._statements.tracked(attempt, how, aside, self._look_alikes.doubt, self._view, clock)
 
     def _prepare(self, image: NDArray[np.uint8]) -> Picture:
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)

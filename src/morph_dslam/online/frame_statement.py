@@ -1,0 +1,90 @@
+"""What is said of a frame: its status and reason, and the estimate with all errors that are known of."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from morph_dslam.online.attempt import Attempt
+from morph_dslam.online.frame_result import (
+    FEW_AGREE,
+    FOLLOWED,
+    REFERENCE_WORSE,
+    UNCHECKED,
+    UNEXPLAINED,
+    FrameResult,
+)
+from morph_dslam.online.known_pose import KnownPose
+from morph_dslam.online.reference_misfit import CLEARLY_WORSE
+from morph_dslam.online.reference_views import FollowedView
+from morph_dslam.online.timing import StageClock
+
+
+def _counts(attempt: Attempt) -> tuple[int, int]:
+    return int(attempt.measurement.visible.sum()), int(attempt.inliers.sum())
+
+
+def missed(
+    attempt: Attempt, why_not: str, aside: str, known: KnownPose | None, clock: StageClock
+) -> FrameResult:
+    """Of a frame in which the object was not found: hidden where the map tells its place, else lost.
+
+    Parameters
+    ----------
+    why_not : the attempt is not believed. aside : follows the reason of a lost frame.
+    known : its pose by the map, None where that does not tell it.
+    """
+    visible, count = _counts(attempt)
+    if known is not None:
+        return FrameResult.hidden(why_not, known, visible, count, clock.milliseconds, clock.total)
+    reason = f"lost: {why_not}{aside}"
+    return FrameResult("lost", reason, None, np.nan, visible, count, clock.milliseconds, clock.total)
+
+
+class FrameStatements:
+    """Of the frames in which one object was found, one after the other."""
+
+    def __init__(self) -> None:
+        self._unchecked = True
+
+    def tracked(
+        self, attempt: Attempt, how: str, aside: str, another: str, view: FollowedView, clock: StageClock
+    ) -> FrameResult:
+        """What is said of a frame.
+
+        Parameters
+        ----------
+        how : the object was found. aside : follows that. another : what speaks for another object like it.
+        view : that the attempt was made against.
+        """
+        residuals = attempt.estimate.residuals[attempt.inliers]
+        rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
+        systematic, recovery = view.systematic, view.recovery
+        left = systematic.unexplained(attempt.estimate, attempt.inliers)
+        doubt, whole = recovery.doubt(attempt), not recovery.partly_hidden(attempt)
+        alike_px = max(left.px, doubt)
+        estimate = systematic.added(attempt.estimate, attempt.weights, alike_px, attempt.prior, whole)
+        if doubt:
+            aside += f"; {FEW_AGREE}: by {attempt.estimate.sigma_px:.1f} px"
+        if another:
+            aside += f"; {another}"
+        if left.is_failure:
+            aside += f"; {UNEXPLAINED}: {left.px:.1f} px are left"
+        if systematic.worse > CLEARLY_WORSE:
+            aside += f"; {REFERENCE_WORSE}: {systematic.worse:.1f} times what it was taken to be known to"
+        self._unchecked &= systematic.is_unchecked
+        if self._unchecked and attempt.prior is None:
+            aside += f"; {UNCHECKED}"
+        return FrameResult(
+            "tracked",
+            how + aside,
+            estimate,
+            rms,
+            *_counts(attempt),
+            clock.milliseconds,
+            clock.total,
+            recovered=how != FOLLOWED,
+            unexplained_px=left.px,
+            reference_worse=systematic.worse,
+            pose_from="points" if attempt.prior is None else "points and map",
+            view=view.number,
+        )
