@@ -17,7 +17,7 @@ from morph_dslam.online.slam.map_file import save_map
 from morph_dslam.online.slam.rigid_map import GOOD, Keyframe, RigidMap
 from morph_dslam.similarity import SimilarityTransform
 from tests.support.rendered_object import CAMERA, scanned, wedge
-from tests.support.shown_frames import covered, moving, passing
+from tests.support.shown_frames import behind_a_thing, covered, crossing, exchanged, moving, passing
 from tests.support.staged_scenes import SCENES, bending_wedge, drawn_out, is_beyond, is_doubted, mean_error
 from tests.support.stated_cases import (
     Shown,
@@ -192,6 +192,43 @@ def test_another_one_that_passes_is_not_followed(sheet, nearer):
     assert found.largest_error < 20e-3
 
 
+@pytest.mark.parametrize("width", [1.3, 0.35])
+def test_what_looks_like_it_by_chance_on_a_cover_is_not_followed(width):
+    """A print of the same kind before it: patches of it correlate with some of the object's."""
+    scene = SCENES["wedge on a table"](0)
+    shown, free = behind_a_thing(scene, 20, width)
+    found = tracked(scene, shown, back_at=free)
+    hidden = range(13, 32)
+    assert all(found.statuses[k] == "lost" for k in hidden)
+    assert found.n_wrong == 0
+    assert found.back_after is not None
+    assert found.back_after <= 1
+
+
+def test_one_like_it_that_covers_it_may_be_it(sheet):
+    found = tracked(sheet, crossing(sheet)[::2])
+    assert found.largest_error > 0.1  # it was followed for some frames
+    assert found.n_wrong == 0
+    assert any(line.startswith("it may be another one like it") for line in found.said)
+
+
+def test_one_like_it_that_comes_while_it_is_covered_may_be_it(sheet):
+    shown, _ = exchanged(sheet, like_it=True, beside=True)
+    found = tracked(sheet, [view for k, view in enumerate(shown) if view.cover < 1.0 or k % 10 == 0])
+    assert found.n_wrong == 0
+    assert any("it could be in two places" in line for line in found.said)
+    assert any(line.startswith("it may be another one like it") for line in found.said)
+
+
+@pytest.mark.parametrize("like_it", [False, True])
+def test_one_that_is_there_instead_is_found_only_if_it_has_the_print(sheet, like_it):
+    shown, free = exchanged(sheet, like_it, n_after=6)
+    kept = [k for k, view in enumerate(shown) if view.cover < 1.0 or k % 10 == 0]
+    found = tracked(sheet, [shown[k] for k in kept], back_at=kept.index(free))
+    assert found.n_wrong == 0
+    assert (found.statuses[-1] == "tracked") == like_it
+
+
 def test_wrong_and_confident_are_measured_as_stated(solid):
     """The measure itself: the truth shifted by 6 mm is wrong; what says that it does not know is not."""
 
@@ -211,6 +248,9 @@ def test_wrong_and_confident_are_measured_as_stated(solid):
     result.estimate.covariance = np.diag([0, 0, 0, 0, 0, 5e-6, 0, 0.0])  # 2.2 mm
     assert not is_beyond(solid.model, result, solid.model, truth)
     result.reason = "followed from the previous frame"
-    assert not is_doubted(result)
+    assert not is_doubted(result, wrong_model=True)
+    result.reason += "; no view so far could show whether the object has the model's dimensions"
+    assert is_doubted(result, wrong_model=True)
+    assert not is_doubted(result, wrong_model=False)
     result.reason += "; the model does not explain the images: 0.7 px are left"
-    assert is_doubted(result)
+    assert is_doubted(result, wrong_model=False)

@@ -37,8 +37,8 @@ from tests.support.rendered_sequence import CAMERA, UPRIGHT, printed_texture
 #: An estimate is off beyond what it states if by so many of its standard deviations and by this share of the
 #: object's size: 5.1 mm of the sheets, 1.3 mm of the wedge.
 CONFIDENT_SIGMAS, CONFIDENT_SHARE = 3.0, 0.01
-#: What a reason says of a frame that is not to be relied on.
-DOUBTS = (UNEXPLAINED, FEW_AGREE, REFERENCE_WORSE, UNCHECKED, HAS_MOVED, MAY_BE_ANOTHER)
+#: What a reason says of a frame that is not to be relied on; the last one only of a model that is wrong.
+DOUBTS = (UNEXPLAINED, FEW_AGREE, REFERENCE_WORSE, HAS_MOVED, MAY_BE_ANOTHER, UNCHECKED)
 #: Height of the wedge, metres, and how far its top is moved.
 HEIGHT, REACH = 0.07, 0.02
 
@@ -266,6 +266,6 @@ def is_beyond(model, result, truth_model, truth) -> bool:
     return bool(error > CONFIDENT_SHARE * size and error > CONFIDENT_SIGMAS * stated)
 
 
-def is_doubted(result) -> bool:
-    """Whether a frame's reason says that it is not to be relied on."""
-    return any(doubt in result.reason for doubt in DOUBTS)
+def is_doubted(result, wrong_model: bool) -> bool:
+    """Whether a frame's reason says that it is not to be relied on, for what is wrong with it."""
+    return any(doubt in result.reason for doubt in (DOUBTS if wrong_model else DOUBTS[:-1]))

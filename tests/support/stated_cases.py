@@ -36,7 +36,8 @@ class Outcome:
     ----------
     said : the error, or the flags of the run and the reasons of lost frames. n_frames : of the recording.
     n_tracked, n_lost : of them. n_beyond : off beyond what they state. n_wrong : those of them of which
-        neither the frame's reason nor a flag of the placement says that they are not to be relied on.
+        neither the frame's reason nor, where the model is wrong, a flag of the placement says that they are
+        not to be relied on.
     back_after : frames after the object could be seen whole again until it was tracked; None if it never was.
     largest_error : of a tracked frame, metres; NaN without one. statuses : of the frames.
     """
@@ -144,7 +145,8 @@ def run_case(
         **options,
     )
     run, errors, back = RunResults(placement.model, 0), [np.nan], None
-    doubtful = any(word in flag for flag in placement.flags for word in DOUBTFUL)
+    wrong_model = placement.model is not scene.model
+    doubtful = wrong_model and any(word in flag for flag in placement.flags for word in DOUBTFUL)
     beyond = wrong = 0
     for number, view in enumerate(shown):
         states = [*view.others, *([] if view.state is None else [view.state])]
@@ -156,7 +158,7 @@ def run_case(
             continue
         off = view.state is None or is_beyond(placement.model, result, scene.model, view.state)
         beyond += off
-        wrong += off and not doubtful and not is_doubted(result)
+        wrong += off and not doubtful and not is_doubted(result, wrong_model)
         if view.state is None:
             continue
         errors.append(mean_error(placement.model, result.estimate, scene.model, view.state))
