@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import os
+from typing import Any
 
 import cv2
 
 #: What OpenCV hands on to FFmpeg as its log level: AV_LOG_QUIET.
 _QUIET = "-8"
+#: OpenCV's own level at which it prints nothing.
+_SILENT = 0
 
 
 def open_capture(source: str | int) -> cv2.VideoCapture:
     """A video file, or a webcam by its number; whether it could be opened, its ``isOpened()`` says."""
     # It is read once, when the first video is opened.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", _QUIET)
-    before = cv2.utils.logging.getLogLevel()  # type: ignore[attr-defined]
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # type: ignore[attr-defined]
+    # Until 4.12 these functions were OpenCV's own, since then they are in a module.
+    log: Any = getattr(cv2.utils, "logging", cv2)
+    before = log.getLogLevel()
+    log.setLogLevel(_SILENT)
     try:
         return cv2.VideoCapture(source)
     finally:
-        cv2.utils.logging.setLogLevel(before)  # type: ignore[attr-defined]
+        log.setLogLevel(before)
