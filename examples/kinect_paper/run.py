@@ -44,6 +44,7 @@ def run(arguments: argparse.Namespace) -> None:
         reference_frame=REFERENCE_FRAME,
         refine_reference=True,
         use_outline=True,
+        use_discrepancy=True,
     )
     check_recording(recording)
     keep_model(HERE / "study.toml", model)

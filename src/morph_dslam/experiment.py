@@ -67,6 +67,7 @@ class Recording:
     reference_frame : the frame that the landmarks belong to; the first one tracked by default.
     refine_reference : refine the reference state over the sequence; for landmarks set by hand.
     use_outline : let the outline count; for surfaces with bare margins.
+    use_discrepancy : look for what the shape has beyond the model's.
     """
 
     frames: Path
@@ -77,6 +78,7 @@ class Recording:
     reference_frame: int | None = None
     refine_reference: bool = False
     use_outline: bool = False
+    use_discrepancy: bool = False
 
 
 def first_truth_frame(recording: Recording) -> int:
@@ -140,6 +142,7 @@ def track_and_evaluate(recording: Recording, model: Path, run: Path) -> dict[str
             reference_frame=recording.reference_frame,
             refine_reference=recording.refine_reference,
             use_outline=recording.use_outline,
+            use_discrepancy=recording.use_discrepancy,
             overwrite=True,
         )
     )

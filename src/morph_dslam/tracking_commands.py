@@ -80,6 +80,7 @@ def object_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
         "pose": arguments.pose,
         "use_outline": arguments.outline,
         "use_depth": arguments.depth,
+        "use_discrepancy": arguments.discrepancy,
         "inner": tuple(arguments.inner),
         "per_sequence": tuple(arguments.per_sequence),
         "random_walk": tuple(arguments.random_walk),
@@ -138,6 +139,12 @@ def add_object_arguments(command: argparse.ArgumentParser) -> None:
         "--outline",
         action="store_true",
         help="let the object's outline count too, where it stands out from the background",
+    )
+    command.add_argument(
+        "--discrepancy",
+        action="store_true",
+        help="look for what the object's shape has beyond the model's: small smooth displacements that "
+        "hardly stretch it; with --refine in the reference view too",
     )
     command.add_argument(
         "--one-view",

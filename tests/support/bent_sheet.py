@@ -86,19 +86,27 @@ def sheet_mesh(columns=43, rows=31):
     return nodes, triangles.astype(np.int64)
 
 
-def bent_sheet_model(columns=43, rows=31):
-    """The reduced model: parameters arch (mm), skew (1), twist (deg); stress on both faces."""
+def bent_sheet_model(columns=43, rows=31, known=3):
+    """The reduced model: parameters arch (mm), skew (1), twist (deg); stress on both faces.
+
+    ``known`` of them are in the model; the others stay 0 in it.
+    """
     nodes, triangles = sheet_mesh(columns, rows)
     x, y = nodes[:, 0], nodes[:, 1]
-    stress = bending_stress_terms(x, y)
+    parameters = PARAMETERS[:known]
+
+    def restricted(terms):
+        return {powers[:known]: field for powers, field in terms.items() if not any(powers[known:])}
+
+    stress = restricted(bending_stress_terms(x, y))
     return ReducedModel(
         name="bent sheet",
         nodes=nodes,
         triangles=triangles,
-        parameters=PARAMETERS,
-        displacement=_separated(deflection_terms(x, y), PARAMETERS),
+        parameters=parameters,
+        displacement=_separated(restricted(deflection_terms(x, y)), parameters),
         stresses={
-            "top": _separated(stress, PARAMETERS),
-            "bottom": _separated({key: -value for key, value in stress.items()}, PARAMETERS),
+            "top": _separated(stress, parameters),
+            "bottom": _separated({key: -value for key, value in stress.items()}, parameters),
         },
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import h5py
@@ -14,6 +14,7 @@ from morph_dslam.errors import EvaluationError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.calibration import load_camera
 from morph_dslam.model import ReducedModel, load_model
+from morph_dslam.model.discrepancy import Discrepancy, load_discrepancies
 
 Array = NDArray[np.float64]
 
@@ -30,6 +31,7 @@ class Run:
     frames : (f,) frame numbers. status, reasons : one text a frame; the state exists where "tracked".
     camera_from_object : (f, 4, 4), NaN where not tracked. parameters : (f, d), SI.
     stage_times : (f,) milliseconds by stage name.
+    discrepancies : what the shapes have beyond the model's, by row; empty where it was not looked for.
     """
 
     folder: Path
@@ -41,6 +43,7 @@ class Run:
     camera_from_object: Array
     parameters: Array
     stage_times: dict[str, Array]
+    discrepancies: dict[int, Discrepancy] = field(default_factory=dict)
 
     @property
     def tracked(self) -> NDArray[np.bool_]:
@@ -63,7 +66,10 @@ class Run:
     def camera_points(self, row: int) -> Array:
         """The estimated mesh nodes (n, 3) of one frame in the camera frame, metres."""
         pose = RigidTransform.from_matrix(self.camera_from_object[row])
-        return pose.apply(self.model.positions(self.parameters[row]))
+        positions = self.model.positions(self.parameters[row])
+        if row in self.discrepancies:
+            positions = positions + self.discrepancies[row].displacement(self.model.nodes)
+        return pose.apply(positions)
 
 
 def _texts(file: h5py.File, name: str) -> tuple[str, ...]:
@@ -109,6 +115,7 @@ def load_run(folder: Path) -> Run:
                 camera_from_object=_array(file, "camera_from_object").astype(float).reshape(-1, 4, 4),
                 parameters=_array(file, "parameters").astype(float),
                 stage_times=dict(zip(names, _array(file, "timings_ms").T, strict=True)),
+                discrepancies=load_discrepancies(file),
             )
     except EvaluationError:
         raise

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.online.depth_residuals import PointDepths
 from morph_dslam.online.estimation import Estimate, Prior
 from morph_dslam.online.measurement import Measurement
@@ -45,6 +46,7 @@ class Attempt:
     weights : (p,) that the measurements counted with, zero for those that do not support it.
     prior : what was known of the pose from the map when it was made; None if nothing was.
     depths : of the points that support it, where a depth camera saw them.
+    discrepancy : what the shape has beyond the model's, once it was looked for.
     """
 
     estimate: Estimate
@@ -54,6 +56,7 @@ class Attempt:
     prior: Prior | None = None
     outline: OutlineMeasurement | None = None
     depths: PointDepths | None = None
+    discrepancy: Discrepancy | None = None
 
 
 def refusal(attempt: Attempt, options: TrackerOptions) -> str:

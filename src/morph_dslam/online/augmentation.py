@@ -36,4 +36,4 @@ def write_video(
             if state is None:
                 video.write(with_caption(image, f"frame {frame.index}: {result.reason}"))
             else:
-                video.write(view.draw(image, state, limits, f"frame {frame.index}"))
+                video.write(view.draw(image, state, limits, f"frame {frame.index}", result.discrepancy))

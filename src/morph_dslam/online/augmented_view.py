@@ -13,6 +13,7 @@ from scipy.stats import qmc
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import TrackingError
 from morph_dslam.model import ReducedModel, SeparatedField
+from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.inner_structure import CarriedStructure
 from morph_dslam.model.reduced_model import MaterialPoints, von_mises
 from morph_dslam.online.binding import DrawnSurface, View, facing
@@ -134,10 +135,20 @@ class AugmentedView:
         return 0.0, max(float(np.percentile(np.stack(fields), PERCENTILE)), 1e-6)
 
     def draw(
-        self, image: NDArray[np.uint8], state: State, limits: tuple[float, float], caption: str
+        self,
+        image: NDArray[np.uint8],
+        state: State,
+        limits: tuple[float, float],
+        caption: str,
+        discrepancy: Discrepancy | None = None,
     ) -> NDArray[np.uint8]:
-        """An undistorted frame (h, w, 3) with the object over it, and in it its inner structures."""
+        """An undistorted frame (h, w, 3) with the object over it, and in it its inner structures.
+
+        The object is drawn where ``discrepancy`` has it beyond the model; stress and strain are the model's.
+        """
         displacement = self._displacement.value(state.parameters)
+        if discrepancy is not None:
+            displacement = displacement + discrepancy.displacement(self._rest)
         view = self._view(state, displacement)
         drawn = draw_overlay(
             image,
@@ -153,7 +164,10 @@ class AugmentedView:
             closed=self._closed,
         )
         for number, structure in enumerate(self._inner):
-            nodes = state.camera_from_object.apply(structure.nodes(state.parameters))
+            nodes = structure.nodes(state.parameters)
+            if discrepancy is not None:
+                nodes = nodes + discrepancy.displacement(structure.rest)
+            nodes = state.camera_from_object.apply(nodes)
             drawn = draw_inner_surface(
                 drawn,
                 self._camera.project(nodes),

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.model import ReducedModel, SurfacePoints
+from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.online.estimation import State
 from morph_dslam.render.picking import pick_surface
 from morph_dslam.render.rasteriser import Buffers, rasterise
@@ -74,9 +75,14 @@ def _closes_a_volume(nodes: Array, triangles: NDArray[np.int64]) -> bool:
     return float(np.einsum("mx,mx->", a, np.cross(b, c))) > 0.0
 
 
-def view_of(model: ReducedModel, camera: PinholeCamera, state: State) -> View:
-    """Deform, place and project the mesh."""
-    nodes = state.camera_from_object.apply(model.positions(state.parameters))
+def view_of(
+    model: ReducedModel, camera: PinholeCamera, state: State, discrepancy: Discrepancy | None = None
+) -> View:
+    """Deform, place and project the mesh; with what its shape has beyond the model's, if that is known."""
+    positions = model.positions(state.parameters)
+    if discrepancy is not None:
+        positions = positions + discrepancy.displacement(model.nodes)
+    nodes = state.camera_from_object.apply(positions)
     return View(nodes, camera.project(nodes))
 
 

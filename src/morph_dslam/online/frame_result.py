@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.geometry import RigidTransform
+from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.online.estimation import Estimate
 from morph_dslam.online.known_pose import KnownPose
 
@@ -26,6 +27,7 @@ STAGES = (
     "outline",
     "depth",
     "fuse",
+    "discrepancy",
     "views",
 )
 
@@ -65,6 +67,7 @@ class FrameResult:
     known : the pose by the map, where that alone tells it.
     view : number of the reference view that the frame was compared with, 0 for the first.
     made_view : whether the frame has become a reference view itself.
+    discrepancy : what the object's shape has beyond the model's; None where it was not looked for.
     """
 
     status: str
@@ -82,6 +85,7 @@ class FrameResult:
     known: KnownPose | None = None
     view: int = 0
     made_view: bool = False
+    discrepancy: Discrepancy | None = None
 
     @classmethod
     def hidden(

@@ -87,4 +87,5 @@ class FrameStatements:
             reference_worse=systematic.worse,
             pose_from="points" if attempt.prior is None else "points and map",
             view=view.number,
+            discrepancy=attempt.discrepancy,
         )

@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.model import ReducedModel
+from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.online.anchoring import Anchoring
 from morph_dslam.online.attempt import Attempt, Picture, refusal
+from morph_dslam.online.discrepancy import DiscrepancyFit
 from morph_dslam.online.estimation import Estimator, Prior, State
 from morph_dslam.online.flow import flatten, follow
 from morph_dslam.online.frame_result import (
@@ -56,6 +58,7 @@ class Tracker:
     reference_covariance : (d + 6, d + 6) of ``state``; it enters that of every frame. None where nothing is
         known of the error of ``state``.
     seen : (h, w) where the object is seen in the reference frame; all that it covers by default.
+    discrepancy : what the object's shape has beyond the model's in the reference frame, if it is known.
 
     Attributes
     ----------
@@ -81,12 +84,17 @@ class Tracker:
         in_sequence: bool = True,
         reference_covariance: Array | None = None,
         seen: NDArray[np.bool_] | None = None,
+        discrepancy: Discrepancy | None = None,
     ) -> None:
         self.model, self.camera, self.options = model, camera, options or TrackerOptions()
         self.estimator = Estimator(model, camera, self.options.estimation)
         self._undistortion = camera.undistortion_maps()
         picture = reference if isinstance(reference, Picture) else self._prepare(reference)
-        reference_view = ReferenceView(self.estimator, picture, state, self.options, seen)
+        reference_view = ReferenceView(
+            self.estimator, picture, state, self.options, seen, discrepancy=discrepancy
+        )
+        sought = self.options.discrepancy
+        self._discrepancy = None if sought is None else DiscrepancyFit(model, camera, sought)
         self._views = ReferenceViews(self.estimator, reference_view, reference_covariance, self.options)
         self._anchoring = Anchoring(self.estimator, reference_view, self.options)
         self._filter = new_filter(self.estimator, self.options)
@@ -96,6 +104,7 @@ class Tracker:
         self._picture, self._pixels = picture, self.reference.pixels
         self._supported = np.ones(len(reference_view.points), dtype=bool)
         self._last, self._velocity_base, self._start = state, state, state
+        self._beyond = discrepancy
         self._lost, self._n_lost = not in_sequence, 0
         self._statements = FrameStatements()
         self._look_alikes = LookAlikes(float(np.linalg.norm(np.ptp(model.nodes, axis=0))))
@@ -142,6 +151,9 @@ class Tracker:
                 attempt = self._view.estimation.fit_depths(picture, attempt)
             with clock.stage("fuse"):
                 attempt = self._fuse(attempt)
+            if self._discrepancy is not None:
+                with clock.stage("discrepancy"):
+                    attempt = self._with_discrepancy(attempt, self._discrepancy)
             if known is not None:
                 self._anchoring.note(self._anchoring.contradicts(known, attempt))
         self._remember(picture, attempt, bool(why_not), known)
@@ -225,6 +237,12 @@ class Tracker:
         return replace(
             attempt, estimate=replace(estimate, residuals=estimate.residuals[: len(attempt.inliers)])
         )
+
+    def _with_discrepancy(self, attempt: Attempt, fit: DiscrepancyFit) -> Attempt:
+        """The attempt with what the object's shape has beyond the model's."""
+        last = None if self._lost else self._beyond
+        self._beyond = fit.fit(self.last_measured, attempt.estimate.state, last)
+        return replace(attempt, discrepancy=self._beyond)
 
     def _remember(self, picture: Picture, attempt: Attempt, lost: bool, known: KnownPose | None) -> None:
         """Keep what the next frame starts from; a lost frame keeps the last known shape."""

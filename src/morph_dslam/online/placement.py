@@ -15,6 +15,7 @@ from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.model import ReducedModel
+from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.turned_model import turned_model
 from morph_dslam.online.depth_residuals import DepthOptions
 from morph_dslam.online.estimation import Estimator, State
@@ -41,6 +42,7 @@ class Placement:
         about an axis.
     covariance : (d + 6, d + 6) of ``state``; None where it is not known.
     place : in the map of the scene; None where there is none.
+    discrepancy : what the object's shape has beyond the model's in the frame; None where it is not known.
     """
 
     model: ReducedModel
@@ -51,6 +53,7 @@ class Placement:
     per_sequence: tuple[str, ...] = ()
     covariance: Array | None = None
     place: PlaceInMap | None = None
+    discrepancy: Discrepancy | None = None
 
 
 def load_placement(path: Path, model: ReducedModel) -> Placement:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import RegistrationError
+from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.online.appearance import ReferenceAppearance, Rendering
 from morph_dslam.online.attempt import Picture
 from morph_dslam.online.binding import DrawnSurface, View, bind_pixels, broadness, draw_view, view_of
@@ -37,6 +38,7 @@ class ReferenceView:
     picture : the view. state : the object in it.
     seen : (h, w) where the object is seen; None where it is all that it covers. Nothing is bound elsewhere.
     surface : what of the model is drawn, if another view knows it already.
+    discrepancy : what the object's shape has beyond the model's in this view, where that is known.
     least_broadness : points do not count where the surface is seen flatter than in this view, by this factor
         of its area or a smaller one.
 
@@ -61,18 +63,21 @@ class ReferenceView:
         seen: NDArray[np.bool_] | None = None,
         surface: DrawnSurface | None = None,
         least_broadness: float = 0.0,
+        discrepancy: Discrepancy | None = None,
     ) -> None:
         self._estimator, self._options, self.state = estimator, options, state
         model, camera = estimator.model, estimator.camera
         self.surface = surface or DrawnSurface.of(model)
         drawn = self.surface.model
-        view = view_of(drawn, camera, state)
+        view = view_of(drawn, camera, state, discrepancy)
         self.appearance = ReferenceAppearance(drawn, camera, picture.flat, view, self.surface.closed)
         if seen is None:
             seen = draw_view(view, drawn.triangles, camera).covered
         mask = interior(seen, options.measurement.patch_half + 2)
         self.points = self._choose_points(picture, mask, view)
-        self.pixels = camera.project(self.points.in_camera(state))
+        beyond = np.zeros((1, 3)) if discrepancy is None else discrepancy.displacement(self.points.rest)
+        turned = beyond @ state.camera_from_object.rotation.T
+        self.pixels = camera.project(self.points.in_camera(state) + turned)
         self._least_broadness = least_broadness * broadness(
             view, drawn.triangles[self.points.surface.triangles]
         )

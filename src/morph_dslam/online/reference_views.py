@@ -219,7 +219,9 @@ class ReferenceViews:
             return None
         seen = seen_part(picture, attempt, should_be, old)
         try:
-            made = ReferenceView(estimator, picture, stated.state, options, seen, surface, LEAST_BROADNESS)
+            made = ReferenceView(
+                estimator, picture, stated.state, options, seen, surface, LEAST_BROADNESS, attempt.discrepancy
+            )
         except RegistrationError:
             self._pause = PAUSE
             return None

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.model import ReducedModel
+from morph_dslam.model.discrepancy import largest_deformation, save_discrepancies
 from morph_dslam.online.binding import DrawnSurface
 from morph_dslam.online.confidence import largest_displacement, largest_von_mises
 from morph_dslam.online.estimation import State
@@ -122,6 +123,15 @@ class RunResults:
         """What the model leaves of the residuals (f,), see `systematic_errors`; NaN where lost."""
         return np.array([result.unexplained_px for result in self.results])
 
+    def beyond_model(self) -> Array:
+        """Largest displacement (f,) of a node of the surface beyond the model's and a rigid motion, metres.
+
+        NaN where it was not looked for.
+        """
+        nodes = self.model.nodes[np.unique(self.model.triangles)]
+        found = [result.discrepancy for result in self.results]
+        return np.array([np.nan if d is None else largest_deformation(nodes, d) for d in found])
+
     def counts(self) -> NDArray[np.int64]:
         """(f, 2): points that could be seen, and those that support the estimate."""
         return np.array([(r.n_points, r.n_inliers) for r in self.results], dtype=np.int64).reshape(-1, 2)
@@ -147,6 +157,7 @@ def write_hdf5(path: Path, run: RunResults) -> None:
         file["n_points"], file["n_inliers"] = run.counts().T
         file["timings_ms"] = run.timings_ms()
         file["timings_ms"].attrs["names"] = [*STAGES, "total"]
+        save_discrepancies(file, [result.discrepancy for result in run.results])
 
 
 def write_csv(path: Path, run: RunResults) -> None:
@@ -202,6 +213,12 @@ def summarise(run: RunResults) -> dict[str, Any]:
     if tracked.any():
         summary["median_residual_rms_px"] = float(np.median(run.residuals_px()[tracked]))
         summary["median_n_inliers"] = float(np.median(run.counts()[tracked, 1]))
+    beyond = run.beyond_model()
+    if np.isfinite(beyond).any():
+        summary["beyond_model_mm"] = {
+            "median": 1e3 * float(np.nanmedian(beyond)),
+            "largest": 1e3 * float(np.nanmax(beyond)),
+        }
     summary["one_over_the_sequence"] = values_over_the_sequence(run)
     return summary | {"flags": flags(run)}
 

@@ -14,6 +14,8 @@ from morph_dslam.errors import SourceError, TrackingError
 from morph_dslam.online.attempt import Picture
 from morph_dslam.online.augmentation import write_video
 from morph_dslam.online.augmented_view import AugmentedView, DrawOptions
+from morph_dslam.online.discrepancy import DiscrepancyFit
+from morph_dslam.online.discrepancy_refinement import Reference, refine_discrepancy
 from morph_dslam.online.output_folders import check_run_folder
 from morph_dslam.online.placement import Placement
 from morph_dslam.online.reference_refinement import (
@@ -185,17 +187,20 @@ def _refined(
     sigma = placement.facts["sigma_px"]
     stated = options.refinement.landmark_px
     trust = replace(options.refinement, landmark_px=max(sigma, 0.1) if np.isfinite(sigma) else stated)
-    state = refine_reference(
-        tracker.estimator,
-        bind_landmarks(placement.model, landmarks.points, options.registration),
-        setup.camera.undistort_pixels(landmarks.pixels),
-        tracker.reference.pixels,
-        placement.state,
-        choose_keyframes(keyframes, options.refinement.n_keyframes),
-        trust,
-        tracker.reference.outline,
-    )
-    return replace(placement, state=state, covariance=None)
+    bound = bind_landmarks(placement.model, landmarks.points, options.registration)
+    seen = setup.camera.undistort_pixels(landmarks.pixels)
+    chosen = choose_keyframes(keyframes, options.refinement.n_keyframes)
+    pixels, outline, sought = tracker.reference.pixels, tracker.reference.outline, tracker.options.discrepancy
+    if sought is None:
+        state = refine_reference(
+            tracker.estimator, bound, seen, pixels, placement.state, chosen, trust, outline
+        )
+        return replace(placement, state=state, covariance=None)
+    # What the state is wrong by counts with the discrepancy: both at once would be the same twice.
+    known = Reference(placement.state, pixels, bound, seen, trust.landmark_px)
+    fit = DiscrepancyFit(placement.model, setup.camera, sought)
+    found = refine_discrepancy(fit, tracker.estimator, known, chosen, outline)
+    return replace(placement, discrepancy=found, covariance=None)
 
 
 def _check(options: TrackOptions) -> None:
@@ -225,6 +230,7 @@ def write_results(
         "reference_refined_over_the_sequence": run.refined,
         "outline_used": options.use_outline,
         "depth_used": options.use_depth,
+        "discrepancy_used": options.use_discrepancy,
         "pose": options.pose if setup.map_path is not None else "free",
         "settings": {
             "registration": asdict(options.registration),

@@ -99,10 +99,10 @@ def _follow(sources: Sequence[FrameSource], first: Chain, tracker: RigTracker, r
 
 
 def _check(options: TrackOptions) -> None:
-    if options.refine_reference or options.reregister_at or options.use_depth:
+    if options.refine_reference or options.reregister_at or options.use_depth or options.use_discrepancy:
         raise TrackingError(
-            "several cameras track an object from where it starts, without depth: leave out --refine, "
-            "--reregister-at and --depth"
+            "several cameras track an object from where it starts, by its model, without depth: leave out "
+            "--refine, --reregister-at, --depth and --discrepancy"
         )
 
 

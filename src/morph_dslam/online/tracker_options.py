@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from morph_dslam.online.depth_residuals import DepthOptions
+from morph_dslam.online.discrepancy import DiscrepancyOptions
 from morph_dslam.online.estimation import EstimationOptions
 from morph_dslam.online.flow import FlowOptions
 from morph_dslam.online.measurement import MeasurementOptions
@@ -38,6 +39,7 @@ class TrackerOptions:
     look_every : a hidden object is looked for elsewhere in every so many frames.
     use_outline : whether the object's outline counts too; it needs a background that it stands out from.
     use_depth : whether the depth images of frames that have them count too.
+    discrepancy : look for what the object's shape has beyond the model's; None for the model alone.
     per_sequence : names of the parameters that are one over the whole sequence.
     random_walk : names of parameters that hardly change from frame to frame, each with the standard deviation
         of the change, SI: a prior on them. None by default.
@@ -64,6 +66,7 @@ class TrackerOptions:
     searches: int = 2
     use_outline: bool = False
     use_depth: bool = False
+    discrepancy: DiscrepancyOptions | None = None
     per_sequence: tuple[str, ...] = ()
     random_walk: tuple[tuple[str, float], ...] = ()
     start: StartFrom = "previous"

@@ -24,6 +24,7 @@ from morph_dslam.online.aids.start import Aid, AidFiles, place_by_aid
 from morph_dslam.online.anchor import Anchor
 from morph_dslam.online.attempt import Picture
 from morph_dslam.online.chain import Chain
+from morph_dslam.online.discrepancy import DiscrepancyOptions
 from morph_dslam.online.outline import rim
 from morph_dslam.online.pipeline import Tracker
 from morph_dslam.online.placement import Placement, load_placement, place_by_landmarks
@@ -53,6 +54,7 @@ class ObjectOptions:
     pose : "map": the object is anchored and the camera is found in the map, "fixed": and the map's pose is
         taken as exact, "free": it may be anywhere.
     use_outline, use_depth : let the object's outline, and the frames' depth images, count beside its texture.
+    use_discrepancy : look in every frame for what the object's shape has beyond the model's.
     inner : files of inner structures (`morph inner`), whose positions are written and drawn.
     per_sequence : names of the parameters that are one over the whole sequence, beside those that the
         placement leaves open.
@@ -69,6 +71,7 @@ class ObjectOptions:
     pose: PoseFrom = "map"
     use_outline: bool = False
     use_depth: bool = False
+    use_discrepancy: bool = False
     inner: tuple[Path, ...] = ()
     per_sequence: tuple[str, ...] = ()
     random_walk: tuple[tuple[str, float], ...] = ()
@@ -129,6 +132,9 @@ class Setup:
             per_sequence=tuple(dict.fromkeys((*placement.per_sequence, *options.per_sequence))),
             use_outline=options.use_outline,
             use_depth=options.use_depth,
+            discrepancy=(options.tracker.discrepancy or DiscrepancyOptions())
+            if options.use_discrepancy
+            else None,
             random_walk=tuple((name, _in_si(placement, name, step)) for name, step in options.random_walk),
             start=options.start,
             hold_pose=options.pose == "fixed",
@@ -151,6 +157,7 @@ class Setup:
             in_sequence,
             placement.covariance,
             seen,
+            placement.discrepancy,
         )
 
     def new_chain(

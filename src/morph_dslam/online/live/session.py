@@ -75,7 +75,9 @@ class LivePicture:
             image = np.asarray(cv2.remap(image, *self._maps, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
         if result.estimate is None:
             return with_caption(image, f"frame {frame.index}: {result.reason}")
-        return self._view.draw(image, result.estimate.state, self._limits, f"frame {frame.index}")
+        return self._view.draw(
+            image, result.estimate.state, self._limits, f"frame {frame.index}", result.discrepancy
+        )
 
 
 class LiveSession:

@@ -1,0 +1,136 @@
+"""What an object's displacement has beyond its model's: a smooth field, as a Gaussian process on the shape.
+
+No reduced model holds all that a real object does: its loads, its supports, its material differ. The
+discrepancy between model and object (Kennedy and O'Hagan, J. R. Stat. Soc. B 63, 2001) is described by the
+displacements at a few points spread over the surface, with a Matern covariance (5/2) of the points' distance
+in the undeformed object. Between them it is the process's conditional mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from morph_dslam.model.array_reading import read_array
+from morph_dslam.similarity import fit_similarity
+
+Array = NDArray[np.float64]
+
+#: Added to the covariance's diagonal, relative: points that lie close together make it nearly singular.
+JITTER = 1e-6
+
+
+@dataclass(frozen=True)
+class DiscrepancyBasis:
+    """Where the discrepancy is given, and how it goes on between.
+
+    Attributes
+    ----------
+    centres : (m, 3) points of the undeformed object, metres.
+    length : correlation length of the process, metres.
+    """
+
+    centres: Array
+    length: float
+
+    @classmethod
+    def spread_over(cls, nodes: Array, count: int, length: float) -> DiscrepancyBasis:
+        """Centres spread evenly over nodes (n, 3), metres; at most ``count``, ``length`` in metres."""
+        return cls(nodes[farthest_points(nodes, count)], length)
+
+    @cached_property
+    def precision(self) -> Array:
+        """Inverse (m, m) of the covariance of a component at the centres, for a process of unit variance."""
+        covariance = self._covariance(self.centres)
+        return np.asarray(cho_solve(cho_factor(covariance), np.eye(len(covariance))))
+
+    def influence(self, positions: Array) -> Array:
+        """What each centre's displacement gives (n, m) at positions (n, 3) of the undeformed object."""
+        return self._covariance(positions) @ self.precision
+
+    def _covariance(self, positions: Array) -> Array:
+        """Matern 5/2 of the distances to the centres (n, m)."""
+        distance = np.linalg.norm(positions[:, None] - self.centres[None], axis=2)
+        scaled = np.sqrt(5.0) * distance / self.length
+        return (1.0 + scaled + scaled**2 / 3.0) * np.exp(-scaled) + JITTER * (distance == 0.0)
+
+
+@dataclass(frozen=True)
+class Discrepancy:
+    """The discrepancy in one frame.
+
+    Attributes
+    ----------
+    values : (m, 3) displacements of the basis's centres beyond the model's, in the object's frame, metres.
+    """
+
+    basis: DiscrepancyBasis
+    values: Array
+
+    def displacement(self, positions: Array) -> Array:
+        """The displacement (n, 3) at positions (n, 3) of the undeformed object, both metres."""
+        return self.basis.influence(positions) @ self.values
+
+
+def farthest_points(nodes: Array, count: int) -> NDArray[np.int64]:
+    """Indices of at most ``count`` of the nodes (n, 3), each as far as can be from those before it.
+
+    It begins with the node that is farthest from the middle (Gonzalez, Theor. Comput. Sci. 38, 1985).
+    """
+    first = int(np.linalg.norm(nodes - nodes.mean(axis=0), axis=1).argmax())
+    chosen, gaps = [first], np.linalg.norm(nodes - nodes[first], axis=1)
+    while len(chosen) < min(count, len(nodes)) and gaps.max() > 0.0:
+        chosen.append(int(gaps.argmax()))
+        gaps = np.minimum(gaps, np.linalg.norm(nodes - nodes[chosen[-1]], axis=1))
+    return np.array(chosen)
+
+
+def largest_deformation(nodes: Array, discrepancy: Discrepancy) -> float:
+    """Largest displacement that is left of a discrepancy after the rigid motion nearest to it, metres.
+
+    Parameters
+    ----------
+    nodes : (n, 3) of the undeformed object, metres.
+    """
+    moved = nodes + discrepancy.displacement(nodes)
+    rigid = fit_similarity(nodes, moved, with_scale=False).apply(nodes)
+    return float(np.linalg.norm(moved - rigid, axis=1).max())
+
+
+def save_discrepancies(file: h5py.File, found: Sequence[Discrepancy | None]) -> None:
+    """Write the group ``discrepancy`` of a run: nothing where none was found.
+
+    It holds ``centres`` (m, 3), metres, with the attribute ``length``; ``values`` (k, m, 3), metres, and
+    ``row`` (k,): which frames of the run they are of.
+    """
+    known = {row: d for row, d in enumerate(found) if d is not None}
+    if not known:
+        return
+    basis, group = next(iter(known.values())).basis, file.create_group("discrepancy")
+    group.attrs["length"], group["centres"] = basis.length, basis.centres
+    group["row"], group["values"] = list(known), np.array([d.values for d in known.values()])
+
+
+def load_discrepancies(file: h5py.File) -> dict[int, Discrepancy]:
+    """The discrepancies of a run by row; empty where the file has none.
+
+    Raises
+    ------
+    ValueError
+        If their arrays do not belong together.
+    """
+    if "discrepancy" not in file:
+        return {}
+    centres = read_array(file, "discrepancy/centres", 2)
+    values, rows = read_array(file, "discrepancy/values", 3), read_array(file, "discrepancy/row", 1, np.int64)
+    length = float(file["discrepancy"].attrs["length"])  # type: ignore[arg-type]
+    if values.shape != (len(rows), *centres.shape) or centres.shape[1] != 3 or not length > 0.0:
+        raise ValueError("its discrepancies do not belong to their centres")
+    basis = DiscrepancyBasis(centres, length)
+    return {int(row): Discrepancy(basis, v) for row, v in zip(rows, values, strict=True)}
