@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from morph_dslam.online.attempt import Attempt, Picture
 from morph_dslam.online.frame_result import MAY_BE_ANOTHER
 from morph_dslam.online.recovery import TWO_PLACES, Recovery
-from morph_dslam.online.state import BoundPoints
 from morph_dslam.online.timing import StageClock
 
 Array = NDArray[np.float64]
@@ -31,11 +30,12 @@ class LookAlikes:
 
     Parameters
     ----------
-    size : of the object, metres.
+    nodes : (n, 3) of the undeformed object, metres.
     """
 
-    def __init__(self, size: float) -> None:
-        self._far = FAR_SHARE * size
+    def __init__(self, nodes: Array) -> None:
+        self._centre = nodes.mean(axis=0)
+        self._far = FAR_SHARE * float(np.linalg.norm(np.ptp(nodes, axis=0)))
         self._another = self._confused = False
         self._since_found, self._since_look, self._away = LOOKS[-1], LOOK_EVERY, 0.0
         self._middle: Array | None = None
@@ -44,7 +44,6 @@ class LookAlikes:
         self,
         picture: Picture,
         attempt: Attempt,
-        points: BoundPoints,
         was_looked_for: bool,
         recovery: Recovery,
         clock: StageClock,
@@ -53,9 +52,9 @@ class LookAlikes:
 
         Parameters
         ----------
-        points : of the view that it was made against. was_looked_for : by the features of the whole frame.
+        was_looked_for : whether it was found by features, anywhere in the frame.
         """
-        middle = points.in_camera(attempt.estimate.state).mean(axis=0)
+        middle = attempt.estimate.state.camera_from_object.apply(self._centre)
         before, self._middle = self._middle, middle
         if attempt.prior is not None:  # the map tells which of them it is
             return ""

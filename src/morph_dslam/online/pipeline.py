@@ -107,7 +107,7 @@ class Tracker:
         self._beyond = discrepancy
         self._lost, self._n_lost = not in_sequence, 0
         self._statements = FrameStatements()
-        self._look_alikes = LookAlikes(float(np.linalg.norm(np.ptp(model.nodes, axis=0))))
+        self._look_alikes = LookAlikes(model.nodes)
 
     def process_frame(
         self,
@@ -142,8 +142,8 @@ class Tracker:
         if why_not:
             self._look_alikes.note_lost(why_not)
         else:
-            recovery, points = self._view.recovery, self.reference.points
-            why_not = self._look_alikes.refusal(picture, attempt, points, how == RECOVERED, recovery, clock)
+            recovery = self._view.recovery
+            why_not = self._look_alikes.refusal(picture, attempt, how == RECOVERED, recovery, clock)
         if not why_not:
             with clock.stage("outline"):
                 attempt = self._view.estimation.fit_outline(picture, attempt)
