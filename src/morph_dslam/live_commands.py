@@ -6,12 +6,10 @@ import argparse
 from collections.abc import Callable
 
 from morph_dslam.command_arguments import frame_range, positive_number
-from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.tracking_commands import add_object_arguments, drawing, object_arguments
 
 
 def _live(arguments: argparse.Namespace) -> None:
-    one_thread_for_algebra()
     from morph_dslam.online.live.run import LiveOptions, run_live
     from morph_dslam.online.tracking_setup import ObjectOptions
 

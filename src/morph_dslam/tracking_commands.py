@@ -9,14 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from morph_dslam.command_arguments import frame_and_file, frame_range, named_value
 from morph_dslam.errors import TrackingError
-from morph_dslam.threads import one_thread_for_algebra
 
 if TYPE_CHECKING:
     from morph_dslam.online.augmented_view import DrawOptions
 
 
 def _track(arguments: argparse.Namespace) -> None:
-    one_thread_for_algebra()
     from morph_dslam.online.track import TrackOptions, track
     from morph_dslam.online.track_objects import OtherObject, track_objects
     from morph_dslam.online.track_rig import track_rig

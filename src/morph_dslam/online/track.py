@@ -31,6 +31,7 @@ from morph_dslam.online.run_writing import RunInputs, write_run
 from morph_dslam.online.tracking_setup import ObjectOptions, Setup, load_setup
 from morph_dslam.sources import Frame, FrameSource, open_source
 from morph_dslam.sources.recorded import RecordedFrames
+from morph_dslam.threads import one_thread_for_algebra
 
 #: Options that name input files.
 _INPUTS = ("frames", "landmarks", "placement")
@@ -64,6 +65,7 @@ class TrackOptions(ObjectOptions):
     refinement: RefinementOptions = field(default_factory=RefinementOptions)
 
 
+@one_thread_for_algebra
 def track(options: TrackOptions) -> dict[str, Any]:
     """Track an object through a sequence and write the run folder.
 

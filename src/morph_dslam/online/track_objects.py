@@ -31,6 +31,7 @@ from morph_dslam.online.track import (
 )
 from morph_dslam.online.tracking_setup import Setup, load_setup, warm_up
 from morph_dslam.sources import FrameSource
+from morph_dslam.threads import one_thread_for_algebra
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,7 @@ class _Object:
         return str(self.options.output)
 
 
+@one_thread_for_algebra
 def track_objects(options: TrackOptions, others: Sequence[OtherObject]) -> dict[Path, dict[str, Any]]:
     """Track an object and others beside it; the summaries by run folder, that of the first one first.
 

@@ -28,11 +28,13 @@ from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.track import TrackOptions, find_begin, open_frames, with_reference, write_results
 from morph_dslam.online.tracking_setup import Setup, load_setup
 from morph_dslam.sources import Frame, FrameSource, open_source
+from morph_dslam.threads import one_thread_for_algebra
 
 #: Correlation of two flattened images that are the same but for the compression.
 SAME_IMAGE = 0.8
 
 
+@one_thread_for_algebra
 def track_rig(options: TrackOptions, others: Sequence[Path]) -> dict[str, Any]:
     """Track an object through the recordings of several cameras and write one run folder.
 

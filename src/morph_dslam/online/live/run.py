@@ -26,6 +26,7 @@ from morph_dslam.online.run_writing import RunInputs, write_run
 from morph_dslam.online.tracking_setup import ObjectOptions, Setup, load_setup
 from morph_dslam.sources import open_live, open_stream
 from morph_dslam.sources.live import LiveCamera, LiveStream
+from morph_dslam.threads import one_thread_for_algebra
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,7 @@ class _Begin:
     frame: int
 
 
+@one_thread_for_algebra
 def run_live(options: LiveOptions) -> dict[str, Any]:
     """Track a live stream; an interrupt ends it, keeps everything, and goes on.
 
