@@ -2,11 +2,12 @@
 SHELL := bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DELETE_ON_ERROR:
-.PHONY: demo test test-all bench lint clean
+.PHONY: demo test test-all test-lowest bench lint clean
 
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed.stamp
+LOWEST := .venv-lowest
 
 # The first interpreter that is new enough and can make virtual environments.
 PYTHON ?= $(shell for p in python3.11 python3 python3.12 python3.13; do \
@@ -25,6 +26,16 @@ test: lint
 
 test-all: lint
 	@$(BIN)/pytest -q
+
+# The unit tests with the oldest versions that pyproject.toml allows, in an environment of their own.
+# The oldest Matplotlib calls pyparsing by names that newer ones warn of.
+test-lowest:
+	@test -x $(LOWEST)/bin/python || $(PYTHON) -m venv $(LOWEST)
+	@sed -nE 's/^[^"]*"([A-Za-z0-9_.-]+)(\[[a-z]+\])?>=([0-9.]+).*/\1==\3.*/p' pyproject.toml | sort -u > $(LOWEST)/lowest.txt
+	@echo 'pyparsing<3.2' >> $(LOWEST)/lowest.txt
+	@$(LOWEST)/bin/python -m pip install --disable-pip-version-check --progress-bar off \
+		--constraint $(LOWEST)/lowest.txt --editable '.[dev]' | $(PIP_PROGRESS)
+	@NUMBA_CACHE_DIR=$(LOWEST)/numba $(LOWEST)/bin/pytest -q tests/unit
 
 bench: $(INSTALLED)
 	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python "$$script"; done
