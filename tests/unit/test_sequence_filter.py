@@ -238,6 +238,25 @@ def test_points_measured_less_exactly_count_by_their_weights():
     assert (spread < 0.35 * np.std(alike, axis=0)).all()
 
 
+def test_noise_is_not_taken_for_smaller_where_an_estimate_takes_up_much_of_it():
+    """Few points whose errors are alike for neighbours: residuals hold only two thirds of the variance."""
+    points, state, rng = bound(60), truth(3), np.random.default_rng(11)
+    pixels = CAMERA.project(points.in_camera(state))
+    correlation = window_correlation(pixels, 110)
+    root, ones = np.linalg.cholesky(correlation + 1e-9 * np.eye(60)), np.ones(60)
+    stated, found, left = [], [], []
+    for _ in range(200):
+        seen = pixels + SIGMA * root @ rng.standard_normal((60, 2))
+        alone = ESTIMATOR.estimate(points, seen, ones, state)
+        measured = Measured(points, seen, ones, np.zeros_like(seen), correlation)
+        estimate = SequenceFilter(ESTIMATOR, []).fuse(measured, alone)
+        stated.append(estimate.parameter_std)
+        found.append(estimate.state.parameters)
+        left.append(np.mean(alone.residuals**2))
+    assert np.mean(left) < 0.75 * SIGMA**2
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(stated), axis=0)), np.std(found, axis=0), rtol=0.12)
+
+
 def test_parameter_that_nothing_tells_has_a_large_deviation():
     """One point seen four times tells of three directions at most."""
     points = bound(1)

@@ -92,6 +92,10 @@ def window_correlation_numpy(pixels: Array, window: int) -> Array:
     return overlap
 
 
+#: An estimate that takes up more of the variance leaves too little, as a share, to tell how large it is.
+LEAST_LEFT = 0.25
+
+
 class PixelNoise:
     """The variance of a coordinate of a point of weight 1: what stays with the point, and what is new."""
 
@@ -104,13 +108,16 @@ class PixelNoise:
         """The next frame's residuals are of other points: they cannot be compared with the last ones."""
         self._before = None
 
-    def add(self, residuals: Array, measured: Measured | RigMeasured, unknowns: int) -> None:
-        """Learn from the residuals (p, 2) of a frame; those of the frame before tell what stays."""
+    def add(self, residuals: Array, measured: Measured | RigMeasured, taken: float) -> None:
+        """Learn from the residuals (p, 2) of a frame; those of the frame before tell what stays.
+
+        ``taken`` is how many numbers' worth of variance the estimate has taken up.
+        """
         used = (measured.weights > 0.0) & np.isfinite(residuals).all(axis=1)
         numbers = measured.numbers[used].sum()
         # In what a point of weight 1 is off by.
         residuals = np.where(used[:, None], np.sqrt(measured.weights)[:, None] * residuals, np.nan)
-        total = np.nansum(residuals**2) / max(numbers - unknowns, 1)
+        total = np.nansum(residuals**2) / max(numbers - taken, LEAST_LEFT * numbers, 1)
         if self._before is not None:
             products = residuals * self._before
             pairs = np.isfinite(products)

@@ -109,8 +109,8 @@ class SequenceFilter(Generic[Frame]):
         alone : the estimate from the frame's measurements, and ``known``, only.
         known : what is known of the frame's pose or parameters from elsewhere, if anything.
         """
-        self._noise.add(alone.residuals, measured, self._unknowns)
         linear = self._estimator.linear(measured, alone)
+        self._noise.add(alone.residuals, measured, _taken(measured, linear, alone.state, known))
         errors = self._errors(measured, linear, alone.state, known)
         by_itself = self._with_covariance(alone, measured, linear, errors, known)
         if not len(self._kept):
@@ -254,6 +254,17 @@ class SequenceFilter(Generic[Frame]):
             for view, rows in by_views.items():
                 covariance += rows.T @ self._past.left[view].covariance @ rows
         return Errors(by_point, by_frames, by_cause, unseen, covariance, inverse, by_views)
+
+
+def _taken(measured: Measured | RigMeasured, linear: LinearCost, state: State, known: Prior | None) -> float:
+    """How many numbers' worth of its measurements' variance an estimate takes up.
+
+    Of errors with the correlation K it is tr(H^-1 J' W^1/2 K W^1/2 J): the number of unknowns where they are
+    independent, and more where neighbours err alike.
+    """
+    hessian = linear.hessian if known is None else linear.hessian + known.terms(state)[1]
+    spread = quadratic(linear.scores, measured.correlation)
+    return float(np.trace(replace(linear, hessian=hessian).inverse @ spread))
 
 
 def _longer(rows: Array, count: int) -> Array:
