@@ -283,7 +283,7 @@ def test_recordings_that_do_not_go_together_are_refused(recording, tmp_path, cap
     assert main(unknown) == 2
     assert "give the first camera of a Kalibr camchain" in capsys.readouterr().err
     assert main(with_both(folder, tmp_path / "run", "--depth")) == 2
-    assert "leave out --refine, --reregister-at and --depth" in capsys.readouterr().err
+    assert "leave out --refine, --reregister-at, --depth and --discrepancy" in capsys.readouterr().err
 
 
 def test_another_recording_than_the_scan_begins_with_an_undeformed_frame(recording, tmp_path, capsys):

@@ -131,7 +131,7 @@ def test_command_tracks_with_both_cameras(model, recording, tmp_path, capsys):
         (
             ["--with", "aside", "--depth"],
             "camchain.yaml#cam0",
-            "leave out --refine, --reregister-at and --depth",
+            "leave out --refine, --reregister-at, --depth and --discrepancy",
         ),
     ],
 )
