@@ -35,10 +35,10 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.calibration import load_camera
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.model import ReducedModel, load_model
-from morph_dslam.online.estimation import BoundPoints, Estimate, Estimator, State, moved
+from morph_dslam.online.estimation.estimator import BoundPoints, Estimate, Estimator, State, moved
 from morph_dslam.online.pipeline import Tracker
-from morph_dslam.online.placement import place_by_landmarks
-from morph_dslam.online.registration import RegistrationOptions
+from morph_dslam.online.start.placement import place_by_landmarks
+from morph_dslam.online.start.registration import RegistrationOptions
 from morph_dslam.sources import open_source
 
 Array = NDArray[np.float64]
@@ -135,7 +135,7 @@ def landmarks_at(folder: Path, frame: int, camera: PinholeCamera, model: Reduced
 
 def _seen(model: ReducedModel, camera: PinholeCamera, state: State):
     """Surface points of pixels that the object covers."""
-    from morph_dslam.online.binding import bind_pixels, draw_view, view_of
+    from morph_dslam.online.measuring.binding import bind_pixels, draw_view, view_of
 
     view = view_of(model, camera, state)
     rows, columns = np.nonzero(draw_view(view, model.triangles, camera).covered)

@@ -17,8 +17,8 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, cross_matrix, rotation_exp
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField, SurfacePoints
 from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
-from morph_dslam.online.estimation import BoundPoints, Estimator, State, moved
-from morph_dslam.online.reprojection import linearise_numpy, project_with_jacobian_numpy
+from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, State, moved
+from morph_dslam.online.estimation.reprojection import linearise_numpy, project_with_jacobian_numpy
 
 N_POINTS, N_MODES, DEGREE = 500, 16, 7
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)

@@ -30,12 +30,12 @@ from morph_dslam.cli import run_and_report_errors
 from morph_dslam.errors import SourceError
 from morph_dslam.experiment import keep, keep_sequence
 from morph_dslam.io.video import VideoWriter
-from morph_dslam.online.augmented_view import AugmentedView
+from morph_dslam.online.drawing.augmented_view import AugmentedView
 from morph_dslam.online.frame_result import STAGES
 from morph_dslam.online.live.session import LivePicture, LiveSession
 from morph_dslam.online.live.sinks import VideoSink
 from morph_dslam.online.mesh_registration.run import run_registration
-from morph_dslam.online.results import RunResults
+from morph_dslam.online.runs.results import RunResults
 from morph_dslam.online.slam.run import SlamRunOptions, run_slam
 from morph_dslam.online.tracking_setup import ObjectOptions, load_setup
 from morph_dslam.sources import Frame, open_source

@@ -52,8 +52,8 @@ from tests.support.stated_cases import (
 )
 
 from morph_dslam.online.mesh_registration.register import register_mesh
-from morph_dslam.online.placement import Placement
-from morph_dslam.online.registration import register
+from morph_dslam.online.start.placement import Placement
+from morph_dslam.online.start.registration import register
 from morph_dslam.similarity import SimilarityTransform
 
 Case = tuple[str, Callable[[], Outcome]]

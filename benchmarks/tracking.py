@@ -27,9 +27,9 @@ from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField, SurfacePoints, load_model
 from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
 from morph_dslam.model.turned_model import turned_model
-from morph_dslam.online.binding import DrawnSurface
-from morph_dslam.online.estimation import BoundPoints, Estimator, State, moved
+from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, State, moved
 from morph_dslam.online.frame_result import STAGES, FrameResult
+from morph_dslam.online.measuring.binding import DrawnSurface
 from morph_dslam.online.pipeline import Tracker
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured

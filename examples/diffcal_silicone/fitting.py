@@ -12,9 +12,9 @@ from silhouette import FINER, Matches, match
 from silicone import PUBLISHED_SHEAR
 
 from morph_dslam.model import ReducedModel
-from morph_dslam.online.binding import bind_pixels, draw_view, view_of
-from morph_dslam.online.depth_residuals import DepthOptions, PointDepths
-from morph_dslam.online.estimation import BoundPoints, EstimationOptions, Estimator, Prior, State
+from morph_dslam.online.estimation.depth_residuals import DepthOptions, PointDepths
+from morph_dslam.online.estimation.estimator import BoundPoints, EstimationOptions, Estimator, Prior, State
+from morph_dslam.online.measuring.binding import bind_pixels, draw_view, view_of
 
 Array = NDArray[np.float64]
 

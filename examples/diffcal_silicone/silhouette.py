@@ -17,8 +17,8 @@ from scipy.spatial import KDTree
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import EvaluationError
 from morph_dslam.model import ReducedModel, SurfacePoints
-from morph_dslam.online.binding import draw_view, facing, view_of
-from morph_dslam.online.state import BoundPoints, State
+from morph_dslam.online.estimation.state import BoundPoints, State
+from morph_dslam.online.measuring.binding import draw_view, facing, view_of
 
 Array = NDArray[np.float64]
 

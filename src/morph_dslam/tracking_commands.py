@@ -11,13 +11,13 @@ from morph_dslam.command_arguments import frame_and_file, frame_range, named_val
 from morph_dslam.errors import TrackingError
 
 if TYPE_CHECKING:
-    from morph_dslam.online.augmented_view import DrawOptions
+    from morph_dslam.online.drawing.augmented_view import DrawOptions
 
 
 def _track(arguments: argparse.Namespace) -> None:
+    from morph_dslam.online.several.track_objects import OtherObject, track_objects
+    from morph_dslam.online.several.track_rig import track_rig
     from morph_dslam.online.track import TrackOptions, track
-    from morph_dslam.online.track_objects import OtherObject, track_objects
-    from morph_dslam.online.track_rig import track_rig
 
     first, last = arguments.range
     options = TrackOptions(
@@ -50,7 +50,7 @@ def _track(arguments: argparse.Namespace) -> None:
 
 def _say(folder: Path, summary: dict[str, Any]) -> None:
     """What the command line says of a run."""
-    from morph_dslam.online.observability import value_line
+    from morph_dslam.online.uncertainty.observability import value_line
 
     for flag in summary["flags"]:
         print(f"note: {flag}")
@@ -89,8 +89,8 @@ def object_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def drawing(arguments: argparse.Namespace) -> DrawOptions:
     """What is to be drawn; raises TrackingError if the section is none."""
-    from morph_dslam.online.augmented_view import DrawOptions
-    from morph_dslam.online.section import SectionPlane
+    from morph_dslam.online.drawing.augmented_view import DrawOptions
+    from morph_dslam.online.drawing.section import SectionPlane
 
     section = None if arguments.section is None else SectionPlane.parse(arguments.section)
     return DrawOptions(arguments.show, section)

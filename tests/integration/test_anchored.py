@@ -14,8 +14,8 @@ from morph_dslam.cli import main
 from morph_dslam.errors import MapError, TrackingError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform
+from morph_dslam.online.anchored.known_pose import KnownPose
 from morph_dslam.online.frame_result import HAS_MOVED
-from morph_dslam.online.known_pose import KnownPose
 from morph_dslam.online.live.run import LiveOptions, run_live
 from morph_dslam.online.live.sinks import VideoSink
 from morph_dslam.online.track import TrackOptions, track

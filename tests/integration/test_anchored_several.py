@@ -14,7 +14,7 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.model import load_model
 from morph_dslam.online.frame_result import HAS_MOVED, STAGES
-from morph_dslam.online.rig_tracking import RigTracker
+from morph_dslam.online.several.rig_tracking import RigTracker
 from morph_dslam.online.tracking_setup import ObjectOptions, load_setup
 from morph_dslam.sources import open_source
 from tests.support.rendered_anchored_rig import FRAMES, RIG, SCAN, make_rig_recording

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morph_dslam.online.confidence import position_std
+from morph_dslam.online.estimation.state import moved
 from morph_dslam.online.pipeline import Tracker
-from morph_dslam.online.state import moved
 from morph_dslam.online.tracker_options import TrackerOptions
+from morph_dslam.online.uncertainty.confidence import position_std
 from tests.support.rendered_sequence import CAMERA, mean_error
 from tests.support.turning_block import BlockFilm, block_state
 

@@ -19,14 +19,14 @@ from morph_dslam.online.aids.board_pose import BoardStart, locate_board
 from morph_dslam.online.aids.guess import GuessFile, GuessStart
 from morph_dslam.online.aids.picture import PictureStart, load_picture
 from morph_dslam.online.aids.start import AidFiles
-from morph_dslam.online.estimation import Estimator
-from morph_dslam.online.flow import flatten
+from morph_dslam.online.estimation.estimator import Estimator
+from morph_dslam.online.estimation.state import BoundPoints, State
 from morph_dslam.online.live.run import LiveOptions, run_live
-from morph_dslam.online.placement import load_placement
-from morph_dslam.online.relocalisation import RelocalisationOptions, state_from_matches
+from morph_dslam.online.measuring.flow import flatten
+from morph_dslam.online.recovering.relocalisation import RelocalisationOptions, state_from_matches
 from morph_dslam.online.slam.map_file import save_map
 from morph_dslam.online.slam.rigid_map import GOOD, Keyframe, RigidMap
-from morph_dslam.online.state import BoundPoints, State
+from morph_dslam.online.start.placement import load_placement
 from morph_dslam.online.track import TrackOptions, track
 from morph_dslam.online.tracking_setup import ObjectOptions
 from morph_dslam.render.rasteriser import rasterise

@@ -12,8 +12,8 @@ from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.model import save_model
 from morph_dslam.online.pipeline import Tracker
-from morph_dslam.online.rig import RigCamera
-from morph_dslam.online.rig_tracking import RigTracker
+from morph_dslam.online.several.rig import RigCamera
+from morph_dslam.online.several.rig_tracking import RigTracker
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.camchain import write_camchain
 from tests.support.rendered_sequence import SheetFilm, mean_error, sheet_state

@@ -10,9 +10,9 @@ from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.calibration import save_camera
 from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.model import save_model
-from morph_dslam.online.estimation import State
+from morph_dslam.online.estimation.estimator import State
 from morph_dslam.online.pipeline import Tracker
-from morph_dslam.online.several_objects import ObjectTracker
+from morph_dslam.online.several.several_objects import ObjectTracker
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, UPRIGHT, SheetFilm, mean_error, sheet_depth
 

@@ -12,9 +12,9 @@ from morph_dslam.model import save_model
 from morph_dslam.online.mesh_registration.register import register_mesh
 from morph_dslam.online.mesh_registration.scene import scene_of_map
 from morph_dslam.online.mesh_registration.unit_check import register_in_unit
-from morph_dslam.online.registration import register
 from morph_dslam.online.slam.map_file import save_map
 from morph_dslam.online.slam.rigid_map import GOOD, Keyframe, RigidMap
+from morph_dslam.online.start.registration import register
 from morph_dslam.similarity import SimilarityTransform
 from tests.support.rendered_object import CAMERA, scanned, wedge
 from tests.support.shown_frames import behind_a_thing, covered, crossing, exchanged, moving, passing

@@ -16,7 +16,7 @@ from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.model import save_model
 from morph_dslam.online.frame_result import STAGES
 from morph_dslam.online.pipeline import Tracker
-from morph_dslam.online.registration import RegistrationOptions
+from morph_dslam.online.start.registration import RegistrationOptions
 from morph_dslam.online.track import TrackOptions, track
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state

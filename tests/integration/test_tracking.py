@@ -7,9 +7,9 @@ import pytest
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.online.binding import draw_view, view_of
-from morph_dslam.online.estimation import State
+from morph_dslam.online.estimation.estimator import State
 from morph_dslam.online.frame_result import STAGES
+from morph_dslam.online.measuring.binding import draw_view, view_of
 from morph_dslam.online.pipeline import Tracker
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, mean_error, sheet_state

@@ -16,7 +16,7 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.calibration import save_camera
 from morph_dslam.model import ReducedModel, save_model
-from morph_dslam.online.rig import RigCamera
+from morph_dslam.online.several.rig import RigCamera
 from morph_dslam.online.slam.map_file import save_map
 from morph_dslam.online.slam.slam import Slam
 from morph_dslam.render.environment import StaticScene

@@ -6,7 +6,7 @@ import numpy as np
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.online.flow import flatten
+from morph_dslam.online.measuring.flow import flatten
 from morph_dslam.online.mesh_registration.scene import MapPoints, View
 from morph_dslam.render.model_view import looking_at
 from morph_dslam.render.rasteriser import rasterise

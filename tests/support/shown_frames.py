@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from morph_dslam.online.estimation import State
+from morph_dslam.online.estimation.estimator import State
 from tests.support.staged_scenes import Scene, aside
 from tests.support.stated_cases import FRAMES, Shown
 

@@ -17,8 +17,7 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.online.confidence import position_std
-from morph_dslam.online.estimation import State
+from morph_dslam.online.estimation.estimator import State
 from morph_dslam.online.frame_result import (
     FEW_AGREE,
     HAS_MOVED,
@@ -27,6 +26,7 @@ from morph_dslam.online.frame_result import (
     UNCHECKED,
     UNEXPLAINED,
 )
+from morph_dslam.online.uncertainty.confidence import position_std
 from morph_dslam.render.model_view import looking_at
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured

@@ -11,13 +11,13 @@ import numpy as np
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import ReducedModel
-from morph_dslam.online.estimation import State
-from morph_dslam.online.known_pose import KnownPose
+from morph_dslam.online.anchored.known_pose import KnownPose
+from morph_dslam.online.estimation.estimator import State
 from morph_dslam.online.pipeline import Tracker
-from morph_dslam.online.placement import Placement
-from morph_dslam.online.registration import register
-from morph_dslam.online.results import RunResults
-from morph_dslam.online.run_flags import flags
+from morph_dslam.online.runs.results import RunResults
+from morph_dslam.online.runs.run_flags import flags
+from morph_dslam.online.start.placement import Placement
+from morph_dslam.online.start.registration import register
 from tests.support.staged_scenes import Scene, is_beyond, is_doubted, mean_error
 
 #: Frames of a recording at 30 a second that show one unit of a scene's time.

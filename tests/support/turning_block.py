@@ -9,7 +9,7 @@ import numpy as np
 
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import Parameter, ReducedModel
-from morph_dslam.online.estimation import State
+from morph_dslam.online.estimation.estimator import State
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
 from tests.support.bent_sheet import _separated

@@ -9,7 +9,7 @@ import pytest
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import SurfacePoints
-from morph_dslam.online.estimation import BoundPoints, Estimator, State, moved
+from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, State, moved
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.real_data import ROOT
 

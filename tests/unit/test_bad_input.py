@@ -18,9 +18,9 @@ from morph_dslam.io.landmarks import load_landmarks
 from morph_dslam.io.trajectory import load_trajectory
 from morph_dslam.model import save_model
 from morph_dslam.online.aids.board import load_board
-from morph_dslam.online.output_folders import check_run_folder, write_registration
-from morph_dslam.online.placement import load_placement
-from morph_dslam.online.reregistration import Reregistration
+from morph_dslam.online.runs.output_folders import check_run_folder, write_registration
+from morph_dslam.online.start.placement import load_placement
+from morph_dslam.online.start.reregistration import Reregistration
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.block_study import write_study
 from tests.support.run_folders import write_run

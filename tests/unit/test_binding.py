@@ -9,7 +9,8 @@ from scipy.spatial import ConvexHull
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel, SeparatedField
-from morph_dslam.online.binding import (
+from morph_dslam.online.estimation.estimator import BoundPoints, State
+from morph_dslam.online.measuring.binding import (
     DrawnSurface,
     bind_pixels,
     draw_view,
@@ -17,7 +18,6 @@ from morph_dslam.online.binding import (
     nearest_surface_points,
     view_of,
 )
-from morph_dslam.online.estimation import BoundPoints, State
 from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)

@@ -16,11 +16,11 @@ from morph_dslam.model.discrepancy import (
     load_discrepancies,
     save_discrepancies,
 )
-from morph_dslam.online.discrepancy import DiscrepancyFit, DiscrepancyOptions
-from morph_dslam.online.discrepancy_refinement import Reference, refine_discrepancy
-from morph_dslam.online.estimation import BoundPoints, Estimator, State
-from morph_dslam.online.measurement_noise import Measured
-from morph_dslam.online.reference_refinement import Keyframe
+from morph_dslam.online.estimation.discrepancy import DiscrepancyFit, DiscrepancyOptions
+from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, State
+from morph_dslam.online.reference.discrepancy_refinement import Reference, refine_discrepancy
+from morph_dslam.online.reference.reference_refinement import Keyframe
+from morph_dslam.online.uncertainty.measurement_noise import Measured
 from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)

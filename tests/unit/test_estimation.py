@@ -7,8 +7,8 @@ from scipy.optimize import least_squares
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.online.bounded_step import bounded_step, bounded_step_numpy
-from morph_dslam.online.estimation import (
+from morph_dslam.online.estimation.bounded_step import bounded_step, bounded_step_numpy
+from morph_dslam.online.estimation.estimator import (
     BoundPoints,
     EstimationOptions,
     Estimator,
@@ -16,13 +16,13 @@ from morph_dslam.online.estimation import (
     State,
     moved,
 )
-from morph_dslam.online.reprojection import (
+from morph_dslam.online.estimation.reprojection import (
     linearise,
     linearise_numpy,
     project_with_jacobian,
     project_with_jacobian_numpy,
 )
-from morph_dslam.online.robust_covariance import huber_covariance, huber_covariance_numpy
+from morph_dslam.online.estimation.robust_covariance import huber_covariance, huber_covariance_numpy
 from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 528.0, 520.0, 320.0, 240.0)

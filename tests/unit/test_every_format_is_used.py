@@ -17,7 +17,7 @@ from morph_dslam.model import SeparatedField, SurfacePoints, load_model, save_mo
 from morph_dslam.model.basis_functions import cubic_spline_basis
 from morph_dslam.model.stacked_functions import stack_components
 from morph_dslam.model.tensor_functions import CPFunctions, TensorTrainFunctions, TuckerFunctions
-from morph_dslam.online.estimation import BoundPoints, Estimator, State, moved
+from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, State, moved
 from tests.support.stretched_block import PARAMETERS, SIZE, YOUNG_MODULUS, stretched_block_model
 
 

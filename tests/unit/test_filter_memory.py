@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from morph_dslam.online.filter_memory import PointChange
-from morph_dslam.online.measurement_noise import Measured
-from morph_dslam.online.sequence_filter import SequenceFilter
+from morph_dslam.online.estimation.filter_memory import PointChange
+from morph_dslam.online.estimation.sequence_filter import SequenceFilter
+from morph_dslam.online.uncertainty.measurement_noise import Measured
 from tests.unit.test_sequence_filter import CAMERA, ESTIMATOR, SIGMA, TWIST, bound, truth, twist_errors
 
 COUNT = 60

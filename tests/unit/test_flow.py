@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.online.appearance import ReferenceAppearance
-from morph_dslam.online.binding import view_of
-from morph_dslam.online.estimation import State
-from morph_dslam.online.features import detect_orb, interior, match_descriptors, spread_corners
-from morph_dslam.online.flow import (
+from morph_dslam.online.estimation.estimator import State
+from morph_dslam.online.measuring.appearance import ReferenceAppearance
+from morph_dslam.online.measuring.binding import view_of
+from morph_dslam.online.measuring.features import detect_orb, interior, match_descriptors, spread_corners
+from morph_dslam.online.measuring.flow import (
     NEUTRAL,
     FlowOptions,
     flatten,
@@ -18,7 +18,7 @@ from morph_dslam.online.flow import (
     patch_agreement_numpy,
     patch_correlation,
 )
-from morph_dslam.online.textured_view import draw_textured, draw_textured_numpy
+from morph_dslam.online.measuring.textured_view import draw_textured, draw_textured_numpy
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, printed_texture, sheet_state
 

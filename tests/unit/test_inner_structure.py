@@ -13,8 +13,8 @@ from morph_dslam.model import ReducedModel, SeparatedField, save_model
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.model.inner_structure import load_inner_structure, save_inner_structure
 from morph_dslam.offline.inner_structures import place_inner_structure
-from morph_dslam.online.estimation import Estimate, State, moved
-from morph_dslam.online.inner_positions import centre_and_std
+from morph_dslam.online.estimation.estimator import Estimate, State, moved
+from morph_dslam.online.runs.inner_positions import centre_and_std
 from morph_dslam.render.overlay import draw_inner_surface, draw_overlay
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.small_models import block_model

@@ -7,13 +7,19 @@ import numpy as np
 import pytest
 
 from morph_dslam.online.attempt import Picture
-from morph_dslam.online.estimation import Estimator
-from morph_dslam.online.flow import flatten
+from morph_dslam.online.estimation.estimator import Estimator
 from morph_dslam.online.frame_estimation import FrameEstimation
 from morph_dslam.online.frame_result import STAGES
-from morph_dslam.online.new_view import is_known_well, is_sharp, seen_part, sharpness, surface_spread
-from morph_dslam.online.reference_view import ReferenceView
-from morph_dslam.online.surface_coverage import SurfaceSamples
+from morph_dslam.online.measuring.flow import flatten
+from morph_dslam.online.reference.new_view import (
+    is_known_well,
+    is_sharp,
+    seen_part,
+    sharpness,
+    surface_spread,
+)
+from morph_dslam.online.reference.reference_view import ReferenceView
+from morph_dslam.online.reference.surface_coverage import SurfaceSamples
 from morph_dslam.online.timing import StageClock
 from morph_dslam.online.tracker_options import TrackerOptions
 from tests.support.bent_sheet import bent_sheet_model

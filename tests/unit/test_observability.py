@@ -7,12 +7,12 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField, SurfacePoints
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.online.estimation import BoundPoints, Estimator, State
+from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, State
+from morph_dslam.online.estimation.sequence_filter import SequenceFilter
 from morph_dslam.online.frame_result import STAGES, FrameResult
-from morph_dslam.online.measurement_noise import Measured
-from morph_dslam.online.observability import one_value, statement, untold, value_line
-from morph_dslam.online.results import RunResults, summarise
-from morph_dslam.online.sequence_filter import SequenceFilter
+from morph_dslam.online.runs.results import RunResults, summarise
+from morph_dslam.online.uncertainty.measurement_noise import Measured
+from morph_dslam.online.uncertainty.observability import one_value, statement, untold, value_line
 from tests.support.bent_sheet import sheet_mesh
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)

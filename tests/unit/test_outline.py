@@ -8,8 +8,14 @@ import pytest
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.online.estimation import State, moved
-from morph_dslam.online.outline import Outline, OutlineOptions, rim, search_outline, search_outline_numpy
+from morph_dslam.online.estimation.estimator import State, moved
+from morph_dslam.online.measuring.outline import (
+    Outline,
+    OutlineOptions,
+    rim,
+    search_outline,
+    search_outline_numpy,
+)
 from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 520.0, 520.0, 320.0, 240.0)

@@ -10,11 +10,11 @@ from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.online.anchor import Anchor, points_on_object
-from morph_dslam.online.place_in_map import PlaceInMap
+from morph_dslam.online.anchored.anchor import Anchor, points_on_object
+from morph_dslam.online.anchored.place_in_map import PlaceInMap
+from morph_dslam.online.estimation.state import State, moved
 from morph_dslam.online.slam.pose import PoseEstimate
 from morph_dslam.online.slam.rigid_map import GOOD, Keyframe, RigidMap
-from morph_dslam.online.state import State, moved
 from morph_dslam.similarity import SimilarityTransform
 from tests.support.bent_sheet import bent_sheet_model
 

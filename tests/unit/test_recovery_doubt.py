@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.online.attempt import refusal
-from morph_dslam.online.recovery import Recovery
+from morph_dslam.online.recovering.recovery import Recovery
 from morph_dslam.online.tracker_options import TrackerOptions
 
 

@@ -5,9 +5,9 @@ import pytest
 
 from morph_dslam.errors import RegistrationError
 from morph_dslam.model import SurfacePoints
-from morph_dslam.online.depth_residuals import DepthOptions
-from morph_dslam.online.estimation import BoundPoints, Estimator
-from morph_dslam.online.reference_depth import refine_by_depth
+from morph_dslam.online.estimation.depth_residuals import DepthOptions
+from morph_dslam.online.estimation.estimator import BoundPoints, Estimator
+from morph_dslam.online.reference.reference_depth import refine_by_depth
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, sheet_depth, sheet_state
 

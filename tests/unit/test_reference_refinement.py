@@ -5,15 +5,15 @@ import numpy as np
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.online.binding import nearest_surface_points
-from morph_dslam.online.estimation import BoundPoints, Estimator, State
-from morph_dslam.online.reference_refinement import (
+from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, State
+from morph_dslam.online.measuring.binding import nearest_surface_points
+from morph_dslam.online.reference.reference_refinement import (
     Keyframe,
     RefinementOptions,
     choose_keyframes,
     refine_reference,
 )
-from morph_dslam.online.registration import register
+from morph_dslam.online.start.registration import register
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import mean_error, sheet_state
 

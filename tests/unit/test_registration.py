@@ -7,8 +7,8 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.online.estimation import BoundPoints, State
-from morph_dslam.online.registration import register, shape_starts, solve_pnp
+from morph_dslam.online.estimation.estimator import BoundPoints, State
+from morph_dslam.online.start.registration import register, shape_starts, solve_pnp
 from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)

@@ -9,14 +9,14 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel, SeparatedField, SurfacePoints
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.online.appearance import ReferenceAppearance
-from morph_dslam.online.augmented_view import AugmentedView
-from morph_dslam.online.binding import view_of
-from morph_dslam.online.estimation import BoundPoints, Estimate, State
+from morph_dslam.online.drawing.augmented_view import AugmentedView
+from morph_dslam.online.estimation.estimator import BoundPoints, Estimate, State
 from morph_dslam.online.frame_result import STAGES, FrameResult
-from morph_dslam.online.measurement import visible_surface
-from morph_dslam.online.results import RunResults, summarise
-from morph_dslam.online.run_flags import flags
+from morph_dslam.online.measuring.appearance import ReferenceAppearance
+from morph_dslam.online.measuring.binding import view_of
+from morph_dslam.online.measuring.measurement import visible_surface
+from morph_dslam.online.runs.results import RunResults, summarise
+from morph_dslam.online.runs.run_flags import flags
 from tests.support.bent_sheet import PARAMETERS, bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)

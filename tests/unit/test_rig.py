@@ -9,11 +9,11 @@ from morph_dslam.errors import CameraError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.stereo_calibration import load_rig
 from morph_dslam.model import SurfacePoints
-from morph_dslam.online.estimation import BoundPoints, Estimator, Prior, State, moved
-from morph_dslam.online.known_pose import KnownPose
-from morph_dslam.online.measurement_noise import Measured, RigMeasured
-from morph_dslam.online.rig import RigCamera, RigEstimator
-from morph_dslam.online.sequence_filter import SequenceFilter
+from morph_dslam.online.anchored.known_pose import KnownPose
+from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, Prior, State, moved
+from morph_dslam.online.estimation.sequence_filter import SequenceFilter
+from morph_dslam.online.several.rig import RigCamera, RigEstimator
+from morph_dslam.online.uncertainty.measurement_noise import Measured, RigMeasured
 from tests.support.bent_sheet import bent_sheet_model
 
 MODEL = bent_sheet_model(22, 16)

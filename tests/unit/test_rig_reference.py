@@ -8,13 +8,13 @@ import pytest
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.online.binding import bind_pixels, view_of
-from morph_dslam.online.estimation import BoundPoints, EstimationOptions
-from morph_dslam.online.measurement_noise import Measured, RigMeasured
-from morph_dslam.online.rig import RigCamera, RigEstimator
-from morph_dslam.online.rig_reference import RigReference
-from morph_dslam.online.state import moved
+from morph_dslam.online.estimation.estimator import BoundPoints, EstimationOptions
+from morph_dslam.online.estimation.state import moved
+from morph_dslam.online.measuring.binding import bind_pixels, view_of
+from morph_dslam.online.several.rig import RigCamera, RigEstimator
+from morph_dslam.online.several.rig_reference import RigReference
 from morph_dslam.online.tracker_options import TrackerOptions
+from morph_dslam.online.uncertainty.measurement_noise import Measured, RigMeasured
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, sheet_state
 

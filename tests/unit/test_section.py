@@ -10,9 +10,9 @@ from morph_dslam.errors import TrackingError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.online.augmented_view import AugmentedView, DrawOptions
-from morph_dslam.online.estimation import State
-from morph_dslam.online.section import SectionPlane, cut
+from morph_dslam.online.drawing.augmented_view import AugmentedView, DrawOptions
+from morph_dslam.online.drawing.section import SectionPlane, cut
+from morph_dslam.online.estimation.estimator import State
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.small_models import block_model
 

@@ -6,10 +6,14 @@ import pytest
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.online.estimation import BoundPoints, Estimator, Prior, State, moved
-from morph_dslam.online.known_pose import KnownPose
-from morph_dslam.online.measurement_noise import Measured, window_correlation, window_correlation_numpy
-from morph_dslam.online.sequence_filter import SequenceFilter
+from morph_dslam.online.anchored.known_pose import KnownPose
+from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, Prior, State, moved
+from morph_dslam.online.estimation.sequence_filter import SequenceFilter
+from morph_dslam.online.uncertainty.measurement_noise import (
+    Measured,
+    window_correlation,
+    window_correlation_numpy,
+)
 from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)

@@ -5,9 +5,9 @@ import numpy as np
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.online.estimation import BoundPoints, EstimationOptions, Estimator, State
-from morph_dslam.online.registration import shape_starts
-from morph_dslam.online.shape_search import ShapeSearch, with_undetermined_at_default
+from morph_dslam.online.estimation.estimator import BoundPoints, EstimationOptions, Estimator, State
+from morph_dslam.online.estimation.shape_search import ShapeSearch, with_undetermined_at_default
+from morph_dslam.online.start.registration import shape_starts
 from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)

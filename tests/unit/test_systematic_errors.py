@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morph_dslam.online.binding import bind_pixels, view_of
-from morph_dslam.online.confidence import position_std
-from morph_dslam.online.estimation import BoundPoints, EstimationOptions, Estimator
-from morph_dslam.online.state import moved
-from morph_dslam.online.systematic_errors import SystematicErrors
+from morph_dslam.online.estimation.estimator import BoundPoints, EstimationOptions, Estimator
+from morph_dslam.online.estimation.state import moved
+from morph_dslam.online.measuring.binding import bind_pixels, view_of
+from morph_dslam.online.uncertainty.confidence import position_std
+from morph_dslam.online.uncertainty.systematic_errors import SystematicErrors
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, sheet_state
 

@@ -6,8 +6,8 @@ import pytest
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import TrackingError
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.online.estimation import Estimator, State
-from morph_dslam.online.temporal import at_constant_velocity, new_filter, temporal_facts
+from morph_dslam.online.estimation.estimator import Estimator, State
+from morph_dslam.online.estimation.temporal import at_constant_velocity, new_filter, temporal_facts
 from morph_dslam.online.tracker_options import TrackerOptions
 from tests.support.bent_sheet import PARAMETERS, bent_sheet_model
 

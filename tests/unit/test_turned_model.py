@@ -14,7 +14,7 @@ from morph_dslam.model.product_functions import ProductFunctions
 from morph_dslam.model.tensor_functions import CPFunctions
 from morph_dslam.model.turned_model import turned_model
 from morph_dslam.offline.meshing.mesh_generators import block, tube
-from morph_dslam.online.placement import load_placement
+from morph_dslam.online.start.placement import load_placement
 
 AXIS = np.array([0.0, 0.0, 1.0])
 

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.model.discrepancy import Discrepancy
-from morph_dslam.online.depth_residuals import PointDepths
-from morph_dslam.online.estimation import Estimate, Prior
-from morph_dslam.online.measurement import Measurement
-from morph_dslam.online.outline import OutlineMeasurement
+from morph_dslam.online.estimation.depth_residuals import PointDepths
+from morph_dslam.online.estimation.estimator import Estimate, Prior
+from morph_dslam.online.measuring.measurement import Measurement
+from morph_dslam.online.measuring.outline import OutlineMeasurement
 from morph_dslam.online.tracker_options import TrackerOptions
 
 #: Where less than this share of all points agree, they must agree closely.

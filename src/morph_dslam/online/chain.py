@@ -8,9 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.online.anchor import Anchor
+from morph_dslam.online.anchored.anchor import Anchor
+from morph_dslam.online.anchored.known_pose import KnownPose
 from morph_dslam.online.frame_result import FrameResult
-from morph_dslam.online.known_pose import KnownPose
 from morph_dslam.online.pipeline import Tracker
 from morph_dslam.sources import Frame
 

@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.online.attempt import Attempt, Picture
-from morph_dslam.online.depth_residuals import PointDepths
-from morph_dslam.online.estimation import Estimate, Estimator, Prior, State
-from morph_dslam.online.measurement import Measurement
-from morph_dslam.online.measurement_noise import Measured, window_correlation
-from morph_dslam.online.point_noise import PointNoise
-from morph_dslam.online.reference_view import ReferenceView
-from morph_dslam.online.shape_search import ShapeSearch
+from morph_dslam.online.estimation.depth_residuals import PointDepths
+from morph_dslam.online.estimation.estimator import Estimate, Estimator, Prior, State
+from morph_dslam.online.estimation.shape_search import ShapeSearch
+from morph_dslam.online.measuring.measurement import Measurement
+from morph_dslam.online.reference.reference_view import ReferenceView
 from morph_dslam.online.timing import StageClock
 from morph_dslam.online.tracker_options import TrackerOptions
+from morph_dslam.online.uncertainty.measurement_noise import Measured, window_correlation
+from morph_dslam.online.uncertainty.point_noise import PointNoise
 
 #: Share of the cost below which another shape is a better explanation and not the same one.
 CLEARLY_BETTER = 0.95

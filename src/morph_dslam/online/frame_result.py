@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model.discrepancy import Discrepancy
-from morph_dslam.online.estimation import Estimate
-from morph_dslam.online.known_pose import KnownPose
+from morph_dslam.online.anchored.known_pose import KnownPose
+from morph_dslam.online.estimation.estimator import Estimate
 
 Array = NDArray[np.float64]
 

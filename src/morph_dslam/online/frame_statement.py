@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from morph_dslam.online.anchored.known_pose import KnownPose
 from morph_dslam.online.attempt import Attempt
 from morph_dslam.online.frame_result import (
     FEW_AGREE,
@@ -13,10 +14,9 @@ from morph_dslam.online.frame_result import (
     UNEXPLAINED,
     FrameResult,
 )
-from morph_dslam.online.known_pose import KnownPose
-from morph_dslam.online.reference_misfit import CLEARLY_WORSE
-from morph_dslam.online.reference_views import FollowedView
+from morph_dslam.online.reference.reference_views import FollowedView
 from morph_dslam.online.timing import StageClock
+from morph_dslam.online.uncertainty.reference_misfit import CLEARLY_WORSE
 
 
 def _counts(attempt: Attempt) -> tuple[int, int]:

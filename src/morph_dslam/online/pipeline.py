@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.discrepancy import Discrepancy
-from morph_dslam.online.anchoring import Anchoring
+from morph_dslam.online.anchored.anchoring import Anchoring
+from morph_dslam.online.anchored.known_pose import KnownPose
 from morph_dslam.online.attempt import Attempt, Picture, refusal
-from morph_dslam.online.discrepancy import DiscrepancyFit
-from morph_dslam.online.estimation import Estimator, Prior, State
-from morph_dslam.online.flow import flatten, follow
+from morph_dslam.online.estimation.discrepancy import DiscrepancyFit
+from morph_dslam.online.estimation.estimator import Estimator, Prior, State
+from morph_dslam.online.estimation.shape_search import with_undetermined_at_default
+from morph_dslam.online.estimation.temporal import at_constant_velocity, new_filter
 from morph_dslam.online.frame_result import (
     FOLLOWED,
     FOUND_AGAIN,
@@ -32,14 +34,12 @@ from morph_dslam.online.frame_result import (
     FrameResult,
 )
 from morph_dslam.online.frame_statement import FrameStatements, missed
-from morph_dslam.online.known_pose import KnownPose
-from morph_dslam.online.look_alikes import LookAlikes
-from morph_dslam.online.measurement import Measurement
-from morph_dslam.online.reference_refinement import Keyframe
-from morph_dslam.online.reference_view import ReferenceView
-from morph_dslam.online.reference_views import Change, FollowedView, ReferenceViews
-from morph_dslam.online.shape_search import with_undetermined_at_default
-from morph_dslam.online.temporal import at_constant_velocity, new_filter
+from morph_dslam.online.measuring.flow import flatten, follow
+from morph_dslam.online.measuring.measurement import Measurement
+from morph_dslam.online.recovering.look_alikes import LookAlikes
+from morph_dslam.online.reference.reference_refinement import Keyframe
+from morph_dslam.online.reference.reference_view import ReferenceView
+from morph_dslam.online.reference.reference_views import Change, FollowedView, ReferenceViews
 from morph_dslam.online.timing import StageClock
 from morph_dslam.online.tracker_options import TrackerOptions
 

@@ -12,22 +12,22 @@ from tqdm import tqdm
 
 from morph_dslam.errors import SourceError, TrackingError
 from morph_dslam.online.attempt import Picture
-from morph_dslam.online.augmentation import write_video
-from morph_dslam.online.augmented_view import AugmentedView, DrawOptions
-from morph_dslam.online.discrepancy import DiscrepancyFit
-from morph_dslam.online.discrepancy_refinement import Reference, refine_discrepancy
-from morph_dslam.online.output_folders import check_run_folder
-from morph_dslam.online.placement import Placement
-from morph_dslam.online.reference_refinement import (
+from morph_dslam.online.drawing.augmentation import write_video
+from morph_dslam.online.drawing.augmented_view import AugmentedView, DrawOptions
+from morph_dslam.online.estimation.discrepancy import DiscrepancyFit
+from morph_dslam.online.reference.discrepancy_refinement import Reference, refine_discrepancy
+from morph_dslam.online.reference.reference_refinement import (
     Keyframe,
     RefinementOptions,
     choose_keyframes,
     refine_reference,
 )
-from morph_dslam.online.registration import bind_landmarks
-from morph_dslam.online.reregistration import Reregistration
-from morph_dslam.online.results import RunResults
-from morph_dslam.online.run_writing import RunInputs, write_run
+from morph_dslam.online.runs.output_folders import check_run_folder
+from morph_dslam.online.runs.results import RunResults
+from morph_dslam.online.runs.run_writing import RunInputs, write_run
+from morph_dslam.online.start.placement import Placement
+from morph_dslam.online.start.registration import bind_landmarks
+from morph_dslam.online.start.reregistration import Reregistration
 from morph_dslam.online.tracking_setup import ObjectOptions, Setup, load_setup
 from morph_dslam.sources import Frame, FrameSource, open_source
 from morph_dslam.sources.recorded import RecordedFrames

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from morph_dslam.online.depth_residuals import DepthOptions
-from morph_dslam.online.discrepancy import DiscrepancyOptions
-from morph_dslam.online.estimation import EstimationOptions
-from morph_dslam.online.flow import FlowOptions
-from morph_dslam.online.measurement import MeasurementOptions
-from morph_dslam.online.outline import OutlineOptions
-from morph_dslam.online.sequence_filter import FilterOptions
+from morph_dslam.online.estimation.depth_residuals import DepthOptions
+from morph_dslam.online.estimation.discrepancy import DiscrepancyOptions
+from morph_dslam.online.estimation.estimator import EstimationOptions
+from morph_dslam.online.estimation.sequence_filter import FilterOptions
+from morph_dslam.online.measuring.flow import FlowOptions
+from morph_dslam.online.measuring.measurement import MeasurementOptions
+from morph_dslam.online.measuring.outline import OutlineOptions
 
 #: Where the search for a frame's state starts.
 StartFrom = Literal["previous", "constant-velocity"]

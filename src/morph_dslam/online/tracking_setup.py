@@ -21,15 +21,15 @@ from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.inner_structure import CarriedStructure, InnerStructure, load_inner_structure
 from morph_dslam.online.aids.start import Aid, AidFiles, place_by_aid
-from morph_dslam.online.anchor import Anchor
+from morph_dslam.online.anchored.anchor import Anchor
 from morph_dslam.online.attempt import Picture
 from morph_dslam.online.chain import Chain
-from morph_dslam.online.discrepancy import DiscrepancyOptions
-from morph_dslam.online.outline import rim
+from morph_dslam.online.estimation.discrepancy import DiscrepancyOptions
+from morph_dslam.online.measuring.outline import rim
 from morph_dslam.online.pipeline import Tracker
-from morph_dslam.online.placement import Placement, load_placement, place_by_landmarks
-from morph_dslam.online.registration import RegistrationOptions
 from morph_dslam.online.slam.map_file import load_map
+from morph_dslam.online.start.placement import Placement, load_placement, place_by_landmarks
+from morph_dslam.online.start.registration import RegistrationOptions
 from morph_dslam.online.tracker_options import StartFrom, TrackerOptions
 from morph_dslam.sources import Frame
 from morph_dslam.units import to_si

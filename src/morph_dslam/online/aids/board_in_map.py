@@ -20,7 +20,7 @@ from morph_dslam.model import load_model
 from morph_dslam.online.aids.board import FEWEST_CORNERS, FiducialBoard, load_board
 from morph_dslam.online.aids.board_pose import LEAST_CORNER_PX, locate_board
 from morph_dslam.online.mesh_registration.scene import View, camera_from_object, scene_of_map
-from morph_dslam.online.output_folders import make_folder, write_registration
+from morph_dslam.online.runs.output_folders import make_folder, write_registration
 from morph_dslam.online.slam.map_file import load_map
 from morph_dslam.similarity import SimilarityTransform
 

@@ -12,9 +12,9 @@ from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, cross_matrix
 from morph_dslam.model import ReducedModel
 from morph_dslam.online.aids.board import FEWEST_CORNERS, FiducialBoard
-from morph_dslam.online.placement import Placement
-from morph_dslam.online.registration import solve_pnp
-from morph_dslam.online.state import State, moved
+from morph_dslam.online.estimation.state import State, moved
+from morph_dslam.online.start.placement import Placement
+from morph_dslam.online.start.registration import solve_pnp
 
 Array = NDArray[np.float64]
 

@@ -22,11 +22,11 @@ from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.online.aids.aid_file import Section, Vector, read_aid
-from morph_dslam.online.binding import DrawnSurface, draw_view, view_of
-from morph_dslam.online.estimation import Estimate, EstimationOptions, Estimator
-from morph_dslam.online.placement import Placement
-from morph_dslam.online.prior import Prior
-from morph_dslam.online.state import BoundPoints, State
+from morph_dslam.online.estimation.estimator import Estimate, EstimationOptions, Estimator
+from morph_dslam.online.estimation.prior import Prior
+from morph_dslam.online.estimation.state import BoundPoints, State
+from morph_dslam.online.measuring.binding import DrawnSurface, draw_view, view_of
+from morph_dslam.online.start.placement import Placement
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

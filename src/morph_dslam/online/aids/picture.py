@@ -15,12 +15,12 @@ from morph_dslam.errors import RegistrationError
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.model import ReducedModel
 from morph_dslam.online.aids.aid_file import Section, Vector, read_aid
-from morph_dslam.online.binding import nearest_surface_points
-from morph_dslam.online.estimation import Estimator
-from morph_dslam.online.placement import Placement, place_by_landmarks
-from morph_dslam.online.registration import RegistrationOptions, shape_starts
-from morph_dslam.online.relocalisation import RelocalisationOptions, state_from_matches
-from morph_dslam.online.state import BoundPoints
+from morph_dslam.online.estimation.estimator import Estimator
+from morph_dslam.online.estimation.state import BoundPoints
+from morph_dslam.online.measuring.binding import nearest_surface_points
+from morph_dslam.online.recovering.relocalisation import RelocalisationOptions, state_from_matches
+from morph_dslam.online.start.placement import Placement, place_by_landmarks
+from morph_dslam.online.start.registration import RegistrationOptions, shape_starts
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.sources.images import read_image
 

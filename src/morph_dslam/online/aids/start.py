@@ -17,7 +17,7 @@ from morph_dslam.online.aids.board import load_board
 from morph_dslam.online.aids.board_pose import BoardStart
 from morph_dslam.online.aids.guess import load_guess
 from morph_dslam.online.aids.picture import load_picture
-from morph_dslam.online.placement import Placement
+from morph_dslam.online.start.placement import Placement
 
 Image = NDArray[np.uint8]
 

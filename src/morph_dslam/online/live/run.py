@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from morph_dslam.errors import SourceError, TrackingError
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.online.attempt import Picture
-from morph_dslam.online.augmented_view import AugmentedView, DrawOptions
+from morph_dslam.online.drawing.augmented_view import AugmentedView, DrawOptions
 from morph_dslam.online.live.session import LivePicture, LiveSession, LiveTimes, Sink
 from morph_dslam.online.live.sinks import BrowserSink, VideoSink
-from morph_dslam.online.output_folders import check_run_folder
-from morph_dslam.online.placement import Placement
-from morph_dslam.online.reregistration import Reregistration
-from morph_dslam.online.results import RunResults
-from morph_dslam.online.run_writing import RunInputs, write_run
+from morph_dslam.online.runs.output_folders import check_run_folder
+from morph_dslam.online.runs.results import RunResults
+from morph_dslam.online.runs.run_writing import RunInputs, write_run
+from morph_dslam.online.start.placement import Placement
+from morph_dslam.online.start.reregistration import Reregistration
 from morph_dslam.online.tracking_setup import ObjectOptions, Setup, load_setup
 from morph_dslam.sources import open_live, open_stream
 from morph_dslam.sources.live import LiveCamera, LiveStream

@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.online.augmented_view import AugmentedView, with_caption
 from morph_dslam.online.chain import Chain, Located
+from morph_dslam.online.drawing.augmented_view import AugmentedView, with_caption
 from morph_dslam.online.frame_result import FrameResult
-from morph_dslam.online.reregistration import Reregistration
-from morph_dslam.online.results import RunResults
+from morph_dslam.online.runs.results import RunResults
 from morph_dslam.online.side_by_side import threads_side_by_side
+from morph_dslam.online.start.reregistration import Reregistration
 from morph_dslam.sources import Frame
 from morph_dslam.sources.live import LiveStream
 from morph_dslam.sources.newest import Newest

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import RegistrationError
 from morph_dslam.model import load_model
-from morph_dslam.online.anchor import points_on_object
+from morph_dslam.online.anchored.anchor import points_on_object
+from morph_dslam.online.anchored.place_in_map import PlaceInMap
 from morph_dslam.online.mesh_registration.scene import MapPoints, View
-from morph_dslam.online.place_in_map import PlaceInMap
 
 
 def left_by_others(

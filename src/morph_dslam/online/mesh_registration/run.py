@@ -23,7 +23,7 @@ from morph_dslam.online.mesh_registration.scene import (
     spread_views,
 )
 from morph_dslam.online.mesh_registration.unit_check import register_in_unit
-from morph_dslam.online.output_folders import make_folder, write_registration
+from morph_dslam.online.runs.output_folders import make_folder, write_registration
 from morph_dslam.online.slam.map_file import load_map
 from morph_dslam.render.overlay import draw_overlay
 from morph_dslam.render.shading import lambert, vertex_normals

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import CameraError
-from morph_dslam.online.flow import flatten
+from morph_dslam.online.measuring.flow import flatten
 from morph_dslam.online.slam.depth import DepthImage, FrameDepth, StereoImages
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.stereo import StereoCamera

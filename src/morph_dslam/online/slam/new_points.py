@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.online.features import spread_corners
+from morph_dslam.online.measuring.features import spread_corners
 from morph_dslam.online.slam.depth import FrameDepth, depth_of
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.slam.projection import project, rays, world_points

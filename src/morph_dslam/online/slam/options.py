@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from morph_dslam.online.flow import FlowOptions
+from morph_dslam.online.measuring.flow import FlowOptions
 
 
 @dataclass(frozen=True)

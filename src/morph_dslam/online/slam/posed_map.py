@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import MapError
 from morph_dslam.io.trajectory import Trajectory
-from morph_dslam.online.flow import FlowOptions
+from morph_dslam.online.measuring.flow import FlowOptions
 from morph_dslam.online.slam.frame_images import FrameImages
 from morph_dslam.online.slam.mapping import Mapper
 from morph_dslam.online.slam.mapping_work import do_all

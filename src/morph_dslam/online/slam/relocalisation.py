@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.online.features import spread_corners
-from morph_dslam.online.flow import FlowOptions
+from morph_dslam.online.measuring.features import spread_corners
+from morph_dslam.online.measuring.flow import FlowOptions
 from morph_dslam.online.slam.descriptors import (
     OCTAVES,
     Descriptors,

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.online.flow import NEUTRAL
+from morph_dslam.online.measuring.flow import NEUTRAL
 from morph_dslam.online.slam.projection import inverse
 from morph_dslam.online.slam.rigid_map import Keyframe
 

@@ -1,0 +1,1 @@
+"""Objects that stay in their place in the map of the scene."""

@@ -1,0 +1,1 @@
+"""The object drawn over the video."""

@@ -1,0 +1,1 @@
+"""Where a frame shows the points of the object."""

@@ -1,0 +1,1 @@
+"""Lost objects, and those that look like them."""

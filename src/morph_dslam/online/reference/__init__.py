@@ -1,0 +1,1 @@
+"""The views that frames are compared with."""

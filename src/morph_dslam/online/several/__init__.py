@@ -1,0 +1,1 @@
+"""Several cameras, and several objects."""

@@ -1,0 +1,130 @@
+"""What an estimate was made from, and how large and how alike the errors of its measurements are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+from numba import njit
+from numpy.typing import NDArray
+
+from morph_dslam.online.estimation.depth_residuals import PointDepths
+from morph_dslam.online.estimation.state import BoundPoints
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What an estimate was made from, in one frame.
+
+    Attributes
+    ----------
+    points : p of them. pixels : (p, 2) as measured. weights : (p,), inverse variances up to a factor.
+    normals : (p, 2), zero for points that count in both directions; see `reprojection.linearise`.
+    correlation : (p, p) of the errors of the points' measurements. depths : where a depth camera saw them.
+    """
+
+    points: BoundPoints
+    pixels: Array
+    weights: Array
+    normals: Array
+    correlation: Array
+    depths: PointDepths | None = None
+
+    @property
+    def numbers(self) -> NDArray[np.int64]:
+        """How many numbers each point (p,) gives: one on an outline, two otherwise."""
+        return np.where((self.normals != 0.0).any(axis=1), 1, 2)
+
+    @property
+    def redundancy(self) -> float:
+        """How many of the points count as one, because their windows overlap."""
+        exactness = np.sqrt(self.weights)
+        return float(exactness @ self.correlation @ exactness) / max(float(self.weights.sum()), 1e-300)
+
+
+@dataclass(frozen=True)
+class RigMeasured:
+    """What several cameras measured at the same time, by camera; their points come one after the other."""
+
+    views: tuple[Measured, ...]
+
+    @cached_property
+    def weights(self) -> Array:
+        """(p,) of all points."""
+        return np.concatenate([view.weights for view in self.views])
+
+    @cached_property
+    def numbers(self) -> NDArray[np.int64]:
+        """(p,) as in `Measured`."""
+        return np.concatenate([view.numbers for view in self.views])
+
+    @cached_property
+    def correlation(self) -> Array:
+        """(p, p); the errors of different cameras have nothing in common."""
+        return np.asarray(scipy.linalg.block_diag(*(view.correlation for view in self.views)))
+
+
+@njit(cache=True, nogil=True)
+def window_correlation(pixels, window):
+    """Correlation (p, p) of measurements at ``pixels`` (p, 2): the share of their windows that is the same.
+
+    ``window`` is the side of the square that is compared, in pixels. Points at NaN have no window.
+    """
+    result = np.eye(len(pixels))
+    for i in range(len(pixels)):
+        for j in range(i):
+            right, down = abs(pixels[i, 0] - pixels[j, 0]), abs(pixels[i, 1] - pixels[j, 1])
+            if right < window and down < window:
+                result[i, j] = result[j, i] = (1.0 - right / window) * (1.0 - down / window)
+    return result
+
+
+def window_correlation_numpy(pixels: Array, window: int) -> Array:
+    """The plain twin of `window_correlation`."""
+    overlap = np.ones((len(pixels), len(pixels)))
+    for column in pixels.T:
+        overlap *= np.fmax(0.0, 1.0 - np.abs(column[:, None] - column[None]) / window)
+    np.fill_diagonal(overlap, 1.0)
+    return overlap
+
+
+#: An estimate that takes up more of the variance leaves too little, as a share, to tell how large it is.
+LEAST_LEFT = 0.25
+
+
+class PixelNoise:
+    """The variance of a coordinate of a point of weight 1: what stays with the point, and what is new."""
+
+    def __init__(self, memory: float) -> None:
+        self._fade, self._count, self._product = np.exp(-1.0 / memory), 0.0, 0.0
+        self._before: Array | None = None
+        self.common, self.frame = 0.0, 0.0
+
+    def change_points(self) -> None:
+        """The next frame's residuals are of other points: they cannot be compared with the last ones."""
+        self._before = None
+
+    def add(self, residuals: Array, measured: Measured | RigMeasured, taken: float) -> None:
+        """Learn from the residuals (p, 2) of a frame; those of the frame before tell what stays.
+
+        ``taken`` is how many numbers' worth of variance the estimate has taken up.
+        """
+        used = (measured.weights > 0.0) & np.isfinite(residuals).all(axis=1)
+        numbers = measured.numbers[used].sum()
+        # In what a point of weight 1 is off by.
+        residuals = np.where(used[:, None], np.sqrt(measured.weights)[:, None] * residuals, np.nan)
+        total = np.nansum(residuals**2) / max(numbers - taken, LEAST_LEFT * numbers, 1)
+        if self._before is not None:
+            products = residuals * self._before
+            pairs = np.isfinite(products)
+            self._count = self._fade * self._count + pairs.sum()
+            self._product = self._fade * self._product + np.nansum(products)
+        self._before = residuals
+        # As long as there is nothing to compare with, all of it is taken to stay.
+        stays = self._product / self._count if self._count else np.inf
+        self.common = float(np.clip(stays, 0.0, total))
+        self.frame = float(total - self.common)

@@ -1,0 +1,251 @@
+"""Errors that more points and more frames do not average out: of the reference state, and of the model.
+
+The points were bound to the mesh in the reference view, so an error of the object's state there moves them
+on the surface, and every frame's estimate with them. Let a pixel of the reference view move by J0 e where its
+state is off by e; the material point under a fixed pixel then moves so that its pixel moves by -J0 e, in
+another view by -M J0 e, with M the map between the images of the point's triangle. The frame's estimate takes
+this for motion, H^-1 J' W M J0 e, to first order. In the reference view itself that is e. What it cannot take
+up stays in the residuals; where they show more of it than the stated covariance of e explains,
+`ReferenceMisfit` says by how much that is too small.
+
+A model that cannot take the object's shape leaves residuals that are alike over parts of the surface much
+wider than the windows that are compared. Their covariance is measured from pairs of points whose windows do
+not overlap, and enters the estimate through the same H^-1 J' W. An estimate takes up most of such an error by
+a wrong pose and shape, so that its residuals show only the rest: what they show is divided by that share, as
+in restricted maximum likelihood (Patterson & Thompson 1971).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.model import SurfacePoints
+from morph_dslam.online.estimation.estimator import BoundPoints, Estimate, Estimator, Prior, State
+from morph_dslam.online.estimation.reprojection import project_with_jacobian
+from morph_dslam.online.estimation.robust_covariance import EIGENVALUE_FLOOR
+from morph_dslam.online.uncertainty.dimension_check import DimensionCheck
+from morph_dslam.online.uncertainty.reference_misfit import ReferenceMisfit
+
+Array = NDArray[np.float64]
+
+#: Over these shares of the points' spread in the reference view a model's errors are taken to be alike, and
+#: are pairs of points compared.
+ALIKE_SHARE, PAIR_SHARE = 0.75, 0.5
+#: More than this, pixels, and more than half of the residuals' variance, is stated as the model's failure.
+UNEXPLAINED_PX = 0.5
+#: An estimate that takes up more of the model's error leaves too little to tell how large it is.
+LEAST_LEFT = 0.02
+#: A triangle seen so much flatter in the reference view than in another says nothing of the motion there.
+LARGEST_STRETCH = 5.0
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """What the model leaves of the residuals.
+
+    Attributes
+    ----------
+    px : standard deviation of a pixel coordinate that neighbours have in common. total_px : of all of it.
+    """
+
+    px: float
+    total_px: float
+
+    @property
+    def is_failure(self) -> bool:
+        """Whether the model, not noise, is what is left."""
+        return self.px > UNEXPLAINED_PX and self.px**2 > 0.5 * self.total_px**2
+
+
+class SystematicErrors:
+    """Adds to covariances what the reference and the model are off by.
+
+    Parameters
+    ----------
+    points : (p) the texture's points, bound in the reference view. reference : the state there.
+    covariance : (d + 6, d + 6) of that state; None where nothing is known of its error.
+    window : side of the square that is compared around a point, pixels.
+    """
+
+    def __init__(
+        self,
+        estimator: Estimator,
+        points: BoundPoints,
+        reference: State,
+        covariance: Array | None,
+        window: int,
+    ) -> None:
+        self._estimator, self._points = estimator, points
+        known = covariance is not None and np.isfinite(covariance).all()
+        self._root = _root(covariance, estimator.scale) if known and covariance is not None else None
+        self._misfit = ReferenceMisfit()
+        self._corners = _corners(estimator, points)
+        self._jacobian = self._project(points, reference)[1]
+        self._dimensions = DimensionCheck(points, reference, self._jacobian, estimator.scale)
+        self._edges = _edges(estimator.camera, self._corners, reference)
+        places = self._project(points, reference)[0]
+        # Coordinate by coordinate: sums over an axis of two cost numpy most of the time that a view takes.
+        right, down = (np.abs(column[:, None] - column[None]) for column in places.T)
+        squared = right**2 + down**2
+        spread = float(np.sqrt(np.mean(np.sum((places - places.mean(axis=0)) ** 2, axis=1))))
+        self._alike = np.exp(-0.5 * squared / (ALIKE_SHARE * spread) ** 2)
+        near = squared < (PAIR_SHARE * spread) ** 2
+        self._pairs = near & (np.maximum(right, down) >= window)
+
+    def unexplained(self, estimate: Estimate, used: NDArray[np.bool_]) -> Unexplained:
+        """What the model leaves of the residuals of the points ``used`` (p,)."""
+        residuals = np.where(used[:, None], estimate.residuals[: len(used)], 0.0)
+        total = float(np.sum(residuals**2)) / max(2 * int(used.sum()), 1)
+        common = float(_in_common(residuals[:, :, None], self._pairs_of(used))[0, 0])
+        return Unexplained(float(np.sqrt(max(common, 0.0))), float(np.sqrt(total)))
+
+    @property
+    def worse(self) -> float:
+        """By how much larger than stated the reference's deviation is, as the frames so far show it."""
+        return float(np.sqrt(self._misfit.factor))
+
+    @property
+    def is_unchecked(self) -> bool:
+        """Whether no frame so far could have shown that the object has not got the model's dimensions."""
+        return self._root is not None and not self._dimensions.is_done
+
+    def added(
+        self,
+        estimate: Estimate,
+        weights: Array,
+        alike_px: float,
+        prior: Prior | None = None,
+        learns: bool = True,
+    ) -> Estimate:
+        """The estimate with a covariance that holds both errors.
+
+        Parameters
+        ----------
+        weights : (p,) of the points, zero for those that do not support it. prior : that it was found with.
+        alike_px : standard deviation of a pixel coordinate that neighbours have in common in the residuals,
+            as of `unexplained`.
+        learns : whether the residuals are the object's, so that they tell how well the reference is known.
+        """
+        usable, jacobian, scores = self._scores(estimate, weights)
+        hessian = np.tensordot(scores, jacobian, axes=([0, 1], [0, 1]))
+        if prior is not None:
+            hessian = hessian + prior.terms(estimate.state)[1]
+        gain = inverse_of_seen(hessian, self._estimator.scale)
+        covariance, pairs = estimate.covariance.copy(), self._pairs_of(usable)
+        if self._root is not None:
+            warps = self._warps(estimate.state)
+            moved = warps @ (self._jacobian @ self._root)
+            transfer = gain @ np.tensordot(scores, moved, axes=([0, 1], [0, 1]))
+            if learns:
+                residuals = np.where(usable[:, None], estimate.residuals[: len(weights)], 0.0)
+                left = np.where(usable[:, None, None], moved - jacobian @ transfer, 0.0)
+                shown, expected = (np.trace(_in_common(x, pairs)) for x in (residuals[:, :, None], left))
+                self._misfit.learn(float(shown), float(expected))
+                stretched = self._dimensions.moved(estimate.state, jacobian, warps)
+                taken = gain @ np.tensordot(scores, stretched, axes=([0, 1], [0, 1]))
+                left = np.where(usable[:, None, None], stretched - jacobian @ taken, 0.0)
+                self._dimensions.learn(_in_common(left, pairs))
+            covariance += self._misfit.factor * transfer @ transfer.T
+        spread = (self._alike @ scores.reshape(len(scores), -1)).reshape(scores.shape)
+        together = np.asarray(np.tensordot(scores, spread, axes=([0, 1], [0, 1])), dtype=np.float64)
+        of_model = gain @ together @ gain
+        share = self._share_left(jacobian, spread @ gain, of_model, pairs)
+        covariance += alike_px**2 / share * of_model
+        return replace(estimate, covariance=covariance)
+
+    def pushed(self, estimate: Estimate, weights: Array) -> tuple[Array, Array]:
+        """How points of these ``weights`` (p,) determine the estimate, and how the reference's error enters.
+
+        Both (d + 6, d + 6): J' W J, and J' W M J0, the gradient by an error of the reference state.
+        """
+        _, jacobian, scores = self._scores(estimate, weights)
+        carried = self._warps(estimate.state) @ self._jacobian
+        hessian, push = (np.tensordot(scores, rows, axes=([0, 1], [0, 1])) for rows in (jacobian, carried))
+        return hessian, push
+
+    def _scores(self, estimate: Estimate, weights: Array) -> tuple[NDArray[np.bool_], Array, Array]:
+        """Which points (p,) count, their pixels' derivatives (p, 2, d + 6), and these times the weights."""
+        _, jacobian = self._project(self._points, estimate.state)
+        length = np.linalg.norm(estimate.residuals[: len(weights)], axis=1)
+        usable = (weights > 0.0) & np.isfinite(length) & np.isfinite(jacobian).all(axis=(1, 2))
+        huber = self._estimator.options.huber_px
+        weights = np.where(usable, weights * np.minimum(1.0, huber / np.maximum(length, 1e-300)), 0.0)
+        jacobian = np.where(usable[:, None, None], jacobian, 0.0)
+        return usable, jacobian, weights[:, None, None] * jacobian
+
+    def _pairs_of(self, used: NDArray[np.bool_]) -> Array:
+        """1 for pairs of points (p, p) that are compared, 0 for others."""
+        return (self._pairs & used[:, None] & used[None]).astype(float)
+
+    def _share_left(self, jacobian: Array, spread: Array, of_model: Array, pairs: Array) -> float:
+        """How much of the variance of the model's error the estimate leaves in the residuals that show it.
+
+        With G = J H^-1 J' W what the estimate takes up, it leaves (I - G) K (I - G)' of a covariance K; this
+        is summed over the pairs of points that `unexplained` sums over.
+        """
+        beside = np.tensordot(pairs, jacobian, axes=(1, 0))
+        whole = 2.0 * float(np.sum(self._alike * pairs))
+        taken = 2.0 * float(np.sum(beside * spread))
+        twice = float(np.sum(np.tensordot(jacobian, beside, axes=([0, 1], [0, 1])) * of_model))
+        return max((whole - taken + twice) / max(2.0 * float(pairs.sum()), 1.0), LEAST_LEFT)
+
+    def _project(self, points: BoundPoints, state: State) -> tuple[Array, Array]:
+        pose = state.camera_from_object
+        functions = points.field.functions.rows(state.parameters)
+        intrinsics = self._estimator.camera.intrinsics
+        return project_with_jacobian(
+            functions, pose.rotation, pose.translation, points.rest, points.field.modes, intrinsics
+        )
+
+    def _warps(self, state: State) -> Array:
+        """How pixels (p, 2, 2) move in a view where they move by one in the reference view."""
+        before, now = self._edges, _edges(self._estimator.camera, self._corners, state)
+        size = before[:, 0, 0] * before[:, 1, 1] - before[:, 0, 1] * before[:, 1, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            adjugate = np.stack(
+                [before[:, 1, 1], -before[:, 0, 1], -before[:, 1, 0], before[:, 0, 0]], axis=1
+            )
+            warps = now @ (adjugate / size[:, None]).reshape(-1, 2, 2)
+            usable = np.abs(warps).max(axis=(1, 2)) < LARGEST_STRETCH
+        return np.where(usable[:, None, None], warps, 0.0)
+
+
+def inverse_of_seen(hessian: Array, scale: Array) -> Array:
+    """H^-1 (n, n); nothing moves along what neither the images nor a prior determine."""
+    values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
+    seen = values > max(values[-1], 1e-30) * EIGENVALUE_FLOOR
+    inverse = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T
+    return np.asarray(inverse * np.outer(scale, scale), dtype=np.float64)
+
+
+def _root(covariance: Array, scale: Array) -> Array:
+    """L (n, n) with L L' = ``covariance``, which may be singular; in unknowns divided by ``scale``."""
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+
+
+def _in_common(rows: Array, pairs: Array) -> Array:
+    """Mean products (k, k), a coordinate, of what the two points of a pair (p, p) have in (p, 2, k)."""
+    beside = (pairs @ rows.reshape(len(rows), -1)).reshape(rows.shape)
+    found = np.tensordot(rows, beside, axes=([0, 1], [0, 1])) / max(2.0 * float(pairs.sum()), 1.0)
+    return np.asarray(found, dtype=np.float64)
+
+
+def _corners(estimator: Estimator, points: BoundPoints) -> BoundPoints:
+    """The three corners of each point's triangle, (3 p) points."""
+    surface = SurfacePoints(np.repeat(points.surface.triangles, 3), np.tile(np.eye(3), (len(points), 1)))
+    model = estimator.model
+    nodes = model.triangles[points.surface.triangles].ravel()
+    return BoundPoints(
+        surface, model.nodes[nodes], model.displacement.with_modes(model.displacement.modes[:, nodes])
+    )
+
+
+def _edges(camera: PinholeCamera, corners: BoundPoints, state: State) -> Array:
+    """Two edges of each triangle in the image, as the columns of (p, 2, 2)."""
+    pixels = camera.project(corners.in_camera(state)).reshape(-1, 3, 2)
+    return np.stack([pixels[:, 1] - pixels[:, 0], pixels[:, 2] - pixels[:, 0]], axis=2)
