@@ -167,8 +167,11 @@ def test_boards_that_are_not_found_or_too_seldom(pictures, tmp_path):
 
 def test_a_camera_file_that_cannot_be_written(pictures, tmp_path):
     folder = write_all(tmp_path / "images", pictures[0][:6])
-    with pytest.raises(CameraError, match=r"cannot write .*images: Is a directory"):
+    with pytest.raises(CameraError, match=r"cannot write .*images: a camera file has the ending \.yaml"):
         calibrate([folder], BOARD, folder)
+    (tmp_path / "cam.yaml").mkdir()
+    with pytest.raises(CameraError, match=r"cannot write .*cam\.yaml: Is a directory"):
+        calibrate([folder], BOARD, tmp_path / "cam.yaml")
 
 
 @pytest.mark.parametrize(
