@@ -94,13 +94,15 @@ class SystematicErrors:
         spread = float(np.sqrt(np.mean(np.sum((places - places.mean(axis=0)) ** 2, axis=1))))
         self._alike = np.exp(-0.5 * squared / (ALIKE_SHARE * spread) ** 2)
         near = squared < (PAIR_SHARE * spread) ** 2
-        self._pairs = near & (np.maximum(right, down) >= window)
+        # As numbers, to be multiplied by in every frame; points that do not count are zero in what it is.
+        self._pairs = (near & (np.maximum(right, down) >= window)).astype(np.float64)
+        self._alike_pairs = self._alike * self._pairs
 
     def unexplained(self, estimate: Estimate, used: NDArray[np.bool_]) -> Unexplained:
         """What the model leaves of the residuals of the points ``used`` (p,)."""
         residuals = np.where(used[:, None], estimate.residuals[: len(used)], 0.0)
         total = float(np.sum(residuals**2)) / max(2 * int(used.sum()), 1)
-        common = float(_in_common(residuals[:, :, None], self._pairs_of(used))[0, 0])
+        common = float(self._in_common(residuals[:, :, None], self._n_pairs(used))[0, 0])
         return Unexplained(float(np.sqrt(max(common, 0.0))), float(np.sqrt(total)))
 
     @property
@@ -135,7 +137,7 @@ class SystematicErrors:
         if prior is not None:
             hessian = hessian + prior.terms(estimate.state)[1]
         gain = inverse_of_seen(hessian, self._estimator.scale)
-        covariance, pairs = estimate.covariance.copy(), self._pairs_of(usable)
+        covariance, n_pairs = estimate.covariance.copy(), self._n_pairs(usable)
         if self._root is not None:
             warps = self._warps(estimate.state)
             moved = warps @ (self._jacobian @ self._root)
@@ -143,17 +145,18 @@ class SystematicErrors:
             if learns:
                 residuals = np.where(usable[:, None], estimate.residuals[: len(weights)], 0.0)
                 left = np.where(usable[:, None, None], moved - jacobian @ transfer, 0.0)
-                shown, expected = (np.trace(_in_common(x, pairs)) for x in (residuals[:, :, None], left))
+                both = (residuals[:, :, None], left)
+                shown, expected = (np.trace(self._in_common(rows, n_pairs)) for rows in both)
                 self._misfit.learn(float(shown), float(expected))
                 stretched = self._dimensions.moved(estimate.state, jacobian, warps)
                 taken = gain @ np.tensordot(scores, stretched, axes=([0, 1], [0, 1]))
                 left = np.where(usable[:, None, None], stretched - jacobian @ taken, 0.0)
-                self._dimensions.learn(_in_common(left, pairs))
+                self._dimensions.learn(self._in_common(left, n_pairs))
             covariance += self._misfit.factor * transfer @ transfer.T
         spread = (self._alike @ scores.reshape(len(scores), -1)).reshape(scores.shape)
         together = np.asarray(np.tensordot(scores, spread, axes=([0, 1], [0, 1])), dtype=np.float64)
         of_model = gain @ together @ gain
-        share = self._share_left(jacobian, spread @ gain, of_model, pairs)
+        share = self._share_left(usable, jacobian, spread @ gain, of_model)
         covariance += alike_px**2 / share * of_model
         return replace(estimate, covariance=covariance)
 
@@ -177,21 +180,27 @@ class SystematicErrors:
         jacobian = np.where(usable[:, None, None], jacobian, 0.0)
         return usable, jacobian, weights[:, None, None] * jacobian
 
-    def _pairs_of(self, used: NDArray[np.bool_]) -> Array:
-        """1 for pairs of points (p, p) that are compared, 0 for others."""
-        return (self._pairs & used[:, None] & used[None]).astype(float)
+    def _n_pairs(self, used: NDArray[np.bool_]) -> float:
+        """How many pairs of the points ``used`` (p,) are compared, counted from both sides."""
+        return float(used @ self._pairs @ used)
 
-    def _share_left(self, jacobian: Array, spread: Array, of_model: Array, pairs: Array) -> float:
+    def _in_common(self, rows: Array, n_pairs: float) -> Array:
+        """Mean products (k, k), a coordinate, of what pairs of points have in (p, 2, k), zero if unused."""
+        beside = (self._pairs @ rows.reshape(len(rows), -1)).reshape(rows.shape)
+        found = np.tensordot(rows, beside, axes=([0, 1], [0, 1])) / max(2.0 * n_pairs, 1.0)
+        return np.asarray(found, dtype=np.float64)
+
+    def _share_left(self, used: NDArray[np.bool_], jacobian: Array, spread: Array, of_model: Array) -> float:
         """How much of the variance of the model's error the estimate leaves in the residuals that show it.
 
         With G = J H^-1 J' W what the estimate takes up, it leaves (I - G) K (I - G)' of a covariance K; this
         is summed over the pairs of points that `unexplained` sums over.
         """
-        beside = np.tensordot(pairs, jacobian, axes=(1, 0))
-        whole = 2.0 * float(np.sum(self._alike * pairs))
-        taken = 2.0 * float(np.sum(beside * spread))
+        beside = (self._pairs @ jacobian.reshape(len(jacobian), -1)).reshape(jacobian.shape)
+        whole = 2.0 * float(used @ self._alike_pairs @ used)
+        taken = 2.0 * float(np.sum(beside[used] * spread[used]))
         twice = float(np.sum(np.tensordot(jacobian, beside, axes=([0, 1], [0, 1])) * of_model))
-        return max((whole - taken + twice) / max(2.0 * float(pairs.sum()), 1.0), LEAST_LEFT)
+        return max((whole - taken + twice) / max(2.0 * self._n_pairs(used), 1.0), LEAST_LEFT)
 
     def _project(self, points: BoundPoints, state: State) -> tuple[Array, Array]:
         pose = state.camera_from_object
@@ -226,13 +235,6 @@ def _root(covariance: Array, scale: Array) -> Array:
     """L (n, n) with L L' = ``covariance``, which may be singular; in unknowns divided by ``scale``."""
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     return scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-
-
-def _in_common(rows: Array, pairs: Array) -> Array:
-    """Mean products (k, k), a coordinate, of what the two points of a pair (p, p) have in (p, 2, k)."""
-    beside = (pairs @ rows.reshape(len(rows), -1)).reshape(rows.shape)
-    found = np.tensordot(rows, beside, axes=([0, 1], [0, 1])) / max(2.0 * float(pairs.sum()), 1.0)
-    return np.asarray(found, dtype=np.float64)
 
 
 def _corners(estimator: Estimator, points: BoundPoints) -> BoundPoints:
