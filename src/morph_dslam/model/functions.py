@@ -63,6 +63,8 @@ class Functions(ABC):
     def rows(self, mu: ArrayLike) -> Array:
         """Values, then the derivative by each parameter (1 + d, n_functions) at ``mu`` (d,), compiled.
 
+        The last ones are kept: fields of the same functions are mostly asked for one after the other.
+
         Raises
         ------
         ValueError
@@ -71,7 +73,18 @@ class Functions(ABC):
         mu = np.ascontiguousarray(mu, dtype=np.float64)
         if mu.shape != (self.dimension,):
             raise ValueError(f"{self.dimension} parameters are needed, not an array of shape {mu.shape}")
-        return self._compiled(mu)
+        last, key = self._last, mu.tobytes()
+        known = last.get(key)
+        if known is None:
+            known = self._compiled(mu)
+            last.clear()
+            last[key] = known
+        return known.copy()
+
+    @cached_property
+    def _last(self) -> dict[bytes, Array]:
+        """The rows of the last parameters, by their bytes."""
+        return {}
 
     def evaluate(self, mu: ArrayLike) -> tuple[Array, Array]:
         """Values (n_functions,) and gradient (d, n_functions) at ``mu`` (d,)."""
