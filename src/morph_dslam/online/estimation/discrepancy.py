@@ -173,7 +173,9 @@ class DiscrepancyFit:
         length = np.linalg.norm(residuals, axis=1)
         huber = np.minimum(1.0, options.huber_px / np.maximum(length, 1e-12))
         sigma = np.where(across, options.outline_px, options.point_px)
-        return derivatives, residuals, np.where(used, huber / sigma**2, 0.0)
+        # The outline has a deviation of its own here, whatever the estimate counts it by.
+        counts = np.where(across, 1.0, measured.weights)
+        return derivatives, residuals, np.where(used, counts * huber / sigma**2, 0.0)
 
     def shape(self, state: State) -> Array:
         """The samples (s, 3) of the surface in the camera frame, in a state of the model, metres."""
