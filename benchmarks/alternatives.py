@@ -40,6 +40,7 @@ from morph_dslam.online.pipeline import Tracker
 from morph_dslam.online.start.placement import place_by_landmarks
 from morph_dslam.online.start.registration import RegistrationOptions
 from morph_dslam.sources import open_source
+from morph_dslam.threads import one_thread_for_algebra
 
 Array = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parents[1]
@@ -218,6 +219,7 @@ def compare(recording: Recording, frames: int) -> None:
         )
 
 
+@one_thread_for_algebra
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter

@@ -55,6 +55,7 @@ from morph_dslam.online.mesh_registration.register import register_mesh
 from morph_dslam.online.start.placement import Placement
 from morph_dslam.online.start.registration import register
 from morph_dslam.similarity import SimilarityTransform
+from morph_dslam.threads import one_thread_for_algebra
 
 Case = tuple[str, Callable[[], Outcome]]
 #: The scene whose object stays in its place while the camera goes round it, as one in a map does.
@@ -214,6 +215,7 @@ def _line(scene: str, case: str, outcomes: list[Outcome]) -> str:
     )
 
 
+@one_thread_for_algebra
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--first", type=int, default=0, help="first seed (%(default)s)")

@@ -33,6 +33,7 @@ from morph_dslam.online.measuring.binding import DrawnSurface
 from morph_dslam.online.pipeline import Tracker
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
+from morph_dslam.threads import one_thread_for_algebra
 
 Array = NDArray[np.float64]
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
@@ -195,6 +196,7 @@ def estimator_alone(model: ReducedModel, repeats: int = 300) -> None:
     )
 
 
+@one_thread_for_algebra
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
