@@ -22,6 +22,8 @@ from morph_dslam.similarity import fit_similarity
 
 Array = NDArray[np.float64]
 
+#: For so many arrays of positions a basis keeps its influence: points, drawn nodes and inner structures.
+KEPT = 8
 #: Added to the covariance's diagonal, relative: points that lie close together make it nearly singular.
 JITTER = 1e-6
 
@@ -51,8 +53,23 @@ class DiscrepancyBasis:
         return np.asarray(cho_solve(cho_factor(covariance), np.eye(len(covariance))))
 
     def influence(self, positions: Array) -> Array:
-        """What each centre's displacement gives (n, m) at positions (n, 3) of the undeformed object."""
-        return self._covariance(positions) @ self.precision
+        """What each centre's displacement gives (n, m) at positions (n, 3) of the undeformed object.
+
+        It is kept for the arrays that were asked for last, which must stay as they are.
+        """
+        known = self._known.get(id(positions))
+        if known is not None and known[0] is positions:
+            return known[1]
+        found = self._covariance(positions) @ self.precision
+        if len(self._known) >= KEPT:
+            self._known.clear()
+        self._known[id(positions)] = positions, found
+        return found
+
+    @cached_property
+    def _known(self) -> dict[int, tuple[Array, Array]]:
+        """Positions and the influence on them, by the array that they are."""
+        return {}
 
     def _covariance(self, positions: Array) -> Array:
         """Matern 5/2 of the distances to the centres (n, m)."""

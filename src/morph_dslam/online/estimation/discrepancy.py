@@ -78,6 +78,13 @@ class Quadratic:
         """
         return cls(weighted_gram(weights, influence), (influence.T @ forces).T.ravel())
 
+    @classmethod
+    def of_residuals(cls, rows: Array, residuals: Array, weights: Array, influence: Array) -> Quadratic:
+        """By residuals (p, k) with ``weights`` (p,) and their derivatives (p, k, 3) by p displacements."""
+        curvature = np.einsum("p,pka,pkb->pab", weights, rows, rows)
+        forces = np.einsum("p,pka,pk->pa", weights, rows, residuals)
+        return cls.of_rows(curvature, forces, influence)
+
     def minimum(self) -> Array:
         """The step (m, 3) that lowers the cost most."""
         return as_displacements(-cho_solve(cho_factor(self.hessian), self.gradient))
@@ -126,31 +133,21 @@ class DiscrepancyFit:
         self._lengths = np.linalg.norm(start - end, axis=1)
         self._influence = self.basis.influence(self._samples.rest)
         self._stretching = self._influence[self._lines[:, 0]] - self._influence[self._lines[:, 1]]
-        self._points: tuple[BoundPoints, Array] | None = None
-
-    def influence(self, points: BoundPoints) -> Array:
-        """Of the centres on bound points (p, m); kept for the next frame."""
-        if self._points is None or self._points[0] is not points:
-            self._points = points, self.basis.influence(points.rest)
-        return self._points[1]
 
     def fit(self, measured: Measured, state: State, last: Discrepancy | None = None) -> Discrepancy:
         """The discrepancy of the frame that was measured, with the model in the estimated state.
 
         ``last`` is that of the frame before, to start from; None where it is not known.
         """
-        influence = self.influence(measured.points)
+        influence = self.basis.influence(measured.points.rest)
         values = np.zeros((len(self.basis.centres), 3)) if last is None else last.values
         positions, shape = measured.points.in_camera(state), self._samples.in_camera(state)
         rotation = state.camera_from_object.rotation
         for _ in range(self.options.steps if last is None else 1):
             there = positions + influence @ values @ rotation.T
             derivatives, residuals, weights = self.seen(measured, there)
-            rows = derivatives @ rotation
-            curvature = np.einsum("p,pka,pkb->pab", weights, rows, rows)
-            forces = np.einsum("p,pka,pk->pa", weights, rows, residuals)
-            cost = self.prior(shape, rotation, values) + Quadratic.of_rows(curvature, forces, influence)
-            values = values + cost.minimum()
+            data = Quadratic.of_residuals(derivatives @ rotation, residuals, weights, influence)
+            values = values + (self.prior(shape, rotation, values) + data).minimum()
         return Discrepancy(self.basis, values)
 
     def seen(self, measured: Measured, positions: Array) -> tuple[Array, Array, Array]:

@@ -74,12 +74,20 @@ def refine_discrepancy(
 
 @dataclass
 class _Frame:
-    """A keyframe: what was measured, the state, and how points move in the image (p, 2, 3) as the reference
-    discrepancy moves them along the surface; and its own discrepancy (m, 3)."""
+    """A keyframe.
+
+    Attributes
+    ----------
+    measured : in it. state : of the model. positions : (p, 3) of the points and shape : (s, 3) of the samples
+        of the surface in that state, camera frame.
+    sliding : (p, 3, 3) how the points move as the reference's discrepancy slides them along the surface.
+    influence : (p, m) of the centres on the points. values : (m, 3) the discrepancy.
+    """
 
     measured: Measured
     state: State
     positions: Array
+    shape: Array
     sliding: Array
     influence: Array
     values: Array
@@ -122,21 +130,14 @@ class _Adjustment:
         return np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=2)
 
     def _frame(self, keyframe: Keyframe, outline: Outline | None) -> _Frame:
-        points, met = self._points, self._met
-        pixels, weights = keyframe.pixels[met], keyframe.weights[met].astype(np.float64)
-        normals = np.zeros_like(pixels)
-        if outline is not None and keyframe.outline is not None:
-            seen = keyframe.outline
-            points = points.joined(outline.points)
-            pixels = np.concatenate([pixels, seen.pixels])
-            weights = np.concatenate([weights, np.where(seen.valid, outline.options.weight, 0.0)])
-            normals = np.concatenate([normals, seen.normals])
+        points, pixels, weights, normals = keyframe.measured(self._points, self._met, outline)
         state = self._estimator.estimate(points, pixels, weights, keyframe.state, normals).state
         sliding = np.zeros((len(points), 3, 3))
         sliding[: len(self._points)] = self._edges(state) @ self._along
         measured = Measured(points, pixels, weights, normals, np.zeros((0, 0)))
         influence, values = self._fit.basis.influence(points.rest), np.zeros_like(self.values)
-        return _Frame(measured, state, points.in_camera(state), sliding, influence, values)
+        shape = self._fit.shape(state)
+        return _Frame(measured, state, points.in_camera(state), shape, sliding, influence, values)
 
     def step(self) -> None:
         """One Gauss-Newton step of all discrepancies."""
@@ -158,17 +159,13 @@ class _Adjustment:
     def _of_reference(self) -> Quadratic:
         """What is known of the reference view's discrepancy by itself: the prior and the landmarks."""
         state, known, camera = self._reference.state, self._reference, self._estimator.camera
-        rotation, influence = (
-            state.camera_from_object.rotation,
-            self._fit.basis.influence(known.landmarks.rest),
-        )
+        rotation = state.camera_from_object.rotation
+        influence = self._fit.basis.influence(known.landmarks.rest)
         there = known.landmarks.in_camera(state) + influence @ self.values @ rotation.T
-        rows = camera.projection_jacobian(there) @ rotation
-        residuals = camera.project(there) - known.landmark_pixels
-        weight = 1.0 / known.landmark_px**2
-        landmarks = Quadratic.of_rows(
-            weight * np.einsum("pka,pkb->pab", rows, rows),
-            weight * np.einsum("pka,pk->pa", rows, residuals),
+        landmarks = Quadratic.of_residuals(
+            camera.projection_jacobian(there) @ rotation,
+            camera.project(there) - known.landmark_pixels,
+            np.full(len(there), known.landmark_px**-2),
             influence,
         )
         return landmarks + self._fit.prior(self._fit.shape(state), rotation, self.values)
@@ -180,12 +177,9 @@ class _Adjustment:
         there = frame.positions + slid + influence @ frame.values @ rotation.T
         derivatives, residuals, weights = self._fit.seen(frame.measured, there)
         own, shared = derivatives @ rotation, derivatives @ frame.sliding
-        weighted = weights[:, None] * residuals
-
-        def cost(rows: Array) -> Quadratic:
-            curvature = np.einsum("p,pka,pkb->pab", weights, rows, rows)
-            return Quadratic.of_rows(curvature, np.einsum("pka,pk->pa", rows, weighted), influence)
-
-        prior = self._fit.prior(self._fit.shape(frame.state), rotation, frame.values)
+        prior = self._fit.prior(frame.shape, rotation, frame.values)
         coupling = weighted_gram(np.einsum("p,pka,pkb->pab", weights, own, shared), influence)
-        return cost(own) + prior, cost(shared), coupling
+        by_own, by_shared = (
+            Quadratic.of_residuals(rows, residuals, weights, influence) for rows in (own, shared)
+        )
+        return by_own + prior, by_shared, coupling

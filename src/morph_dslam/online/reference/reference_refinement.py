@@ -39,6 +39,25 @@ class Keyframe:
     sigma_px: float
     outline: OutlineMeasurement | None = None
 
+    def measured(
+        self, points: BoundPoints, met: NDArray[np.bool_], outline: Outline | None
+    ) -> tuple[BoundPoints, Array, Array, Array]:
+        """All that was measured, of ``points`` (those of the reference view that ``met``) and of the outline.
+
+        Returns
+        -------
+        points : p of them. pixels : (p, 2). weights : (p,). normals : (p, 2), zero but on the outline.
+        """
+        pixels, weights = self.pixels[met], self.weights[met].astype(np.float64)
+        normals = np.zeros_like(pixels)
+        if outline is not None and self.outline is not None:
+            seen = self.outline
+            points = points.joined(outline.points)
+            pixels = np.concatenate([pixels, seen.pixels])
+            weights = np.concatenate([weights, np.where(seen.valid, outline.options.weight, 0.0)])
+            normals = np.concatenate([normals, seen.normals])
+        return points, pixels, weights, normals
+
 
 @dataclass(frozen=True)
 class RefinementOptions:
@@ -122,12 +141,7 @@ def _frame_residuals(
     outline: Outline | None,
 ) -> Array:
     """Scaled residuals of a keyframe at its best state, with Huber weights; 0 for points unused."""
-    pixels, weights, normals = frame.pixels[met], frame.weights[met], np.zeros((int(met.sum()), 2))
-    if outline is not None and frame.outline is not None:
-        points = points.joined(outline.points)
-        pixels = np.concatenate([pixels, frame.outline.pixels])
-        weights = np.concatenate([weights, outline.options.weight * frame.outline.valid]).astype(float)
-        normals = np.concatenate([normals, frame.outline.normals])
+    points, pixels, weights, normals = frame.measured(points, met, outline)
     estimate = inner.estimate(points, pixels, weights, frame.state, normals)
     length = np.linalg.norm(estimate.residuals, axis=1)
     huber = np.minimum(1.0, inner.options.huber_px / np.maximum(length, 1e-12))
