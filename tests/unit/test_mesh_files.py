@@ -250,6 +250,22 @@ def test_vtk_files_that_are_cut_short_are_refused(tmp_path):
                 load_mesh(path, "mm")
 
 
+def test_sets_of_a_vtk_file_that_states_its_one_component_are_read(tmp_path):
+    """`SCALARS name int 1`, as many scripts write it; meshio returns such data as a column."""
+    drawn = block((2.0, 2.0, 3.0), (1, 1, 2), "hex8")
+    held = (drawn.nodes[:, 2] == 0).astype(int)
+    lines = ["# vtk DataFile Version 3.0", "block", "ASCII", "DATASET UNSTRUCTURED_GRID"]
+    lines += [f"POINTS {len(drawn.nodes)} double", *(" ".join(map(str, node)) for node in drawn.nodes)]
+    lines += ["CELLS 2 18", *("8 " + " ".join(map(str, cell)) for cell in drawn.blocks[0].connectivity)]
+    lines += ["CELL_TYPES 2", "12", "12"]
+    lines += ["CELL_DATA 2", "SCALARS part int 1", "LOOKUP_TABLE default", "0", "1"]
+    lines += [f"POINT_DATA {len(held)}", "SCALARS held int 1", "LOOKUP_TABLE default", *map(str, held)]
+    (tmp_path / "block.vtk").write_text("\n".join(lines) + "\n")
+    mesh = load_mesh(tmp_path / "block.vtk", "mm")
+    np.testing.assert_array_equal(mesh.set_nodes("held_1"), np.flatnonzero(held))
+    np.testing.assert_array_equal(mesh.cells("part_1"), [1])
+
+
 def icosphere(refinements):
     """Triangles on the unit sphere: an octahedron, each triangle cut in four, pushed out to the sphere."""
     points = [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]

@@ -145,8 +145,9 @@ def _groups(content: Any) -> Iterator[tuple[str, list[Indices]]]:
                     for block, tags in zip(content.cells, physical, strict=True)
                 ],
             )
-    for name, parts in content.cell_data.items():
-        if name.startswith("gmsh:") or not all(np.issubdtype(part.dtype, np.integer) for part in parts):
+    for name, columns in content.cell_data.items():
+        parts = [_column(part) for part in columns]
+        if name.startswith("gmsh:") or not all(_is_one_integer_each(part) for part in parts):
             continue
         values = np.unique(np.concatenate(parts))
         for value in values if len(values) <= _MOST_GROUPS else ():
@@ -192,9 +193,19 @@ def _faces(mesh: Mesh, content: Any, rows: list[tuple[int, Indices]], name: str,
 
 
 def _point_groups(content: Any) -> Iterator[tuple[str, Indices]]:
-    for name, values in content.point_data.items():
-        if name.startswith("gmsh:") or values.ndim != 1 or not np.issubdtype(values.dtype, np.integer):
+    for name, column in content.point_data.items():
+        values = _column(column)
+        if name.startswith("gmsh:") or not _is_one_integer_each(values):
             continue
         kinds = np.unique(values)
         for value in kinds if len(kinds) <= _MOST_GROUPS else ():
             yield f"{name}_{value}", np.flatnonzero(values == value)
+
+
+def _column(values: np.ndarray) -> np.ndarray:
+    """Legacy VTK that states its one component, `SCALARS part int 1`, is read as a column (n, 1)."""
+    return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
+
+
+def _is_one_integer_each(values: np.ndarray) -> bool:
+    return values.ndim == 1 and np.issubdtype(values.dtype, np.integer)
