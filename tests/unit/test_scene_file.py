@@ -4,6 +4,7 @@ import re
 import sys
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -177,3 +178,14 @@ def test_the_documentation_names_every_key():
 
 def test_scene_of_the_demo_is_valid():
     assert load_scene_file(PROJECT / "examples" / "demo" / "scene.toml").frames > 1
+
+
+def test_folder_that_another_simulation_writes_is_left_alone(tmp_path):
+    path = write_scene(tmp_path, "frames = 1\n", POSE)
+    simulate(path, tmp_path / "sequence", progress=False)
+    with (
+        h5py.File(tmp_path / "sequence" / "depth.h5", "a"),
+        pytest.raises(SceneError, match=r"cannot write .*depth\.h5: is another simulation writing"),
+    ):
+        simulate(path, tmp_path / "sequence", progress=False)
+    assert (tmp_path / "sequence" / "frames" / "000000.png").is_file()

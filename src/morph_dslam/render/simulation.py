@@ -138,6 +138,14 @@ def _prepare_folder(output: Path) -> None:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise SceneError(f"cannot write the sequence to {output}: {error.strerror}") from error
+    try:
+        h5py.File(output / "depth.h5", "w").close()  # HDF5 locks it while it is written
+    except OSError as error:
+        raise SceneError(
+            f"cannot write {output / 'depth.h5'}: is another simulation writing to this folder, or another "
+            "program reading the file? Name another folder, or wait for it"
+        ) from error
+    for folder in (output / "frames", output / "depth"):
         for path in folder.iterdir():
             if re.fullmatch(r"\d{6}\.(png|jpg)", path.name):
                 path.unlink()

@@ -34,7 +34,7 @@ export class SolidView {
     this.scene = new THREE.Scene();
     this.scene.add(surface, this.rest, new THREE.AmbientLight(0xffffff, 0.6 * Math.PI));
     this.renderer = new THREE.WebGLRenderer({ antialias: true });
-    this.renderer.setClearColor(0x20252b);
+    this.renderer.setClearColor(0x5a646f);
     container.append(this.renderer.domElement);
     this.placeCamera(reach);
     new ResizeObserver(() => this.resize()).observe(container);

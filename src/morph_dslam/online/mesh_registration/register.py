@@ -214,17 +214,30 @@ def _distinct(places: list[_Place], n_points: int, surface: Surface) -> list[_Pl
     """The best places, no two of them the same, by their score."""
     places = sorted(places, key=lambda place: -place.evidence.score)
     if not places or places[0].evidence.score < FEWEST_EXPLAINED:
-        found = max((int(place.evidence.solid.sum()) for place in places), default=0)
         raise RegistrationError(
-            f"the object was not found in the map: no place explains more than {found} of its {n_points} "
-            "points without hiding others. Film the undeformed object closer and from more sides, and check "
-            "the unit of its mesh"
+            f"the object was not found in the map of {n_points} points: {_best_of(places)}. Film the "
+            "undeformed object closer and from more sides, and check the unit of its mesh"
         )
     kept: list[_Place] = []
     for place in places:
         if all(not _same_place(place.transform, other.transform, surface) for other in kept):
             kept.append(place)
     return kept
+
+
+def _best_of(places: list[_Place]) -> str:
+    """What speaks for the best of the places (by score, the best first), none of which is good enough."""
+    if not places:
+        return "no region of it has enough points"
+    explained, solid, hidden = (
+        int(kind.sum())
+        for kind in (places[0].evidence.explained, places[0].evidence.solid, places[0].evidence.hidden)
+    )
+    return (
+        f"the best place explains {explained} of them, but only {solid} outside of a single plane (a flat face "
+        f"fits anywhere), and would hide {hidden} that were seen; {FEWEST_EXPLAINED} outside of it are needed, "
+        "and two more for each that is hidden"
+    )
 
 
 def _chosen(candidates: list[_Place], aligner: TextureAlignment, surface: Surface) -> MeshRegistration:

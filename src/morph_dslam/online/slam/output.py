@@ -201,14 +201,20 @@ def _plot_frames(path: Path, frames: list[SlamFrame]) -> None:
 def draw_frame(image: NDArray[np.uint8], frame: SlamFrame) -> NDArray[np.uint8]:
     """The undistorted image (h, w, 3) with map points green, corners blue, what disagrees red."""
     drawn = image.copy()
+    size = max(
+        1.0, image.shape[0] / 480
+    )  # of what is drawn, so that it stays as large beside a larger picture
     for pixels, colour in (
         (frame.candidates, CANDIDATE),
         (frame.points.pixels, INLIER),
         (frame.disagreeing.pixels, DISAGREEING),
     ):
         for x, y in np.rint(pixels).astype(int).tolist():
-            cv2.circle(drawn, (x, y), 2, colour, -1, cv2.LINE_AA)
-    text = f"{frame.index}  {frame.status}  {frame.reason}"
-    cv2.putText(drawn, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 3, cv2.LINE_AA)
-    cv2.putText(drawn, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
+            cv2.circle(drawn, (x, y), round(2 * size), colour, -1, cv2.LINE_AA)
+    text, corner = f"{frame.index}  {frame.status}  {frame.reason}", (round(8 * size), round(18 * size))
+    for thickness, grey in ((3, 0), (1, 255)):
+        width = round(thickness * size)
+        cv2.putText(
+            drawn, text, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.45 * size, (grey, grey, grey), width, cv2.LINE_AA
+        )
     return drawn
