@@ -161,3 +161,8 @@ def test_field_names_in_words(name, title):
 def test_tables_are_aligned_as_text():
     table = Table([["a", "bcd"], ["efg", ""]], ("h", "i"))
     assert table.text() == ["h    i", "a    bcd", "efg"]
+
+
+def test_linear_solver_of_external_solutions_is_said_not_to_be_ours(tmp_path):
+    model = replace(stretched_block_model(), provenance={"linear_solver": None, "versions": {}})
+    assert ("linear solver", "that of another program") in summarise_model(model)["made with"].rows

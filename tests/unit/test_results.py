@@ -47,9 +47,25 @@ def test_summary_counts_and_flags():
     assert summary["median_n_inliers"] == 280
     told = flags(run)
     assert "1 of 3 frames were lost" in told[0]
-    assert "'arch' is at a bound of the model's range in 1 frames" in told[1]
+    assert (
+        "'arch' is at the upper bound of its range (60 mm) in 1 frames: the object may be outside" in told[1]
+    )
     assert "'skew' cannot be told from the images in 1 frames" in told[2]
     assert len(told) == 3
+
+
+def test_bound_where_the_undeformed_object_rests_is_told_from_one_that_it_reached():
+    model = bent_sheet_model(22, 16)
+    arch = replace(model.parameters[0], lower=0.0, default=0.0)
+    run = RunResults(replace(model, parameters=(arch, *model.parameters[1:])), reference_frame=0)
+    run.add(0, 0.0, frame_result([0.0, 0.1, 0.0], [1e-3, 0.05, 0.01], [True, False, False]))
+    run.add(1, 0.1, frame_result([0.06, 0.1, 0.0], [1e-3, 0.05, 0.01], [True, False, False]))
+    resting, reached = flags(run)
+    assert (
+        "'arch' is at the lower bound of its range (0 mm) in 1 frames: the object rests there, or is"
+        in resting
+    )
+    assert "'arch' is at the upper bound of its range (60 mm) in 1 frames: the object may be" in reached
 
 
 def test_stress_shown_is_that_of_the_side_turned_to_the_camera():

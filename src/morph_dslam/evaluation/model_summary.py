@@ -183,6 +183,7 @@ def _stability(certificate: Mapping[str, Any]) -> Facts:
 
 def _versions_last(provenance: Mapping[str, Any]) -> dict[str, Any]:
     """The provenance without nesting, versions by their packages' names."""
-    return {key: value for key, value in provenance.items() if key != "versions"} | dict(
-        provenance.get("versions", {})
-    )
+    facts = {key: value for key, value in provenance.items() if key != "versions"}
+    if facts.get("linear_solver", "") is None:
+        facts["linear_solver"] = "that of another program"
+    return facts | dict(provenance.get("versions", {}))

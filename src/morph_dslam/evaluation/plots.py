@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -126,9 +126,17 @@ def _plot_map(path: Path, rest: NDArray, mean: NDArray, model: ReducedModel, lab
     """Points (p, 3) of the undeformed object coloured by their means (p,); both in metres."""
     # The two longest directions of the object span the picture.
     first, second = sorted(np.argsort(np.ptp(model.nodes, axis=0))[-2:])
-    figure = Figure(figsize=(7.5, 5.2), layout="constrained")
+    wide, high = np.ptp(model.nodes[:, [first, second]], axis=0)
+    height = float(np.clip(5.5 * high / wide, 2.5, 5.2))
+    figure = Figure(
+        figsize=(height * float(np.clip(wide / high, 0.4, 2.2)) + 2.2, height), layout="constrained"
+    )
     axes = figure.add_subplot()
-    segments = 1e3 * model.nodes[outline_edges(model.triangles)][:, :, [first, second]]
+    flat = 1e3 * model.nodes[:, [first, second]]
+    axes.add_collection(
+        PolyCollection(list(flat[model.triangles]), facecolors="#e3e7eb", edgecolors="#e3e7eb")
+    )
+    segments = flat[outline_edges(model.triangles)]  # a closed surface has none
     axes.add_collection(LineCollection(list(segments), colors="#57606a", linewidths=1.0))
     dots = axes.scatter(
         1e3 * rest[:, first], 1e3 * rest[:, second], c=1e3 * mean, s=26, cmap="viridis", vmin=0.0
@@ -137,5 +145,5 @@ def _plot_map(path: Path, rest: NDArray, mean: NDArray, model: ReducedModel, lab
     axes.autoscale()
     axes.set_xlabel(f"{'xyz'[first]} on the undeformed object [mm]")
     axes.set_ylabel(f"{'xyz'[second]} [mm]")
-    figure.colorbar(dots, shrink=0.75, label=label)
+    figure.colorbar(dots, label=label)
     figure.savefig(path, dpi=DPI)

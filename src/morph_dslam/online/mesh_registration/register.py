@@ -234,9 +234,9 @@ def _best_of(places: list[_Place]) -> str:
         for kind in (places[0].evidence.explained, places[0].evidence.solid, places[0].evidence.hidden)
     )
     return (
-        f"the best place explains {explained} of them, but only {solid} outside of a single plane (a flat face "
-        f"fits anywhere), and would hide {hidden} that were seen; {FEWEST_EXPLAINED} outside of it are needed, "
-        "and two more for each that is hidden"
+        f"the best place explains {explained} of them, but only {solid} outside of a single plane (a flat "
+        f"face fits anywhere), and would hide {hidden} that were seen; {FEWEST_EXPLAINED} outside of it are "
+        "needed, and two more for each that is hidden"
     )
 
 

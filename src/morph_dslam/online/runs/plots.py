@@ -12,6 +12,8 @@ from morph_dslam.online.frame_result import STAGES
 from morph_dslam.online.runs.results import RunResults
 
 DPI = 110
+#: Stages that are drawn with a colour of their own: as many as there are colours, with this part of the time.
+MOST_STAGES, LEAST_SHARE = 10, 0.005
 
 
 def write_plots(folder: Path, run: RunResults) -> None:
@@ -112,7 +114,18 @@ def plot_timings(path: Path, run: RunResults) -> None:
     times = run.timings_ms()
     figure = Figure(figsize=(9.0, 4.0), layout="constrained")
     axes = figure.add_subplot()
-    axes.stackplot(run.frames, times[:, :-1].T, labels=STAGES, step="mid", linewidth=0)
+    sums = times[:, :-1].sum(axis=0)
+    used = [int(k) for k in np.sort(np.argsort(sums)[-MOST_STAGES:]) if sums[k] > LEAST_SHARE * sums.sum()]
+    rest = np.maximum(times[:, -1] - times[:, used].sum(axis=1), 0.0)
+    colours = [*(f"C{k}" for k in range(len(used))), "#d0d7de"]
+    axes.stackplot(
+        run.frames,
+        [*times[:, used].T, rest],
+        labels=[*(STAGES[k] for k in used), "all else"],
+        colors=colours,
+        step="mid",
+        linewidth=0,
+    )
     axes.plot(run.frames, times[:, -1], color="#1b1f24", linewidth=0.9, label="total")
     axes.axhline(1e3 / 30, color="#d9534f", linewidth=1.0, linestyle="--", label="30 frames a second")
     axes.set_ylabel("time a frame [ms]")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from morph_dslam.model import Parameter
 from morph_dslam.online.frame_result import HAS_MOVED, MAY_BE_ANOTHER, REFERENCE_WORSE, UNCHECKED, UNEXPLAINED
 from morph_dslam.online.uncertainty.observability import UNTOLD_SHARE, statement, untold_in_run
 from morph_dslam.online.uncertainty.reference_misfit import CLEARLY_WORSE
@@ -54,14 +55,24 @@ def _at_bound(run: RunResults) -> list[str]:
     found = []
     with np.errstate(invalid="ignore"):
         determined = run.parameter_std() < UNTOLD_SHARE * (run.model.upper - run.model.lower)
+    at_bound, values = run.at_bound() & determined, run.parameters()
     for k, parameter in enumerate(run.model.parameters):
-        count = int((run.at_bound()[:, k] & determined[:, k]).sum())
-        if count:
-            found.append(
-                f"parameter '{parameter.name}' is at a bound of the model's range in {count} frames: "
-                "the object may be outside what the model covers"
-            )
+        upper = values[:, k] > 0.5 * (parameter.lower + parameter.upper)
+        for bound, name, side in ((parameter.lower, "lower", ~upper), (parameter.upper, "upper", upper)):
+            count = int((at_bound[:, k] & side).sum())
+            if count:
+                rests = "rests there, or is" if bound == parameter.default else "may be"
+                found.append(
+                    f"parameter '{parameter.name}' is at the {name} bound of its range "
+                    f"({_shown(parameter, bound)}) in {count} frames: the object {rests} outside what the "
+                    "model covers"
+                )
     return found
+
+
+def _shown(parameter: Parameter, value: float) -> str:
+    unit = "" if parameter.quantity == "ratio" else f" {parameter.unit}"
+    return f"{parameter.display(value):.4g}{unit}"
 
 
 def _untold(run: RunResults) -> list[str]:
