@@ -16,7 +16,7 @@ from pathlib import Path
 
 from morph_dslam import __version__
 from morph_dslam.camera_commands import add_camera_commands
-from morph_dslam.command_arguments import positive_integer
+from morph_dslam.command_arguments import positive_integer, with_signed_sections
 from morph_dslam.errors import EvaluationError, MorphError, StudyError
 from morph_dslam.inner_commands import add_inner_commands
 from morph_dslam.live_commands import add_live_commands
@@ -249,7 +249,8 @@ def run_and_report_errors(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status of `run_and_report_errors`."""
-    parsed = _parser().parse_args(arguments)
+    given = sys.argv[1:] if arguments is None else arguments
+    parsed = _parser().parse_args(with_signed_sections(given))
     return run_and_report_errors(parsed.action, parsed, parsed.kept)
 
 

@@ -3,7 +3,19 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+
+
+def with_signed_sections(arguments: Sequence[str]) -> list[str]:
+    """The arguments with "--section -x=12" as one, because argparse takes "-x=12" alone for an option."""
+    joined: list[str] = []
+    for text in arguments:
+        if joined and joined[-1] == "--section" and text[:2] in ("-x", "-y", "-z"):
+            joined[-1] += f"={text}"
+        else:
+            joined.append(text)
+    return joined
 
 
 def frame_range(text: str) -> tuple[int | None, int | None]:

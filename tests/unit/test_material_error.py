@@ -83,6 +83,7 @@ def test_points_off_the_surface_are_counted(tracked, tmp_path):
     binding = bind_truth(run, saved(tmp_path / "truth.npz", truth | {"pixels": pixels}), 10)
     assert binding.n_outline == 1
     assert binding.unbound.tolist() == [1, 2]
+    assert binding.n_unseen == 1  # the second has a pixel, but it misses the surface
     assert binding.columns.tolist() == [0, *range(3, 60)]
 
 

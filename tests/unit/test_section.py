@@ -11,7 +11,7 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.online.drawing.augmented_view import AugmentedView, DrawOptions
-from morph_dslam.online.drawing.section import SectionPlane, cut
+from morph_dslam.online.drawing.section import SectionPlane, cut, surface_before
 from morph_dslam.online.estimation.estimator import State
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.small_models import block_model
@@ -37,6 +37,15 @@ def stretching_block():
         strain=SeparatedField(0.3 * strain, functions),
         reactions={},
     )
+
+
+def closed(model):
+    """The block with all triangles of its surface, outwards: faces that belong to one cell."""
+    rows = [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
+    faces = model.cells["hex8"][:, rows].reshape(-1, 4)
+    _, first, counts = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    outer = faces[first[counts == 1]]
+    return replace(model, triangles=np.concatenate([outer[:, [0, 1, 2]], outer[:, [0, 2, 3]]]))
 
 
 def area(nodes, triangles):
@@ -72,6 +81,27 @@ def test_a_cube_is_cut_in_squares_rectangles_and_hexagons(kind, normal, offset, 
     nodes = model.rest_positions(points)
     np.testing.assert_allclose(plane.beyond(nodes), 0.0, atol=1e-9)
     assert area(nodes, triangles) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "left"),
+    [
+        ("x=30", 2 + 4 * 0.3 - 1),
+        ("-x=30", 2 + 4 * 0.7 - 1),
+        ("y=50", 2 + 4 * 0.5 - 1),
+        ("-z=71", 2 + 4 * 0.29 - 1),
+    ],
+)
+def test_the_surface_ends_where_it_is_cut(text, left):
+    """Of a cube's six faces, one and a part of four others; with the cut it is closed: no vector area."""
+    model, plane = closed(stretching_block()), SectionPlane.parse(text)
+    points, triangles = surface_before(model, plane)
+    nodes = model.rest_positions(points)
+    assert plane.beyond(nodes).max() < 1e-9
+    assert area(nodes, triangles) == pytest.approx(left * SIDE**2, rel=1e-6)
+    a, b, c = (nodes[triangles[:, k]] for k in range(3))
+    vector = 0.5 * np.cross(b - a, c - a).sum(axis=0)
+    np.testing.assert_allclose(vector, -plane.normal * SIDE**2, atol=1e-8)
 
 
 def test_what_is_drawn_is_carried_along_and_coloured():

@@ -33,7 +33,8 @@ class Binding:
     frame : the frame whose pixels bound them.
     columns : (b,) which truth points. points : where they are on the mesh, length b.
     n_outline : how many of them missed the surface by at most `OUTLINE_TOLERANCE_PX`.
-    unbound : (u,) the truth points that missed it by more, which cannot be compared.
+    unbound : (u,) the other truth points, which cannot be compared: those that missed it by more, and
+        ``n_unseen`` that are hidden or not measured in ``frame``.
     """
 
     frame: int
@@ -41,6 +42,7 @@ class Binding:
     points: SurfacePoints
     n_outline: int
     unbound: NDArray[np.int64]
+    n_unseen: int
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,8 @@ def bind_truth(run: Run, truth: PointTruth, frame: int) -> Binding:
         raise EvaluationError(f"in frame {frame} no truth pixel falls on the estimated surface")
     unbound = np.setdiff1d(np.arange(recorded.shape[0]), columns[bound])
     n_outline = int(bound[missed].sum())
-    return Binding(frame, columns[bound], points.take(bound), n_outline, unbound)
+    n_unseen = len(recorded) - len(columns)
+    return Binding(frame, columns[bound], points.take(bound), n_outline, unbound, n_unseen)
 
 
 def material_error(run: Run, truth: PointTruth, bind_frame: int) -> MaterialError:
@@ -204,6 +207,7 @@ def summarise(error: MaterialError) -> dict[str, Any]:
         "n_points_bound_at_outline": error.binding.n_outline,
         "outline_tolerance_px": OUTLINE_TOLERANCE_PX,
         "points_not_bound": error.binding.unbound.tolist(),
+        "n_points_unseen": error.binding.n_unseen,
         "n_comparisons": int(measured.sum()),
         "n_comparisons_without_measurement": int((~measured).sum()),
         "frames_compared": error.frames.tolist(),

@@ -16,9 +16,13 @@ def remarks(figures: Mapping[str, Any]) -> list[str]:
     if figures["truth_frames_outside_the_run"]:
         lines.append(f"truth frames outside the run: {figures['truth_frames_outside_the_run']}")
     if figures["points_not_bound"]:
+        unseen = figures["n_points_unseen"]
+        off = len(figures["points_not_bound"]) - unseen
+        why = [f"{unseen} are hidden or not measured"] * bool(unseen)
+        why += [f"{off} fall off the estimated surface"] * bool(off)
         lines.append(
-            f"{len(figures['points_not_bound'])} of {figures['n_points']} truth points fall off the "
-            f"estimated surface in frame {figures['bind_frame']} and were not compared"
+            f"of {figures['n_points']} truth points {' and '.join(why)} in frame {figures['bind_frame']}: "
+            "these were not compared"
         )
     if figures["n_points_bound_at_outline"]:
         lines.append(

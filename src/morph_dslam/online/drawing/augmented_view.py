@@ -16,7 +16,7 @@ from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.inner_structure import CarriedStructure
 from morph_dslam.model.reduced_model import MaterialPoints, von_mises
-from morph_dslam.online.drawing.section import SectionPlane, cut
+from morph_dslam.online.drawing.section import SectionPlane, cut, surface_before
 from morph_dslam.online.estimation.estimator import State
 from morph_dslam.online.measuring.binding import DrawnSurface, View, facing
 from morph_dslam.render.colour_maps import text_patch
@@ -216,15 +216,13 @@ def _drawn_mesh(
     model: ReducedModel, section: SectionPlane | None
 ) -> tuple[MaterialPoints, NDArray[np.int64]]:
     """The nodes that are drawn and their triangles: the surface, or what a section leaves of it, and that."""
-    triangles = model.triangles
-    if section is not None:
-        middle = model.nodes[triangles].mean(axis=1)
-        triangles = triangles[section.beyond(middle) < 0.0]
-    used, corners = np.unique(triangles, return_inverse=True)
-    corners = corners.reshape(-1, 3)
-    pairs, weights = np.column_stack([used, used]), np.tile([1.0, 0.0], (len(used), 1))
-    if section is not None:
-        points, inside = cut(model, section)
-        corners = np.concatenate([corners, inside + len(used)])
-        pairs, weights = np.concatenate([pairs, points.corners]), np.concatenate([weights, points.weights])
-    return MaterialPoints(pairs, weights), corners
+    if section is None:
+        used, corners = np.unique(model.triangles, return_inverse=True)
+        pairs, weights = np.column_stack([used, used]), np.tile([1.0, 0.0], (len(used), 1))
+        return MaterialPoints(pairs, weights), corners.reshape(-1, 3)
+    inside, cut_open = cut(model, section)
+    left, triangles = surface_before(model, section)
+    points = MaterialPoints(
+        np.concatenate([left.corners, inside.corners]), np.concatenate([left.weights, inside.weights])
+    )
+    return points, np.concatenate([triangles, cut_open + len(left)])

@@ -69,10 +69,7 @@ def cut(model: ReducedModel, plane: SectionPlane) -> tuple[MaterialPoints, NDArr
     """
     if not model.cells:
         raise TrackingError(f"'{model.name}' is a sheet: it has no inside to show in a section")
-    tetrahedra = _tetrahedra(model)
-    depth = plane.beyond(model.nodes)
-    # A node that lies in the plane belongs to one side, by a hair.
-    depth = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
+    tetrahedra, depth = _tetrahedra(model), _depth(model, plane)
     below = depth[tetrahedra] < 0.0
     count = below.sum(axis=1)
     # Corners below the plane first.
@@ -83,18 +80,50 @@ def cut(model: ReducedModel, plane: SectionPlane) -> tuple[MaterialPoints, NDArr
         _edges(ordered[count == 2], [(0, 2), (0, 3), (1, 3)]),
         _edges(ordered[count == 2], [(0, 2), (1, 3), (1, 2)]),
     ]
-    corners = np.concatenate(edges).reshape(-1, 2)
-    if not len(corners):
+    triangles = np.concatenate(edges)
+    if not len(triangles):
         low, high = 1e3 * depth.min() + 1e3 * plane.offset, 1e3 * depth.max() + 1e3 * plane.offset
         raise TrackingError(
             f"the section misses the object: along its normal '{model.name}' reaches from {low:.1f} to "
             f"{high:.1f} mm"
         )
-    unique, triangles = np.unique(corners, axis=0, return_inverse=True)
+    return _on_edges(triangles, depth)
+
+
+def surface_before(model: ReducedModel, plane: SectionPlane) -> tuple[MaterialPoints, NDArray[np.int64]]:
+    """What the plane leaves of the surface: its nodes, between two mesh nodes each, and its triangles (m, 3).
+
+    Triangles that the plane crosses are cut along it, and keep the direction in which they run.
+    """
+    depth = _depth(model, plane)
+    below = depth[model.triangles] < 0.0
+    count = below.sum(axis=1)
+    # First the one corner that is on its side of the plane alone.
+    alone = np.where(count == 1, below.argmax(axis=1), (~below).argmax(axis=1))
+    turned = np.take_along_axis(model.triangles, (alone[:, None] + np.arange(3)) % 3, axis=1)
+    one, two = turned[count == 1], turned[count == 2]
+    parts = [
+        _edges(model.triangles[count == 3], [(0, 0), (1, 1), (2, 2)]),
+        _edges(one, [(0, 0), (0, 1), (0, 2)]),
+        _edges(two, [(1, 0), (1, 1), (2, 2)]),
+        _edges(two, [(1, 0), (2, 2), (2, 0)]),
+    ]
+    return _on_edges(np.concatenate(parts), depth)
+
+
+def _depth(model: ReducedModel, plane: SectionPlane) -> Array:
+    """How far the nodes (n,) lie beyond the plane; one that lies in it belongs to one side, by a hair."""
+    depth = plane.beyond(model.nodes)
+    return np.where(np.abs(depth) < 1e-12, 1e-12, depth)
+
+
+def _on_edges(triangles: NDArray[np.int64], depth: Array) -> tuple[MaterialPoints, NDArray[np.int64]]:
+    """Triangles (t, 3, 2), each corner where the plane cuts the edge between two nodes, or a node itself."""
+    unique, corners = np.unique(triangles.reshape(-1, 2), axis=0, return_inverse=True)
     here, there = depth[unique[:, 0]], depth[unique[:, 1]]
-    share = here / (here - there)
-    points = MaterialPoints(unique, np.column_stack([1.0 - share, share]))
-    return points, triangles.reshape(-1, 3)
+    is_node = unique[:, 0] == unique[:, 1]
+    share = np.where(is_node, 0.0, here / np.where(is_node, 1.0, here - there))
+    return MaterialPoints(unique, np.column_stack([1.0 - share, share])), corners.reshape(-1, 3)
 
 
 def _tetrahedra(model: ReducedModel) -> NDArray[np.int64]:
@@ -110,6 +139,6 @@ def _tetrahedra(model: ReducedModel) -> NDArray[np.int64]:
     return np.concatenate(parts)
 
 
-def _edges(tetrahedra: NDArray[np.int64], pairs: list[tuple[int, int]]) -> NDArray[np.int64]:
-    """Three edges (t, 3, 2) of each tetrahedron, by its corners; they make a triangle of the section."""
-    return np.stack([tetrahedra[:, list(pair)] for pair in pairs], axis=1)
+def _edges(cells: NDArray[np.int64], pairs: list[tuple[int, int]]) -> NDArray[np.int64]:
+    """Three edges (t, 3, 2) of each tetrahedron or triangle, by its corners; they make a triangle."""
+    return np.stack([cells[:, list(pair)] for pair in pairs], axis=1)
