@@ -36,7 +36,14 @@ def place_inner_structure(
     try:
         points = material_points(model, nodes)
     except StudyError as error:
-        raise StudyError(f"the inner structure '{name}' does not fit into '{model.name}': {error}") from error
+        low, high = (
+            ", ".join(f"{1e3 * value:.1f}" for value in corner)
+            for corner in (model.nodes.min(axis=0), model.nodes.max(axis=0))
+        )
+        raise StudyError(
+            f"the inner structure '{name}' does not fit into '{model.name}': {error}; the solid reaches from "
+            f"({low}) to ({high}) mm. Is the unit right, and is it drawn in the object's frame?"
+        ) from error
     # Shape functions reproduce the positions to rounding; what is kept is what the model says.
     return InnerStructure(name, model.rest_positions(points), triangles.astype(np.int64), points)
 

@@ -89,6 +89,6 @@ def locate(mesh: Mesh, points: Array) -> LocatedPoints:
         lost = points[np.flatnonzero(cells < 0)[0]]
         raise StudyError(
             f"{int((cells < 0).sum())} of {len(points)} points lie outside of the solid, the first at "
-            f"({', '.join(f'{1e3 * value:g}' for value in lost)}) mm"
+            f"({', '.join(f'{round(1e3 * value, 3):g}' for value in lost)}) mm"
         )
     return LocatedPoints(cells, reference)
