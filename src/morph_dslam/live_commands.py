@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 from morph_dslam.command_arguments import frame_range, positive_number
 from morph_dslam.tracking_commands import add_object_arguments, drawing, object_arguments
@@ -14,7 +17,7 @@ def _live(arguments: argparse.Namespace) -> None:
     from morph_dslam.online.tracking_setup import ObjectOptions
 
     first, last = arguments.range
-    summary = run_live(
+    run_live(
         LiveOptions(
             source=arguments.source,
             output=arguments.output,
@@ -27,14 +30,19 @@ def _live(arguments: argparse.Namespace) -> None:
             record=not arguments.no_video,
             seconds=arguments.seconds,
             overwrite=arguments.overwrite,
-        )
+        ),
+        partial(_tell, arguments.output),
     )
+
+
+def _tell(output: Path, summary: dict[str, Any]) -> None:
+    """Print what came of a session; Ctrl-C is its usual end."""
     if not summary:
         print("no frame was tracked: nothing was written")
         return
     for flag in summary["flags"]:
         print(f"note: {flag}")
-    print(f"wrote {arguments.output}")
+    print(f"wrote {output}")
     figures = summary["live"]
     print(
         f"tracked={summary['n_tracked']}/{summary['n_frames']} fps={figures['fps']:.1f} "

@@ -224,8 +224,10 @@ def test_an_interrupt_keeps_a_live_run(recording, monkeypatch, capsys):
     command += ["--camera", str(folder / "sequence" / "camera.yaml"), "--show", "displacement"]
     command += ["--place", str(folder / "registration.json"), "-o", str(folder / "stopped")]
     assert main(command) == 130
-    assert "everything until then is kept" in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert "everything until then is kept" in said.err
     frames = load_run(folder / "stopped").frames.tolist()
+    assert f"tracked={len(frames)}/{len(frames)} fps=" in said.out  # as at any other end
     assert frames == shown
     assert 1 <= len(frames) < 39
     assert (folder / "stopped" / "augmented.mp4").is_file()

@@ -229,6 +229,16 @@ def test_a_registration_with_parts_of_another_shape(tmp_path):
             load_placement(path, model)
 
 
+def test_a_registration_of_another_object(tmp_path):
+    path, model = tmp_path / "registration.json", bent_sheet_model(7, 5)
+    size = np.linalg.norm(np.ptp(model.nodes, axis=0))
+    path.write_text(json.dumps(REGISTRATION | {"mean_node_m": [0.08 * size, 0.0, 0.0]}))
+    assert load_placement(path, model).frame == 3
+    path.write_text(json.dumps(REGISTRATION | {"mean_node_m": [0.0, 0.2 * size, 0.0]}))
+    with pytest.raises(RegistrationError, match=rf"places another object .* are {200 * size:.1f} mm apart"):
+        load_placement(path, model)
+
+
 def test_a_folder_that_holds_a_run_or_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("")
     check_run_folder(tmp_path / "a" / "run", overwrite=False)

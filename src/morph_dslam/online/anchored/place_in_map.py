@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, cross_matrix
+from morph_dslam.model import ReducedModel
 from morph_dslam.online.anchored.known_pose import KnownPose
 from morph_dslam.online.slam.pose import PoseEstimate
 from morph_dslam.similarity import SimilarityTransform
@@ -17,6 +20,8 @@ Array = NDArray[np.float64]
 
 #: No number of a registration is meant to be larger.
 LARGEST = 1e20
+#: Mean nodes that are farther apart than this share of the size belong to different objects.
+OTHER_OBJECT = 0.1
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,22 @@ class PlaceInMap:
             numbers_of(content["mean_node_m"], (3,)),
             None if covariance is None else numbers_of(covariance, (7, 7)),
         )
+
+    def check_model(self, model: ReducedModel, path: Path) -> None:
+        """Refuse a registration of another object; one of a finer mesh of the same object will do.
+
+        Raises
+        ------
+        RegistrationError
+            If the mean nodes of the two are farther apart than `OTHER_OBJECT` of the object's size.
+        """
+        nodes = model.positions(model.default)
+        apart = np.linalg.norm(nodes.mean(axis=0) - self.centre)
+        if apart > OTHER_OBJECT * np.linalg.norm(np.ptp(nodes, axis=0)):
+            raise RegistrationError(
+                f"{path} places another object than '{model.name}': their mean nodes are {1e3 * apart:.1f} "
+                "mm apart; give the model that was registered, or register this one"
+            )
 
     def slopes(self, pose: RigidTransform) -> Array:
         """How the increment (6,) of the object's ``pose`` in a camera depends on the registration: (6, 7).

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import sys
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -67,8 +68,14 @@ class _Begin:
 
 
 @one_thread_for_algebra
-def run_live(options: LiveOptions) -> dict[str, Any]:
+def run_live(
+    options: LiveOptions, tell: Callable[[dict[str, Any]], None] = lambda summary: None
+) -> dict[str, Any]:
     """Track a live stream; an interrupt ends it, keeps everything, and goes on.
+
+    Parameters
+    ----------
+    tell : called with the content of ``summary.json`` when it is written, after an interrupt too.
 
     Returns
     -------
@@ -104,6 +111,7 @@ def run_live(options: LiveOptions) -> dict[str, Any]:
             flags = (*begin.placement.flags, *again.notes)
             begin = replace(begin, placement=replace(begin.placement, flags=flags))
             summary = _write(setup, begin, session, options) if len(run) else {}
+            tell(summary)
     return summary
 
 

@@ -42,7 +42,8 @@ def check_run_folder(folder: Path, overwrite: bool, sign: str = "result.h5") -> 
     """
     if (folder / sign).exists() and not overwrite:
         raise TrackingError(
-            f"{folder} holds a run already: choose another folder, or allow it to be overwritten"
+            f"{folder} holds a run already: choose another folder, or allow it to be overwritten "
+            "(`--overwrite`)"
         )
     make_folder(folder, "the run", TrackingError)
 

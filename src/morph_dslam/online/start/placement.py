@@ -62,7 +62,7 @@ def load_placement(path: Path, model: ReducedModel) -> Placement:
     Raises
     ------
     RegistrationError
-        If the file is missing or not one of `morph register`.
+        If the file is missing, not one of `morph register`, or places another object.
     """
     try:
         content = json.loads(path.read_text())
@@ -79,6 +79,7 @@ def load_placement(path: Path, model: ReducedModel) -> Placement:
         raise RegistrationError(f"cannot read the registration {path}: {error.strerror}") from error
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise RegistrationError(f"{path} is not a registration.json of `morph register` ({error})") from error
+    place.check_model(model, path)
     open_angles: tuple[str, ...] = ()
     flags = []
     if not outline_fits:
