@@ -94,6 +94,7 @@ def test_a_folder_of_images_is_read_in_its_unit(folder, tmp_path):
         (["small", "--depth-per-metre", "1000"], "register the depth"),
         (["small", "--depth-per-metre", "0"], "cannot have 0 values a metre"),
         (["broken.h5"], "simulate again"),
+        (["depth.h5", "--depth-per-metre", "1000"], "--depth-per-metre is for a folder of depth images"),
     ],
 )
 def test_what_cannot_be_compared_is_one_message(folder, capsys, arguments, message):

@@ -31,11 +31,16 @@ def read_depths(
     Raises
     ------
     EvaluationError
-        If there is nothing of the kind, or it is damaged.
+        If there is nothing of the kind, it is damaged, or a file is given a unit.
     """
     wanted = sorted(frames)
     try:
         if path.is_file():
+            if values_per_metre is not None:
+                raise EvaluationError(
+                    f"--depth-per-metre is for a folder of depth images, and {path} is a file, whose depths "
+                    "are metres: leave it out"
+                )
             yield from _from_file(path, wanted)
         elif not path.is_dir():
             raise EvaluationError(f"there are no depth images at {path}")

@@ -27,12 +27,14 @@ from morph_dslam.lens import LensModel
 
 #: No focal length or principal point is meant by what is larger, pixels.
 LARGEST_PX = 1e7
+#: Image sides of more pixels are refused before memory is asked for them.
+LARGEST_SIDE_PX = 65_535
 
 
 class _CameraFile(BaseModel):
     model_config = ConfigDict(extra="forbid")
-    width: int = Field(gt=0)
-    height: int = Field(gt=0)
+    width: int = Field(gt=0, le=LARGEST_SIDE_PX)
+    height: int = Field(gt=0, le=LARGEST_SIDE_PX)
     fx: float = Field(gt=0, lt=LARGEST_PX)
     fy: float = Field(gt=0, lt=LARGEST_PX)
     cx: float = Field(gt=-LARGEST_PX, lt=LARGEST_PX)

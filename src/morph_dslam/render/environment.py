@@ -26,6 +26,8 @@ CELL = 0.08
 MOST_CELLS = 60
 #: A texture has at most so many pixels along a side.
 LARGEST_TEXTURE = 3000
+#: A rectangle with a shorter edge is none, metres.
+SHORTEST_EDGE = 1e-6
 
 #: The faces of a box: a corner, then the directions along its rows and columns, in halves of the size.
 _BOX_FACES = (
@@ -85,8 +87,8 @@ def environment_faces(environment: Environment) -> list[Face]:
         centre, right, down = (
             1e-3 * np.array(vector) for vector in (section.centre_mm, section.right_mm, section.down_mm)
         )
-        lengths = np.linalg.norm(right) * np.linalg.norm(down)
-        if lengths == 0.0 or abs(right @ down) > 1e-6 * lengths:
+        lengths = np.linalg.norm([right, down], axis=1)
+        if lengths.min() < SHORTEST_EDGE or abs(right @ down) > 1e-6 * lengths.prod():
             raise SceneError(
                 f"environment.rectangles.{number}: right_mm and down_mm must be its edges, perpendicular to "
                 "each other"

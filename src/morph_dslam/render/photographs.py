@@ -68,7 +68,8 @@ def resize_to_fill(image: NDArray[np.uint8], width: int, height: int) -> NDArray
 def crop_to_aspect(image: NDArray[np.uint8], aspect: float) -> NDArray[np.uint8]:
     """The largest centred part (k, l, ...) of an image (h, w, ...) with this width-to-height ratio."""
     height, width = image.shape[:2]
-    kept_width, kept_height = min(width, round(height * aspect)), min(height, round(width / aspect))
+    kept_width = min(width, max(1, round(height * aspect)))
+    kept_height = min(height, max(1, round(width / aspect)))
     left, top = (width - kept_width) // 2, (height - kept_height) // 2
     return image[top : top + kept_height, left : left + kept_width]
 

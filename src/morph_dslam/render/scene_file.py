@@ -16,9 +16,15 @@ Colour = tuple[
     Annotated[int, Field(ge=0, le=255)],
     Annotated[int, Field(ge=0, le=255)],
 ]
-Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-FrameNumber = Annotated[int, Field(ge=0)]
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+#: No number of a scene is meant where it is larger: a kilometre in millimetres, degrees, pixels, frames. What
+#: is computed with those below cannot overflow.
+LARGEST = 1_000_000
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Vector = tuple[Number, Number, Number]
+FrameNumber = Annotated[int, Field(ge=0, le=LARGEST)]
+Side = Annotated[float, Field(ge=1e-3, le=LARGEST)]
+#: Standard deviation of a blur: OpenCV filters with a kernel some eight times as wide.
+Blur = Annotated[float, Field(ge=0.0, le=100.0)]
 
 
 class _Section(BaseModel):
@@ -36,7 +42,7 @@ class Surface(_Section):
 
     texture: str
     printed_face: Literal["top", "bottom"] = "top"
-    border_mm: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+    border_mm: float = Field(default=0.0, ge=0.0, le=LARGEST)
     back_colour: Colour = (226, 224, 218)
 
 
@@ -45,7 +51,7 @@ class Background(_Section):
 
     image: str | None = None
     colour: Colour = (120, 124, 128)
-    blur_px: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+    blur_px: Blur = 0.0
 
 
 class Light(_Section):
@@ -56,7 +62,7 @@ class Light(_Section):
 
     @model_validator(mode="after")
     def _has_direction(self) -> Light:
-        if not any(self.direction):
+        if max(map(abs, self.direction)) < 1e-6:
             raise ValueError("direction must not be zero")
         return self
 
@@ -64,8 +70,8 @@ class Light(_Section):
 class Sensor(_Section):
     """Gaussian blur (standard deviation, pixels), then Gaussian noise (standard deviation, grey levels)."""
 
-    blur_px: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
-    noise: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+    blur_px: Blur = 0.0
+    noise: float = Field(default=0.0, ge=0.0, le=255.0)
 
 
 class ParameterKeyFrame(BaseModel):
@@ -111,8 +117,8 @@ class Box(_Section):
 
     texture: str
     centre_mm: Vector
-    size_mm: tuple[Positive, Positive, Positive]
-    turn_deg: FiniteFloat = 0.0
+    size_mm: tuple[Side, Side, Side]
+    turn_deg: Number = 0.0
 
 
 class Environment(_Section):
@@ -135,7 +141,7 @@ class DepthSensor(_Section):
     ``rim_px`` of a jump in depth, and beyond ``range_mm``, there is no depth.
     """
 
-    noise_mm_at_1m: float = Field(default=1.4, ge=0.0, allow_inf_nan=False)
+    noise_mm_at_1m: float = Field(default=1.4, ge=0.0, le=1000.0)
     rim_px: int = Field(default=2, ge=0, le=20)
     range_mm: float = Field(default=5000.0, gt=0.0, le=13000.0)
 
@@ -144,13 +150,13 @@ class OccluderKeyFrame(_Section):
     """Where the disc is in one frame."""
 
     frame: FrameNumber
-    centre_px: tuple[FiniteFloat, FiniteFloat]
+    centre_px: tuple[Number, Number]
 
 
 class Occluder(_Section):
     """A disc of one colour (red, green, blue) in front of everything, moving over the image."""
 
-    radius_px: float = Field(gt=0.0, allow_inf_nan=False)
+    radius_px: float = Field(gt=0.0, le=LARGEST)
     colour: Colour = (196, 150, 122)
     path: list[OccluderKeyFrame] = Field(min_length=1)
 
@@ -160,8 +166,8 @@ class Scene(_Section):
 
     model: str
     camera: str | dict[str, Any]
-    frames: int = Field(ge=1)
-    fps: float = Field(default=30.0, gt=0.0, allow_inf_nan=False)
+    frames: int = Field(ge=1, le=LARGEST)
+    fps: float = Field(default=30.0, ge=1e-3, le=LARGEST)
     seed: int = Field(default=0, ge=0)
     image_format: Literal["jpg", "png"] = "jpg"
     supersampling: int = Field(default=2, ge=1, le=4)

@@ -24,6 +24,9 @@ from morph_dslam.render.texture import interpolate, render_textured
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
+#: An object's print has at most so many pixels along its longer side.
+LARGEST_PRINT = 8000
+
 
 def supersampled(camera: PinholeCamera, factor: int) -> PinholeCamera:
     """The camera whose image, averaged over ``factor`` x ``factor`` pixels, is this camera's image."""
@@ -43,9 +46,11 @@ def print_texture(surface: Surface, folder: Path, size: Array, pixels_per_metre:
 
     Parameters
     ----------
-    size : (2,) of the sheet, metres. pixels_per_metre : of the image, where the sheet is seen face on.
+    size : (2,) of the sheet, metres. pixels_per_metre : of the image, where the sheet is seen face on; less
+        is taken where the longer side would have more than `LARGEST_PRINT` pixels.
     """
     photograph = load_photograph(surface.texture, folder)
+    pixels_per_metre = min(pixels_per_metre, LARGEST_PRINT / float(size.max()))
     width, height = np.maximum(np.rint(size * pixels_per_metre).astype(int), 2)
     border = min(round(surface.border_mm * 1e-3 * pixels_per_metre), (min(width, height) - 1) // 2)
     inner = (int(width - 2 * border), int(height - 2 * border))

@@ -1,0 +1,372 @@
+"""Samples in the documentation are what the program accepts, and what it accepts is documented."""
+
+import argparse
+import importlib
+import re
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+from types import GenericAlias
+from typing import get_args
+
+import cv2
+import ngsolve as ngs
+import numpy as np
+import pytest
+from pydantic import BaseModel
+
+from morph_dslam import cli, make_study
+from morph_dslam.errors import StudyError
+from morph_dslam.export.export import StateChoice
+from morph_dslam.io.calibration import _CameraFile, load_camera
+from morph_dslam.io.landmarks import load_landmarks
+from morph_dslam.model import Parameter, load_model, save_model
+from morph_dslam.model.inner_structure import save_inner_structure
+from morph_dslam.offline.external import ExternalStudy, read_table
+from morph_dslam.offline.inner_structures import place_inner_structure
+from morph_dslam.offline.materials.table import LAWS, constant_quantities
+from morph_dslam.offline.materials.user import UserMaterial
+from morph_dslam.offline.report.reference_curve import read_reference_curve
+from morph_dslam.offline.studies.affine import read_affine
+from morph_dslam.offline.studies.sheet_study import SheetStudy
+from morph_dslam.offline.studies.solid_study import SolidStudy
+from morph_dslam.online.aids.board import BoardFile, load_board
+from morph_dslam.online.aids.guess import GuessFile, load_guess
+from morph_dslam.online.aids.picture import PictureFile, load_picture
+from morph_dslam.render.scene_file import Scene, load_scene_file
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.small_models import block_model
+
+PROJECT = Path(__file__).parents[2]
+PAGES = {path.stem: path.read_text() for path in [*(PROJECT / "docs").glob("*.md"), PROJECT / "README.md"]}
+
+
+def samples(page: str, language: str) -> list[str]:
+    """The fenced blocks of one language in a page."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", PAGES[page], flags=re.DOTALL | re.MULTILINE)
+
+
+def test_every_sample_file_is_read_by_a_test_here():
+    """A new sample needs a line here, and a test."""
+    counts = {(page, kind): len(samples(page, kind)) for page in PAGES for kind in ("toml", "yaml", "csv")}
+    assert {key: count for key, count in counts.items() if count} == {
+        ("cameras", "yaml"): 1,
+        ("certificate", "csv"): 1,
+        ("export", "csv"): 1,
+        ("registration-aids", "toml"): 3,
+        ("scene-file", "toml"): 2,
+        ("registration-aids", "csv"): 1,
+        ("solid-study", "csv"): 1,
+        ("solid-study", "toml"): 3,
+        ("study-file", "toml"): 1,
+    }
+
+
+# -- files -------------------------------------------------------------------------------------------------
+
+
+def test_camera_file(tmp_path):
+    (tmp_path / "camera.yaml").write_text(samples("cameras", "yaml")[0])
+    camera = load_camera(tmp_path / "camera.yaml")
+    assert (camera.width, camera.fx, len(camera.distortion)) == (640, 528.0, 4)
+
+
+def test_scene_files(tmp_path):
+    still, moving = samples("scene-file", "toml")
+    (tmp_path / "scene.toml").write_text(still)
+    assert load_scene_file(tmp_path / "scene.toml").occluder is not None
+    # the second sample's camera goes round what the first one shows
+    (tmp_path / "scene.toml").write_text(still + moving)
+    scene = load_scene_file(tmp_path / "scene.toml")
+    assert scene.environment is not None
+    assert (len(scene.camera_path), scene.environment.boxes[0].turn_deg) == (2, 30)
+
+
+def test_boards_pictures_and_guesses(tmp_path):
+    for name, text in zip(("board", "picture", "guess"), samples("registration-aids", "toml"), strict=True):
+        (tmp_path / f"{name}.toml").write_text(text)
+    board = load_board(tmp_path / "board.toml")
+    np.testing.assert_allclose(board.size, [4 * 0.030 + 3 * 0.009, 3 * 0.030 + 2 * 0.009])
+    cv2.imwrite(str(tmp_path / "print.png"), np.zeros((30, 42, 3), np.uint8))
+    rectangle = load_picture(tmp_path / "picture.toml").rectangle
+    assert rectangle is not None
+    np.testing.assert_allclose(rectangle[1], [0.420, 0.0, 0.0])
+    state = load_guess(tmp_path / "guess.toml").state(bent_sheet_model(9, 7))
+    np.testing.assert_allclose(state.parameters, [0.020, 0.0, 0.0])
+
+
+def test_landmarks_and_curves(tmp_path):
+    (tmp_path / "landmarks.csv").write_text(samples("registration-aids", "csv")[0])
+    landmarks = load_landmarks(tmp_path / "landmarks.csv")
+    np.testing.assert_allclose(landmarks.points[0], [-0.210, 0.1485, 0.0])
+    (tmp_path / "curve.csv").write_text(samples("certificate", "csv")[0])
+    assert read_reference_curve(tmp_path / "curve.csv").label == "the paper"
+
+
+def test_paths_of_an_export(tmp_path):
+    (tmp_path / "path.csv").write_text(samples("export", "csv")[0])
+    states = StateChoice(path=tmp_path / "path.csv").states(bent_sheet_model(9, 7))
+    np.testing.assert_allclose(states[-1], [0.040, 0.0, np.radians(10.0)])
+
+
+def test_study_of_a_sheet():
+    study = make_study(tomllib.loads(samples("study-file", "toml")[0]))
+    assert isinstance(study, SheetStudy)
+    assert study.sheet.length == pytest.approx(0.420)
+
+
+def test_values_of_a_solids_study():
+    """Each line of the sample is read as what its key measures, with parameters of the kinds it tells."""
+    parameters = tuple(
+        Parameter(name, quantity, unit, 0.0, 1.0, 0.0)
+        for name, quantity, unit in (
+            ("lever", "angle", "deg"),
+            ("inflation", "pressure", "kPa"),
+            ("share", "ratio", "1"),
+            ("held", "time", "s"),
+        )
+    )
+    measured = {"young": "stress", "angle": "angle", "pressure": "pressure", "force": "force", "x": "length"}
+    values = tomllib.loads(samples("solid-study", "toml")[0])
+    assert set(values) == set(measured)
+    found = {
+        key: [read_affine(text, measured[key], parameters) for text in np.atleast_1d(value).tolist()]
+        for key, value in values.items()
+    }
+    assert found["young"][0].constant == 3e6
+    assert (found["pressure"][0].constant, found["pressure"][0].slopes) == (2e3, (0.0, 0.5, 0.0, 0.0))
+    assert found["force"][2].slopes == (0.0, 0.0, -20.0, 0.0)
+    assert found["x"][0].slopes == pytest.approx((0.0, 0.0, 0.0, 0.0015))
+
+
+def test_shape_of_a_solid():
+    study = {
+        "name": "tube",
+        "mesh": {
+            "generator": "tube",
+            "inner_radius": "10 mm",
+            "outer_radius": "14 mm",
+            "length": "30 mm",
+            "divisions": [1, 1, 6],
+        },
+        "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.4}},
+        "supports": [{"kind": "fixed", "on": "bottom"}],
+        "parameters": {"growth": {"range": ["-0.5 mm", "1 mm"]}},
+    }
+    study |= tomllib.loads(samples("solid-study", "toml")[1])
+    made = make_study(study)
+    assert isinstance(made, SolidStudy)
+    assert [shape.kind for shape in made.shape] == ["thickness"]
+    with pytest.raises(StudyError, match="amplitude"):
+        make_study(study | {"shape": [{"kind": "thickness", "on": "outer", "kept": "inner"}]})
+
+
+def test_solutions_of_another_program(tmp_path):
+    study = make_study(tomllib.loads(samples("solid-study", "toml")[2]), tmp_path)
+    assert isinstance(study, ExternalStudy)
+    (tmp_path / "parameters.csv").write_text(samples("solid-study", "csv")[0])
+    parameters, values, rows = read_table(study.external.table)
+    assert [parameter.name for parameter in parameters] == ["force", "tilt"]
+    np.testing.assert_allclose(values[0], [0.5, np.radians(-3.0)])
+    assert rows[0]["file"] == "run0.vtu"
+
+
+# -- keys --------------------------------------------------------------------------------------------------
+
+
+def sections(*roots: type[BaseModel]) -> set[type[BaseModel]]:
+    """A file's sections, those in its sections too."""
+    found: set[type[BaseModel]] = set()
+    pending: list = list(roots)
+    while pending:
+        kind = pending.pop()
+        if isinstance(kind, type) and not isinstance(kind, GenericAlias) and issubclass(kind, BaseModel):
+            if kind not in found:
+                found.add(kind)
+                pending += [field.annotation for field in kind.model_fields.values()]
+        else:
+            pending += get_args(kind)
+    return found
+
+
+def keys_of(*roots: type[BaseModel]) -> set[str]:
+    return {name for section in sections(*roots) for name in section.model_fields}
+
+
+def code_words(page: str) -> set[str]:
+    """Words that a page shows as code, in a line or in a block."""
+    blocks = re.findall(r"^```.*?^```$", PAGES[page], flags=re.DOTALL | re.MULTILINE)
+    spans = re.findall(
+        r"`([^`\n]+)`", re.sub(r"^```.*?^```$", "", PAGES[page], flags=re.DOTALL | re.MULTILINE)
+    )
+    return set(re.findall(r"\w+", " ".join([*blocks, *spans])))
+
+
+@pytest.mark.parametrize(
+    ("pages", "roots", "n_sections"),
+    [
+        (["scene-file"], [Scene], 14),
+        (["cameras"], [_CameraFile], 1),
+        (["registration-aids"], [BoardFile, PictureFile, GuessFile], 6),
+        (["solid-study"], [SolidStudy, ExternalStudy], 25),
+        (["study-file", "solid-study"], [SheetStudy], 8),
+    ],
+)
+def test_every_key_is_documented(pages, roots, n_sections):
+    assert len(sections(*roots)) >= n_sections
+    named = set().union(*(code_words(page) for page in pages))
+    assert keys_of(*roots) - named == set()
+
+
+def test_every_law_and_its_constants_are_documented():
+    for page in ("solid-study", "materials"):
+        assert set(LAWS) - code_words(page) == set()
+    constants = {name for law in LAWS for name in constant_quantities(law)}
+    assert constants - code_words("solid-study") == set()
+
+
+@pytest.mark.parametrize(
+    ("page", "roots"), [("study-file", [SheetStudy]), ("solid-study", [SolidStudy, ExternalStudy])]
+)
+def test_every_key_in_a_table_exists(page, roots):
+    known = keys_of(*roots) | {"relative_moduli", "times", "bulk_moduli", "prony", "density"}
+    # keys of a material are those of its law; generators are values
+    known |= {"block", "tube", "revolution"}
+    n_keys = 0
+    for table in re.findall(r"^\| key \|.*\n\|[-|]+\n((?:\|.*\n)+)", PAGES[page], flags=re.MULTILINE):
+        for row in table.splitlines():
+            words = re.findall(r"\w+", " ".join(re.findall(r"`([^`]+)`", row.split("|")[1])))
+            assert set(words) <= known, row
+            n_keys += len(words)
+    assert n_keys > 15
+
+
+# -- options and names -------------------------------------------------------------------------------------
+
+
+def commands() -> dict[str, argparse.ArgumentParser]:
+    (action,) = (a for a in cli._parser()._actions if isinstance(a, argparse._SubParsersAction))
+    return dict(action.choices)
+
+
+def test_every_command_and_option_is_documented():
+    everything = " ".join(PAGES.values())
+    for name, parser in commands().items():
+        assert re.search(rf"morph {name}\b", everything), name
+        options = {text for a in parser._actions for text in a.option_strings if text.startswith("--")}
+        missing = {o for o in options - {"--help", "--output"} if not re.search(rf"{o}\b(?!-)", everything)}
+        assert missing == set(), name
+
+
+def test_options_that_pages_name_exist():
+    """Of the command line, or of a program in examples/ or benchmarks/ that has it; Dask's are its own."""
+    known = {text for parser in commands().values() for a in parser._actions for text in a.option_strings}
+    for folder in ("examples", "benchmarks"):
+        for path in (PROJECT / folder).rglob("*.py"):
+            known |= set(re.findall(r"\"(--[a-z][\w-]*)\"", path.read_text()))
+    known |= {"--nworkers", "--nthreads", "--fifo", "--help"}
+    for page, text in PAGES.items():
+        assert set(re.findall(r"(?<![\w-])--[a-z][\w-]*", text)) <= known, page
+
+
+def test_modules_and_names_in_pages_exist():
+    """Dotted names in code, `offline.reduction.pod` say, are modules or what they hold; a `model` is one."""
+    n_names, a_model = 0, block_model("tucker")
+    for page, text in PAGES.items():
+        for name in re.findall(r"`((?:morph_dslam|offline|online|model|materials)\.[\w.]+\w)[`(]", text):
+            first, _, rest = name.partition(".")
+            package = {"morph_dslam": "morph_dslam", "materials": "morph_dslam.offline.materials"}
+            full = f"{package.get(first, f'morph_dslam.{first}')}.{rest}"
+            of_a_model = first == "model" and hasattr(a_model, rest.partition(".")[0])
+            assert of_a_model or name == "model.morph" or exists(full), f"{page}: {name}"
+            n_names += 1
+    assert n_names > 25
+
+
+def exists(dotted: str) -> bool:
+    """Whether a dotted name is a module, or an attribute of one."""
+    module, attributes = dotted, []
+    while module:
+        try:
+            thing = importlib.import_module(module)
+        except ModuleNotFoundError:
+            module, _, last = module.rpartition(".")
+            attributes.insert(0, last)
+            continue
+        for name in attributes:
+            if not hasattr(thing, name):
+                return False
+            thing = getattr(thing, name)
+        return True
+    return False
+
+
+# -- programs ----------------------------------------------------------------------------------------------
+
+
+def run_sample(page: str, number: int = 0) -> dict:
+    names: dict = {}
+    exec(samples(page, "python")[number], names)
+    return names
+
+
+def test_every_program_is_run_by_a_test():
+    """Those of model-file and solid-study in `test_docs`, that of slam in `test_slam`."""
+    counts = {page: len(samples(page, "python")) for page in PAGES}
+    assert {page: count for page, count in counts.items() if count} == {
+        "certificate": 1,
+        "materials": 1,
+        "meshes": 1,
+        "model-file": 2,
+        "slam": 1,
+        "solid-study": 2,
+        "tracking": 1,
+    }
+
+
+INP = """*NODE
+1, 0, 0, 0
+2, 10, 0, 0
+3, 0, 10, 0
+4, 0, 0, 10
+*ELEMENT, TYPE=C3D4, ELSET=rubber
+1, 1, 2, 3, 4
+*NSET, NSET=grip
+1, 2, 3
+"""
+
+
+def test_meshes(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("mount.inp").write_text(INP)
+    mesh = run_sample("meshes")["mesh"]
+    np.testing.assert_allclose(np.ptp(mesh.nodes, axis=0), [0.010, 0.010, 0.010])
+
+
+def test_law_of_ones_own():
+    """The sample with its bulk modulus is neo-Hookean: its shear modulus at small strain is mu."""
+    law = UserMaterial(function=run_sample("materials")["energy"], values={"mu": 2.5e5}, bulk=5e6)
+    law.check()
+    stiffness = law.small_strain_stiffness()
+    np.testing.assert_allclose(stiffness[3, 3], 2.5e5, rtol=1e-10)
+    np.testing.assert_allclose(stiffness[0, 0], 5e6 + 4.0 / 3.0 * 2.5e5, rtol=1e-10)
+    assert law.function(ngs.Id(3), 2.0).dim == 1
+
+
+def test_inner_structure(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save_model(Path("liver.morph"), block_model("polynomial"))
+    nodes = np.array([[0.02, 0.03, 0.04], [0.06, 0.03, 0.04], [0.03, 0.07, 0.05], [0.04, 0.05, 0.08]])
+    triangles = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    model = load_model(Path("liver.morph"))
+    save_inner_structure(Path("tumour.h5"), place_inner_structure(model, "tumour", nodes, triangles))
+    names = run_sample("tracking")
+    rest = replace(names["tumour"]).nodes(names["model"].default)
+    assert rest.shape == (4, 3)
+
+
+def test_report_from_the_model_alone(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save_model(Path("seal.morph"), bent_sheet_model(9, 7))
+    run_sample("certificate")
+    assert "<html" in Path("seal.report.html").read_text()
