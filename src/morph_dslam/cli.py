@@ -6,6 +6,8 @@ Each command imports what it needs when it runs, so that `morph --help` answers 
 from __future__ import annotations
 
 import argparse
+import os
+import select
 import signal
 import sys
 import threading
@@ -26,6 +28,8 @@ from morph_dslam.view_commands import add_view_commands
 
 USER_ERROR = 2
 INTERRUPTED = 130
+#: Whoever read the output has stopped, `morph info sheet.morph | head` say: as a shell reports SIGPIPE.
+OUTPUT_CLOSED = 141
 
 
 def _build(arguments: argparse.Namespace) -> None:
@@ -231,13 +235,35 @@ def _terminated_as_interrupted() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
+def _output_is_closed() -> bool:
+    """Whether nobody reads what is printed; what is still to be written then goes to the null device."""
+    try:
+        output = sys.stdout.fileno()
+    except (OSError, ValueError):  # it is no file
+        return False
+    poll = select.poll()
+    poll.register(output, 0)
+    if not any(event & select.POLLERR for _, event in poll.poll(0)):
+        return False
+    os.dup2(os.open(os.devnull, os.O_WRONLY), output)
+    return True
+
+
 def run_and_report_errors(
     action: Callable[[argparse.Namespace], None], arguments: argparse.Namespace, kept: str
 ) -> int:
-    """Run an action; returns the exit status: 0, 2 for a mistake the user can mend, 130 if interrupted."""
+    """Run an action and return the exit status.
+
+    0; 2 for a mistake the user can mend; 130 if interrupted; 141 if nobody reads what it prints any more.
+    """
     try:
         with _terminated_as_interrupted():
             action(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        if not _output_is_closed():
+            raise
+        return OUTPUT_CLOSED
     except MorphError as error:
         print(f"morph: {error}", file=sys.stderr)
         return USER_ERROR

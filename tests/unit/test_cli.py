@@ -1,5 +1,6 @@
 """The command line: exit statuses, messages, and a quick start."""
 
+import os
 import subprocess
 import sys
 
@@ -49,6 +50,28 @@ def test_the_installed_command_exits_2_without_a_traceback():
     assert done.returncode == 2
     assert done.stderr.startswith("morph: there is no model file absent.morph")
     assert "Traceback" not in done.stderr
+
+
+def test_output_that_nobody_reads_any_more_ends_quietly(tmp_path):
+    """As in `morph info sheet.morph | head -1`: no traceback, and the status that a shell gives SIGPIPE."""
+    save_model(tmp_path / "sheet.morph", bent_sheet_model(9, 7))
+    program = "import sys; from morph_dslam.cli import main; sys.exit(main(['info', 'sheet.morph']))"
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, stdout=write, stderr=subprocess.PIPE, text=True
+    )
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_a_broken_pipe_elsewhere_is_not_hidden(monkeypatch):
+    def fail(arguments):
+        raise BrokenPipeError
+
+    monkeypatch.setattr(cli, "_info", fail)
+    with pytest.raises(BrokenPipeError):
+        cli.main(["info", "model.morph"])
 
 
 @pytest.mark.parametrize(

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.discrepancy import largest_deformation, save_discrepancies
-from morph_dslam.online.measuring.binding import DrawnSurface
-from morph_dslam.online.uncertainty.confidence import largest_displacement, largest_von_mises
 from morph_dslam.online.estimation.estimator import State
 from morph_dslam.online.frame_result import STAGES, FrameResult
-from morph_dslam.online.uncertainty.observability import one_value
+from morph_dslam.online.measuring.binding import DrawnSurface
 from morph_dslam.online.runs.run_flags import flags
+from morph_dslam.online.uncertainty.confidence import largest_displacement, largest_von_mises
+from morph_dslam.online.uncertainty.observability import one_value
 
 Array = NDArray[np.float64]
 FORMAT = "morph-dslam run"

@@ -17,11 +17,11 @@ from morph_dslam import __version__
 from morph_dslam.io.calibration import load_camera, save_camera
 from morph_dslam.model import save_model
 from morph_dslam.model.inner_structure import CarriedStructure
+from morph_dslam.online.estimation.temporal import temporal_facts
 from morph_dslam.online.runs.inner_positions import write_inner_positions
-from morph_dslam.online.start.placement import Placement
 from morph_dslam.online.runs.plots import write_plots
 from morph_dslam.online.runs.results import RunResults, write_csv, write_hdf5, write_summary
-from morph_dslam.online.estimation.temporal import temporal_facts
+from morph_dslam.online.start.placement import Placement
 from morph_dslam.online.tracker_options import TrackerOptions
 
 
