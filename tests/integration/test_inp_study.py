@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from morph_dslam import build, cli, load_model, make_study
+from morph_dslam import build, cli, load_model, load_study, make_study
 from morph_dslam.errors import StudyError
 from morph_dslam.offline.studies.file_materials import file_materials
 from morph_dslam.offline.studies.mesh_section import FileMesh
@@ -176,3 +176,11 @@ def test_a_section_that_the_study_covers_in_part_is_refused(tmp_path: Path, caps
     path = written(tmp_path, one, STUDY + foam)
     assert cli.main(["build", str(path), "-o", str(tmp_path / "x.morph")]) == 2
     assert "1 of the 2 elements of 'both' have a material of the study too" in capsys.readouterr().err
+
+
+def test_gravity_needs_the_density_of_every_card(tmp_path: Path) -> None:
+    path = written(tmp_path, study=STUDY + '[[loads]]\nkind = "gravity"\n')
+    with pytest.raises(StudyError, match="gravity needs densities, and the material of 'stiff' has none"):
+        load_study(path)
+    dense = BAR.replace("*MATERIAL, NAME=Putty", "*MATERIAL, NAME=Putty\n*DENSITY\n1.5E-9")
+    load_study(written(tmp_path, dense, STUDY + '[[loads]]\nkind = "gravity"\n'))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from morph_dslam import make_study
+from morph_dslam.errors import StudyError
 from morph_dslam.offline.problem import Snapshot
 from morph_dslam.offline.studies.solid_study import SolidStudy
 
@@ -146,3 +147,13 @@ def test_derivatives_by_a_parameter_agree_with_differences(index: int) -> None:
         assert np.abs(slope).max() > 0.0
         found = at.sensitivities[name][index]
         np.testing.assert_allclose(found, slope, atol=1e-4 * np.abs(slope).max())
+
+
+def test_gravity_without_a_density_is_refused() -> None:
+    """It would be a load that is silently not there; no weight must be said."""
+    massless = {key: value for key, value in STIFF.items() if key != "density"}
+    weight = {"loads": [{"kind": "gravity"}]}
+    with pytest.raises(StudyError, match="gravity needs densities, and the material stiff has none"):
+        snapshot(materials={"stiff": massless}, **weight)
+    light = massless | {"density": "0 kg/m3"}
+    np.testing.assert_allclose(snapshot(materials={"stiff": light}, **weight).outputs["force_z_min"], 0.0)

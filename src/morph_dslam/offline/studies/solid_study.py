@@ -126,11 +126,26 @@ class SolidStudy(Section):
         except StudyError as error:
             raise ValueError(str(error)) from error
         self._check_time(parameters, [name for name, material in from_file.items() if material.prony])
+        self._check_weight(from_file)
         return self
 
     def _file_materials(self) -> dict[str, Material]:
         """Materials of the mesh file by cell set."""
         return file_materials(self.mesh, [material.on for material in self.materials.values()])
+
+    def _check_weight(self, from_file: dict[str, Material]) -> None:
+        """Gravity acts on densities; one that was forgotten would be a load that is not there."""
+        if not any(load.kind == "gravity" for load in self.loads):
+            return
+        weightless = [
+            name for name, material in self.materials.items() if "density" not in material.constants
+        ]
+        weightless += [f"of '{cells}'" for cells, material in from_file.items() if material.density == 0.0]
+        if weightless:
+            raise ValueError(
+                f"gravity needs densities, and the material {weightless[0]} has none: add density, which is "
+                '"0 kg/m3" if it shall have no weight, or *DENSITY to a material of the mesh file'
+            )
 
     def _check_time(self, parameters: tuple[Parameter, ...], viscous: list[str]) -> None:
         """Viscous materials need a clock that starts at the lower end of its range.
