@@ -184,3 +184,10 @@ def test_gravity_needs_the_density_of_every_card(tmp_path: Path) -> None:
         load_study(path)
     dense = BAR.replace("*MATERIAL, NAME=Putty", "*MATERIAL, NAME=Putty\n*DENSITY\n1.5E-9")
     load_study(written(tmp_path, dense, STUDY + '[[loads]]\nkind = "gravity"\n'))
+
+
+def test_a_mesh_file_that_was_written_again_is_read_again(tmp_path: Path) -> None:
+    """In one process too, in a notebook say."""
+    longer = BAR.replace(", 20\n", ", 30\n")
+    heights = [load_study(written(tmp_path, bar)).model_mesh().nodes[:, 2].max() for bar in (BAR, longer)]
+    np.testing.assert_allclose(heights, [0.02, 0.03])

@@ -14,7 +14,7 @@ from morph_dslam.io.inp_file import InpFile, Section, read_inp
 from morph_dslam.offline.materials.anisotropic import Orthotropic
 from morph_dslam.offline.materials.base import Material
 from morph_dslam.offline.materials.cards import material_from_card
-from morph_dslam.offline.studies.mesh_section import FileMesh
+from morph_dslam.offline.studies.mesh_section import FileMesh, file_stamp
 
 
 def file_materials(mesh: Any, given: Collection[str]) -> dict[str, Material]:
@@ -35,7 +35,7 @@ def file_materials(mesh: Any, given: Collection[str]) -> dict[str, Material]:
     """
     if not isinstance(mesh, FileMesh) or mesh.file.suffix.lower() != ".inp" or "all" in given:
         return {}
-    file = _read(mesh.file)
+    file = _read(mesh.file, file_stamp(mesh.file))
     taken = np.concatenate([np.zeros(0, np.int64), *(file.element_sets.get(name, []) for name in given)])
     spelled = {name.upper(): name for name in file.element_sets}
     result: dict[str, Material] = {}
@@ -52,8 +52,8 @@ def file_materials(mesh: Any, given: Collection[str]) -> dict[str, Material]:
 
 
 @lru_cache(maxsize=2)
-def _read(path: Path) -> InpFile:
-    """The file, read once for all that is asked of it."""
+def _read(path: Path, stamp: tuple[int, int]) -> InpFile:
+    """The file, read once for all that is asked of it, as long as it has this stamp."""
     return read_inp(path)
 
 

@@ -131,15 +131,28 @@ MeshSection = Annotated[
 ]
 
 
-@lru_cache(maxsize=2)
+def file_stamp(path: Path) -> tuple[int, int]:
+    """What changes when a file is written again: time in nanoseconds, and size; zeros if there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return 0, 0
+    return found.st_mtime_ns, found.st_size
+
+
 def make_mesh(section: Any) -> Mesh:
-    """The mesh of a `MeshSection`, checked; made once.
+    """The mesh of a `MeshSection`, checked; made once, and again when its file has been written again.
 
     Raises
     ------
     StudyError
         If it cannot be made or read, or is not fit to be solved on.
     """
+    return _made(section, file_stamp(section.file) if isinstance(section, FileMesh) else None)
+
+
+@lru_cache(maxsize=2)
+def _made(section: Any, stamp: tuple[int, int] | None) -> Mesh:
     mesh = section.make()
     check_mesh(mesh)
     return mesh
