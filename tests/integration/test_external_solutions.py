@@ -109,6 +109,9 @@ def test_an_xdmf_series_is_read_step_by_step(tmp_path, monkeypatch):
         ("runs/table.csv", "run7.vtu", "run70.vtu", r"run70\.vtu that the table names does not exist"),
         ("runs/table.csv", "force [N]", "force [lbf]", r"'lbf' is not a known unit"),
         ("runs/table.csv", "file,", "name,", r"needs a column 'file'"),
+        ("runs/table.csv", "run7.vtu", "run5.vtu", r"line 9: 'run5\.vtu' is in line 7 already"),
+        ("runs/table.csv", "run7.vtu", "table.csv", r"table\.csv is no solution that can be read; use \.vtu"),
+        ("study.toml", '"mm"', '"m"', r"which is hardly meant: its unit of length is probably wrong"),
         ("study.toml", '"U"', '"u"', r"no point data 'u'; it has: U, S, E"),
         ("study.toml", '"runs/table.csv"', '"table.csv"', r"cannot read the table .*No such file"),
         (
@@ -135,3 +138,11 @@ def test_a_solution_on_another_mesh_is_refused(folder, capsys):
     content.write(folder / "runs" / "run3.vtu")
     assert cli.main(["build", str(folder / "study.toml"), "-o", str(folder / "x.morph")]) == 2
     assert re.search(r"run3\.vtu has another mesh than the first", capsys.readouterr().err)
+
+
+def test_a_damaged_solution_is_one_message(folder, capsys):
+    path = folder / "runs" / "run3.vtu"
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    assert cli.main(["build", str(folder / "study.toml"), "-o", str(folder / "x.morph")]) == 2
+    assert re.search(r"^morph: cannot read the solution .*run3\.vtu", capsys.readouterr().err)

@@ -18,6 +18,7 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from morph_dslam.errors import StudyError
 from morph_dslam.model import Parameter
+from morph_dslam.offline.meshing.mesh_checks import check_size
 from morph_dslam.offline.meshing.meshes import CellBlock, Mesh
 from morph_dslam.offline.meshing.model_meshes import model_mesh_of
 from morph_dslam.offline.problem import ModelMesh, Snapshot
@@ -26,6 +27,13 @@ from morph_dslam.units import quantity_of, to_si
 
 Array = NDArray[np.float64]
 
+#: Of meshio, by the ending of a file's name: `meshio.read` itself ends the program where a file is damaged.
+_READERS = {
+    ".vtu": meshio.vtu.read,
+    ".vtk": meshio.vtk.read,
+    ".xdmf": meshio.xdmf.read,
+    ".xmf": meshio.xdmf.read,
+}
 #: Cell types by the names that meshio gives them; the order of their nodes is VTK's.
 _CELL_TYPES = {
     "hexahedron": "hex8",
@@ -100,7 +108,9 @@ class ExternalStudy(Section):
             path = self.external.table.parent / row["file"]
             content = _read(path, row.get("step"))
             here = _mesh(content, to_si(1.0, self.external.length_unit, "length"), path)
-            mesh = mesh or here
+            if mesh is None:
+                check_size(here)
+                mesh = here
             _check_same(mesh, here, path)
             snapshots.append(Snapshot(point, self._fields(content, path)))
         assert mesh is not None
@@ -155,6 +165,7 @@ def read_table(path: Path) -> tuple[tuple[Parameter, ...], Array, list[dict[str,
         raise StudyError(f"cannot read the table {path}: {error.strerror}") from error
     if "file" not in header or not rows:
         raise StudyError(f"{path} needs a column 'file' and a row for each solution")
+    _check_listed_once(path, rows)
     columns = [_column(path, name) for name in header if name not in ("file", "step")]
     if not columns:
         raise StudyError(f"{path} has no parameter: add a column such as 'angle [deg]'")
@@ -170,6 +181,19 @@ def read_table(path: Path) -> tuple[tuple[Parameter, ...], Array, list[dict[str,
             raise StudyError(f"{path}: the parameter {name} is the same in all rows; leave the column out")
         parameters.append(Parameter(name, quantity, unit, lower, upper, min(max(0.0, lower), upper)))
     return tuple(parameters), values, rows
+
+
+def _check_listed_once(path: Path, rows: list[dict[str, str]]) -> None:
+    """One solution has one set of parameters."""
+    lines: dict[tuple[str | None, str | None], int] = {}
+    for line, row in enumerate(rows, 2):
+        solution = (row.get("file"), row.get("step"))
+        if solution in lines:
+            raise StudyError(
+                f"{path}, line {line}: '{solution[0]}' is in line {lines[solution]} already; list each "
+                "solution once"
+            )
+        lines[solution] = line
 
 
 def _column(path: Path, header: str) -> tuple[str, str, str]:
@@ -191,9 +215,12 @@ def _read(path: Path, step: str | None) -> meshio.Mesh:
     """A file's mesh and point data; of an XDMF series those of one step."""
     if not path.is_file():
         raise StudyError(f"the solution {path} that the table names does not exist")
+    read = _READERS.get(path.suffix.lower())
+    if read is None:
+        raise StudyError(f"{path} is no solution that can be read; use {', '.join(_READERS)}")
     try:
         if step is None:
-            return meshio.read(path)
+            return read(str(path))
         with meshio.xdmf.TimeSeriesReader(path) as reader:
             points, cells = reader.read_points_cells()
             _, point_data, _ = reader.read_data(int(step))

@@ -33,7 +33,7 @@ def check_mesh(mesh: Mesh, sets: Iterable[str] = (), regions: Iterable[str] = ()
     regions : cell sets that a study refers to.
     """
     _check_arrays(mesh)
-    _check_size(mesh)
+    check_size(mesh)
     _check_duplicates(mesh)
     _check_orientation(mesh)
     _check_faces(mesh)
@@ -65,7 +65,8 @@ def _check_arrays(mesh: Mesh) -> None:
             raise StudyError(f"the {what} '{name}' refer to index {numbers.max()}, but there are {count}")
 
 
-def _check_size(mesh: Mesh) -> None:
+def check_size(mesh: Mesh) -> None:
+    """Refuse a mesh of a size that no object has here: its unit is probably wrong; raises StudyError."""
     extent = np.ptp(mesh.nodes, axis=0)
     diagonal = float(np.linalg.norm(extent))
     if SMALLEST <= diagonal <= LARGEST:
