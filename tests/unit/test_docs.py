@@ -14,6 +14,7 @@ from morph_dslam.model import SeparatedField, load_model, save_model
 from morph_dslam.model.basis_functions import chebyshev_basis
 from morph_dslam.model.tensor_functions import TuckerFunctions
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.documents import code_words
 from tests.support.function_formats import FORMATS
 from tests.support.small_models import block_model
 
@@ -95,6 +96,19 @@ def test_the_programs_for_solids_pull_a_block_as_far_as_its_law_says(tmp_path, m
     exec(problem, names)
     np.testing.assert_allclose(names["fields"]["displacement"][top, 2], 0.06 * 0.104988, rtol=1e-5)
     np.testing.assert_allclose(names["force"], [0.0, 0.0, -0.3e6 * 0.02**2], atol=1e-6)
+    check_that_the_certificate_is_documented(names["model"])
+
+
+def check_that_the_certificate_is_documented(model):
+    """Its keys, and those of its entries; endings with units are `_*` in the page."""
+    entries = model.certificate.values()
+    keys = {*model.certificate, *(key for entry in entries if isinstance(entry, dict) for key in entry)}
+    keys -= {*model.fields, *(parameter.name for parameter in model.parameters)}
+    named = code_words("certificate")
+    assert len(keys) > 30
+    assert {
+        key for key in keys if not {key, re.sub(r"(_N|_Nmm|_mm|_MPa)?$", "_", key, count=1)} & named
+    } == set()
 
 
 def anchor(heading: str) -> str:

@@ -1,49 +1,35 @@
-"""Samples in the documentation are what the program accepts, and what it accepts is documented."""
+"""Sample files and programs in the documentation are what the program accepts."""
 
-import argparse
-import importlib
-import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
-from types import GenericAlias
-from typing import get_args
 
 import cv2
 import ngsolve as ngs
 import numpy as np
 import pytest
-from pydantic import BaseModel
 
-from morph_dslam import cli, make_study
+from morph_dslam import make_study
 from morph_dslam.errors import StudyError
 from morph_dslam.export.export import StateChoice
-from morph_dslam.io.calibration import _CameraFile, load_camera
+from morph_dslam.io.calibration import load_camera
 from morph_dslam.io.landmarks import load_landmarks
 from morph_dslam.model import Parameter, load_model, save_model
 from morph_dslam.model.inner_structure import save_inner_structure
 from morph_dslam.offline.external import ExternalStudy, read_table
 from morph_dslam.offline.inner_structures import place_inner_structure
-from morph_dslam.offline.materials.table import LAWS, constant_quantities
 from morph_dslam.offline.materials.user import UserMaterial
 from morph_dslam.offline.report.reference_curve import read_reference_curve
 from morph_dslam.offline.studies.affine import read_affine
 from morph_dslam.offline.studies.sheet_study import SheetStudy
 from morph_dslam.offline.studies.solid_study import SolidStudy
-from morph_dslam.online.aids.board import BoardFile, load_board
-from morph_dslam.online.aids.guess import GuessFile, load_guess
-from morph_dslam.online.aids.picture import PictureFile, load_picture
-from morph_dslam.render.scene_file import Scene, load_scene_file
+from morph_dslam.online.aids.board import load_board
+from morph_dslam.online.aids.guess import load_guess
+from morph_dslam.online.aids.picture import load_picture
+from morph_dslam.render.scene_file import load_scene_file
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.documents import PAGES, samples
 from tests.support.small_models import block_model
-
-PROJECT = Path(__file__).parents[2]
-PAGES = {path.stem: path.read_text() for path in [*(PROJECT / "docs").glob("*.md"), PROJECT / "README.md"]}
-
-
-def samples(page: str, language: str) -> list[str]:
-    """The fenced blocks of one language in a page."""
-    return re.findall(rf"^```{language}\n(.*?)^```$", PAGES[page], flags=re.DOTALL | re.MULTILINE)
 
 
 def test_every_sample_file_is_read_by_a_test_here():
@@ -60,9 +46,6 @@ def test_every_sample_file_is_read_by_a_test_here():
         ("solid-study", "toml"): 3,
         ("study-file", "toml"): 1,
     }
-
-
-# -- files -------------------------------------------------------------------------------------------------
 
 
 def test_camera_file(tmp_path):
@@ -169,151 +152,6 @@ def test_solutions_of_another_program(tmp_path):
     assert [parameter.name for parameter in parameters] == ["force", "tilt"]
     np.testing.assert_allclose(values[0], [0.5, np.radians(-3.0)])
     assert rows[0]["file"] == "run0.vtu"
-
-
-# -- keys --------------------------------------------------------------------------------------------------
-
-
-def sections(*roots: type[BaseModel]) -> set[type[BaseModel]]:
-    """A file's sections, those in its sections too."""
-    found: set[type[BaseModel]] = set()
-    pending: list = list(roots)
-    while pending:
-        kind = pending.pop()
-        if isinstance(kind, type) and not isinstance(kind, GenericAlias) and issubclass(kind, BaseModel):
-            if kind not in found:
-                found.add(kind)
-                pending += [field.annotation for field in kind.model_fields.values()]
-        else:
-            pending += get_args(kind)
-    return found
-
-
-def keys_of(*roots: type[BaseModel]) -> set[str]:
-    return {name for section in sections(*roots) for name in section.model_fields}
-
-
-def code_words(page: str) -> set[str]:
-    """Words that a page shows as code, in a line or in a block."""
-    blocks = re.findall(r"^```.*?^```$", PAGES[page], flags=re.DOTALL | re.MULTILINE)
-    spans = re.findall(
-        r"`([^`\n]+)`", re.sub(r"^```.*?^```$", "", PAGES[page], flags=re.DOTALL | re.MULTILINE)
-    )
-    return set(re.findall(r"\w+", " ".join([*blocks, *spans])))
-
-
-@pytest.mark.parametrize(
-    ("pages", "roots", "n_sections"),
-    [
-        (["scene-file"], [Scene], 14),
-        (["cameras"], [_CameraFile], 1),
-        (["registration-aids"], [BoardFile, PictureFile, GuessFile], 6),
-        (["solid-study"], [SolidStudy, ExternalStudy], 25),
-        (["study-file", "solid-study"], [SheetStudy], 8),
-    ],
-)
-def test_every_key_is_documented(pages, roots, n_sections):
-    assert len(sections(*roots)) >= n_sections
-    named = set().union(*(code_words(page) for page in pages))
-    assert keys_of(*roots) - named == set()
-
-
-def test_every_law_and_its_constants_are_documented():
-    for page in ("solid-study", "materials"):
-        assert set(LAWS) - code_words(page) == set()
-    constants = {name for law in LAWS for name in constant_quantities(law)}
-    assert constants - code_words("solid-study") == set()
-
-
-@pytest.mark.parametrize(
-    ("page", "roots"), [("study-file", [SheetStudy]), ("solid-study", [SolidStudy, ExternalStudy])]
-)
-def test_every_key_in_a_table_exists(page, roots):
-    known = keys_of(*roots) | {"relative_moduli", "times", "bulk_moduli", "prony", "density"}
-    # keys of a material are those of its law; generators are values
-    known |= {"block", "tube", "revolution"}
-    n_keys = 0
-    for table in re.findall(r"^\| key \|.*\n\|[-|]+\n((?:\|.*\n)+)", PAGES[page], flags=re.MULTILINE):
-        for row in table.splitlines():
-            words = re.findall(r"\w+", " ".join(re.findall(r"`([^`]+)`", row.split("|")[1])))
-            assert set(words) <= known, row
-            n_keys += len(words)
-    assert n_keys > 15
-
-
-# -- options and names -------------------------------------------------------------------------------------
-
-
-def commands() -> dict[str, argparse.ArgumentParser]:
-    (action,) = (a for a in cli._parser()._actions if isinstance(a, argparse._SubParsersAction))
-    return dict(action.choices)
-
-
-def test_every_command_and_option_is_documented():
-    everything = " ".join(PAGES.values())
-    for name, parser in commands().items():
-        assert re.search(rf"morph {name}\b", everything), name
-        options = {text for a in parser._actions for text in a.option_strings if text.startswith("--")}
-        missing = {o for o in options - {"--help", "--output"} if not re.search(rf"{o}\b(?!-)", everything)}
-        assert missing == set(), name
-
-
-def test_options_that_pages_name_exist():
-    """Of the command line, or of a program in examples/ or benchmarks/ that has it; Dask's are its own."""
-    known = {text for parser in commands().values() for a in parser._actions for text in a.option_strings}
-    for folder in ("examples", "benchmarks"):
-        for path in (PROJECT / folder).rglob("*.py"):
-            known |= set(re.findall(r"\"(--[a-z][\w-]*)\"", path.read_text()))
-    known |= {"--nworkers", "--nthreads", "--fifo", "--help"}
-    for page, text in PAGES.items():
-        assert set(re.findall(r"(?<![\w-])--[a-z][\w-]*", text)) <= known, page
-
-
-def test_modules_and_names_in_pages_exist():
-    """Dotted names in code, `offline.reduction.pod` say, are modules or what they hold; a `model` is one."""
-    n_names, a_model = 0, block_model("tucker")
-    for page, text in PAGES.items():
-        for name in re.findall(r"`((?:morph_dslam|offline|online|model|materials)\.[\w.]+\w)[`(]", text):
-            first, _, rest = name.partition(".")
-            package = {"morph_dslam": "morph_dslam", "materials": "morph_dslam.offline.materials"}
-            full = f"{package.get(first, f'morph_dslam.{first}')}.{rest}"
-            of_a_model = first == "model" and hasattr(a_model, rest.partition(".")[0])
-            assert of_a_model or name == "model.morph" or exists(full), f"{page}: {name}"
-            n_names += 1
-    assert n_names > 25
-
-
-def exists(dotted: str) -> bool:
-    """Whether a dotted name is a module, or an attribute of one."""
-    module, attributes = dotted, []
-    while module:
-        try:
-            thing = importlib.import_module(module)
-        except ModuleNotFoundError:
-            module, _, last = module.rpartition(".")
-            attributes.insert(0, last)
-            continue
-        for name in attributes:
-            if not hasattr(thing, name):
-                return False
-            thing = getattr(thing, name)
-        return True
-    return False
-
-
-def test_flags_in_the_table_are_those_of_the_program():
-    """Every phrase in the table of flags stands in the source, across the lines that a text is broken into."""
-    source = " ".join(path.read_text() for path in (PROJECT / "src/morph_dslam/online").rglob("*.py"))
-    source = re.sub(r'"\s*\n\s*f?"', "", source)
-    source = re.sub(r"\{HAS_MOVED\}|\{MAY_BE_ANOTHER\}|\{REFERENCE_WORSE\}|\{UN\w+\}", "", source)
-    table = PAGES["run-folder"].partition("### Flags")[2].partition("\n\n[")[0]
-    phrases = re.findall(r"`([^`]+)`", " ".join(row.split("|")[1] for row in table.splitlines() if row))
-    assert len(phrases) > 20
-    for phrase in phrases:
-        assert phrase in source, phrase
-
-
-# -- programs ----------------------------------------------------------------------------------------------
 
 
 def run_sample(page: str, number: int = 0) -> dict:

@@ -1,0 +1,21 @@
+"""The documentation as tests read it: its pages, their samples, and the words that they show as code."""
+
+import re
+from pathlib import Path
+
+PROJECT = Path(__file__).parents[2]
+PAGES = {path.stem: path.read_text() for path in [*(PROJECT / "docs").glob("*.md"), PROJECT / "README.md"]}
+
+
+def samples(page: str, language: str) -> list[str]:
+    """The fenced blocks of one language in a page."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", PAGES[page], flags=re.DOTALL | re.MULTILINE)
+
+
+def code_words(page: str) -> set[str]:
+    """Words that a page shows as code, in a line or in a block."""
+    blocks = re.findall(r"^```.*?^```$", PAGES[page], flags=re.DOTALL | re.MULTILINE)
+    spans = re.findall(
+        r"`([^`\n]+)`", re.sub(r"^```.*?^```$", "", PAGES[page], flags=re.DOTALL | re.MULTILINE)
+    )
+    return set(re.findall(r"\w+", " ".join([*blocks, *spans])))
