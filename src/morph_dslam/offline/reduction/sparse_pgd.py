@@ -27,6 +27,8 @@ SMOOTHING = np.logspace(-14.0, 2.0, 33)
 
 #: Sweeps over all modes end when one lowers the misfit by less than this, relatively.
 SETTLED = 0.02
+#: A relative misfit that is rounding: what is left has no direction to be enriched by.
+EXACT = 1e-12
 
 
 class SamplingWarning(UserWarning):
@@ -112,6 +114,12 @@ class _Fit:
             t @ c for k, (t, c) in enumerate(zip(self.tables, self.coefficients, strict=True)) if k != skip
         ]
         return np.prod(parts, axis=0) if parts else np.ones((len(self.data), self.mixing.shape[0]))
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the sum goes through all data to rounding, so that nothing is left to enrich it by."""
+        missed = np.linalg.norm(self.data - self._products() @ self.mixing)
+        return len(self.mixing) > 0 and bool(missed <= EXACT * np.linalg.norm(self.data))
 
     def enrich(self, tolerance: float, max_iterations: int) -> None:
         """Add the product that alternating least squares settles on for the residual."""
@@ -214,9 +222,10 @@ def fit_sparse_pgd(
     errors: dict[int, float] = {}
     best: tuple[Array, list[Array]] = (fit.mixing, fit.coefficients)
     since = 0
-    while since < options.patience and len(fit.mixing) < options.max_modes:
+    while since < options.patience and len(fit.mixing) < options.max_modes and not fit.is_exact:
         for _ in range(min(options.refit_every, options.max_modes - len(fit.mixing))):
-            fit.enrich(options.inner_tolerance, options.inner_iterations)
+            if not fit.is_exact:
+                fit.enrich(options.inner_tolerance, options.inner_iterations)
         fit.refit(options.refit_sweeps)
         products = np.prod([t[aside] @ c for t, c in zip(tables, fit.coefficients, strict=True)], axis=0)
         error = float(np.linalg.norm(products @ fit.mixing - data[aside]) / np.linalg.norm(data[aside]))
