@@ -11,6 +11,7 @@ import select
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import partial
@@ -34,9 +35,9 @@ OUTPUT_CLOSED = 141
 
 def _build(arguments: argparse.Namespace) -> None:
     from morph_dslam.offline.build import build
+    from morph_dslam.offline.build_warnings import build_warnings
     from morph_dslam.offline.report.build_report import report_path, write_build_report
     from morph_dslam.offline.report.reference_curve import read_reference_curve
-    from morph_dslam.offline.stability import stability_warnings
 
     if arguments.output.is_dir():
         raise StudyError(f"{arguments.output} is a folder: give the name of the model file to write")
@@ -47,7 +48,8 @@ def _build(arguments: argparse.Namespace) -> None:
         from morph_dslam.offline.cluster import cluster_executor
 
         cluster = cluster_executor(arguments.scheduler)
-    with cluster as executor:
+    with cluster as executor, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".* nearly incompressible")  # said once, at the end
         model = build(
             arguments.study, arguments.output, arguments.workers, executor, compare=arguments.compare
         )
@@ -58,8 +60,7 @@ def _build(arguments: argparse.Namespace) -> None:
         from morph_dslam.offline.comparison import comparison_lines
 
         print("\n".join(comparison_lines(arguments.output)))
-    of_the_method = model.certificate["reduction"].get("warnings", [])
-    for line in [*stability_warnings(model.certificate), *of_the_method]:
+    for line in build_warnings(model.certificate):
         print(f"warning: {line}")
 
 

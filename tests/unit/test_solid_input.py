@@ -9,6 +9,7 @@ import pytest
 
 from morph_dslam.errors import StudyError
 from morph_dslam.model import Parameter
+from morph_dslam.offline.build_warnings import build_warnings
 from morph_dslam.offline.materials.isotropic import NeoHookean
 from morph_dslam.offline.mechanics.kinematics import ShapeField
 from morph_dslam.offline.mechanics.loads import DeadTraction, FollowerPressure, MovingPatch, PointLoad
@@ -23,6 +24,9 @@ from morph_dslam.offline.mechanics.supports import (
 )
 from morph_dslam.offline.meshing.mesh_generators import block, sheet
 from morph_dslam.offline.solvers.newton import PathError
+from morph_dslam.offline.studies.locking import locking_warnings
+from morph_dslam.offline.studies.study import load_study
+from tests.support.block_study import write_study
 from tests.support.solids import RUBBER, load_parameter, solved
 
 MESH = block((1.0, 1.0, 1.0), (2, 1, 1), "hex8")
@@ -146,3 +150,29 @@ def test_a_load_that_cannot_be_carried_keeps_what_converged() -> None:
     assert 0.0 < kept.mu[0] < 200.0
     residual = problem.residual(kept.dofs, kept.mu)
     assert np.abs(residual[problem.free]).max() < 1e-6 * np.abs(residual).max()
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ([], []),
+        (
+            [("poisson = 0.3", "poisson = 0.4995")],
+            ["'rubber' is nearly incompressible (Poisson's ratio 0.4995)"],
+        ),
+        ([("poisson = 0.3", "poisson = 0.4995"), ("threads = 1", 'formulation = "mixed"')], []),
+    ],
+)
+def test_elements_that_lock_are_said_of_a_study(tmp_path, changes, expected):
+    """Young's modulus is a parameter there; its default counts."""
+    found = locking_warnings(load_study(write_study(tmp_path, *changes)))
+    assert len(found) == len(expected)
+    for line, part in zip(found, expected, strict=True):
+        assert part in line
+        assert line.endswith('set solver.formulation = "mixed"')
+
+
+def test_build_warns_of_elements_method_and_stability():
+    certificate = {"warnings": ["locks"], "reduction": {"warnings": ["too few samples"]}}
+    assert build_warnings(certificate) == ["locks", "too few samples"]
+    assert build_warnings({"reduction": {}}) == []

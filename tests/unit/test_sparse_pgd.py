@@ -131,6 +131,18 @@ def test_the_smoothing_weight_has_the_least_score_of_cross_validation() -> None:
     assert np.linalg.norm(found - np.sin(3.0 * x)) < np.linalg.norm(plain - np.sin(3.0 * x))
 
 
+@pytest.mark.parametrize(("n_samples", "degree"), [(2, 20), (3, 8), (8, 8)])
+def test_samples_that_are_met_exactly_end_the_enrichment(n_samples: int, degree: int) -> None:
+    """Fewer samples than functions: after some products nothing is left, and no direction to enrich by."""
+    mu = np.random.default_rng(5).random((n_samples, 2))
+    values = np.cos(mu.sum(axis=1))[:, None] * MODES[0]
+    bases = (chebyshev_basis(0.0, 1.0, degree),) * 2
+    with pytest.warns(SamplingWarning):
+        found = fit_sparse_pgd(mu, values, bases)
+    fitted = np.stack([found.functions.evaluate(x)[0] for x in mu]) @ found.pod.modes
+    np.testing.assert_allclose(fitted, values, atol=1e-4 * np.abs(values).max())
+
+
 def test_one_parameter_is_allowed() -> None:
     x = np.linspace(-1.0, 1.0, 40)[:, None]
     field = np.column_stack([np.exp(x[:, 0]), np.cos(2.0 * x[:, 0])]) @ MODES

@@ -78,6 +78,9 @@ def summarise_model(model: ReducedModel) -> dict[str, Table]:
         "error estimator": Table.of(flatten(certificate.get("estimator", {}))),
         "reduction": Table.of(_reduction(certificate)),
         "stability": Table.of(_stability(certificate)),
+        "warnings": Table.of(
+            {f"{n}": line for n, line in enumerate(certificate.get("warnings", []), start=1)}
+        ),
         "made with": Table.of(flatten(_versions_last(model.provenance))),
     }
     return {heading: table for heading, table in summary.items() if table.rows}

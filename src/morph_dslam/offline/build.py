@@ -24,6 +24,7 @@ from morph_dslam.offline.provenance import provenance
 from morph_dslam.offline.reduction.method import METHODS, ReductionTask
 from morph_dslam.offline.reduction.reduced_solver import FullSolutions, ReducedSolver, solid_equations
 from morph_dslam.offline.solutions import Solutions
+from morph_dslam.offline.studies.locking import locking_warnings
 from morph_dslam.offline.studies.study import Study, load_study
 from morph_dslam.offline.studies.study_sections import ReductionSection
 from morph_dslam.offline.sweep import SweepResult, run_sweep
@@ -66,6 +67,8 @@ def build(
     else:
         model = certified_model(known, chosen.reduction, chosen.name)
     model.provenance.update(provenance(text, chosen, model))
+    if found := locking_warnings(chosen):
+        model.certificate["warnings"] = found
     save_model(output, model)
     return model
 

@@ -18,11 +18,11 @@ from morph_dslam.evaluation.model_summary import (
 )
 from morph_dslam.evaluation.report import Block, KeyFigures, Listing, Section, Table, Text, write_report
 from morph_dslam.model import ReducedModel
+from morph_dslam.offline.build_warnings import build_warnings
 from morph_dslam.offline.report.error_maps import plot_error_maps, plot_errors_by_parameter
 from morph_dslam.offline.report.mode_curves import plot_convergence, plot_parameter_functions
 from morph_dslam.offline.report.reference_curve import ReferenceCurve
 from morph_dslam.offline.report.shape_pictures import draw_model_states, draw_modes
-from morph_dslam.offline.stability import stability_warnings
 
 #: Parts of the model's summary that the report repeats as they are.
 _REPEATED = ("fields", "memory and samples", "error estimator", "reduction", "made with")
@@ -126,7 +126,7 @@ def _largest_relative(name: str, entries: Iterable[dict[str, Any]]) -> dict[str,
 
 
 def _warnings(certificate: dict[str, Any]) -> list[Callable[[], Block]]:
-    return [lambda line=line: Text(line, warning=True) for line in stability_warnings(certificate)]
+    return [lambda line=line: Text(line, warning=True) for line in build_warnings(certificate)]
 
 
 def _sensitivities(certificate: dict[str, Any]) -> list[Callable[[], Block]]:
