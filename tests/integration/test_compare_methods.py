@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from morph_dslam import cli
-from morph_dslam.errors import StudyError
+from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.model import load_model
 from morph_dslam.offline.choices import with_choices
-from morph_dslam.offline.comparison import comparison_lines
+from morph_dslam.offline.comparison import compare_methods, comparison_lines
 from morph_dslam.offline.studies.study import make_study
+from tests.support.small_models import block_model
 
 STUDY = """
 name = "pushed block"
@@ -145,3 +146,20 @@ def test_defaults_follow_the_study():
     }
     assert with_choices(make_study(one)).reduction.method == "pod"
     assert with_choices(make_study(one)).sampling.scheme == "sobol"
+
+
+def test_a_method_that_fails_in_any_known_way_costs_no_model():
+    """Solves that do not converge too: the row says why, and the study's own model is there."""
+    study = with_choices(make_study(tomllib.loads(STUDY)))
+    model = block_model("tucker")
+    figures = {"mean_mm": 0.1, "max_mm": 0.2, "relative_l2": 0.01, "mean_mm_by_modes": [0.1]}
+    model.certificate.update({"displacement": figures, "reduction": {"format": "tucker"}})
+
+    def reduce(options):
+        if options.method != study.reduction.method:
+            raise SolverError("no equilibrium found")
+        return model
+
+    kept, rows = compare_methods(study, reduce)
+    assert kept is model
+    assert [row.get("unusable") for row in rows[1:]] == ["no equilibrium found"] * 3

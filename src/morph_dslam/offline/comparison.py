@@ -10,7 +10,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from morph_dslam.errors import StudyError
+from morph_dslam.errors import MorphError
 from morph_dslam.evaluation.report import Table
 from morph_dslam.model import ReducedModel
 from morph_dslam.offline.choices import usable_methods
@@ -59,7 +59,7 @@ def compare_methods(study: Study, reduce: Reduce) -> tuple[ReducedModel, list[di
         options = study.reduction.model_copy(update={"method": name, "format": None, "basis": None})
         try:
             rows.append(_row(name, *_timed(reduce, options)))
-        except StudyError as error:
+        except MorphError as error:
             rows.append({"method": name, "unusable": str(error)})
     return model, rows
 

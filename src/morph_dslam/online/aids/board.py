@@ -69,6 +69,9 @@ class BoardFile(Section):
             raise ValueError("a charuco board needs square_mm, larger than marker_mm")
         if self.kind == "charuco" and min(self.columns, self.rows) < 3:
             raise ValueError("a charuco board needs 3 x 3 squares at least")
+        other = "square_mm" if self.kind == "grid" else "gap_mm"
+        if getattr(self, other) is not None:
+            raise ValueError(f"{other} is for the other kind of board: leave it out of a {self.kind}")
         pitch = self.marker_mm + (self.gap_mm or 0.0) if self.kind == "grid" else self.square_mm or 0.0
         if 1e-3 * pitch * max(self.columns, self.rows) > LARGEST_SIDE:
             raise ValueError(
