@@ -7,10 +7,12 @@ from types import GenericAlias
 from typing import get_args
 
 import h5py
+import numpy as np
 import pytest
 from pydantic import BaseModel
 
 from morph_dslam import cli
+from morph_dslam.camera import PinholeCamera
 from morph_dslam.io.calibration import _CameraFile
 from morph_dslam.offline.external import ExternalStudy
 from morph_dslam.offline.materials.table import LAWS, constant_quantities
@@ -20,6 +22,8 @@ from morph_dslam.online.aids.board import BoardFile
 from morph_dslam.online.aids.guess import GuessFile
 from morph_dslam.online.aids.picture import PictureFile
 from morph_dslam.online.runs.results import RunResults, summarise, write_csv, write_hdf5
+from morph_dslam.online.slam.output import write_run as write_slam_run
+from morph_dslam.online.slam.slam import Slam
 from morph_dslam.render.scene_file import Scene
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.documents import PAGES, PROJECT, code_words
@@ -80,6 +84,16 @@ def test_every_result_of_a_run_is_documented(tmp_path):
     found |= {name for name in columns if not name.startswith(("arch", "skew", "twist"))}
     assert len(found) > 45
     assert found - code_words("run-folder") == set()
+
+
+def test_every_result_of_camera_tracking_is_documented(tmp_path):
+    slam = Slam(PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0))
+    frame = slam.process_frame(np.zeros((480, 640, 3), np.uint8), 0, 0.0)
+    found = set(write_slam_run(tmp_path, slam, [frame.record(is_final=False)], {}))
+    columns = (tmp_path / "frames.csv").read_text().splitlines()[0].split(",")
+    found |= {name for name in columns if not name.endswith("_ms")}
+    assert len(found) > 35
+    assert found - code_words("slam") == set()
 
 
 @pytest.mark.parametrize(
