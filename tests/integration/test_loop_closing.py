@@ -12,10 +12,12 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.online.slam.loop_closing import LoopCloser
 from morph_dslam.online.slam.output import trajectory_of
 from morph_dslam.online.slam.pose_graph import Similarities, optimise
+from morph_dslam.online.slam.rigid_map import Keyframe
 from morph_dslam.online.slam.slam import Slam
 from morph_dslam.similarity import fit_similarity
 from tests.support.rendered_room import RoomFilm, closed_room, pose, round_trip
 
+NONE = np.empty(0, dtype=np.int64)
 CAMERA = PinholeCamera(480, 360, 380.0, 380.0, 239.5, 179.5)
 
 
@@ -82,6 +84,23 @@ def test_a_round_trip_closes_beside_the_frames(monkeypatch):
     errors = path_errors(slam, frames, truth)
     assert np.median(errors) < 0.01
     assert errors.max() < 0.02
+
+
+@pytest.mark.parametrize("threaded", [False, True])
+def test_a_view_that_is_wanted_goes_before_the_loop(threaded, monkeypatch):
+    """Beside the frames none can be kept while a loop is closed; so that is begun after a frame."""
+    making = Slam(CAMERA, threaded=threaded)._making
+    making._map.keyframes.append(Keyframe(0, 0.0, np.zeros((4, 4), np.uint8), np.eye(4), NONE, NONE))
+    monkeypatch.setattr(LoopCloser, "has_found", True)
+    monkeypatch.setattr(
+        LoopCloser, "close", lambda closer: monkeypatch.setattr(LoopCloser, "has_found", False)
+    )
+    making.advance()
+    assert LoopCloser.has_found == threaded
+    assert making.can_keep
+    making.end_frame()
+    assert making.can_keep != threaded
+    making.stop()
 
 
 def transforms(rng, n, spread=1.0):

@@ -46,6 +46,23 @@ def test_merged_points_keep_all_views_and_removed_ones_none():
     assert rigid_map.good.tolist() == [0, 2]
 
 
+def test_a_frame_keeps_its_points_when_they_are_made_one_with_others():
+    """2 became 3, which became 0; 0 was seen itself, where it counts first; 4 is a candidate."""
+    rigid_map = small_map()
+    rigid_map.add_points(np.zeros((1, 3)), np.zeros((1, 2)), 1, CANDIDATE)
+    rigid_map.merge(3, 2)
+    rigid_map.merge(0, 3)
+    draft = RigidMap()
+    draft.copy_of(rigid_map)
+    pixels = np.array([[1.0, 2], [3, 4], [5, 6], [7, 8]])
+    for one in (rigid_map, draft):
+        seen = one.good_of(Followed(np.array([2, 4, 1, 3]), pixels))
+        assert seen.ids.tolist() == [0, 1]
+        assert seen.pixels.tolist() == [[1, 2], [5, 6]]
+    rigid_map.remove(np.array([0]))
+    assert rigid_map.good_of(Followed(np.array([2, 1]), pixels[:2])).ids.tolist() == [1]
+
+
 def test_new_corners_join_the_keyframe_that_found_them():
     rigid_map = small_map()
     ids = rigid_map.add_points(np.zeros((2, 3)), np.ones((2, 2)), 1, CANDIDATE)

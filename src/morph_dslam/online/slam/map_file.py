@@ -80,6 +80,7 @@ def _read(path: Path, file: h5py.File, camera: PinholeCamera) -> RigidMap:
     rigid_map.usual_rms_px = float(np.asarray(file.attrs["usual_rms_px"]))
     for name in POINT_ARRAYS:
         setattr(rigid_map, name, np.asarray(file[f"points/{name}"]))
+    rigid_map.merged_into = np.arange(len(rigid_map.state))
     for name in keyframes:
         arrays = [np.asarray(keyframes[f"{name}/{array}"]) for array in KEYFRAME_ARRAYS]
         index, timestamp = (np.asarray(keyframes[name].attrs[key]).item() for key in ("index", "timestamp"))

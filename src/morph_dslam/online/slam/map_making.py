@@ -89,6 +89,14 @@ class MapMaking:
         self._search.advance()
         self._proceed(to_end=False)
 
+    def end_frame(self) -> None:
+        """Beside the frames, begin to close a loop that was found, unless this frame is being kept.
+
+        No view can be kept until the loop is closed, and a frame with few points left must not wait so long.
+        """
+        if self._threaded:
+            self._close_loop()
+
     def stop(self) -> None:
         """Leave the map as it is from now on.
 
@@ -140,12 +148,18 @@ class MapMaking:
             pose, ids = tracked.pose.camera_from_world, tracked.points.ids
         if self._kept is not None and self._work.is_idle:
             view, self._kept = self._kept[0], None
-            if self._search.is_idle:
+            if self._search.is_idle and not self._loops.has_found:
                 self._search.begin(self._loops.search(view))
-        if self._loops.has_found and self._work.is_idle:
-            self._work.begin(one_step(self._loops.close))
+        if (to_end or not self._threaded) and self._close_loop():
             proceed()
         self._follow(pose, ids)
+
+    def _close_loop(self) -> bool:
+        """Begin to close a loop that was found, if nothing else is under way; whether it was begun."""
+        begins = self._loops.has_found and self._work.is_idle
+        if begins:
+            self._work.begin(one_step(self._loops.close))
+        return begins
 
     def _follow(self, pose: Array, ids: Indices) -> None:
         """Let the tracker follow what changed for the newest keyframe, whose pose and points these were."""

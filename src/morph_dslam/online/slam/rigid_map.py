@@ -30,6 +30,8 @@ POINT_ARRAYS = (
     "n_expected",
     "n_found",
 )
+#: These and what is of no use to later runs, so not kept in files.
+_ALL_POINT_ARRAYS = (*POINT_ARRAYS, "merged_into")
 #: Error that poses are taken to have before there is any.
 FIRST_RMS_PX = 4.0
 
@@ -126,6 +128,7 @@ class RigidMap:
     state : (n,) CANDIDATE, GOOD or REMOVED.
     first_keyframe, first_pixels : (n,), (n, 2) where a point was first seen.
     template_keyframe, template_pixels : (n,), (n, 2) the view whose patch stands for the point.
+    merged_into : (n,) the point that a point was made one with, by `merge`; its own number otherwise.
     n_expected, n_found : (n,) frames in which it should have been seen, and in which it was.
     usual_rms_px : running mean of the errors of the poses found in it.
     baseline_px : focal length times the baseline that right columns refer to, px m; 0 where no depth is
@@ -142,6 +145,7 @@ class RigidMap:
         self.state = np.empty(0, dtype=np.int8)
         self.first_keyframe, self.first_pixels = np.empty(0, dtype=np.int64), np.empty((0, 2))
         self.template_keyframe, self.template_pixels = np.empty(0, dtype=np.int64), np.empty((0, 2))
+        self.merged_into = np.empty(0, dtype=np.int64)
         self.n_expected, self.n_found = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
 
     @property
@@ -158,13 +162,13 @@ class RigidMap:
         """Become what another map is now, and stay so while it changes."""
         self.usual_rms_px, self.passing = other.usual_rms_px, other.passing.copy()
         self.keyframes = [copy(keyframe) for keyframe in other.keyframes]
-        for name in POINT_ARRAYS:
+        for name in _ALL_POINT_ARRAYS:
             setattr(self, name, getattr(other, name).copy())
 
     def share(self, other: RigidMap) -> None:
         """Become what another map is now, at once: with the same arrays, which must not change any more."""
         self.usual_rms_px, self.keyframes = other.usual_rms_px, other.keyframes
-        for name in POINT_ARRAYS:
+        for name in _ALL_POINT_ARRAYS:
             setattr(self, name, getattr(other, name))
 
     def take_over(self, draft: RigidMap) -> None:
@@ -187,7 +191,9 @@ class RigidMap:
         self.template_pixels = np.concatenate([self.template_pixels, pixels])
         self.n_expected = np.concatenate([self.n_expected, np.zeros(n, dtype=np.int64)])
         self.n_found = np.concatenate([self.n_found, np.zeros(n, dtype=np.int64)])
-        return np.arange(before, before + n)
+        numbers = np.arange(before, before + n)
+        self.merged_into = np.concatenate([self.merged_into, numbers])
+        return numbers
 
     def add_keyframe(self, keyframe: Keyframe) -> int:
         """Append a view, which becomes the template of the points it sees; returns its number."""
@@ -268,6 +274,17 @@ class RigidMap:
                 keyframe.point_ids = ids
                 keyframe.keep(np.argsort(ids))
         self.remove(np.array([dropped]))
+        self.merged_into[dropped] = kept
+
+    def good_of(self, seen: Followed) -> Followed:
+        """Those of the points seen in a frame that are map points now, by the numbers that they have now."""
+        ids = seen.ids
+        while (self.merged_into[ids] != ids).any():
+            ids = self.merged_into[ids]
+        _, first = np.unique(ids, return_index=True)
+        rows = np.sort(first)
+        rows = rows[self.state[ids[rows]] == GOOD]
+        return Followed(ids[rows], seen.pixels[rows], seen.right[rows])
 
     def shared_points(self, ids: Indices) -> Indices:
         """How many of these points each keyframe (k,) saw: covisibility."""

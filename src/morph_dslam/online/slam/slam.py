@@ -19,7 +19,7 @@ from morph_dslam.online.slam.mapping import pose_in_keyframe
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.slam.pose import refine_pose
 from morph_dslam.online.slam.relocalisation import Relocaliser
-from morph_dslam.online.slam.rigid_map import CANDIDATE, GOOD, NOWHERE, Followed, RigidMap
+from morph_dslam.online.slam.rigid_map import CANDIDATE, NOWHERE, Followed, RigidMap
 from morph_dslam.online.slam.slam_frame import STAGES, SlamFrame, corners_of, points_of
 from morph_dslam.online.slam.tracking import Tracked, Tracker
 from morph_dslam.online.timing import StageClock, WaitClock
@@ -108,8 +108,7 @@ class Slam:
         self._making = MapMaking(self.map, k, options, self._tracker, self._threaded)
         self._relocaliser = Relocaliser(self.map, k, options)
         # In a map from elsewhere the camera is lost until it is found.
-        self._n_lost, self._n_held = int(bool(rigid_map.keyframes)), 0
-        self._n_deforming = 0
+        self._n_lost, self._n_held, self._n_deforming = int(bool(rigid_map.keyframes)), 0, 0
         if self.is_frozen:
             self._tracker.choose_templates()
 
@@ -145,6 +144,8 @@ class Slam:
             result = self._relocalise(view, clock)
         else:
             result = self._track(view, clock)
+        if not self.is_frozen:
+            self._making.end_frame()
         self._n_lost = self._n_lost + 1 if result["status"] == "lost" else 0
         is_young = len(self.map.keyframes) < self.options.window and not self.is_frozen
         if is_young and self._n_lost > self.options.restart_after:
@@ -192,7 +193,7 @@ class Slam:
         if frame.from_keyframe is None or not self.is_placed(frame):
             return None
         start = frame.from_keyframe @ self.map.pose_of(frame.keyframe)
-        points = frame.points[self.map.state[frame.points.ids] == GOOD]
+        points = self.map.good_of(frame.points)
         if len(points.ids) < self.options.least_inliers:
             return start
         known = self.map.positions[points.ids]
