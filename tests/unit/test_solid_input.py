@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
+import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +28,7 @@ from morph_dslam.offline.mechanics.supports import (
 from morph_dslam.offline.meshing.mesh_generators import block, sheet
 from morph_dslam.offline.solvers.newton import PathError
 from morph_dslam.offline.studies.locking import locking_warnings
-from morph_dslam.offline.studies.study import load_study
+from morph_dslam.offline.studies.study import load_study, make_study
 from tests.support.block_study import write_study
 from tests.support.solids import RUBBER, load_parameter, solved
 
@@ -176,3 +179,40 @@ def test_build_warns_of_elements_method_and_stability():
     certificate = {"warnings": ["locks"], "reduction": {"warnings": ["too few samples"]}}
     assert build_warnings(certificate) == ["locks", "too few samples"]
     assert build_warnings({"reduction": {}}) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (('"2 MPa"', '"1e300 MPa"'), "parameters.young: '1e300 MPa' cannot be meant"),
+        (("poisson = 0.3", "poisson = nan"), "materials.rubber: poisson: 'nan' cannot be meant"),
+        (('"20 mm", "20 mm", "60 mm"', '"20 mm", "20 mm", "1e300 mm"'), "mesh.size.2: '1e300 mm' cannot"),
+        (
+            ("divisions = [1, 1, 3]", "divisions = [500, 500, 500]"),
+            "mesh.divisions: these make 125000000 cells",
+        ),
+        (("training = 24", "training = 1000000000"), "sampling.training: "),
+        (("training = 24", "training = 24\nseed = -1"), "sampling.seed: "),
+    ],
+)
+def test_numbers_that_no_study_means_are_one_message(tmp_path, change, message):
+    with pytest.raises(StudyError) as caught:
+        load_study(write_study(tmp_path, change))
+    assert str(caught.value).startswith(f"{tmp_path / 'study.toml'}: ")
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("bend = [0.5, 1.2]", "bend = [0.5, inf]"), "parameters.bend.1"),
+        (('depth = "12 mm"', 'depth = "nan mm"'), "grips.depth: 'nan mm' cannot be meant"),
+        (("divisions = [8, 6]", "divisions = [0, 6]"), "solver.divisions.0"),
+        (("grid = [48, 34]", "grid = [48, 100000]"), "reduction.grid.1"),
+    ],
+)
+def test_numbers_that_no_sheet_means_are_one_message(change, message):
+    text = (Path(__file__).parents[2] / "examples/demo/study.toml").read_text()
+    assert change[0] in text
+    with pytest.raises(StudyError, match=re.escape(message)):
+        make_study(tomllib.loads(text.replace(*change)))

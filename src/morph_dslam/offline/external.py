@@ -82,7 +82,7 @@ class HoldOutSection(Section):
     """How many of the solutions only measure the error (a fifth, and at least 4, if absent), and which."""
 
     held_out: int | None = Field(default=None, ge=4)
-    seed: int = 0
+    seed: int = Field(default=0, ge=0)
 
 
 class ExternalStudy(Section):

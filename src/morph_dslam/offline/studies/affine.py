@@ -21,6 +21,9 @@ from morph_dslam.units import FACTORS, quantity_of, to_si
 
 Array = NDArray[np.float64]
 
+#: No number of a study is meant where it is larger, in whatever unit: what follows from it could overflow.
+LARGEST = 1e30
+
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _WORD = r"[A-Za-z_][\w./]*"
 _TERM = re.compile(
@@ -69,7 +72,8 @@ def read_affine(value: Any, quantity: str | None, parameters: Sequence[Parameter
     Raises
     ------
     StudyError
-        If it cannot be read, names an unknown parameter, or measures something else.
+        If it cannot be read, names an unknown parameter, measures something else, or has a number that no
+        study means.
     """
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         raise StudyError(f"{value!r} is not a number with a unit, nor an expression of parameters")
@@ -77,7 +81,7 @@ def read_affine(value: Any, quantity: str | None, parameters: Sequence[Parameter
         if quantity not in ("ratio", None):
             unit = next(iter(FACTORS[quantity]))
             raise StudyError(f'write {value} with its unit, "{value} {unit}" for example')
-        return Affine(float(value), (0.0,) * len(parameters))
+        return Affine(possible(float(value), str(value)), (0.0,) * len(parameters))
     known = {parameter.name: index for index, parameter in enumerate(parameters)}
     quantity = quantity or _own_quantity(value, known, parameters)
     constant, slopes = 0.0, np.zeros(len(parameters))
@@ -88,6 +92,13 @@ def read_affine(value: Any, quantity: str | None, parameters: Sequence[Parameter
         else:
             slopes[known[name]] += sign * number
     return Affine(constant, tuple(slopes.tolist()))
+
+
+def possible(number: float, text: str) -> float:
+    """The number; raises StudyError, naming the text, if it is not finite or larger than `LARGEST`."""
+    if not abs(number) <= LARGEST:
+        raise StudyError(f"'{text}' cannot be meant: numbers are finite, and at most {LARGEST:g}")
+    return number
 
 
 def _own_quantity(text: str, known: Mapping[str, int], parameters: Sequence[Parameter]) -> str:
@@ -122,6 +133,8 @@ def _read_term(
 ) -> tuple[float, str | None]:
     """Number (SI) and parameter's name, if any, of one term."""
     number, unit = term["number"], term["unit"]
+    if number is not None:
+        possible(float(number), text)
     name = term["factor"] or term["name"]
     if name is not None and name not in known:
         raise StudyError(f"'{text}' names '{name}', which is no parameter; {_listed(known)}")

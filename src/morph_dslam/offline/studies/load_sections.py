@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from morph_dslam.offline.mechanics import loads, supports
-from morph_dslam.offline.studies.study_sections import PositiveLength, Section
+from morph_dslam.offline.studies.study_sections import Number, PositiveLength, Section
 
 #: A quantity in a study file.
 Value = str | float
@@ -59,7 +59,7 @@ class RotationSupport(Section):
 
     kind: Literal["rotation"]
     on: str
-    axis: tuple[float, float, float]
+    axis: tuple[Number, Number, Number]
     angle: Value
     centre: Triple | str | None = None
     translation: Triple = ("0 m", "0 m", "0 m")
@@ -167,7 +167,7 @@ class MovingLineLoad(Section):
     on: str
     force: Triple
     centre: Triple
-    direction: tuple[float, float, float]
+    direction: tuple[Number, Number, Number]
     width: PositiveLength
 
     def make(self, read: Reader) -> loads.MovingLine:

@@ -3,23 +3,36 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Discriminator, Field, Tag, ValidationInfo, field_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationInfo, field_validator
 
 from morph_dslam.errors import StudyError
 from morph_dslam.offline.meshing import mesh_generators
 from morph_dslam.offline.meshing.mesh_checks import check_mesh
 from morph_dslam.offline.meshing.mesh_files import load_mesh
 from morph_dslam.offline.meshing.meshes import Mesh
-from morph_dslam.offline.studies.study_sections import Angle, PositiveLength, Section
+from morph_dslam.offline.studies.study_sections import Angle, Number, PositiveLength, Section
 from morph_dslam.units import to_si
 
 CellName = Literal["hex8", "hex20", "hex27", "tet4", "tet10", "prism6", "prism15", "prism18"]
 Count = Annotated[int, Field(ge=1)]
+
+#: More cells than these are a mistake: no memory holds their factorisation.
+MOST_CELLS = 5_000_000
+
+
+def _few(divisions: tuple[int, int, int]) -> tuple[int, int, int]:
+    if math.prod(divisions) > MOST_CELLS:
+        raise ValueError(f"these make {math.prod(divisions)} cells, and {MOST_CELLS} are the most")
+    return divisions
+
+
+Divisions = Annotated[tuple[Count, Count, Count], AfterValidator(_few)]
 
 
 class FileMesh(Section):
@@ -47,7 +60,7 @@ class BlockMesh(Section):
 
     generator: Literal["block"]
     size: tuple[PositiveLength, PositiveLength, PositiveLength]
-    divisions: tuple[Count, Count, Count]
+    divisions: Divisions
     cells: CellName = "hex20"
 
     def make(self) -> Mesh:
@@ -64,7 +77,7 @@ class TubeMesh(Section):
     inner_radius: PositiveLength
     outer_radius: PositiveLength
     length: PositiveLength
-    divisions: tuple[Count, Count, Count]
+    divisions: Divisions
     cells: CellName = "hex20"
     angles: tuple[Angle, Angle] = (0.0, 2.0 * np.pi)
 
@@ -91,10 +104,10 @@ class RevolutionMesh(Section):
     """
 
     generator: Literal["revolution"]
-    profile: tuple[tuple[float, float], ...]
+    profile: tuple[tuple[Number, Number], ...]
     unit: str
     thickness: PositiveLength
-    divisions: tuple[Count, Count, Count]
+    divisions: Divisions
     cells: CellName = "hex20"
     angles: tuple[Angle, Angle] = (0.0, 2.0 * np.pi)
     collars: tuple[CollarSection, ...] = ()

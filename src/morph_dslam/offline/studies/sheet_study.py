@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,7 @@ from morph_dslam.offline.studies.sheet_snapshots import (
 from morph_dslam.offline.studies.study_sections import (
     Angle,
     Length,
+    Number,
     PositiveLength,
     ReductionSection,
     SamplingSection,
@@ -42,6 +44,9 @@ Array = NDArray[np.float64]
 
 #: Code on which the solution of a sheet depends.
 _SOLVER = ("mechanics/shell", "mechanics/grips", "mechanics/gripped_sheet", "studies/sheet_snapshots")
+
+#: Cells along a side of a sheet: more than these are a mistake.
+Count = Annotated[int, Field(ge=1, le=1000)]
 
 #: Smallest |bulge| that is solved, over the largest: in the flat state itself the equations are singular.
 SMALLEST_BULGE = 0.02
@@ -87,9 +92,9 @@ class SheetParametersSection(Section):
     """Ranges of the four coordinates (`morph_dslam.offline.mechanics.grips` says what they mean)."""
 
     bulge: tuple[Length, Length]
-    bend: tuple[float, float]
+    bend: tuple[Number, Number]
     skew: tuple[Angle, Angle]
-    slant: tuple[float, float]
+    slant: tuple[Number, Number]
 
     @property
     def bounds(self) -> Array:
@@ -113,7 +118,7 @@ class SheetSolverSection(WorkSection):
     bending stress is scaled back in proportion to thickness, membrane stress to its square.
     """
 
-    divisions: tuple[int, int] = (12, 10)
+    divisions: tuple[Count, Count] = (12, 10)
     order: int = Field(default=3, ge=2, le=4)
     thickness: PositiveLength | None = None
 
@@ -121,7 +126,7 @@ class SheetSolverSection(WorkSection):
 class SheetReductionSection(ReductionSection):
     """Reduction, and the cells of the model's mesh along x and y."""
 
-    grid: tuple[int, int] = (60, 42)
+    grid: tuple[Count, Count] = (60, 42)
 
 
 class SheetStudy(Section):
@@ -198,9 +203,7 @@ class SheetStudy(Section):
         for option in WorkSection.model_fields:
             del content["solver"][option]
         content["grid"] = self.reduction.grid
-        content["code"] = source_fingerprint(
-            ("mechanics/shell", "mechanics/grips", "mechanics/gripped_sheet", "studies/sheet_snapshots")
-        )
+        content["code"] = source_fingerprint(_SOLVER)
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def model_parameters(self) -> tuple[Parameter, ...]:

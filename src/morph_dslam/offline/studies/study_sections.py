@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
 from morph_dslam.errors import StudyError
+from morph_dslam.offline.studies.affine import LARGEST, possible
 from morph_dslam.units import to_si
 
 
@@ -20,13 +21,15 @@ def quantity(kind: str) -> BeforeValidator:
         if len(parts) != 2:
             raise ValueError(f"'{value}' is not a number and a unit")
         try:
-            return to_si(float(parts[0]), parts[1], kind)
+            return to_si(possible(float(parts[0]), value), parts[1], kind)
         except StudyError as error:
             raise ValueError(str(error)) from error
 
     return BeforeValidator(read)
 
 
+#: A plain number of a study: a ratio, a component of a direction.
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Length = Annotated[float, quantity("length")]
 PositiveLength = Annotated[float, quantity("length"), Field(gt=0, allow_inf_nan=False)]
 Stress = Annotated[float, quantity("stress"), Field(gt=0, allow_inf_nan=False)]
@@ -39,6 +42,10 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+#: More solves than these are a mistake.
+MOST_SAMPLES = 1_000_000
+
+
 class SamplingSection(Section):
     """Numbers of training and held-out solves, where they lie, and the seed of their positions.
 
@@ -49,12 +56,12 @@ class SamplingSection(Section):
     ``training``. The method of reduction chooses where it is absent. Held-out samples are always scattered.
     """
 
-    training: int = Field(default=256, ge=8)
-    held_out: int = Field(default=59, ge=4)
+    training: int = Field(default=256, ge=8, le=MOST_SAMPLES)
+    held_out: int = Field(default=59, ge=4, le=MOST_SAMPLES)
     scheme: Literal["sobol", "even", "grid", "adaptive"] | None = None
     points: int | tuple[int, ...] | None = None
     first: int = Field(default=16, ge=4)
-    seed: int = 0
+    seed: int = Field(default=0, ge=0)
 
     @field_validator("points")
     @classmethod
