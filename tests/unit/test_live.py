@@ -167,6 +167,9 @@ def test_the_newest_item_is_taken_and_an_error_comes_last():
 def test_webcams_that_cannot_be_opened():
     with pytest.raises(SourceError, match="webcam 97 cannot be opened"):
         open_stream("webcam:97")
+    for name in ("webcam", "webcam:x"):
+        with pytest.raises(SourceError, match=f"'{name}' is no webcam: write webcam:0"):
+            open_stream(name)
     with pytest.raises(SourceError, match="is live and has no range"):
         open_stream("webcam:0", 3, 4)
     with pytest.raises(SourceError, match="no folder of images and no video at webcam:x"):
