@@ -132,9 +132,8 @@ def _read_term(
     term: re.Match, text: str, quantity: str, known: Mapping[str, int], parameters: Sequence[Parameter]
 ) -> tuple[float, str | None]:
     """Number (SI) and parameter's name, if any, of one term."""
-    number, unit = term["number"], term["unit"]
-    if number is not None:
-        possible(float(number), text)
+    unit = term["unit"]
+    number = 1.0 if term["number"] is None else possible(float(term["number"]), text)
     name = term["factor"] or term["name"]
     if name is not None and name not in known:
         raise StudyError(f"'{text}' names '{name}', which is no parameter; {_listed(known)}")
@@ -143,14 +142,14 @@ def _read_term(
     if term["divisor"] is not None:
         share, measured = _share(term, text, measured, name), "ratio"
     if unit is not None:
-        value = to_si(float(number), unit, quantity) * share
+        value = to_si(number, unit, quantity) * share
         if name is not None and measured != "ratio":
             raise StudyError(
-                f"'{text}': only a parameter without unit can be multiplied by {number} {unit}; make it one "
-                f'with "{name} / 1 {parameters[known[name]].unit}"'
+                f"'{text}': only a parameter without unit can be multiplied by {term['number']} {unit}; "
+                f'make it one with "{name} / 1 {parameters[known[name]].unit}"'
             )
         return value, name
-    value = share if number is None else float(number) * share
+    value = number * share
     if name is None:
         if quantity != "ratio":
             raise StudyError(f"'{text}' lacks a unit of {quantity}: {', '.join(FACTORS[quantity])}")
@@ -162,7 +161,7 @@ def _read_term(
 
 def _share(term: re.Match, text: str, measured: str, name: str | None) -> float:
     """One over the quantity that a parameter, which measures the same, is divided by."""
-    divisor = float(term["divisor"])
+    divisor = possible(float(term["divisor"]), text)
     if name is None or not divisor:
         raise StudyError(f"'{text}': only a parameter can be divided, and not by zero")
     return 1.0 / to_si(divisor, term["divisor_unit"], measured)
