@@ -183,7 +183,7 @@ def _add_offline_commands(commands: argparse._SubParsersAction) -> None:
         "the frames written so far are kept, without truth",
         "film a model moving through given parameters and camera positions, with exact truth",
     )
-    simulate.add_argument("scene", type=Path, help="scene file")
+    simulate.add_argument("scene", type=Path, help="scene file (docs/scene-file.md)")
     simulate.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FOLDER", help="folder to write"
     )
@@ -199,7 +199,7 @@ def _add_evaluation_commands(commands: argparse._SubParsersAction) -> None:
     )
     evaluate.add_argument("run", type=Path, help="run folder, or a trajectory file")
     truth = evaluate.add_mutually_exclusive_group(required=True)
-    truth.add_argument("--points", type=Path, metavar="TRUTH", help="truth file (.npz)")
+    truth.add_argument("--points", type=Path, metavar="TRUTH", help="truth file, .npz (docs/run-folder.md)")
     truth.add_argument(
         "--trajectory", type=Path, metavar="TRUTH", help="true camera path (TUM, KITTI, COLMAP or 7-Scenes)"
     )

@@ -59,7 +59,7 @@ def add_live_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         "everything until then is kept in the run folder",
         "track an object in the pictures of a webcam, or of a recording at its own pace, as they come",
     )
-    live.add_argument("source", metavar="SOURCE", help="webcam:0, or a video file or folder of images")
+    live.add_argument("source", metavar="SOURCE", help="webcam:0, or a recording (docs/sources.md)")
     add_object_arguments(live)
     live.add_argument(
         "--serve",

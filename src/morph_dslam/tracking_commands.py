@@ -213,7 +213,12 @@ def add_tracking_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         "the frames tracked so far are kept in the run folder",
         "find an object's pose and parameters in every frame, and draw the stress over the video",
     )
-    track.add_argument("frames", type=Path, metavar="FRAMES", help="video file, or folder of numbered images")
+    track.add_argument(
+        "frames",
+        type=Path,
+        metavar="FRAMES",
+        help="video file, folder of numbered images, or another recording (docs/sources.md)",
+    )
     add_object_arguments(track)
     track.add_argument(
         "--range", type=frame_range, default=(None, None), metavar="FIRST-LAST", help="frames to track"

@@ -151,3 +151,21 @@ def test_programs_and_files_in_documents_exist():
                 assert (DOCS.parent / name).exists(), f"{page.name}: {name}"
                 n_files += 1
     assert n_files > 50
+
+
+def test_pages_that_messages_and_programs_name_exist():
+    named = set()
+    for folder in ("src", "examples", "benchmarks"):
+        for path in (DOCS.parent / folder).rglob("*.py"):
+            named |= set(re.findall(r"\bdocs/[\w-]+\.md", path.read_text()))
+    assert len(named) > 5
+    assert {name for name in named if not (DOCS.parent / name).exists()} == set()
+
+
+def test_targets_of_make_exist():
+    targets = set(re.findall(r"^([a-z-]+):", (DOCS.parent / "Makefile").read_text(), flags=re.MULTILINE))
+    named = {
+        t for page in PAGES for t in re.findall(r"(?:^|`)make ([a-z-]+)", page.read_text(), re.MULTILINE)
+    }
+    assert {"demo", "test", "test-all"} <= named
+    assert named <= targets

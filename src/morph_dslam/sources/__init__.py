@@ -67,7 +67,9 @@ def open_stream(source: str | Path, first: int | None = None, last: int | None =
     webcam = _WEBCAM.fullmatch(str(source))
     if webcam is None:
         if str(source).startswith("webcam") and not Path(source).exists():
-            raise SourceError(f"'{source}' is no webcam: write webcam:0 for the first one, webcam:1 for the next")
+            raise SourceError(
+                f"'{source}' is no webcam: write webcam:0 for the first one, webcam:1 for the next"
+            )
         return open_source(Path(source), first, last)
     if first is not None or last is not None:
         raise SourceError(f"{source} is live and has no range of frames to choose from")
