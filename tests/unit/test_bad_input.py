@@ -261,3 +261,13 @@ def test_a_registration_names_its_files_relative_to_itself(tmp_path):
     assert json.loads((tmp_path / "place" / "registration.json").read_text()) == written
     with pytest.raises(RegistrationError, match="cannot write the registration"):
         write_registration(tmp_path / "absent", {}, *files)
+
+
+@pytest.mark.parametrize("aid", ["board", "picture", "guess"])
+def test_a_reference_that_is_to_be_refined_without_landmarks(tmp_path, capsys, aid):
+    """It would be tracked as it is, and the option have no effect."""
+    arguments = ("track", "film", "--model", "m.morph", "--camera", "c.yaml", f"--{aid}", "aid.toml")
+    assert "start from landmarks, or leave out --refine" in message_of(
+        capsys, *arguments, "--refine", "-o", tmp_path / "run"
+    )
+    assert not (tmp_path / "run").exists()

@@ -216,6 +216,10 @@ def _check(options: TrackOptions) -> None:
             "a registration in a map brings its own reference frame, refined already: leave out --refine and "
             "--reference-frame"
         )
+    if options.refine_reference and any(path is not None for path in vars(options.aids).values()):
+        raise TrackingError(
+            "the reference is refined with the landmarks in it: start from landmarks, or leave out --refine"
+        )
     check_run_folder(options.output, options.overwrite)
 
 
@@ -226,7 +230,7 @@ def write_results(
     carried = setup.carried(run.model)
     named = {name: str(getattr(options, name)) for name in _INPUTS if getattr(options, name)}
     aids = {name: str(path) for name, path in vars(options.aids).items() if path is not None}
-    named |= aids | {} if setup.map_path is None else {"map": str(setup.map_path)}
+    named |= aids | ({} if setup.map_path is None else {"map": str(setup.map_path)})
     tracker = setup.tracker_options(placement)
     extra = {
         "reference_refined_over_the_sequence": run.refined,

@@ -152,6 +152,7 @@ def _write(setup: Setup, begin: _Begin, session: LiveSession, options: LiveOptio
     """Write all files of the run folder but the video, which was written on the way."""
     of_object = options.of_object
     named = {"source": options.source}
+    named |= {name: str(path) for name, path in vars(of_object.aids).items() if path is not None}
     for name, path in (("landmarks", of_object.landmarks), ("placement", of_object.placement)):
         named |= {} if path is None else {name: str(path)}
     named |= {} if setup.map_path is None else {"map": str(setup.map_path)}
