@@ -7,41 +7,14 @@ import pytest
 
 from morph_dslam.errors import ModelFileError, RegistrationError
 from morph_dslam.evaluation.model_summary import summarise_model
-from morph_dslam.model import Parameter, ReducedModel, SeparatedField, load_model, save_model
+from morph_dslam.model import load_model, save_model
 from morph_dslam.model.basis_functions import chebyshev_basis, fourier_basis
-from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.model.product_functions import ProductFunctions
 from morph_dslam.model.tensor_functions import CPFunctions
 from morph_dslam.model.turned_model import turned_model
-from morph_dslam.offline.meshing.mesh_generators import block, tube
+from morph_dslam.offline.meshing.mesh_generators import block
 from morph_dslam.online.start.placement import load_placement
-
-AXIS = np.array([0.0, 0.0, 1.0])
-
-
-def polynomial(coefficients):
-    """Functions of one parameter in [0, 2], by their Chebyshev coefficients (terms, functions)."""
-    degrees = np.arange(len(coefficients))[:, None]
-    return ParameterFunctions(
-        np.array([0.0]), np.array([2.0]), degrees, np.asarray(coefficients, dtype=float)
-    )
-
-
-def bent_tube(mesh=None):
-    """u = mu z² e_x, and a stress mu (e_x e_x + y e_x e_y): on a tube 0.1 m long, for a load along x."""
-    mesh = mesh or tube(0.02, 0.03, 0.1, (4, 1, 24), cell_type="hex8")
-    x, y, z = mesh.nodes.T
-    zero = np.zeros_like(x)
-    linear = polynomial([[1.0], [1.0]])  # mu = 1 + T_1(mu - 1)
-    stress = np.column_stack([1e6 + zero, zero, zero, zero, zero, 1e7 * y])
-    return ReducedModel(
-        "bent tube",
-        mesh.nodes,
-        mesh.surface_triangles(),
-        (Parameter("load", "ratio", "1", 0.0, 2.0, 0.0),),
-        SeparatedField(np.column_stack([z**2, zero, zero])[None], linear),
-        stresses={"solid": SeparatedField(stress[None], linear)},
-    )
+from tests.support.bent_tube import AXIS, bent_tube, polynomial
 
 
 def turned_stress(nodes, load, angle):

@@ -71,6 +71,16 @@ class LinearCost:
         hessian, of_depths = (chain.T @ matrix @ chain for matrix in (self.hessian, self.of_depths))
         return LinearCost(self.scores @ chain, of_depths, hessian, self.scale)
 
+    def holding(self, indices: NDArray[np.int64]) -> LinearCost:
+        """The same cost with the unknowns at ``indices`` (k,) known: how well the others are then."""
+        scores, of_depths, hessian = self.scores.copy(), self.of_depths.copy(), self.hessian.copy()
+        largest = float(np.max(np.diag(hessian) * self.scale**2))
+        scores[:, :, indices] = 0.0
+        for matrix in (of_depths, hessian):
+            matrix[indices], matrix[:, indices] = 0.0, 0.0
+        hessian[indices, indices] = max(largest, 1e-30) / self.scale[indices] ** 2
+        return LinearCost(scores, of_depths, hessian, self.scale)
+
     @staticmethod
     def joined(costs: Sequence[LinearCost]) -> LinearCost:
         """The sum of costs of the same unknowns, their points one after the other."""

@@ -23,6 +23,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from morph_dslam.model import ReducedModel
+from morph_dslam.online.estimation.clear_effect import without_clear_effect
 from morph_dslam.online.estimation.estimator import Estimate, Prior, State
 from morph_dslam.online.estimation.filter_memory import Errors, Past, PointChange, quadratic
 from morph_dslam.online.estimation.linear_cost import LinearCost
@@ -93,6 +94,7 @@ class SequenceFilter(Generic[Frame]):
         self._unknowns = len(estimator.model.parameters) + 6
         self._noise = PixelNoise(self.options.memory)
         self._past: Past | None = None
+        self._untold = np.zeros(len(self._constant))
         self._conflicts = 0
 
     def change_points(self, change: PointChange) -> None:
@@ -111,6 +113,7 @@ class SequenceFilter(Generic[Frame]):
         """
         linear = self._estimator.linear(measured, alone)
         self._noise.add(alone.residuals, measured, _taken(measured, linear, alone.state, known))
+        self._untold = self._without_effect(measured, linear, alone, known)
         errors = self._errors(measured, linear, alone.state, known)
         by_itself = self._with_covariance(alone, measured, linear, errors, known)
         if not len(self._kept):
@@ -133,6 +136,27 @@ class SequenceFilter(Generic[Frame]):
             self._keep(fused, errors)
         fused = self._with_covariance(fused, measured, linear, errors, known, past)
         return self._without_walk(fused, by_itself) if self._walks else fused
+
+    def _without_effect(
+        self, measured: Frame, linear: LinearCost, alone: Estimate, known: Prior | None
+    ) -> Array:
+        """Variances (k,) of what is one per sequence where a frame tells nothing of it, zero where it does."""
+        model, d, constant = self._estimator.model, self._unknowns - 6, self._constant
+        nothing = np.zeros(len(constant))
+        if not 0 < len(constant) < d:
+            return nothing
+        self._untold = nothing
+        held = self._errors(measured, linear.holding(constant), alone.state, known).covariance
+        absent = without_clear_effect(
+            model,
+            linear,
+            lambda state: self._estimator.linear(measured, replace(alone, state=state)),
+            alone.state,
+            np.sqrt(np.diag(held)[:d]),
+            constant,
+        )
+        # Any value in the range is then as likely as any other.
+        return np.where(absent, (model.upper - model.lower)[constant] ** 2 / 12.0, 0.0)
 
     def _with_covariance(
         self,
@@ -235,6 +259,8 @@ class SequenceFilter(Generic[Frame]):
             information, by_cause = known.terms(state)[1], known.lasting_scores
             hessian += information
             by_frames += known.squared_px * information - by_cause.T @ by_cause
+        # What a frame does not tell is no better known by many: one more cause that stays the same.
+        by_cause = np.vstack([np.sqrt(self._untold)[:, None] * hessian[self._constant], by_cause])
         if past is not None and self._past is not None:
             hessian[:d, :d] += past.information
             weight = self._of_kept(past.information)

@@ -1,0 +1,91 @@
+"""What acts only while something else does: simulated measurements of a tube that bends to an unknown side."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.model import SurfacePoints
+from morph_dslam.model.turned_model import turned_model
+from morph_dslam.online.estimation.clear_effect import without_clear_effect
+from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, State
+from morph_dslam.online.estimation.sequence_filter import SequenceFilter
+from morph_dslam.online.uncertainty.measurement_noise import Measured
+from tests.support.bent_tube import AXIS, bent_tube
+
+CAMERA = PinholeCamera(640, 480, 560.0, 560.0, 320.0, 240.0)
+MODEL = turned_model(bent_tube(), AXIS)
+ESTIMATOR = Estimator(MODEL, CAMERA)
+POSE = RigidTransform(rotation_exp(np.array([2.2, 0.1, 0.0])), np.array([0.0, 0.04, 0.4]))
+TURN, SIDE = 1, 2.1
+COUNT, SIGMA = 80, 0.05
+#: No load in ten frames, then more of it in each.
+LOADS = 0.03 * np.maximum(np.arange(24) - 9, 0)
+
+
+def bound():
+    rng = np.random.default_rng(0)
+    surface = SurfacePoints(rng.integers(0, len(MODEL.triangles), COUNT), rng.dirichlet(np.ones(3), COUNT))
+    return BoundPoints.from_surface(MODEL, surface)
+
+
+def measured(points, state, errors):
+    pixels = CAMERA.project(points.in_camera(state)) + errors
+    return Measured(points, pixels, np.ones(COUNT), np.zeros((COUNT, 2)), np.eye(COUNT))
+
+
+def followed(seed):
+    """Errors and stated deviations (f,) of the side, half of the noise being the same in all frames."""
+    points, rng, start, found = bound(), np.random.default_rng(seed), State(MODEL.default, POSE), []
+    filtered, stays = SequenceFilter(ESTIMATOR, [TURN]), rng.standard_normal((COUNT, 2))
+    for load in LOADS:
+        errors = np.sqrt(0.5) * SIGMA * (stays + rng.standard_normal((COUNT, 2)))
+        seen = measured(points, State(np.array([load, SIDE]), POSE), errors)
+        starts = [State(np.array([0.1, side]), POSE) for side in (-2.0, 0.0, 2.0)]
+        alone = min(
+            (ESTIMATOR.fit(seen, one) for one in (start, *starts)), key=lambda estimate: estimate.cost
+        )
+        estimate = filtered.fuse(seen, alone)
+        start = estimate.state
+        off = (start.parameters[TURN] - SIDE + np.pi) % (2.0 * np.pi) - np.pi
+        found.append((abs(off), estimate.parameter_std[TURN]))
+    return np.array(found).T
+
+
+def test_the_side_of_what_is_not_bent_is_not_said_to_be_known():
+    """Without regard to whether there is an effect it is 4 to 7 stated deviations off in these frames."""
+    found = np.array([followed(seed) for seed in range(20)])
+    off, bent = found[:, 0] / found[:, 1], LOADS > 0.0
+    spread_of_any = np.ptp([MODEL.lower[TURN], MODEL.upper[TURN]]) / np.sqrt(12.0)
+    assert (found[:, 1][:, ~bent] > 0.95 * spread_of_any).all()
+    # As soon as it bends the side is told, and as well as stated.
+    assert (found[:, 1][:, bent] < 0.2).all()
+    assert 0.7 < np.sqrt(np.mean(off[:, bent] ** 2)) < 1.4
+
+
+@pytest.mark.parametrize(("lengths", "absent"), [(3.5, True), (4.5, False)])
+def test_an_effect_is_clear_from_four_standard_deviations_on(lengths, absent):
+    """The side acts in proportion to the load."""
+    points, load = bound(), 0.2
+    state = State(np.array([load, SIDE]), POSE)
+    seen = measured(points, state, np.zeros((COUNT, 2)))
+    alone = ESTIMATOR.fit(seen, state)
+
+    def linear_at(there):
+        return ESTIMATOR.linear(seen, replace(alone, state=there))
+
+    spread = np.array([load / lengths, 0.1])
+    found = without_clear_effect(MODEL, linear_at(state), linear_at, state, spread, np.array([TURN]))
+    assert found.tolist() == [absent]
+
+
+def test_what_is_held_leaves_the_others_as_if_it_were_known():
+    seen = measured(bound(), State(np.array([0.3, SIDE]), POSE), np.zeros((COUNT, 2)))
+    linear = ESTIMATOR.linear(seen, ESTIMATOR.fit(seen, State(np.array([0.3, SIDE]), POSE)))
+    others = np.delete(np.arange(8), TURN)
+    expected = np.linalg.inv(np.delete(np.delete(linear.hessian, TURN, 0), TURN, 1))
+    held = linear.holding(np.array([TURN]))
+    np.testing.assert_allclose(held.inverse[np.ix_(others, others)], expected, rtol=1e-6)
+    assert not held.scores[:, :, TURN].any()
