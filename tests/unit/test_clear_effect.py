@@ -1,4 +1,4 @@
-"""What acts only while something else does: simulated measurements of a tube that bends to an unknown side."""
+"""What acts only while something else does: measurements of a tube that bends to an unknown side."""
 
 from dataclasses import replace
 

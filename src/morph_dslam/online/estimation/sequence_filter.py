@@ -140,7 +140,7 @@ class SequenceFilter(Generic[Frame]):
     def _without_effect(
         self, measured: Frame, linear: LinearCost, alone: Estimate, known: Prior | None
     ) -> Array:
-        """Variances (k,) of what is one per sequence where a frame tells nothing of it, zero where it does."""
+        """Variances (k,) of what is one per sequence where a frame tells nothing of it, else zero."""
         model, d, constant = self._estimator.model, self._unknowns - 6, self._constant
         nothing = np.zeros(len(constant))
         if not 0 < len(constant) < d:
