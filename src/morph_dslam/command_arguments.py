@@ -6,6 +6,9 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+#: No value in whatever unit is meant by what is larger: its square could overflow.
+LARGEST = 1e30
+
 
 def with_signed_sections(arguments: Sequence[str]) -> list[str]:
     """The arguments with "--section -x=12" as one, because argparse takes "-x=12" alone for an option."""
@@ -64,7 +67,7 @@ def named_value(text: str) -> tuple[str, float]:
         value = float(number)
     except ValueError:
         value = 0.0
-    if not name or not 0.0 < value < float("inf"):
+    if not name or not 0.0 < value < LARGEST:
         raise argparse.ArgumentTypeError(f"'{text}' is not a name and a positive number such as load=0.5")
     return name, value
 

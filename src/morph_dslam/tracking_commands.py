@@ -88,7 +88,10 @@ def object_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def drawing(arguments: argparse.Namespace) -> DrawOptions:
-    """What is to be drawn; raises TrackingError if the section is none."""
+    """What is to be drawn; raises TrackingError if the section is none, or nothing shows it."""
+    is_shown = not arguments.no_video or getattr(arguments, "serve", None) is not None
+    if not is_shown and (arguments.show, arguments.section) != (None, None):
+        raise TrackingError("--show and --section say what the video shows: leave them or --no-video out")
     from morph_dslam.online.drawing.augmented_view import DrawOptions
     from morph_dslam.online.drawing.section import SectionPlane
 

@@ -271,3 +271,20 @@ def test_a_reference_that_is_to_be_refined_without_landmarks(tmp_path, capsys, a
         capsys, *arguments, "--refine", "-o", tmp_path / "run"
     )
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("command", ["track", "live"])
+@pytest.mark.parametrize("option", [["--show", "strain"], ["--section", "x=3"]])
+def test_what_a_video_is_to_show_that_is_not_drawn(tmp_path, capsys, command, option):
+    arguments = (command, "film", "--model", "m.morph", "--camera", "c.yaml", "--landmarks", "l.csv")
+    assert "leave them or --no-video out" in message_of(
+        capsys, *arguments, "-o", tmp_path / "run", "--no-video", *option
+    )
+
+
+def test_a_random_walk_whose_square_overflows(capsys):
+    arguments = ["track", "film", "--model", "m", "--camera", "c", "--landmarks", "l", "-o", "run"]
+    with pytest.raises(SystemExit) as caught:
+        cli.main([*arguments, "--random-walk", "arch=1e300"])
+    assert caught.value.code == 2
+    assert "'arch=1e300' is not a name and a positive number" in capsys.readouterr().err
