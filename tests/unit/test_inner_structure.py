@@ -151,3 +151,11 @@ def test_the_command_places_a_surface_file(tmp_path, capsys):
     np.testing.assert_allclose(np.sort(found.rest, axis=0), np.sort(NODES, axis=0), atol=1e-9)
     assert main([*command, "--unit", "cm", "-o", str(tmp_path / "wrong.h5")]) == 2
     assert "does not fit into 'block'" in capsys.readouterr().err
+
+
+def test_a_file_of_another_kind_is_named_with_those_that_are_read(tmp_path, capsys):
+    save_model(tmp_path / "block.morph", affine_block())
+    (tmp_path / "tumour.step").write_text("ISO-10303-21;")
+    command = ["inner", str(tmp_path / "tumour.step"), "--model", str(tmp_path / "block.morph")]
+    assert main([*command, "--unit", "mm", "-o", str(tmp_path / "tumour.h5")]) == 2
+    assert "is no surface file that is read; use .stl, .obj, .ply" in capsys.readouterr().err

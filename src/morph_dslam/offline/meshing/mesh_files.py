@@ -14,13 +14,13 @@ from morph_dslam.offline.meshing.mesh_repair import reoriented, without_collapse
 from morph_dslam.offline.meshing.meshes import CellBlock, Mesh
 from morph_dslam.offline.meshing.meshio_files import read_with_meshio
 from morph_dslam.offline.meshing.netgen_meshing import mesh_step_file, mesh_surface_file
+from morph_dslam.offline.meshing.surface_files import SURFACES
 from morph_dslam.units import to_si
 
 Indices = NDArray[np.int64]
 
 #: Abaqus lists a C3D27's centre before the centres of its faces S1 to S6; VTK has opposite faces, then it.
 _HEX27_FROM_ABAQUS = [*range(20), 26, 24, 23, 25, 21, 22, 20]
-_SURFACES = (".stl", ".obj", ".ply")
 _VOLUMES = (".inp", ".msh", ".vtk", ".vtu", ".step", ".stp")
 
 
@@ -46,13 +46,13 @@ def load_mesh(path: Path | str, unit: str, size: float | None = None) -> Mesh:
     """
     path, scale = Path(path), to_si(1.0, unit, "length")
     kind = path.suffix.lower()
-    if kind not in _VOLUMES + _SURFACES:
-        raise StudyError(f"{path} is no mesh file that is read; use {', '.join(_VOLUMES + _SURFACES)}")
+    if kind not in _VOLUMES + SURFACES:
+        raise StudyError(f"{path} is no mesh file that is read; use {', '.join(_VOLUMES + SURFACES)}")
     if size is not None and size <= 0.0:
         raise StudyError(f"a cell size of {size} m cannot be; give a positive length")
-    if size is not None and kind not in (*_SURFACES, ".step", ".stp"):
+    if size is not None and kind not in (*SURFACES, ".step", ".stp"):
         raise StudyError(f"{path} is meshed already; a cell size is for surfaces and STEP files")
-    if kind in _SURFACES:
+    if kind in SURFACES:
         return mesh_surface_file(path, None if size is None else size / scale).transformed(scale)
     if kind in (".step", ".stp"):
         return mesh_step_file(path, unit, None if size is None else size * 1e3).transformed(1e-3)

@@ -15,6 +15,9 @@ from morph_dslam.errors import StudyError
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+#: Endings of the files that are read.
+SURFACES = (".stl", ".obj", ".ply")
+
 
 @dataclass(frozen=True)
 class TriangleSurface:
@@ -30,8 +33,10 @@ def read_surface(path: Path) -> TriangleSurface:
     Raises
     ------
     StudyError
-        If the file cannot be read or holds no faces.
+        If it is a file of another kind, cannot be read, or holds no faces.
     """
+    if path.suffix.lower() not in SURFACES:
+        raise StudyError(f"{path} is no surface file that is read; use {', '.join(SURFACES)}")
     try:
         points, triangles = _read_obj(path) if path.suffix.lower() == ".obj" else _read_stl_or_ply(path)
     except OSError as error:
