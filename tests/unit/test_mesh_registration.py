@@ -1,5 +1,7 @@
 """Registration of a mesh to a map: known places, in every unit; none, two, and turns that cannot be told."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -39,6 +41,18 @@ def test_a_wedge_on_a_table_is_found_in_a_map_of_unknown_scale():
     assert not found.ambiguous
     assert found.axis is None
     assert found.rms_px is None  # the views have no images here
+
+
+def test_a_place_that_no_image_confirms_is_doubted():
+    """The same map, with images that show something beside the object, and nothing on it."""
+    nodes, triangles, _ = wedge()
+    points, views = scanned(WORLD)
+    rim = np.full_like(views[0].flat, 128)
+    rim[:4] = np.arange(rim.shape[1]) % 251
+    found = register_mesh(nodes, triangles, points, [replace(view, flat=rim) for view in views], CAMERA)
+    assert found.rms_px is None
+    assert found.runner_up < 0.8 * found.score
+    assert found.ambiguous
 
 
 def test_images_refine_what_the_points_leave_open():

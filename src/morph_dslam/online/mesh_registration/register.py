@@ -74,6 +74,8 @@ class MeshRegistration:
     axis : about which the surface can be turned without a difference, so that this angle is not known.
     keyframes : those with a pose of their own about the object; None if there was too little to compare.
     outline : how much of its outline the keyframes show where it is.
+    unconfirmed : whether there are images, but nothing on the object could be compared in them: a floor and a
+        wall, say, that have its shape in another size.
     """
 
     world_from_object: SimilarityTransform
@@ -85,13 +87,14 @@ class MeshRegistration:
     axis: Axis | None
     keyframes: AdjustedKeyframes | None = None
     outline: OutlineFit = field(default_factory=OutlineFit)
+    unconfirmed: bool = False
 
     @property
     def ambiguous(self) -> bool:
-        """Whether another place is nearly as good, or the images contradict this one."""
+        """Whether another place is nearly as good, or the images contradict this one or tell nothing."""
         contradicted = self.rms_px is not None and self.rms_px > POOR_AGREEMENT_PX
         contradicted |= self.outline.contradicts
-        return contradicted or self.runner_up > AMBIGUOUS * self.score
+        return self.unconfirmed or contradicted or self.runner_up > AMBIGUOUS * self.score
 
 
 @dataclass(frozen=True)
@@ -147,7 +150,8 @@ def register_mesh(
         adjustment = KeyframeAdjustment(nodes, triangles, camera, points, views, surface.axis_of_revolution)
         found = _adjusted(found, adjustment, nodes.mean(axis=0), metric)
     outline = outline_fit(found.world_from_object, nodes, triangles, more, camera)
-    return replace(found, outline=outline)
+    unconfirmed = found.rms_px is None and any(np.ptp(view.flat) > 0 for view in views)
+    return replace(found, outline=outline, unconfirmed=unconfirmed)
 
 
 def _adjusted(

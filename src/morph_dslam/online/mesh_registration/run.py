@@ -15,7 +15,7 @@ from morph_dslam.errors import RegistrationError
 from morph_dslam.io.calibration import load_camera
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.online.mesh_registration.beside import left_by_others
-from morph_dslam.online.mesh_registration.register import MeshRegistration
+from morph_dslam.online.mesh_registration.register import POOR_AGREEMENT_PX, MeshRegistration
 from morph_dslam.online.mesh_registration.scene import (
     View,
     camera_from_object,
@@ -113,14 +113,24 @@ def remarks(content: dict[str, Any]) -> list[str]:
         )
     elif content["ambiguous"]:
         lines.append(
-            "ambiguous: another place is nearly as good (see runner_up_score); look at registration.jpg, and "
-            "give landmarks if it is wrong"
+            f"ambiguous: {_why_ambiguous(content)}; look at registration.jpg, and give landmarks if it is "
+            "wrong"
         )
     if content["axis_of_revolution"] is not None:
         lines.append("the object is a body of revolution: the angle about its axis cannot be seen")
     if content["rms_px"] is None:
         lines.append("the keyframes show too little texture on the object to refine its place")
     return lines
+
+
+def _why_ambiguous(content: dict[str, Any]) -> str:
+    if content["rms_px"] is None:
+        return (
+            "no image confirms this place, and scenery that has the object's shape in another size would do"
+        )
+    if content["rms_px"] > POOR_AGREEMENT_PX:
+        return f"the keyframes' images differ by {content['rms_px']:.2f} px on it"
+    return "another place is nearly as good (see runner_up_score)"
 
 
 def registration_line(content: dict[str, Any]) -> str:

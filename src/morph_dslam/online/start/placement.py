@@ -85,7 +85,7 @@ def load_placement(path: Path, model: ReducedModel) -> Placement:
     if not outline_fits:
         flags.append("registration doubtful: the keyframes show the object's outline elsewhere")
     elif ambiguous:
-        flags.append("registration ambiguous: another place in the map is nearly as good")
+        flags.append("registration ambiguous: another place is nearly as good, or no image confirms this one")
     if axis is not None:
         model = turned_model(model, axis)
         open_angles = (model.parameters[-1].name,)
