@@ -6,8 +6,8 @@ import pytest
 from morph_dslam.online.estimation.estimator import BoundPoints, EstimationOptions, Estimator
 from morph_dslam.online.measuring.binding import bind_pixels, view_of
 from morph_dslam.online.uncertainty.dimension_check import STRETCH
-from morph_dslam.online.uncertainty.systematic_errors import SystematicErrors
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.one_view import errors_of
 from tests.support.rendered_sequence import CAMERA, sheet_state
 from tests.support.staged_scenes import SCENES, drawn_out
 
@@ -32,7 +32,7 @@ def test_what_a_wrong_length_leaves_is_as_predicted():
     surface, met = bind_pixels(model, CAMERA, view_of(model, CAMERA, placed), first)
     assert met.all()
     points = BoundPoints.from_surface(model, surface)
-    errors = SystematicErrors(estimator, points, placed, 1e-12 * np.eye(9), 17)
+    errors = errors_of(estimator, points, placed, 1e-12 * np.eye(9))
     found = estimator.estimate(points, pixels, weights, placed)
     used = weights > 0.0
     shown = errors.unexplained(found, used).px
@@ -49,7 +49,7 @@ def test_the_reference_view_shows_nothing_and_a_bent_sheet_does():
     nodes = np.flatnonzero((np.abs(model.nodes) < [0.19, 0.13, 1.0]).all(axis=1))[::7]
     surface, _ = bind_pixels(model, CAMERA, view_of(model, CAMERA, reference), seen(model, reference, nodes))
     points, estimator = BoundPoints.from_surface(model, surface), Estimator(model, CAMERA, EXACT)
-    errors = SystematicErrors(estimator, points, reference, 1e-8 * np.eye(9), 17)
+    errors = errors_of(estimator, points, reference, 1e-8 * np.eye(9))
     used = np.ones(len(points), dtype=bool)
     for time, unchecked in ((0.1, True), (0.11, True), (0.8, False), (0.1, False)):
         pixels = CAMERA.project(points.in_camera(sheet_state(time)))
@@ -68,7 +68,7 @@ def test_a_compact_body_that_hardly_turns_does_not_show_its_length():
     )
     longer = BoundPoints.from_surface(real, points.surface)
     estimator, used = Estimator(model, camera, EXACT), np.ones(len(points), dtype=bool)
-    errors = SystematicErrors(estimator, points, scene.state(0.0), 1e-8 * np.eye(8), 17)
+    errors = errors_of(estimator, points, scene.state(0.0), 1e-8 * np.eye(8))
     for time in (0.2, 0.4, 0.6):
         pixels = camera.project(longer.in_camera(scene.state(time)))
         found = estimator.estimate(points, pixels, used.astype(float), scene.state(time))

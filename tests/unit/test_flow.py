@@ -1,4 +1,4 @@
-"""Flow, patch correlation, features and the rendered appearance on images whose motion is known."""
+"""Flow, features and the rendered appearance on images whose motion is known."""
 
 import cv2
 import numpy as np
@@ -14,9 +14,6 @@ from morph_dslam.online.measuring.flow import (
     FlowOptions,
     flatten,
     follow,
-    patch_agreement,
-    patch_agreement_numpy,
-    patch_correlation,
 )
 from morph_dslam.online.measuring.textured_view import draw_textured, draw_textured_numpy
 from tests.support.bent_sheet import bent_sheet_model
@@ -56,66 +53,6 @@ def test_following_no_points_is_allowed(image):
     found, ok = follow(image, image, np.empty((0, 2)), np.empty((0, 2)), OPTIONS)
     assert found.shape == (0, 2)
     assert ok.shape == (0,)
-
-
-def test_compiled_and_plain_agreement_agree(image):
-    rng = np.random.default_rng(0)
-    first = rng.uniform([-5, -5], [645, 485], (80, 2))
-    second = first + rng.uniform(-2, 2, first.shape)
-    other = shifted(image, 1.0, 0.5)
-    compiled = patch_agreement(image, other, first, second, 7)
-    plain = patch_agreement_numpy(image, other, first, second, 7)
-    for one, twin in zip(compiled, plain, strict=True):
-        np.testing.assert_allclose(one, twin, atol=1e-6)
-    # Blank paper, and what leaves the image, tells no place.
-    assert np.isinf(compiled[1][compiled[0] == -1.0]).all()
-
-
-def test_the_spread_of_a_patch_is_how_far_off_points_are_found(image):
-    """Points are followed into images with more and more noise; in each the errors are as told."""
-    flat = flatten(image, 31)
-    points = spread_corners(flat, np.pad(np.full((400, 560), 255, np.uint8), 40), 300)
-    errors, told, half = [], [], OPTIONS.window // 2
-    for noise in (2.0, 8.0, 16.0):
-        rng = np.random.default_rng(int(noise))
-        noisy = np.clip(image + noise * rng.standard_normal(image.shape), 0, 255).astype(np.uint8)
-        target = flatten(noisy, 31)
-        found, ok = follow(flat, target, points, points, OPTIONS)
-        close = ok & (np.linalg.norm(found - points, axis=1) < 2.0)
-        errors.append(np.sqrt(np.mean((found - points)[close] ** 2)))
-        spread = patch_agreement(flat, target, points[close], found[close], half)[1]
-        told.append(np.sqrt(np.mean(spread**2)))
-    assert errors[2] > 4.0 * errors[0]
-    np.testing.assert_allclose(told, errors, rtol=0.25)
-
-
-def test_a_window_that_is_covered_in_part_is_told_by_its_spread(image):
-    """A disc moves over the image: its rim shifts what is found in the windows that straddle it."""
-    flat = flatten(image, 31)
-    points = spread_corners(flat, np.pad(np.full((400, 560), 255, np.uint8), 40), 300)
-    covered = image.copy()
-    cv2.circle(covered, (320, 240), 90, 150, -1, cv2.LINE_AA)
-    target = flatten(covered, 31)
-    found, ok = follow(flat, target, points, points, OPTIONS)
-    correlation, spread = patch_agreement(flat, target, points, found, 7)
-    far = np.linalg.norm(points - [320.0, 240.0], axis=1)
-    off = np.linalg.norm(found - points, axis=1)
-    passed = ok & (correlation > 0.6)
-    rim, free = passed & (far < 100.0), passed & (far > 130.0)
-    assert rim.sum() > 5
-    assert np.median(off[rim]) > 5.0 * np.median(off[free])
-    assert np.median(spread[rim]) > 5.0 * np.median(spread[free])
-
-
-def test_correlation_ignores_gain_and_offset_and_sees_difference(image):
-    centre = np.array([[320.0, 240.0], [100.0, 100.0]])
-    darker = (0.5 * image + 20).astype(np.uint8)
-    assert patch_correlation(image, darker, centre, centre, 7).min() > 0.99
-    assert patch_correlation(image, image, centre, centre + 35.0, 7).max() < 0.6
-    assert patch_correlation(image, image, centre, np.array([[-3.0, 5.0], [639.0, 5.0]]), 7).tolist() == [
-        -1,
-        -1,
-    ]
 
 
 def test_corners_are_spread_over_the_mask_and_stay_in_it(image):
@@ -162,7 +99,7 @@ def test_rendering_looks_like_the_frame_it_predicts():
     film = SheetFilm(model)
     first, second = sheet_state(0.0), sheet_state(0.15)
     flat = flatten(film.frame(first, noise=0.0)[..., 0], 31)
-    appearance = ReferenceAppearance(model, CAMERA, flat, view_of(model, CAMERA, first))
+    appearance = ReferenceAppearance(model, CAMERA, [flat], [view_of(model, CAMERA, first)])
     rendering = appearance.render(view_of(model, CAMERA, second))
     actual = flatten(film.frame(second, noise=0.0)[..., 0], 31)
     inside = interior(np.isfinite(rendering.depth), 20) > 0
@@ -176,13 +113,13 @@ def test_drawing_in_one_pass_equals_drawing_in_two(closed):
     model = bent_sheet_model(22, 16)
     texture = np.random.default_rng(4).integers(0, 256, (480, 640)).astype(np.uint8)
     view, other = (view_of(model, CAMERA, sheet_state(bend)) for bend in (0.0, 0.15))
-    pictures = []
+    pictures, places = [], view.pixels[model.triangles]
     for draw in (draw_textured, draw_textured_numpy):
         image, depth = np.full((480, 640), NEUTRAL, np.uint8), np.full((480, 640), np.inf, np.float32)
         # Something is drawn there already, nearer than the right half.
         depth[:, 320:400] = 0.01
         depths = np.ascontiguousarray(other.nodes[:, 2])
-        draw(other.pixels, depths, model.triangles, view.pixels, texture, closed, image, depth)
+        draw(other.pixels, depths, model.triangles, places, texture, closed, image, depth)
         pictures.append((image, depth))
     (image, depth), (expected, expected_depth) = pictures
     np.testing.assert_allclose(depth, expected_depth, rtol=1e-6)
@@ -197,7 +134,7 @@ def test_rendering_an_object_outside_the_image_is_empty():
     model = bent_sheet_model(22, 16)
     state = sheet_state(0.0)
     flat = np.full((480, 640), 90, np.uint8)
-    appearance = ReferenceAppearance(model, CAMERA, flat, view_of(model, CAMERA, state))
+    appearance = ReferenceAppearance(model, CAMERA, [flat], [view_of(model, CAMERA, state)])
     for position in ([9.0, 0.0, 0.6], [0.0, 0.0, -0.6]):
         away = State(state.parameters, RigidTransform(state.camera_from_object.rotation, np.array(position)))
         rendering = appearance.render(view_of(model, CAMERA, away))

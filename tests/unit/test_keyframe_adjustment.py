@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.geometry import RigidTransform, rotation_log
-from morph_dslam.online.mesh_registration.keyframe_adjustment import KeyframeAdjustment
+from morph_dslam.online.mesh_registration.keyframe_adjustment import AdjustedKeyframes, KeyframeAdjustment
 from morph_dslam.online.mesh_registration.scene import camera_from_object
 from morph_dslam.online.mesh_registration.similarity_of_path import similarity_of_path
 from morph_dslam.online.mesh_registration.surface import Axis
@@ -122,3 +122,32 @@ def test_derivatives_of_points_and_poses_are_those_of_differences():
     turn = rotation_log(pair[0].rotation @ pair[1].rotation.T) / (2 * h)
     np.testing.assert_allclose(slope[:3], turn, atol=1e-6)
     np.testing.assert_allclose(slope[3:], (pair[0].translation - pair[1].translation) / (2 * h), atol=1e-8)
+
+
+def test_the_causes_that_keyframes_share_make_up_each_covariance_and_what_two_have_in_common():
+    """Poses of eight keyframes err by seven causes in common, and each a little by itself."""
+    rng = np.random.default_rng(5)
+    scale = np.tile([1e-3, 1e-3, 1e-3, 3e-4, 3e-4, 3e-4], 8)
+    common = scale[:, None] * rng.standard_normal((48, 7))
+    own = 0.2 * scale
+    covariance = common @ common.T + np.diag(own**2)
+    adjusted = AdjustedKeyframes([], [RigidTransform(np.eye(3), np.zeros(3))] * 8, covariance, 0.1)
+    causes = adjusted.causes()
+    assert causes.shape == (8, 6, 8)
+    for k in range(8):
+        expected = adjusted.covariance_of(k)
+        np.testing.assert_allclose(causes[k] @ causes[k].T, expected, atol=1e-6 * np.abs(expected).max())
+    between = causes[1] @ causes[6].T / np.outer(scale[:6], scale[:6])
+    expected = (common[6:12] @ common[36:42].T) / np.outer(scale[:6], scale[:6])
+    assert np.abs(between - expected).max() < 0.15 * np.abs(expected).max()
+
+
+def test_causes_of_a_body_of_revolution_hold_nothing_of_its_turn():
+    rng = np.random.default_rng(6)
+    rows = rng.standard_normal((24, 9))
+    rows[[2, 8, 14, 20]] = 0.0
+    adjusted = AdjustedKeyframes([], [RigidTransform(np.eye(3), np.zeros(3))] * 4, rows @ rows.T, 0.1)
+    causes = adjusted.causes()
+    assert np.abs(causes[:, 2]).max() < 1e-6
+    for k in range(4):
+        np.testing.assert_allclose(causes[k] @ causes[k].T, adjusted.covariance_of(k), atol=1e-6)

@@ -18,7 +18,7 @@ from morph_dslam.online.reference.new_view import (
     sharpness,
     surface_spread,
 )
-from morph_dslam.online.reference.reference_view import ReferenceView
+from morph_dslam.online.reference.reference_view import KnownView, ReferenceView
 from morph_dslam.online.reference.surface_coverage import SurfaceSamples
 from morph_dslam.online.timing import StageClock
 from morph_dslam.online.tracker_options import TrackerOptions
@@ -38,7 +38,8 @@ def scene():
     """The first view, and an attempt at the picture of a later frame."""
     film = SheetFilm(bent_sheet_model(43, 31))
     estimator = Estimator(film.model, CAMERA)
-    view = ReferenceView(estimator, picture(film.frame(sheet_state(0.0))), sheet_state(0.0), OPTIONS)
+    known = KnownView(picture(film.frame(sheet_state(0.0))), sheet_state(0.0))
+    view = ReferenceView(estimator, [known], OPTIONS)
     estimation = FrameEstimation(estimator, view, OPTIONS)
 
     def attempt(image):
@@ -107,8 +108,7 @@ def test_nothing_is_bound_around_points_that_disagree_or_behind_another_object(s
     assert hidden[300:400, 400:500].mean() < 0.1
     depths = np.where(inside, np.float32(0.3), np.float32(np.inf))
     assert not seen_part(replace(made, in_front=depths), tried, should_be, view)[inside].any()
-    new = ReferenceView(
-        Estimator(film.model, CAMERA), made, tried.estimate.state, OPTIONS, seen, view.surface
-    )
+    found = KnownView(made, tried.estimate.state, seen=seen)
+    new = ReferenceView(Estimator(film.model, CAMERA), [found], OPTIONS, view.surface)
     places = np.rint(new.pixels).astype(int)
     assert seen[places[:, 1], places[:, 0]].all()

@@ -9,8 +9,8 @@ from morph_dslam.online.estimation.estimator import BoundPoints, EstimationOptio
 from morph_dslam.online.estimation.state import moved
 from morph_dslam.online.measuring.binding import bind_pixels, view_of
 from morph_dslam.online.uncertainty.reference_misfit import FLOOR_PX, ReferenceMisfit
-from morph_dslam.online.uncertainty.systematic_errors import SystematicErrors
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.one_view import errors_of
 from tests.support.rendered_sequence import CAMERA, sheet_state
 
 REFERENCE, LATER = sheet_state(0.1), sheet_state(0.6)
@@ -52,13 +52,13 @@ def test_a_reference_that_is_off_more_than_stated_is_found_to_be(times):
         surface, met = bind_pixels(model, CAMERA, view_of(model, CAMERA, off), seen[0])
         assert met.all()
         points = BoundPoints.from_surface(model, surface)
-        errors = SystematicErrors(estimator, points, off, np.diag(SPREAD**2), 17)
+        errors = errors_of(estimator, points, off, np.diag(SPREAD**2))
         estimate = estimator.estimate(points, seen[1], used.astype(float), LATER)
         estimate = replace(estimate, covariance=np.zeros((9, 9)))
         for _ in range(20):
             stated = errors.added(estimate, used, 0.0)
         found.append(errors.worse)
-        unlearnt = SystematicErrors(estimator, points, off, np.diag(SPREAD**2), 17)
+        unlearnt = errors_of(estimator, points, off, np.diag(SPREAD**2))
         before = unlearnt.added(estimate, used, 0.0, learns=False).covariance
         np.testing.assert_allclose(stated.covariance, errors.worse**2 * before, rtol=1e-9)
     found = np.sqrt(np.mean(np.square(found)))

@@ -113,7 +113,7 @@ def test_points_hidden_by_the_object_or_turned_away_are_not_visible():
     )
     front = State(np.zeros(3), FRONT)
     flat = np.full((480, 640), 90, np.uint8)
-    appearance = ReferenceAppearance(model, CAMERA, flat, view_of(model, CAMERA, front))
+    appearance = ReferenceAppearance(model, CAMERA, [flat], [view_of(model, CAMERA, front)])
 
     def visible(state):
         view = view_of(model, CAMERA, state)

@@ -9,8 +9,8 @@ from morph_dslam.online.estimation.estimator import BoundPoints, EstimationOptio
 from morph_dslam.online.estimation.state import moved
 from morph_dslam.online.measuring.binding import bind_pixels, view_of
 from morph_dslam.online.uncertainty.confidence import position_std
-from morph_dslam.online.uncertainty.systematic_errors import SystematicErrors
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.one_view import errors_of
 from tests.support.rendered_sequence import CAMERA, sheet_state
 
 REFERENCE, LATER = sheet_state(0.1), sheet_state(0.6)
@@ -54,7 +54,7 @@ def test_an_error_of_the_reference_moves_later_estimates_as_predicted(model, est
         points = bound(model, off, pixels)
         found = estimator.estimate(points, seen, weights, LATER)
         covariance = np.outer(step, step)
-        errors = SystematicErrors(estimator, points, off, covariance, 17)
+        errors = errors_of(estimator, points, off, covariance)
         used = np.ones(len(pixels), dtype=bool)
         plain = replace(found, covariance=np.zeros((9, 9)))
         stated = errors.added(plain, used, 0.0)
@@ -68,7 +68,7 @@ def test_an_error_of_the_reference_moves_later_estimates_as_predicted(model, est
 def test_in_the_reference_view_itself_the_error_is_that_of_the_reference(model, estimator, pixels):
     points = bound(model, REFERENCE, pixels)
     root = np.random.default_rng(1).standard_normal((9, 9)) * estimator.scale[:, None] * 1e-3
-    errors = SystematicErrors(estimator, points, REFERENCE, root @ root.T, 17)
+    errors = errors_of(estimator, points, REFERENCE, root @ root.T)
     found = estimator.estimate(points, pixels, np.ones(len(pixels)), REFERENCE)
     used = np.ones(len(pixels), dtype=bool)
     plain = replace(found, covariance=np.zeros((9, 9)))
@@ -78,7 +78,7 @@ def test_in_the_reference_view_itself_the_error_is_that_of_the_reference(model, 
 
 def test_what_neighbours_have_in_common_is_not_noise(model, estimator, pixels):
     points = bound(model, REFERENCE, pixels)
-    errors = SystematicErrors(estimator, points, REFERENCE, None, 17)
+    errors = errors_of(estimator, points, REFERENCE, None)
     found = estimator.estimate(points, pixels, np.ones(len(pixels)), REFERENCE)
     used = np.ones(len(pixels), dtype=bool)
     noise = np.random.default_rng(2).standard_normal(pixels.shape)
@@ -94,7 +94,7 @@ def test_what_neighbours_have_in_common_is_not_noise(model, estimator, pixels):
 
 def test_a_failure_of_the_model_widens_the_deviations(model, estimator, pixels):
     points = bound(model, REFERENCE, pixels)
-    errors = SystematicErrors(estimator, points, REFERENCE, None, 17)
+    errors = errors_of(estimator, points, REFERENCE, None)
     found = estimator.estimate(points, pixels, np.ones(len(pixels)), REFERENCE)
     used = np.ones(len(pixels), dtype=bool)
     narrow, wide = (errors.added(found, used, px) for px in (0.0, 1.0))
@@ -112,7 +112,7 @@ def test_a_smooth_error_of_the_model_is_stated_as_large_as_it_is_though_the_fit_
 ):
     """Random fields that vary over the whole object; what the fit leaves of them is a small part."""
     points = bound(model, REFERENCE, pixels)
-    errors = SystematicErrors(estimator, points, REFERENCE, None, 17)
+    errors = errors_of(estimator, points, REFERENCE, None)
     used = np.ones(len(pixels), dtype=bool)
     spread = np.sqrt(np.mean(np.sum((pixels - pixels.mean(axis=0)) ** 2, axis=1)))
     squared = np.sum((pixels[:, None] - pixels[None]) ** 2, axis=2)

@@ -37,11 +37,13 @@ from morph_dslam.online.frame_statement import FrameStatements, missed
 from morph_dslam.online.measuring.flow import flatten, follow
 from morph_dslam.online.measuring.measurement import Measurement
 from morph_dslam.online.recovering.look_alikes import LookAlikes
+from morph_dslam.online.reference.further_views import FurtherViews
 from morph_dslam.online.reference.reference_refinement import Keyframe
-from morph_dslam.online.reference.reference_view import ReferenceView
+from morph_dslam.online.reference.reference_view import KnownView, ReferenceView
 from morph_dslam.online.reference.reference_views import Change, FollowedView, ReferenceViews
 from morph_dslam.online.timing import StageClock
 from morph_dslam.online.tracker_options import TrackerOptions
+from morph_dslam.online.uncertainty.bound_part import causes_of
 
 Array = NDArray[np.float64]
 
@@ -59,6 +61,7 @@ class Tracker:
         known of the error of ``state``.
     seen : (h, w) where the object is seen in the reference frame; all that it covers by default.
     discrepancy : what the object's shape has beyond the model's in the reference frame, if it is known.
+    further : other pictures of the object as it is there; they bring the error of ``state`` with them.
 
     Attributes
     ----------
@@ -85,17 +88,18 @@ class Tracker:
         reference_covariance: Array | None = None,
         seen: NDArray[np.bool_] | None = None,
         discrepancy: Discrepancy | None = None,
+        further: FurtherViews | None = None,
     ) -> None:
         self.model, self.camera, self.options = model, camera, options or TrackerOptions()
         self.estimator = Estimator(model, camera, self.options.estimation)
         self._undistortion = camera.undistortion_maps()
         picture = reference if isinstance(reference, Picture) else self._prepare(reference)
-        reference_view = ReferenceView(
-            self.estimator, picture, state, self.options, seen, discrepancy=discrepancy
-        )
+        further = further or FurtherViews(causes_of(reference_covariance, self.estimator.scale))
+        first = KnownView(picture, state, further.causes, seen, discrepancy)
+        reference_view = ReferenceView(self.estimator, [first, *further.views], self.options)
         sought = self.options.discrepancy
         self._discrepancy = None if sought is None else DiscrepancyFit(model, camera, sought)
-        self._views = ReferenceViews(self.estimator, reference_view, reference_covariance, self.options)
+        self._views = ReferenceViews(self.estimator, reference_view, self.options)
         self._anchoring = Anchoring(self.estimator, reference_view, self.options)
         self._filter = new_filter(self.estimator, self.options)
         self._unfiltered = np.zeros((len(model.parameters) + 6,) * 2)

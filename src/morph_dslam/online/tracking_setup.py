@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -25,8 +26,11 @@ from morph_dslam.online.anchored.anchor import Anchor
 from morph_dslam.online.attempt import Picture
 from morph_dslam.online.chain import Chain
 from morph_dslam.online.estimation.discrepancy import DiscrepancyOptions
+from morph_dslam.online.estimation.estimator import Estimator, State
 from morph_dslam.online.measuring.outline import rim
 from morph_dslam.online.pipeline import Tracker
+from morph_dslam.online.reference.further_views import FurtherViews, choose_further
+from morph_dslam.online.reference.reference_view import KnownView
 from morph_dslam.online.slam.map_file import load_map
 from morph_dslam.online.start.placement import Placement, load_placement, place_by_landmarks
 from morph_dslam.online.start.registration import RegistrationOptions
@@ -88,7 +92,7 @@ class Setup:
     ----------
     model : as it is in its file. placement : None as long as the frame that landmarks belong to is not there.
     map_path : of the map that the object is anchored in; None if it is free.
-    reference : the keyframe of that map in which the object is, None where a frame has to be it.
+    keyframes : of that map, by frame, in which the object is; none where a frame has to be the reference.
     aid : that places the object in the reference frame; None if something else does.
     """
 
@@ -99,8 +103,36 @@ class Setup:
     inner: tuple[InnerStructure, ...]
     placement: Placement | None
     map_path: Path | None
-    reference: Picture | None
+    keyframes: Mapping[int, Picture]
     aid: Aid | None = None
+
+    @property
+    def reference(self) -> Picture | None:
+        """The keyframe that the object is placed in; None where a frame has to be it."""
+        if self.placement is None or self.placement.frame is None:
+            return None
+        return self.keyframes.get(self.placement.frame)
+
+    @cached_property
+    def further(self) -> FurtherViews | None:
+        """Other keyframes that show more of the object, where it is known how they are off with the first."""
+        placement = self.placement
+        if placement is None or not len(self.keyframes) or not placement.views:
+            return None
+        d = len(placement.model.parameters)
+        views = [
+            KnownView(
+                self.keyframes[view.frame],
+                State(placement.model.default, view.pose),
+                np.vstack([np.zeros((d, view.causes.shape[1])), view.causes]),
+            )
+            for view in placement.views
+            if view.frame in self.keyframes
+        ]
+        if len(views) < 2:
+            return None
+        estimator = Estimator(placement.model, self.camera)
+        return choose_further(estimator, views[0], views[1:], self.tracker_options(placement))
 
     def placed(
         self, image: NDArray[np.uint8] | Picture, depth: NDArray[np.float32] | None = None
@@ -147,7 +179,12 @@ class Setup:
         in_sequence: bool,
         seen: NDArray[np.bool_] | None = None,
     ) -> Tracker:
-        """A tracker at its beginning; see `Tracker` for the arguments."""
+        """A tracker at its beginning; see `Tracker` for the arguments.
+
+        Where other objects hide a part of it in the reference, they may in other pictures too; none of these
+        is taken then.
+        """
+        by_map = self.reference is not None and reference is self.reference and seen is None
         return Tracker(
             placement.model,
             self.camera,
@@ -158,6 +195,7 @@ class Setup:
             placement.covariance,
             seen,
             placement.discrepancy,
+            self.further if by_map and not __import__("os").environ.get("ONE") else None,
         )
 
     def new_chain(
@@ -224,17 +262,17 @@ def load_setup(options: ObjectOptions) -> Setup:
         structure.carried_by(model)  # says so before the tracking if it is not for this model
     if options.placement is None:
         landmarks = None if options.landmarks is None else load_landmarks(options.landmarks)
-        return Setup(options, model, camera, landmarks, inner, None, None, None, aid)
+        return Setup(options, model, camera, landmarks, inner, None, None, {}, aid)
     placement, path = load_placement(options.placement, model), None
     if options.pose != "free":
         path = _map_of(options.placement, options.map_path)
         if path is None:
             note = "no map was given or found beside the registration: the object is tracked as a free one"
             placement = replace(placement, flags=(*placement.flags, note))
-    reference = None
+    keyframes: dict[int, Picture] = {}
     if path is not None and not options.use_outline:
-        reference = _keyframe(path, camera, placement)
-    return Setup(options, model, camera, None, inner, placement, path, reference)
+        keyframes = _keyframes(path, camera, placement)
+    return Setup(options, model, camera, None, inner, placement, path, keyframes)
 
 
 def _map_of(registration: Path, given: Path | None) -> Path | None:
@@ -248,13 +286,18 @@ def _map_of(registration: Path, given: Path | None) -> Path | None:
     return next((path for path in beside if path.is_file()), None)
 
 
-def _keyframe(path: Path, camera: PinholeCamera, placement: Placement) -> Picture:
-    """The keyframe that the placement is for; its image is flattened, which is all that is needed of it."""
+def _keyframes(path: Path, camera: PinholeCamera, placement: Placement) -> dict[int, Picture]:
+    """The keyframes that the placement is for; their images are flattened, which is all that is needed."""
+    wanted, pictures = {placement.frame, *(view.frame for view in placement.views)}, {}
     for keyframe in load_map(path, camera).keyframes:
+        if keyframe.index not in wanted:
+            continue
+        pictures[keyframe.index] = Picture(keyframe.flat, keyframe.flat)
         if keyframe.index == placement.frame and placement.place is not None:
             _check_pose(path, placement, placement.place.pose_in(keyframe.camera_from_world))
-            return Picture(keyframe.flat, keyframe.flat)
-    raise MapError(f"{path} is not the map of the registration: it has no keyframe {placement.frame}")
+    if placement.frame not in pictures:
+        raise MapError(f"{path} is not the map of the registration: it has no keyframe {placement.frame}")
+    return pictures
 
 
 def _check_pose(path: Path, placement: Placement, by_map: RigidTransform) -> None:

@@ -1,11 +1,12 @@
-"""What the object looks like: the reference image as its texture, rendered in any other state.
+"""What the object looks like: the reference pictures as its texture, rendered in any other state.
 
-Measurements against this rendering always refer to the reference view, so their errors do not accumulate
+Measurements against this rendering always refer to the reference pictures, so their errors do not accumulate
 from frame to frame, and points that were hidden come back by themselves.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,26 +36,40 @@ class Rendering:
 
 
 class ReferenceAppearance:
-    """The reference view as a texture.
+    """Reference pictures as a texture.
 
     Parameters
     ----------
-    flat : (h, w) the flattened reference image. view : the mesh in it. closed : see `rasterise`.
+    flats : (h, w) each, the flattened pictures. views : the mesh in each of them.
+    sources : (m,) the picture that gives each triangle its texture; the first by default.
+    closed : see `rasterise`.
+
+    Attributes
+    ----------
+    facing : (m,) which side of each triangle its picture shows; see `binding.facing`.
     """
 
     def __init__(
         self,
         model: ReducedModel,
         camera: PinholeCamera,
-        flat: NDArray[np.uint8],
-        view: View,
+        flats: Sequence[NDArray[np.uint8]],
+        views: Sequence[View],
+        sources: NDArray[np.int64] | None = None,
         closed: bool = False,
     ) -> None:
         self._triangles, self._closed = np.ascontiguousarray(model.triangles, dtype=np.int64), closed
         self._camera = camera
-        self._texture = np.ascontiguousarray(flat)
-        self._coordinates = np.ascontiguousarray(view.pixels)
-        self.facing = facing(view, model.triangles)
+        sources = np.zeros(len(self._triangles), dtype=np.int64) if sources is None else sources
+        # One picture below the other, so that a triangle's place says which one it is from.
+        self._texture = np.ascontiguousarray(np.concatenate(flats))
+        self._coordinates = np.empty((len(self._triangles), 3, 2))
+        self.facing = np.empty(len(self._triangles), dtype=bool)
+        for number, view in enumerate(views):
+            rows = sources == number
+            below = np.array([0.0, number * camera.height])
+            self._coordinates[rows] = view.pixels[self._triangles[rows]] + below
+            self.facing[rows] = facing(view, self._triangles[rows])
 
     def render(self, view: View) -> Rendering:
         """The object alone, in another view of it."""

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from morph_dslam.model import SurfacePoints
 from morph_dslam.online.measuring.appearance import ReferenceAppearance, Rendering
 from morph_dslam.online.measuring.binding import View, facing
-from morph_dslam.online.measuring.flow import FlowOptions, follow, patch_agreement
+from morph_dslam.online.measuring.flow import FlowOptions, follow
+from morph_dslam.online.measuring.patches import compare_patches
 from morph_dslam.render.rasteriser import visible_points
 
 Array = NDArray[np.float64]
@@ -45,7 +46,7 @@ class Measurement:
     ----------
     pixels : (p, 2) where they were found. valid : (p,) which to believe.
     visible : (p,) which no other part of the object hides.
-    spread : (p,) how exactly by what the patches differ, pixels, up to a factor; see `patch_agreement`.
+    spread : (p,) how exactly by what the patches differ, pixels, up to a factor; see `compare_patches`.
     depth : (h, w) metres, of the object as it was drawn for the comparison; None where it was not.
     """
 
@@ -96,11 +97,12 @@ def compare_with_rendering(
     rows = np.flatnonzero(visible)
     near = replace(flow, levels=min(flow.levels, CORRECTION_LEVELS))
     found, ok = follow(rendering.image, frame, predicted[rows], guesses[rows], near)
-    correction = np.linalg.norm(found - predicted[rows], axis=1)
-    correlation, exactness = patch_agreement(
+    found, correlation, exactness = compare_patches(
         rendering.image, frame, predicted[rows], found, options.patch_half
     )
-    ok &= (correction < options.largest_correction_px) & (correlation > options.least_correlation)
+    correction = np.linalg.norm(found - predicted[rows], axis=1)
+    ok &= (correction < options.largest_correction_px) & np.isfinite(exactness)
+    ok &= correlation > options.least_correlation
     pixels, valid = predicted.copy(), np.zeros(len(predicted), dtype=bool)
     spread = np.full(len(predicted), np.inf)
     pixels[rows], valid[rows], spread[rows] = found, ok, exactness

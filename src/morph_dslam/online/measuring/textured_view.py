@@ -55,8 +55,8 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
 
     Parameters
     ----------
-    pixels, depths, triangles, closed : see `rasterise`. coordinates : (n, 2) column and row of each node in
-        the texture, texture pixels; coordinates outside it take its border. texture : (H, W) uint8.
+    pixels, depths, triangles, closed : see `rasterise`. coordinates : (m, 3, 2) column and row of each
+        triangle's corners in the texture, texture pixels; outside it is its border. texture : (H, W) uint8.
     image, depth : (h, w) uint8 and float32, the unit of ``depths``; changed where the surface is nearest.
     """
     u, v, q, x, y = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -65,8 +65,7 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
         if area == 0.0:
             continue
         for corner in range(3):
-            node = triangles[t, corner]
-            x[corner], y[corner] = coordinates[node, 0], coordinates[node, 1]
+            x[corner], y[corner] = coordinates[t, corner, 0], coordinates[t, corner, 1]
         _draw_triangle(area, u, v, q, x, y, texture, image, depth)
 
 
@@ -74,5 +73,6 @@ def draw_textured_numpy(pixels, depths, triangles, coordinates, texture, closed,
     """The plain twin of `draw_textured`, in two passes."""
     buffers = rasterise(pixels, depths, triangles, *depth.shape, closed=closed)
     nearest = buffers.depth < depth
-    image[nearest] = render_textured(buffers, triangles, coordinates, texture)[nearest]
+    corners = np.arange(3 * len(triangles)).reshape(-1, 3)
+    image[nearest] = render_textured(buffers, corners, coordinates.reshape(-1, 2), texture)[nearest]
     depth[nearest] = buffers.depth[nearest]

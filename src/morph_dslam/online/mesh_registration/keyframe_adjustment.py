@@ -48,6 +48,8 @@ ACROSS_PATCHES = 9.0 / 4.0
 IN_COMMON = 16.0 / 9.0
 #: Directions that are seen worse than this, over the best one, stay as they are.
 LEAST_SEEN = 1e-9
+#: Errors of all poses together are given by so many causes: the registration's seven, and one more.
+N_CAUSES = 8
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,30 @@ class AdjustedKeyframes:
         """That of one pose, (6, 6)."""
         part = slice(6 * view, 6 * view + 6)
         return self.covariance[part, part]
+
+    def causes(self) -> Array:
+        """How each pose is off (K, 6, c) by the few causes that most of the errors have in common.
+
+        What is a keyframe's own is added to that, in its own directions: a pose's rows times their transpose
+        are its whole covariance.
+        """
+        size = len(self.covariance)
+        scale = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
+        values, vectors = np.linalg.eigh(self.covariance / np.outer(scale, scale))
+        leading = np.arange(size) >= size - N_CAUSES
+        roots = vectors[:, leading] * np.sqrt(np.maximum(values[leading], 0.0))
+        causes = (scale[:, None] * roots).reshape(-1, 6, roots.shape[1])
+        return np.stack([_filled_up(part, self.covariance_of(view)) for view, part in enumerate(causes)])
+
+
+def _filled_up(causes: Array, covariance: Array) -> Array:
+    """Causes (6, c), c >= 6, changed as little as can be so that they make up a covariance (6, 6)."""
+    values, vectors = np.linalg.eigh(covariance)
+    roots = np.sqrt(np.maximum(values, 0.0))
+    # Nothing is known of the turn about an axis, and nothing of it is in either.
+    weights = np.where(roots > 1e-9 * roots[-1], 1.0 / np.maximum(roots, 1e-300), 0.0)
+    left, _, right = np.linalg.svd(weights[:, None] * (vectors.T @ causes), full_matrices=False)
+    return np.asarray((vectors * roots) @ left @ right, dtype=np.float64)
 
 
 class KeyframeAdjustment:

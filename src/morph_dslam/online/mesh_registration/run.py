@@ -88,8 +88,12 @@ def _content(found: MeshRegistration, nodes: NDArray[np.float64]) -> dict[str, A
 
 
 def _keyframes(found: MeshRegistration, views: Sequence[View]) -> list[dict[str, Any]]:
-    """The object's pose in every keyframe, metres, with its covariance where it has one of its own."""
+    """The object's pose in every keyframe, metres, with its covariance where it has one of its own.
+
+    With it, the derivatives of the pose by what all keyframes' errors have in common.
+    """
     adjusted = found.keyframes
+    causes = None if adjusted is None else adjusted.causes()
     row = {} if adjusted is None else {view.frame: k for k, view in enumerate(adjusted.views)}
     poses = []
     for view in views:
@@ -98,6 +102,8 @@ def _keyframes(found: MeshRegistration, views: Sequence[View]) -> list[dict[str,
             pose = adjusted.poses[row[view.frame]]
             covariance = adjusted.covariance_of(row[view.frame]).tolist()
         entry = {"frame": view.frame, "camera_from_object": pose.matrix.tolist(), "covariance": covariance}
+        if causes is not None and view.frame in row:
+            entry["causes"] = causes[row[view.frame]].tolist()
         poses.append(entry)
     return poses
 

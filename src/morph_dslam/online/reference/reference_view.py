@@ -1,8 +1,14 @@
-"""The reference view: the object's texture, the points bound in it, and features to find it again by."""
+"""The reference view: the object's texture, the points bound in it, and features to find it again by.
+
+Of an object in a map there are many pictures, from all sides from which it was scanned. What the first one
+does not show, or shows very flat, takes its texture and its points from another.
+"""
 
 from __future__ import annotations
 
-from functools import cached_property
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,30 +34,55 @@ from morph_dslam.online.measuring.measurement import (
     visible_surface,
 )
 from morph_dslam.online.measuring.outline import Outline
+from morph_dslam.online.measuring.texture_sources import choose_sources, part_from, shown_areas
 from morph_dslam.online.recovering.relocalisation import Relocaliser
+from morph_dslam.online.reference.surface_coverage import SurfaceSamples
 from morph_dslam.online.timing import StageClock
 from morph_dslam.online.tracker_options import TrackerOptions
+from morph_dslam.online.uncertainty.bound_part import BoundPart
 from morph_dslam.online.uncertainty.measurement_noise import Measured, window_correlation
 from morph_dslam.render.rasteriser import visible_points
 
 Array = NDArray[np.float64]
 
+#: With several pictures there are at most so many times the points of one.
+MOST_TIMES = 2.0
+
+
+@dataclass(frozen=True)
+class KnownView:
+    """A picture of the object in a known state.
+
+    Attributes
+    ----------
+    causes : (d + 6, c) how ``state`` is off by c causes, the same for all views of an object, in their
+        standard deviations; None where nobody knows.
+    seen : (h, w) where the picture shows the object; None where it is all that it covers.
+    discrepancy : what the object's shape has beyond the model's in it, where that is known.
+    """
+
+    picture: Picture
+    state: State
+    causes: Array | None = None
+    seen: NDArray[np.bool_] | None = None
+    discrepancy: Discrepancy | None = None
+
 
 class ReferenceView:
-    """A registered view of the object.
+    """A registered view of the object, or several of the same undeformed one.
 
     Parameters
     ----------
-    picture : the view. state : the object in it.
-    seen : (h, w) where the object is seen; None where it is all that it covers. Nothing is bound elsewhere.
+    views : the view, and others that show what it does not. Nothing is bound but where they show the object.
     surface : what of the model is drawn, if another view knows it already.
-    discrepancy : what the object's shape has beyond the model's in this view, where that is known.
-    least_broadness : points do not count where the surface is seen flatter than in this view, by this factor
+    least_broadness : points do not count where the surface is seen flatter than in their view, by this factor
         of its area or a smaller one.
 
     Attributes
     ----------
-    surface : what of the model is drawn. points : p of them, bound in the view. pixels : (p, 2) there.
+    state : in the first view. surface : what of the model is drawn.
+    points : p of them, bound in the views. parts : which of them in which view, in order.
+    pixels : (p, 2) where they are in the first view, hidden or not.
     outline : the object's rim, None where it is not used. all_points : with those of the outline.
     correlation : of the errors of all points' measurements.
 
@@ -64,37 +95,42 @@ class ReferenceView:
     def __init__(
         self,
         estimator: Estimator,
-        picture: Picture,
-        state: State,
+        views: Sequence[KnownView],
         options: TrackerOptions,
-        seen: NDArray[np.bool_] | None = None,
         surface: DrawnSurface | None = None,
         least_broadness: float = 0.0,
-        discrepancy: Discrepancy | None = None,
     ) -> None:
-        self._estimator, self._options, self.state = estimator, options, state
-        model, camera = estimator.model, estimator.camera
+        self._estimator, self._options, self._views = estimator, options, views
+        model, camera, first = estimator.model, estimator.camera, views[0]
+        self.state = first.state
         self.surface = surface or DrawnSurface.of(model)
         drawn = self.surface.model
-        view = view_of(drawn, camera, state, discrepancy)
-        self.appearance = ReferenceAppearance(drawn, camera, picture.flat, view, self.surface.closed)
-        if seen is None:
-            seen = draw_view(view, drawn.triangles, camera).covered
-        mask = interior(seen, options.measurement.patch_half + 2)
-        self.points = self._choose_points(picture, mask, view)
-        beyond = np.zeros((1, 3)) if discrepancy is None else discrepancy.displacement(self.points.rest)
-        turned = beyond @ state.camera_from_object.rotation.T
-        self.pixels = camera.project(self.points.in_camera(state) + turned)
-        self._least_broadness = least_broadness * broadness(
-            view, drawn.triangles[self.points.surface.triangles]
+        meshes = [view_of(drawn, camera, view.state, view.discrepancy) for view in views]
+        masks, per_pixel = self._draw(meshes)
+        bound = self._bind(meshes, masks, per_pixel)
+        self.points = reduce(BoundPoints.joined, bound)
+        ends = np.cumsum([len(points) for points in bound])
+        self.parts = [
+            BoundPart(slice(end - len(points), end), view.state, view.causes)
+            for end, points, view in zip(ends.tolist(), bound, views, strict=True)
+        ]
+        beyond = np.zeros((1, 3))
+        if first.discrepancy is not None:
+            beyond = first.discrepancy.displacement(self.points.rest)
+        turned = beyond @ self.state.camera_from_object.rotation.T
+        self.pixels = camera.project(self.points.in_camera(self.state) + turned)
+        self._least_broadness = least_broadness * np.concatenate(
+            [
+                broadness(mesh, drawn.triangles[points.surface.triangles])
+                for mesh, points in zip(meshes, bound, strict=True)
+            ]
         )
-        self._grey, self._mask, self._view = picture.grey, mask, view
+        self._mask, self._mesh = masks[0], meshes[0]
         self.outline, self.all_points = None, self.points
         if options.use_outline:
-            self.outline = Outline(model, camera, picture.grey, state, options.outline)
+            self.outline = Outline(model, camera, first.picture.grey, self.state, options.outline)
             self.all_points = self.points.joined(self.outline.points)
-        places = camera.project(self.all_points.in_camera(state))
-        self.correlation = window_correlation(places, options.flow.window)
+        self.correlation = self._correlation()
 
     def take_features(self) -> None:
         """Take the features that a lost object is looked for by, unless that was done already."""
@@ -103,7 +139,8 @@ class ReferenceView:
     @cached_property
     def relocaliser(self) -> Relocaliser:
         """Finds the object by the view's features; these are taken when it is first asked for."""
-        return Relocaliser(self._estimator, self.surface.model, self._grey, self._mask, self._view)
+        grey = self._views[0].picture.grey
+        return Relocaliser(self._estimator, self.surface.model, grey, self._mask, self._mesh)
 
     @property
     def redundancy(self) -> float:
@@ -126,6 +163,11 @@ class ReferenceView:
         """Depth (h, w) of the object in a state, metres, infinite where it is not."""
         camera, drawn = self._estimator.camera, self.surface.model
         return draw_view(view_of(drawn, camera, state), drawn.triangles, camera).depth
+
+    def shown(self, samples: SurfaceSamples) -> Array:
+        """What the pictures show of each sample (k,), as `SurfaceSamples.seen` has it, the most of all."""
+        seen = np.stack([samples.seen(view.state, self.depth(view.state)) for view in self._views])
+        return seen[np.abs(seen).argmax(axis=0), np.arange(seen.shape[1])]
 
     def projected(self, state: State) -> Array:
         """Where the points (p, 2) are in the image in a state, pixels; NaN behind the camera."""
@@ -171,13 +213,67 @@ class ReferenceView:
                 self._options.measurement,
             )
 
-    def _choose_points(self, picture: Picture, mask: NDArray[np.uint8], view: View) -> BoundPoints:
+    def _draw(self, meshes: Sequence[View]) -> tuple[list[NDArray[np.uint8]], float]:
+        """Make the texture.
+
+        Returns
+        -------
+        masks : (h, w) each, 255 where points may be bound in the picture. per_pixel : how many a pixel.
+        """
+        drawn, closed, camera = self.surface.model, self.surface.closed, self._estimator.camera
+        buffers = [draw_view(mesh, drawn.triangles, camera) for mesh in meshes]
+        seen = [
+            buffer.covered if view.seen is None else view.seen & buffer.covered
+            for view, buffer in zip(self._views, buffers, strict=True)
+        ]
+        sources = np.zeros(len(drawn.triangles), dtype=np.int64)
+        if len(meshes) > 1:
+            # Where something else is before the object nothing of it is shown, as if that were at depth 0.
+            depths = [
+                np.where(buffer.covered & ~shown, np.float32(0.0), buffer.depth)
+                for buffer, shown in zip(buffers, seen, strict=True)
+            ]
+            sources = choose_sources(
+                [
+                    shown_areas(mesh, drawn.triangles, depth, closed)
+                    for mesh, depth in zip(meshes, depths, strict=True)
+                ]
+            )
+        flats = [view.picture.flat for view in self._views]
+        self.appearance = ReferenceAppearance(drawn, camera, flats, meshes, sources, closed)
+        masks = [interior(shown, self._options.measurement.patch_half + 2) for shown in seen]
+        per_pixel = self._options.n_points / max(np.count_nonzero(masks[0]), 1)
+        for number, (mask, buffer) in enumerate(zip(masks, buffers, strict=True)):
+            mask[~part_from(number, buffer.triangle_ids, sources)] = 0
+        return masks, per_pixel
+
+    def _bind(
+        self, meshes: Sequence[View], masks: Sequence[NDArray[np.uint8]], per_pixel: float
+    ) -> list[BoundPoints]:
+        """Corners of every picture bound to the mesh, as dense in the others as in the first."""
         model, camera = self._estimator.model, self._estimator.camera
-        corners = spread_corners(picture.flat, mask, self._options.n_points)
-        surface, _ = bind_pixels(self.surface.model, camera, view, corners)
-        if len(surface) < 2 * (len(model.parameters) + 6):
+        counts = per_pixel * np.array([np.count_nonzero(mask) for mask in masks])
+        counts *= min(1.0, MOST_TIMES * self._options.n_points / max(counts.sum(), 1.0))
+        bound = []
+        for view, mesh, mask, count in zip(self._views, meshes, masks, counts, strict=True):
+            corners = spread_corners(view.picture.flat, mask, max(round(count), 1))
+            surface, _ = bind_pixels(self.surface.model, camera, mesh, corners)
+            bound.append(BoundPoints.from_surface(model, surface))
+        found = sum(len(points) for points in bound)
+        if found < 2 * (len(model.parameters) + 6):
             raise RegistrationError(
-                f"the object shows only {len(surface)} corners in the reference frame, too few to follow it: "
+                f"the object shows only {found} corners in the reference frame, too few to follow it: "
                 "take a sharper reference frame, or give the object a printed texture"
             )
-        return BoundPoints.from_surface(model, surface)
+        return bound
+
+    def _correlation(self) -> Array:
+        """Of the points' errors (p, p): those of one picture share what their windows do."""
+        camera, window = self._estimator.camera, self._options.flow.window
+        result = np.zeros((len(self.all_points),) * 2)
+        ends = [*(part.rows.stop for part in self.parts[:-1]), len(self.all_points)]
+        for part, end in zip(self.parts, ends, strict=True):
+            rows = slice(part.rows.start, end)
+            places = camera.project(self.all_points.in_camera(part.state)[rows])
+            result[rows, rows] = window_correlation(places, window)
+        return result

@@ -20,10 +20,11 @@ from morph_dslam.online.estimation.filter_memory import PointChange
 from morph_dslam.online.frame_estimation import FrameEstimation
 from morph_dslam.online.recovering.recovery import Recovery
 from morph_dslam.online.reference.new_view import is_known_well, is_sharp, seen_part, surface_spread
-from morph_dslam.online.reference.reference_view import ReferenceView
+from morph_dslam.online.reference.reference_view import KnownView, ReferenceView
 from morph_dslam.online.reference.surface_coverage import SurfaceSamples, choose_view, covered_share
 from morph_dslam.online.timing import StageClock
 from morph_dslam.online.tracker_options import TrackerOptions
+from morph_dslam.online.uncertainty.bound_part import causes_of
 from morph_dslam.online.uncertainty.systematic_errors import SystematicErrors
 
 Array = NDArray[np.float64]
@@ -59,17 +60,16 @@ class FollowedView:
     def of(
         cls,
         reference: ReferenceView,
-        covariance: Array | None,
         estimator: Estimator,
         options: TrackerOptions,
         number: int = 0,
         error: float = 0.0,
     ) -> FollowedView:
-        """Parameters: ``covariance`` (d + 6, d + 6) of the reference's state, None where it is not known."""
+        """A view that is to be followed from now on, with these numbers."""
         estimation = FrameEstimation(estimator, reference, options)
         recovery = Recovery(estimator.model, estimator.camera, reference, estimation, options)
         window = options.flow.window
-        systematic = SystematicErrors(estimator, reference.points, reference.state, covariance, window)
+        systematic = SystematicErrors(estimator, reference.points, reference.parts, window)
         return cls(number, reference, estimation, recovery, systematic, error)
 
 
@@ -95,11 +95,10 @@ class _BegunView:
 
     Attributes
     ----------
-    covariance : (d + 6, d + 6) of its state. error : as in `FollowedView`. seen : of `SurfaceSamples` in it.
+    error : as in `FollowedView`. seen : of `SurfaceSamples` in it.
     """
 
     reference: ReferenceView
-    covariance: Array
     error: float
     seen: Array
 
@@ -109,7 +108,7 @@ class ReferenceViews:
 
     Parameters
     ----------
-    reference : the first view. covariance : (d + 6, d + 6) of its state; None where it is not known.
+    reference : the first view.
 
     Attributes
     ----------
@@ -120,15 +119,13 @@ class ReferenceViews:
         self,
         estimator: Estimator,
         reference: ReferenceView,
-        covariance: Array | None,
         options: TrackerOptions,
     ) -> None:
         self._estimator, self._options = estimator, options
         self._size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
         self._samples = SurfaceSamples(estimator, reference.surface)
-        self.active = FollowedView.of(reference, covariance, estimator, options)
-        seen = self._samples.seen(reference.state, reference.depth(reference.state))
-        self._kept, self._seen = [self.active], [seen]
+        self.active = FollowedView.of(reference, estimator, options)
+        self._kept, self._seen = [self.active], [reference.shown(self._samples)]
         self._n_made, self._n_frames, self._pause = 0, 0, 0
         self._followed = self.active
         self._begun: _BegunView | None = None
@@ -219,13 +216,13 @@ class ReferenceViews:
             return None
         seen = seen_part(picture, attempt, should_be, old)
         try:
-            made = ReferenceView(
-                estimator, picture, stated.state, options, seen, surface, LEAST_BROADNESS, attempt.discrepancy
-            )
+            causes = causes_of(stated.covariance, estimator.scale)
+            view = KnownView(picture, stated.state, causes, seen, attempt.discrepancy)
+            made = ReferenceView(estimator, [view], options, surface, LEAST_BROADNESS)
         except RegistrationError:
             self._pause = PAUSE
             return None
-        return _BegunView(made, stated.covariance, spread, now)
+        return _BegunView(made, spread, now)
 
     def _gone_on(self, state: State) -> Change | None:
         """A change to the view that was begun, the object being in ``state`` by now.
@@ -237,9 +234,7 @@ class ReferenceViews:
             self.active.reference.take_features()
             return None
         self._n_made += 1
-        view = FollowedView.of(
-            begun.reference, begun.covariance, self._estimator, self._options, self._n_made, begun.error
-        )
+        view = FollowedView.of(begun.reference, self._estimator, self._options, self._n_made, begun.error)
         self._kept.append(view)
         self._seen.append(begun.seen)
         if len(self._kept) > self._options.max_views:

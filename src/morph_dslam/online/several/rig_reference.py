@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from morph_dslam.online.estimation.estimator import Estimate, Prior
 from morph_dslam.online.pipeline import Tracker
 from morph_dslam.online.several.rig import RigCamera
+from morph_dslam.online.uncertainty.bound_part import BoundPart
 from morph_dslam.online.uncertainty.measurement_noise import RigMeasured
 from morph_dslam.online.uncertainty.systematic_errors import SystematicErrors, inverse_of_seen
 
@@ -42,8 +43,7 @@ class RigReference:
             SystematicErrors(
                 tracker.estimator,
                 tracker.reference.points,
-                tracker.reference.state,
-                None,
+                [BoundPart(slice(None), tracker.reference.state, None)],
                 tracker.options.flow.window,
             )
             for tracker in trackers

@@ -129,7 +129,7 @@ def _with_reference(setup: Setup, options: TrackOptions) -> tuple[Setup, TrackOp
     covariance[d:, d:] = located.known.covariance
     state = State(placement.model.default, located.known.pose)
     placed = replace(placement, frame=number, state=state, covariance=covariance)
-    setup = replace(setup, placement=placed, reference=None)
+    setup = replace(setup, placement=placed, keyframes={})
     return setup, with_reference(options, setup)
 
 

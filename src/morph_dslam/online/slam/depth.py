@@ -14,7 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from morph_dslam.online.measuring.flow import FlowOptions, follow, patch_correlation
+from morph_dslam.online.measuring.flow import FlowOptions, follow
+from morph_dslam.online.measuring.patches import patch_correlation
 from morph_dslam.online.slam.options import SlamOptions
 
 Array = NDArray[np.float64]

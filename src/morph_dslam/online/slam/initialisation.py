@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from morph_dslam.geometry import rotation_log
 from morph_dslam.online.measuring.features import spread_corners
-from morph_dslam.online.measuring.flow import follow, patch_correlation
+from morph_dslam.online.measuring.flow import follow
+from morph_dslam.online.measuring.patches import patch_correlation
 from morph_dslam.online.slam.bundle_adjustment import Observations, adjust
 from morph_dslam.online.slam.frame_images import FrameView
 from morph_dslam.online.slam.options import SlamOptions

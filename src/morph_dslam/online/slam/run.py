@@ -18,7 +18,7 @@ from morph_dslam.io.colmap_model import read_colmap_model
 from morph_dslam.io.stereo_calibration import load_camera_or_pair
 from morph_dslam.io.trajectory import load_trajectory
 from morph_dslam.io.video import VideoWriter
-from morph_dslam.online.measuring.flow import patch_correlation
+from morph_dslam.online.measuring.patches import patch_correlation
 from morph_dslam.online.runs.output_folders import check_run_folder
 from morph_dslam.online.side_by_side import threads_side_by_side
 from morph_dslam.online.slam.bundle_adjustment import Observations, adjust

@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.online.measuring.flow import FlowOptions, follow, patch_correlation
+from morph_dslam.online.measuring.flow import FlowOptions, follow
+from morph_dslam.online.measuring.patches import patch_correlation
 from morph_dslam.online.slam.consensus import Sight
 from morph_dslam.online.slam.depth import FrameDepth
 from morph_dslam.online.slam.options import SlamOptions

@@ -30,6 +30,21 @@ LANDMARK_PX, LEAST_LANDMARK_PX = 2.0, 0.1
 
 
 @dataclass(frozen=True)
+class PlacedView:
+    """The undeformed object in a keyframe of the map.
+
+    Attributes
+    ----------
+    frame : number of the keyframe. causes : (6, c) how ``pose`` is off by c causes, the same for all
+        keyframes, in their standard deviations.
+    """
+
+    frame: int
+    pose: RigidTransform
+    causes: Array
+
+
+@dataclass(frozen=True)
 class Placement:
     """An object in a reference frame.
 
@@ -43,6 +58,7 @@ class Placement:
     covariance : (d + 6, d + 6) of ``state``; None where it is not known.
     place : in the map of the scene; None where there is none.
     discrepancy : what the object's shape has beyond the model's in the frame; None where it is not known.
+    views : keyframes that show the object, that of ``frame`` first; none where their errors are not known.
     """
 
     model: ReducedModel
@@ -54,6 +70,7 @@ class Placement:
     covariance: Array | None = None
     place: PlaceInMap | None = None
     discrepancy: Discrepancy | None = None
+    views: tuple[PlacedView, ...] = ()
 
 
 def load_placement(path: Path, model: ReducedModel) -> Placement:
@@ -70,6 +87,7 @@ def load_placement(path: Path, model: ReducedModel) -> Placement:
         pose = RigidTransform.from_matrix(numbers_of(keyframe["camera_from_object"], (4, 4)))
         own = keyframe.get("covariance")  # of a keyframe whose pose was adjusted by itself
         own = None if own is None else numbers_of(own, (6, 6))
+        views = _views(content["keyframes"])
         frame, axis = int(keyframe["frame"]), content["axis_of_revolution"]
         axis = None if axis is None else numbers_of(axis["direction"], (3,))
         facts = {key: content[key] for key in ("score", "runner_up_score", "rms_px", "map_units_per_metre")}
@@ -97,7 +115,24 @@ def load_placement(path: Path, model: ReducedModel) -> Placement:
     of_pose = place.pose_covariance(pose) if own is None else own
     covariance = None if of_pose is None else _of_state(of_pose, len(model.parameters))
     facts = {"from": "map", **facts}
-    return Placement(model, frame, state, facts, tuple(flags), open_angles, covariance, place)
+    # Without an estimate of its own the pose of the reference frame has none of the others' causes.
+    views = tuple(sorted(views, key=lambda view: view.frame != frame)) if own is not None else ()
+    return Placement(model, frame, state, facts, tuple(flags), open_angles, covariance, place, views=views)
+
+
+def _views(keyframes: list[dict[str, Any]]) -> list[PlacedView]:
+    """The keyframes whose poses were adjusted together; raises ValueError as `numbers_of` does."""
+    views = []
+    for entry in keyframes:
+        if entry.get("causes") is None:
+            continue
+        causes = np.array(entry["causes"], dtype=np.float64)
+        causes = numbers_of(causes, (6, causes.size // 6))
+        pose = RigidTransform.from_matrix(numbers_of(entry["camera_from_object"], (4, 4)))
+        views.append(PlacedView(int(entry["frame"]), pose, causes))
+    if len({view.causes.shape for view in views}) > 1:
+        raise ValueError("the keyframes' errors have different numbers of causes")
+    return views
 
 
 def _of_state(of_pose: Array, n_parameters: int) -> Array:

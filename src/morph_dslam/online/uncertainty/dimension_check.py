@@ -11,10 +11,13 @@ and is left out: the stretches are those that keep the mean length.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.online.estimation.state import BoundPoints, State
+from morph_dslam.online.uncertainty.bound_part import BoundPart
 from morph_dslam.online.uncertainty.reference_misfit import FLOOR_PX
 
 Array = NDArray[np.float64]
@@ -30,20 +33,25 @@ class DimensionCheck:
 
     Parameters
     ----------
-    points : (p) bound in the reference view, in which the object is in the state ``reference``.
+    points : (p) bound in the reference view. parts : its pictures.
     jacobian : (p, 2, d + 6) of their pixels there. scale : (d + 6,) of the unknowns.
     """
 
-    def __init__(self, points: BoundPoints, reference: State, jacobian: Array, scale: Array) -> None:
+    def __init__(
+        self, points: BoundPoints, parts: Sequence[BoundPart], jacobian: Array, scale: Array
+    ) -> None:
         self._rest = points.rest
         extent = np.ptp(points.rest, axis=0)
         axes = np.eye(3)[:, extent > FLAT * extent.max()]
         # Stretches (3, k) of the axes that keep the mean length.
         self._stretches = axes @ np.linalg.svd(np.ones((1, axes.shape[1])))[2][1:].T
-        moved = self._by_stretch(reference, jacobian)
-        rows, size = jacobian.reshape(-1, len(scale)) * scale, moved.shape[2]
-        taken = np.linalg.lstsq(rows, moved.reshape(-1, size), rcond=1e-9)[0]
-        self._bound_off = moved - (rows @ taken).reshape(moved.shape)
+        left = []
+        for part in parts:
+            moved = self._by_stretch(part.state, jacobian)[part.rows]
+            rows, size = jacobian[part.rows].reshape(-1, len(scale)) * scale, moved.shape[2]
+            taken = np.linalg.lstsq(rows, moved.reshape(-1, size), rcond=1e-9)[0]
+            left.append(moved - (rows @ taken).reshape(moved.shape))
+        self._bound_off = np.concatenate(left)
         self._seen = 0.0
 
     def _by_stretch(self, state: State, jacobian: Array) -> Array:

@@ -44,7 +44,7 @@ class PointNoise:
     def weights(self, spread: Array, used: NDArray[np.bool_]) -> Array:
         """Inverse variances (p,), in that of a typical point; zero for points that are not ``used`` (p,).
 
-        ``spread`` (p,) is what the patches tell, see `patch_agreement`.
+        ``spread`` (p,) is what the patches tell, see `compare_patches`.
         """
         common = self.common
         if np.isinf(common) or not used.any():

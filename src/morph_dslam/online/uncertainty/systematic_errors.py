@@ -17,6 +17,7 @@ in restricted maximum likelihood (Patterson & Thompson 1971).
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +28,7 @@ from morph_dslam.model import SurfacePoints
 from morph_dslam.online.estimation.estimator import BoundPoints, Estimate, Estimator, Prior, State
 from morph_dslam.online.estimation.reprojection import project_with_jacobian
 from morph_dslam.online.estimation.robust_covariance import EIGENVALUE_FLOOR
+from morph_dslam.online.uncertainty.bound_part import BoundPart
 from morph_dslam.online.uncertainty.dimension_check import DimensionCheck
 from morph_dslam.online.uncertainty.reference_misfit import ReferenceMisfit
 
@@ -66,36 +68,52 @@ class SystematicErrors:
 
     Parameters
     ----------
-    points : (p) the texture's points, bound in the reference view. reference : the state there.
-    covariance : (d + 6, d + 6) of that state; None where nothing is known of its error.
+    points : (p) the texture's points. parts : the reference pictures that they were bound in.
     window : side of the square that is compared around a point, pixels.
     """
 
     def __init__(
-        self,
-        estimator: Estimator,
-        points: BoundPoints,
-        reference: State,
-        covariance: Array | None,
-        window: int,
+        self, estimator: Estimator, points: BoundPoints, parts: Sequence[BoundPart], window: int
     ) -> None:
         self._estimator, self._points = estimator, points
-        known = covariance is not None and np.isfinite(covariance).all()
-        self._root = _root(covariance, estimator.scale) if known and covariance is not None else None
         self._misfit = ReferenceMisfit()
         self._corners = _corners(estimator, points)
-        self._jacobian = self._project(points, reference)[1]
-        self._dimensions = DimensionCheck(points, reference, self._jacobian, estimator.scale)
-        self._edges = _edges(estimator.camera, self._corners, reference)
-        places = self._project(points, reference)[0]
-        # Coordinate by coordinate: sums over an axis of two cost numpy most of the time that a view takes.
-        right, down = (np.abs(column[:, None] - column[None]) for column in places.T)
-        squared = right**2 + down**2
+        self._jacobian = self._by_parts(parts, lambda state: self._project(points, state)[1])
+        self._edges = self._by_parts(parts, lambda state: _edges(estimator.camera, self._corners, state))
+        self._moved = self._by_causes(parts)
+        self._dimensions = DimensionCheck(points, parts, self._jacobian, estimator.scale)
+        self._compare_neighbours(parts[0].state, window)
+
+    def _by_parts(self, parts: Sequence[BoundPart], of_state: Callable[[State], Array]) -> Array:
+        """What ``of_state`` gives for all points (p, ...), of each part's points in its own state."""
+        return np.concatenate([of_state(part.state)[part.rows] for part in parts])
+
+    def _by_causes(self, parts: Sequence[BoundPart]) -> Array | None:
+        """By what each cause moves the points' pixels (p, 2, c) in their pictures; None where not known."""
+        moved = []
+        for part in parts:
+            if part.causes is None:
+                return None
+            moved.append(self._jacobian[part.rows] @ part.causes)
+        return np.concatenate(moved)
+
+    def _compare_neighbours(self, state: State, window: int) -> None:
+        """Which pairs of points are compared, and how alike a model's errors are in each two (p, p).
+
+        By their distances in the object as it is in the first picture, in pixels at its depth.
+        """
+        camera, positions = self._estimator.camera, self._points.in_camera(state)
+        focal = 0.5 * (camera.fx + camera.fy)
+        places = positions * focal / np.median(positions[:, 2])
+        # Coordinate by coordinate: sums over a short axis cost numpy most of the time that a view takes.
+        apart = [np.abs(column[:, None] - column[None]) for column in places.T]
+        squared = apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2
         spread = float(np.sqrt(np.mean(np.sum((places - places.mean(axis=0)) ** 2, axis=1))))
         self._alike = np.exp(-0.5 * squared / (ALIKE_SHARE * spread) ** 2)
         near = squared < (PAIR_SHARE * spread) ** 2
+        beside = np.maximum(np.maximum(apart[0], apart[1]), apart[2]) >= window
         # As numbers, to be multiplied by in every frame; points that do not count are zero in what it is.
-        self._pairs = (near & (np.maximum(right, down) >= window)).astype(np.float64)
+        self._pairs = (near & beside).astype(np.float64)
         self._alike_pairs = self._alike * self._pairs
 
     def unexplained(self, estimate: Estimate, used: NDArray[np.bool_]) -> Unexplained:
@@ -113,7 +131,7 @@ class SystematicErrors:
     @property
     def is_unchecked(self) -> bool:
         """Whether no frame so far could have shown that the object has not got the model's dimensions."""
-        return self._root is not None and not self._dimensions.is_done
+        return self._moved is not None and not self._dimensions.is_done
 
     def added(
         self,
@@ -138,9 +156,9 @@ class SystematicErrors:
             hessian = hessian + prior.terms(estimate.state)[1]
         gain = inverse_of_seen(hessian, self._estimator.scale)
         covariance, n_pairs = estimate.covariance.copy(), self._n_pairs(usable)
-        if self._root is not None:
+        if self._moved is not None:
             warps = self._warps(estimate.state)
-            moved = warps @ (self._jacobian @ self._root)
+            moved = warps @ self._moved
             transfer = gain @ np.tensordot(scores, moved, axes=([0, 1], [0, 1]))
             if learns:
                 residuals = np.where(usable[:, None], estimate.residuals[: len(weights)], 0.0)
@@ -162,6 +180,8 @@ class SystematicErrors:
 
     def pushed(self, estimate: Estimate, weights: Array) -> tuple[Array, Array]:
         """How points of these ``weights`` (p,) determine the estimate, and how the reference's error enters.
+
+        Of points that were all bound in one picture.
 
         Both (d + 6, d + 6): J' W J, and J' W M J0, the gradient by an error of the reference state.
         """
@@ -229,12 +249,6 @@ def inverse_of_seen(hessian: Array, scale: Array) -> Array:
     seen = values > max(values[-1], 1e-30) * EIGENVALUE_FLOOR
     inverse = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T
     return np.asarray(inverse * np.outer(scale, scale), dtype=np.float64)
-
-
-def _root(covariance: Array, scale: Array) -> Array:
-    """L (n, n) with L L' = ``covariance``, which may be singular; in unknowns divided by ``scale``."""
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    return scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
 
 
 def _corners(estimator: Estimator, points: BoundPoints) -> BoundPoints:
