@@ -233,6 +233,7 @@ def write_results(
     named |= aids | ({} if setup.map_path is None else {"map": str(setup.map_path)})
     tracker = setup.tracker_options(placement)
     extra = {
+        "reference_keyframes": setup.reference_keyframes,
         "reference_refined_over_the_sequence": run.refined,
         "outline_used": options.use_outline,
         "depth_used": options.use_depth,

@@ -117,7 +117,7 @@ class Setup:
     def further(self) -> FurtherViews | None:
         """Other keyframes that show more of the object, where it is known how they are off with the first."""
         placement = self.placement
-        if placement is None or not len(self.keyframes) or not placement.views:
+        if placement is None or not placement.views or not self.options.tracker.new_views:
             return None
         d = len(placement.model.parameters)
         views = [
@@ -125,6 +125,7 @@ class Setup:
                 self.keyframes[view.frame],
                 State(placement.model.default, view.pose),
                 np.vstack([np.zeros((d, view.causes.shape[1])), view.causes]),
+                frame=view.frame,
             )
             for view in placement.views
             if view.frame in self.keyframes
@@ -133,6 +134,14 @@ class Setup:
             return None
         estimator = Estimator(placement.model, self.camera)
         return choose_further(estimator, views[0], views[1:], self.tracker_options(placement))
+
+    @property
+    def reference_keyframes(self) -> list[int]:
+        """Numbers of the map's keyframes that the object is compared with, the one it is placed in first."""
+        if self.placement is None or self.placement.frame not in self.keyframes:
+            return []
+        others = [] if self.further is None else [view.frame for view in self.further.views]
+        return [self.placement.frame, *(frame for frame in others if frame is not None)]
 
     def placed(
         self, image: NDArray[np.uint8] | Picture, depth: NDArray[np.float32] | None = None
@@ -178,13 +187,9 @@ class Setup:
         reference: NDArray[np.uint8] | Picture,
         in_sequence: bool,
         seen: NDArray[np.bool_] | None = None,
+        further: FurtherViews | None = None,
     ) -> Tracker:
-        """A tracker at its beginning; see `Tracker` for the arguments.
-
-        Where other objects hide a part of it in the reference, they may in other pictures too; none of these
-        is taken then.
-        """
-        by_map = self.reference is not None and reference is self.reference and seen is None
+        """A tracker at its beginning; see `Tracker` for the arguments."""
         return Tracker(
             placement.model,
             self.camera,
@@ -195,14 +200,19 @@ class Setup:
             placement.covariance,
             seen,
             placement.discrepancy,
-            self.further if by_map and not __import__("os").environ.get("ONE") else None,
+            further,
         )
 
     def new_chain(
         self, placement: Placement, reference: NDArray[np.uint8] | Picture, in_sequence: bool
     ) -> Chain:
-        """As `new_tracker`, with the camera in the map before it where the object is anchored."""
-        tracker = self.new_tracker(placement, reference, in_sequence)
+        """As `new_tracker`, with the camera in the map before it where the object is anchored.
+
+        An object that is alone in the map is known by other keyframes too; others might hide it in these.
+        """
+        by_map = self.reference is not None and reference is self.reference
+        further = self.further if by_map else None
+        tracker = self.new_tracker(placement, reference, in_sequence, further=further)
         return Chain(self.camera, tracker, self.new_anchor({self.model.name: placement}))
 
     def new_anchor(self, placements: Mapping[str, Placement]) -> Anchor | None:

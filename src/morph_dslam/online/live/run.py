@@ -161,6 +161,7 @@ def _write(setup: Setup, begin: _Begin, session: LiveSession, options: LiveOptio
         "live": live_figures(session.times),
         "pose": of_object.pose if setup.map_path is not None else "free",
         "outline_used": of_object.use_outline,
+        "reference_keyframes": setup.reference_keyframes,
         "settings": {"tracker": asdict(tracker)},
     }
     inputs = RunInputs(of_object.model, of_object.camera, named)

@@ -248,7 +248,7 @@ def compare_patches_numpy(
         a, b = _sampled(first, p, half + 1), _sampled(second, q, half + 1)
         if a is None or b is None:
             continue
-        down, right = (slope[inner, inner] for slope in np.gradient(0.5 * (a + b)))
+        down, right = (np.asarray(np.gradient(0.5 * (a + b), axis=k))[inner, inner] for k in (0, 1))
         a, b = a[inner, inner], b[inner, inner]
         correlation[j] = _correlated(a, b)
         rows = np.stack([-right, -down, np.ones_like(x), x, y, a - 128.0], axis=-1).reshape(-1, 6)
@@ -256,6 +256,6 @@ def compare_patches_numpy(
         if rank == 6 and np.linalg.norm(solution[:2]) < LONGEST_STEP:
             places[j] += solution[:2]
             ends = [slice(0, half), slice(n - half, n)]
-            worst = max((b - a)[rows_, columns].var() for rows_ in ends for columns in ends)
+            worst = max(np.var((b - a)[part, side]) for part in ends for side in ends)
             spread[j] = np.sqrt(0.5 * worst * np.trace(np.linalg.inv(rows.T @ rows)[:2, :2]))
     return places, correlation, spread

@@ -59,6 +59,7 @@ class KnownView:
         standard deviations; None where nobody knows.
     seen : (h, w) where the picture shows the object; None where it is all that it covers.
     discrepancy : what the object's shape has beyond the model's in it, where that is known.
+    frame : its number in the recording, if it is known.
     """
 
     picture: Picture
@@ -66,6 +67,7 @@ class KnownView:
     causes: Array | None = None
     seen: NDArray[np.bool_] | None = None
     discrepancy: Discrepancy | None = None
+    frame: int | None = None
 
 
 class ReferenceView:
