@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -15,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.errors import MapError, TrackingError
-from morph_dslam.geometry import RigidTransform, rotation_log
+from morph_dslam.errors import TrackingError
 from morph_dslam.io.calibration import load_camera
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel, load_model
@@ -26,22 +24,20 @@ from morph_dslam.online.anchored.anchor import Anchor
 from morph_dslam.online.attempt import Picture
 from morph_dslam.online.chain import Chain
 from morph_dslam.online.estimation.discrepancy import DiscrepancyOptions
-from morph_dslam.online.estimation.estimator import Estimator, State
+from morph_dslam.online.estimation.estimator import Estimator
 from morph_dslam.online.measuring.outline import rim
 from morph_dslam.online.pipeline import Tracker
 from morph_dslam.online.reference.further_views import FurtherViews, choose_further
-from morph_dslam.online.reference.reference_view import KnownView
 from morph_dslam.online.slam.map_file import load_map
 from morph_dslam.online.start.placement import Placement, load_placement, place_by_landmarks
 from morph_dslam.online.start.registration import RegistrationOptions
+from morph_dslam.online.start.scan_pictures import map_of, pictures_of, views_of
 from morph_dslam.online.tracker_options import StartFrom, TrackerOptions
 from morph_dslam.sources import Frame
 from morph_dslam.units import to_si
 
 #: How an object's pose is found: by the map and its points, by the map alone, by its points alone.
 PoseFrom = Literal["map", "fixed", "free"]
-#: Keyframes are placed anew by the registration, but never by so much: rad, and share of the distance.
-OTHER_MAP_TURN, OTHER_MAP_SHIFT = 0.1, 0.1
 
 
 @dataclass(frozen=True)
@@ -119,17 +115,7 @@ class Setup:
         placement = self.placement
         if placement is None or not placement.views or not self.options.tracker.new_views:
             return None
-        d = len(placement.model.parameters)
-        views = [
-            KnownView(
-                self.keyframes[view.frame],
-                State(placement.model.default, view.pose),
-                np.vstack([np.zeros((d, view.causes.shape[1])), view.causes]),
-                frame=view.frame,
-            )
-            for view in placement.views
-            if view.frame in self.keyframes
-        ]
+        views = views_of(placement, self.keyframes)
         if len(views) < 2:
             return None
         estimator = Estimator(placement.model, self.camera)
@@ -138,10 +124,16 @@ class Setup:
     @property
     def reference_keyframes(self) -> list[int]:
         """Numbers of the map's keyframes that the object is compared with, the one it is placed in first."""
-        if self.placement is None or self.placement.frame not in self.keyframes:
+        if self.placement is None or self.placement.frame is None or self.reference is None:
             return []
         others = [] if self.further is None else [view.frame for view in self.further.views]
         return [self.placement.frame, *(frame for frame in others if frame is not None)]
+
+    @property
+    def with_one_view(self) -> Setup:
+        """The same with one keyframe as reference: where objects may hide one another in the others."""
+        frame, picture = None if self.placement is None else self.placement.frame, self.reference
+        return replace(self, keyframes={} if picture is None or frame is None else {frame: picture})
 
     def placed(
         self, image: NDArray[np.uint8] | Picture, depth: NDArray[np.float32] | None = None
@@ -208,7 +200,7 @@ class Setup:
     ) -> Chain:
         """As `new_tracker`, with the camera in the map before it where the object is anchored.
 
-        An object that is alone in the map is known by other keyframes too; others might hide it in these.
+        An object in a map is known by further keyframes too.
         """
         by_map = self.reference is not None and reference is self.reference
         further = self.further if by_map else None
@@ -275,48 +267,11 @@ def load_setup(options: ObjectOptions) -> Setup:
         return Setup(options, model, camera, landmarks, inner, None, None, {}, aid)
     placement, path = load_placement(options.placement, model), None
     if options.pose != "free":
-        path = _map_of(options.placement, options.map_path)
+        path = map_of(options.placement, options.map_path)
         if path is None:
             note = "no map was given or found beside the registration: the object is tracked as a free one"
             placement = replace(placement, flags=(*placement.flags, note))
     keyframes: dict[int, Picture] = {}
     if path is not None and not options.use_outline:
-        keyframes = _keyframes(path, camera, placement)
+        keyframes = pictures_of(path, camera, placement)
     return Setup(options, model, camera, None, inner, placement, path, keyframes)
-
-
-def _map_of(registration: Path, given: Path | None) -> Path | None:
-    """The map: as given, as the registration names it, or beside it; None if there is none."""
-    if given is not None:
-        return given
-    beside = [registration.with_name("map.h5")]
-    named = json.loads(registration.read_text()).get("map")
-    if named:
-        beside.insert(0, registration.parent / named)
-    return next((path for path in beside if path.is_file()), None)
-
-
-def _keyframes(path: Path, camera: PinholeCamera, placement: Placement) -> dict[int, Picture]:
-    """The keyframes that the placement is for; their images are flattened, which is all that is needed."""
-    wanted, pictures = {placement.frame, *(view.frame for view in placement.views)}, {}
-    for keyframe in load_map(path, camera).keyframes:
-        if keyframe.index not in wanted:
-            continue
-        pictures[keyframe.index] = Picture(keyframe.flat, keyframe.flat)
-        if keyframe.index == placement.frame and placement.place is not None:
-            _check_pose(path, placement, placement.place.pose_in(keyframe.camera_from_world))
-    if placement.frame not in pictures:
-        raise MapError(f"{path} is not the map of the registration: it has no keyframe {placement.frame}")
-    return pictures
-
-
-def _check_pose(path: Path, placement: Placement, by_map: RigidTransform) -> None:
-    """Raise MapError if the map has the keyframe of the placement elsewhere than the registration."""
-    pose = placement.state.camera_from_object
-    turn = np.linalg.norm(rotation_log(by_map.rotation @ pose.rotation.T))
-    shift = np.linalg.norm(by_map.translation - pose.translation)
-    if turn > OTHER_MAP_TURN or shift > OTHER_MAP_SHIFT * np.linalg.norm(pose.translation):
-        raise MapError(
-            f"{path} is not the map of the registration: by the map the object is {1e3 * shift:.0f} mm and "
-            f"{np.degrees(turn):.0f} deg from where the registration has it in keyframe {placement.frame}"
-        )

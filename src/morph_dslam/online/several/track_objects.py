@@ -86,7 +86,7 @@ def track_objects(options: TrackOptions, others: Sequence[OtherObject]) -> dict[
     everything = [_for_first(options, others), *(_for_other(options, other) for other in others)]
     for part in everything:
         check_run_folder(part.output, part.overwrite)
-    objects = _prepare(everything, [load_setup(part) for part in everything])
+    objects = _prepare(everything, [load_setup(part).with_one_view for part in everything])
     source = open_frames(objects[0].options)
     chain = _new_chain(objects)
     warm_up(chain.process, objects[0].begin.picture)
