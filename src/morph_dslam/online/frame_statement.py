@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from morph_dslam.online.anchored.known_pose import KnownPose
 from morph_dslam.online.attempt import Attempt
@@ -16,6 +17,7 @@ from morph_dslam.online.frame_result import (
 )
 from morph_dslam.online.reference.reference_views import FollowedView
 from morph_dslam.online.timing import StageClock
+from morph_dslam.online.uncertainty.best_told import BestTold
 from morph_dslam.online.uncertainty.reference_misfit import CLEARLY_WORSE
 
 
@@ -41,18 +43,31 @@ def missed(
 
 
 class FrameStatements:
-    """Of the frames in which one object was found, one after the other."""
+    """Of the frames in which one object was found, one after the other.
 
-    def __init__(self) -> None:
-        self._unchecked = True
+    Parameters
+    ----------
+    constant : (k,) indices of the parameters that are one over the sequence.
+    """
+
+    def __init__(self, constant: NDArray[np.int64]) -> None:
+        self._unchecked, self._best_told = True, BestTold(constant)
 
     def tracked(
-        self, attempt: Attempt, how: str, aside: str, another: str, view: FollowedView, clock: StageClock
+        self,
+        attempt: Attempt,
+        untold: NDArray[np.bool_],
+        how: str,
+        aside: str,
+        another: str,
+        view: FollowedView,
+        clock: StageClock,
     ) -> FrameResult:
         """What is said of a frame.
 
         Parameters
         ----------
+        untold : (k,) parameters that are one over the sequence, of which the frame tells nothing.
         how : the object was found. aside : follows that. another : what speaks for another object like it.
         view : that the attempt was made against.
         """
@@ -63,6 +78,7 @@ class FrameStatements:
         doubt, whole = recovery.doubt(attempt), not recovery.partly_hidden(attempt)
         alike_px = max(left.px, doubt)
         estimate = systematic.added(attempt.estimate, attempt.weights, alike_px, attempt.prior, whole)
+        estimate = self._best_told.stated(estimate, untold)
         if doubt:
             aside += f"; {FEW_AGREE}: by {attempt.estimate.sigma_px:.1f} px"
         if another:

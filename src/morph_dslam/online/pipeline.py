@@ -110,7 +110,7 @@ class Tracker:
         self._last, self._velocity_base, self._start = state, state, state
         self._beyond = discrepancy
         self._lost, self._n_lost = not in_sequence, 0
-        self._statements = FrameStatements()
+        self._statements = FrameStatements(self._filter.constant)
         self._look_alikes = LookAlikes(model.nodes)
 
     def process_frame(
@@ -305,7 +305,8 @@ class Tracker:
             aside += f"; by reference view {self._view.number}"
         if why_not:
             return missed(attempt, why_not, aside, None if has_moved else known, clock)
-        return self._statements.tracked(attempt, how, aside, self._look_alikes.doubt, self._view, clock)
+        doubt, untold = self._look_alikes.doubt, self._filter.untold
+        return self._statements.tracked(attempt, untold, how, aside, doubt, self._view, clock)
 
     def _prepare(self, image: NDArray[np.uint8]) -> Picture:
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)

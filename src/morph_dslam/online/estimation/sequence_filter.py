@@ -97,6 +97,16 @@ class SequenceFilter(Generic[Frame]):
         self._untold = np.zeros(len(self._constant))
         self._conflicts = 0
 
+    @property
+    def constant(self) -> NDArray[np.int64]:
+        """Indices (k,) of the parameters that are one per sequence."""
+        return self._constant
+
+    @property
+    def untold(self) -> NDArray[np.bool_]:
+        """Of which of these (k,) the last frame told nothing by itself."""
+        return self._untold > 0.0
+
     def change_points(self, change: PointChange) -> None:
         """Go on with the points of another view; what those so far have put into the past stays in it."""
         self._noise.change_points()
