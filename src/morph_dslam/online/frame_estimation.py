@@ -150,5 +150,5 @@ class FrameEstimation:
         if seen is not None:
             pixels, normals = np.concatenate([pixels, seen.pixels]), np.concatenate([normals, seen.normals])
             weights = np.concatenate([weights, np.where(seen.valid, self._options.outline.weight, 0.0)])
-        correlation = window_correlation(pixels, self._options.flow.window)
+        correlation = window_correlation(pixels, self._options.measurement.window)
         return Measured(self._reference.all_points, pixels, weights, normals, correlation, attempt.depths)

@@ -37,6 +37,11 @@ class MeasurementOptions:
     least_correlation: float = 0.6
     largest_correction_px: float = 12.0
 
+    @property
+    def window(self) -> int:
+        """Side of the patches that tell where a point is, pixels."""
+        return 2 * self.patch_half + 1
+
 
 @dataclass(frozen=True)
 class Measurement:

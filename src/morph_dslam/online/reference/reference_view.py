@@ -271,7 +271,7 @@ class ReferenceView:
 
     def _correlation(self) -> Array:
         """Of the points' errors (p, p): those of one picture share what their windows do."""
-        camera, window = self._estimator.camera, self._options.flow.window
+        camera, window = self._estimator.camera, self._options.measurement.window
         result = np.zeros((len(self.all_points),) * 2)
         ends = [*(part.rows.stop for part in self.parts[:-1]), len(self.all_points)]
         for part, end in zip(self.parts, ends, strict=True):

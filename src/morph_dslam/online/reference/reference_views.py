@@ -68,7 +68,7 @@ class FollowedView:
         """A view that is to be followed from now on, with these numbers."""
         estimation = FrameEstimation(estimator, reference, options)
         recovery = Recovery(estimator.model, estimator.camera, reference, estimation, options)
-        window = options.flow.window
+        window = options.measurement.window
         systematic = SystematicErrors(estimator, reference.points, reference.parts, window)
         return cls(number, reference, estimation, recovery, systematic, error)
 

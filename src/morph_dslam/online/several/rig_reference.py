@@ -44,7 +44,7 @@ class RigReference:
                 tracker.estimator,
                 tracker.reference.points,
                 [BoundPart(slice(None), tracker.reference.state, None)],
-                tracker.options.flow.window,
+                tracker.options.measurement.window,
             )
             for tracker in trackers
         ]
