@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,6 @@ Array = NDArray[np.float64]
 HERE = Path(__file__).resolve().parent
 MODEL = HERE.parent / "examples" / "boot_seal" / "output" / "boot_seal.morph"
 OUTPUT = HERE / "output" / "registration_seeds"
-FRAMES = 150
 GROUNDS, PICTURES = ("brick", "coffee", "gravel", "rocket"), ("chelsea", "rocket", "coffee", "astronaut")
 #: The example's camera path about the seal: frame, degrees about the vertical, distance and height, mm.
 PATH = (
@@ -54,20 +54,20 @@ PATH = (
 SCALE_LIMIT, PLACE_LIMIT = 0.01, 1.5
 
 
-def scene_text(seed: int) -> str:
-    """The scene file of a seed."""
+def scene_text(seed: int, path: Sequence[tuple[int, float, float, float]] = PATH) -> str:
+    """The scene file of a seed; a longer path that begins as `PATH` changes nothing else."""
     rng = np.random.default_rng(seed)
     x, y = rng.uniform([-40.0, -40.0], [40.0, 30.0])
     light, turn = rng.uniform([-0.8, -0.9], [0.8, -0.2]), rng.uniform(0.0, 360.0)
     lines = [
-        f'model = "{MODEL}"\nframes = {FRAMES}\nfps = 30.0\nseed = {seed}\n',
+        f'model = "{MODEL}"\nframes = {path[-1][0] + 1}\nfps = 30.0\nseed = {seed}\n',
         "[camera]\nwidth = 640\nheight = 480\nfx = 560.0\nfy = 560.0\ncx = 320.0\ncy = 240.0\n",
         '[surface]\ntexture = "gravel"\n',
         f"[light]\ndirection = [{light[0]:.3f}, {light[1]:.3f}, 1.0]\n",
         "[sensor]\nblur_px = 0.5\nnoise = 2.0\n",
         f"[[pose]]\nframe = 0\nposition_mm = [{x:.2f}, {y:.2f}, 0]\nrotation_deg = [0, 0, {turn:.2f}]\n",
     ]
-    return "\n".join([*lines, *_surroundings(rng, x, y), *_camera_path(rng, x, y)])
+    return "\n".join([*lines, *_surroundings(rng, x, y), *_camera_path(rng, x, y, path)])
 
 
 def _surroundings(rng: np.random.Generator, x: float, y: float) -> list[str]:
@@ -91,11 +91,13 @@ def _surroundings(rng: np.random.Generator, x: float, y: float) -> list[str]:
     return lines
 
 
-def _camera_path(rng: np.random.Generator, x: float, y: float) -> list[str]:
+def _camera_path(
+    rng: np.random.Generator, x: float, y: float, path: Sequence[tuple[int, float, float, float]]
+) -> list[str]:
     """The example's path, mirrored or not, turned about the seal, nearer or farther, and disturbed."""
     lines = []
     mirrored, about, farther = rng.choice([-1.0, 1.0]), rng.uniform(-15.0, 15.0), rng.uniform(0.9, 1.15)
-    for frame, angle, distance, height in PATH:
+    for frame, angle, distance, height in path:
         turn = np.radians(mirrored * angle + about + rng.uniform(-6.0, 6.0))
         away = farther * distance + rng.uniform(-20.0, 20.0)
         target = np.array([x, y, 42.0]) + rng.normal(0.0, 6.0, 3)
@@ -119,14 +121,15 @@ def recorded(seed: int) -> Path:
     return folder
 
 
-def mapped(folder: Path, again: bool) -> None:
-    """The map of a recording, made once."""
+def mapped(folder: Path, again: bool, last: int | None = None) -> None:
+    """The map of a recording up to its frame ``last``, made once."""
     if again or not (folder / "scan" / "map.h5").is_file():
         run_slam(
             SlamRunOptions(
                 source=folder / "recording" / "frames",
                 camera=folder / "recording" / "camera.yaml",
                 output=folder / "scan",
+                last=last,
                 video=False,
                 overwrite=True,
             )
