@@ -41,14 +41,14 @@ def covered_run():
 
 
 def test_windows_at_the_rim_do_not_spoil_what_the_others_tell(covered_run):
-    """With the same weight for all points the errors are 0.36 mm on average and 0.24 in the median."""
+    """With the same weight for all points the errors are 0.38 mm on average and 0.23 in the median."""
     errors, _, share = covered_run
     assert 0.3 < share.mean() < 0.6
-    assert errors.mean() < 0.27
-    assert np.median(errors) < 0.15
+    assert errors.mean() < 0.15
+    assert np.median(errors) < 0.1
 
 
 def test_errors_are_as_large_as_stated(covered_run):
-    """With the same weight for all points 95 % are below 3.0."""
+    """95 % of Gaussian errors are below 1.96."""
     _, normalised, _ = covered_run
     assert 1.5 < np.quantile(normalised, 0.95) < 2.6
