@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import RegistrationError
 from morph_dslam.online.estimation.estimator import Estimator
 from morph_dslam.online.measuring.binding import DrawnSurface, draw_view, view_of
+from morph_dslam.online.reference.new_view import KEEP_OFF_PX, around
 from morph_dslam.online.reference.reference_view import KnownView, ReferenceView
 from morph_dslam.online.reference.surface_coverage import SurfaceSamples
 from morph_dslam.online.timing import StageClock
@@ -26,8 +26,6 @@ Array = NDArray[np.float64]
 
 #: Another picture is taken as long as it adds this share of what all of them show, and at most so many are.
 LEAST_GAIN, MOST_FURTHER = 0.03, 5
-#: Around points that no other picture agrees with, so far, pixels, nothing is bound.
-KEEP_OFF_PX = 12
 
 
 @dataclass(frozen=True)
@@ -47,8 +45,7 @@ def choose_further(
     estimator: Estimator, first: KnownView, others: Sequence[KnownView], options: TrackerOptions
 ) -> FurtherViews:
     """What to take beside the first view; nothing where the object shows too few corners in it."""
-    samples = SurfaceSamples(estimator, DrawnSurface.of(estimator.model))
-    chosen = _most_shown(estimator, samples, [first, *others])
+    chosen = _most_shown(estimator, [first, *others])
     try:
         agreed = _agreed(estimator, [first, *(others[k] for k in chosen)], [first, *others], options)
     except RegistrationError:
@@ -56,9 +53,10 @@ def choose_further(
     return FurtherViews(first.causes, tuple(agreed[1:]))
 
 
-def _most_shown(estimator: Estimator, samples: SurfaceSamples, views: Sequence[KnownView]) -> list[int]:
+def _most_shown(estimator: Estimator, views: Sequence[KnownView]) -> list[int]:
     """Indices into ``views`` without the first, which is taken anyway; those that show most first."""
-    surface = DrawnSurface.of(estimator.model).model
+    drawn = DrawnSurface.of(estimator.model)
+    surface, samples = drawn.model, SurfaceSamples(estimator, drawn)
     meshes = [view_of(surface, estimator.camera, view.state) for view in views]
     depths = [draw_view(mesh, surface.triangles, estimator.camera).depth for mesh in meshes]
     areas = np.abs([samples.seen(view.state, depth) for view, depth in zip(views, depths, strict=True)])
@@ -93,13 +91,7 @@ def _agreed(
         if alone.all():
             continue
         places = estimator.camera.project(reference.points.in_camera(view.state)[part.rows][alone])
-        result.append(replace(view, seen=reference.covered(view.state) & ~_around(view, places)))
+        result.append(
+            replace(view, seen=reference.covered(view.state) & ~around(view.picture, places, KEEP_OFF_PX))
+        )
     return result
-
-
-def _around(view: KnownView, places: Array) -> NDArray[np.bool_]:
-    """Pixels (h, w) of a picture near places (k, 2)."""
-    near = np.zeros(view.picture.flat.shape, dtype=np.uint8)
-    for x, y in np.rint(places).astype(int).tolist():
-        cv2.circle(near, (x, y), KEEP_OFF_PX, 1, -1)
-    return near.astype(bool)

@@ -62,8 +62,8 @@ def is_sharp(picture: Picture, attempt: Attempt, should_be: Rendering, half: int
     should_be : that view in the state of the attempt. half : of the side of the squares about points in which
         sharpness is compared, pixels.
     """
-    around = _around(picture, attempt.measurement.pixels[attempt.inliers], half)
-    return sharpness(picture.flat, around) > LEAST_SHARPNESS * sharpness(should_be.image, around)
+    near = around(picture, attempt.measurement.pixels[attempt.inliers], half)
+    return sharpness(picture.flat, near) > LEAST_SHARPNESS * sharpness(should_be.image, near)
 
 
 def seen_part(
@@ -77,7 +77,7 @@ def seen_part(
     """
     disagree = attempt.measurement.visible & ~attempt.inliers
     seen = np.isfinite(should_be.depth)
-    seen &= ~_around(picture, view.projected(attempt.estimate.state)[disagree], KEEP_OFF_PX)
+    seen &= ~around(picture, view.projected(attempt.estimate.state)[disagree], KEEP_OFF_PX)
     if picture.in_front is not None:
         seen &= picture.in_front >= should_be.depth
     return seen
@@ -103,7 +103,7 @@ def _cut_out(
     return np.ascontiguousarray(flat[rows, columns]), where[rows, columns]
 
 
-def _around(picture: Picture, pixels: Array, half: int) -> NDArray[np.bool_]:
+def around(picture: Picture, pixels: Array, half: int) -> NDArray[np.bool_]:
     """Pixels (h, w) in squares about points (p, 2)."""
     height, width = picture.flat.shape[:2]
     marks = np.zeros((height, width), np.uint8)
