@@ -18,6 +18,20 @@ from tests.support.block_study import write_study
 
 N_SAMPLES = 30
 
+#: Stopped while workers send results that are long in the pipe.
+STOPPED_WHILE_SENDING = """
+import time
+from concurrent.futures import wait
+from morph_dslam.offline.executors import default_executor
+
+if __name__ == "__main__":
+    with default_executor(2) as executor:
+        wait([executor.submit(bytes, 1) for _ in range(2)])
+        sent = [executor.submit(bytes, 100_000_000) for _ in range(20)]
+        time.sleep(0.3)
+        raise SystemExit(3)
+"""
+
 
 def start(study: Path, output: Path) -> subprocess.Popen:
     """A build on two worker processes, in a process group of its own."""
@@ -77,7 +91,11 @@ def test_a_stopped_build_keeps_what_it_solved_and_says_so(number, alone: bytes, 
     process = start(study, output)
     wait_until(lambda: len(solved(output)) >= 3 or process.poll() is not None)
     (os.killpg if number == signal.SIGINT else os.kill)(process.pid, number)
-    message = process.communicate(timeout=60)[1]
+    try:
+        message = process.communicate(timeout=60)[1]
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
     assert process.returncode == INTERRUPTED
     assert "Traceback" not in message
     said = message.splitlines()[-1]
@@ -88,6 +106,20 @@ def test_a_stopped_build_keeps_what_it_solved_and_says_so(number, alone: bytes, 
     assert 3 <= len(solved(output)) < N_SAMPLES
     assert main(["build", str(study), "-o", str(output)]) == 0
     assert output.read_bytes() == alone
+
+
+def test_workers_stopped_while_they_send_results_do_not_hold_up_the_end(tmp_path: Path) -> None:
+    """What is half sent is never completed: nobody may wait for the rest."""
+    script = tmp_path / "stopped.py"
+    script.write_text(STOPPED_WHILE_SENDING)
+    process = subprocess.Popen([sys.executable, str(script)], start_new_session=True)
+    try:
+        assert process.wait(timeout=60) == 3
+        wait_until(lambda: nothing_left(process.pid))
+    finally:
+        if not nothing_left(process.pid):
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
 
 
 @pytest.mark.slow

@@ -51,6 +51,21 @@ class WorkerProcesses(ProcessPoolExecutor):
         context = multiprocessing.get_context("spawn")
         super().__init__(count, mp_context=context, initializer=_start_worker)
         self.slots = 2 * count
+        self._others = set(multiprocessing.active_children())
+
+    def end_now(self) -> None:
+        """Stop the workers where they are; what they were solving is lost.
+
+        A worker may be stopped half-way through sending a result. The thread that receives it would wait for
+        the rest for ever, and the interpreter for the thread, as long as this process has the sending end of
+        that pipe open too.
+        """
+        results = self._result_queue
+        self.shutdown(wait=False, cancel_futures=True)
+        for worker in set(multiprocessing.active_children()) - self._others:
+            worker.terminate()
+        if results is not None:  # None once it was shut down
+            results._writer.close()  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _start_worker() -> None:
@@ -82,14 +97,11 @@ def default_executor(workers: int | None) -> Iterator[Executor]:
         with SerialExecutor() as executor:
             yield executor
         return
-    others = set(multiprocessing.active_children())
     executor = WorkerProcesses(workers or os.cpu_count() or 1)
     try:
         yield executor
     except BaseException as error:
-        executor.shutdown(wait=False, cancel_futures=True)
-        for process in set(multiprocessing.active_children()) - others:
-            process.terminate()
+        executor.end_now()
         if isinstance(error, BrokenProcessPool):
             raise WorkerError(
                 "a worker process died, most likely for want of memory; take fewer with --workers. What was "
