@@ -29,18 +29,14 @@ from morph_dslam.online.estimation.estimator import BoundPoints, Estimate, Estim
 from morph_dslam.online.estimation.reprojection import project_with_jacobian
 from morph_dslam.online.estimation.robust_covariance import EIGENVALUE_FLOOR
 from morph_dslam.online.uncertainty.bound_part import BoundPart
+from morph_dslam.online.uncertainty.common_errors import CommonErrors
 from morph_dslam.online.uncertainty.dimension_check import DimensionCheck
 from morph_dslam.online.uncertainty.reference_misfit import ReferenceMisfit
 
 Array = NDArray[np.float64]
 
-#: Over these shares of the points' spread in the reference view a model's errors are taken to be alike, and
-#: are pairs of points compared.
-ALIKE_SHARE, PAIR_SHARE = 0.75, 0.5
 #: More than this, pixels, and more than half of the residuals' variance, is stated as the model's failure.
 UNEXPLAINED_PX = 0.5
-#: An estimate that takes up more of the model's error leaves too little to tell how large it is.
-LEAST_LEFT = 0.02
 #: A triangle seen so much flatter in the reference view than in another says nothing of the motion there.
 LARGEST_STRETCH = 5.0
 
@@ -82,7 +78,7 @@ class SystematicErrors:
         self._edges = self._by_parts(parts, lambda state: _edges(estimator.camera, self._corners, state))
         self._moved = self._by_causes(parts)
         self._dimensions = DimensionCheck(points, parts, self._jacobian, estimator.scale)
-        self._compare_neighbours(parts[0].state, window)
+        self._common = CommonErrors(self._places(parts[0].state), window)
 
     def _by_parts(self, parts: Sequence[BoundPart], of_state: Callable[[State], Array]) -> Array:
         """What ``of_state`` gives for all points (p, ...), of each part's points in its own state."""
@@ -97,30 +93,16 @@ class SystematicErrors:
             moved.append(self._jacobian[part.rows] @ part.causes)
         return np.concatenate(moved)
 
-    def _compare_neighbours(self, state: State, window: int) -> None:
-        """Which pairs of points are compared, and how alike a model's errors are in each two (p, p).
-
-        By their distances in the object as it is in the first picture, in pixels at its depth.
-        """
+    def _places(self, state: State) -> Array:
+        """Places (p, 3) of the points in an object of this state, in pixels at its depth."""
         camera, positions = self._estimator.camera, self._points.in_camera(state)
-        focal = 0.5 * (camera.fx + camera.fy)
-        places = positions * focal / np.median(positions[:, 2])
-        # Coordinate by coordinate: sums over a short axis cost numpy most of the time that a view takes.
-        apart = [np.abs(column[:, None] - column[None]) for column in places.T]
-        squared = apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2
-        spread = float(np.sqrt(np.mean(np.sum((places - places.mean(axis=0)) ** 2, axis=1))))
-        self._alike = np.exp(-0.5 * squared / (ALIKE_SHARE * spread) ** 2)
-        near = squared < (PAIR_SHARE * spread) ** 2
-        beside = np.maximum(np.maximum(apart[0], apart[1]), apart[2]) >= window
-        # As numbers, to be multiplied by in every frame; points that do not count are zero in what it is.
-        self._pairs = (near & beside).astype(np.float64)
-        self._alike_pairs = self._alike * self._pairs
+        return np.asarray(positions * 0.5 * (camera.fx + camera.fy) / np.median(positions[:, 2]))
 
     def unexplained(self, estimate: Estimate, used: NDArray[np.bool_]) -> Unexplained:
         """What the model leaves of the residuals of the points ``used`` (p,)."""
         residuals = np.where(used[:, None], estimate.residuals[: len(used)], 0.0)
         total = float(np.sum(residuals**2)) / max(2 * int(used.sum()), 1)
-        common = float(self._in_common(residuals[:, :, None], self._n_pairs(used))[0, 0])
+        common = float(self._common.in_common(residuals[:, :, None], self._common.n_pairs(used))[0, 0])
         return Unexplained(float(np.sqrt(max(common, 0.0))), float(np.sqrt(total)))
 
     @property
@@ -155,7 +137,7 @@ class SystematicErrors:
         if prior is not None:
             hessian = hessian + prior.terms(estimate.state)[1]
         gain = inverse_of_seen(hessian, self._estimator.scale)
-        covariance, n_pairs = estimate.covariance.copy(), self._n_pairs(usable)
+        covariance, n_pairs = estimate.covariance.copy(), self._common.n_pairs(usable)
         if self._moved is not None:
             warps = self._warps(estimate.state)
             moved = warps @ self._moved
@@ -164,18 +146,16 @@ class SystematicErrors:
                 residuals = np.where(usable[:, None], estimate.residuals[: len(weights)], 0.0)
                 left = np.where(usable[:, None, None], moved - jacobian @ transfer, 0.0)
                 both = (residuals[:, :, None], left)
-                shown, expected = (np.trace(self._in_common(rows, n_pairs)) for rows in both)
+                shown, expected = (np.trace(self._common.in_common(rows, n_pairs)) for rows in both)
                 self._misfit.learn(float(shown), float(expected))
                 stretched = self._dimensions.moved(estimate.state, jacobian, warps)
                 taken = gain @ np.tensordot(scores, stretched, axes=([0, 1], [0, 1]))
                 left = np.where(usable[:, None, None], stretched - jacobian @ taken, 0.0)
-                self._dimensions.learn(self._in_common(left, n_pairs))
+                self._dimensions.learn(self._common.in_common(left, n_pairs))
             covariance += self._misfit.factor * transfer @ transfer.T
-        spread = (self._alike @ scores.reshape(len(scores), -1)).reshape(scores.shape)
-        together = np.asarray(np.tensordot(scores, spread, axes=([0, 1], [0, 1])), dtype=np.float64)
-        of_model = gain @ together @ gain
-        share = self._share_left(usable, jacobian, spread @ gain, of_model)
-        covariance += alike_px**2 / share * of_model
+        gradients = self._common.gradients(scores)
+        share = self._common.share_left(usable, jacobian, gradients, gain)
+        covariance += alike_px**2 / share * (gain @ (gradients.T @ gradients) @ gain)
         return replace(estimate, covariance=covariance)
 
     def pushed(self, estimate: Estimate, weights: Array) -> tuple[Array, Array]:
@@ -199,28 +179,6 @@ class SystematicErrors:
         weights = np.where(usable, weights * np.minimum(1.0, huber / np.maximum(length, 1e-300)), 0.0)
         jacobian = np.where(usable[:, None, None], jacobian, 0.0)
         return usable, jacobian, weights[:, None, None] * jacobian
-
-    def _n_pairs(self, used: NDArray[np.bool_]) -> float:
-        """How many pairs of the points ``used`` (p,) are compared, counted from both sides."""
-        return float(used @ self._pairs @ used)
-
-    def _in_common(self, rows: Array, n_pairs: float) -> Array:
-        """Mean products (k, k), a coordinate, of what pairs of points have in (p, 2, k), zero if unused."""
-        beside = (self._pairs @ rows.reshape(len(rows), -1)).reshape(rows.shape)
-        found = np.tensordot(rows, beside, axes=([0, 1], [0, 1])) / max(2.0 * n_pairs, 1.0)
-        return np.asarray(found, dtype=np.float64)
-
-    def _share_left(self, used: NDArray[np.bool_], jacobian: Array, spread: Array, of_model: Array) -> float:
-        """How much of the variance of the model's error the estimate leaves in the residuals that show it.
-
-        With G = J H^-1 J' W what the estimate takes up, it leaves (I - G) K (I - G)' of a covariance K; this
-        is summed over the pairs of points that `unexplained` sums over.
-        """
-        beside = (self._pairs @ jacobian.reshape(len(jacobian), -1)).reshape(jacobian.shape)
-        whole = 2.0 * float(used @ self._alike_pairs @ used)
-        taken = 2.0 * float(np.sum(beside[used] * spread[used]))
-        twice = float(np.sum(np.tensordot(jacobian, beside, axes=([0, 1], [0, 1])) * of_model))
-        return max((whole - taken + twice) / max(2.0 * self._n_pairs(used), 1.0), LEAST_LEFT)
 
     def _project(self, points: BoundPoints, state: State) -> tuple[Array, Array]:
         pose = state.camera_from_object
