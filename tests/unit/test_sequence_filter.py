@@ -195,7 +195,7 @@ def test_covariance_of_one_frame_is_that_of_repeated_measurements_with_overlappi
     rng = np.random.default_rng(1)
     pixels = CAMERA.project(points.in_camera(state))
     correlation = window_correlation(pixels, 60)
-    root = np.linalg.cholesky(correlation + 1e-12 * np.eye(150))
+    root = np.linalg.cholesky(correlation.toarray() + 1e-12 * np.eye(150))
     found, stated = [], []
     for _ in range(150):
         errors = SIGMA * np.einsum("ij,jc->ic", root, rng.standard_normal((150, 2)))
@@ -214,10 +214,10 @@ def test_covariance_of_one_frame_is_that_of_repeated_measurements_with_overlappi
 def test_windows_correlate_by_what_they_share():
     pixels = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 5.0], [30.0, 0.0]])
     expected = np.array([1.0, 6 / 10, 6 / 10 * 5 / 10, 0.0])
-    np.testing.assert_allclose(window_correlation(pixels, 10)[0], expected)
+    np.testing.assert_allclose(window_correlation(pixels, 10).toarray()[0], expected)
     many = np.random.default_rng(0).uniform(0.0, 60.0, (40, 2))
     many[3] = np.nan
-    compiled = window_correlation(many, 17)
+    compiled = window_correlation(many, 17).toarray()
     np.testing.assert_allclose(compiled, window_correlation_numpy(many, 17), atol=1e-12)
     np.testing.assert_array_equal(compiled[3], np.eye(40)[3])
 

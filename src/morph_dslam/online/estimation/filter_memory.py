@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.online.uncertainty.measurement_noise import Correlation
+
 Array = NDArray[np.float64]
 
 
@@ -25,7 +27,7 @@ class PointChange:
 
     left: int
     taken: int
-    correlation: Array
+    correlation: Correlation
     n_points: int
     kept: Collection[int]
     besides: Array
@@ -120,8 +122,8 @@ class Past:
         )
 
 
-def quadratic(scores: Array, correlation: Array, others: Array | None = None) -> Array:
+def quadratic(scores: Array, correlation: Correlation, others: Array | None = None) -> Array:
     """sum_ij K_ij W_i' V_j (n, n) of scores (p, 2, n), twice the same or two, and correlation K (p, p)."""
     others = scores if others is None else others
-    spread = (correlation @ others.reshape(len(others), -1)).reshape(others.shape)
+    spread = np.asarray(correlation @ others.reshape(len(others), -1)).reshape(others.shape)
     return np.tensordot(scores, spread, axes=([0, 1], [0, 1]))

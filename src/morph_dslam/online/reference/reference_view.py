@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property, reduce
 
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
 
 from morph_dslam.errors import RegistrationError
@@ -40,7 +41,7 @@ from morph_dslam.online.reference.surface_coverage import SurfaceSamples
 from morph_dslam.online.timing import StageClock
 from morph_dslam.online.tracker_options import TrackerOptions
 from morph_dslam.online.uncertainty.bound_part import BoundPart
-from morph_dslam.online.uncertainty.measurement_noise import Measured, window_correlation
+from morph_dslam.online.uncertainty.measurement_noise import Correlation, Measured, window_correlation
 from morph_dslam.render.rasteriser import visible_points
 
 Array = NDArray[np.float64]
@@ -147,7 +148,7 @@ class ReferenceView:
     @property
     def redundancy(self) -> float:
         """How many of the points count as one, because their windows overlap."""
-        return float(self.correlation.sum() / len(self.correlation))
+        return float(self.correlation.sum() / self.correlation.shape[0])
 
     @property
     def nothing_measured(self) -> Measured:
@@ -269,13 +270,12 @@ class ReferenceView:
             )
         return bound
 
-    def _correlation(self) -> Array:
+    def _correlation(self) -> Correlation:
         """Of the points' errors (p, p): those of one picture share what their windows do."""
-        camera, window = self._estimator.camera, self._options.measurement.window
-        result = np.zeros((len(self.all_points),) * 2)
+        camera, window, blocks = self._estimator.camera, self._options.measurement.window, []
         ends = [*(part.rows.stop for part in self.parts[:-1]), len(self.all_points)]
         for part, end in zip(self.parts, ends, strict=True):
             rows = slice(part.rows.start, end)
             places = camera.project(self.all_points.in_camera(part.state)[rows])
-            result[rows, rows] = window_correlation(places, window)
-        return result
+            blocks.append(window_correlation(places, window))
+        return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.linalg
+import scipy.sparse
 from numba import njit
 from numpy.typing import NDArray
 
@@ -14,6 +14,8 @@ from morph_dslam.online.estimation.depth_residuals import PointDepths
 from morph_dslam.online.estimation.state import BoundPoints
 
 Array = NDArray[np.float64]
+#: Of errors: whole, or, of those that few others share, sparse.
+Correlation = Array | scipy.sparse.csr_array
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class Measured:
     pixels: Array
     weights: Array
     normals: Array
-    correlation: Array
+    correlation: Correlation
     depths: PointDepths | None = None
 
     @property
@@ -63,24 +65,44 @@ class RigMeasured:
         return np.concatenate([view.numbers for view in self.views])
 
     @cached_property
-    def correlation(self) -> Array:
+    def correlation(self) -> Correlation:
         """(p, p); the errors of different cameras have nothing in common."""
-        return np.asarray(scipy.linalg.block_diag(*(view.correlation for view in self.views)))
+        return scipy.sparse.csr_array(scipy.sparse.block_diag([view.correlation for view in self.views]))
 
 
-@njit(cache=True, nogil=True)
-def window_correlation(pixels, window):
+def window_correlation(pixels: Array, window: int) -> scipy.sparse.csr_array:
     """Correlation (p, p) of measurements at ``pixels`` (p, 2): the share of their windows that is the same.
 
     ``window`` is the side of the square that is compared, in pixels. Points at NaN have no window.
     """
-    result = np.eye(len(pixels))
-    for i in range(len(pixels)):
-        for j in range(i):
-            right, down = abs(pixels[i, 0] - pixels[j, 0]), abs(pixels[i, 1] - pixels[j, 1])
-            if right < window and down < window:
-                result[i, j] = result[j, i] = (1.0 - right / window) * (1.0 - down / window)
-    return result
+    return scipy.sparse.csr_array(_overlaps(pixels, float(window)), shape=(len(pixels), len(pixels)))
+
+
+@njit(cache=True, nogil=True)
+def _overlaps(pixels, window):
+    """Values, columns and beginnings of the rows of the sparse matrix of shared windows."""
+    count = len(pixels)
+    from_left = np.argsort(np.where(np.isfinite(pixels[:, 0]), pixels[:, 0], np.inf))
+    found, begins = np.ones(count, np.int32), np.zeros(count + 1, np.int32)
+    for fill in (False, True):
+        if fill:
+            begins[1:] = np.cumsum(found)
+            values, columns = np.ones(begins[-1]), np.empty(begins[-1], np.int32)
+            columns[begins[:-1]] = np.arange(count)
+            found[:] = 1
+        for place, i in enumerate(from_left):
+            for j in from_left[place + 1 :]:
+                right, down = pixels[j, 0] - pixels[i, 0], abs(pixels[i, 1] - pixels[j, 1])
+                if not right < window:
+                    break
+                if down < window:
+                    if fill:
+                        share = (1.0 - right / window) * (1.0 - down / window)
+                        values[begins[i] + found[i]] = values[begins[j] + found[j]] = share
+                        columns[begins[i] + found[i]], columns[begins[j] + found[j]] = j, i
+                    found[i] += 1
+                    found[j] += 1
+    return values, columns, begins
 
 
 def window_correlation_numpy(pixels: Array, window: int) -> Array:
