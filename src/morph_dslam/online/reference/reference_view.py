@@ -148,7 +148,7 @@ class ReferenceView:
     @property
     def redundancy(self) -> float:
         """How many of the points count as one, because their windows overlap."""
-        return float(self.correlation.sum() / self.correlation.shape[0])
+        return float(self.correlation.sum() / len(self.all_points))
 
     @property
     def nothing_measured(self) -> Measured:

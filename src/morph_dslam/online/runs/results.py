@@ -44,6 +44,7 @@ class RunResults:
     timestamps: list[float] = field(default_factory=list)
     results: list[FrameResult] = field(default_factory=list)
     _largest: list[tuple[float, float]] = field(default_factory=list, repr=False)
+    _stressed: list[tuple[float, float]] = field(default_factory=list, repr=False)
 
     def add(self, frame: int, timestamp: float, result: FrameResult) -> None:
         self.frames.append(frame)
@@ -107,9 +108,11 @@ class RunResults:
         """
         used = np.unique(self.model.triangles)
         stresses = {place: f.with_modes(f.modes[:, used]) for place, f in self.model.stresses.items()}
-        surface, none = replace(self.model, stresses=stresses), (np.nan, np.nan)
-        estimates = [result.estimate for result in self.results]
-        return np.array([none if e is None else largest_von_mises(surface, e) for e in estimates])
+        surface = replace(self.model, stresses=stresses)
+        for result in self.results[len(self._stressed) :]:
+            found = result.estimate
+            self._stressed.append((np.nan, np.nan) if found is None else largest_von_mises(surface, found))
+        return np.array(self._stressed).reshape(-1, 2)
 
     def timings_ms(self) -> Array:
         """(f, len(STAGES) + 1): each stage, then the whole frame."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from morph_dslam.geometry import cross_matrix
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.reduced_model import von_mises
+from morph_dslam.model.separated import SeparatedField
 from morph_dslam.online.estimation.estimator import Estimate
 
 Array = NDArray[np.float64]
@@ -62,26 +63,32 @@ def von_mises_std(model: ReducedModel, estimate: Estimate, place: str) -> Array:
 
 def largest_displacement(model: ReducedModel, estimate: Estimate) -> tuple[float, float]:
     """The largest length of a node's displacement, metres, and its standard deviation."""
-    value, slopes = model.displacement.value_and_sensitivities(estimate.state.parameters)
+    value = model.displacement.value(estimate.state.parameters)
     length = np.linalg.norm(value, axis=1)
     node = int(length.argmax())
     direction = value[node] / max(float(length[node]), 1e-300)
-    along = slopes[:, node] @ direction
-    return float(length[node]), float(np.sqrt(_variances(along[:, None, None], estimate)[0, 0]))
+    return float(length[node]), _deviation(model.displacement, node, direction, estimate)
 
 
 def largest_von_mises(model: ReducedModel, estimate: Estimate) -> tuple[float, float]:
     """The largest von Mises stress of a node at any place, pascals, and its standard deviation; or NaN."""
     found = (float("nan"), float("nan"))
     for place in model.stresses:
-        stress, slopes = model.stresses[place].value_and_sensitivities(estimate.state.parameters)
+        stress = model.stresses[place].value(estimate.state.parameters)
         sizes = von_mises(stress)
         node = int(sizes.argmax())
         if not sizes[node] <= found[0]:
             form = _PLANE if stress.shape[1] == 3 else _SOLID
-            along = slopes[:, node] @ (form @ stress[node]) / max(float(sizes[node]), 1e-300)
-            found = (float(sizes[node]), float(np.sqrt(_variances(along[:, None, None], estimate)[0, 0])))
+            direction = form @ stress[node] / max(float(sizes[node]), 1e-300)
+            found = float(sizes[node]), _deviation(model.stresses[place], node, direction, estimate)
     return found
+
+
+def _deviation(field: SeparatedField, node: int, direction: Array, estimate: Estimate) -> float:
+    """Standard deviation of a field's component along a direction (c,), at one of its points."""
+    there = field.with_modes(field.modes[:, [node]])
+    along = there.value_and_sensitivities(estimate.state.parameters)[1][:, 0] @ direction
+    return float(np.sqrt(_variances(along[:, None, None], estimate)[0, 0]))
 
 
 def _variances(slopes: Array, estimate: Estimate) -> Array:
