@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 
 import cv2
-import h5py
 import numpy as np
 import pytest
 
@@ -17,16 +16,16 @@ from morph_dslam.online.frame_result import HAS_MOVED, STAGES
 from morph_dslam.online.several.rig_tracking import RigTracker
 from morph_dslam.online.tracking_setup import ObjectOptions, load_setup
 from morph_dslam.sources import open_source
-from tests.support.rendered_anchored_rig import FRAMES, RIG, SCAN, make_rig_recording
+from tests.support.rendered_anchored_rig import FRAMES, RIG, SCAN
+from tests.support.tracked_rig import column, errors, exact_nodes
 
 #: What the map made from the scan is off by at the objects, and the registrations with it, metres.
 MAP_ERROR = 1.6e-3
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("anchored")
-    return folder, make_rig_recording(folder)
+def recording(rig_recording):
+    return rig_recording
 
 
 def command(folder, output, *more, first="sheet", camera="camera.yaml"):
@@ -39,30 +38,6 @@ def command(folder, output, *more, first="sheet", camera="camera.yaml"):
 def also(folder, name, start=None):
     start = start or folder / name / "registration.json"
     return ["--also", name, folder / f"{name}.morph", start]
-
-
-def exact_nodes(folder, truth, name, frame):
-    model, of_object = load_model(folder / f"{name}.morph"), truth[name]
-    pose = RigidTransform.from_matrix(of_object["camera_from_object"][frame])
-    return pose.apply(model.positions(of_object["parameters"][frame]))
-
-
-def errors(folder, truth, name, run_folder):
-    """Mean distance of all nodes from the truth in each frame, metres."""
-    run = load_run(run_folder)
-    assert set(run.status) == {"tracked"}
-    return np.array(
-        [
-            np.linalg.norm(run.camera_points(row) - exact_nodes(folder, truth, name, frame), axis=1).mean()
-            for row, frame in enumerate(run.frames)
-        ]
-    )
-
-
-def column(run_folder, name):
-    with h5py.File(run_folder / "result.h5") as file:
-        values = file[name]
-        return values.asstr()[()] if values.dtype.kind == "O" else values[:]
 
 
 def test_two_objects_are_tracked_in_one_map(recording, tmp_path, capsys):

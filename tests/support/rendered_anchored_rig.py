@@ -1,11 +1,13 @@
 """A sheet that bulges on a table and a wedge before it whose top is pushed, filmed by a rig of two cameras.
 
 The second camera films the end of the scan and what comes then. The registrations of both objects come from
-the truth and the camera's path in the map, not from `morph register`.
+the truth and the camera's path in the map, not from `morph register`; others have poses in the keyframes that
+are nearly exact, as those that `morph register` adjusts by the images.
 """
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,9 +15,9 @@ import cv2
 import numpy as np
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.geometry import RigidTransform, cross_matrix, rotation_exp
 from morph_dslam.io.calibration import save_camera
-from morph_dslam.model import ReducedModel, save_model
+from morph_dslam.model import ReducedModel, load_model, save_model
 from morph_dslam.online.several.rig import RigCamera
 from morph_dslam.online.slam.map_file import save_map
 from morph_dslam.online.slam.slam import Slam
@@ -31,6 +33,10 @@ from tests.support.staged_scenes import bending_wedge
 
 #: Frames of the scan, in which nothing deforms, all frames, and the first one of the second camera.
 SCAN, FRAMES, FIRST_BESIDE = 36, 48, 24
+#: Frames of the first camera's second recording, in which it all deforms again.
+LEFT_FRAMES = 10
+#: How well `adjusted.json` has the objects in the keyframes: turn, rad, and shift, metres.
+KEYFRAME_DEVIATIONS = np.array([5e-4, 5e-4, 5e-4, 2e-4, 2e-4, 2e-4])
 #: The wedge is so much larger than the one on the stage.
 WEDGE_SIZE = 2.0
 
@@ -56,30 +62,20 @@ texture = "{name}.png"
 direction = [-0.3, -0.5, 1.0]
 [sensor]
 noise = 1.5
+"""
+_PATH = """
 [[camera_path]]
-frame = 0
-position_mm = [-200, -560, 340]
-target_mm = [0, -60, 0]
-[[camera_path]]
-frame = 16
-position_mm = [0, -480, 440]
-target_mm = [0, -60, 0]
-[[camera_path]]
-frame = 35
-position_mm = [120, -560, 330]
-target_mm = [0, -60, 0]
-[[camera_path]]
-frame = 47
-position_mm = [40, -560, 360]
+frame = {frame}
+position_mm = [{position}]
 target_mm = [0, -60, 0]
 """
 _SHEET = """
 [[parameters]]
-frame = 36
+frame = {begin}
 arch = 0.0
 skew = 0.0
 [[parameters]]
-frame = 47
+frame = {end}
 arch = 35.0
 skew = 0.2
 [[environment.rectangles]]
@@ -95,17 +91,37 @@ down_mm = [0, 0, -500]
 """
 _WEDGE = """
 [[parameters]]
-frame = 36
+frame = {begin}
 push_x = 0.0
 push_y = 0.0
 [[parameters]]
-frame = 47
+frame = {end}
 push_x = 15.0
 push_y = -10.0
 [[pose]]
 frame = 0
 position_mm = [-90, -290, 0]
 """
+
+
+@dataclass(frozen=True)
+class _Film:
+    """How many frames, where the first camera is in some of them, mm, and when the objects are deformed."""
+
+    frames: int
+    path: dict[int, str]
+    begin: int
+    end: int
+
+
+_SCAN_AND_BEND = _Film(
+    FRAMES,
+    {0: "-200, -560, 340", 16: "0, -480, 440", 35: "120, -560, 330", 47: "40, -560, 360"},
+    SCAN,
+    FRAMES - 1,
+)
+#: From where the scan began, and farther round, where the last keyframes show little of the wedge.
+_LEFT = _Film(LEFT_FRAMES, {0: "-200, -560, 340", LEFT_FRAMES - 1: "-420, -420, 320"}, 0, LEFT_FRAMES - 1)
 
 
 @dataclass
@@ -134,33 +150,52 @@ def make_rig_recording(folder: Path) -> dict[str, dict[str, np.ndarray]]:
         cv2.imwrite(str(folder / f"{name}.png"), picture)
     wedge = bending_wedge()
     models = {"sheet": bent_sheet_model(29, 21), "wedge": replace(wedge, nodes=WEDGE_SIZE * wedge.nodes)}
-    parts = {name: _part(folder, name, model) for name, model in models.items()}
+    for name, model in models.items():
+        save_model(folder / f"{name}.morph", model)
+    parts = {name: _part(folder, name, model, _SCAN_AND_BEND) for name, model in models.items()}
     for camera, name, frames in (
         (RIG[0], "front", range(FRAMES)),
         (RIG[1], "aside", range(FIRST_BESIDE, FRAMES)),
     ):
-        (folder / name).mkdir()
-        for frame, image in _film(folder, parts, camera, frames):
-            cv2.imwrite(str(folder / name / f"{frame:06}.png"), image)
-    truth = {
-        name: {
-            "parameters": part.motion.parameters,
-            "camera_from_object": np.stack([pose.matrix for pose in part.motion.camera_from_object]),
-        }
-        for name, part in parts.items()
-    }
+        _write_film(folder, name, parts, camera, frames)
+    truth = _truth(parts)
     save_camera(folder / "camera.yaml", _CAMERA)
     write_camchain(folder / "camchain.yaml", RIG)
     _scan(folder, models, truth)
     return truth
 
 
-def _part(folder: Path, name: str, model: ReducedModel) -> _Part:
-    save_model(folder / f"{name}.morph", model)
+def make_left_recording(folder: Path) -> dict[str, dict[str, np.ndarray]]:
+    """Write `left/` beside what `make_rig_recording` has written; returns its truth."""
+    models = {name: load_model(folder / f"{name}.morph") for name in ("sheet", "wedge")}
+    parts = {name: _part(folder, name, model, _LEFT) for name, model in models.items()}
+    _write_film(folder, "left", parts, RIG[0], range(LEFT_FRAMES))
+    return _truth(parts)
+
+
+def _truth(parts: dict[str, _Part]) -> dict[str, dict[str, np.ndarray]]:
+    return {
+        name: {
+            "parameters": part.motion.parameters,
+            "camera_from_object": np.stack([pose.matrix for pose in part.motion.camera_from_object]),
+        }
+        for name, part in parts.items()
+    }
+
+
+def _part(folder: Path, name: str, model: ReducedModel, film: _Film) -> _Part:
     path = folder / f"{name}.toml"
-    path.write_text(_HEAD.format(name=name, frames=FRAMES) + {"sheet": _SHEET, "wedge": _WEDGE}[name])
+    moves = {"sheet": _SHEET, "wedge": _WEDGE}[name].format(begin=film.begin, end=film.end)
+    camera = [_PATH.format(frame=frame, position=position) for frame, position in film.path.items()]
+    path.write_text(_HEAD.format(name=name, frames=film.frames) + "".join(camera) + moves)
     scene = load_scene_file(path)
     return _Part(scene, model, plan_motion(scene, model))
+
+
+def _write_film(folder, name, parts, camera, frames):
+    (folder / name).mkdir()
+    for frame, image in _film(folder, parts, camera, frames):
+        cv2.imwrite(str(folder / name / f"{frame:06}.png"), image)
 
 
 def _film(folder, parts, part, frames):
@@ -206,3 +241,29 @@ def _scan(folder, models, truth):
         path = folder / name / "registration.json"
         names = {"map": "../map.h5", "model": f"../{name}.morph"}
         write_registration(path, slam, frames, truth[name], model.nodes.mean(axis=0), names)
+        _write_adjusted(path, truth[name], model.nodes.mean(axis=0))
+
+
+def _write_adjusted(path, truth, centre):
+    """`adjusted.json`: the registration as `morph register` has it, with a pose of its own in each keyframe.
+
+    These are off by the same turn about the middle and the same shift of the object, one draw of what is
+    stated.
+    """
+    content = json.loads(path.read_text())
+    error = KEYFRAME_DEVIATIONS * np.random.default_rng(7).standard_normal(6)
+    for keyframe in content["keyframes"]:
+        exact = truth["camera_from_object"][keyframe["frame"]]
+        turn = exact[:3, :3]
+        causes = np.zeros((6, 6))
+        causes[:3, :3] = causes[3:, 3:] = turn
+        causes[3:, :3] = cross_matrix(turn @ centre) @ turn
+        step = causes @ error
+        pose = RigidTransform(rotation_exp(step[:3]) @ turn, exact[:3, 3] + step[3:])
+        causes *= KEYFRAME_DEVIATIONS
+        keyframe |= {
+            "camera_from_object": pose.matrix.tolist(),
+            "causes": causes.tolist(),
+            "covariance": (causes @ causes.T).tolist(),
+        }
+    path.with_name("adjusted.json").write_text(json.dumps(content))

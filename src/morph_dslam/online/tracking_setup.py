@@ -31,7 +31,7 @@ from morph_dslam.online.reference.further_views import FurtherViews, choose_furt
 from morph_dslam.online.slam.map_file import load_map
 from morph_dslam.online.start.placement import Placement, load_placement, place_by_landmarks
 from morph_dslam.online.start.registration import RegistrationOptions
-from morph_dslam.online.start.scan_pictures import map_of, pictures_of, views_of
+from morph_dslam.online.start.scan_pictures import ScanPicture, map_of, pictures_of, views_of
 from morph_dslam.online.tracker_options import StartFrom, TrackerOptions
 from morph_dslam.sources import Frame
 from morph_dslam.units import to_si
@@ -90,6 +90,7 @@ class Setup:
     map_path : of the map that the object is anchored in; None if it is free.
     keyframes : of that map, by frame, in which the object is; none where a frame has to be the reference.
     aid : that places the object in the reference frame; None if something else does.
+    seen : (h, w) by frame, where it shows the object, if other objects hide some of it there.
     """
 
     options: ObjectOptions
@@ -99,15 +100,17 @@ class Setup:
     inner: tuple[InnerStructure, ...]
     placement: Placement | None
     map_path: Path | None
-    keyframes: Mapping[int, Picture]
+    keyframes: Mapping[int, ScanPicture]
     aid: Aid | None = None
+    seen: Mapping[int, NDArray[np.bool_]] = field(default_factory=dict)
 
     @property
     def reference(self) -> Picture | None:
         """The keyframe that the object is placed in; None where a frame has to be it."""
         if self.placement is None or self.placement.frame is None:
             return None
-        return self.keyframes.get(self.placement.frame)
+        keyframe = self.keyframes.get(self.placement.frame)
+        return None if keyframe is None else keyframe.picture
 
     @cached_property
     def further(self) -> FurtherViews | None:
@@ -115,7 +118,7 @@ class Setup:
         placement = self.placement
         if placement is None or not placement.views or not self.options.tracker.new_views:
             return None
-        views = views_of(placement, self.keyframes)
+        views = views_of(placement, self.keyframes, self.seen)
         if len(views) < 2:
             return None
         estimator = Estimator(placement.model, self.camera)
@@ -128,12 +131,6 @@ class Setup:
             return []
         others = [] if self.further is None else [view.frame for view in self.further.views]
         return [self.placement.frame, *(frame for frame in others if frame is not None)]
-
-    @property
-    def with_one_view(self) -> Setup:
-        """The same with one keyframe as reference: where objects may hide one another in the others."""
-        frame, picture = None if self.placement is None else self.placement.frame, self.reference
-        return replace(self, keyframes={} if picture is None or frame is None else {frame: picture})
 
     def placed(
         self, image: NDArray[np.uint8] | Picture, depth: NDArray[np.float32] | None = None
@@ -179,9 +176,12 @@ class Setup:
         reference: NDArray[np.uint8] | Picture,
         in_sequence: bool,
         seen: NDArray[np.bool_] | None = None,
-        further: FurtherViews | None = None,
     ) -> Tracker:
-        """A tracker at its beginning; see `Tracker` for the arguments."""
+        """A tracker at its beginning; see `Tracker` for the arguments.
+
+        An object in a map is known by further keyframes too.
+        """
+        by_map = self.reference is not None and reference is self.reference
         return Tracker(
             placement.model,
             self.camera,
@@ -192,19 +192,14 @@ class Setup:
             placement.covariance,
             seen,
             placement.discrepancy,
-            further,
+            self.further if by_map else None,
         )
 
     def new_chain(
         self, placement: Placement, reference: NDArray[np.uint8] | Picture, in_sequence: bool
     ) -> Chain:
-        """As `new_tracker`, with the camera in the map before it where the object is anchored.
-
-        An object in a map is known by further keyframes too.
-        """
-        by_map = self.reference is not None and reference is self.reference
-        further = self.further if by_map else None
-        tracker = self.new_tracker(placement, reference, in_sequence, further=further)
+        """As `new_tracker`, with the camera in the map before it where the object is anchored."""
+        tracker = self.new_tracker(placement, reference, in_sequence)
         return Chain(self.camera, tracker, self.new_anchor({self.model.name: placement}))
 
     def new_anchor(self, placements: Mapping[str, Placement]) -> Anchor | None:
@@ -271,7 +266,7 @@ def load_setup(options: ObjectOptions) -> Setup:
         if path is None:
             note = "no map was given or found beside the registration: the object is tracked as a free one"
             placement = replace(placement, flags=(*placement.flags, note))
-    keyframes: dict[int, Picture] = {}
+    keyframes: dict[int, ScanPicture] = {}
     if path is not None and not options.use_outline:
         keyframes = pictures_of(path, camera, placement)
     return Setup(options, model, camera, None, inner, placement, path, keyframes)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import RegistrationError
+from morph_dslam.online.attempt import Picture
 from morph_dslam.online.estimation.estimator import Estimator
 from morph_dslam.online.measuring.binding import DrawnSurface, draw_view, view_of
 from morph_dslam.online.reference.new_view import KEEP_OFF_PX, around
@@ -58,7 +59,10 @@ def _most_shown(estimator: Estimator, views: Sequence[KnownView]) -> list[int]:
     drawn = DrawnSurface.of(estimator.model)
     surface, samples = drawn.model, SurfaceSamples(estimator, drawn)
     meshes = [view_of(surface, estimator.camera, view.state) for view in views]
-    depths = [draw_view(mesh, surface.triangles, estimator.camera).depth for mesh in meshes]
+    depths = [
+        view.shown(draw_view(mesh, surface.triangles, estimator.camera))[1]
+        for view, mesh in zip(views, meshes, strict=True)
+    ]
     areas = np.abs([samples.seen(view.state, depth) for view, depth in zip(views, depths, strict=True)])
     # Of each sample the share of what the best picture shows of it.
     shares = areas / np.maximum(areas.max(axis=0), 1e-300)
@@ -83,7 +87,7 @@ def _agreed(
     reference, clock = ReferenceView(estimator, views, options), StageClock(("render", "correct"))
     agreed = np.zeros((len(pictures), len(reference.points)), dtype=bool)
     for row, picture in enumerate(pictures):
-        agreed[row] = reference.measure(picture.picture, picture.state, None, clock).valid
+        agreed[row] = reference.measure(_as_frame(picture), picture.state, None, clock).valid
     result = [views[0]]
     for view, part in zip(views[1:], reference.parts[1:], strict=True):
         rows = [row for row, picture in enumerate(pictures) if picture is not view]
@@ -91,7 +95,13 @@ def _agreed(
         if alone.all():
             continue
         places = estimator.camera.project(reference.points.in_camera(view.state)[part.rows][alone])
-        result.append(
-            replace(view, seen=reference.covered(view.state) & ~around(view.picture, places, KEEP_OFF_PX))
-        )
+        seen = reference.covered(view.state) & ~around(view.picture, places, KEEP_OFF_PX)
+        result.append(replace(view, seen=seen if view.seen is None else view.seen & seen))
     return result
+
+
+def _as_frame(view: KnownView) -> Picture:
+    """A view's picture, to be measured in; points do not count where something is before the object."""
+    if view.seen is None:
+        return view.picture
+    return replace(view.picture, in_front=np.where(view.seen, np.float32(np.inf), np.float32(0.0)))

@@ -42,7 +42,7 @@ from morph_dslam.online.timing import StageClock
 from morph_dslam.online.tracker_options import TrackerOptions
 from morph_dslam.online.uncertainty.bound_part import BoundPart
 from morph_dslam.online.uncertainty.measurement_noise import Correlation, Measured, window_correlation
-from morph_dslam.render.rasteriser import visible_points
+from morph_dslam.render.rasteriser import Buffers, visible_points
 
 Array = NDArray[np.float64]
 
@@ -69,6 +69,14 @@ class KnownView:
     seen: NDArray[np.bool_] | None = None
     discrepancy: Discrepancy | None = None
     frame: int | None = None
+
+    def shown(self, drawn: Buffers) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+        """Where (h, w) the picture shows the object as ``drawn``, and its depth (h, w), metres.
+
+        Where something else is before the object nothing of it is shown, as if that were at depth 0.
+        """
+        shown = drawn.covered if self.seen is None else self.seen & drawn.covered
+        return shown, np.where(drawn.covered & ~shown, np.float32(0.0), drawn.depth)
 
 
 class ReferenceView:
@@ -225,26 +233,18 @@ class ReferenceView:
         """
         drawn, closed, camera = self.surface.model, self.surface.closed, self._estimator.camera
         buffers = [draw_view(mesh, drawn.triangles, camera) for mesh in meshes]
-        seen = [
-            buffer.covered if view.seen is None else view.seen & buffer.covered
-            for view, buffer in zip(self._views, buffers, strict=True)
-        ]
+        shown = [view.shown(buffer) for view, buffer in zip(self._views, buffers, strict=True)]
         sources = np.zeros(len(drawn.triangles), dtype=np.int64)
         if len(meshes) > 1:
-            # Where something else is before the object nothing of it is shown, as if that were at depth 0.
-            depths = [
-                np.where(buffer.covered & ~shown, np.float32(0.0), buffer.depth)
-                for buffer, shown in zip(buffers, seen, strict=True)
-            ]
             sources = choose_sources(
                 [
                     shown_areas(mesh, drawn.triangles, depth, closed)
-                    for mesh, depth in zip(meshes, depths, strict=True)
+                    for mesh, (_, depth) in zip(meshes, shown, strict=True)
                 ]
             )
         flats = [view.picture.flat for view in self._views]
         self.appearance = ReferenceAppearance(drawn, camera, flats, meshes, sources, closed)
-        masks = [interior(shown, self._options.measurement.patch_half + 2) for shown in seen]
+        masks = [interior(seen, self._options.measurement.patch_half + 2) for seen, _ in shown]
         per_pixel = self._options.n_points / max(np.count_nonzero(masks[0]), 1)
         for number, (mask, buffer) in enumerate(zip(masks, buffers, strict=True)):
             mask[~part_from(number, buffer.triangle_ids, sources)] = 0

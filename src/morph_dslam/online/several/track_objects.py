@@ -10,16 +10,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from morph_dslam.errors import TrackingError
 from morph_dslam.online.aids.start import AidFiles
-from morph_dslam.online.pipeline import Tracker
 from morph_dslam.online.runs.output_folders import check_run_folder
 from morph_dslam.online.runs.results import RunResults
-from morph_dslam.online.several.several_objects import ObjectsChain, widened
+from morph_dslam.online.several.hiding import Known, seen_parts
+from morph_dslam.online.several.several_objects import ObjectsChain
 from morph_dslam.online.start.placement import Placement
 from morph_dslam.online.track import (
     Begin,
@@ -86,7 +84,7 @@ def track_objects(options: TrackOptions, others: Sequence[OtherObject]) -> dict[
     everything = [_for_first(options, others), *(_for_other(options, other) for other in others)]
     for part in everything:
         check_run_folder(part.output, part.overwrite)
-    objects = _prepare(everything, [load_setup(part).with_one_view for part in everything])
+    objects = _prepare(everything, [load_setup(part) for part in everything])
     source = open_frames(objects[0].options)
     chain = _new_chain(objects)
     warm_up(chain.process, objects[0].begin.picture)
@@ -174,27 +172,27 @@ def _prepare(everything: Sequence[TrackOptions], setups: Sequence[Setup]) -> lis
         constant = setup.tracker_options(placement).per_sequence
         run = RunResults(placement.model, begin.frame, per_sequence=constant)
         objects.append(_Object(part, setup, begin, placement, run))
-    return objects
+    return _without_hidden(objects)
 
 
-def _new_tracker(part: _Object, seen: NDArray[np.bool_] | None = None) -> Tracker:
-    return part.setup.new_tracker(part.placement, part.begin.picture, part.begin.in_sequence, seen)
+def _without_hidden(objects: Sequence[_Object]) -> list[_Object]:
+    """The objects, bound only where none is before another in the pictures that they are known by."""
+    known = [Known(part.setup, part.placement, part.begin.frame) for part in objects]
+    seen = seen_parts(known)
+    return [
+        replace(part, setup=replace(part.setup, seen=own)) for part, own in zip(objects, seen, strict=True)
+    ]
 
 
 def _new_chain(objects: Sequence[_Object]) -> ObjectsChain:
-    """All objects at their beginning; nothing is bound where one is before another in the reference frame."""
+    """All objects at their beginning."""
     anchored = [part for part in objects if part.setup.map_path is not None]
     placements = {part.name: part.placement for part in anchored}
     anchor = anchored[0].setup.new_anchor(placements) if anchored else None
-    alone = [_new_tracker(part) for part in objects]
-    drawn = [tracker.reference.depth(tracker.state) for tracker in alone]
     trackers = {}
-    for part, tracker, own in zip(objects, alone, drawn, strict=True):
-        others = [
-            widened(depth)
-            for depth, other in zip(drawn, objects, strict=True)
-            if other is not part and other.begin.frame == part.begin.frame
-        ]
-        seen = np.isfinite(own) & (own <= np.minimum.reduce([own, *others]))
-        trackers[part.name] = tracker if np.array_equal(seen, np.isfinite(own)) else _new_tracker(part, seen)
+    for part in objects:
+        seen = part.setup.seen.get(part.begin.frame)
+        trackers[part.name] = part.setup.new_tracker(
+            part.placement, part.begin.picture, part.begin.in_sequence, seen
+        )
     return ObjectsChain(objects[0].setup.camera, trackers, anchor)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import MapError
@@ -21,6 +23,14 @@ from morph_dslam.online.start.placement import Placement
 OTHER_MAP_TURN, OTHER_MAP_SHIFT = 0.1, 0.1
 
 
+@dataclass(frozen=True)
+class ScanPicture:
+    """A keyframe: its image made ready, and the camera's pose (4, 4), metres times the map's scale."""
+
+    picture: Picture
+    camera_from_world: NDArray[np.float64]
+
+
 def map_of(registration: Path, given: Path | None) -> Path | None:
     """The map: as given, as the registration names it, or beside it; None if there is none."""
     if given is not None:
@@ -32,7 +42,7 @@ def map_of(registration: Path, given: Path | None) -> Path | None:
     return next((path for path in beside if path.is_file()), None)
 
 
-def pictures_of(path: Path, camera: PinholeCamera, placement: Placement) -> dict[int, Picture]:
+def pictures_of(path: Path, camera: PinholeCamera, placement: Placement) -> dict[int, ScanPicture]:
     """The keyframes that the placement is for; their images are flattened, which is all that is needed.
 
     Raises
@@ -44,7 +54,8 @@ def pictures_of(path: Path, camera: PinholeCamera, placement: Placement) -> dict
     for keyframe in load_map(path, camera).keyframes:
         if keyframe.index not in wanted:
             continue
-        pictures[keyframe.index] = Picture(keyframe.flat, keyframe.flat)
+        picture = Picture(keyframe.flat, keyframe.flat)
+        pictures[keyframe.index] = ScanPicture(picture, keyframe.camera_from_world)
         if keyframe.index == placement.frame and placement.place is not None:
             _check_pose(path, placement, placement.place.pose_in(keyframe.camera_from_world))
     if placement.frame not in pictures:
@@ -52,14 +63,20 @@ def pictures_of(path: Path, camera: PinholeCamera, placement: Placement) -> dict
     return pictures
 
 
-def views_of(placement: Placement, pictures: Mapping[int, Picture]) -> list[KnownView]:
-    """The undeformed object in those keyframes whose errors are known, that of the placement first."""
+def views_of(
+    placement: Placement, pictures: Mapping[int, ScanPicture], seen: Mapping[int, NDArray[np.bool_]]
+) -> list[KnownView]:
+    """The undeformed object in those keyframes whose errors are known, that of the placement first.
+
+    ``seen`` (h, w) says of some keyframes where they show the object.
+    """
     d = len(placement.model.parameters)
     return [
         KnownView(
-            pictures[view.frame],
+            pictures[view.frame].picture,
             State(placement.model.default, view.pose),
             np.vstack([np.zeros((d, view.causes.shape[1])), view.causes]),
+            seen=seen.get(view.frame),
             frame=view.frame,
         )
         for view in placement.views
