@@ -83,7 +83,7 @@ def object_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
         "per_sequence": tuple(arguments.per_sequence),
         "random_walk": tuple(arguments.random_walk),
         "start": arguments.start,
-        "tracker": TrackerOptions(new_views=not arguments.one_view),
+        "tracker": TrackerOptions(new_views=not arguments.one_view, further_views=not arguments.one_view),
     }
 
 
@@ -150,7 +150,8 @@ def add_object_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--one-view",
         action="store_true",
-        help="make no further reference views when the object turns other parts to the camera",
+        help="take one keyframe of the map as reference view, and make none when the object turns other "
+        "parts to the camera",
     )
     command.add_argument(
         "--depth",

@@ -7,13 +7,22 @@ import numpy as np
 import pytest
 
 from morph_dslam.cli import main
-from morph_dslam.geometry import RigidTransform
+from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.model import load_model
 from morph_dslam.online.several.hiding import Known, seen_parts
+from morph_dslam.online.several.rig_views import further_of_rig, pictures_from
 from morph_dslam.online.tracking_setup import ObjectOptions, load_setup
 from morph_dslam.render.rasteriser import rasterise
-from tests.support.rendered_anchored_rig import LEFT_FRAMES, RIG, make_left_recording
-from tests.support.tracked_rig import errors
+from tests.support.rendered_anchored_rig import (
+    FIRST_BESIDE,
+    LEFT_FRAMES,
+    MIRRORED_RIG,
+    RIG,
+    SCAN,
+    make_left_recording,
+    make_mirrored_recording,
+)
+from tests.support.tracked_rig import column, errors, exact_nodes
 
 NAMES = ("sheet", "wedge")
 CAMERA = RIG[0].camera
@@ -60,10 +69,8 @@ def setups_of(folder):
 
 
 def exact_depth(folder, truth, name, frame):
-    model = load_model(folder / f"{name}.morph")
-    pose = RigidTransform.from_matrix(truth[name]["camera_from_object"][frame])
-    nodes = pose.apply(model.positions(truth[name]["parameters"][frame]))
-    return rasterise(CAMERA.project(nodes), nodes[:, 2], model.triangles, CAMERA.height, CAMERA.width).depth
+    nodes, triangles = exact_nodes(folder, truth, name, frame), load_model(folder / f"{name}.morph").triangles
+    return rasterise(CAMERA.project(nodes), nodes[:, 2], triangles, CAMERA.height, CAMERA.width).depth
 
 
 def wedge_before_sheet(folder, truth, frame):
@@ -126,3 +133,47 @@ def test_what_is_hidden_in_the_last_keyframe_is_bound_in_another(rig_recording, 
     )
     hidden[inside] = before[pixels[inside, 1], pixels[inside, 0]]
     assert hidden.sum() > 50
+
+
+def test_each_camera_of_a_rig_knows_the_object_by_its_own_pictures_of_the_scan(rig_recording, left, tmp_path):
+    """In the last keyframe neither camera shows the side of the wedge that the first one films then."""
+    folder, mean = rig_recording[0], {}
+    setup = setups_of(folder)["wedge"]
+    truth = make_mirrored_recording(folder, sorted(setup.keyframes))
+    for further, part in zip(
+        further_of_rig(setup, MIRRORED_RIG, [folder / "mirrored"]), MIRRORED_RIG, strict=True
+    ):
+        assert further.views
+        for view in further.views:
+            exact = part.camera_from_rig.apply(exact_nodes(folder, truth, "wedge", view.frame))
+            nodes = view.state.camera_from_object.apply(setup.model.positions(view.state.parameters))
+            assert np.linalg.norm(nodes - exact, axis=1).max() < 0.4e-3
+    arguments = [
+        folder / "both",
+        "--with",
+        folder / "mirrored",
+        "--camera",
+        f"{folder}/camchain_mirrored.yaml#cam0",
+    ]
+    arguments += ["--model", folder / "wedge.morph", "--place", folder / "wedge" / "adjusted.json"]
+    arguments += ["--range", f"{SCAN}-{SCAN + LEFT_FRAMES - 1}", "--no-video", "-o"]
+    for name, more in (("one", ["--one-view"]), ("several", [])):
+        assert main(["track", *map(str, [*arguments, tmp_path / name, *more])]) == 0
+        mean[name] = errors(folder, truth, "wedge", tmp_path / name).mean()
+    # 1.5 and 0.24 mm.
+    assert mean["several"] < min(0.35e-3, 0.4 * mean["one"])
+    run, apart = load_run(tmp_path / "several"), truth["wedge"]["parameters"][SCAN:]
+    std = column(tmp_path / "several", "parameter_std")
+    assert (np.abs(run.parameters - apart) < 3.0 * std + 0.02e-3).all()
+
+
+def test_a_camera_has_those_pictures_of_the_scan_that_it_filmed(rig_recording):
+    """The second camera's recording begins in the midst of the scan."""
+    folder = rig_recording[0]
+    setup = setups_of(folder)["wedge"]
+    filmed = [number for number in sorted(setup.keyframes) if number >= FIRST_BESIDE]
+    assert 1 < len(filmed) < len(setup.keyframes)
+    assert sorted(pictures_from(folder / "aside", RIG[1].camera, setup.keyframes)) == filmed
+    first, second = further_of_rig(setup, RIG, [folder / "aside"])
+    assert first is setup.further
+    assert {view.frame for view in second.views} <= set(filmed)

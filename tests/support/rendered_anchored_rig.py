@@ -8,6 +8,7 @@ are nearly exact, as those that `morph register` adjusts by the images.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -40,16 +41,19 @@ KEYFRAME_DEVIATIONS = np.array([5e-4, 5e-4, 5e-4, 2e-4, 2e-4, 2e-4])
 #: The wedge is so much larger than the one on the stage.
 WEDGE_SIZE = 2.0
 
-_TURN = rotation_exp(np.array([0.0, 0.38, 0.0]))
 _CAMERA = PinholeCamera(480, 360, 420.0, 420.0, 239.5, 179.5)
-#: 0.22 m beside the first camera, turned so that both look at the same place 0.55 m away.
-RIG = (
-    RigCamera(_CAMERA, RigidTransform.identity()),
-    RigCamera(
-        PinholeCamera(480, 360, 400.0, 400.0, 236.0, 182.0),
-        RigidTransform(_TURN, np.array([0.0, 0.0, 0.55]) - _TURN @ np.array([0.0, 0.0, 0.55])),
-    ),
-)
+
+
+def _rig(turn: float) -> tuple[RigCamera, RigCamera]:
+    """The second camera 0.22 m beside the first, turned so that both look at the same place 0.55 m away."""
+    around, place = rotation_exp(np.array([0.0, turn, 0.0])), np.array([0.0, 0.0, 0.55])
+    beside = PinholeCamera(480, 360, 400.0, 400.0, 236.0, 182.0)
+    pose = RigidTransform(around, place - around @ place)
+    return RigCamera(_CAMERA, RigidTransform.identity()), RigCamera(beside, pose)
+
+
+#: With the second camera to the right of the first, and to the left.
+RIG, MIRRORED_RIG = _rig(0.38), _rig(-0.38)
 
 _HEAD = """
 model = "{name}.morph"
@@ -104,7 +108,7 @@ position_mm = [-90, -290, 0]
 """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Film:
     """How many frames, where the first camera is in some of them, mm, and when the objects are deformed."""
 
@@ -140,9 +144,7 @@ class _Part:
 def make_rig_recording(folder: Path) -> dict[str, dict[str, np.ndarray]]:
     """Write models, `front/`, `aside/`, `camchain.yaml`, `camera.yaml`, `map.h5` and both registrations.
 
-    Returns
-    -------
-    By object, parameters (T, d) and camera_from_object (T, 4, 4) in the first camera.
+    Returns by object the parameters (T, d) and camera_from_object (T, 4, 4) in the first camera.
     """
     for seed, (name, cells) in enumerate((("sheet", 75), ("wedge", 75), ("table", 150))):
         noise = np.random.default_rng(seed).integers(20, 236, (cells, cells, 3), dtype=np.uint8)
@@ -171,6 +173,34 @@ def make_left_recording(folder: Path) -> dict[str, dict[str, np.ndarray]]:
     parts = {name: _part(folder, name, model, _LEFT) for name, model in models.items()}
     _write_film(folder, "left", parts, RIG[0], range(LEFT_FRAMES))
     return _truth(parts)
+
+
+def make_mirrored_recording(folder: Path, keyframes: Sequence[int]) -> dict[str, dict[str, np.ndarray]]:
+    """Write `both/` and `mirrored/`, the scan and what `left/` shows after it, and `camchain_mirrored.yaml`.
+
+    The second camera is to the left of the first, and has of the scan the ``keyframes`` alone. Returns
+    the truth.
+    """
+    models = {name: load_model(folder / f"{name}.morph") for name in ("sheet", "wedge")}
+    films = {
+        film: {name: _part(folder, name, model, film) for name, model in models.items()}
+        for film in (_SCAN_AND_BEND, _LEFT)
+    }
+    for name in ("both", "mirrored"):
+        (folder / name).mkdir()
+    for first, film, frames in ((0, _SCAN_AND_BEND, keyframes), (SCAN, _LEFT, range(LEFT_FRAMES))):
+        for frame, image in _film(folder, films[film], MIRRORED_RIG[1], frames):
+            cv2.imwrite(str(folder / "mirrored" / f"{first + frame:06}.png"), image)
+    for first, source, count in ((0, "front", SCAN), (SCAN, "left", LEFT_FRAMES)):
+        for frame in range(count):
+            path = folder / "both" / f"{first + frame:06}.png"
+            path.symlink_to(folder / source / f"{frame:06}.png")
+    write_camchain(folder / "camchain_mirrored.yaml", MIRRORED_RIG)
+    scan, left = _truth(films[_SCAN_AND_BEND]), _truth(films[_LEFT])
+    return {
+        name: {key: np.concatenate([scan[name][key][:SCAN], left[name][key]]) for key in scan[name]}
+        for name in scan
+    }
 
 
 def _truth(parts: dict[str, _Part]) -> dict[str, dict[str, np.ndarray]]:

@@ -1,6 +1,7 @@
 """The error of a rig's reference state in the covariance, against what it does to estimates."""
 
 from dataclasses import replace
+from functools import reduce
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,11 +15,12 @@ from morph_dslam.online.measuring.binding import bind_pixels, view_of
 from morph_dslam.online.several.rig import RigCamera, RigEstimator
 from morph_dslam.online.several.rig_reference import RigReference
 from morph_dslam.online.tracker_options import TrackerOptions
+from morph_dslam.online.uncertainty.bound_part import BoundPart
 from morph_dslam.online.uncertainty.measurement_noise import Measured, RigMeasured
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, sheet_state
 
-REFERENCE, LATER = sheet_state(0.1), sheet_state(0.6)
+REFERENCE, ANOTHER, LATER = sheet_state(0.1), sheet_state(0.3), sheet_state(0.6)
 TURN = rotation_exp(np.array([0.02, 0.4, -0.05]))
 RIG = (
     RigCamera(CAMERA, RigidTransform.identity()),
@@ -36,42 +38,50 @@ def model():
     return bent_sheet_model(43, 31)
 
 
-def pixels_of(model, part):
-    """Places of corners in a camera's reference view, on the sheet with a margin."""
+def pixels_of(model, part, reference):
+    """Places of corners in a camera's picture of the sheet in this state, on it with a margin."""
     nodes = np.random.default_rng(0).choice(len(model.nodes), 200, replace=False)
     inside = np.abs(model.nodes[nodes]) < [0.18, 0.12, 1.0]
-    seen = part.seen(REFERENCE).camera_from_object.apply(model.positions(REFERENCE.parameters))[nodes]
+    seen = part.seen(reference).camera_from_object.apply(model.positions(reference.parameters))[nodes]
     return part.camera.project(seen[inside.all(axis=1)])
 
 
-def bound(model, part, state):
-    """The points that those corners are if the object is in this state, in the rig's frame."""
+def bound(model, part, reference, state):
+    """The points that those corners are if the object is in another state, in the rig's frame."""
     view = view_of(model, part.camera, part.seen(state))
-    surface, met = bind_pixels(model, part.camera, view, pixels_of(model, part))
+    surface, met = bind_pixels(model, part.camera, view, pixels_of(model, part, reference))
     assert met.all()
     return BoundPoints.from_surface(model, surface)
 
 
-def estimated(model, state):
-    """What exact measurements of a later frame lead to if the reference state was this one, and by what."""
+def estimated(model, pictures):
+    """What exact measurements of a later frame lead to, and by what.
+
+    ``pictures`` : in each, the reference state, what it was taken for, and the causes (9, c) of that error.
+    """
     views, trackers = [], []
-    estimator = RigEstimator(model, RIG, EstimationOptions(huber_px=50.0))
+    estimator = RigEstimator(model, RIG, EstimationOptions(huber_px=50.0, max_iterations=50, tolerance=1e-9))
     for part, single in zip(RIG, estimator._single, strict=True):
-        true_points, points = bound(model, part, REFERENCE), bound(model, part, state)
+        every_true = [bound(model, part, true, true) for true, _, _ in pictures]
+        every = [bound(model, part, true, taken) for true, taken, _ in pictures]
+        true_points, points = (reduce(BoundPoints.joined, parts) for parts in (every_true, every))
         count, options = len(points), TrackerOptions()
         pixels = part.camera.project(true_points.in_camera(part.seen(LATER)))
         views.append(Measured(points, pixels, np.ones(count), np.zeros((count, 2)), np.eye(count)))
-        reference = SimpleNamespace(points=points, state=part.seen(state))
+        ends, parts = np.cumsum([len(own) for own in every]), []
+        for own, end, (_, taken, causes) in zip(every, ends, pictures, strict=True):
+            seen = None if causes is None else part.chain(len(model.parameters)) @ causes
+            parts.append(BoundPart(slice(end - len(own), end), part.seen(taken), seen))
+        reference = SimpleNamespace(points=points, parts=parts)
         trackers.append(SimpleNamespace(estimator=single, reference=reference, options=options))
     measured = RigMeasured(tuple(views))
     return estimator.fit(measured, LATER), measured, trackers
 
 
-@pytest.mark.parametrize("step", STEPS)
-def test_an_error_of_the_reference_moves_later_estimates_as_predicted(model, step):
-    found, measured, trackers = estimated(model, moved(REFERENCE, step))
+def check_prediction(model, pictures):
+    found, measured, trackers = estimated(model, pictures)
     plain = replace(found, covariance=np.zeros((9, 9)))
-    stated = RigReference(trackers, RIG, np.outer(step, step)).added(plain, measured, None).covariance
+    stated = RigReference(trackers, RIG).added(plain, measured, None).covariance
     pose, true = found.state.camera_from_object, LATER.camera_from_object
     turn = pose.rotation @ true.rotation.T
     away = np.concatenate(
@@ -87,6 +97,18 @@ def test_an_error_of_the_reference_moves_later_estimates_as_predicted(model, ste
     np.testing.assert_allclose(deviations, np.abs(away), atol=0.1 * np.linalg.norm(away))
 
 
+@pytest.mark.parametrize("step", STEPS)
+def test_an_error_of_the_reference_moves_later_estimates_as_predicted(model, step):
+    check_prediction(model, [(REFERENCE, moved(REFERENCE, step), step[:, None])])
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_of_two_pictures_each_is_off_in_its_own_way_by_the_same_cause(model, step):
+    other = np.roll(STEPS, 4, axis=0)[np.argmax(step)]
+    pictures = [(REFERENCE, step), (ANOTHER, other)]
+    check_prediction(model, [(true, moved(true, own), own[:, None]) for true, own in pictures])
+
+
 def test_nothing_is_added_where_nothing_is_known(model):
-    found, measured, trackers = estimated(model, REFERENCE)
-    assert RigReference(trackers, RIG, None).added(found, measured, None) is found
+    found, measured, trackers = estimated(model, [(REFERENCE, REFERENCE, None)])
+    assert RigReference(trackers, RIG).added(found, measured, None) is found

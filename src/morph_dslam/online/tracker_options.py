@@ -47,6 +47,8 @@ class TrackerOptions:
         lead at constant velocity.
     new_views, max_views : whether frames in which the reference view shows too little of what is seen may
         become reference views too, and how many are kept, the first one included.
+    further_views : whether other keyframes of the map of an anchored object are reference views with the one
+        that it is placed in.
     """
 
     n_points: int = 350
@@ -72,6 +74,7 @@ class TrackerOptions:
     start: StartFrom = "previous"
     new_views: bool = True
     max_views: int = 12
+    further_views: bool = True
     flow: FlowOptions = field(default_factory=FlowOptions)
     measurement: MeasurementOptions = field(default_factory=MeasurementOptions)
     outline: OutlineOptions = field(default_factory=OutlineOptions)

@@ -116,7 +116,7 @@ class Setup:
     def further(self) -> FurtherViews | None:
         """Other keyframes that show more of the object, where it is known how they are off with the first."""
         placement = self.placement
-        if placement is None or not placement.views or not self.options.tracker.new_views:
+        if placement is None or not placement.views or not self.options.tracker.further_views:
             return None
         views = views_of(placement, self.keyframes, self.seen)
         if len(views) < 2:

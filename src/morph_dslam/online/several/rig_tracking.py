@@ -22,10 +22,12 @@ from morph_dslam.online.estimation.estimator import Estimate, Prior, State
 from morph_dslam.online.estimation.temporal import new_filter
 from morph_dslam.online.frame_result import FOLLOWED, HAS_MOVED, STAGES, FrameResult
 from morph_dslam.online.pipeline import Tracker
+from morph_dslam.online.reference.further_views import FurtherViews
 from morph_dslam.online.several.rig import RigCamera, RigEstimator
 from morph_dslam.online.several.rig_reference import RigReference
 from morph_dslam.online.timing import StageClock
 from morph_dslam.online.tracker_options import TrackerOptions
+from morph_dslam.online.uncertainty.bound_part import causes_of
 from morph_dslam.online.uncertainty.measurement_noise import RigMeasured
 
 Image = NDArray[np.uint8]
@@ -42,6 +44,8 @@ class RigTracker:
     cameras : of the rig. references : by camera, the reference frame, of one instant; see `Tracker`.
     state : of the object in them, its pose in the rig's frame (the first camera's).
     reference_covariance : (d + 6, d + 6) of ``state``; None where nothing is known of its error.
+    further : by camera, other pictures of the object as it is there, and how it is off in all of them by the
+        same causes; these count in place of ``reference_covariance``.
 
     Raises
     ------
@@ -58,15 +62,17 @@ class RigTracker:
         options: TrackerOptions | None = None,
         in_sequence: bool = True,
         reference_covariance: NDArray[np.float64] | None = None,
+        further: Sequence[FurtherViews] | None = None,
     ) -> None:
         self.model, self.cameras, self.options = model, tuple(cameras), options or TrackerOptions()
-        self.trackers = [
-            self._new_tracker(number, part, image, part.seen(state), in_sequence)
-            for number, (part, image) in enumerate(zip(self.cameras, references, strict=True))
-        ]
         self.estimator = RigEstimator(model, self.cameras, self.options.estimation)
+        further = further or self._without_further(reference_covariance)
+        self.trackers = [
+            self._new_tracker(number, image, self.cameras[number].seen(state), in_sequence, others)
+            for number, (image, others) in enumerate(zip(references, further, strict=True))
+        ]
         self._filter = new_filter(self.estimator, self.options)
-        self._reference = RigReference(self.trackers, self.cameras, reference_covariance)
+        self._reference = RigReference(self.trackers, self.cameras)
         self._sigma_px = FIRST_SIGMA_PX
 
     def process_frame(self, images: Sequence[Image], known: KnownPose | None = None) -> FrameResult:
@@ -146,16 +152,23 @@ class RigTracker:
             kept.append(replace(view, weights=weights))
         return RigMeasured(tuple(kept))
 
+    def _without_further(self, covariance: NDArray[np.float64] | None) -> list[FurtherViews]:
+        """Of each camera no other pictures, but how the reference state is off there."""
+        causes = causes_of(covariance, self.estimator.scale)
+        chains = [part.chain(len(self.model.parameters)) for part in self.cameras]
+        return [FurtherViews(None if causes is None else chain @ causes) for chain in chains]
+
     def _new_tracker(
-        self, number: int, part: RigCamera, image: Image | Picture, state: State, in_sequence: bool
+        self, number: int, image: Image | Picture, state: State, in_sequence: bool, further: FurtherViews
     ) -> Tracker:
+        part = self.cameras[number]
         picture = image.grey if isinstance(image, Picture) else image
         part.camera.check_image(picture, f"the reference frame of camera {number}")
         # What is one over the sequence, or walks, is found from all cameras together.
-        # The joint estimate ties lasting errors to the points of one view a camera, so these stay the same.
+        # The joint estimate ties lasting errors to the points of one view a camera, so that none is made.
         single = replace(self.options, per_sequence=(), random_walk=(), new_views=False)
         try:
-            return Tracker(self.model, part.camera, image, state, single, in_sequence)
+            return Tracker(self.model, part.camera, image, state, single, in_sequence, further=further)
         except RegistrationError as error:
             raise RegistrationError(f"camera {number}: {error}") from error
 

@@ -23,6 +23,7 @@ from morph_dslam.online.runs.output_folders import check_run_folder
 from morph_dslam.online.runs.results import RunResults
 from morph_dslam.online.several.rig import RigCamera
 from morph_dslam.online.several.rig_tracking import RigTracker
+from morph_dslam.online.several.rig_views import further_of_rig
 from morph_dslam.online.slam.frame_images import FrameImages
 from morph_dslam.online.slam.options import SlamOptions
 from morph_dslam.online.track import TrackOptions, find_begin, open_frames, with_reference, write_results
@@ -57,15 +58,17 @@ def track_rig(options: TrackOptions, others: Sequence[Path]) -> dict[str, Any]:
         frames are not known.
     """
     _check(options)
-    # Each camera keeps its one reference view; see `RigTracker`.
+    # No camera makes a reference view; see `RigTracker`.
     options = replace(options, tracker=replace(options.tracker, new_views=False))
     cameras = _cameras(options.camera, 1 + len(others))
     check_run_folder(options.output, options.overwrite)
     setup, options = _with_reference(load_setup(options), options)
     sources = [open_frames(options), *(open_source(path, options.first, options.last) for path in others)]
     begin = find_begin(setup, options)
+    further = None
     if setup.reference is not None:
         _check_scan(setup.camera, setup.reference, options.frames, begin.frame)
+        further = further_of_rig(setup, cameras, others)
     references = [begin.picture, *(_frame(path, begin.frame).image for path in others)]
     placement = setup.placed(begin.picture)
     setup.warm_up(placement, begin.picture)
@@ -78,6 +81,7 @@ def track_rig(options: TrackOptions, others: Sequence[Path]) -> dict[str, Any]:
         tracked_with,
         begin.in_sequence,
         placement.covariance,
+        further,
     )
     first = setup.new_chain(placement, begin.picture, begin.in_sequence)
     run = RunResults(placement.model, begin.frame, per_sequence=tracked_with.per_sequence)

@@ -161,12 +161,11 @@ class SystematicErrors:
     def pushed(self, estimate: Estimate, weights: Array) -> tuple[Array, Array]:
         """How points of these ``weights`` (p,) determine the estimate, and how the reference's error enters.
 
-        Of points that were all bound in one picture.
-
-        Both (d + 6, d + 6): J' W J, and J' W M J0, the gradient by an error of the reference state.
+        J' W J, (d + 6, d + 6), and J' W M J0 times the causes of the reference's error, (d + 6, c).
         """
+        assert self._moved is not None
         _, jacobian, scores = self._scores(estimate, weights)
-        carried = self._warps(estimate.state) @ self._jacobian
+        carried = self._warps(estimate.state) @ self._moved
         hessian, push = (np.tensordot(scores, rows, axes=([0, 1], [0, 1])) for rows in (jacobian, carried))
         return hessian, push
 
