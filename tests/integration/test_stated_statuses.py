@@ -1,5 +1,6 @@
 """What is not as it should be leads to a stated status, never to a confident wrong answer."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -51,7 +52,8 @@ def test_the_right_model_is_not_accused(name):
     scene = SCENES[name](0)
     found = tracked(scene, moving(scene, 40)[::4])
     assert (found.n_tracked, found.n_wrong) == (10, 0)
-    assert not any("does not explain" in line or "bound" in line for line in found.said)
+    accusing = ("does not explain", "bound", "dimensions in")
+    assert not any(word in line for line in found.said for word in accusing)
     assert found.largest_error < 5e-3
 
 
@@ -72,6 +74,20 @@ def test_a_sheet_of_another_format_is_not_sure_of_itself(factors):
     assert found.n_wrong == 0
     said = ("the frames contradict the reference state", "the model does not explain the images")
     assert all(any(line.startswith(what) for line in found.said) for what in said)
+
+
+@pytest.mark.parametrize(("seed", "axis", "factor"), [(3, 0, 1.02), (3, 1, 0.96), (2, 1, 1.04)])
+def test_how_far_the_format_of_a_sheet_is_off_is_said(seed, axis, factor):
+    scene = SCENES["far sheet"](seed)
+    factors = np.ones(3)
+    factors[axis] = factor
+    found = tracked(scene, moving(scene, 80)[::4], drawn_out(scene.model, factors))
+    assert found.n_wrong == 0
+    what = r".* had not got the model's dimensions in \d+ of 20 frames: along [xy] by about (\d+) %"
+    said = [re.match(what, line) for line in found.said]
+    per_cent = [int(match.group(1)) for match in said if match]
+    assert len(per_cent) == 1
+    assert per_cent[0] == pytest.approx(100.0 * abs(factor - 1.0), abs=1.5)
 
 
 @pytest.mark.parametrize("factor", [1000.0, 25.4, 10.0])

@@ -19,6 +19,7 @@ from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.online.estimation.estimator import State
 from morph_dslam.online.frame_result import (
+    DIMENSIONS_OFF,
     FEW_AGREE,
     HAS_MOVED,
     MAY_BE_ANOTHER,
@@ -38,7 +39,7 @@ from tests.support.rendered_sequence import CAMERA, UPRIGHT, printed_texture
 #: object's size: 5.1 mm of the sheets, 1.3 mm of the wedge.
 CONFIDENT_SIGMAS, CONFIDENT_SHARE = 3.0, 0.01
 #: What a reason says of a frame that is not to be relied on; the last one only of a model that is wrong.
-DOUBTS = (UNEXPLAINED, FEW_AGREE, REFERENCE_WORSE, HAS_MOVED, MAY_BE_ANOTHER, UNCHECKED)
+DOUBTS = (UNEXPLAINED, FEW_AGREE, REFERENCE_WORSE, HAS_MOVED, MAY_BE_ANOTHER, DIMENSIONS_OFF, UNCHECKED)
 #: Height of the wedge, metres, and how far its top is moved.
 HEIGHT, REACH = 0.07, 0.02
 

@@ -47,6 +47,7 @@ def test_a_reference_that_is_off_more_than_stated_is_found_to_be(times):
         for s in (REFERENCE, LATER)
     ]
     used, rng, found = np.ones(len(nodes), dtype=bool), np.random.default_rng(1), []
+    n_widened = 0
     for _ in range(24):
         off = moved(REFERENCE, times * SPREAD * rng.standard_normal(9))
         surface, met = bind_pixels(model, CAMERA, view_of(model, CAMERA, off), seen[0])
@@ -60,7 +61,12 @@ def test_a_reference_that_is_off_more_than_stated_is_found_to_be(times):
         found.append(errors.worse)
         unlearnt = errors_of(estimator, points, off, np.diag(SPREAD**2))
         before = unlearnt.added(estimate, used, 0.0, learns=False).covariance
-        np.testing.assert_allclose(stated.covariance, errors.worse**2 * before, rtol=1e-9)
+        stretched = errors.stretch.excess
+        n_widened += stretched.any()
+        if not stretched.any():
+            np.testing.assert_allclose(stated.covariance, errors.worse**2 * before, rtol=1e-9)
+    # Few take such a reference for an object of other dimensions, none where it is as was stated.
+    assert n_widened <= (0 if times == 1.0 else 4)
     found = np.sqrt(np.mean(np.square(found)))
     # It is never below one, so that it is above one on average where all is as stated.
     assert found == pytest.approx(max(times, 1.25), rel=0.25)

@@ -38,7 +38,9 @@ RECOVERED = "recovered from the reference view's features"
 UNEXPLAINED = "the model does not explain the images"
 #: Follows the reason of a frame in which few points agree, and less closely than usual.
 FEW_AGREE = "few points agree, and less closely than usual"
-#: Follows the reason of a frame as long as all frames look too much like the reference view to tell.
+#: Follows the reason of frames by which the object is longer or shorter than the model along an axis.
+DIMENSIONS_OFF = "it looks as if the object had not got the model's dimensions"
+#: Follows the reason of a frame as long as the frames do not exclude that.
 UNCHECKED = "no view so far could show whether the object has the model's dimensions"
 #: Follows the reason of frames by which the reference state is worse known than it was stated.
 REFERENCE_WORSE = "the frames contradict the reference state"
@@ -63,6 +65,8 @@ class FrameResult:
     unexplained_px : what the model leaves of the residuals, see `systematic_errors`; NaN when lost.
     reference_worse : by how much larger than stated the deviation of the reference state is, by all frames so
         far; see `reference_misfit`.
+    dimensions_off : along which axis of the object, and by how much, it is longer or shorter than the model,
+        against the others, as all frames so far show it; "" where they do not.
     pose_from : "points", "points and map", "map" where it is hidden, or "" where there is no pose.
     known : the pose by the map, where that alone tells it.
     view : number of the reference view that the frame was compared with, 0 for the first.
@@ -81,6 +85,7 @@ class FrameResult:
     recovered: bool = False
     unexplained_px: float = float("nan")
     reference_worse: float = 1.0
+    dimensions_off: str = ""
     pose_from: str = ""
     known: KnownPose | None = None
     view: int = 0

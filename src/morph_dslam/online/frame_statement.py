@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from morph_dslam.online.anchored.known_pose import KnownPose
 from morph_dslam.online.attempt import Attempt
 from morph_dslam.online.frame_result import (
+    DIMENSIONS_OFF,
     FEW_AGREE,
     FOLLOWED,
     REFERENCE_WORSE,
@@ -19,6 +20,7 @@ from morph_dslam.online.reference.reference_views import FollowedView
 from morph_dslam.online.timing import StageClock
 from morph_dslam.online.uncertainty.best_told import BestTold
 from morph_dslam.online.uncertainty.reference_misfit import CLEARLY_WORSE
+from morph_dslam.online.uncertainty.stretch_evidence import StretchEvidence
 
 
 def _counts(attempt: Attempt) -> tuple[int, int]:
@@ -51,7 +53,9 @@ class FrameStatements:
     """
 
     def __init__(self, constant: NDArray[np.int64]) -> None:
-        self._unchecked, self._best_told = True, BestTold(constant)
+        self._best_told = BestTold(constant)
+        # What the frames that were compared with each view tell of the object's dimensions.
+        self._stretch: dict[int, StretchEvidence] = {}
 
     def tracked(
         self,
@@ -77,7 +81,10 @@ class FrameStatements:
         left = systematic.unexplained(attempt.estimate, attempt.inliers)
         doubt, whole = recovery.doubt(attempt), not recovery.partly_hidden(attempt)
         alike_px = max(left.px, doubt)
-        estimate = systematic.added(attempt.estimate, attempt.weights, alike_px, attempt.prior, whole)
+        elsewhere = [told for number, told in self._stretch.items() if number != view.number]
+        estimate = systematic.added(
+            attempt.estimate, attempt.weights, alike_px, attempt.prior, whole, elsewhere
+        )
         estimate = self._best_told.stated(estimate, untold)
         if doubt:
             aside += f"; {FEW_AGREE}: by {attempt.estimate.sigma_px:.1f} px"
@@ -87,9 +94,8 @@ class FrameStatements:
             aside += f"; {UNEXPLAINED}: {left.px:.1f} px are left"
         if systematic.worse > CLEARLY_WORSE:
             aside += f"; {REFERENCE_WORSE}: {systematic.worse:.1f} times what it was taken to be known to"
-        self._unchecked &= systematic.is_unchecked
-        if self._unchecked and attempt.prior is None:
-            aside += f"; {UNCHECKED}"
+        off, on_dimensions = self._on_dimensions(view, elsewhere, attempt.prior is None)
+        aside += on_dimensions
         return FrameResult(
             "tracked",
             how + aside,
@@ -101,7 +107,25 @@ class FrameStatements:
             recovered=how != FOLLOWED,
             unexplained_px=left.px,
             reference_worse=systematic.worse,
+            dimensions_off=off,
             pose_from="points" if attempt.prior is None else "points and map",
             view=view.number,
             discrepancy=attempt.discrepancy,
         )
+
+    def _on_dimensions(
+        self, view: FollowedView, elsewhere: list[StretchEvidence], is_free: bool
+    ) -> tuple[str, str]:
+        """How an object is shown to be off the model's dimensions, "" if it is not, and what is said of that.
+
+        A free one may be off as long as the frames do not exclude it; one in a map has been found there.
+        """
+        told = view.systematic.stretch
+        if told is None:
+            return "", ""
+        self._stretch[view.number] = told
+        told = told.joined(elsewhere)
+        if told.is_shown:
+            how = f"along {'xyz'[told.axis]} by about {100.0 * told.off_by:.0f} %"
+            return how, f"; {DIMENSIONS_OFF}: {how}"
+        return "", f"; {UNCHECKED}" if is_free and not told.is_excluded else ""

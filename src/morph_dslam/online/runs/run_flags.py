@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from morph_dslam.model import Parameter
-from morph_dslam.online.frame_result import HAS_MOVED, MAY_BE_ANOTHER, REFERENCE_WORSE, UNCHECKED, UNEXPLAINED
+from morph_dslam.online.frame_result import (
+    DIMENSIONS_OFF,
+    HAS_MOVED,
+    MAY_BE_ANOTHER,
+    REFERENCE_WORSE,
+    UNCHECKED,
+    UNEXPLAINED,
+)
 from morph_dslam.online.uncertainty.observability import UNTOLD_SHARE, statement, untold_in_run
 from morph_dslam.online.uncertainty.reference_misfit import CLEARLY_WORSE
 
@@ -39,6 +46,12 @@ def flags(run: RunResults) -> list[str]:
         found.append(
             f"{REFERENCE_WORSE}: {worse:.1f} times what it was taken to be known to, and the deviations are "
             "that much wider; check the landmarks and whether the object has the model's dimensions"
+        )
+    off = [result for result in run.results if result.dimensions_off]
+    if off:
+        found.append(
+            f"{DIMENSIONS_OFF} in {len(off)} of {len(run)} frames: {off[-1].dimensions_off}, "
+            "longer or shorter than the model against its other lengths; measure it"
         )
     last = next((result for result in reversed(run.results) if result.estimate), None)
     if last is not None and UNCHECKED in last.reason:

@@ -1,12 +1,20 @@
-"""Whether the frames could have shown that an object has not got the model's dimensions.
+"""What the frames tell of an object that has not got the model's dimensions.
 
 The reference state takes most of a wrong length up: a sheet that is narrower than its model passes for a
 turned one. Let a stretch s of the undeformed model along its axes move the points' pixels by S0 s in the
 reference view and by S s in a frame. The reference state is then off by e = J0^+ S0 s, the points are bound
 off by what that leaves, S0 s - J0 e, and the frame's residuals are (1 - J H^-1 J' W) (S s - M (S0 s - J0 e)),
-with J, W and M as in `systematic_errors`. In the reference view that is zero, so it tells nothing; how much
-it is in a frame says what could have been seen there. A change of size alone stays invisible to one camera,
-and is left out: the stretches are those that keep the mean length.
+with J, W and M as in `systematic_errors`. In the reference view that is zero, so it tells nothing; in a frame
+that looks otherwise the residuals have a known pattern X s. What an error of the reference state leaves has
+one too, C a, with causes a that stay the same in all frames. Their variance is one where the reference is as
+well known as was stated, and more where the frames show that with s left free: bad landmarks are no stretch.
+
+Both are found together by weighted least squares over the frames, a matched filter; what the frames tell of
+s is the normal equations with a eliminated. Points err alike over wide parts of the object, so that a frame
+counts as `NUMBERS` independent numbers, none better than `FLOOR_PX`; and frames err alike, so that all of
+them together count as no more than `AS_BEST` like the one that tells most.
+
+A change of size alone stays invisible to one camera, and is left out: the stretches keep the mean length.
 """
 
 from __future__ import annotations
@@ -19,22 +27,30 @@ from numpy.typing import NDArray
 from morph_dslam.online.estimation.state import BoundPoints, State
 from morph_dslam.online.uncertainty.bound_part import BoundPart
 from morph_dslam.online.uncertainty.reference_misfit import FLOOR_PX
+from morph_dslam.online.uncertainty.stretch_evidence import StretchEvidence, keeping_the_mean
 
 Array = NDArray[np.float64]
 
-#: A stretch that should have been seen.
-STRETCH = 0.02
 #: Axes along which the points extend less than this share of the largest extent have no length to be wrong.
 FLAT = 0.01
+#: Of the variance of the causes; a few bring it near its end.
+ROUNDS = 4
+#: As so many independent numbers the residuals of a frame count; and all frames as so many like the best.
+NUMBERS, AS_BEST = 20.0, 4.0
 
 
 class DimensionCheck:
-    """Takes in how well each frame could have shown a stretch.
+    """Predicts what stretches leave in frames, and takes in what the frames show.
 
     Parameters
     ----------
     points : (p) bound in the reference view. parts : its pictures.
     jacobian : (p, 2, d + 6) of their pixels there. scale : (d + 6,) of the unknowns.
+
+    Attributes
+    ----------
+    stretches : (3, k) of the object's axes, orthonormal, that keep the mean length.
+    evidence : what the frames so far tell of stretches.
     """
 
     def __init__(
@@ -42,37 +58,76 @@ class DimensionCheck:
     ) -> None:
         self._rest = points.rest
         extent = np.ptp(points.rest, axis=0)
-        axes = np.eye(3)[:, extent > FLAT * extent.max()]
-        # Stretches (3, k) of the axes that keep the mean length.
-        self._stretches = axes @ np.linalg.svd(np.ones((1, axes.shape[1])))[2][1:].T
+        self._axes = extent > FLAT * extent.max()
+        self.stretches = keeping_the_mean(self._axes)
         left = []
         for part in parts:
             moved = self._by_stretch(part.state, jacobian)[part.rows]
-            rows, size = jacobian[part.rows].reshape(-1, len(scale)) * scale, moved.shape[2]
-            taken = np.linalg.lstsq(rows, moved.reshape(-1, size), rcond=1e-9)[0]
+            rows = jacobian[part.rows].reshape(-1, len(scale)) * scale
+            taken = np.linalg.lstsq(rows, moved.reshape(-1, 3), rcond=1e-9)[0]
             left.append(moved - (rows @ taken).reshape(moved.shape))
         self._bound_off = np.concatenate(left)
-        self._seen = 0.0
+        self._information, self._product, self._best = np.zeros((0, 0)), np.zeros(0), 0.0
+        self.evidence = StretchEvidence.none(self._axes)
 
     def _by_stretch(self, state: State, jacobian: Array) -> Array:
-        """Motion (p, 2, k) of the pixels by each stretch."""
-        turned = state.camera_from_object.rotation @ (self._rest[:, :, None] * self._stretches)
-        return jacobian[:, :, -3:] @ turned
+        """Motion (p, 2, 3) of the pixels by a stretch of each axis."""
+        by_axis = jacobian[:, :, -3:].reshape(-1, 3) @ state.camera_from_object.rotation
+        return by_axis.reshape(-1, 2, 3) * self._rest[:, None]
 
     def moved(self, state: State, jacobian: Array, warps: Array) -> Array:
-        """By what each stretch moves the pixels (p, 2, k) in a frame away from where the points are bound.
+        """By what a stretch of each axis moves the pixels (p, 2, 3) in a frame from where they are bound.
 
         ``warps`` (p, 2, 2) between the images of the points' triangles there and in the reference view.
         """
         return self._by_stretch(state, jacobian) - warps @ self._bound_off
 
-    def learn(self, in_common: Array) -> None:
-        """Take in what neighbouring points' residuals would have in common by each two stretches (k, k)."""
-        if len(in_common):
-            least = float(np.linalg.eigvalsh(in_common)[0])
-            self._seen = max(self._seen, STRETCH * float(np.sqrt(max(least, 0.0))))
+    def learn(self, residuals: Array, left: Array, weights: Array) -> None:
+        """Take in a frame.
 
-    @property
-    def is_done(self) -> bool:
-        """Whether any stretch by `STRETCH` would have left more in some frame than windows leave anyway."""
-        return self._stretches.shape[1] == 0 or self._seen > FLOOR_PX
+        Parameters
+        ----------
+        residuals : (p, 2) of the points, pixels. weights : (p,) of them, zero for those that do not count.
+        left : (p, 2, k + c) what the k stretches and the c causes would leave in the residuals, when the
+            points alone decide on the state.
+        """
+        k, total = self.stretches.shape[1], 2.0 * float(weights.sum())
+        if not k or not total:
+            return
+        each, rows, shown = np.repeat(weights, 2), left.reshape(-1, left.shape[2]), residuals.ravel()
+        weighted = rows * each[:, None]
+        share = NUMBERS / total / (float(each @ shown**2) / total + FLOOR_PX**2)
+        information, product = share * (weighted.T @ rows), share * (weighted.T @ shown)
+        if len(self._information):
+            information, product = information + self._information, product + self._product
+        self._best = max(self._best, float(np.trace((share * weighted[:, :k]).T @ rows[:, :k])))
+        sure = float(np.trace(information[:k, :k]))
+        fade = min(AS_BEST * self._best / sure, 1.0) if sure > 0.0 else 1.0
+        self._information, self._product = fade * information, fade * product
+        self.evidence = self._without_causes(k)
+
+    def _without_causes(self, k: int) -> StretchEvidence:
+        """What the normal equations tell of the first ``k`` unknowns, whatever the causes are."""
+        own, shared, others = self._information[:k, :k], self._information[:k, k:], self._information[k:, k:]
+        own_product, product = self._product[:k], self._product[k:]
+        from_own = np.linalg.solve(own + np.eye(k), np.column_stack([shared, own_product]))
+        larger = _variance(others - shared.T @ from_own[:, :-1], product - shared.T @ from_own[:, -1])
+        causes = others + np.eye(len(others)) / larger
+        taken = shared @ np.linalg.solve(causes, np.column_stack([shared.T, product]))
+        told, product = own - taken[:, :-1], own_product - taken[:, -1]
+        stretches = self.stretches
+        return StretchEvidence(self._axes, stretches @ told @ stretches.T, stretches @ product)
+
+
+def _variance(information: Array, product: Array) -> float:
+    """Of causes that were taken to have unit variance, at least that: frames may show more.
+
+    The fixed point of MacKay (1992), Neural Computation 4, 415: their mean square over those that are told.
+    """
+    told, vectors = np.linalg.eigh(information)
+    told, along, variance = np.maximum(told, 0.0), vectors.T @ product, 1.0
+    for _ in range(ROUNDS):
+        sum_of_squares = float(np.sum((along / (told + 1.0 / variance)) ** 2))
+        n_told = float(np.sum(told / (told + 1.0 / variance)))
+        variance = max(sum_of_squares / max(n_told, 1e-3), 1.0)
+    return variance

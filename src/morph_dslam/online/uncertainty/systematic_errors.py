@@ -32,6 +32,7 @@ from morph_dslam.online.uncertainty.bound_part import BoundPart
 from morph_dslam.online.uncertainty.common_errors import CommonErrors
 from morph_dslam.online.uncertainty.dimension_check import DimensionCheck
 from morph_dslam.online.uncertainty.reference_misfit import ReferenceMisfit
+from morph_dslam.online.uncertainty.stretch_evidence import StretchEvidence
 
 Array = NDArray[np.float64]
 
@@ -57,6 +58,32 @@ class Unexplained:
     def is_failure(self) -> bool:
         """Whether the model, not noise, is what is left."""
         return self.px > UNEXPLAINED_PX and self.px**2 > 0.5 * self.total_px**2
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """A frame's points about its estimate; all is zero for those that do not count.
+
+    Attributes
+    ----------
+    usable : (p,) those that count. weights : (p,) how much. residuals : (p, 2), pixels.
+    jacobian : (p, 2, d + 6) of the pixels. scores : (p, 2, d + 6) that times the weights.
+    """
+
+    usable: NDArray[np.bool_]
+    weights: Array
+    residuals: Array
+    jacobian: Array
+    scores: Array
+
+    def products(self, rows: Array) -> Array:
+        """Sums (d + 6, m) over all coordinates of the scores times ``rows`` (p, 2, m)."""
+        return self.scores.reshape(-1, self.scores.shape[2]).T @ rows.reshape(-1, rows.shape[2])
+
+    def left(self, moved: Array, gain: Array) -> Array:
+        """What an estimate of this ``gain`` (d + 6, d + 6) leaves of motions (p, 2, m) of the pixels."""
+        taken = self.jacobian.reshape(-1, len(gain)) @ (gain @ self.products(moved))
+        return np.where(self.usable[:, None, None], moved - taken.reshape(moved.shape), 0.0)
 
 
 class SystematicErrors:
@@ -111,9 +138,9 @@ class SystematicErrors:
         return float(np.sqrt(self._misfit.factor))
 
     @property
-    def is_unchecked(self) -> bool:
-        """Whether no frame so far could have shown that the object has not got the model's dimensions."""
-        return self._moved is not None and not self._dimensions.is_done
+    def stretch(self) -> StretchEvidence | None:
+        """What the frames so far tell of the object's dimensions; None where the reference is not known."""
+        return None if self._moved is None else self._dimensions.evidence
 
     def added(
         self,
@@ -122,8 +149,9 @@ class SystematicErrors:
         alike_px: float,
         prior: Prior | None = None,
         learns: bool = True,
+        elsewhere: Sequence[StretchEvidence] = (),
     ) -> Estimate:
-        """The estimate with a covariance that holds both errors.
+        """The estimate with a covariance that holds both errors, and wrong dimensions that the frames show.
 
         Parameters
         ----------
@@ -131,32 +159,39 @@ class SystematicErrors:
         alike_px : standard deviation of a pixel coordinate that neighbours have in common in the residuals,
             as of `unexplained`.
         learns : whether the residuals are the object's, so that they tell how well the reference is known.
+        elsewhere : what frames that were compared with other views tell of the object's dimensions.
         """
-        usable, jacobian, scores = self._scores(estimate, weights)
-        hessian = np.tensordot(scores, jacobian, axes=([0, 1], [0, 1]))
+        frame = self._linear(estimate, weights)
+        hessian = frame.products(frame.jacobian)
+        free = gain = inverse_of_seen(hessian, self._estimator.scale)
         if prior is not None:
-            hessian = hessian + prior.terms(estimate.state)[1]
-        gain = inverse_of_seen(hessian, self._estimator.scale)
-        covariance, n_pairs = estimate.covariance.copy(), self._common.n_pairs(usable)
+            gain = inverse_of_seen(hessian + prior.terms(estimate.state)[1], self._estimator.scale)
+        covariance = estimate.covariance.copy()
         if self._moved is not None:
             warps = self._warps(estimate.state)
             moved = warps @ self._moved
-            transfer = gain @ np.tensordot(scores, moved, axes=([0, 1], [0, 1]))
+            stretched = self._dimensions.moved(estimate.state, frame.jacobian, warps)
             if learns:
-                residuals = np.where(usable[:, None], estimate.residuals[: len(weights)], 0.0)
-                left = np.where(usable[:, None, None], moved - jacobian @ transfer, 0.0)
-                both = (residuals[:, :, None], left)
-                shown, expected = (np.trace(self._common.in_common(rows, n_pairs)) for rows in both)
-                self._misfit.learn(float(shown), float(expected))
-                stretched = self._dimensions.moved(estimate.state, jacobian, warps)
-                taken = gain @ np.tensordot(scores, stretched, axes=([0, 1], [0, 1]))
-                left = np.where(usable[:, None, None], stretched - jacobian @ taken, 0.0)
-                self._dimensions.learn(self._common.in_common(left, n_pairs))
+                self._learn_reference(frame, frame.left(moved, gain))
+                causes = np.concatenate([stretched @ self._dimensions.stretches, moved], axis=2)
+                self._dimensions.learn(frame.residuals, frame.left(causes, free), frame.weights)
+            transfer = gain @ frame.products(moved)
             covariance += self._misfit.factor * transfer @ transfer.T
-        gradients = self._common.gradients(scores)
-        share = self._common.share_left(usable, jacobian, gradients, gain)
+            excess = self._dimensions.evidence.joined(elsewhere).excess
+            if excess.any():
+                taken = gain @ frame.products(stretched)
+                covariance += taken @ excess @ taken.T
+        gradients = self._common.gradients(frame.scores)
+        share = self._common.share_left(frame.usable, frame.jacobian, gradients, gain)
         covariance += alike_px**2 / share * (gain @ (gradients.T @ gradients) @ gain)
         return replace(estimate, covariance=covariance)
+
+    def _learn_reference(self, frame: _Linear, left: Array) -> None:
+        """Take in what a frame shows of the reference's error, which would leave ``left`` (p, 2, c) in it."""
+        n_pairs = self._common.n_pairs(frame.usable)
+        both = (frame.residuals[:, :, None], left)
+        shown, expected = (np.trace(self._common.in_common(rows, n_pairs)) for rows in both)
+        self._misfit.learn(float(shown), float(expected))
 
     def pushed(self, estimate: Estimate, weights: Array) -> tuple[Array, Array]:
         """How points of these ``weights`` (p,) determine the estimate, and how the reference's error enters.
@@ -164,20 +199,21 @@ class SystematicErrors:
         J' W J, (d + 6, d + 6), and J' W M J0 times the causes of the reference's error, (d + 6, c).
         """
         assert self._moved is not None
-        _, jacobian, scores = self._scores(estimate, weights)
+        frame = self._linear(estimate, weights)
         carried = self._warps(estimate.state) @ self._moved
-        hessian, push = (np.tensordot(scores, rows, axes=([0, 1], [0, 1])) for rows in (jacobian, carried))
-        return hessian, push
+        return frame.products(frame.jacobian), frame.products(carried)
 
-    def _scores(self, estimate: Estimate, weights: Array) -> tuple[NDArray[np.bool_], Array, Array]:
-        """Which points (p,) count, their pixels' derivatives (p, 2, d + 6), and these times the weights."""
+    def _linear(self, estimate: Estimate, weights: Array) -> _Linear:
+        """The frame of an estimate whose points had these ``weights`` (p,)."""
         _, jacobian = self._project(self._points, estimate.state)
-        length = np.linalg.norm(estimate.residuals[: len(weights)], axis=1)
+        residuals = estimate.residuals[: len(weights)]
+        length = np.linalg.norm(residuals, axis=1)
         usable = (weights > 0.0) & np.isfinite(length) & np.isfinite(jacobian).all(axis=(1, 2))
         huber = self._estimator.options.huber_px
         weights = np.where(usable, weights * np.minimum(1.0, huber / np.maximum(length, 1e-300)), 0.0)
+        residuals = np.where(usable[:, None], residuals, 0.0)
         jacobian = np.where(usable[:, None, None], jacobian, 0.0)
-        return usable, jacobian, weights[:, None, None] * jacobian
+        return _Linear(usable, weights, residuals, jacobian, weights[:, None, None] * jacobian)
 
     def _project(self, points: BoundPoints, state: State) -> tuple[Array, Array]:
         pose = state.camera_from_object
