@@ -32,7 +32,7 @@ from morph_dslam.experiment import keep, keep_sequence
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.online.drawing.augmented_view import AugmentedView
 from morph_dslam.online.frame_result import STAGES
-from morph_dslam.online.live.session import LivePicture, LiveSession
+from morph_dslam.online.live.session import LivePicture, LiveSession, OneObject
 from morph_dslam.online.live.sinks import VideoSink
 from morph_dslam.online.mesh_registration.run import run_registration
 from morph_dslam.online.runs.results import RunResults
@@ -147,7 +147,7 @@ def run(arguments: argparse.Namespace) -> None:
     images = [frame.image for frame in open_source(folder / "recording" / "frames", placement.frame)]
     setup.warm_up(placement, reference)
     chain = setup.new_chain(placement, reference, in_sequence=False)
-    picture = LivePicture(setup.camera, AugmentedView(placement.model, setup.camera))
+    picture = LivePicture(setup.camera, {"seal": AugmentedView(placement.model, setup.camera)})
     picture_time, locate, track = Timed(picture, "draw"), Timed(chain, "locate"), Timed(chain, "track")
     results = RunResults(placement.model, placement.frame or 0)
     stream = PacedRecording(BackAndForth(images, arguments.minutes))
@@ -156,7 +156,7 @@ def run(arguments: argparse.Namespace) -> None:
         with VideoWriter(Path(temporary) / "augmented.mp4", FPS, size) as writer:
             sink = VideoSink(writer, FPS)
             record = Timed(sink, "show")
-            session = LiveSession(stream, chain, picture, results, [sink])
+            session = LiveSession(stream, OneObject("seal", chain), picture, {"seal": results}, [sink])
             begin = time.process_time()
             session.run()
             spent = 1e3 * (time.process_time() - begin)
@@ -165,7 +165,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def report(session: LiveSession, spent: float, timed: dict[str, Timed]) -> None:
     """Print processor time by thread and by stage, how it went, and the result line."""
-    times, results = session.times, session.results.results
+    times, results = session.times, session.runs["seal"].results
     print(f"\n{'processor time [ms]':<22}{'median':>8}{'p95':>8}")
     for name, one in timed.items():
         print(f"{name:<22}{np.median(one.milliseconds):>8.1f}{np.percentile(one.milliseconds, 95):>8.1f}")

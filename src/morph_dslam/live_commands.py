@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from morph_dslam.command_arguments import frame_range, positive_number
-from morph_dslam.tracking_commands import add_object_arguments, drawing, object_arguments
+from morph_dslam.tracking_commands import add_object_arguments, drawing, object_arguments, other_objects
 
 
 def _live(arguments: argparse.Namespace) -> None:
@@ -23,6 +22,7 @@ def _live(arguments: argparse.Namespace) -> None:
             output=arguments.output,
             of_object=ObjectOptions(**object_arguments(arguments)),
             drawing=drawing(arguments),
+            others=other_objects(arguments),
             first=first,
             last=last,
             reregister_at=tuple(arguments.reregister_at),
@@ -31,7 +31,7 @@ def _live(arguments: argparse.Namespace) -> None:
             seconds=arguments.seconds,
             overwrite=arguments.overwrite,
         ),
-        partial(_tell, arguments.output),
+        _tell,
     )
 
 

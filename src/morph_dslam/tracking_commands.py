@@ -12,10 +12,11 @@ from morph_dslam.errors import TrackingError
 
 if TYPE_CHECKING:
     from morph_dslam.online.drawing.augmented_view import DrawOptions
+    from morph_dslam.online.several.starting_objects import OtherObject
 
 
 def _track(arguments: argparse.Namespace) -> None:
-    from morph_dslam.online.several.track_objects import OtherObject, track_objects
+    from morph_dslam.online.several.track_objects import track_objects
     from morph_dslam.online.several.track_rig import track_rig
     from morph_dslam.online.track import TrackOptions, track
 
@@ -43,8 +44,7 @@ def _track(arguments: argparse.Namespace) -> None:
     if not arguments.also:
         _say(options.output, track(options))
         return
-    others = [OtherObject(name, Path(model), Path(start)) for name, model, start in arguments.also]
-    for folder, summary in track_objects(options, others).items():
+    for folder, summary in track_objects(options, other_objects(arguments)).items():
         _say(folder, summary)
 
 
@@ -85,6 +85,13 @@ def object_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
         "start": arguments.start,
         "tracker": TrackerOptions(new_views=not arguments.one_view, further_views=not arguments.one_view),
     }
+
+
+def other_objects(arguments: argparse.Namespace) -> tuple[OtherObject, ...]:
+    """The objects beside the first, of ``--also``."""
+    from morph_dslam.online.several.starting_objects import OtherObject
+
+    return tuple(OtherObject(name, Path(model), Path(start)) for name, model, start in arguments.also)
 
 
 def drawing(arguments: argparse.Namespace) -> DrawOptions:
@@ -198,6 +205,15 @@ def add_object_arguments(command: argparse.ArgumentParser) -> None:
         "the run starts from; may be repeated",
     )
     command.add_argument(
+        "--also",
+        nargs=3,
+        action="append",
+        default=[],
+        metavar=("NAME", "MODEL", "START"),
+        help="another object in the same frames, its results in RUN/NAME; START is its registration.json in "
+        "the same map or, with `morph track`, its file of landmarks; may be repeated",
+    )
+    command.add_argument(
         "--show",
         choices=("stress", "strain", "displacement"),
         help="what colours the object: von Mises stress (the default), equivalent strain, displacement",
@@ -248,14 +264,5 @@ def add_tracking_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         metavar="FRAMES",
         help="what the next camera of the rig saw; with --camera camchain.yaml#cam0, which a map is of too; "
         "may be repeated",
-    )
-    track.add_argument(
-        "--also",
-        nargs=3,
-        action="append",
-        default=[],
-        metavar=("NAME", "MODEL", "START"),
-        help="another object in the same frames, its results in RUN/NAME; START is its file of landmarks, or "
-        "its registration.json in the same map; may be repeated",
     )
     track.add_argument("--no-video", action="store_true", help="do not draw the augmented video")

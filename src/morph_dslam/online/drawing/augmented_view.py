@@ -101,6 +101,10 @@ class AugmentedView:
         nodes = state.camera_from_object.apply(self._rest + displacement)
         return View(nodes, self._camera.project(nodes))
 
+    def distance(self, state: State) -> float:
+        """Depth of the middle of what is drawn, undeformed, metres."""
+        return float(state.camera_from_object.apply(self._rest.mean(axis=0))[2])
+
     def values(self, state: State) -> Array:
         """The field (n,) at the drawn nodes, in the unit of `label`; for a sheet on the side that is seen."""
         return self._values(state.parameters, self._displacement.value(state.parameters), self.view(state))

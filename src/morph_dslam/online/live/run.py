@@ -1,30 +1,33 @@
-"""`morph live`: track an object in a live stream, show and record it, and write the run folder at the end."""
+"""`morph live`: track objects in a live stream, show and record them, and write their run folders."""
 
 from __future__ import annotations
 
 import csv
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from morph_dslam.errors import SourceError, TrackingError
 from morph_dslam.io.video import VideoWriter
-from morph_dslam.online.attempt import Picture
 from morph_dslam.online.drawing.augmented_view import AugmentedView, DrawOptions
-from morph_dslam.online.live.session import LivePicture, LiveSession, LiveTimes, Sink
+from morph_dslam.online.live.session import LiveChain, LivePicture, LiveSession, LiveTimes, OneObject, Sink
 from morph_dslam.online.live.sinks import BrowserSink, VideoSink
 from morph_dslam.online.runs.output_folders import check_run_folder
 from morph_dslam.online.runs.results import RunResults
 from morph_dslam.online.runs.run_writing import RunInputs, write_run
-from morph_dslam.online.start.placement import Placement
+from morph_dslam.online.several.starting_objects import (
+    OtherObject,
+    StartingObject,
+    check_names,
+    check_one_map,
+    objects_chain,
+    without_hidden,
+)
 from morph_dslam.online.start.reregistration import Reregistration
-from morph_dslam.online.tracking_setup import ObjectOptions, Setup, load_setup
+from morph_dslam.online.tracking_setup import ObjectOptions, Setup, load_setup, warm_up
 from morph_dslam.sources import open_live, open_stream
 from morph_dslam.sources.live import LiveCamera, LiveStream
 from morph_dslam.threads import one_thread_for_algebra
@@ -38,6 +41,7 @@ class LiveOptions:
     ----------
     source : `webcam:0`, or a recording that plays at its own pace. output : the run folder.
     of_object : what is tracked and with what. drawing : what is drawn.
+    others : more objects, registered in the same map, each with its run folder in ``output``.
     first, last : frame numbers of a recording to play, both included; all by default.
     reregister_at : see `TrackOptions`; by the aid it may be a later frame, where that one was dropped.
     serve : port on this computer at which browsers see the pictures; None for none, 0 for any.
@@ -49,6 +53,7 @@ class LiveOptions:
     output: Path
     of_object: ObjectOptions
     drawing: DrawOptions = field(default_factory=DrawOptions)
+    others: tuple[OtherObject, ...] = ()
     first: int | None = None
     last: int | None = None
     reregister_at: tuple[tuple[int, Path | None], ...] = ()
@@ -59,69 +64,125 @@ class LiveOptions:
 
 
 @dataclass(frozen=True)
-class _Begin:
-    """The reference view, the object in it, and its frame."""
+class _Object:
+    """An object at its beginning, its run folder, and what goes there."""
 
-    picture: NDArray[np.uint8] | Picture
-    placement: Placement
-    frame: int
+    folder: Path
+    start: StartingObject
+    run: RunResults
+
+    @property
+    def name(self) -> str:
+        """Its run folder, by which messages call it too."""
+        return str(self.folder)
 
 
 @one_thread_for_algebra
 def run_live(
-    options: LiveOptions, tell: Callable[[dict[str, Any]], None] = lambda summary: None
+    options: LiveOptions, tell: Callable[[Path, dict[str, Any]], None] = lambda folder, summary: None
 ) -> dict[str, Any]:
     """Track a live stream; an interrupt ends it, keeps everything, and goes on.
 
     Parameters
     ----------
-    tell : called with the content of ``summary.json`` when it is written, after an interrupt too.
+    tell : called with each run folder and the content of its ``summary.json`` when it is written, after an
+        interrupt too; with nothing where no frame was tracked.
 
     Returns
     -------
-    The content of ``summary.json``.
+    The content of the first object's ``summary.json``.
 
     Raises
     ------
     MorphError
         If an input cannot be used (ModelFileError, CameraError, SourceError, RegistrationError, MapError), or
-        the run folder holds a run, depth images are to be used, or the port is taken (TrackingError).
+        a run folder holds a run, depth images are to be used, the port is taken, or several objects are not
+        all registered in one map (TrackingError).
     """
-    if options.of_object.use_depth:
-        raise TrackingError("live tracking takes no depth images: leave out --depth, or use `morph track`")
-    setup = load_setup(options.of_object)
-    AugmentedView(setup.model, setup.camera, options.drawing)  # says so now if it cannot be drawn
-    check_run_folder(options.output, options.overwrite)
+    _check(options)
+    setups = [load_setup(part) for part in _parts(options)]
+    views = [AugmentedView(setup.model, setup.camera, options.drawing) for setup in setups]
+    if options.others:
+        _check_several(setups, views)
+    folders = [options.output, *(options.output / other.name for other in options.others)]
+    for folder in folders:
+        check_run_folder(folder, options.overwrite)
     with ExitStack() as stack:
         stream = stack.enter_context(open_live(options.source, options.first, options.last))
-        begin = _begin(setup, stream, options)
-        again = Reregistration(setup, begin.placement, options.reregister_at, begin.frame)
-        setup.warm_up(begin.placement, begin.picture)
-        model = begin.placement.model
-        view = AugmentedView(model, setup.camera, options.drawing, setup.carried(model))
-        sinks = _sinks(stack, setup, stream, options)
-        chain = setup.new_chain(begin.placement, begin.picture, in_sequence=False)
-        kept = setup.tracker_options(begin.placement).per_sequence
-        run = RunResults(model, begin.frame, per_sequence=kept)
-        session = LiveSession(stream, chain, LivePicture(setup.camera, view), run, sinks, again)
+        starts = without_hidden([_start(setup, stream, options) for setup in setups])
+        objects = [
+            _Object(folder, start, start.new_run()) for folder, start in zip(folders, starts, strict=True)
+        ]
+        first = starts[0]
+        again = Reregistration(first.setup, first.placement, options.reregister_at, first.frame)
+        _warm_up(objects)
+        sinks = _sinks(stack, first.setup, stream, options)
+        runs = {part.name: part.run for part in objects}
+        picture = _picture(objects, options.drawing)
+        session = LiveSession(stream, _new_chain(objects, again), picture, runs, sinks)
         print(f"tracking {stream.name} (Ctrl-C ends it)", file=sys.stderr)
+        summaries = []
         try:
             session.run(options.seconds)
         finally:
-            flags = (*begin.placement.flags, *again.notes)
-            begin = replace(begin, placement=replace(begin.placement, flags=flags))
-            summary = _write(setup, begin, session, options) if len(run) else {}
-            tell(summary)
-    return summary
+            for part in objects:
+                summaries.append(_write(part, again.notes, session.times, options) if len(part.run) else {})
+                tell(part.folder, summaries[-1])
+    return summaries[0]
 
 
-def _begin(setup: Setup, stream: LiveStream, options: LiveOptions) -> _Begin:
+def _parts(options: LiveOptions) -> list[ObjectOptions]:
+    """What is tracked and with what, of each object."""
+    return [options.of_object, *(other.options(options.of_object) for other in options.others)]
+
+
+def _check(options: LiveOptions) -> None:
+    if options.of_object.use_depth:
+        raise TrackingError("live tracking takes no depth images: leave out --depth, or use `morph track`")
+    if options.others and options.reregister_at:
+        raise TrackingError("several objects are tracked from where they start: leave out --reregister-at")
+    check_names(options.others)
+
+
+def _check_several(setups: Sequence[Setup], views: Sequence[AugmentedView]) -> None:
+    if any(setup.map_path is None or setup.reference is None for setup in setups):
+        raise TrackingError(
+            "several objects are tracked live in the map that they are all registered in: give each its "
+            "registration.json, and leave out --outline and --pose free"
+        )
+    check_one_map(setups)
+    if len({view.show for view in views}) > 1:
+        raise TrackingError("the models hold different fields to colour the objects by: --show displacement")
+
+
+def _new_chain(objects: Sequence[_Object], again: Reregistration | None = None) -> LiveChain:
+    if len(objects) > 1:
+        return objects_chain({part.name: part.start for part in objects})
+    start = objects[0].start
+    chain = start.setup.new_chain(start.placement, start.picture, start.in_sequence)
+    return OneObject(objects[0].name, chain, again)
+
+
+def _warm_up(objects: Sequence[_Object]) -> None:
+    chain = _new_chain(objects)
+    warm_up(lambda frame: chain.track(frame, chain.locate(frame)), objects[0].start.picture)
+
+
+def _picture(objects: Sequence[_Object], drawing: DrawOptions) -> LivePicture:
+    views, camera = {}, objects[0].start.setup.camera
+    for part in objects:
+        model = part.run.model
+        views[part.name] = AugmentedView(model, camera, drawing, part.start.setup.carried(model))
+    return LivePicture(camera, views)
+
+
+def _start(setup: Setup, stream: LiveStream, options: LiveOptions) -> StartingObject:
     """The keyframe of the map, or the first frame that comes, with the landmarks in it."""
     placement = setup.placement
     if setup.reference is not None:
         assert placement is not None
         assert placement.frame is not None
-        return _Begin(setup.reference, placement, placement.frame)
+        return StartingObject(setup, placement, setup.reference, placement.frame, False)
     if placement is not None:
         raise TrackingError(
             "a registration needs the map that it was made in, to know what the object looks like: give "
@@ -131,7 +192,7 @@ def _begin(setup: Setup, stream: LiveStream, options: LiveOptions) -> _Begin:
     is_camera = isinstance(stream, LiveCamera)
     for frame in stream if is_camera else open_stream(options.source, options.first, options.last):
         setup.camera.check_image(frame.image, f"frame {frame.index} of {options.source}")
-        return _Begin(frame.image, setup.placed(frame.image), frame.index)
+        return StartingObject(setup, setup.placed(frame.image), frame.image, frame.index, False)
     raise SourceError(f"{options.source} ended before the first frame")
 
 
@@ -148,26 +209,27 @@ def _sinks(stack: ExitStack, setup: Setup, stream: LiveStream, options: LiveOpti
     return sinks
 
 
-def _write(setup: Setup, begin: _Begin, session: LiveSession, options: LiveOptions) -> dict[str, Any]:
-    """Write all files of the run folder but the video, which was written on the way."""
-    of_object = options.of_object
+def _write(part: _Object, notes: Sequence[str], times: LiveTimes, options: LiveOptions) -> dict[str, Any]:
+    """Write all files of an object's run folder but the video, which was written on the way."""
+    setup, run, of_object = part.start.setup, part.run, part.start.setup.options
+    placement = part.start.placement
+    placement = replace(placement, flags=(*placement.flags, *notes))
     named = {"source": options.source}
     named |= {name: str(path) for name, path in vars(of_object.aids).items() if path is not None}
     for name, path in (("landmarks", of_object.landmarks), ("placement", of_object.placement)):
         named |= {} if path is None else {name: str(path)}
     named |= {} if setup.map_path is None else {"map": str(setup.map_path)}
-    tracker = setup.tracker_options(begin.placement)
+    tracker = setup.tracker_options(placement)
     extra = {
-        "live": live_figures(session.times),
+        "live": live_figures(times),
         "pose": of_object.pose if setup.map_path is not None else "free",
         "outline_used": of_object.use_outline,
         "reference_keyframes": setup.reference_keyframes,
         "settings": {"tracker": asdict(tracker)},
     }
     inputs = RunInputs(of_object.model, of_object.camera, named)
-    carried = setup.carried(session.results.model)
-    summary = write_run(options.output, session.results, inputs, begin.placement, carried, tracker, extra)
-    write_latencies(options.output / "latency.csv", session.times)
+    summary = write_run(part.folder, run, inputs, placement, setup.carried(run.model), tracker, extra)
+    write_latencies(part.folder / "latency.csv", times)
     return summary
 
 

@@ -1,17 +1,18 @@
 """A live session: each frame goes through three threads, and each of these always takes the newest.
 
-One finds the camera in the map, one the object, and one draws and records, so that while a frame is drawn the
-next is tracked already. None waits for a later one; a frame that the next thread has no time for is dropped.
-What is compiled, or OpenCV's, leaves the interpreter to the others.
+One finds the camera in the map, one the objects, and one draws and records, so that while a frame is drawn
+the next is tracked already. None waits for a later one; a frame that the next thread has no time for is
+dropped. What is compiled, or OpenCV's, leaves the interpreter to the others.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -62,22 +63,67 @@ class LiveTimes:
         return 1e3 * float(np.percentile(self.latency, percentile)) if self.latency else float("nan")
 
 
-class LivePicture:
-    """Draws a tracked frame: undistorted, with the object over it, or with the reason why it is not there."""
+class LiveChain(Protocol):
+    """What finds objects in a frame, in two steps that take turns in two threads; see `Chain`."""
 
-    def __init__(self, camera: PinholeCamera, view: AugmentedView) -> None:
-        self._view, self._limits = view, view.range_of_box()
+    def locate(self, frame: Frame) -> Any: ...
+
+    def track(self, frame: Frame, located: Any) -> Mapping[str, FrameResult]: ...
+
+
+class OneObject:
+    """The chain of one object by its name; ``again`` decides when it is placed anew, never by default."""
+
+    def __init__(self, name: str, chain: Chain, again: Reregistration | None = None) -> None:
+        self._name, self._chain, self._again = name, chain, again
+
+    def locate(self, frame: Frame) -> Located:
+        """See `Chain.locate`."""
+        return self._chain.locate(frame)
+
+    def track(self, frame: Frame, located: Located) -> dict[str, FrameResult]:
+        """See `Chain.track`."""
+        if self._again is not None:
+            self._chain = self._again.chain(frame, self._chain)
+        result = self._chain.track(frame, located)
+        if self._again is not None:
+            self._again.take_in(result)
+        return {self._name: result}
+
+
+class LivePicture:
+    """Draws a tracked frame: undistorted, with the objects over it, or the reason why one is not there.
+
+    Parameters
+    ----------
+    views : by object, whose run folder it is called by; all of the same field, with one range of colours.
+    """
+
+    def __init__(self, camera: PinholeCamera, views: Mapping[str, AugmentedView]) -> None:
+        ranges = np.array([view.range_of_box() for view in views.values()])
+        self._views, self._limits = dict(views), (float(ranges[:, 0].min()), float(ranges[:, 1].max()))
         self._maps = camera.undistortion_maps()
 
-    def draw(self, frame: Frame, result: FrameResult) -> NDArray[np.uint8]:
-        image = frame.image
+    def draw(self, frame: Frame, results: Mapping[str, FrameResult]) -> NDArray[np.uint8]:
+        """The picture, the nearest object over the others."""
+        image, caption = frame.image, f"frame {frame.index}"
         if self._maps is not None:
             image = np.asarray(cv2.remap(image, *self._maps, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
-        if result.estimate is None:
-            return with_caption(image, f"frame {frame.index}: {result.reason}")
-        return self._view.draw(
-            image, result.estimate.state, self._limits, f"frame {frame.index}", result.discrepancy
-        )
+        missing = {name: result.reason for name, result in results.items() if result.estimate is None}
+        if missing and len(results) == 1:
+            caption = f"{caption}: {next(iter(missing.values()))}"
+        elif missing:
+            caption = "; ".join([caption, *(f"{Path(name).name}: {why}" for name, why in missing.items())])
+        if len(missing) == len(results):
+            return with_caption(image, caption)
+        found = [
+            (self._views[name], result.estimate.state, result.discrepancy)
+            for name, result in results.items()
+            if result.estimate is not None
+        ]
+        for view, state, discrepancy in sorted(found, key=lambda one: -one[0].distance(one[1])):
+            image = view.draw(image, state, self._limits, caption, discrepancy)
+        return image
 
 
 class LiveSession:
@@ -85,26 +131,23 @@ class LiveSession:
 
     Parameters
     ----------
-    run : gets the results, without the residuals of single points: sessions are long.
-    again : decides when the object is placed anew; it never is by default.
+    runs : by object, get the results, without the residuals of single points: sessions are long.
     sinks : get the pictures, after the latency has been taken.
     """
 
     def __init__(
         self,
         stream: LiveStream,
-        chain: Chain,
+        chain: LiveChain,
         picture: LivePicture,
-        run: RunResults,
+        runs: Mapping[str, RunResults],
         sinks: Sequence[Sink] = (),
-        again: Reregistration | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._again = again
         self._stream, self._chain, self._picture, self._clock = stream, chain, picture, clock
-        self._sinks, self.results, self.times = sinks, run, LiveTimes()
-        self._located: Newest[tuple[Frame, Located]] = Newest()
-        self._tracked: Newest[tuple[Frame, FrameResult]] = Newest()
+        self._sinks, self.runs, self.times = sinks, runs, LiveTimes()
+        self._located: Newest[tuple[Frame, Any]] = Newest()
+        self._tracked: Newest[tuple[Frame, Mapping[str, FrameResult]]] = Newest()
         self._errors: list[BaseException] = []
         self._done = threading.Event()
         self._threads = [
@@ -119,7 +162,7 @@ class LiveSession:
     def run(self, seconds: float | None = None) -> None:
         """Work until the stream ends, or for some seconds; raises what went wrong in a thread.
 
-        An interrupt ends it too; what was found until then is in `results` and `times`.
+        An interrupt ends it too; what was found until then is in `runs` and `times`.
         """
         with threads_side_by_side():
             for thread in self._threads:
@@ -162,22 +205,18 @@ class LiveSession:
     def _track(self) -> None:
         while (item := self._located.take()) is not None:
             frame, located = item
-            if self._again is not None:
-                self._chain = self._again.chain(frame, self._chain)
-            result = self._chain.track(frame, located)
-            if self._again is not None:
-                self._again.take_in(result)
-            self._tracked.put((frame, result))
+            self._tracked.put((frame, self._chain.track(frame, located)))
 
     def _draw(self) -> None:
         while (item := self._tracked.take()) is not None:
-            frame, result = item
-            picture = self._picture.draw(frame, result)
+            frame, results = item
+            picture = self._picture.draw(frame, results)
             captured = self._clock() if frame.captured is None else frame.captured
             self.times.frames.append(frame.index)
             self.times.captured.append(captured)
             self.times.latency.append(self._clock() - captured)
-            self.results.add(frame.index, frame.timestamp, _without_points(result))
+            for name, result in results.items():
+                self.runs[name].add(frame.index, frame.timestamp, _without_points(result))
             for sink in self._sinks:
                 sink.show(frame, picture)
 
