@@ -60,7 +60,6 @@ def test_two_objects_are_tracked_live_in_one_map(rig_recording, tmp_path, capsys
         (["--show", "displacement", "--outline"], "in the map that they are all"),
         (
             ["--show", "displacement", "--reregister-at", "40=a.csv"],
-            "adjusted.json",
             "leave out --reregister-at",
         ),
     ],
