@@ -9,6 +9,8 @@ import pytest
 from morph_dslam.cli import main
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.model import load_model
+from morph_dslam.online.estimation.estimator import Estimator
+from morph_dslam.online.reference.surface_coverage import SurfaceSamples
 from morph_dslam.online.several.hiding import Known, seen_parts
 from morph_dslam.online.several.rig_views import further_of_rig, pictures_from
 from morph_dslam.online.tracking_setup import ObjectOptions, load_setup
@@ -133,6 +135,19 @@ def test_what_is_hidden_in_the_last_keyframe_is_bound_in_another(rig_recording, 
     )
     hidden[inside] = before[pixels[inside, 1], pixels[inside, 0]]
     assert hidden.sum() > 50
+
+
+def test_what_is_hidden_does_not_count_as_shown_by_the_reference_view(rig_recording, sheets):
+    sheet, last = sheets["aware"], sheets["aware"].placement.frame
+    reference, bound = bound_points(replace(sheet, keyframes={last: sheet.keyframes[last]}))
+    assert list(bound) == [last]
+    samples, state = SurfaceSamples(Estimator(sheet.model, CAMERA), reference.surface), sheet.placement.state
+    share = np.abs(reference.shown(samples)).sum() / np.abs(samples.seen(state, reference.depth(state))).sum()
+    covered = np.isfinite(exact_depth(*rig_recording, "sheet", last))
+    hidden = wedge_before_sheet(*rig_recording, last) & covered
+    assert hidden.sum() > 0.15 * covered.sum()
+    # An object hides a margin of 5 pixels too.
+    assert abs(share - (1.0 - hidden.sum() / covered.sum())) < 0.08
 
 
 def test_each_camera_of_a_rig_knows_the_object_by_its_own_pictures_of_the_scan(rig_recording, left, tmp_path):

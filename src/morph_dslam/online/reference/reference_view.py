@@ -167,17 +167,20 @@ class ReferenceView:
 
     def covered(self, state: State) -> NDArray[np.bool_]:
         """Pixels (h, w) that the object covers in a state."""
-        camera, drawn = self._estimator.camera, self.surface.model
-        return draw_view(view_of(drawn, camera, state), drawn.triangles, camera).covered
+        return self._drawn(state).covered
 
     def depth(self, state: State) -> NDArray[np.float32]:
         """Depth (h, w) of the object in a state, metres, infinite where it is not."""
+        return self._drawn(state).depth
+
+    def _drawn(self, state: State) -> Buffers:
         camera, drawn = self._estimator.camera, self.surface.model
-        return draw_view(view_of(drawn, camera, state), drawn.triangles, camera).depth
+        return draw_view(view_of(drawn, camera, state), drawn.triangles, camera)
 
     def shown(self, samples: SurfaceSamples) -> Array:
         """What the pictures show of each sample (k,), as `SurfaceSamples.seen` has it, the most of all."""
-        seen = np.stack([samples.seen(view.state, self.depth(view.state)) for view in self._views])
+        depths = [view.shown(self._drawn(view.state))[1] for view in self._views]
+        seen = np.stack([samples.seen(v.state, depth) for v, depth in zip(self._views, depths, strict=True)])
         return seen[np.abs(seen).argmax(axis=0), np.arange(seen.shape[1])]
 
     def projected(self, state: State) -> Array:
