@@ -48,7 +48,23 @@ def test_nothing_is_taken_to_be_exact():
     _, _, noise = learnt(3.0, 0.0)
     assert noise.common >= LEAST_SPREAD_PX**2
     weights = noise.weights(np.array([1e-6, 0.02]), np.ones(2, dtype=bool))
-    assert weights.max() / weights.min() <= 2.0
+    assert weights.max() / weights.min() <= 5.5
+
+
+@pytest.mark.parametrize("power", [1.15, 1.35])
+def test_points_that_err_by_more_than_in_proportion_count_for_less(power):
+    rng, noise = np.random.default_rng(1), PointNoise()
+    spread = np.exp(rng.uniform(np.log(0.03), np.log(0.3), 400))
+    deviation, used = 1.2 * spread**power / 0.05 ** (power - 1.0), np.ones(400, dtype=bool)
+    for _ in range(80):
+        noise.learn(spread, deviation[:, None] * rng.standard_normal((400, 2)), used)
+    assert noise.power == pytest.approx(power, abs=0.05)
+    ratio = noise.weights(spread, used) * deviation**2
+    assert ratio.max() / ratio.min() < 1.5
+
+
+def test_power_is_one_where_the_model_leaves_something():
+    assert learnt(3.0, 0.1)[2].power == 1.0
 
 
 def test_few_or_equal_points_teach_nothing():

@@ -5,10 +5,17 @@ import numpy as np
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
+from morph_dslam.model.turned_model import turned_model
+from morph_dslam.online.anchored.known_pose import KnownPose
 from morph_dslam.online.estimation.estimator import BoundPoints, EstimationOptions, Estimator, State
-from morph_dslam.online.estimation.shape_search import ShapeSearch, with_undetermined_at_default
+from morph_dslam.online.estimation.shape_search import (
+    BoundSearch,
+    ShapeSearch,
+    with_undetermined_at_default,
+)
 from morph_dslam.online.start.registration import shape_starts
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.bent_tube import bent_tube
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
 POSE = RigidTransform(
@@ -53,3 +60,30 @@ def test_only_undetermined_parameters_return_to_their_default():
     kept = with_undetermined_at_default(model, found)
     assert kept.parameters[1] == 0.0
     np.testing.assert_array_equal(kept.parameters[[0, 2]], found.state.parameters[[0, 2]])
+
+
+def test_an_estimate_leaves_a_bound_that_it_reached_on_the_wrong_side():
+    """A tube that is bent away from where its load is sought looks as if the load were less than none."""
+    model = turned_model(bent_tube(), np.array([0.0, 0.0, 1.0]))
+    rng = np.random.default_rng(2)
+    surface = SurfacePoints(rng.integers(0, len(model.triangles), 80), rng.dirichlet(np.ones(3), 80))
+    points, weights = BoundPoints.from_surface(model, surface), np.ones(80)
+    truth = State(np.array([0.5, np.pi - 0.1]), RigidTransform(POSE.rotation, np.array([0.0, 0.0, 0.4])))
+    pixels = CAMERA.project(points.in_camera(truth)) + 0.1 * rng.standard_normal((80, 2))
+    known = KnownPose(truth.camera_from_object, 1e-8 * np.eye(6), np.zeros((6, 0))).prior(2, 0.01)
+    estimator, search = Estimator(model, CAMERA), BoundSearch(model, 2)
+    start = State(np.array([0.1, 0.0]), truth.camera_from_object)
+    stuck = estimator.estimate(points, pixels, weights, start, prior=known)
+    assert stuck.at_bound[0]
+    assert stuck.state.parameters[0] < 1e-3
+    for _ in range(3):
+        starts = search.next_starts(stuck)
+        assert len(starts) == 2
+        found = [estimator.estimate(points, pixels, weights, s, prior=known) for s in starts]
+        best = min(found, key=lambda estimate: estimate.cost)
+        if best.cost < 0.5 * stuck.cost:
+            break
+    load, side = best.state.parameters
+    assert abs(load - truth.parameters[0]) < 0.01
+    assert np.cos(side - truth.parameters[1]) > np.cos(0.02)
+    assert search.next_starts(best) == []

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from morph_dslam.online.attempt import Attempt, Picture
 from morph_dslam.online.estimation.depth_residuals import PointDepths
 from morph_dslam.online.estimation.estimator import Estimate, Estimator, Prior, State
-from morph_dslam.online.estimation.shape_search import ShapeSearch
+from morph_dslam.online.estimation.shape_search import BoundSearch, ShapeSearch
 from morph_dslam.online.measuring.measurement import Measurement
 from morph_dslam.online.reference.reference_view import ReferenceView
 from morph_dslam.online.timing import StageClock
@@ -31,6 +31,7 @@ class FrameEstimation:
         self._estimator, self._reference, self._options = estimator, reference, options
         self._noise = PointNoise()
         self._search = ShapeSearch(estimator.model, options.searches)
+        self._off_bound = BoundSearch(estimator.model, options.searches)
         brief = replace(options.estimation, max_iterations=10, tolerance=1e-3)
         self._scout = Estimator(estimator.model, estimator.camera, brief)
 
@@ -84,7 +85,12 @@ class FrameEstimation:
 
     def search_other_shapes(self, attempt: Attempt) -> Attempt:
         """The attempt, or a clearly better explanation of its measurements reached from another shape."""
-        if not self._options.search_above_px < attempt.estimate.sigma_px < np.inf:
+        if not attempt.estimate.sigma_px < np.inf:
+            return attempt
+        starts = self._off_bound.next_starts(attempt.estimate)
+        if starts:
+            attempt = self.best_of(attempt, starts)
+        if not self._options.search_above_px < attempt.estimate.sigma_px:
             return attempt
         return self.best_of(attempt, self._search.next_starts(attempt.estimate.state.camera_from_object))
 

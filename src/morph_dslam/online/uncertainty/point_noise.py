@@ -4,6 +4,9 @@ What patches of the rendered view and of the frame differ by, tells how exactly 
 else may be in a part of its window, or the surface may be seen much broader than in the reference view. Apart
 from that, a model that is a little off leaves residuals that all points have alike. A residual's variance is
 so taken to be f s² + t, with s what the patches tell; f and t are learnt from the residuals of the frames.
+Where the model leaves nothing, points whose patches differ more err by more than in proportion, because a
+part of a window that is covered moves what is found as a whole. The variance is then taken to be f s^2p, and
+the power p >= 1 is learnt.
 """
 
 from __future__ import annotations
@@ -14,10 +17,12 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 #: Nothing is known better than by this, pixels, whatever the patches say.
-LEAST_SPREAD_PX = 0.02
+LEAST_SPREAD_PX = 0.01
 #: With differences that are independent from pixel to pixel f is 1; blur makes neighbours alike, so that they
 #: count as fewer. A larger f is no noise of the patches but what the model leaves, where it moves them most.
 LARGEST_FACTOR = 4.0
+#: Larger powers of what the patches tell would leave few points to decide.
+LARGEST_POWER = 1.5
 #: Share of the latest frame in what is learnt, and points that it must have to tell.
 LEARNING_RATE, LEAST_POINTS = 0.05, 20
 #: The length of a Gaussian pair has this median, in standard deviations of a coordinate (Rayleigh).
@@ -41,6 +46,14 @@ class PointNoise:
             return np.inf
         return max(float(squared.mean() / factor - told.mean()), LEAST_SPREAD_PX**2)
 
+    @property
+    def power(self) -> float:
+        """p; 1 where the patches tell too little, or the model leaves something."""
+        if self.common > LEAST_SPREAD_PX**2:
+            return 1.0
+        told, squared = np.log(self._moments.T)  # type: ignore[union-attr]
+        return float(np.clip((squared[1] - squared[0]) / (told[1] - told[0]), 1.0, LARGEST_POWER))
+
     def weights(self, spread: Array, used: NDArray[np.bool_]) -> Array:
         """Inverse variances (p,), in that of a typical point; zero for points that are not ``used`` (p,).
 
@@ -49,7 +62,7 @@ class PointNoise:
         common = self.common
         if np.isinf(common) or not used.any():
             return used.astype(float)
-        variance = spread**2 + common
+        variance = (spread**2 + common) ** self.power
         return np.where(used, _middle(variance[used]) / variance, 0.0)
 
     def learn(self, spread: Array, residuals: Array, used: NDArray[np.bool_]) -> None:
