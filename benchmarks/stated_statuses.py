@@ -6,7 +6,8 @@ Of each case: how often the registration was refused; frames tracked, and not; t
 frame; frames that are off by more than 1 % of the object's size (mean over all nodes) and by more than three
 times what they state ("beyond"); those of them of which nothing says that they are not to be relied on,
 neither the frame's reason nor, of a wrong model, a flag of the placement ("confident wrong"). That no view
-could show the model's dimensions yet counts for wrong models only. Objects start from 16 landmarks with
+could show the model's dimensions yet counts for wrong models only. "dimensions named": recordings in which
+it is said that the object has not got the model's. Objects start from 16 landmarks with
 0.3 px of noise, or, "in a map", from a place with errors of a usual size. `map` says what comes of the
 registration in a map of a scan. `right` is the right model of an object in full view, for comparison; `one
 size` are mesh and landmarks that are both too large or too small, which one camera cannot tell: it is listed,
@@ -51,6 +52,7 @@ from tests.support.stated_cases import (
     stated,
 )
 
+from morph_dslam.online.frame_result import DIMENSIONS_OFF
 from morph_dslam.online.mesh_registration.register import register_mesh
 from morph_dslam.online.start.placement import Placement
 from morph_dslam.online.start.registration import register
@@ -207,11 +209,13 @@ def _line(scene: str, case: str, outcomes: list[Outcome]) -> str:
     wrong, refused = sum(o.n_wrong for o in outcomes), sum(o.n_frames == 0 for o in outcomes)
     largest = [o.largest_error for o in outcomes if np.isfinite(o.largest_error)]
     error = f"{1e3 * max(largest):6.1f}" if largest else "     -"
+    named = sum(any(DIMENSIONS_OFF in line for line in o.said) for o in outcomes)
     backs = [o.back_after for o in outcomes if o.back_after is not None]
     back = f" back after {max(backs)}" if backs else ""
     return (
         f"{scene:19} | {case:58} | refused {refused} of {len(outcomes)} | tracked {seen:4} not {lost:4} | "
-        f"mm {error} | beyond {beyond:3} confident wrong {wrong:3} of {frames}{back} | {said[:100]}"
+        f"mm {error} | beyond {beyond:3} confident wrong {wrong:3} of {frames}{back} | "
+        f"dimensions named {named} | {said[:100]}"
     )
 
 

@@ -54,6 +54,18 @@ def test_summary_counts_and_flags():
     assert len(told) == 3
 
 
+def test_dimensions_that_frames_show_to_be_off_are_flagged_as_the_last_of_them_has_it():
+    run = RunResults(bent_sheet_model(22, 16), reference_frame=0)
+    plain = frame_result([0.01, 0.1, 0.0], [1e-3, 0.05, 0.01], [False, False, False])
+    for number, off in enumerate(
+        ("", "by about 5 % along x against y", "by about 3 % along x against y", "")
+    ):
+        run.add(number, 0.1 * number, replace(plain, dimensions_off=off))
+    told = [flag for flag in flags(run) if "dimensions" in flag]
+    assert len(told) == 1
+    assert "the model's dimensions in 2 of 4 frames: by about 3 % along x against y, longer or" in told[0]
+
+
 def test_bound_where_the_undeformed_object_rests_is_told_from_one_that_it_reached():
     model = bent_sheet_model(22, 16)
     arch = replace(model.parameters[0], lower=0.0, default=0.0)

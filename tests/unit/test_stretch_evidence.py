@@ -29,6 +29,7 @@ def test_a_flat_object_is_off_along_one_axis_against_the_other():
     assert told.sigmas == pytest.approx(0.03 / (0.004 * np.sqrt(2.0)))
     assert told.is_shown
     assert not told.is_excluded
+    assert told.in_words == "by about 3 % along x against y"
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -38,19 +39,20 @@ def test_a_solid_is_off_along_the_axis_that_is_longer_than_both_others(axis):
     told = evidence(SOLID, off, 0.002)
     assert told.axis == axis
     assert told.by_axis[axis] == pytest.approx(-0.04)
+    assert told.in_words == f"by about 4 % along {'xyz'[axis]} against the others"
     np.testing.assert_allclose(np.delete(told.by_axis, axis), 0.02)
     assert told.deviations[axis] == pytest.approx(0.002 * np.sqrt(1.5))
 
 
 def test_little_or_unsure_stretches_are_not_said_to_be_there():
-    wide, narrow = 0.02 / CLEAR, 0.02 / LIKELY
+    narrow = 0.02 / LIKELY
     for off, deviation, shown, excluded in (
         (0.03, 1.1 * 0.03 / CLEAR, False, False),
         (0.03, 0.9 * 0.03 / CLEAR, True, False),
         (0.009, 0.0001, False, True),  # ever so sure, but of no account
         (0.0, 0.9 * narrow, False, True),
         (0.0, 1.1 * narrow, False, False),
-        (0.01, 0.9 * wide, False, False),
+        (0.01, 1.1 * 0.01 / LIKELY, False, False),
     ):
         # Against the other axis a stretch is the root of two times as long, and so is its deviation.
         told = evidence(FLAT, [off, 0.0, 0.0], deviation / np.sqrt(2.0))

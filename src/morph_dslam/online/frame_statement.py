@@ -126,6 +126,5 @@ class FrameStatements:
         self._stretch[view.number] = told
         told = told.joined(elsewhere)
         if told.is_shown:
-            how = f"along {'xyz'[told.axis]} by about {100.0 * told.off_by:.0f} %"
-            return how, f"; {DIMENSIONS_OFF}: {how}"
+            return told.in_words, f"; {DIMENSIONS_OFF}: {told.in_words}"
         return "", f"; {UNCHECKED}" if is_free and not told.is_excluded else ""

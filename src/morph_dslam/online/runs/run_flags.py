@@ -51,7 +51,7 @@ def flags(run: RunResults) -> list[str]:
     if off:
         found.append(
             f"{DIMENSIONS_OFF} in {len(off)} of {len(run)} frames: {off[-1].dimensions_off}, "
-            "longer or shorter than the model against its other lengths; measure it"
+            "longer or shorter than the model; measure it, or see whether it is a model of something else"
         )
     last = next((result for result in reversed(run.results) if result.estimate), None)
     if last is not None and UNCHECKED in last.reason:
