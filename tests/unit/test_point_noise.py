@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from morph_dslam.online.uncertainty.point_noise import LEAST_SPREAD_PX, PointNoise
+from morph_dslam.online.uncertainty.point_noise import LARGEST_POWER, LEAST_SPREAD_PX, PointNoise
 
 
 def learnt(factor, common_px, frames=60, count=300, seed=0):
@@ -65,6 +65,13 @@ def test_points_that_err_by_more_than_in_proportion_count_for_less(power):
 
 def test_power_is_one_where_the_model_leaves_something():
     assert learnt(3.0, 0.1)[2].power == 1.0
+
+
+def test_residuals_of_nothing_give_no_larger_power_than_any():
+    spread, noise = np.linspace(0.02, 0.3, 300), PointNoise()
+    residuals = np.where(spread[:, None] > 0.16, [0.1, 0.1], 0.0)
+    noise.learn(spread, residuals, np.ones(300, dtype=bool))
+    assert noise.power == LARGEST_POWER
 
 
 def test_few_or_equal_points_teach_nothing():

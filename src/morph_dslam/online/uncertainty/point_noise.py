@@ -49,9 +49,9 @@ class PointNoise:
     @property
     def power(self) -> float:
         """p; 1 where the patches tell too little, or the model leaves something."""
-        if self.common > LEAST_SPREAD_PX**2:
+        if self._moments is None or self.common > LEAST_SPREAD_PX**2:
             return 1.0
-        told, squared = np.log(self._moments.T)  # type: ignore[union-attr]
+        told, squared = np.log(np.maximum(self._moments.T, 1e-300))
         return float(np.clip((squared[1] - squared[0]) / (told[1] - told[0]), 1.0, LARGEST_POWER))
 
     def weights(self, spread: Array, used: NDArray[np.bool_]) -> Array:
