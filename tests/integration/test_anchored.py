@@ -165,6 +165,26 @@ def test_a_pose_that_is_held_is_the_maps(recording):
         assert result.pose_from == "points and map"
 
 
+def test_a_free_object_is_known_by_the_maps_pictures_wherever_it_is(recording):
+    """The camera stands on its head, where the map would not have the object."""
+    folder, truth = recording
+    setup, chain = new_chain(folder, pose="free")
+    assert (setup.map_path, chain.anchor) == (None, None)
+    placement = setup.placement
+    half_turn = RigidTransform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    width, height = setup.camera.width, setup.camera.height
+    middle = np.array([2.0 * setup.camera.cx, 2.0 * setup.camera.cy])
+    moves = np.array([[-1.0, 0.0, middle[0]], [0.0, -1.0, middle[1]]])
+    for frame in frames_of(folder, 40, 52):
+        image = cv2.warpAffine(frame.image, moves, (width, height), borderMode=cv2.BORDER_REFLECT)
+        result = chain.process(replace(frame, image=np.asarray(image, dtype=np.uint8)))
+    assert (result.status, result.pose_from) == ("tracked", "points"), result.reason
+    assert result.estimate.state.parameters[0] == pytest.approx(truth["parameters"][52, 0], abs=1e-3)
+    found, true = result.estimate.state.camera_from_object, half_turn @ true_pose(truth, 52)
+    apart = (found.apply(placement.model.nodes) - true.apply(placement.model.nodes)).mean(axis=0)
+    assert np.linalg.norm(apart) < 2.0 * MAP_ERROR
+
+
 def test_a_live_run_keeps_the_pace_and_everything_it_found(recording):
     folder, truth = recording
     options = LiveOptions(

@@ -260,13 +260,13 @@ def load_setup(options: ObjectOptions) -> Setup:
     if options.placement is None:
         landmarks = None if options.landmarks is None else load_landmarks(options.landmarks)
         return Setup(options, model, camera, landmarks, inner, None, None, {}, aid)
-    placement, path = load_placement(options.placement, model), None
-    if options.pose != "free":
-        path = map_of(options.placement, options.map_path)
-        if path is None:
-            note = "no map was given or found beside the registration: the object is tracked as a free one"
-            placement = replace(placement, flags=(*placement.flags, note))
+    placement, path = load_placement(options.placement, model), map_of(options.placement, options.map_path)
+    free = options.pose == "free"
+    if path is None and not free:
+        note = "no map was given or found beside the registration: the object is tracked as a free one"
+        placement = replace(placement, flags=(*placement.flags, note))
     keyframes: dict[int, ScanPicture] = {}
     if path is not None and not options.use_outline:
         keyframes = pictures_of(path, camera, placement)
-    return Setup(options, model, camera, None, inner, placement, path, keyframes)
+    # A free object is not where the map has it, but looks as in the map's pictures.
+    return Setup(options, model, camera, None, inner, placement, None if free else path, keyframes)

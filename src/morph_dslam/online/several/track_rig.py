@@ -117,7 +117,7 @@ def _with_reference(setup: Setup, options: TrackOptions) -> tuple[Setup, TrackOp
     number, placement = options.reference_frame, setup.placement
     if number is None or placement is None:
         return setup, with_reference(options, setup)
-    if setup.reference is None or placement.place is None:
+    if setup.map_path is None or setup.reference is None or placement.place is None:
         raise TrackingError(
             "without its map a registration brings its own reference frame: leave out --reference-frame"
         )
