@@ -51,9 +51,18 @@ def keep_model(study: Path, model: Path) -> None:
 
 
 def keep_sequence(scene: Path, model: Path, folder: Path) -> None:
-    """Film a model once; it is filmed again when the scene, the model or the renderer changes."""
+    """Film a model once; it is filmed again when the scene, the model or the renderer changes.
+
+    Raises
+    ------
+    SceneError
+        If there is no such scene, or it cannot be filmed.
+    """
+    from morph_dslam.errors import SceneError
     from morph_dslam.render.simulation import simulate
 
+    if not scene.is_file():
+        raise SceneError(f"there is no scene file {scene}: give the path of one that is there")
     keep(folder, [scene, model, *sources("render")], lambda: simulate(scene, folder))
 
 

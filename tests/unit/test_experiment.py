@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from morph_dslam.errors import EvaluationError
-from morph_dslam.experiment import Recording, first_truth_frame, keep
+from morph_dslam.errors import EvaluationError, SceneError
+from morph_dslam.experiment import Recording, first_truth_frame, keep, keep_sequence
 
 
 def test_a_product_is_made_once_for_the_same_ingredients(tmp_path, capsys):
@@ -60,3 +60,11 @@ def test_a_range_without_truth_is_refused(tmp_path):
     np.savez(path, frame=np.array([9]), points_mm=np.ones((1, 5, 3)), pixels=np.ones((1, 5, 2)))
     with pytest.raises(EvaluationError, match=r"has no frame in the range tracked; it has \[9\]"):
         first_truth_frame(Recording(tmp_path, tmp_path, tmp_path, path, (10, 20)))
+
+
+def test_a_scene_that_is_not_there_is_named(tmp_path):
+    model, film = tmp_path / "seal.morph", tmp_path / "recording"
+    model.write_text("a model")
+    with pytest.raises(SceneError, match=r"there is no scene file .*other\.toml"):
+        keep_sequence(tmp_path / "other.toml", model, film)
+    assert not film.exists()
