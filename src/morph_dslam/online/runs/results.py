@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.discrepancy import largest_deformation, save_discrepancies
-from morph_dslam.online.estimation.estimator import State
+from morph_dslam.online.estimation.estimator import Estimate, State
 from morph_dslam.online.frame_result import STAGES, FrameResult
 from morph_dslam.online.measuring.binding import DrawnSurface
 from morph_dslam.online.runs.run_flags import flags
@@ -95,11 +96,7 @@ class RunResults:
 
     def largest_displacements(self) -> Array:
         """The largest displacement of a node of the surface and its standard deviation (f, 2), metres."""
-        surface = DrawnSurface.of(self.model).model
-        for result in self.results[len(self._largest) :]:
-            found = result.estimate
-            self._largest.append((np.nan, np.nan) if found is None else largest_displacement(surface, found))
-        return np.array(self._largest).reshape(-1, 2)
+        return self._added_to(self._largest, largest_displacement, DrawnSurface.of(self.model).model)
 
     def largest_stresses(self) -> Array:
         """The largest von Mises stress of a node of the surface and its standard deviation (f, 2), pascals.
@@ -108,11 +105,19 @@ class RunResults:
         """
         used = np.unique(self.model.triangles)
         stresses = {place: f.with_modes(f.modes[:, used]) for place, f in self.model.stresses.items()}
-        surface = replace(self.model, stresses=stresses)
-        for result in self.results[len(self._stressed) :]:
+        return self._added_to(self._stressed, largest_von_mises, replace(self.model, stresses=stresses))
+
+    def _added_to(
+        self,
+        known: list[tuple[float, float]],
+        largest: Callable[[ReducedModel, Estimate], tuple[float, float]],
+        surface: ReducedModel,
+    ) -> Array:
+        """What is ``known`` of the frames so far (f, 2), added to by what is ``largest`` in those since."""
+        for result in self.results[len(known) :]:
             found = result.estimate
-            self._stressed.append((np.nan, np.nan) if found is None else largest_von_mises(surface, found))
-        return np.array(self._stressed).reshape(-1, 2)
+            known.append((np.nan, np.nan) if found is None else largest(surface, found))
+        return np.array(known).reshape(-1, 2)
 
     def timings_ms(self) -> Array:
         """(f, len(STAGES) + 1): each stage, then the whole frame."""

@@ -8,7 +8,7 @@ where the map has it in this frame if it is anchored.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -86,13 +86,6 @@ class ObjectTracker:
         return widened(self.trackers[name].reference.depth(state))
 
 
-@dataclass(frozen=True)
-class LocatedObjects:
-    """What the map told of each anchored object in a frame, by name."""
-
-    anchored: Mapping[str, Located] = field(default_factory=dict)
-
-
 class ObjectsChain:
     """From a frame to the objects in it, as `Chain` for one: the camera in the map once, then each object.
 
@@ -110,20 +103,18 @@ class ObjectsChain:
         """Find the objects, by name; raises CameraError if the frame has not the camera's size."""
         return self.track(frame, self.locate(frame))
 
-    def locate(self, frame: Frame) -> LocatedObjects:
-        """Find the camera of the next frame in the map."""
+    def locate(self, frame: Frame) -> dict[str, Located]:
+        """Find the camera of the next frame in the map: what that tells of each anchored object, by name."""
         self._camera.check_image(frame.image, f"frame {frame.index}")
         if self._anchor is None:
-            return LocatedObjects()
+            return {}
         known, camera = self._anchor.locate(frame.image, frame.index, frame.timestamp)
-        return LocatedObjects(
-            {name: Located(known.get(name), camera.reason, camera.total_ms) for name in self._anchor.names}
-        )
+        return {name: Located(known.get(name), camera.reason, camera.total_ms) for name in self._anchor.names}
 
-    def track(self, frame: Frame, located: LocatedObjects) -> dict[str, FrameResult]:
+    def track(self, frame: Frame, located: Mapping[str, Located]) -> dict[str, FrameResult]:
         """Find the objects in a frame that `locate` has seen."""
-        known = {name: one.known for name, one in located.anchored.items() if one.known is not None}
+        known = {name: one.known for name, one in located.items() if one.known is not None}
         results = self._objects.process_frame(frame.image, frame.depth, known)
-        for name, one in located.anchored.items():
+        for name, one in located.items():
             results[name] = one.told_of(results[name])
         return results

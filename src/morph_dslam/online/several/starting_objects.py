@@ -115,10 +115,9 @@ def objects_chain(objects: Mapping[str, StartingObject]) -> ObjectsChain:
         If two are registered in the same place, or one shows too few corners.
     """
     anchored = {name: part for name, part in objects.items() if part.setup.map_path is not None}
-    placements, anchor = {name: part.placement for name, part in anchored.items()}, None
-    for part in anchored.values():
-        anchor = part.setup.new_anchor(placements)
-        break
+    placements = {name: part.placement for name, part in anchored.items()}
+    first = next(iter(anchored.values()), None)
+    anchor = None if first is None else first.setup.new_anchor(placements)
     trackers = {
         name: part.setup.new_tracker(
             part.placement, part.picture, part.in_sequence, part.setup.seen.get(part.frame)
