@@ -32,15 +32,15 @@ from alternative_functions import Differenced, Hats, Linearised
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import MorphError
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.io.calibration import load_camera
-from morph_dslam.io.landmarks import Landmarks
+from morph_dslam.io.camera_files import load_camera
+from morph_dslam.io.tables import Landmarks
 from morph_dslam.model import ReducedModel, load_model
-from morph_dslam.online.estimation.estimator import BoundPoints, Estimate, Estimator, State, moved
-from morph_dslam.online.pipeline import Tracker
-from morph_dslam.online.start.placement import place_by_landmarks
-from morph_dslam.online.start.registration import RegistrationOptions
+from morph_dslam.registration.landmarks import RegistrationOptions
+from morph_dslam.registration.registration import register_by_landmarks
 from morph_dslam.sources import open_source
 from morph_dslam.threads import one_thread_for_algebra
+from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State, moved
+from morph_dslam.tracking.tracker import Tracker
 
 Array = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parents[1]
@@ -136,7 +136,7 @@ def landmarks_at(folder: Path, frame: int, camera: PinholeCamera, model: Reduced
 
 def _seen(model: ReducedModel, camera: PinholeCamera, state: State):
     """Surface points of pixels that the object covers."""
-    from morph_dslam.online.measuring.binding import bind_pixels, draw_view, view_of
+    from morph_dslam.tracking.binding import bind_pixels, draw_view, view_of
 
     view = view_of(model, camera, state)
     rows, columns = np.nonzero(draw_view(view, model.triangles, camera).covered)
@@ -159,22 +159,20 @@ class Row:
     why: str = ""
 
 
-def follow(
-    model: ReducedModel, kind: type[Counted], recording: Recording, exact: ReducedModel, frames: int
-) -> Row:
+def follow(model: ReducedModel, kind: type[Counted], recording: Recording, exact: ReducedModel, frames: int) -> Row:
     """Track the recording with a variant of the model and of the estimator."""
     camera, truth = load_camera(recording.folder / "camera.yaml"), np.load(recording.folder / "truth.npz")
     last = min(recording.first + frames, len(truth["frame"])) - 1
     landmarks = landmarks_at(recording.folder, recording.first, camera, exact)
     row, tracker = Row([], [], [], 0), None
     with (
-        patch("morph_dslam.online.pipeline.Estimator", kind),
-        patch("morph_dslam.online.frame_estimation.Estimator", kind),
+        patch("morph_dslam.tracking.tracker.Estimator", kind),
+        patch("morph_dslam.tracking.frame_estimation.Estimator", kind),
     ):
         for frame in open_source(recording.folder / "frames", recording.first, last):
             if tracker is None:
                 try:
-                    placed = place_by_landmarks(model, camera, landmarks, RegistrationOptions())
+                    placed = register_by_landmarks(model, camera, landmarks, RegistrationOptions())
                 except MorphError as error:
                     return Row([], [], [], last + 1 - recording.first, str(error))
                 tracker = Tracker(model, camera, frame.image, placed.state)
@@ -221,9 +219,7 @@ def compare(recording: Recording, frames: int) -> None:
 
 @one_thread_for_algebra
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=150, help="of each recording (%(default)s)")
     parser.add_argument("--only", choices=[r.name for r in RECORDINGS], help="one of the recordings")
     arguments = parser.parse_args()

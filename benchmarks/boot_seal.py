@@ -61,13 +61,13 @@ def bellows() -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
 
 def follow_path() -> dict:
     """Solve the path with this project."""
+    from morph_dslam.mechanics.materials.isotropic import NeoHookean
+    from morph_dslam.mechanics.parameters import ParameterSymbols
+    from morph_dslam.mechanics.solid import SolidProblem
+    from morph_dslam.mechanics.solvers.newton import State, solve
+    from morph_dslam.mechanics.supports import PrescribedDisplacement, RigidRotation, fixed
+    from morph_dslam.meshing.meshes import CellBlock, Mesh
     from morph_dslam.model import Parameter
-    from morph_dslam.offline.materials.isotropic import NeoHookean
-    from morph_dslam.offline.mechanics.parameters import ParameterSymbols
-    from morph_dslam.offline.mechanics.solid import SolidProblem
-    from morph_dslam.offline.mechanics.supports import PrescribedDisplacement, RigidRotation, fixed
-    from morph_dslam.offline.meshing.meshes import CellBlock, Mesh
-    from morph_dslam.offline.solvers.newton import State, solve
 
     nodes, hexes, sets = bellows()
     symbols = ParameterSymbols((Parameter("lever", "angle", "deg", 0.0, float(ANGLES[-1]), 0.0),))
@@ -108,9 +108,7 @@ def run_peer(python: Path, folder: Path) -> dict:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--ours", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.ours:

@@ -17,8 +17,14 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, cross_matrix, rotation_exp
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField, SurfacePoints
 from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
-from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, State, moved
-from morph_dslam.online.estimation.reprojection import linearise_numpy, project_with_jacobian_numpy
+from morph_dslam.tracking.estimator import (
+    BoundPoints,
+    Estimator,
+    State,
+    linearise_numpy,
+    moved,
+    project_with_jacobian_numpy,
+)
 
 N_POINTS, N_MODES, DEGREE = 500, 16, 7
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
@@ -62,9 +68,7 @@ def median_ms(function, repeats: int) -> float:
 def main() -> None:
     rng = np.random.default_rng(1)
     model = smooth_model()
-    surface = SurfacePoints(
-        rng.integers(0, len(model.triangles), N_POINTS), rng.dirichlet(np.ones(3), N_POINTS)
-    )
+    surface = SurfacePoints(rng.integers(0, len(model.triangles), N_POINTS), rng.dirichlet(np.ones(3), N_POINTS))
     points = BoundPoints.from_surface(model, surface)
     pose = RigidTransform(
         rotation_exp(np.array([0.2, -0.3, 0.1])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.02, 0.0, 0.6])
@@ -96,10 +100,7 @@ def main() -> None:
         return least_squares(residuals, np.zeros(10), jac=jac, x_scale=scale, ftol=1e-6, method="lm").cost
 
     methods = {
-        "analytic sensitivities, compiled": (
-            lambda: compiled.estimate(points, pixels, weights, start).cost,
-            200,
-        ),
+        "analytic sensitivities, compiled": (lambda: compiled.estimate(points, pixels, weights, start).cost, 200),
         "analytic sensitivities, numpy": (lambda: plain.estimate(points, pixels, weights, start).cost, 20),
         "scipy least_squares, analytic": (lambda: scipy_cost(jacobian), 10),
         "scipy least_squares, differences": (lambda: scipy_cost("2-point"), 10),

@@ -26,20 +26,19 @@ os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.cli import run_and_report_errors
+from morph_dslam.cli.app import run_and_report_errors
 from morph_dslam.errors import SourceError
 from morph_dslam.experiment import keep, keep_sequence
 from morph_dslam.io.video import VideoWriter
-from morph_dslam.online.drawing.augmented_view import AugmentedView
-from morph_dslam.online.frame_result import STAGES
-from morph_dslam.online.live.session import LivePicture, LiveSession, OneObject
-from morph_dslam.online.live.sinks import VideoSink
-from morph_dslam.online.mesh_registration.run import run_registration
-from morph_dslam.online.runs.results import RunResults
-from morph_dslam.online.slam.run import SlamRunOptions, run_slam
-from morph_dslam.online.tracking_setup import ObjectOptions, load_setup
+from morph_dslam.registration.run import run_registration
+from morph_dslam.slam.run import SlamRunOptions, run_slam
 from morph_dslam.sources import Frame, open_source
 from morph_dslam.sources.live import PacedRecording
+from morph_dslam.tracking.drawing import AugmentedView
+from morph_dslam.tracking.live import LivePicture, LiveSession, OneObject, VideoSink
+from morph_dslam.tracking.result import STAGES
+from morph_dslam.tracking.run_folder import RunResults
+from morph_dslam.tracking.setup import ObjectOptions, load_setup
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLE = ROOT / "examples" / "boot_seal"
@@ -183,9 +182,7 @@ def report(session: LiveSession, spent: float, timed: dict[str, Timed]) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=1.0, help="how long (default: %(default)s)")
     parser.add_argument("--size", choices=("640x480", "1280x720"), default="640x480")
     return run_and_report_errors(run, parser.parse_args(), "nothing was written")

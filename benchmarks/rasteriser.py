@@ -66,10 +66,7 @@ def main() -> None:
     own = median_ms(lambda: rasterise(pixels, depths, triangles, *size), 50)
     textured = median_ms(lambda: render_textured(buffers, triangles, coordinates, texture), 50)
     overlay = median_ms(
-        lambda: draw_overlay(
-            image, pixels, depths, triangles, values, (0, 1), label="von Mises stress [MPa]"
-        ),
-        30,
+        lambda: draw_overlay(image, pixels, depths, triangles, values, (0, 1), label="von Mises stress [MPa]"), 30
     )
     twin = median_ms(lambda: rasterise_numpy(pixels, depths, triangles, *size), 2)
     painter = median_ms(lambda: paint(pixels, depths, triangles), 5)

@@ -20,9 +20,9 @@ from types import ModuleType
 
 from matplotlib.figure import Figure
 
-from morph_dslam.cli import run_and_report_errors
-from morph_dslam.offline.certificate import compression_percent
-from morph_dslam.offline.report.reference_curve import read_reference_curve
+from morph_dslam.cli.app import run_and_report_errors
+from morph_dslam.reduction.certificate import compression_percent
+from morph_dslam.reduction.report_pictures import read_reference_curve
 from reduction_snapshots import SolvedStudy, solve_study
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "boot_seal"
@@ -113,13 +113,9 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--positions", type=int, help="solved in all (default: those of the study, 104)")
-    parser.add_argument(
-        "--divisions", type=int, nargs=3, metavar="N", help="a coarser mesh, as the example's"
-    )
+    parser.add_argument("--divisions", type=int, nargs=3, metavar="N", help="a coarser mesh, as the example's")
     parser.add_argument("--output", type=Path, default=EXAMPLE / "output", help="folder (%(default)s)")
     return run_and_report_errors(run, parser.parse_args(), "the positions solved so far are kept")
 

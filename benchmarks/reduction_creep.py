@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from morph_dslam.cli import run_and_report_errors
+from morph_dslam.cli.app import run_and_report_errors
 from morph_dslam.errors import StudyError
-from morph_dslam.io.toml_file import read_toml
+from morph_dslam.io.tables import read_toml
 from morph_dslam.model import ReducedModel
-from morph_dslam.offline.studies.solid_study import SolidStudy
-from morph_dslam.offline.studies.study import make_study
+from morph_dslam.studies.solid_study import SolidStudy
+from morph_dslam.studies.study import make_study
 from reduction_snapshots import SolvedStudy, solve_study
 
 STUDY = Path(__file__).resolve().parent / "studies" / "creep.toml"
@@ -79,9 +79,7 @@ def draw(model: ReducedModel, solved: SolvedStudy, path: Path) -> None:
     for pull in pulls[np.linspace(0, len(pulls) - 1, 4).astype(int)]:
         line = [model.displacement.value(np.array([t, pull]))[end, 2].mean() for t in times]
         axes.plot(times, 1e3 * np.array(line), color="#2f6690")
-        axes.annotate(
-            f"{1e-3 * pull:.0f} kPa", (times[-1], 1e3 * line[-1]), (5, -3), textcoords="offset points"
-        )
+        axes.annotate(f"{1e-3 * pull:.0f} kPa", (times[-1], 1e3 * line[-1]), (5, -3), textcoords="offset points")
         solutions = [s for s in solved.seen if s.coordinates[1] == pull]
         means = [1e3 * s.fields["displacement"][end, 2].mean() for s in solutions]
         axes.plot([s.coordinates[0] for s in solutions], means, "k.", markersize=4)
@@ -107,9 +105,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, nargs=2, metavar="N", help="of the grid, of times and of pulls")
     parser.add_argument("--held-out", type=int, help="solutions (default: those of the study, 59)")
     parser.add_argument("--divisions", type=int, nargs=3, metavar="N", help="cells along x, y and z")

@@ -26,15 +26,10 @@ from morph_dslam.model.basis_functions import (
     p_spline_basis,
 )
 from morph_dslam.model.separated import SeparatedField
-from morph_dslam.model.tensor_functions import (
-    CPFunctions,
-    TensorFunctions,
-    TensorTrainFunctions,
-    TuckerFunctions,
-)
-from morph_dslam.offline.reduction.pod import Pod, compute_pod
-from morph_dslam.offline.reduction.sparse_pgd import SparsePgdOptions, fit_sparse_pgd
-from morph_dslam.offline.reduction.tensor_formats import (
+from morph_dslam.model.tensor_functions import CPFunctions, TensorFunctions, TensorTrainFunctions, TuckerFunctions
+from morph_dslam.reduction.pod import Pod, compute_pod
+from morph_dslam.reduction.sparse_pgd import SparsePgdOptions, fit_sparse_pgd
+from morph_dslam.reduction.tensor_formats import (
     cp,
     cp_functions,
     tensor_train,
@@ -88,27 +83,21 @@ def elastica(load, position, ratio):
 def fields(mu: Array) -> Array:
     """Displacements (N, 610) at 61 stations times 5 heights for scaled parameters ``mu`` (N, 3)."""
     ratio = np.exp(np.log(0.3) + (mu[:, 2] + 1.0) / 2.0 * np.log(10.0))
-    theta = np.stack(
-        [elastica(4.0 * (m[0] + 1.0), 0.7 + 0.3 * m[1], k) for m, k in zip(mu, ratio, strict=True)]
-    )
+    theta = np.stack([elastica(4.0 * (m[0] + 1.0), 0.7 + 0.3 * m[1], k) for m, k in zip(mu, ratio, strict=True)])
     zero = np.zeros((len(mu), 1))
     x = np.hstack([zero, np.cumsum(np.cos(theta), axis=1)]) / CELLS
     y = np.hstack([zero, np.cumsum(np.sin(theta), axis=1)]) / CELLS
     at_faces = np.hstack([zero, (theta[:, 1:] + theta[:, :-1]) / 2.0, theta[:, -1:]])
     stations = slice(None, None, 2)
     height = np.linspace(-DEPTH / 2.0, DEPTH / 2.0, 5)
-    along = (x - np.arange(CELLS + 1) / CELLS)[:, stations, None] - np.sin(at_faces)[
-        :, stations, None
-    ] * height
+    along = (x - np.arange(CELLS + 1) / CELLS)[:, stations, None] - np.sin(at_faces)[:, stations, None] * height
     across = y[:, stations, None] + (np.cos(at_faces)[:, stations, None] - 1.0) * height
     return np.stack([along, across], axis=3).reshape(len(mu), -1)
 
 
 def slopes(mu: Array, step: float = 1e-4) -> Array:
     """Sensitivities (3, N, 610) by central differences of the solver."""
-    return np.stack(
-        [(fields(mu + step * unit) - fields(mu - step * unit)) / (2.0 * step) for unit in np.eye(3)]
-    )
+    return np.stack([(fields(mu + step * unit) - fields(mu - step * unit)) / (2.0 * step) for unit in np.eye(3)])
 
 
 def microseconds(functions: TensorFunctions) -> float:
@@ -139,8 +128,7 @@ class Report:
         slope = np.linalg.norm(gradients - self.slopes) / np.linalg.norm(self.slopes)
         floats = functions.n_floats + pod.modes.size
         print(
-            f"{name:34s} {n_solves:6d} {floats:8d} {value:8.1e} {slope:8.1e} {microseconds(functions):5.0f}",
-            flush=True,
+            f"{name:34s} {n_solves:6d} {floats:8d} {value:8.1e} {slope:8.1e} {microseconds(functions):5.0f}", flush=True
         )
 
 
@@ -179,9 +167,7 @@ def scattered_formats(report: Report) -> None:
         "Chebyshev": chebyshev_basis(-1.0, 1.0, 8),
     }
     for name, basis in bases.items():
-        fit = fit_sparse_pgd(
-            mu, snapshots, (basis,) * 3, SparsePgdOptions(max_modes=N_MODES, pod_tolerance=1e-5)
-        )
+        fit = fit_sparse_pgd(mu, snapshots, (basis,) * 3, SparsePgdOptions(max_modes=N_MODES, pod_tolerance=1e-5))
         report.line(f"sparse PGD {fit.n_products}, {name}", fit.pod, fit.functions, len(mu))
 
 

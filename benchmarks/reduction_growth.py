@@ -20,12 +20,12 @@ from typing import Any
 
 import numpy as np
 
-from morph_dslam.cli import run_and_report_errors
+from morph_dslam.cli.app import run_and_report_errors
 from morph_dslam.errors import StudyError
-from morph_dslam.io.toml_file import read_toml
+from morph_dslam.io.tables import read_toml
 from morph_dslam.model import ReducedModel
-from morph_dslam.offline.studies.solid_study import SolidStudy
-from morph_dslam.offline.studies.study import make_study
+from morph_dslam.studies.solid_study import SolidStudy
+from morph_dslam.studies.study import make_study
 from reduction_snapshots import SolvedStudy, solve_study
 
 STUDIES = Path(__file__).resolve().parent / "studies"
@@ -56,9 +56,7 @@ def freed(content: dict[str, Any], count: int) -> dict[str, Any]:
         return fixed.get(value, value) if isinstance(value, str) else value
 
     kept = {name: content["parameters"][name] for name in names[:count]}
-    return {key: replaced(entry) for key, entry in content.items() if key != "parameters"} | {
-        "parameters": kept
-    }
+    return {key: replaced(entry) for key, entry in content.items() if key != "parameters"} | {"parameters": kept}
 
 
 def study_of(count: int, training: int, held_out: int) -> SolidStudy:
@@ -120,9 +118,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "--parameters", type=int, nargs="+", choices=TRAINING, default=list(TRAINING), help="numbers of them"
     )

@@ -29,26 +29,18 @@ import numpy as np
 import tensorly.decomposition as tensorly
 from numpy.typing import NDArray
 
-from morph_dslam.cli import run_and_report_errors
+from morph_dslam.cli.app import run_and_report_errors
 from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.model.basis_functions import chebyshev_basis
-from morph_dslam.offline.build import certified_model, solve_or_read
-from morph_dslam.offline.choices import with_choices
-from morph_dslam.offline.problem import Snapshot
-from morph_dslam.offline.reduction.grid_functions import interpolation_nodes
-from morph_dslam.offline.reduction.linear_solid import LinearSolid, linear_solid
-from morph_dslam.offline.reduction.pod import Pod, compute_pod
-from morph_dslam.offline.reduction.separation import SeparatedVector
-from morph_dslam.offline.reduction.tensor_formats import (
-    CP,
-    Tucker,
-    cp,
-    cp_functions,
-    tucker,
-    tucker_functions,
-)
-from morph_dslam.offline.studies.solid_study import SolidStudy
-from morph_dslam.offline.studies.study import load_study
+from morph_dslam.reduction.grid_functions import interpolation_nodes
+from morph_dslam.reduction.linear_solid import LinearSolid, linear_solid
+from morph_dslam.reduction.pod import Pod, compute_pod
+from morph_dslam.reduction.separation import SeparatedVector
+from morph_dslam.reduction.tensor_formats import CP, Tucker, cp, cp_functions, tucker, tucker_functions
+from morph_dslam.studies.build import certified_model, solve_or_read
+from morph_dslam.studies.problem import Snapshot
+from morph_dslam.studies.solid_study import SolidStudy
+from morph_dslam.studies.study import load_study, resolve_defaults
 from peer_environment import peer_python
 
 Array = NDArray[np.float64]
@@ -76,17 +68,13 @@ class Table:
         self.samples = np.array([snapshot.coordinates for snapshot in unseen])
         self.truth = np.array([snapshot.fields["displacement"] for snapshot in unseen], dtype=np.float64)
         self.errors: dict[str, float] = {}
-        print(
-            f"{'method':22s} {'solves':>6s} {'modes':>5s} {'error':>8s} {'s':>7s} {'query, us':>9s}",
-            flush=True,
-        )
+        print(f"{'method':22s} {'solves':>6s} {'modes':>5s} {'error':>8s} {'s':>7s} {'query, us':>9s}", flush=True)
 
     def add(self, name: str, solves: int, modes: int, found: Array, seconds: float, query: float) -> None:
         missed = found.reshape(self.truth.shape) - self.truth
         self.errors[name] = float(np.linalg.norm(missed) / np.linalg.norm(self.truth))
         print(
-            f"{name:22s} {solves:6d} {modes:5d} {self.errors[name]:8.1e} {seconds:7.1f} {1e6 * query:9.0f}",
-            flush=True,
+            f"{name:22s} {solves:6d} {modes:5d} {self.errors[name]:8.1e} {seconds:7.1f} {1e6 * query:9.0f}", flush=True
         )
 
     def add_field(self, name: str, solves: int, field: SeparatedField, seconds: float) -> None:
@@ -100,7 +88,7 @@ class Table:
 def reduced_by(study: SolidStudy, method: str) -> SolidStudy:
     """The study with a method of reduction."""
     options = type(study.reduction)(method=method, tolerance=TOLERANCE, **METHODS[method])
-    return with_choices(study.model_copy(update={"reduction": options}))
+    return resolve_defaults(study.model_copy(update={"reduction": options}))
 
 
 def own_model(study: SolidStudy, held_out: Path, folder: Path) -> tuple[ReducedModel, float]:
@@ -153,9 +141,7 @@ def nodal_displacements(solid: LinearSolid, found: Array) -> Array:
 def run_tensors(solid: LinearSolid, table: Table) -> None:
     """CP and Tucker forms of the solutions on a grid, by the project and by tensorly."""
     began = time.process_time()
-    bases = tuple(
-        chebyshev_basis(p.lower, p.upper, n - 1) for p, n in zip(solid.parameters, GRID, strict=True)
-    )
+    bases = tuple(chebyshev_basis(p.lower, p.upper, n - 1) for p, n in zip(solid.parameters, GRID, strict=True))
     nodes = tuple(interpolation_nodes(basis) for basis in bases)
     grid = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, len(bases))
     fields = nodal_displacements(solid, np.array([solid.solve(mu) for mu in grid]))
@@ -173,14 +159,10 @@ def run_tensors(solid: LinearSolid, table: Table) -> None:
         table.add_field(name, len(grid), field_of(pod, functions), solving + seconds)
     terms, own_seconds = timed(lambda: cp(tensor, TOLERANCE, MOST_TERMS))
     rank = terms.factors[0].shape[1]
-    other, other_seconds = timed(
-        lambda: tensorly.parafac(tensor, rank=rank, init="svd", n_iter_max=2000, tol=1e-10)
-    )
+    other, other_seconds = timed(lambda: tensorly.parafac(tensor, rank=rank, init="svd", n_iter_max=2000, tol=1e-10))
     scaled = (np.asarray(other[1][0]) * other[0], *(np.asarray(f) for f in other[1][1:]))
     for name, form, seconds in (("CP", terms, own_seconds), ("tensorly CP", CP(scaled), other_seconds)):
-        table.add_field(
-            f"{name} {rank}", len(grid), field_of(pod, cp_functions(form, nodes, bases)), solving + seconds
-        )
+        table.add_field(f"{name} {rank}", len(grid), field_of(pod, cp_functions(form, nodes, bases)), solving + seconds)
 
 
 def timed(make: Callable[[], Any]) -> tuple[Any, float]:
@@ -213,9 +195,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), help="of the project")
     return run_and_report_errors(run, parser.parse_args(), "nothing was kept")
 

@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from morph_dslam.model import ReducedModel
-from morph_dslam.offline.certificate import certify
-from morph_dslam.offline.executors import default_executor
-from morph_dslam.offline.problem import Snapshot
-from morph_dslam.offline.reduction.method import METHODS, ReductionTask
-from morph_dslam.offline.sampling import held_out_samples, training_samples
-from morph_dslam.offline.snapshots import load_snapshot
-from morph_dslam.offline.studies.solid_study import SolidStudy
-from morph_dslam.offline.sweep import run_sweep
+from morph_dslam.reduction.certificate import certify
+from morph_dslam.reduction.method import METHODS, ReductionTask
+from morph_dslam.studies.problem import Snapshot
+from morph_dslam.studies.sampling import held_out_samples, training_samples
+from morph_dslam.studies.snapshots import load_snapshot
+from morph_dslam.studies.solid_study import SolidStudy
+from morph_dslam.studies.sweep import default_executor, run_sweep
 
 
 @dataclass(frozen=True)

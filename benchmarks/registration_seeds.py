@@ -29,14 +29,13 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import RegistrationError
 from morph_dslam.experiment import keep
-from morph_dslam.geometry import RigidTransform, cross_matrix
-from morph_dslam.io.calibration import load_camera
-from morph_dslam.online.mesh_registration.run import run_registration
-from morph_dslam.online.slam.map_file import load_map
-from morph_dslam.online.slam.rigid_map import RigidMap
-from morph_dslam.online.slam.run import SlamRunOptions, run_slam
+from morph_dslam.geometry import RigidTransform, cross_matrix, fit_similarity
+from morph_dslam.io.camera_files import load_camera
+from morph_dslam.registration.run import run_registration
 from morph_dslam.render.simulation import simulate
-from morph_dslam.similarity import fit_similarity
+from morph_dslam.slam.map_files import load_map
+from morph_dslam.slam.rigid_map import RigidMap
+from morph_dslam.slam.run import SlamRunOptions, run_slam
 
 Array = NDArray[np.float64]
 HERE = Path(__file__).resolve().parent
@@ -44,12 +43,7 @@ MODEL = HERE.parent / "examples" / "boot_seal" / "output" / "boot_seal.morph"
 OUTPUT = HERE / "output" / "registration_seeds"
 GROUNDS, PICTURES = ("brick", "coffee", "gravel", "rocket"), ("chelsea", "rocket", "coffee", "astronaut")
 #: The example's camera path about the seal: frame, degrees about the vertical, distance and height, mm.
-PATH = (
-    (0, -11.0, 306.0, 230.0),
-    (40, -38.0, 306.0, 200.0),
-    (100, 38.0, 306.0, 260.0),
-    (149, 12.0, 296.0, 220.0),
-)
+PATH = ((0, -11.0, 306.0, 230.0), (40, -38.0, 306.0, 200.0), (100, 38.0, 306.0, 260.0), (149, 12.0, 296.0, 220.0))
 #: What counts as registered: relative error of the scale, and of the place, mm.
 SCALE_LIMIT, PLACE_LIMIT = 0.01, 1.5
 
@@ -154,9 +148,7 @@ class Outcome:
 
     @property
     def registered(self) -> bool:
-        return (
-            abs(self.scale) <= SCALE_LIMIT and 1e3 * self.places.mean() <= PLACE_LIMIT and not self.ambiguous
-        )
+        return abs(self.scale) <= SCALE_LIMIT and 1e3 * self.places.mean() <= PLACE_LIMIT and not self.ambiguous
 
 
 def outcome(content: dict[str, Any], rigid_map: RigidMap, true_poses: Array) -> Outcome:
@@ -208,9 +200,7 @@ def last_line(found: list[Outcome], count: int) -> str:
     """How many were registered, the largest errors, and the normalised errors' 95th percentile."""
     scales, places = [100.0 * abs(each.scale) for each in found], [1e3 * each.places.mean() for each in found]
     normalised = np.abs(np.array([each.normalised for each in found]))
-    p95 = [
-        float(np.percentile(part, 95)) for part in (normalised[:, 0], normalised[:, 1:3], normalised[:, 3:])
-    ]
+    p95 = [float(np.percentile(part, 95)) for part in (normalised[:, 0], normalised[:, 1:3], normalised[:, 3:])]
     return (
         f"registered={sum(each.registered for each in found)}/{count} "
         f"scale_max={np.max(scales):.3f} scale_median={np.median(scales):.3f} "

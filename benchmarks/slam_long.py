@@ -36,11 +36,11 @@ from tests.support.rendered_room import CAMERA, RoomFilm, closed_room, hand_held
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import MorphError
-from morph_dslam.online.side_by_side import threads_side_by_side
-from morph_dslam.online.slam.run import warm_up
-from morph_dslam.online.slam.slam import Slam
-from morph_dslam.online.slam.slam_frame import SlamFrame
+from morph_dslam.slam.frame_images import SlamFrame
+from morph_dslam.slam.run import warm_up
+from morph_dslam.slam.slam import Slam
 from morph_dslam.sources import open_source
+from morph_dslam.threads import threads_side_by_side
 
 Image = NDArray[np.uint8]
 
@@ -152,9 +152,7 @@ def main() -> int:
             images = [film.frame(place) for place in tqdm(path, desc="rendering", unit="frame")]
         else:
             recorded = islice(open_source(arguments.data), FILM_FRAMES)
-            images = [
-                np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8) for frame in recorded
-            ]
+            images = [np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8) for frame in recorded]
         warm_up()
         parts = [noise(arguments.noise_frames), video(images, CAMERA, arguments.minutes), waits()]
     except MorphError as error:

@@ -39,11 +39,11 @@ from tests.support.rendered_room import (
     wall,
 )
 
-from morph_dslam.online.slam.output import trajectory_of
-from morph_dslam.online.slam.run import warm_up
-from morph_dslam.online.slam.slam import Slam
-from morph_dslam.online.slam.slam_frame import SlamFrame
-from morph_dslam.similarity import fit_similarity
+from morph_dslam.geometry import fit_similarity
+from morph_dslam.slam.frame_images import SlamFrame
+from morph_dslam.slam.output import trajectory_of
+from morph_dslam.slam.run import warm_up
+from morph_dslam.slam.slam import Slam
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -55,11 +55,7 @@ WRONG = 0.05
 
 
 def _film(
-    scene: Callable,
-    seed: int,
-    path: Array,
-    change: Callable[[Image, int], Image] | None = None,
-    prints: int = 1,
+    scene: Callable, seed: int, path: Array, change: Callable[[Image, int], Image] | None = None, prints: int = 1
 ) -> Film:
     film = RoomFilm(seed=seed, scene=scene, prints=prints)
 
@@ -182,9 +178,7 @@ def run(film: Film) -> Outcome:
     return _outcome(slam, frames, late, path, np.array(places))
 
 
-def _outcome(
-    slam: Slam, frames: list[SlamFrame], late: list[SlamFrame], path: Array, places: Array
-) -> Outcome:
+def _outcome(slam: Slam, frames: list[SlamFrame], late: list[SlamFrame], path: Array, places: Array) -> Outcome:
     found = [frame for frame in frames if slam.is_placed(frame)]
     if len(found) < 3:
         return Outcome("waited", np.nan, False, frames[-1].reason)
@@ -193,10 +187,7 @@ def _outcome(
     length = np.linalg.norm(np.diff(truth, axis=0), axis=1).sum()
     error = float(np.median(np.linalg.norm(to_truth.apply(estimate) - truth, axis=1)) / length)
     again = [(frame, place) for frame, place in zip(late, places, strict=True) if slam.is_placed(frame)]
-    misses = [
-        np.linalg.norm(to_truth.apply(trajectory_of(slam, [f]).positions)[0] - p[:3, 3])
-        for f, p in again[-5:]
-    ]
+    misses = [np.linalg.norm(to_truth.apply(trajectory_of(slam, [f]).positions)[0] - p[:3, 3]) for f, p in again[-5:]]
     relocalised = bool(misses) and late[-1].pose is not None and float(np.median(misses)) < WRONG * length
     return Outcome("right" if error < WRONG else "wrong", error, relocalised, "")
 
@@ -220,9 +211,7 @@ def main() -> int:
     arguments = parser.parse_args()
     unknown = [name for name in arguments.scenes.split(",") if name not in SCENES]
     if unknown:
-        print(
-            f"slam_rendered: there is no scene {unknown[0]}; there are {', '.join(SCENES)}", file=sys.stderr
-        )
+        print(f"slam_rendered: there is no scene {unknown[0]}; there are {', '.join(SCENES)}", file=sys.stderr)
         return 2
     cv2.setNumThreads(1)
     warm_up()

@@ -41,23 +41,14 @@ from tests.support.shown_frames import (
     strange,
 )
 from tests.support.staged_scenes import SCENES, Scene, drawn_out
-from tests.support.stated_cases import (
-    InMap,
-    Outcome,
-    Shown,
-    in_unit,
-    landmarks,
-    placed_by_landmarks,
-    run_case,
-    stated,
-)
+from tests.support.stated_cases import InMap, Outcome, Shown, in_unit, landmarks, placed_by_landmarks, run_case, stated
 
-from morph_dslam.online.frame_result import DIMENSIONS_OFF
-from morph_dslam.online.mesh_registration.register import register_mesh
-from morph_dslam.online.start.placement import Placement
-from morph_dslam.online.start.registration import register
-from morph_dslam.similarity import SimilarityTransform
+from morph_dslam.geometry import SimilarityTransform
+from morph_dslam.registration.landmarks import register
+from morph_dslam.registration.mesh import register_mesh
+from morph_dslam.registration.registration import Registration
 from morph_dslam.threads import one_thread_for_algebra
+from morph_dslam.tracking.result import DIMENSIONS_OFF
 
 Case = tuple[str, Callable[[], Outcome]]
 #: The scene whose object stays in its place while the camera goes round it, as one in a map does.
@@ -129,7 +120,7 @@ def _in_unit(scene: Scene, factor: float) -> Outcome:
     points, pixels = landmarks(scene, scene.model)
     model = in_unit(scene.model, factor)
     found = register(model, scene.stage.camera, points, pixels)
-    placed = Placement(model, None, found.state, {}, found.flags, covariance=found.covariance)
+    placed = Registration(model, None, found.state, {}, found.flags, covariance=found.covariance)
     return run_case(scene, placed, moving(scene, 5))
 
 
@@ -183,9 +174,7 @@ def map_cases(seed: int, quick: bool) -> Iterator[Case]:
     yield "map: a second one", lambda: _in_map(nodes, world, seed, two)
 
 
-def _in_map(
-    nodes, world: SimilarityTransform, seed: int, objects, metric: bool = False, flip: bool = False
-) -> Outcome:
+def _in_map(nodes, world: SimilarityTransform, seed: int, objects, metric: bool = False, flip: bool = False) -> Outcome:
     """Register ``nodes`` (n, 3), whose surface is turned inside out by a mirror (``flip``), in a scan."""
     true_nodes, triangles, _ = wedge()
     points, views = scanned(world, objects, seed=seed, with_images=True)

@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.experiment import keep
-from morph_dslam.online.mesh_registration.run import run_registration
-from morph_dslam.online.track import TrackOptions, track
+from morph_dslam.registration.run import run_registration
 from morph_dslam.render.simulation import simulate
+from morph_dslam.tracking.track import TrackOptions, track
 from registration_seeds import MODEL, PATH, mapped, scene_text
 
 HERE = Path(__file__).resolve().parent
@@ -87,9 +87,7 @@ def tracked(seed: int, pose: str) -> NDArray[np.float64]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=5, help="how many (%(default)s)")
     parser.add_argument("--first", type=int, default=31, help="the first one (%(default)s)")
     parser.add_argument("--pose", choices=("map", "free"), default="map", help="as of morph track (map)")

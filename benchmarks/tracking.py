@@ -26,14 +26,14 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField, SurfacePoints, load_model
 from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
-from morph_dslam.model.turned_model import turned_model
-from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, State, moved
-from morph_dslam.online.frame_result import STAGES, FrameResult
-from morph_dslam.online.measuring.binding import DrawnSurface
-from morph_dslam.online.pipeline import Tracker
+from morph_dslam.model.reduced_model import with_revolution_angle
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
 from morph_dslam.threads import one_thread_for_algebra
+from morph_dslam.tracking.binding import DrawnSurface
+from morph_dslam.tracking.estimator import BoundPoints, Estimator, State, moved
+from morph_dslam.tracking.result import STAGES, FrameResult
+from morph_dslam.tracking.tracker import Tracker
 
 Array = NDArray[np.float64]
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
@@ -198,20 +198,16 @@ def estimator_alone(model: ReducedModel, repeats: int = 300) -> None:
 
 @one_thread_for_algebra
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=40, help="frames rendered and tracked (%(default)s)")
-    parser.add_argument(
-        "--solid", type=Path, default=SEAL, help="model of a body of revolution about z (%(default)s)"
-    )
+    parser.add_argument("--solid", type=Path, default=SEAL, help="model of a body of revolution about z (%(default)s)")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     flat = sheet()
     compare(flat, 0.6, arguments.frames)
     solid = tube()
     if arguments.solid.is_file():
-        solid = turned_model(load_model(arguments.solid), np.array([0.0, 0.0, 1.0]))
+        solid = with_revolution_angle(load_model(arguments.solid), np.array([0.0, 0.0, 1.0]))
     compare(solid, 4.0 * float(np.ptp(solid.nodes, axis=0).max()), arguments.frames)
     estimator_alone(flat)
 

@@ -15,7 +15,7 @@ import felupe
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from morph_dslam.offline.solvers.linear_solver import LinearSolver
+from morph_dslam.mechanics.solvers.linear_solver import LinearSolver
 
 MAX_ITERATIONS = 20
 
@@ -60,9 +60,7 @@ def main() -> None:
         change = np.where(free, 0.0, target - displacement)
         for iteration in range(MAX_ITERATIONS):
             matrix, force = body.assemble(displacement)
-            if iteration and np.linalg.norm(force[free_dofs]) <= tolerance * np.linalg.norm(
-                force[~free_dofs]
-            ):
+            if iteration and np.linalg.norm(force[free_dofs]) <= tolerance * np.linalg.norm(force[~free_dofs]):
                 break
             right = -force
             if iteration == 0:

@@ -25,27 +25,21 @@ from pymor.reductors.coercive import CoerciveRBReductor
 def full_model(problem: np.lib.npyio.NpzFile) -> StationaryModel:
     """sum_q a_q K_q u = sum_j f_j h_j with the functions' values a and f as parameters."""
     n = len(problem["loads"])
-    matrices = [
-        sp.csc_array((d, problem["indices"], problem["indptr"]), shape=(n, n)) for d in problem["stiffness"]
-    ]
+    matrices = [sp.csc_array((d, problem["indices"], problem["indptr"]), shape=(n, n)) for d in problem["stiffness"]]
     operators = [NumpyMatrixOperator(sp.csc_matrix(matrix)) for matrix in matrices]
     stiffness = [ProjectionParameterFunctional("a", len(operators), q) for q in range(len(operators))]
     vectors = [VectorOperator(operators[0].source.from_numpy(column)) for column in problem["loads"].T]
     load = [ProjectionParameterFunctional("f", len(vectors), j) for j in range(len(vectors))]
     middle = sp.csc_array((problem["middle"], problem["indices"], problem["indptr"]), shape=(n, n))
     products = {"energy": NumpyMatrixOperator(sp.csc_matrix(middle))}
-    return StationaryModel(
-        LincombOperator(operators, stiffness), LincombOperator(vectors, load), products=products
-    )
+    return StationaryModel(LincombOperator(operators, stiffness), LincombOperator(vectors, load), products=products)
 
 
 def main() -> None:
     set_log_levels({"pymor": "ERROR"})
     with np.load(sys.argv[1]) as problem:
         model = full_model(problem)
-        training = [
-            {"a": a, "f": f} for a, f in zip(problem["training_a"], problem["training_f"], strict=True)
-        ]
+        training = [{"a": a, "f": f} for a, f in zip(problem["training_a"], problem["training_f"], strict=True)]
         unseen = [{"a": a, "f": f} for a, f in zip(problem["unseen_a"], problem["unseen_f"], strict=True)]
         counts = [int(count) for count in problem["modes"]]
     energy = model.products["energy"]
@@ -53,10 +47,7 @@ def main() -> None:
 
     def record(name: str, reductor: StationaryRBReductor, solves: int, began: float) -> None:
         largest = reductor.reduce()
-        result[f"{name}_seconds"], result[f"{name}_solves"] = (
-            np.array(time.process_time() - began),
-            np.array(solves),
-        )
+        result[f"{name}_seconds"], result[f"{name}_solves"] = (np.array(time.process_time() - began), np.array(solves))
         for count in counts:
             reduced = reductor.reduce(count) if count < len(reductor.bases["RB"]) else largest
             asked = time.process_time()
@@ -72,9 +63,7 @@ def main() -> None:
     record("pod", StationaryRBReductor(model, RB=modes, product=energy), len(training), began)
     began = time.process_time()
     greedy = CoerciveRBReductor(model, product=energy)
-    found = rb_greedy(
-        model, greedy, [model.parameters.parse(mu) for mu in training], max_extensions=max(counts)
-    )
+    found = rb_greedy(model, greedy, [model.parameters.parse(mu) for mu in training], max_extensions=max(counts))
     record("greedy", greedy, found["extensions"], began)
     np.savez(sys.argv[2], **result)
 

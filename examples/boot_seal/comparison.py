@@ -29,9 +29,7 @@ def _draw(path: Path, frames: Array, nodes: Array, lever: Array, side: Array, de
     axes, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.6, 1.0))
     axes.plot(frames, nodes, color="#1b1f24", label="all nodes of the solid against the exact truth")
     measured = [depth["per_frame"][str(frame)]["mean_mm"] for frame in depth["frames_compared"]]
-    axes.plot(
-        depth["frames_compared"], measured, color="#8fb3d9", label="depth sensor's points to the surface"
-    )
+    axes.plot(depth["frames_compared"], measured, color="#8fb3d9", label="depth sensor's points to the surface")
     base = depth["base"]["mean_mm"]
     axes.axhline(base, color="#8fb3d9", linestyle=":", label=f"the same, seal undeformed: {base:.2f} mm")
     axes.axhline(PAPER_MEAN, color="#b4530a", label=f"the paper, its own recording: mean {PAPER_MEAN} mm")
@@ -47,9 +45,7 @@ def _draw(path: Path, frames: Array, nodes: Array, lever: Array, side: Array, de
     figure.savefig(path, dpi=110)
 
 
-def write_comparison(
-    run: Path, frames: Array, nodes: Array, lever: Array, side: Array, depth: dict[str, Any]
-) -> Path:
+def write_comparison(run: Path, frames: Array, nodes: Array, lever: Array, side: Array, depth: dict[str, Any]) -> Path:
     """Write ``comparison.html`` into a run folder.
 
     Parameters

@@ -16,18 +16,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from morph_dslam.cli import run_and_report_errors
+from morph_dslam.cli.app import run_and_report_errors
 from morph_dslam.errors import StudyError
-from morph_dslam.io.toml_file import read_toml
+from morph_dslam.io.tables import read_toml
 from morph_dslam.model import ReducedModel
-from morph_dslam.offline.build import build
-from morph_dslam.offline.problem import Snapshot
-from morph_dslam.offline.report.build_report import report_path, write_build_report
-from morph_dslam.offline.report.reference_curve import read_reference_curve
-from morph_dslam.offline.snapshots import load_snapshot, snapshot_key
-from morph_dslam.offline.studies.solid_study import SolidStudy
-from morph_dslam.offline.studies.study import make_study
+from morph_dslam.reduction.report import report_path, write_build_report
+from morph_dslam.reduction.report_pictures import read_reference_curve
 from morph_dslam.render.model_view import draw_states
+from morph_dslam.studies.build import build
+from morph_dslam.studies.problem import Snapshot
+from morph_dslam.studies.snapshots import load_snapshot, snapshot_key
+from morph_dslam.studies.solid_study import SolidStudy
+from morph_dslam.studies.study import make_study
 
 HERE = Path(__file__).resolve().parent
 OUTPUT = HERE / "output"
@@ -97,12 +97,8 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--divisions", type=int, nargs=3, metavar="N", help="cells along, through and around the wall"
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--divisions", type=int, nargs=3, metavar="N", help="cells along, through and around the wall")
     parser.add_argument("--cells", choices=("hex8", "hex20", "hex27"), help="type of cell")
     parser.add_argument("--positions", type=int, help="solved in all (default: those of the study, 104)")
     parser.add_argument("--output", type=Path, default=OUTPUT, help="folder to write (%(default)s)")

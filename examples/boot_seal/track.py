@@ -22,16 +22,16 @@ import numpy as np
 from comparison import write_comparison
 from numpy.typing import NDArray
 
-from morph_dslam.cli import run_and_report_errors
+from morph_dslam.cli.app import run_and_report_errors
 from morph_dslam.errors import TrackingError
 from morph_dslam.evaluation.evaluate import evaluate_depth
-from morph_dslam.evaluation.statements import depth_line
+from morph_dslam.evaluation.run_folder import depth_line
 from morph_dslam.experiment import keep_sequence
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import load_model
-from morph_dslam.online.mesh_registration.run import registration_line, run_registration
-from morph_dslam.online.slam.run import SlamRunOptions, run_slam
-from morph_dslam.online.track import TrackOptions, track
+from morph_dslam.registration.run import registration_line, run_registration
+from morph_dslam.slam.run import SlamRunOptions, run_slam
+from morph_dslam.tracking.track import TrackOptions, track
 
 Array = NDArray[np.float64]
 HERE = Path(__file__).resolve().parent
@@ -115,12 +115,7 @@ def run(arguments: argparse.Namespace) -> None:
     camera, frames = sequence / "camera.yaml", sequence / "frames"
     run_slam(
         SlamRunOptions(
-            source=frames,
-            camera=camera,
-            output=output / "scan",
-            first=0,
-            last=arguments.frozen_at,
-            overwrite=True,
+            source=frames, camera=camera, output=output / "scan", first=0, last=arguments.frozen_at, overwrite=True
         )
     )
     registration = run_registration(output / "scan" / "map.h5", model, camera, output / "registration")
@@ -150,9 +145,7 @@ def run(arguments: argparse.Namespace) -> None:
     depth = evaluate_depth(output / "run", depths, base_frame=int(found.frames[0]))
     deformed = deformed_frames(found, sequence)
     angles = (np.degrees(angle[deformed]) for angle in (found.lever, found.side))
-    page = write_comparison(
-        output / "run", found.frames[deformed], 1e3 * found.nodes[deformed], *angles, depth
-    )
+    page = write_comparison(output / "run", found.frames[deformed], 1e3 * found.nodes[deformed], *angles, depth)
     print(f"video   {output / 'run' / 'augmented.mp4'}")
     print(f"picture {output / 'registration' / 'registration.jpg'}")
     print(f"compare {page}")
@@ -161,9 +154,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, default=HERE / "scene.toml", help="scene file (%(default)s)")
     parser.add_argument(
         "--frozen-at", type=int, default=FROZEN_AT, metavar="N", help="last frame of the scan (%(default)s)"

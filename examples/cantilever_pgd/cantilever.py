@@ -11,11 +11,7 @@ from ngsolve.meshes import MakeStructured2DMesh
 from numpy.typing import NDArray
 
 from morph_dslam.model.basis_functions import cubic_spline_basis
-from morph_dslam.offline.reduction.separable_problem import (
-    SeparableProblem,
-    collocation_axis,
-    galerkin_axis,
-)
+from morph_dslam.reduction.separable_problem import SeparableProblem, collocation_axis, galerkin_axis
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 from cantilever import HEIGHT, LENGTH, Cantilever
 from matplotlib.figure import Figure
 
-from morph_dslam.offline.reduction.pgd import PgdSolution
+from morph_dslam.reduction.pgd import PgdSolution
 
 N_SHOWN = 5
 SLICE = 0.6  # position of the load that is cut out of the response surface, in lengths
@@ -68,9 +68,7 @@ def _draw_response(figure, beam: Cantilever, solution: PgdSolution) -> None:
     functions = solution.functions.bases[0].evaluate(beam.positions) @ solution.functions.factors[0]
     surface = 1e6 * (functions @ (beam.vertical @ solution.modes.T)[beam.top].T)
     x = beam.vertices[beam.top, 0]
-    ax.plot_surface(
-        *np.meshgrid(x, beam.positions), surface, cmap="viridis", alpha=0.75, rcount=60, ccount=60
-    )
+    ax.plot_surface(*np.meshgrid(x, beam.positions), surface, cmap="viridis", alpha=0.75, rcount=60, ccount=60)
     values, _ = solution.functions.evaluate([SLICE * LENGTH])
     slice_ = 1e6 * (beam.vertical @ (values @ solution.modes))[beam.top]
     ax.plot(x, np.full(len(x), SLICE * LENGTH), slice_, color="#b4530a", linewidth=2.5, zorder=5)

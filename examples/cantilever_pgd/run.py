@@ -20,10 +20,10 @@ from cantilever import STIFFNESS_RATIO, Cantilever, build_cantilever, moving_loa
 from figures import draw_errors, draw_modes
 from numpy.typing import NDArray
 
-from morph_dslam.cli import run_and_report_errors
-from morph_dslam.offline.reduction.pgd import PgdOptions, PgdSolution, solve_pgd
-from morph_dslam.offline.reduction.separable_problem import factorise
-from morph_dslam.offline.reduction.tensor_formats import khatri_rao
+from morph_dslam.cli.app import run_and_report_errors
+from morph_dslam.reduction.pgd import PgdOptions, PgdSolution, solve_pgd
+from morph_dslam.reduction.separable_problem import factorise
+from morph_dslam.reduction.tensor_formats import khatri_rao
 
 Array = NDArray[np.float64]
 
@@ -41,9 +41,7 @@ def on_grid(solution: PgdSolution, *grids: Array) -> Array:
     """The separated solution (n, g_1, ..., g_d) at all points of the grids."""
     tables = tuple(
         basis.evaluate(grid) @ factor
-        for basis, factor, grid in zip(
-            solution.functions.bases, solution.functions.factors, grids, strict=True
-        )
+        for basis, factor, grid in zip(solution.functions.bases, solution.functions.factors, grids, strict=True)
     )
     return (solution.modes.T @ khatri_rao(tables).T).reshape(-1, *(len(grid) for grid in grids))
 
@@ -82,9 +80,7 @@ def compare_one_parameter(beam: Cantilever) -> tuple[PgdSolution, dict[str, list
 
 def compare_two_parameters(beam: Cantilever) -> float:
     """Relative L2 error of the solution with a stiffness parameter, over positions and held-out ratios."""
-    solution = solve_pgd(
-        moving_load_and_stiffness(beam), PgdOptions(max_modes=STIFFNESS_MODES, tolerance=0.0)
-    )
+    solution = solve_pgd(moving_load_and_stiffness(beam), PgdOptions(max_modes=STIFFNESS_MODES, tolerance=0.0))
     missed = total = 0.0
     found = on_grid(solution, beam.positions, np.log(HELD_OUT))
     for i, ratio in enumerate(HELD_OUT):
@@ -97,9 +93,7 @@ def compare_two_parameters(beam: Cantilever) -> float:
 def run(_: argparse.Namespace) -> None:
     OUTPUT.mkdir(exist_ok=True)
     beam = build_cantilever()
-    print(
-        f"{beam.loads.shape[0]} degrees of freedom, {beam.loads.shape[1]} positions of the load", flush=True
-    )
+    print(f"{beam.loads.shape[0]} degrees of freedom, {beam.loads.shape[1]} positions of the load", flush=True)
     solution, results = compare_one_parameter(beam)
     print("modes  energy error (best, dual residual)      L2 error (best)")
     for i, count in enumerate(MODE_COUNTS):
@@ -114,9 +108,7 @@ def run(_: argparse.Namespace) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     return run_and_report_errors(run, parser.parse_args(), "nothing was kept")
 
 

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import cv2
 
-from morph_dslam.cli import main as morph
+from morph_dslam.cli.app import main as morph
 from morph_dslam.model import load_model
 from morph_dslam.render.scene_file import load_scene_file
 from morph_dslam.render.scene_renderer import print_texture
-from morph_dslam.render.sheet_points import sheet_bounds
+from morph_dslam.render.texture import sheet_bounds
 
 HERE = Path(__file__).resolve().parent
 DEMO = HERE.parents[1] / "demo"
@@ -40,8 +40,7 @@ def write_picture() -> None:
 def write_guess() -> None:
     """About where the scene file puts the sheet at first."""
     (FOLDER / "guess.toml").write_text(
-        "[pose]\nposition_mm = [-25, 3, 405]\nrotation_deg = [182, 1, 2]\n"
-        "[parameters]\nbulge = 6\nbend = 0.9\n"
+        "[pose]\nposition_mm = [-25, 3, 405]\nrotation_deg = [182, 1, 2]\n[parameters]\nbulge = 6\nbend = 0.9\n"
     )
 
 

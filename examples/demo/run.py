@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from morph_dslam.cli import run_and_report_errors
+from morph_dslam.cli.app import run_and_report_errors
 from morph_dslam.experiment import Recording, keep_model, keep_sequence, report, track_and_evaluate
 
 HERE = Path(__file__).resolve().parent
@@ -30,9 +30,7 @@ def run(_: argparse.Namespace) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     return run_and_report_errors(run, parser.parse_args(), "what was built and filmed so far is kept")
 
 

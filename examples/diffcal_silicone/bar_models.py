@@ -8,11 +8,11 @@ from pathlib import Path
 
 from recording import CLAMP_X, HangingBar
 
-from morph_dslam.experiment import keep, sources
+from morph_dslam.experiment import keep
+from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning
 from morph_dslam.model import ReducedModel, load_model
-from morph_dslam.offline.build import build
-from morph_dslam.offline.mechanics.solid_materials import NearlyIncompressibleWarning
-from morph_dslam.offline.studies.study import Study, make_study
+from morph_dslam.studies.build import build
+from morph_dslam.studies.study import Study, make_study
 
 HERE = Path(__file__).resolve().parent
 #: Of the shear modulus over the published one: from 160 kPa to 20 kPa.
@@ -30,9 +30,7 @@ class Discretisation:
 
 
 #: As the published modulus was identified; the same elements, smaller; and elements that do not lock.
-PUBLISHED = Discretisation(
-    "linear, published mesh", "cantilever_coarse/cantilever_f640_v322", 1, "displacement"
-)
+PUBLISHED = Discretisation("linear, published mesh", "cantilever_coarse/cantilever_f640_v322", 1, "displacement")
 FINER = Discretisation("linear, finer mesh", "cantilever/cantilever_f1494_v749", 1, "displacement")
 CONVERGED = Discretisation("second order, mixed", "cantilever/cantilever_f1494_v749", 2, "mixed")
 
@@ -40,9 +38,7 @@ CONVERGED = Discretisation("second order, mixed", "cantilever/cantilever_f1494_v
 def write_mesh(path: Path, bar: HangingBar) -> None:
     """Write the bar's tetrahedra and its clamped nodes as an Abaqus input file, in millimetres."""
     lines = ["*NODE"]
-    lines += [
-        "{}, {:.9g}, {:.9g}, {:.9g}".format(label, *node) for label, node in enumerate(1e3 * bar.nodes, 1)
-    ]
+    lines += ["{}, {:.9g}, {:.9g}, {:.9g}".format(label, *node) for label, node in enumerate(1e3 * bar.nodes, 1)]
     lines.append("*ELEMENT, TYPE=C3D4")
     lines += [f"{label}, " + ", ".join(map(str, cell)) for label, cell in enumerate(bar.tetrahedra + 1, 1)]
     lines.append("*NSET, NSET=clamp")
@@ -90,5 +86,5 @@ def bar_model(output: Path, bar: HangingBar, discretisation: Discretisation) -> 
             warnings.simplefilter("ignore", NearlyIncompressibleWarning)
             build(bar_study(mesh, discretisation), model)
 
-    keep(model, [mesh, HERE / "silicone.py", HERE / "bar_models.py", *sources("offline", "model")], make)
+    keep(model, [mesh, HERE / "silicone.py", HERE / "bar_models.py"], make)
     return load_model(model)

@@ -28,10 +28,10 @@ from recording import load_bar
 from run import OUTPUT, default_data
 from silicone import PUBLISHED_SHEAR
 
-from morph_dslam.cli import run_and_report_errors
+from morph_dslam.cli.app import run_and_report_errors
+from morph_dslam.evaluation.depth import distances_to_surface
 from morph_dslam.evaluation.report import Picture as Image
 from morph_dslam.evaluation.report import Section, Table, Text, write_report
-from morph_dslam.evaluation.surface_distance import distances_to_surface
 from morph_dslam.model import ReducedModel
 from morph_dslam.render.overlay import draw_overlay
 
@@ -41,16 +41,7 @@ Array = NDArray[np.float64]
 SHOWN = np.array([700, 500])
 #: How far the bar may turn in its clamp where that is not held to the marker, radians.
 FREE_TURN = np.radians(10.0)
-HEADER = (
-    "elements",
-    "picture",
-    "turned by",
-    "shear modulus",
-    "95 % interval",
-    "outline",
-    "turn",
-    "to the surface",
-)
+HEADER = ("elements", "picture", "turned by", "shear modulus", "95 % interval", "outline", "turn", "to the surface")
 
 
 @dataclass(frozen=True)
@@ -135,15 +126,9 @@ def write_page(cases: list[Case], picture: Path) -> list[tuple[str, ...]]:
         "The interval holds the errors of the outline, alike over stretches of it, and of the marker's pose. "
         "It does not hold those of the discretisation or of the clamp, which the rows show.",
     ]
-    blocks = [
-        Table(rows, HEADER),
-        *map(Text, notes),
-        Image.read(picture, "Estimated bars over their pictures."),
-    ]
+    blocks = [Table(rows, HEADER), *map(Text, notes), Image.read(picture, "Estimated bars over their pictures.")]
     page = OUTPUT / "estimate.html"
-    write_report(
-        page, "Stiffness of a hanging silicone bar from pictures", [Section("Shear modulus", blocks)]
-    )
+    write_report(page, "Stiffness of a hanging silicone bar from pictures", [Section("Shear modulus", blocks)])
     print(f"page {page}")
     return rows
 
@@ -168,12 +153,8 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--data", type=Path, default=default_data(), help="the recordings' folder (%(default)s)"
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=default_data(), help="the recordings' folder (%(default)s)")
     return run_and_report_errors(run, parser.parse_args(), "models built so far are kept")
 
 

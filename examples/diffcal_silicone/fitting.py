@@ -12,9 +12,9 @@ from silhouette import FINER, Matches, match
 from silicone import PUBLISHED_SHEAR
 
 from morph_dslam.model import ReducedModel
-from morph_dslam.online.estimation.depth_residuals import DepthOptions, PointDepths
-from morph_dslam.online.estimation.estimator import BoundPoints, EstimationOptions, Estimator, Prior, State
-from morph_dslam.online.measuring.binding import bind_pixels, draw_view, view_of
+from morph_dslam.tracking.binding import bind_pixels, draw_view, view_of
+from morph_dslam.tracking.depth import DepthOptions, PointDepths
+from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, Prior, State
 
 Array = NDArray[np.float64]
 
@@ -135,8 +135,4 @@ def _with_depths(
     points = matches.points.joined(inner)
     pixels = np.concatenate([matches.pixels, pixels[met][shown]])
     used = np.arange(len(points)) >= len(matches.points)
-    return (
-        points,
-        pixels,
-        PointDepths.sampled(picture.depth, pixels, used, picture.camera, variance, DepthOptions()),
-    )
+    return (points, pixels, PointDepths.sampled(picture.depth, pixels, used, picture.camera, variance, DepthOptions()))

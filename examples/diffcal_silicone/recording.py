@@ -45,9 +45,7 @@ class HangingBar:
     points: Array
 
 
-def load_bar(
-    data: Path, recording: str = "h_m_c", mesh: str = "cantilever/cantilever_f1494_v749"
-) -> HangingBar:
+def load_bar(data: Path, recording: str = "h_m_c", mesh: str = "cantilever/cantilever_f1494_v749") -> HangingBar:
     """Read a recording.
 
     Raises

@@ -25,16 +25,16 @@ from numpy.typing import NDArray
 from recording import CLAMP_X, HangingBar, load_bar
 from scipy.optimize import minimize_scalar
 
-from morph_dslam.cli import run_and_report_errors
-from morph_dslam.evaluation.surface_distance import distances_to_surface
+from morph_dslam.cli.app import run_and_report_errors
+from morph_dslam.evaluation.depth import distances_to_surface
+from morph_dslam.mechanics.loads import Gravity
+from morph_dslam.mechanics.materials.isotropic import NeoHookean
+from morph_dslam.mechanics.parameters import ParameterSymbols
+from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.mechanics.solvers.newton import State, advance
+from morph_dslam.mechanics.supports import fixed
+from morph_dslam.meshing.meshes import CellBlock, Mesh
 from morph_dslam.model import Parameter
-from morph_dslam.offline.materials.isotropic import NeoHookean
-from morph_dslam.offline.mechanics.loads import Gravity
-from morph_dslam.offline.mechanics.parameters import ParameterSymbols
-from morph_dslam.offline.mechanics.solid import SolidOptions, SolidProblem
-from morph_dslam.offline.mechanics.supports import fixed
-from morph_dslam.offline.meshing.meshes import CellBlock, Mesh
-from morph_dslam.offline.solvers.newton import State, advance
 from morph_dslam.render.overlay import draw_overlay
 
 Array = NDArray[np.float64]
@@ -54,10 +54,7 @@ FACE_BAND = 0.012
 def hanging_problem(bar: HangingBar, options: SolidOptions) -> SolidProblem:
     """The bar with gravity (0 to 1) and shear modulus (Pa) as parameters."""
     symbols = ParameterSymbols(
-        (
-            Parameter("gravity", "ratio", "1", 0.0, 1.0, 0.0),
-            Parameter("shear", "stress", "kPa", *SEARCHED, 100e3),
-        )
+        (Parameter("gravity", "ratio", "1", 0.0, 1.0, 0.0), Parameter("shear", "stress", "kPa", *SEARCHED, 100e3))
     )
     shear = symbols["shear"]
     poisson = LAME / (2.0 * (LAME + shear))
@@ -186,12 +183,8 @@ def default_data() -> Path:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--data", type=Path, default=default_data(), help="the recordings' folder (%(default)s)"
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=default_data(), help="the recordings' folder (%(default)s)")
     return run_and_report_errors(run, parser.parse_args(), "pictures drawn so far are kept")
 
 

@@ -17,8 +17,8 @@ from scipy.spatial import KDTree
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import EvaluationError
 from morph_dslam.model import ReducedModel, SurfacePoints
-from morph_dslam.online.estimation.state import BoundPoints, State
-from morph_dslam.online.measuring.binding import draw_view, facing, view_of
+from morph_dslam.tracking.binding import draw_view, facing, view_of
+from morph_dslam.tracking.state import BoundPoints, State
 
 Array = NDArray[np.float64]
 
@@ -112,21 +112,14 @@ def silhouette_points(
 
 def _edges(triangles: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Edges (e, 2) of a closed surface and the two triangles (e, 2) of each."""
-    sides = np.sort(
-        np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1
-    )
+    sides = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
     owners = np.tile(np.arange(len(triangles)), 3)
     order = np.lexsort(sides.T)
     return sides[order][::2], owners[order].reshape(-1, 2)
 
 
 def match(
-    model: ReducedModel,
-    camera: PinholeCamera,
-    state: State,
-    free: NDArray[np.bool_],
-    outline: Array,
-    reach_px: float,
+    model: ReducedModel, camera: PinholeCamera, state: State, free: NDArray[np.bool_], outline: Array, reach_px: float
 ) -> Matches:
     """Silhouette points of a state and the nearest of the outline's points (k, 2), within a reach."""
     points, normals = silhouette_points(model, camera, state, free)

@@ -13,8 +13,8 @@ import os
 import sys
 from pathlib import Path
 
-from morph_dslam.cli import run_and_report_errors
-from morph_dslam.command_arguments import frame_range
+from morph_dslam.cli.app import run_and_report_errors
+from morph_dslam.cli.arguments import frame_range
 from morph_dslam.experiment import Recording, check_recording, keep_model, report, track_and_evaluate
 
 HERE = Path(__file__).resolve().parent
@@ -52,12 +52,8 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--data", type=Path, default=default_data(), help="folder of the recording (%(default)s)"
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=default_data(), help="folder of the recording (%(default)s)")
     parser.add_argument("--frames", type=frame_range, default=(9, 100), help="frames to track (9-100)")
     return run_and_report_errors(run, parser.parse_args(), "what was built and tracked so far is kept")
 

@@ -112,9 +112,7 @@ def result_line(found: Comparison, summary: dict) -> str:
 def plot(path: Path, found: Comparison, parameters: tuple[Parameter, ...]) -> None:
     """The tumour's error, then each parameter as estimated and in truth, with two standard deviations."""
     figure = Figure(figsize=(9.0, 3.0 + 1.7 * len(parameters)), layout="constrained")
-    top, *others = figure.subplots(
-        1 + len(parameters), 1, sharex=True, height_ratios=[1.6, *(1.0 for _ in parameters)]
-    )
+    top, *others = figure.subplots(1 + len(parameters), 1, sharex=True, height_ratios=[1.6, *(1.0 for _ in parameters)])
     predicted = 2e3 * np.linalg.norm(found.centre_std, axis=1)
     top.fill_between(
         found.frames, 0.0, predicted, color=ESTIMATED, alpha=0.2, linewidth=0, label="2 predicted deviations"

@@ -11,8 +11,8 @@ from organ_mesh import Patch
 from scipy.spatial import ConvexHull
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.meshing.mesh_files import load_mesh
-from morph_dslam.offline.meshing.meshes import Mesh
+from morph_dslam.meshing.mesh_files import load_mesh
+from morph_dslam.meshing.meshes import Mesh
 
 Array = NDArray[np.float64]
 

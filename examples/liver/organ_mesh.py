@@ -17,10 +17,9 @@ from scipy.ndimage import gaussian_filter
 from scipy.sparse import coo_matrix
 from skimage.measure import marching_cubes
 
-from morph_dslam.offline.meshing.mesh_checks import check_mesh
-from morph_dslam.offline.meshing.mesh_conversion import to_second_order
-from morph_dslam.offline.meshing.mesh_files import load_mesh
-from morph_dslam.offline.meshing.meshes import Mesh
+from morph_dslam.meshing.mesh_checks import check_mesh
+from morph_dslam.meshing.mesh_files import load_mesh, to_second_order
+from morph_dslam.meshing.meshes import Mesh
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -103,9 +102,7 @@ def with_patches(mesh: Mesh, patches: Mapping[str, Patch]) -> Mesh:
     """The mesh with these parts of its boundary named; a face belongs to one if its middle does."""
     faces = mesh.boundary_faces()
     middles = mesh.nodes[mesh.face_nodes(faces, corners_only=True)].mean(axis=1)
-    near = {
-        name: np.linalg.norm(middles - patch.centre, axis=1) < patch.radius for name, patch in patches.items()
-    }
+    near = {name: np.linalg.norm(middles - patch.centre, axis=1) < patch.radius for name, patch in patches.items()}
     return replace(mesh, surfaces={name: faces[chosen] for name, chosen in near.items()})
 
 
@@ -129,9 +126,7 @@ def organ_mesh(fine: Mesh, size: float, patches: Mapping[str, Patch]) -> Mesh:
 def write_inp(path: Path, mesh: Mesh) -> None:
     """Write second-order tetrahedra and their named surfaces as an Abaqus input file, in millimetres."""
     lines = ["*NODE"]
-    lines += [
-        "{}, {:.9g}, {:.9g}, {:.9g}".format(label, *node) for label, node in enumerate(1e3 * mesh.nodes, 1)
-    ]
+    lines += ["{}, {:.9g}, {:.9g}, {:.9g}".format(label, *node) for label, node in enumerate(1e3 * mesh.nodes, 1)]
     lines.append("*ELEMENT, TYPE=C3D10")
     for label, cell in enumerate(mesh.blocks[0].connectivity + 1, 1):
         lines.append(f"{label}, " + ", ".join(map(str, cell)))

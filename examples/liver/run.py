@@ -21,18 +21,17 @@ from comparison import Comparison, compare, plot, result_line
 from organ import PATCHES, SIZE, TUMOUR_AXES, TUMOUR_CENTRE, ellipsoid, fine_liver
 from organ_mesh import organ_mesh, write_inp
 
-from morph_dslam.cli import run_and_report_errors
-from morph_dslam.evaluation.surface_distance import distances_to_surface
-from morph_dslam.experiment import keep, keep_sequence, sources
+from morph_dslam.cli.app import run_and_report_errors
+from morph_dslam.evaluation.depth import distances_to_surface
+from morph_dslam.experiment import keep, keep_sequence
 from morph_dslam.model import MaterialPoints, ReducedModel, load_model
 from morph_dslam.model.inner_structure import CarriedStructure, save_inner_structure
-from morph_dslam.offline.build import build
-from morph_dslam.offline.inner_structures import place_inner_structure
-from morph_dslam.offline.snapshots import load_snapshot, snapshot_key
-from morph_dslam.offline.studies.study import load_study
-from morph_dslam.online.mesh_registration.run import registration_line, run_registration
-from morph_dslam.online.slam.run import SlamRunOptions, run_slam
-from morph_dslam.online.track import TrackOptions, track
+from morph_dslam.registration.run import registration_line, run_registration
+from morph_dslam.slam.run import SlamRunOptions, run_slam
+from morph_dslam.studies.build import build, place_inner_structure
+from morph_dslam.studies.snapshots import load_snapshot, snapshot_key
+from morph_dslam.studies.study import load_study
+from morph_dslam.tracking.track import TrackOptions, track
 
 HERE = Path(__file__).resolve().parent
 OUTPUT = HERE / "output"
@@ -48,7 +47,7 @@ def make_model(data: Path) -> ReducedModel:
     fine, study = fine_liver(file), HERE / "study.toml"
     code = [HERE / "organ.py", HERE / "organ_mesh.py"]
     keep(MESH, [file, *code], lambda: write_inp(MESH, organ_mesh(fine, SIZE, PATCHES)))
-    keep(MODEL, [study, MESH, *sources("offline", "model")], lambda: build(load_study(study), MODEL))
+    keep(MODEL, [study, MESH], lambda: build(load_study(study), MODEL))
     return load_model(MODEL)
 
 
@@ -97,9 +96,7 @@ def track_from_map(folder: Path) -> dict:
     """Map the scene, find the liver in the map, and track from there."""
     camera, frames = SEQUENCE / "camera.yaml", SEQUENCE / "frames"
     scan, place = OUTPUT / "scan", OUTPUT / "registration"
-    run_slam(
-        SlamRunOptions(source=frames, camera=camera, output=scan, first=0, last=FROZEN_AT, overwrite=True)
-    )
+    run_slam(SlamRunOptions(source=frames, camera=camera, output=scan, first=0, last=FROZEN_AT, overwrite=True))
     print(registration_line(run_registration(scan / "map.h5", MODEL, camera, place)))
     return track(
         TrackOptions(
@@ -152,9 +149,7 @@ def default_data() -> Path:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=default_data(), help="folder of meshes (%(default)s)")
     return run_and_report_errors(run, parser.parse_args(), "what was done so far is kept")
 

@@ -20,23 +20,21 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from morph_dslam.meshing.generators import sheet as sheet_mesh
+from morph_dslam.meshing.meshes import model_mesh_of
 from morph_dslam.model import Parameter, ReducedModel, save_model
 from morph_dslam.model.basis_functions import cubic_spline_basis
 from morph_dslam.model.reduced_model import von_mises
 from morph_dslam.model.tensor_functions import CPFunctions
-from morph_dslam.offline.certificate import certify, compression_percent
-from morph_dslam.offline.meshing.mesh_generators import sheet as sheet_mesh
-from morph_dslam.offline.meshing.model_meshes import model_mesh_of
-from morph_dslam.offline.problem import ModelMesh, Snapshot
-from morph_dslam.offline.reduction.method import METHODS, ReductionTask
-from morph_dslam.offline.reduction.tensor_formats import cp, cp_functions
-from morph_dslam.offline.studies.study_sections import ReductionSection
+from morph_dslam.reduction.certificate import certify, compression_percent
+from morph_dslam.reduction.method import METHODS, ReductionTask
+from morph_dslam.reduction.tensor_formats import cp, cp_functions
+from morph_dslam.studies.problem import ModelMesh, Snapshot
+from morph_dslam.studies.sections import ReductionSection
 
 Array = NDArray[np.float64]
 
-PATH = Parameter(
-    "path", "ratio", "1", 0.0, 1.0, 0.0, "part of the path from the flat sheet to its full height"
-)
+PATH = Parameter("path", "ratio", "1", 0.0, 1.0, 0.0, "part of the path from the flat sheet to its full height")
 OPTIONS = ReductionSection(method="pod", basis="cubic_spline", tolerance=5e-5)
 #: The model file is made from about so many positions: as many splines interpolate between them.
 NODES = 41
@@ -111,9 +109,7 @@ def separate_space(snapshots: Sequence[Snapshot], name: str, grid: Grid) -> CPFu
     return cp_functions(cp(tensor, CP_TOLERANCE, PRODUCTS), axes, bases)
 
 
-def evaluate_separated(
-    functions: CPFunctions, grid: Grid, position: float, products: int | None = None
-) -> Array:
+def evaluate_separated(functions: CPFunctions, grid: Grid, position: float, products: int | None = None) -> Array:
     """The field (n, c) at all nodes, of the first ``products`` products if wished."""
     at = (*grid.axes(), np.array([position]))
     x, y, path = (
@@ -124,9 +120,7 @@ def evaluate_separated(
     return np.einsum("yt,xt,tc->yxc", y, x, amplitudes).reshape(-1, functions.n_functions)
 
 
-def _separated_errors(
-    separated: dict[str, CPFunctions], snapshots: Sequence[Snapshot], grid: Grid
-) -> dict[str, float]:
+def _separated_errors(separated: dict[str, CPFunctions], snapshots: Sequence[Snapshot], grid: Grid) -> dict[str, float]:
     """Relative L2 errors over snapshots, by field, and of the von Mises stress."""
     errors, missed, norm = {}, 0.0, 0.0
     for name, functions in separated.items():
@@ -199,9 +193,7 @@ def draw_reduction(file: Path, reduced: Reduced, unseen: Sequence[Snapshot], gri
     error_axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     error_axes.legend(frameon=False)
     shown = min(5, len(functions.mixing))
-    for axes, basis, factor in zip(
-        (x_axes, y_axes, path_axes), functions.bases, functions.factors, strict=True
-    ):
+    for axes, basis, factor in zip((x_axes, y_axes, path_axes), functions.bases, functions.factors, strict=True):
         points = np.linspace(basis.lower, basis.upper, 401)
         curves = basis.evaluate(points) @ factor[:, :shown]
         scale = 1.0 if axes is path_axes else 1e3

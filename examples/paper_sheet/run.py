@@ -23,10 +23,9 @@ from matplotlib.ticker import MaxNLocator
 from reduction import Grid, write_reduction
 from tqdm import tqdm
 
-from morph_dslam.cli import run_and_report_errors
+from morph_dslam.cli.app import run_and_report_errors
 from morph_dslam.errors import SolverError
-from morph_dslam.offline.executors import default_executor
-from morph_dslam.offline.mechanics.sheet_buckling import (
+from morph_dslam.mechanics.sheet_buckling import (
     BuckledSheet,
     BucklingFolder,
     PathRecord,
@@ -35,9 +34,10 @@ from morph_dslam.offline.mechanics.sheet_buckling import (
     solve_positions,
     southwell_load,
 )
-from morph_dslam.offline.mechanics.shell import OrthotropicSheet
-from morph_dslam.offline.snapshots import load_snapshot
-from morph_dslam.offline.solvers.arc_length import PathPoint, missed_bifurcations
+from morph_dslam.mechanics.shell import OrthotropicSheet
+from morph_dslam.mechanics.solvers.arc_length import PathPoint, missed_bifurcations
+from morph_dslam.studies.snapshots import load_snapshot
+from morph_dslam.studies.sweep import default_executor
 
 HERE = Path(__file__).resolve().parent
 OUTPUT = HERE / "output"
@@ -205,12 +205,8 @@ def draw_shapes(file: Path, sheet: BuckledSheet, folder: BucklingFolder, count: 
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--positions", type=int, default=POSITIONS, help="along the path (default %(default)s)"
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--positions", type=int, default=POSITIONS, help="along the path (default %(default)s)")
     parser.add_argument("--cells", type=int, nargs=2, default=(42, 30), metavar=("NX", "NY"))
     parser.add_argument("--output", type=Path, default=OUTPUT, help="folder of results (default %(default)s)")
     parser.add_argument("--workers", type=int, help="processes; one a core unless said otherwise")

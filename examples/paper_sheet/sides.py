@@ -14,13 +14,11 @@ import numpy as np
 from reduction import NODES, OPTIONS, Grid
 
 from morph_dslam.model import Parameter, ReducedModel
-from morph_dslam.offline.certificate import certify
-from morph_dslam.offline.problem import Snapshot
-from morph_dslam.offline.reduction.method import METHODS, ReductionTask
+from morph_dslam.reduction.certificate import certify
+from morph_dslam.reduction.method import METHODS, ReductionTask
+from morph_dslam.studies.problem import Snapshot
 
-PATH = Parameter(
-    "path", "ratio", "1", -1.0, 1.0, 0.0, "part of the path to full height; negative below the plane"
-)
+PATH = Parameter("path", "ratio", "1", -1.0, 1.0, 0.0, "part of the path to full height; negative below the plane")
 #: The model that is filmed is made of every position, to this tolerance.
 FILMED = OPTIONS.model_copy(update={"tolerance": 1e-6})
 
@@ -45,9 +43,7 @@ def tracked_model(snapshots: Sequence[Snapshot], grid: Grid) -> ReducedModel:
     """The model that the tracker has: of few positions, certified on all others."""
     every = max(1, round((len(snapshots) - 1) / (NODES - 1)))
     seen, unseen = snapshots[::every], [s for i, s in enumerate(snapshots) if i % every]
-    task = ReductionTask(
-        grid.mesh(), (PATH,), [[s] for s in both_sides(seen)], OPTIONS, "paper sheet, either side"
-    )
+    task = ReductionTask(grid.mesh(), (PATH,), [[s] for s in both_sides(seen)], OPTIONS, "paper sheet, either side")
     model = METHODS["pod"](task)
     model.certificate.update(certify(model, [*unseen, *map(below, unseen)]))
     return model

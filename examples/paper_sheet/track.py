@@ -22,16 +22,16 @@ from reduction import Grid
 from run import HEIGHT, OUTPUT, PAPER, POSITIONS, SIZE
 from sides import filmed_model, tracked_model
 
-from morph_dslam.cli import run_and_report_errors
+from morph_dslam.cli.app import run_and_report_errors
 from morph_dslam.errors import TrackingError
 from morph_dslam.evaluation.evaluate import evaluate_depth
 from morph_dslam.evaluation.report import KeyFigures, Link, Picture, Section, Table, Text, write_report
-from morph_dslam.evaluation.statements import depth_line
-from morph_dslam.experiment import Recording, keep, keep_sequence, report, sources, track_and_evaluate
+from morph_dslam.evaluation.run_folder import depth_line
+from morph_dslam.experiment import Recording, keep, keep_sequence, report, track_and_evaluate
+from morph_dslam.mechanics.sheet_buckling import BuckledSheet, BucklingFolder
 from morph_dslam.model import load_model, save_model
-from morph_dslam.offline.mechanics.sheet_buckling import BuckledSheet, BucklingFolder
-from morph_dslam.offline.problem import Snapshot
-from morph_dslam.offline.snapshots import load_snapshot
+from morph_dslam.studies.problem import Snapshot
+from morph_dslam.studies.snapshots import load_snapshot
 
 Array = NDArray[np.float64]
 HERE = Path(__file__).resolve().parent
@@ -61,7 +61,7 @@ def make_models() -> None:
             f"{missing} of the {POSITIONS} positions are not in {folder.root}: solve them with "
             f"`python examples/{HERE.name}/run.py` first"
         )
-    ingredients = [HERE / "sides.py", HERE / "reduction.py", *sources("offline/reduction", "model"), *files]
+    ingredients = [HERE / "sides.py", HERE / "reduction.py", *files]
     for model, make in ((MODEL, tracked_model), (FILMED, filmed_model)):
         keep(model, ingredients, lambda model=model, make=make: save_model(model, make(read(files), GRID)))
 
@@ -92,15 +92,10 @@ def draw(path: Path, figures: dict[str, Any], surface: dict[str, Any], height: A
     ):
         frames = content["frames_compared"]
         means = [content["per_frame"][str(frame)]["mean_mm"] for frame in frames]
-        axes.plot(
-            frames, means, color=colour, linewidth=1.3, label=f"{label}, mean {content['mean_mm']:.2f} mm"
-        )
+        axes.plot(frames, means, color=colour, linewidth=1.3, label=f"{label}, mean {content['mean_mm']:.2f} mm")
     axes.axhline(PAPER_MEAN, color="#b4530a", label=f"the paper, its own recording: mean {PAPER_MEAN} mm")
     axes.axhline(
-        PAPER_CAMERA,
-        color="#b4530a",
-        linestyle=":",
-        label=f"the paper: error of its camera, {PAPER_CAMERA} mm",
+        PAPER_CAMERA, color="#b4530a", linestyle=":", label=f"the paper: error of its camera, {PAPER_CAMERA} mm"
     )
     axes.set(ylabel="mean error in the frame / mm", ylim=(0.0, 1.6 * PAPER_MEAN))
     axes.legend(frameon=False, fontsize=8, loc="upper left")
@@ -138,9 +133,7 @@ def write_comparison(figures: dict[str, Any], surface: dict[str, Any]) -> list[t
         "blur, so that its truth is exact. It lacks the errors of material and supports of a real sheet."
     )
     blocks = [
-        KeyFigures(
-            {"mean error, paper": f"{PAPER_MEAN} mm", "mean error, here": f"{figures['mean_mm']:.2f} mm"}
-        ),
+        KeyFigures({"mean error, paper": f"{PAPER_MEAN} mm", "mean error, here": f"{figures['mean_mm']:.2f} mm"}),
         Table(table, ("", "paper", "here")),
         Text(note),
         Picture.read(RUN / "comparison.png", "Mean error in each frame, and how high the sheet stands."),
@@ -167,9 +160,7 @@ def run(_: argparse.Namespace) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     return run_and_report_errors(run, parser.parse_args(), "what was done so far is kept")
 
 

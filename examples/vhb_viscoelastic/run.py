@@ -21,11 +21,10 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from morph_dslam.cli import run_and_report_errors
+from morph_dslam.cli.app import run_and_report_errors
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.materials.fit import Fit, fit_law
-from morph_dslam.offline.materials.ogden import Ogden
-from morph_dslam.offline.materials.uniaxial import TensionTest, evaluate_tests, relative_error
+from morph_dslam.mechanics.materials.fit import Fit, TensionTest, evaluate_tests, fit_law, relative_error
+from morph_dslam.mechanics.materials.isotropic import Ogden
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -72,10 +71,7 @@ def read_test(path: Path, kind: str) -> TensionTest:
     # The first reading of a loop is taken at a small stretch already.
     start = time[0] - 1e-3
     return TensionTest(
-        name,
-        np.r_[1.0, stretch[chosen]],
-        np.r_[0.0, stress[chosen] * KILOPASCAL],
-        np.r_[start, time[chosen]],
+        name, np.r_[1.0, stretch[chosen]], np.r_[0.0, stress[chosen] * KILOPASCAL], np.r_[start, time[chosen]]
     )
 
 
@@ -100,12 +96,7 @@ def two_term_ogden(modulus_1: float, exponent_1: float, modulus_2: float, expone
 
 
 def fit(tests: list[TensionTest]) -> Fit:
-    bounds = {
-        "modulus_1": (1e3, 1e6),
-        "exponent_1": (0.2, 2.0),
-        "modulus_2": (1e2, 1e5),
-        "exponent_2": (2.0, 6.0),
-    }
+    bounds = {"modulus_1": (1e3, 1e6), "exponent_1": (0.2, 2.0), "modulus_2": (1e2, 1e5), "exponent_2": (2.0, 6.0)}
     shares, times = [(0.01, 0.99)] * 3, [(0.1, 5.0), (5.0, 50.0), (50.0, 1000.0)]
     return fit_law(two_term_ogden, bounds, tests, (shares, times), starts=2)
 
@@ -133,9 +124,7 @@ def draw(parts: dict[str, tuple[list[TensionTest], list[np.ndarray]]], path: Pat
                 axis.annotate(test.name.split()[-1], end, (5, -3), textcoords="offset points", fontsize=8)
     for name, axis in panels.items():
         relaxing = name == "relaxation"
-        axis.set_title(
-            "relaxation at the stretches written" if relaxing else f"loading and unloading, {name}"
-        )
+        axis.set_title("relaxation at the stretches written" if relaxing else f"loading and unloading, {name}")
         axis.set_xlabel("time, s" if relaxing else "stretch")
         axis.set_ylabel("nominal stress, kPa")
     axes[0, 0].set_xscale("log")
@@ -161,22 +150,16 @@ def run(arguments: argparse.Namespace) -> None:
             print(f"{part:9}  {test.name:18} {100 * relative_error(test.stress, computed):5.1f} %")
     OUTPUT.mkdir(parents=True, exist_ok=True)
     (OUTPUT / "constants.json").write_text(json.dumps(result.constants, indent=2) + "\n")
-    draw(
-        {"fitted": (fitted, stresses["fitted"]), "predicted": (predicted, stresses["predicted"])},
-        OUTPUT / "fit.png",
-    )
+    draw({"fitted": (fitted, stresses["fitted"]), "predicted": (predicted, stresses["predicted"])}, OUTPUT / "fit.png")
     print(f"constants and plot are in {OUTPUT}")
     errors = {
-        part: overall_error(tests, stresses[part])
-        for part, tests in (("fitted", fitted), ("predicted", predicted))
+        part: overall_error(tests, stresses[part]) for part, tests in (("fitted", fitted), ("predicted", predicted))
     }
     print(f"fit_error_percent={errors['fitted']:.2f} predicted_error_percent={errors['predicted']:.2f}")
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=default_data(), help="folder of the tests (%(default)s)")
     return run_and_report_errors(run, parser.parse_args(), "nothing was written")
 

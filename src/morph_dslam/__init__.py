@@ -10,9 +10,9 @@ __version__ = "0.1.0"
 
 #: Where each public name is; loaded when first asked for, so that the command line answers at once.
 _PUBLIC = {
-    "build": "morph_dslam.offline.build",
-    "load_study": "morph_dslam.offline.studies.study",
-    "make_study": "morph_dslam.offline.studies.study",
+    "build": "morph_dslam.studies.build",
+    "load_study": "morph_dslam.studies.study",
+    "make_study": "morph_dslam.studies.study",
     "load_model": "morph_dslam.model",
     "save_model": "morph_dslam.model",
 }

@@ -8,13 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from morph_dslam import __version__
+
 FrameRange = tuple[int | None, int | None]
-
-
-def sources(*packages: str) -> list[Path]:
-    """The source files of subpackages of morph_dslam."""
-    root = Path(__file__).parent
-    return [path for package in packages for path in sorted((root / package).glob("*.py"))]
 
 
 def keep(product: Path, ingredients: Sequence[Path], make: Callable[[], object]) -> bool:
@@ -29,7 +25,7 @@ def keep(product: Path, ingredients: Sequence[Path], make: Callable[[], object])
     -------
     Whether it was made.
     """
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(__version__.encode())
     for path in ingredients:
         digest.update(path.read_bytes())
     recipe, wanted = product.with_name(product.name + ".made-from"), digest.hexdigest()
@@ -44,14 +40,14 @@ def keep(product: Path, ingredients: Sequence[Path], make: Callable[[], object])
 
 
 def keep_model(study: Path, model: Path) -> None:
-    """Build a model once; it is built again when the study, or the code that builds it, changes."""
-    from morph_dslam.offline.build import build
+    """Build a model once; it is built again when the study or the release changes."""
+    from morph_dslam.studies.build import build
 
-    keep(model, [study, *sources("offline", "model")], lambda: build(study, model))
+    keep(model, [study], lambda: build(study, model))
 
 
 def keep_sequence(scene: Path, model: Path, folder: Path) -> None:
-    """Film a model once; it is filmed again when the scene, the model or the renderer changes.
+    """Film a model once; it is filmed again when the scene, the model or the release changes.
 
     Raises
     ------
@@ -63,7 +59,7 @@ def keep_sequence(scene: Path, model: Path, folder: Path) -> None:
 
     if not scene.is_file():
         raise SceneError(f"there is no scene file {scene}: give the path of one that is there")
-    keep(folder, [scene, model, *sources("render")], lambda: simulate(scene, folder))
+    keep(folder, [scene, model], lambda: simulate(scene, folder))
 
 
 @dataclass(frozen=True)
@@ -99,7 +95,7 @@ def first_truth_frame(recording: Recording) -> int:
         If the range holds no frame with truth, or the truth file cannot be read.
     """
     from morph_dslam.errors import EvaluationError
-    from morph_dslam.evaluation.truth import load_truth
+    from morph_dslam.evaluation.points import load_truth
 
     first, last = recording.range
     frames = sorted(load_truth(recording.truth).frames.tolist())
@@ -117,8 +113,8 @@ def check_recording(recording: Recording) -> None:
     MorphError
         If a file is missing or malformed, or the range does not fit the frames or the truth.
     """
-    from morph_dslam.io.calibration import load_camera
-    from morph_dslam.io.landmarks import load_landmarks
+    from morph_dslam.io.camera_files import load_camera
+    from morph_dslam.io.tables import load_landmarks
     from morph_dslam.sources import open_source
 
     open_source(recording.frames, *recording.range)
@@ -135,7 +131,7 @@ def track_and_evaluate(recording: Recording, model: Path, run: Path) -> dict[str
     The figures of ``evaluation.json``.
     """
     from morph_dslam.evaluation.evaluate import evaluate
-    from morph_dslam.online.track import TrackOptions, track
+    from morph_dslam.tracking.track import TrackOptions, track
 
     bind_frame = first_truth_frame(recording)
     first, last = recording.range
@@ -160,7 +156,7 @@ def track_and_evaluate(recording: Recording, model: Path, run: Path) -> dict[str
 
 def report(figures: dict[str, Any], run: Path) -> None:
     """Print where the results are and, last, the result line."""
-    from morph_dslam.evaluation.statements import alignment_line, remarks, result_line
+    from morph_dslam.evaluation.run_folder import alignment_line, remarks, result_line
 
     for remark in remarks(figures):
         print(f"note: {remark}")

@@ -10,17 +10,17 @@ import h5py
 import numpy as np
 import pytest
 
-from morph_dslam.cli import main
+from morph_dslam.cli.app import main
 from morph_dslam.errors import MapError, TrackingError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.online.anchored.known_pose import KnownPose
-from morph_dslam.online.frame_result import HAS_MOVED
-from morph_dslam.online.live.run import LiveOptions, run_live
-from morph_dslam.online.live.sinks import VideoSink
-from morph_dslam.online.track import TrackOptions, track
-from morph_dslam.online.tracking_setup import ObjectOptions, load_setup
+from morph_dslam.registration.registration import PosePrior
 from morph_dslam.sources import open_source
+from morph_dslam.tracking.live import VideoSink
+from morph_dslam.tracking.result import HAS_MOVED
+from morph_dslam.tracking.run_live import LiveOptions, run_live
+from morph_dslam.tracking.setup import ObjectOptions, load_setup
+from morph_dslam.tracking.track import TrackOptions, track
 from tests.support.rendered_anchored import SCAN, make_anchored_recording
 
 #: What the map made from the scan is off by, and the registration with it, metres.
@@ -142,7 +142,7 @@ def test_an_object_that_was_moved_is_said_to_be_and_is_followed_by_its_points(re
         if 44 <= frame.index < 50:
             pose = known.pose
             there = RigidTransform(pose.rotation, pose.translation + pose.rotation @ push)
-            known = KnownPose(there, known.from_camera, known.lasting)
+            known = PosePrior(there, known.from_camera, known.lasting)
         result = chain.tracker.process_frame(frame.image, known)
         assert result.status == "tracked", result.reason
         apart = result.pose.translation - truth["camera_from_object"][frame.index][:3, 3]
@@ -187,9 +187,7 @@ def test_a_free_object_is_known_by_the_maps_pictures_wherever_it_is(recording):
 
 def test_a_live_run_keeps_the_pace_and_everything_it_found(recording):
     folder, truth = recording
-    options = LiveOptions(
-        str(folder / "sequence" / "frames"), folder / "live", of_object(folder), first=30, serve=0
-    )
+    options = LiveOptions(str(folder / "sequence" / "frames"), folder / "live", of_object(folder), first=30, serve=0)
     summary = run_live(options)
     drawn, dropped = summary["n_frames"], summary["live"]["n_dropped"]
     assert drawn + dropped == 30
@@ -266,9 +264,7 @@ def test_inputs_that_do_not_fit_are_refused(recording, tmp_path):
     assert "no map was given or found" in alone.placement.flags[-1]
     with pytest.raises(TrackingError, match="a registration needs the map that it was made in"):
         run_live(
-            LiveOptions(
-                str(folder / "sequence" / "frames"), tmp_path / "run", replace(alone.options, pose="free")
-            )
+            LiveOptions(str(folder / "sequence" / "frames"), tmp_path / "run", replace(alone.options, pose="free"))
         )
     with pytest.raises(TrackingError, match="a map needs the object's place in it"):
         load_setup(of_object(folder, placement=None, landmarks=tmp_path / "landmarks.csv"))

@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.cli import main
+from morph_dslam.cli.app import main
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.model import load_model
-from morph_dslam.online.estimation.estimator import Estimator
-from morph_dslam.online.reference.surface_coverage import SurfaceSamples
-from morph_dslam.online.several.hiding import Known, seen_parts
-from morph_dslam.online.several.rig_views import further_of_rig, pictures_from
-from morph_dslam.online.tracking_setup import ObjectOptions, load_setup
 from morph_dslam.render.rasteriser import rasterise
+from morph_dslam.tracking.estimator import Estimator
+from morph_dslam.tracking.multi_camera import keyframe_views_of_rig, pictures_from
+from morph_dslam.tracking.multi_object import Known, seen_parts
+from morph_dslam.tracking.reference import SurfaceSamples
+from morph_dslam.tracking.setup import ObjectOptions, load_setup
 from tests.support.rendered_anchored_rig import (
     FIRST_BESIDE,
     LEFT_FRAMES,
@@ -60,11 +60,7 @@ def test_objects_are_known_by_what_other_keyframes_show_of_them(rig_recording, l
 def setups_of(folder):
     return {
         name: load_setup(
-            ObjectOptions(
-                folder / f"{name}.morph",
-                folder / "camera.yaml",
-                placement=folder / name / "adjusted.json",
-            )
+            ObjectOptions(folder / f"{name}.morph", folder / "camera.yaml", placement=folder / name / "adjusted.json")
         )
         for name in NAMES
     }
@@ -129,10 +125,7 @@ def test_what_is_hidden_in_the_last_keyframe_is_bound_in_another(rig_recording, 
     assert len(bound) > 1
     pixels = np.rint(reference.projected(sheet.placement.state)).astype(int)
     inside = ((pixels >= 0) & (pixels < [CAMERA.width, CAMERA.height])).all(axis=1)
-    hidden, before = (
-        np.zeros(len(pixels), dtype=bool),
-        wedge_before_sheet(*rig_recording, sheet.placement.frame),
-    )
+    hidden, before = (np.zeros(len(pixels), dtype=bool), wedge_before_sheet(*rig_recording, sheet.placement.frame))
     hidden[inside] = before[pixels[inside, 1], pixels[inside, 0]]
     assert hidden.sum() > 50
 
@@ -156,20 +149,14 @@ def test_each_camera_of_a_rig_knows_the_object_by_its_own_pictures_of_the_scan(r
     setup = setups_of(folder)["wedge"]
     truth = make_mirrored_recording(folder, sorted(setup.keyframes))
     for further, part in zip(
-        further_of_rig(setup, MIRRORED_RIG, [folder / "mirrored"]), MIRRORED_RIG, strict=True
+        keyframe_views_of_rig(setup, MIRRORED_RIG, [folder / "mirrored"]), MIRRORED_RIG, strict=True
     ):
         assert further.views
         for view in further.views:
             exact = part.camera_from_rig.apply(exact_nodes(folder, truth, "wedge", view.frame))
             nodes = view.state.camera_from_object.apply(setup.model.positions(view.state.parameters))
             assert np.linalg.norm(nodes - exact, axis=1).max() < 0.4e-3
-    arguments = [
-        folder / "both",
-        "--with",
-        folder / "mirrored",
-        "--camera",
-        f"{folder}/camchain_mirrored.yaml#cam0",
-    ]
+    arguments = [folder / "both", "--with", folder / "mirrored", "--camera", f"{folder}/camchain_mirrored.yaml#cam0"]
     arguments += ["--model", folder / "wedge.morph", "--place", folder / "wedge" / "adjusted.json"]
     arguments += ["--range", f"{SCAN}-{SCAN + LEFT_FRAMES - 1}", "--no-video", "-o"]
     for name, more in (("one", ["--one-view"]), ("several", [])):
@@ -189,6 +176,6 @@ def test_a_camera_has_those_pictures_of_the_scan_that_it_filmed(rig_recording):
     filmed = [number for number in sorted(setup.keyframes) if number >= FIRST_BESIDE]
     assert 1 < len(filmed) < len(setup.keyframes)
     assert sorted(pictures_from(folder / "aside", RIG[1].camera, setup.keyframes)) == filmed
-    first, second = further_of_rig(setup, RIG, [folder / "aside"])
+    first, second = keyframe_views_of_rig(setup, RIG, [folder / "aside"])
     assert first is setup.further
     assert {view.frame for view in second.views} <= set(filmed)

@@ -7,15 +7,15 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.cli import main
+from morph_dslam.cli.app import main
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.io.landmarks import Landmarks, save_landmarks
+from morph_dslam.io.tables import Landmarks, save_landmarks
 from morph_dslam.model import load_model
-from morph_dslam.online.frame_result import HAS_MOVED, STAGES
-from morph_dslam.online.several.rig_tracking import RigTracker
-from morph_dslam.online.tracking_setup import ObjectOptions, load_setup
 from morph_dslam.sources import open_source
+from morph_dslam.tracking.multi_camera import RigTracker
+from morph_dslam.tracking.result import HAS_MOVED, STAGES
+from morph_dslam.tracking.setup import ObjectOptions, load_setup
 from tests.support.rendered_anchored_rig import FRAMES, RIG, SCAN
 from tests.support.tracked_rig import column, errors, exact_nodes
 
@@ -199,9 +199,7 @@ def test_what_one_camera_does_not_see_the_other_tells_and_else_it_is_hidden(reco
     assert apart.max() < MAP_ERROR
     for row, frame in enumerate(run.frames):
         is_hidden = frame >= SCAN + 7
-        assert (run.status[row], pose_from[row]) == (
-            ("hidden", "map") if is_hidden else ("tracked", "points and map")
-        )
+        assert (run.status[row], pose_from[row]) == (("hidden", "map") if is_hidden else ("tracked", "points and map"))
         assert ("camera 0: hidden" in reasons[row]) == (frame >= SCAN + 2)
         if not is_hidden:
             true = truth["wedge"]["parameters"][frame]
@@ -212,9 +210,7 @@ def test_an_object_moved_before_two_cameras_is_followed_by_its_points(recording)
     """The map's pose is shifted, as if the object had been pushed by 20 mm."""
     folder, truth = recording
     options = ObjectOptions(
-        folder / "wedge.morph",
-        folder / "camera.yaml",
-        placement=folder / "wedge" / "registration.json",
+        folder / "wedge.morph", folder / "camera.yaml", placement=folder / "wedge" / "registration.json"
     )
     setup = load_setup(options)
     placement = setup.placement

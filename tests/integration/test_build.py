@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import SolverError, StudyError
+from morph_dslam.mechanics.gripped_sheet import GrippedSheet
+from morph_dslam.mechanics.solvers.continuation import advance
 from morph_dslam.model import load_model
-from morph_dslam.offline.build import build
-from morph_dslam.offline.mechanics.gripped_sheet import GrippedSheet
-from morph_dslam.offline.neighbour_tree import neighbour_tree
-from morph_dslam.offline.problem import bounds
-from morph_dslam.offline.sampling import sample_box
-from morph_dslam.offline.snapshots import load_snapshot
-from morph_dslam.offline.solvers.continuation import advance
-from morph_dslam.offline.studies.study import load_study
+from morph_dslam.studies.build import build
+from morph_dslam.studies.problem import bounds
+from morph_dslam.studies.sample_task import neighbour_tree
+from morph_dslam.studies.sampling import sample_box
+from morph_dslam.studies.snapshots import load_snapshot
+from morph_dslam.studies.study import load_study
 
 STUDY = """
 name = "tiny sheet"
@@ -146,9 +146,7 @@ def test_hopeless_range_is_refused_and_solved_samples_stay(tmp_path: Path, monke
 
     monkeypatch.setattr(GrippedSheet, "solve", limited)
     (tmp_path / "study.toml").write_text(STUDY.replace('"12 mm"', '"60 mm"').replace("-12 mm", "-60 mm"))
-    with pytest.raises(
-        StudyError, match=r"of 32 samples could be solved; the first failure: beyond .* kept in"
-    ):
+    with pytest.raises(StudyError, match=r"of 32 samples could be solved; the first failure: beyond .* kept in"):
         build(tmp_path / "study.toml", tmp_path / "tiny.morph", executor=InProcess())
     assert list((tmp_path / "tiny.morph.snapshots").glob("*.npz"))
     assert not (tmp_path / "tiny.morph").exists()
@@ -196,10 +194,7 @@ def test_changed_study_solves_again_only_what_it_must(built: Path) -> None:
 def test_little_memory_gives_the_same_model_from_blocks(built: Path) -> None:
     """A megabyte holds a few of the solutions and their mirror images at a time."""
     (built / "small.toml").write_text(STUDY.replace("max_degree = 3", "max_degree = 3\nmemory_gb = 1e-3"))
-    models = [
-        build(built / name, built / "tiny.morph", executor=InProcess())
-        for name in ("study.toml", "small.toml")
-    ]
+    models = [build(built / name, built / "tiny.morph", executor=InProcess()) for name in ("study.toml", "small.toml")]
     for mu in ([0.01, 0.9, 0.02, 0.0], [-0.006, 0.7, -0.05, 0.01]):
         direct, blocked = (model.displacement.value(np.array(mu)) for model in models)
         assert np.linalg.norm(blocked - direct) < 1e-3 * np.linalg.norm(direct)

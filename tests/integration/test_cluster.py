@@ -12,15 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from morph_dslam.cli import main
+from morph_dslam.cli.app import main
 from morph_dslam.errors import WorkerError
-from morph_dslam.offline import cluster
-from morph_dslam.offline.executors import default_executor
-from morph_dslam.offline.sampling import training_samples
-from morph_dslam.offline.snapshots import damage
-from morph_dslam.offline.studies.solid_study import SolidStudy
-from morph_dslam.offline.studies.study import load_study
-from morph_dslam.offline.sweep import run_sweep
+from morph_dslam.studies import sweep as cluster
+from morph_dslam.studies.sampling import training_samples
+from morph_dslam.studies.snapshots import damage
+from morph_dslam.studies.solid_study import SolidStudy
+from morph_dslam.studies.study import load_study
+from morph_dslam.studies.sweep import default_executor, run_sweep
 from tests.support.block_study import write_study
 
 pytest.importorskip("distributed", reason="needs the extra 'dask'")
@@ -125,9 +124,7 @@ def test_a_lost_scheduler_is_one_message_and_what_was_solved_stays(
     assert isinstance(study, SolidStudy)
     loopback.add_workers()
     monkeypatch.setattr(cluster, "PATIENCE", 3.0)
-    lost = pytest.raises(
-        WorkerError, match=r"the connection to the scheduler at tcp://\S+ was lost\. What was"
-    )
+    lost = pytest.raises(WorkerError, match=r"the connection to the scheduler at tcp://\S+ was lost\. What was")
     with lost, cluster.cluster_executor(loopback.address) as executor:
         kill_after(8, loopback.processes[0], executor, monkeypatch)
         run_sweep(study, training_samples(study), tmp_path / "spread", executor)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import yaml
 
-from morph_dslam import cli
+from morph_dslam.cli import app as cli
 from morph_dslam.io.video import VideoWriter
-from morph_dslam.model.file_seal import seal
+from morph_dslam.model.storage import write_checksum
 from tests.support.real_data import ROOT
 from tests.support.scenes import write_scene
 
@@ -130,7 +130,7 @@ def newer_model(folder, tmp_path):
     shutil.copyfile(folder / "sheet.morph", tmp_path / "newer.morph")
     with h5py.File(tmp_path / "newer.morph", "r+") as file:
         file.attrs["version"] = 7
-    seal(tmp_path / "newer.morph")
+    write_checksum(tmp_path / "newer.morph")
     return {"model": tmp_path / "newer.morph"}
 
 
@@ -147,9 +147,7 @@ def off_the_object(folder, tmp_path):
 
 def scattered_pixels(folder, tmp_path):
     rng = np.random.default_rng(0)
-    return landmarks_of(
-        folder, tmp_path, lambda t: np.column_stack([t[:, :3], rng.uniform(0, 360, (len(t), 2))])
-    )
+    return landmarks_of(folder, tmp_path, lambda t: np.column_stack([t[:, :3], rng.uniform(0, 360, (len(t), 2))]))
 
 
 def too_few_landmarks(folder, tmp_path):
@@ -173,7 +171,7 @@ BAD_INPUTS = {
     "camera of another size": (spoiled_camera, "480x360 pixels but the camera file is for 640x480"),
     "camera missing": (lambda f, t: {"camera": t / "absent.yaml"}, "cannot read the camera file"),
     "half a model": (halved_model, "is damaged or cut short"),
-    "newer model": (newer_model, "version 7, this release reads versions 1 to 3: update morph-dslam"),
+    "newer model": (newer_model, "version 7, this release reads version 3: update morph-dslam"),
     "landmarks missing": (lambda f, t: {"landmarks": t / "absent.csv"}, "cannot read the landmarks"),
     "landmarks off the object": (off_the_object, "landmark"),
     "landmarks at random pixels": (scattered_pixels, "landmark"),
@@ -214,7 +212,7 @@ def test_a_truncated_video_keeps_the_frames_before_the_break(sequence, tmp_path,
 
 
 def test_an_interrupt_keeps_the_frames_so_far_and_says_so(sequence, tmp_path, capsys, monkeypatch):
-    from morph_dslam.online.pipeline import Tracker
+    from morph_dslam.tracking.tracker import Tracker
 
     whole, frames_seen = Tracker.process_frame, []
 

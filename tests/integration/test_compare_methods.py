@@ -9,12 +9,11 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from morph_dslam import cli
+from morph_dslam.cli import app as cli
 from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.model import load_model
-from morph_dslam.offline.choices import with_choices
-from morph_dslam.offline.comparison import compare_methods, comparison_lines
-from morph_dslam.offline.studies.study import make_study
+from morph_dslam.reduction.comparison import compare_methods, comparison_lines
+from morph_dslam.studies.study import make_study, resolve_defaults
 from tests.support.small_models import block_model
 
 STUDY = """
@@ -132,25 +131,25 @@ def test_methods_that_do_not_suit_a_study_are_refused_with_those_that_do():
         "reduction": {"method": "galerkin"},
     }
     with pytest.raises(StudyError, match=r'"galerkin" does not suit this study: .*Use "pod" or "sparse_pgd"'):
-        with_choices(make_study(external))
+        resolve_defaults(make_study(external))
 
 
 def test_defaults_follow_the_study():
     content = tomllib.loads(STUDY)
-    assert with_choices(make_study(content)).reduction.method == "galerkin"
-    assert with_choices(make_study(content)).sampling.scheme == "adaptive"
+    assert resolve_defaults(make_study(content)).reduction.method == "galerkin"
+    assert resolve_defaults(make_study(content)).sampling.scheme == "adaptive"
     one = content | {
         "parameters": {"bend": content["parameters"]["bend"]},
         "loads": [],
         "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.45}},
     }
-    assert with_choices(make_study(one)).reduction.method == "pod"
-    assert with_choices(make_study(one)).sampling.scheme == "sobol"
+    assert resolve_defaults(make_study(one)).reduction.method == "pod"
+    assert resolve_defaults(make_study(one)).sampling.scheme == "sobol"
 
 
 def test_a_method_that_fails_in_any_known_way_costs_no_model():
     """Solves that do not converge too: the row says why, and the study's own model is there."""
-    study = with_choices(make_study(tomllib.loads(STUDY)))
+    study = resolve_defaults(make_study(tomllib.loads(STUDY)))
     model = block_model("tucker")
     figures = {"mean_mm": 0.1, "max_mm": 0.2, "relative_l2": 0.01, "mean_mm_by_modes": [0.1]}
     model.certificate.update({"displacement": figures, "reduction": {"format": "tucker"}})

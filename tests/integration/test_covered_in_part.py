@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.online.pipeline import Tracker
+from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, mean_error, sheet_state
 

@@ -10,9 +10,9 @@ import pytest
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import EvaluationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.meshing.generators import block
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.offline.meshing.mesh_generators import block
 from morph_dslam.render.rasteriser import rasterise
 from tests.support.real_data import ROOT
 

@@ -55,8 +55,7 @@ def move(page, parameter, value):
 def choose(page, key):
     before = largest(page)
     page.evaluate(
-        f"(s => {{ s.value = '{key}'; s.dispatchEvent(new Event('change')); }})"
-        "(document.getElementById('field'))"
+        f"(s => {{ s.value = '{key}'; s.dispatchEvent(new Event('change')); }})(document.getElementById('field'))"
     )
     page.wait_for(f"document.getElementById('largest').value !== '{before}'")
     return largest(page)
@@ -102,21 +101,15 @@ def test_the_fields_of_a_sheet_and_their_colour_bar(show):
     assert move(page, "arch", 40).endswith(" MPa")
     bending = 3e9 * 0.05e-3 / (1 - 0.3**2) * 8 * 0.040 / 0.420**2 * np.sqrt(1 - 0.3 + 0.3**2)
     assert float(largest(page).split()[0]) == pytest.approx(1e-6 * bending, rel=1e-3)
-    assert page.evaluate("document.querySelector('#bar figcaption').textContent") == (
-        "von Mises stress, top [MPa]"
-    )
+    assert page.evaluate("document.querySelector('#bar figcaption').textContent") == ("von Mises stress, top [MPa]")
     text = choose(page, "displacement")
     assert text.endswith(" mm")
-    expected = 1e3 * np.linalg.norm(
-        bent_sheet_model(17, 13).displacement.value(np.array([0.04, 0, 0])), axis=1
-    )
+    expected = 1e3 * np.linalg.norm(bent_sheet_model(17, 13).displacement.value(np.array([0.04, 0, 0])), axis=1)
     assert float(text.split()[0]) == pytest.approx(expected.max(), rel=1e-3)
     page.evaluate("document.getElementById('fit').click()")
     top = page.evaluate("document.querySelector('#bar li').textContent")
     assert float(top) == pytest.approx(expected.max(), rel=5e-3)
     _, arched = drawn(page)
-    page.evaluate(
-        "(s => { s.value = 0; s.dispatchEvent(new Event('input')); })(document.getElementById('scale'))"
-    )
+    page.evaluate("(s => { s.value = 0; s.dispatchEvent(new Event('input')); })(document.getElementById('scale'))")
     _, flat = drawn(page)
     assert (arched != flat).mean() > 0.01

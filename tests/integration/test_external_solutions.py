@@ -8,9 +8,9 @@ import meshio
 import numpy as np
 import pytest
 
-from morph_dslam import cli
+from morph_dslam.cli import app as cli
+from morph_dslam.meshing.generators import block
 from morph_dslam.model import load_model
-from morph_dslam.offline.meshing.mesh_generators import block
 
 STUDY = """
 name = "cantilever, solved elsewhere"
@@ -89,9 +89,7 @@ def test_an_xdmf_series_is_read_step_by_step(tmp_path, monkeypatch):
         writer.write_points_cells(1e3 * MESH.nodes, [("hexahedron", MESH.blocks[0].connectivity)])
         for step, force in enumerate(np.linspace(0.0, 2.0, 15)):
             writer.write_data(step, point_data={"U": displacement(1e3 * MESH.nodes, force, 0.0)})
-    rows = [
-        f"series.xdmf, {step}, {force!r}" for step, force in enumerate(np.linspace(0.0, 2.0, 15).tolist())
-    ]
+    rows = [f"series.xdmf, {step}, {force!r}" for step, force in enumerate(np.linspace(0.0, 2.0, 15).tolist())]
     (tmp_path / "table.csv").write_text("\n".join(["file, step, force [N]", *rows]) + "\n")
     text = STUDY.replace("runs/table.csv", "table.csv")
     text = "\n".join(line for line in text.splitlines() if line.split(" ")[0] not in ("stress", "strain"))
@@ -114,12 +112,7 @@ def test_an_xdmf_series_is_read_step_by_step(tmp_path, monkeypatch):
         ("study.toml", '"mm"', '"m"', r"which is hardly meant: its unit of length is probably wrong"),
         ("study.toml", '"U"', '"u"', r"no point data 'u'; it has: U, S, E"),
         ("study.toml", '"runs/table.csv"', '"table.csv"', r"cannot read the table .*No such file"),
-        (
-            "study.toml",
-            "max_degree",
-            "degree",
-            r"unknown key reduction\.degree; known here: method, format, basis",
-        ),
+        ("study.toml", "max_degree", "degree", r"unknown key reduction\.degree; known here: method, format, basis"),
     ],
 )
 def test_a_mistake_is_one_message(folder, capsys, file, before, after, message):

@@ -6,16 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.online.attempt import Picture
-from morph_dslam.online.estimation.estimator import Estimator
-from morph_dslam.online.estimation.state import moved
-from morph_dslam.online.measuring.flow import flatten
-from morph_dslam.online.pipeline import Tracker
-from morph_dslam.online.reference.further_views import FurtherViews, choose_further
-from morph_dslam.online.reference.reference_view import KnownView, ReferenceView
-from morph_dslam.online.timing import StageClock
-from morph_dslam.online.tracker_options import TrackerOptions
-from morph_dslam.online.uncertainty.confidence import position_std
+from morph_dslam.timing import StageClock
+from morph_dslam.tracking.estimator import Estimator
+from morph_dslam.tracking.observability import position_std
+from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.patches import flatten
+from morph_dslam.tracking.reference import PosedImage, ReferenceView
+from morph_dslam.tracking.result import Image
+from morph_dslam.tracking.state import moved
+from morph_dslam.tracking.tracker import Tracker
+from morph_dslam.tracking.views import KeyframeViews, choose_keyframe_views
 from tests.support.rendered_sequence import CAMERA, mean_error
 from tests.support.turning_block import BlockFilm, block_state
 
@@ -30,12 +30,12 @@ def known_views(film, step=None, deviations=None):
     for degrees in SCAN:
         state = block_state(np.radians(degrees), 0.0)
         grey = np.ascontiguousarray(film.frame(state)[..., 0])
-        causes = None
+        error_factors = None
         if deviations is not None:
-            causes = np.vstack([np.zeros((2, 6)), np.diag(deviations)])
+            error_factors = np.vstack([np.zeros((2, 6)), np.diag(deviations)])
         if step is not None:
             state = moved(state, np.concatenate([np.zeros(2), step]))
-        views.append(KnownView(Picture(grey, flatten(grey, OPTIONS.flow.flatten_window)), state, causes))
+        views.append(PosedImage(Image(grey, flatten(grey, OPTIONS.flow.flatten_window)), state, error_factors))
     return views
 
 
@@ -60,7 +60,7 @@ def estimator(film):
 
 
 def test_those_pictures_are_chosen_that_show_another_side(film, views, estimator):
-    further = choose_further(estimator, views[0], views[1:], OPTIONS)
+    further = choose_keyframe_views(estimator, views[0], views[1:], OPTIONS)
     degrees = chosen_degrees(further, views)
     # From 20 degrees hardly anything new is seen; the far side and one between are needed.
     assert 20 not in degrees
@@ -78,7 +78,7 @@ def test_a_view_from_between_looks_as_it_is_rendered_from_both_sides(film, views
     assert likeness[0] < 0.8
     assert likeness[1] > 0.95
     assert len(both.points) > 1.4 * len(first.points)
-    measurement = both.measure(Picture(actual, actual), between, None, StageClock(("render", "correct")))
+    measurement = both.measure(Image(actual, actual), between, None, StageClock(("render", "correct")))
     for part in both.parts:
         good = measurement.valid[part.rows]
         off = measurement.pixels - both.projected(between)
@@ -87,7 +87,7 @@ def test_a_view_from_between_looks_as_it_is_rendered_from_both_sides(film, views
 
 
 def test_the_block_is_followed_all_around_without_a_view_that_is_made(film, views, estimator):
-    further = choose_further(estimator, views[0], views[1:], OPTIONS)
+    further = choose_keyframe_views(estimator, views[0], views[1:], OPTIONS)
     start = block_state(0.0, 0.0)
     turns = np.radians(np.linspace(4, 160, 40))
     truths = [block_state(turn, (k + 1) / 40) for k, turn in enumerate(turns)]
@@ -95,9 +95,7 @@ def test_the_block_is_followed_all_around_without_a_view_that_is_made(film, view
     results = [tracker.process_frame(film.frame(truth)) for truth in truths]
     assert not any(result.made_view for result in results)
     assert [result.status for result in results] == ["tracked"] * 40
-    errors = np.array(
-        [mean_error(film.model, r.estimate.state, t) for r, t in zip(results, truths, strict=True)]
-    )
+    errors = np.array([mean_error(film.model, r.estimate.state, t) for r, t in zip(results, truths, strict=True)])
     assert errors.mean() < 0.1e-3
     assert errors.max() < 0.6e-3
 
@@ -110,8 +108,8 @@ def test_what_covers_a_picture_is_not_taken_for_the_object(film, views, estimato
     hand = np.zeros(grey.shape, dtype=bool)
     hand[200:280, 280:360] = True
     grey[hand] = np.clip(grey.astype(int) + noise, 0, 255)[hand].astype(np.uint8)
-    covered = replace(views[4], picture=Picture(grey, flatten(grey, 31)))
-    further = choose_further(estimator, views[0], [views[2], covered, views[5]], OPTIONS)
+    covered = replace(views[4], picture=Image(grey, flatten(grey, 31)))
+    further = choose_keyframe_views(estimator, views[0], [views[2], covered, views[5]], OPTIONS)
     (number,) = (k for k, view in enumerate(further.views) if view.picture is covered.picture)
     bound = ReferenceView(estimator, [views[0], *further.views], OPTIONS)
     part = bound.parts[1 + number]
@@ -127,7 +125,7 @@ def test_the_error_that_all_views_have_in_common_is_stated(film, estimator):
     rng, squared = np.random.default_rng(3), []
     for _ in range(6):
         views = known_views(film, deviations * rng.standard_normal(6), deviations)
-        further = FurtherViews(views[0].causes, (views[3], views[5]))
+        further = KeyframeViews(views[0].error_factors, (views[3], views[5]))
         tracker = Tracker(film.model, CAMERA, views[0].picture, views[0].state, OPTIONS, further=further)
         for turn in np.radians([10, 25, 40]):
             truth = block_state(turn, 0.25)

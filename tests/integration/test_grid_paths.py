@@ -6,12 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from morph_dslam.offline import sweep
-from morph_dslam.offline.executors import SerialExecutor
-from morph_dslam.offline.sampling import training_samples
-from morph_dslam.offline.studies import solid_sweep
-from morph_dslam.offline.studies.solid_study import SolidStudy
-from morph_dslam.offline.studies.study import make_study
+from morph_dslam.studies import solid_sweep, sweep
+from morph_dslam.studies.sampling import training_samples
+from morph_dslam.studies.solid_study import SolidStudy
+from morph_dslam.studies.study import make_study
+from morph_dslam.studies.sweep import SerialExecutor
 
 BAR = {
     "name": "bar",

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from morph_dslam import build, cli, load_model, load_study, make_study
+from morph_dslam import build, load_model, load_study, make_study
+from morph_dslam.cli import app as cli
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.studies.file_materials import file_materials
-from morph_dslam.offline.studies.mesh_section import FileMesh
+from morph_dslam.studies.file_materials import file_materials
+from morph_dslam.studies.solid_sections import FileMesh
 
 BAR = """*NODE
 {nodes}
@@ -105,9 +106,7 @@ def test_the_study_may_replace_one_of_them(tmp_path: Path) -> None:
     np.testing.assert_allclose(model.von_mises(np.array([0.003]), "solid"), stress, rtol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("unit", "young", "density"), [("mm", 1e6, 1100.0), ("m", 1.0, 1.1e-9)], ids=["mm", "m"]
-)
+@pytest.mark.parametrize(("unit", "young", "density"), [("mm", 1e6, 1100.0), ("m", 1.0, 1.1e-9)], ids=["mm", "m"])
 def test_the_unit_of_length_fixes_the_others(tmp_path: Path, unit: str, young: float, density: float) -> None:
     written(tmp_path)
     materials = file_materials(FileMesh(file=tmp_path / "bar.inp", unit=unit), [])

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from morph_dslam.cli import INTERRUPTED, main
-from morph_dslam.offline.snapshots import PARTIAL
+from morph_dslam.cli.app import INTERRUPTED, main
+from morph_dslam.studies.snapshots import PARTIAL
 from tests.support.block_study import write_study
 
 N_SAMPLES = 30
@@ -22,7 +22,7 @@ N_SAMPLES = 30
 STOPPED_WHILE_SENDING = """
 import time
 from concurrent.futures import wait
-from morph_dslam.offline.executors import default_executor
+from morph_dslam.studies.sweep import default_executor
 
 if __name__ == "__main__":
     with default_executor(2) as executor:
@@ -35,17 +35,7 @@ if __name__ == "__main__":
 
 def start(study: Path, output: Path) -> subprocess.Popen:
     """A build on two worker processes, in a process group of its own."""
-    command = [
-        sys.executable,
-        "-m",
-        "morph_dslam.cli",
-        "build",
-        str(study),
-        "-o",
-        str(output),
-        "--workers",
-        "2",
-    ]
+    command = [sys.executable, "-m", "morph_dslam.cli", "build", str(study), "-o", str(output), "--workers", "2"]
     return subprocess.Popen(
         command,
         stderr=subprocess.PIPE,
@@ -99,9 +89,7 @@ def test_a_stopped_build_keeps_what_it_solved_and_says_so(number, alone: bytes, 
     assert process.returncode == INTERRUPTED
     assert "Traceback" not in message
     said = message.splitlines()[-1]
-    assert said == (
-        "morph: interrupted; the solutions found so far are kept, and the same command goes on from there"
-    )
+    assert said == ("morph: interrupted; the solutions found so far are kept, and the same command goes on from there")
     wait_until(lambda: nothing_left(process.pid))
     assert 3 <= len(solved(output)) < N_SAMPLES
     assert main(["build", str(study), "-o", str(output)]) == 0
@@ -129,9 +117,7 @@ def test_killed_ten_times_at_random_moments(alone: bytes, tmp_path: Path) -> Non
     rng = np.random.default_rng(5)
     for count in np.sort(rng.integers(0, N_SAMPLES + 1, 10)):
         process = start(study, output)
-        wait_until(
-            lambda process=process, count=count: len(solved(output)) >= count or process.poll() is not None
-        )
+        wait_until(lambda process=process, count=count: len(solved(output)) >= count or process.poll() is not None)
         time.sleep(rng.uniform(0.0, 2.0 if count in (0, N_SAMPLES) else 0.02))
         (os.killpg if rng.random() < 0.5 else os.kill)(process.pid, signal.SIGKILL)
         process.communicate()

@@ -7,15 +7,15 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.cli import main
+from morph_dslam.cli.app import main
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import load_model
-from morph_dslam.online.drawing.augmented_view import AugmentedView, DrawOptions
-from morph_dslam.online.estimation.estimator import State
-from morph_dslam.online.live.session import LivePicture
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.sources import Frame
+from morph_dslam.tracking.drawing import AugmentedView, DrawOptions
+from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.live import LivePicture
 from tests.support.rendered_anchored_rig import FRAMES, RIG, SCAN
 from tests.support.tracked_rig import column, errors, exact_nodes
 
@@ -58,10 +58,7 @@ def test_two_objects_are_tracked_live_in_one_map(rig_recording, tmp_path, capsys
         ([], "the models hold different fields to colour the objects by"),
         (["--show", "displacement", "--pose", "free"], "in the map that they are all"),
         (["--show", "displacement", "--outline"], "in the map that they are all"),
-        (
-            ["--show", "displacement", "--reregister-at", "40=a.csv"],
-            "leave out --reregister-at",
-        ),
+        (["--show", "displacement", "--reregister-at", "40=a.csv"], "leave out --reregister-at"),
     ],
 )
 def test_what_does_not_fit_several_live_objects_is_refused(rig_recording, tmp_path, capsys, more, message):

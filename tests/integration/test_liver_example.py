@@ -10,15 +10,15 @@ import h5py
 import numpy as np
 import pytest
 
-from morph_dslam.cli import main
+from morph_dslam.cli.app import main
 from morph_dslam.geometry import RigidTransform
+from morph_dslam.meshing.generators import block
+from morph_dslam.meshing.mesh_files import load_mesh
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField, load_model, save_model
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.model.inner_structure import save_inner_structure
-from morph_dslam.offline.inner_structures import place_inner_structure
-from morph_dslam.offline.meshing.mesh_files import load_mesh
-from morph_dslam.offline.meshing.mesh_generators import block
 from morph_dslam.render.simulation import simulate
+from morph_dslam.studies.build import place_inner_structure
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "liver"
 SIZE = (0.12, 0.08, 0.06)

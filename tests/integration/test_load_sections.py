@@ -9,8 +9,8 @@ import pytest
 
 from morph_dslam import make_study
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.problem import Snapshot
-from morph_dslam.offline.studies.solid_study import SolidStudy
+from morph_dslam.studies.problem import Snapshot
+from morph_dslam.studies.solid_study import SolidStudy
 
 STIFF = {"law": "neo_hookean", "young": "3 GPa", "poisson": 0.3, "density": "2 g/cm3"}
 FIXED = {"kind": "fixed", "on": "z_min"}
@@ -47,12 +47,7 @@ MIDDLE = np.array([0.02, 0.02, HEIGHT])
 PULLED, HELD = 1e4 * AREA, np.array([0.02, 0.02, HEIGHT / 2])
 #: A load, its resultant (N), a point on its line of action (m), and the tolerance.
 LOADS: dict[str, tuple[dict[str, Any], tuple[float, float, float], np.ndarray, float]] = {
-    "traction": (
-        {"on": "z_max", "traction": ["pull", "0 Pa", "-pull"]},
-        (PULLED, 0.0, -PULLED),
-        MIDDLE,
-        1e-4,
-    ),
+    "traction": ({"on": "z_max", "traction": ["pull", "0 Pa", "-pull"]}, (PULLED, 0.0, -PULLED), MIDDLE, 1e-4),
     "pressure": ({"on": "z_max", "pressure": "2 * pull"}, (0.0, 0.0, -2.0 * PULLED), MIDDLE, 1e-4),
     "body_force": (
         {"force": ["0 N/m3", "2000 N/m3 * share", "0 N/m3"]},
@@ -61,12 +56,7 @@ LOADS: dict[str, tuple[dict[str, Any], tuple[float, float, float], np.ndarray, f
         1e-4,
     ),
     "gravity": ({}, (0.0, 0.0, -9.80665 * 2000.0 * AREA * HEIGHT), HELD, 1e-6),
-    "point": (
-        {"on": "z_max", "force": ["0 N", "5 N * pull / 20 kPa", "0 N"]},
-        (0.0, 2.5, 0.0),
-        MIDDLE,
-        1e-3,
-    ),
+    "point": ({"on": "z_max", "force": ["0 N", "5 N * pull / 20 kPa", "0 N"]}, (0.0, 2.5, 0.0), MIDDLE, 1e-3),
     "moving_patch": (
         {**PATCH, "force": ["0 N", "0 N", "-8 N * share"]},
         (0.0, 0.0, -4.0),
@@ -139,9 +129,7 @@ def test_derivatives_by_a_parameter_agree_with_differences(index: int) -> None:
         {"kind": "traction", "on": "x_max", "traction": ["pull", "0 Pa", "0 Pa"]},
     ]
     step = 1e-4 * np.array([1.0, 1.0, 0.01, 1.0, 1e6]) * np.eye(5)[index]
-    at, before, after = (
-        snapshot(mu, materials={"m": fibred}, loads=loads) for mu in (MU, MU - step, MU + step)
-    )
+    at, before, after = (snapshot(mu, materials={"m": fibred}, loads=loads) for mu in (MU, MU - step, MU + step))
     for name in ("displacement", "stress_solid", "strain"):
         slope = (after.fields[name] - before.fields[name]) / (2.0 * step[index])
         assert np.abs(slope).max() > 0.0

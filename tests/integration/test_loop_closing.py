@@ -9,12 +9,11 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.online.slam.loop_closing import LoopCloser
-from morph_dslam.online.slam.output import trajectory_of
-from morph_dslam.online.slam.pose_graph import Similarities, optimise
-from morph_dslam.online.slam.rigid_map import Keyframe
-from morph_dslam.online.slam.slam import Slam
-from morph_dslam.similarity import fit_similarity
+from morph_dslam.geometry import fit_similarity
+from morph_dslam.slam.loop_closing import LoopCloser, Similarities, optimise
+from morph_dslam.slam.output import trajectory_of
+from morph_dslam.slam.rigid_map import Keyframe
+from morph_dslam.slam.slam import Slam
 from tests.support.rendered_room import RoomFilm, closed_room, pose, round_trip
 
 NONE = np.empty(0, dtype=np.int64)
@@ -92,9 +91,7 @@ def test_a_view_that_is_wanted_goes_before_the_loop(threaded, monkeypatch):
     making = Slam(CAMERA, threaded=threaded)._making
     making._map.keyframes.append(Keyframe(0, 0.0, np.zeros((4, 4), np.uint8), np.eye(4), NONE, NONE))
     monkeypatch.setattr(LoopCloser, "has_found", True)
-    monkeypatch.setattr(
-        LoopCloser, "close", lambda closer: monkeypatch.setattr(LoopCloser, "has_found", False)
-    )
+    monkeypatch.setattr(LoopCloser, "close", lambda closer: monkeypatch.setattr(LoopCloser, "has_found", False))
     making.advance()
     assert LoopCloser.has_found == threaded
     assert making.can_keep
@@ -105,9 +102,7 @@ def test_a_view_that_is_wanted_goes_before_the_loop(threaded, monkeypatch):
 
 def transforms(rng, n, spread=1.0):
     rotations = Rotation.from_rotvec(spread * rng.normal(size=(n, 3))).as_matrix()
-    return Similarities(
-        np.exp(0.3 * spread * rng.normal(size=n)), rotations, spread * rng.normal(size=(n, 3))
-    )
+    return Similarities(np.exp(0.3 * spread * rng.normal(size=n)), rotations, spread * rng.normal(size=(n, 3)))
 
 
 def test_transforms_are_composed_and_inverted_as_matrices():
@@ -115,9 +110,7 @@ def test_transforms_are_composed_and_inverted_as_matrices():
     first, second, points = transforms(rng, 5), transforms(rng, 5), rng.normal(size=(5, 3))
     assert (first @ second).apply(points) == pytest.approx(first.apply(second.apply(points)))
     assert first.inverse.apply(first.apply(points)) == pytest.approx(points)
-    poses = np.array(
-        [pose(t, r) for t, r in zip(rng.normal(size=(4, 3)), rng.normal(size=(4, 3)), strict=True)]
-    )
+    poses = np.array([pose(t, r) for t, r in zip(rng.normal(size=(4, 3)), rng.normal(size=(4, 3)), strict=True)])
     of_poses = Similarities.of_poses(poses)
     assert of_poses.camera_from_world() == pytest.approx(poses)
     assert of_poses.translations == pytest.approx(np.linalg.inv(poses)[:, :3, 3])
@@ -133,9 +126,7 @@ def test_exact_measurements_are_met(with_scale):
     if not with_scale:
         truth, moved = (Similarities(np.ones(8), s.rotations, s.translations) for s in (truth, moved))
     start = truth @ moved
-    start = Similarities(
-        *(np.concatenate([a[:1], b[1:]]) for a, b in zip(parts(truth), parts(start), strict=True))
-    )
+    start = Similarities(*(np.concatenate([a[:1], b[1:]]) for a, b in zip(parts(truth), parts(start), strict=True)))
     measured = truth[RING[:, 0]].inverse @ truth[RING[:, 1]]
     found = optimise(start, RING, measured, with_scale)
     for one, other in zip(parts(found), parts(truth), strict=True):

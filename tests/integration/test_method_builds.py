@@ -29,12 +29,7 @@ BEAM = {
 
 BLOCK = {
     "name": "rubber block",
-    "mesh": {
-        "generator": "block",
-        "size": ["20 mm", "20 mm", "60 mm"],
-        "divisions": [2, 2, 6],
-        "cells": "hex8",
-    },
+    "mesh": {"generator": "block", "size": ["20 mm", "20 mm", "60 mm"], "divisions": [2, 2, 6], "cells": "hex8"},
     "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.4}},
     "supports": [
         {"kind": "fixed", "on": "z_min"},

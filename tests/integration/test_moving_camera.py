@@ -5,8 +5,8 @@ import h5py
 import numpy as np
 import pytest
 
-from morph_dslam.cli import main
-from morph_dslam.io.calibration import load_camera
+from morph_dslam.cli.app import main
+from morph_dslam.io.camera_files import load_camera
 from morph_dslam.io.trajectory import load_trajectory
 from morph_dslam.render.simulation import simulate
 from morph_dslam.sources import open_source

@@ -17,9 +17,9 @@ from morph_dslam import load_model
 from morph_dslam.evaluation.evaluate import evaluate
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.model import save_model
-from morph_dslam.offline.problem import Snapshot
-from morph_dslam.online.track import TrackOptions, track
 from morph_dslam.render.simulation import simulate
+from morph_dslam.studies.problem import Snapshot
+from morph_dslam.tracking.track import TrackOptions, track
 from tests.support.real_data import ROOT
 
 RESULT = r"positions=(\d+) largest_mm=([\d.]+) pcr_path_N=([\d.]+) pcr_eigen_N=([\d.]+) seconds=(\d+)"
@@ -29,9 +29,7 @@ RESULT = r"positions=(\d+) largest_mm=([\d.]+) pcr_path_N=([\d.]+) pcr_eigen_N=(
 def test_the_papers_sheet_is_followed_to_its_full_height_and_not_solved_twice(tmp_path) -> None:
     program = ROOT / "examples" / "paper_sheet" / "run.py"
     options = ["--cells", "12", "6", "--positions", "81", "--output", str(tmp_path)]
-    done = [
-        subprocess.run([sys.executable, str(program), *options], capture_output=True, text=True) for _ in "12"
-    ]
+    done = [subprocess.run([sys.executable, str(program), *options], capture_output=True, text=True) for _ in "12"]
     assert done[0].returncode == 0, done[0].stderr[-2000:]
     first, second = (re.search(rf"^{RESULT}$", run.stdout, re.MULTILINE) for run in done)
     assert first
@@ -68,13 +66,9 @@ YOUNG, THICKNESS = 5e9, 1e-4
 
 def rolled(path: float) -> Snapshot:
     """A sheet rolled to a cylinder of curvature 4 path / m: x = sin(k X) / k, z = (1 - cos(k X)) / k."""
-    x, y = np.meshgrid(
-        *(np.linspace(-a / 2, a / 2, n + 1) for a, n in zip((LENGTH, WIDTH), CELLS, strict=True))
-    )
+    x, y = np.meshgrid(*(np.linspace(-a / 2, a / 2, n + 1) for a, n in zip((LENGTH, WIDTH), CELLS, strict=True)))
     curvature = max(4.0 * path, 1e-6)
-    moved = np.stack(
-        [np.sin(curvature * x) / curvature - x, 0.0 * y, (1 - np.cos(curvature * x)) / curvature]
-    )
+    moved = np.stack([np.sin(curvature * x) / curvature - x, 0.0 * y, (1 - np.cos(curvature * x)) / curvature])
     along = YOUNG * THICKNESS / 2.0 * curvature * np.stack([1.0 + 0.0 * x, 0.3 * np.cos(10.0 * y), 0.0 * x])
     stress = along.reshape(3, -1).T
     fields = {"displacement": moved.reshape(3, -1).T, "stress_top": -stress, "stress_bottom": stress}
@@ -116,9 +110,7 @@ def sides(reduction: ModuleType, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return importlib.import_module("sides")
 
 
-def test_a_sheet_below_its_plane_is_the_one_above_it_in_a_mirror(
-    reduction: ModuleType, sides: ModuleType
-) -> None:
+def test_a_sheet_below_its_plane_is_the_one_above_it_in_a_mirror(reduction: ModuleType, sides: ModuleType) -> None:
     """Against the closed form with a negative curvature, which no snapshot has."""
     model = sides.tracked_model(
         [rolled(path) for path in np.linspace(0.0, 1.0, 81)], reduction.Grid((LENGTH, WIDTH), CELLS)
@@ -178,9 +170,7 @@ def test_a_flat_sheet_is_followed_to_whichever_side_it_bends(
     reduction: ModuleType, sides: ModuleType, tmp_path: Path
 ) -> None:
     snapshots = [rolled(path) for path in np.linspace(0.0, 1.0, 81)]
-    save_model(
-        tmp_path / "sheet.morph", sides.tracked_model(snapshots, reduction.Grid((LENGTH, WIDTH), CELLS))
-    )
+    save_model(tmp_path / "sheet.morph", sides.tracked_model(snapshots, reduction.Grid((LENGTH, WIDTH), CELLS)))
     noise = np.random.default_rng(3).integers(0, 256, (40, 60, 3)).astype(np.uint8)
     cv2.imwrite(str(tmp_path / "print.png"), cv2.resize(noise, (900, 600), interpolation=cv2.INTER_CUBIC))
     (tmp_path / "scene.toml").write_text(SCENE)

@@ -7,12 +7,12 @@ import pytest
 
 from morph_dslam import make_study
 from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.solid import SolidProblem
 from morph_dslam.model import ReducedModel
-from morph_dslam.offline.mechanics.solid import SolidProblem
-from morph_dslam.offline.reduction.pgd_method import reduce_by_pgd
-from morph_dslam.offline.reduction.task import ReductionTask
-from morph_dslam.offline.studies.solid_study import SolidStudy
-from morph_dslam.offline.studies.solid_sweep import support_reactions
+from morph_dslam.reduction.pgd import reduce_by_pgd
+from morph_dslam.reduction.task import ReductionTask
+from morph_dslam.studies.solid_study import SolidStudy
+from morph_dslam.studies.solid_sweep import support_reactions
 
 BLOCK = {"generator": "block", "size": ["100 mm", "10 mm", "10 mm"], "divisions": [6, 1, 1]}
 FIXED = {"kind": "fixed", "on": "x_min"}
@@ -149,11 +149,7 @@ def test_prescribed_motions_may_depend_on_parameters() -> None:
     study = cantilever(
         supports=[FIXED, turned, BED],
         loads=[],
-        parameters={
-            "tilt": {"range": ["-20 deg", "30 deg"]},
-            "shift": {"range": ["0 mm", "3 mm"]},
-            "bed": STIFF_BED,
-        },
+        parameters={"tilt": {"range": ["-20 deg", "30 deg"]}, "shift": {"range": ["0 mm", "3 mm"]}, "bed": STIFF_BED},
     )
     model, problem = reduce(study), study.problem()
     for mu in anywhere(model, 5):
@@ -179,19 +175,11 @@ def test_other_functions_of_the_parameters_may_be_chosen(basis: str) -> None:
             r"the material 'neo_hookean' is not: linear_elastic is: use method = \"galerkin\"",
         ),
         (
-            {
-                "loads": [{"kind": "pressure", "on": "z_max", "pressure": "0.1 kPa"}, MOVING],
-            },
+            {"loads": [{"kind": "pressure", "on": "z_max", "pressure": "0.1 kPa"}, MOVING]},
             r"the pressure on 'z_max' follows the deformation: a traction does not",
         ),
-        (
-            {"mesh": BLOCK | {"cells": "hex27"}},
-            r"takes hex20 or hex8 in place of hex27",
-        ),
-        (
-            {"loads": [], "parameters": {"bed": STIFF_BED}},
-            r"nothing moves this solid",
-        ),
+        ({"mesh": BLOCK | {"cells": "hex27"}}, r"takes hex20 or hex8 in place of hex27"),
+        ({"loads": [], "parameters": {"bed": STIFF_BED}}, r"nothing moves this solid"),
         ({"solver": {"threads": 1, "formulation": "mixed"}}, r"has no pressures: leave out"),
         (
             {"loads": [MOVING | {"width": "0.1 mm"}]},

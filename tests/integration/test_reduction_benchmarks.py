@@ -68,7 +68,7 @@ def test_parameters_that_are_not_freed_stand_at_their_defaults(growth: ModuleTyp
     two, six = growth.study_of(2, 24, 59), growth.study_of(6, 300, 59)
     assert [p.name for p in two.model_parameters()] == ["line", "place"]
     assert [p.name for p in six.model_parameters()] == [
-        *("line", "place", "tip_young", "across", "middle_young", "pull"),
+        *("line", "place", "tip_young", "across", "middle_young", "pull")
     ]
     residuals = []
     for study in (two, six):

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morph_dslam.online.estimation.state import moved
-from morph_dslam.online.pipeline import Tracker
-from morph_dslam.online.tracker_options import TrackerOptions
-from morph_dslam.online.uncertainty.confidence import position_std
+from morph_dslam.tracking.observability import position_std
+from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.state import moved
+from morph_dslam.tracking.tracker import Tracker
 from tests.support.rendered_sequence import CAMERA, mean_error
 from tests.support.turning_block import BlockFilm, block_state
 
@@ -25,9 +25,7 @@ def tracked(truths=TRUTHS, step=None, covariance=None, **options):
     """The film, and what was found in its frames; the first view is off by ``step`` (8,)."""
     film, start = BlockFilm(), block_state(0.0, 0.0)
     state = start if step is None else moved(start, step)
-    tracker = Tracker(
-        film.model, CAMERA, film.frame(start), state, TrackerOptions(**options), True, covariance
-    )
+    tracker = Tracker(film.model, CAMERA, film.frame(start), state, TrackerOptions(**options), True, covariance)
     return film, [tracker.process_frame(film.frame(truth)) for truth in truths]
 
 

@@ -7,31 +7,28 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.cli import main
+from morph_dslam.cli.app import main
 from morph_dslam.errors import RegistrationError, TrackingError
 from morph_dslam.evaluation.run_folder import load_run
-from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.io.calibration import save_camera
-from morph_dslam.io.landmarks import Landmarks, save_landmarks
+from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_exp
+from morph_dslam.io.camera_files import save_camera
+from morph_dslam.io.tables import Landmarks, save_landmarks
 from morph_dslam.model import SurfacePoints, save_model
-from morph_dslam.online.aids.board import FiducialBoard, load_board
-from morph_dslam.online.aids.board_pose import BoardStart, locate_board
-from morph_dslam.online.aids.guess import GuessFile, GuessStart
-from morph_dslam.online.aids.picture import PictureStart, load_picture
-from morph_dslam.online.aids.start import AidFiles
-from morph_dslam.online.estimation.estimator import Estimator
-from morph_dslam.online.estimation.state import BoundPoints, State
-from morph_dslam.online.live.run import LiveOptions, run_live
-from morph_dslam.online.measuring.flow import flatten
-from morph_dslam.online.recovering.relocalisation import RelocalisationOptions, state_from_matches
-from morph_dslam.online.slam.map_file import save_map
-from morph_dslam.online.slam.rigid_map import GOOD, Keyframe, RigidMap
-from morph_dslam.online.start.placement import load_placement
-from morph_dslam.online.track import TrackOptions, track
-from morph_dslam.online.tracking_setup import ObjectOptions
+from morph_dslam.registration.board import BoardStart, FiducialBoard, load_board, locate_board
+from morph_dslam.registration.guess import GuessFile, GuessStart, PictureStart, load_picture
+from morph_dslam.registration.registration import load_registration
+from morph_dslam.registration.start import InitializerFiles
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
-from morph_dslam.similarity import SimilarityTransform
+from morph_dslam.slam.map_files import save_map
+from morph_dslam.slam.rigid_map import GOOD, Keyframe, RigidMap
+from morph_dslam.tracking.estimator import Estimator
+from morph_dslam.tracking.patches import flatten
+from morph_dslam.tracking.relocalization import RelocalizationOptions, state_from_matches
+from morph_dslam.tracking.run_live import LiveOptions, run_live
+from morph_dslam.tracking.setup import ObjectOptions
+from morph_dslam.tracking.state import BoundPoints, State
+from morph_dslam.tracking.track import TrackOptions, track
 from tests.support.bent_sheet import LENGTH, WIDTH
 from tests.support.rendered_sequence import CAMERA
 from tests.support.staged_scenes import SCENES, aside
@@ -65,9 +62,7 @@ def written(folder, text):
 def picture_of(board: FiducialBoard, pose: RigidTransform, noise=2.0):
     """A print (h, w) with a white margin of 2 cm in the camera, in front of grey."""
     density, margin = 8000.0, 0.02
-    print_ = cv2.copyMakeBorder(
-        board.image(density), *[int(margin * density)] * 4, cv2.BORDER_CONSTANT, value=255
-    )
+    print_ = cv2.copyMakeBorder(board.image(density), *[int(margin * density)] * 4, cv2.BORDER_CONSTANT, value=255)
     width, height = board.size
     a, b = np.meshgrid(np.linspace(-margin, width + margin, 30), np.linspace(-margin, height + margin, 30))
     nodes = np.column_stack([a.ravel(), b.ravel(), np.zeros(a.size)])
@@ -166,9 +161,7 @@ def test_a_board_in_a_map_tells_the_unit_and_the_place(tmp_path, scene):
     rigid_map = RigidMap()
     rigid_map.add_points(np.zeros((1, 3)), np.zeros((1, 2)), 0, GOOD)
     for k, angle in enumerate((-0.3, 0.0, 0.3)):
-        pose = RigidTransform(
-            rotation_exp(np.array([0.2, angle, 0.1])) @ BOARD_POSE.rotation, BOARD_POSE.translation
-        )
+        pose = RigidTransform(rotation_exp(np.array([0.2, angle, 0.1])) @ BOARD_POSE.rotation, BOARD_POSE.translation)
         rotation = pose.rotation @ world.rotation.T
         view = np.eye(4)
         view[:3, :3], view[:3, 3] = rotation, 3.7 * pose.translation - rotation @ world.translation
@@ -180,7 +173,7 @@ def test_a_board_in_a_map_tells_the_unit_and_the_place(tmp_path, scene):
     files = [str(tmp_path / name) for name in ("map.h5", "sheet.morph", "camera.yaml", "board.toml", "place")]
     arguments = ["register", files[0], "--model", files[1], "--camera", files[2], "--board", files[3]]
     assert main([*arguments, "-o", files[4]]) == 0
-    placed = load_placement(tmp_path / "place" / "registration.json", scene.model)
+    placed = load_registration(tmp_path / "place" / "registration.json", scene.model)
     assert placed.facts["map_units_per_metre"] == pytest.approx(3.7, rel=2e-3)
     turn = Rotation.from_euler("xyz", [10, 5, 30], degrees=True).as_matrix()
     truth = pose @ RigidTransform(turn, np.array([0.020, -0.040, -0.015]))
@@ -321,13 +314,9 @@ def test_a_run_starts_from_a_picture_and_is_placed_anew(recording, scene, tmp_pa
 
 def test_a_live_run_is_placed_anew_in_the_frame_or_the_next_that_is_not_dropped(recording, scene, tmp_path):
     of_object = ObjectOptions(
-        recording / "sheet.morph",
-        recording / "camera.yaml",
-        aids=AidFiles(picture=recording / "picture.toml"),
+        recording / "sheet.morph", recording / "camera.yaml", aids=InitializerFiles(picture=recording / "picture.toml")
     )
-    live = LiveOptions(
-        str(recording / "frames"), tmp_path / "run", of_object, reregister_at=((7, None),), record=False
-    )
+    live = LiveOptions(str(recording / "frames"), tmp_path / "run", of_object, reregister_at=((7, None),), record=False)
     flags = run_live(live)["flags"]
     placed = [int(flag.split()[-1]) for flag in flags if flag.startswith("placed anew in frame")]
     assert len(placed) == 1
@@ -346,9 +335,7 @@ def test_landmarks_of_another_frame_place_the_object_anew(recording, scene, tmp_
         seen = CAMERA.project(state.camera_from_object.apply(scene.model.positions(state.parameters)))[nodes]
         files.append(tmp_path / f"landmarks_{number}.csv")
         save_landmarks(files[-1], Landmarks(scene.model.nodes[nodes], seen))
-    summary = track(
-        options(recording, tmp_path / "run", landmarks=files[0], reregister_at=((8, files[1]),), last=9)
-    )
+    summary = track(options(recording, tmp_path / "run", landmarks=files[0], reregister_at=((8, files[1]),), last=9))
     assert "placed anew in frame 8" in summary["flags"]
     run, truth = load_run(tmp_path / "run"), state_of(scene, 9)
     expected = truth.camera_from_object.apply(scene.model.positions(truth.parameters))
@@ -359,13 +346,9 @@ def test_landmarks_of_another_frame_place_the_object_anew(recording, scene, tmp_
 
 def test_matches_of_one_spot_span_no_pose(scene):
     """A texture that repeats makes many matches of the same few points; they must not stop a run."""
-    points = BoundPoints.from_surface(
-        scene.model, SurfacePoints(np.full(20, 5), np.tile([0.2, 0.3, 0.5], (20, 1)))
-    )
+    points = BoundPoints.from_surface(scene.model, SurfacePoints(np.full(20, 5), np.tile([0.2, 0.3, 0.5], (20, 1))))
     pixels = np.random.default_rng(0).uniform(100.0, 300.0, (20, 2))
-    options = RelocalisationOptions()
-    state, agreeing = state_from_matches(
-        Estimator(scene.model, CAMERA), points, pixels, [scene.model.default], options
-    )
+    options = RelocalizationOptions()
+    state, agreeing = state_from_matches(Estimator(scene.model, CAMERA), points, pixels, [scene.model.default], options)
     assert state is None
     assert agreeing.sum() < options.least_matches

@@ -2,7 +2,7 @@
 
 import pytest
 
-from morph_dslam.offline.report.build_report import write_build_report
+from morph_dslam.reduction.report import write_build_report
 from tests.support.certified_block import certified_block_model
 from tests.support.chromium import Page, find_chromium
 

@@ -5,15 +5,14 @@ import numpy as np
 import pytest
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.cli import main
+from morph_dslam.cli.app import main
 from morph_dslam.errors import RegistrationError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.io.landmarks import Landmarks, save_landmarks
+from morph_dslam.io.tables import Landmarks, save_landmarks
 from morph_dslam.model import save_model
-from morph_dslam.online.pipeline import Tracker
-from morph_dslam.online.several.rig import RigCamera
-from morph_dslam.online.several.rig_tracking import RigTracker
+from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
+from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.camchain import write_camchain
 from tests.support.rendered_sequence import SheetFilm, mean_error, sheet_state

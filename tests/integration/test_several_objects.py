@@ -4,15 +4,15 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.cli import main
+from morph_dslam.cli.app import main
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.io.calibration import save_camera
-from morph_dslam.io.landmarks import Landmarks, save_landmarks
+from morph_dslam.io.camera_files import save_camera
+from morph_dslam.io.tables import Landmarks, save_landmarks
 from morph_dslam.model import save_model
-from morph_dslam.online.estimation.estimator import State
-from morph_dslam.online.pipeline import Tracker
-from morph_dslam.online.several.several_objects import ObjectTracker
+from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.multi_object import ObjectTracker
+from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, UPRIGHT, SheetFilm, mean_error, sheet_depth
 
@@ -32,9 +32,7 @@ def films(model):
 def states(time):
     """The sheet behind bends; the one before passes it from right to left."""
     bend = np.array([0.03 * np.sin(4.0 * time), 0.2, 0.1])
-    behind = RigidTransform(
-        rotation_exp(np.array([0.1, 0.2, 0.1 * time])) @ UPRIGHT, np.array([-0.1, 0.0, 0.9])
-    )
+    behind = RigidTransform(rotation_exp(np.array([0.1, 0.2, 0.1 * time])) @ UPRIGHT, np.array([-0.1, 0.0, 0.9]))
     before = RigidTransform(
         rotation_exp(np.array([0.0, -0.3, 0.0])) @ UPRIGHT, np.array([0.33 - 0.35 * time, 0.12, 0.75])
     )

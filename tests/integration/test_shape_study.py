@@ -7,7 +7,7 @@ import pytest
 
 from morph_dslam import build, make_study
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.studies.solid_study import SolidStudy
+from morph_dslam.studies.solid_study import SolidStudy
 
 THICKNESS = {"kind": "thickness", "on": "outer", "kept": "inner", "amplitude": "growth"}
 RADIUS = {"kind": "radius", "axis": [0, 0, 3], "amplitude": "-1 mm + 0.5 * growth"}
@@ -45,11 +45,7 @@ def tube_study(inner: str, outer: str, shape: list[dict]) -> SolidStudy:
 
 @pytest.mark.parametrize(
     ("shape", "inner", "outer"),
-    [
-        ([THICKNESS], "20 mm", "32 mm"),
-        ([RADIUS], "20 mm", "30 mm"),
-        ([THICKNESS, RADIUS], "20 mm", "32 mm"),
-    ],
+    [([THICKNESS], "20 mm", "32 mm"), ([RADIUS], "20 mm", "30 mm"), ([THICKNESS, RADIUS], "20 mm", "32 mm")],
     ids=["thickness", "radius", "both"],
 )
 def test_a_snapshot_is_that_of_the_other_mesh(shape: list[dict], inner: str, outer: str) -> None:

@@ -5,7 +5,7 @@ import h5py
 import numpy as np
 import pytest
 
-from morph_dslam.io.calibration import load_camera
+from morph_dslam.io.camera_files import load_camera
 from morph_dslam.model import load_model
 from morph_dslam.render.simulation import simulate
 from morph_dslam.sources import open_source
@@ -47,9 +47,7 @@ def test_the_folder_holds_what_a_tracker_needs(moving, truth):
 
 
 def test_truth_points_follow_the_sheet_equation(truth):
-    x, y = np.meshgrid(
-        ((np.arange(21) + 0.5) / 21 - 0.5) * LENGTH, ((np.arange(15) + 0.5) / 15 - 0.5) * WIDTH
-    )
+    x, y = np.meshgrid(((np.arange(21) + 0.5) / 21 - 0.5) * LENGTH, ((np.arange(15) + 0.5) / 15 - 0.5) * WIDTH)
     s, y = 2 * x.ravel() / LENGTH, y.ravel()
     for frame in range(5):
         pose = truth["camera_from_object"][frame]
@@ -114,9 +112,7 @@ def flat_scene(folder, extra="", rotation="[180, 0, 0]"):
     """A flat sheet face on at 0.6 m whose print is a smooth function of the place on it."""
     x, y = np.meshgrid((np.arange(840) + 0.5) / 840 - 0.5, 0.5 - (np.arange(594) + 0.5) / 594)
     cv2.imwrite(str(folder / "smooth.png"), np.rint(print_value(x, y)).astype(np.uint8))
-    tail = (
-        f"[[pose]]\nframe = 0\nposition_mm = [0, 0, 600]\nrotation_deg = {rotation}\n[light]\nambient = 1.0\n"
-    )
+    tail = f"[[pose]]\nframe = 0\nposition_mm = [0, 0, 600]\nrotation_deg = {rotation}\n[light]\nambient = 1.0\n"
     return write_scene(folder, top="frames = 1\n", tail=tail + extra, texture="smooth.png")
 
 

@@ -9,25 +9,16 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.cli import main
+from morph_dslam.cli.app import main
 from morph_dslam.errors import MapError
+from morph_dslam.geometry import fit_similarity
 from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
-from morph_dslam.online.slam.map_file import load_map, save_map
-from morph_dslam.online.slam.options import SlamOptions
-from morph_dslam.online.slam.output import trajectory_of
-from morph_dslam.online.slam.rigid_map import RigidMap
-from morph_dslam.online.slam.slam import Slam
-from morph_dslam.similarity import fit_similarity
-from tests.support.rendered_room import (
-    CAMERA,
-    SHEET_NODES,
-    RoomFilm,
-    hand_held,
-    pose,
-    room,
-    room_with_sheet,
-    wall,
-)
+from morph_dslam.slam.map_files import load_map, save_map
+from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.output import trajectory_of
+from morph_dslam.slam.rigid_map import RigidMap
+from morph_dslam.slam.slam import Slam
+from tests.support.rendered_room import CAMERA, SHEET_NODES, RoomFilm, hand_held, pose, room, room_with_sheet, wall
 
 N_FRAMES = 80
 DOCS = Path(__file__).parents[2] / "docs"
@@ -109,9 +100,7 @@ def test_a_plane_gives_the_right_path():
 
 def test_a_camera_that_only_turns_waits_and_says_why():
     film = RoomFilm(seed=3)
-    turns = [
-        pose((0.0, 0.0, 0.0), (0.05 * np.sin(i / 4.0), 0.01 * i, 0.02 * np.cos(i / 5.0))) for i in range(25)
-    ]
+    turns = [pose((0.0, 0.0, 0.0), (0.05 * np.sin(i / 4.0), 0.01 * i, 0.02 * np.cos(i / 5.0))) for i in range(25)]
     _, frames = follow([film.frame(place) for place in turns])
     assert {frame.status for frame in frames} == {"waiting"}
     assert "not enough parallax" in frames[-1].reason
@@ -263,9 +252,7 @@ def test_a_young_map_that_stays_lost_is_given_up_with_its_poses(room_film):
     film = [*images[:16], *(elsewhere.frame(place) for place in places)]
     frames = [slam.process_frame(image, index, index / 30.0) for index, image in enumerate(film)]
     assert slam.n_restarts == 1
-    errors, length = errors_after_alignment(
-        slam, [f for f in frames if slam.is_placed(f)], [*truth[:16], *places]
-    )
+    errors, length = errors_after_alignment(slam, [f for f in frames if slam.is_placed(f)], [*truth[:16], *places])
     assert len(trajectory_of(slam, frames)) == len(errors)
     assert all(frame.index > 20 for frame in frames if slam.is_placed(frame))
     assert np.median(errors) < 0.005 * length

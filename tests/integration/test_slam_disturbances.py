@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.cli import main
+from morph_dslam.cli.app import main
 from morph_dslam.errors import CameraError
 from morph_dslam.io.trajectory import load_trajectory
-from morph_dslam.online.slam.calibration_check import suspected_focal_factor
-from morph_dslam.online.slam.map_file import load_map
-from morph_dslam.online.slam.mapping import Mapper
-from morph_dslam.online.slam.rigid_map import RigidMap
-from morph_dslam.online.slam.slam import Slam
+from morph_dslam.slam.map_files import load_map
+from morph_dslam.slam.mapping import Mapper
+from morph_dslam.slam.output import suspected_focal_factor
+from morph_dslam.slam.rigid_map import RigidMap
+from morph_dslam.slam.slam import Slam
 from tests.support.rendered_room import CAMERA, RoomFilm, hand_held, wall
 
 
@@ -49,9 +49,7 @@ def test_a_wrong_focal_length_is_found_out(images, scale):
 
 def test_a_wrong_focal_length_is_found_out_on_a_plane():
     film = RoomFilm(seed=2, scene=wall)
-    assert factor_with([film.frame(place) for place in hand_held(80, seed=2)], 1.2) == pytest.approx(
-        1 / 1.2, rel=0.02
-    )
+    assert factor_with([film.frame(place) for place in hand_held(80, seed=2)], 1.2) == pytest.approx(1 / 1.2, rel=0.02)
 
 
 def command_on_film(folder, images, focal_length):

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.cli import main
+from morph_dslam.cli.app import main
 from morph_dslam.errors import MapError
-from morph_dslam.io.colmap_model import ColmapImage, read_colmap_model, write_colmap_model
+from morph_dslam.io.colmap import ColmapImage, read_colmap_model, write_colmap_model
 from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
 from tests.support.rendered_room import CAMERA, RoomFilm, hand_held, pose
 

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.cli import main
+from morph_dslam.cli.app import main
+from morph_dslam.geometry import fit_similarity
 from morph_dslam.io.trajectory import load_trajectory
-from morph_dslam.online.slam.mapping_work import MappingWork, do_all
-from morph_dslam.online.slam.output import trajectory_of
-from morph_dslam.online.slam.slam import Slam
-from morph_dslam.similarity import fit_similarity
+from morph_dslam.slam.mapping import MappingWork, do_all
+from morph_dslam.slam.output import trajectory_of
+from morph_dslam.slam.slam import Slam
 from tests.support.rendered_room import CAMERA, RoomFilm, hand_held
 
 N_FRAMES = 80

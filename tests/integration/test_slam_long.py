@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from morph_dslam.online.slam.slam import Slam
+from morph_dslam.slam.slam import Slam
 from tests.support.rendered_room import CAMERA, RoomFilm, hand_held
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "slam_long.py"

@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.cli import main
+from morph_dslam.camera import StereoCamera
+from morph_dslam.cli.app import main
 from morph_dslam.errors import CameraError, MapError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
-from morph_dslam.online.slam.output import trajectory_of
-from morph_dslam.online.slam.rigid_map import RigidMap
-from morph_dslam.online.slam.slam import Slam
-from morph_dslam.stereo import StereoCamera
+from morph_dslam.slam.output import trajectory_of
+from morph_dslam.slam.rigid_map import RigidMap
+from morph_dslam.slam.slam import Slam
 from tests.support.rendered_room import CAMERA, RoomFilm, hand_held, pose
 
 N_FRAMES = 36
@@ -32,10 +32,7 @@ def views(kind, seed, n=N_FRAMES):
 
 
 def follow(slam, images, more):
-    return [
-        slam.process_frame(image, i, i / 30.0, **m)
-        for i, (image, m) in enumerate(zip(images, more, strict=True))
-    ]
+    return [slam.process_frame(image, i, i / 30.0, **m) for i, (image, m) in enumerate(zip(images, more, strict=True))]
 
 
 @pytest.fixture(scope="module", params=["depth", "stereo"])
@@ -121,9 +118,7 @@ def write_tum(folder, images, more):
     for name, lines in lists.items():
         (folder / name).mkdir(parents=True)
         for i in range(len(images)):
-            stored = (
-                images[i] if name == "rgb" else np.nan_to_num(5000.0 * more[i]["depth"]).astype(np.uint16)
-            )
+            stored = images[i] if name == "rgb" else np.nan_to_num(5000.0 * more[i]["depth"]).astype(np.uint16)
             cv2.imwrite(str(folder / name / f"{i:03d}.png"), stored)
             lines.append(f"{i / 30.0:.6f} {name}/{i:03d}.png")
         (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")

@@ -3,17 +3,10 @@
 import numpy as np
 import pytest
 
-from morph_dslam.online.slam.output import trajectory_of
-from morph_dslam.online.slam.slam import Slam
-from morph_dslam.similarity import fit_similarity
-from tests.support.rendered_room import (
-    CAMERA,
-    SHEET_NODES,
-    RoomFilm,
-    checkerboard,
-    hand_held,
-    room_with_sheet,
-)
+from morph_dslam.geometry import fit_similarity
+from morph_dslam.slam.output import trajectory_of
+from morph_dslam.slam.slam import Slam
+from tests.support.rendered_room import CAMERA, SHEET_NODES, RoomFilm, checkerboard, hand_held, room_with_sheet
 
 N_FRAMES = 120
 

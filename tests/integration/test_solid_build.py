@@ -8,10 +8,10 @@ import re
 import numpy as np
 import pytest
 
-from morph_dslam import cli
+from morph_dslam.cli import app as cli
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.model import load_model
-from morph_dslam.offline.snapshots import load_snapshot
+from morph_dslam.studies.snapshots import load_snapshot
 from tests.support.scenes import write_texture
 
 BLOCK = """
@@ -136,9 +136,7 @@ def test_sensitivities_agree_with_differences_of_the_model(built):
     for name in ("displacement", "stress_solid", "strain"):
         for k, step in enumerate((1e-3, 1e-5)):
             change = step * np.eye(2)[k]
-            slope = (model.fields[name].value(mu + change) - model.fields[name].value(mu - change)) / (
-                2 * step
-            )
+            slope = (model.fields[name].value(mu + change) - model.fields[name].value(mu - change)) / (2 * step)
             missed = np.linalg.norm(slope - snapshot.sensitivities[name][k])
             assert missed < 0.03 * np.linalg.norm(slope)
 
@@ -159,13 +157,7 @@ def filmed(built):
     sequence = built / "seq"
     assert cli.main(["simulate", str(built / "scene.toml"), "-o", str(sequence)]) == 0
     options = [str(sequence / "frames"), "--model", str(built / "block.morph")]
-    return [
-        *options,
-        "--camera",
-        str(sequence / "camera.yaml"),
-        "--landmarks",
-        str(sequence / "landmarks.csv"),
-    ]
+    return [*options, "--camera", str(sequence / "camera.yaml"), "--landmarks", str(sequence / "landmarks.csv")]
 
 
 def test_a_solid_is_filmed_and_tracked(built, filmed):
@@ -190,9 +182,7 @@ def test_uniaxial_stretch_reaches_the_closed_form_through_the_whole_chain(tmp_pa
     for face, axis in (("x_min", "x"), ("y_min", "y"), ("z_min", "z")):
         text += f'[[supports]]\nkind = "displacement"\non = "{face}"\n{axis} = "0 mm"\n'
     text += '[[supports]]\nkind = "displacement"\non = "z_max"\nz = "80 mm * stretch"\n'
-    text += (
-        '[parameters.stretch]\nrange = [0.0, 0.6]\n[sampling]\nscheme = "even"\ntraining = 13\nheld_out = 5\n'
-    )
+    text += '[parameters.stretch]\nrange = [0.0, 0.6]\n[sampling]\nscheme = "even"\ntraining = 13\nheld_out = 5\n'
     text += "[reduction]\nmax_degree = 10\ntolerance = 1e-7\n"
     (tmp_path / "study.toml").write_text(text)
     assert cli.main(["build", str(tmp_path / "study.toml"), "-o", str(tmp_path / "bar.morph")]) == 0
@@ -208,9 +198,7 @@ def test_uniaxial_stretch_reaches_the_closed_form_through_the_whole_chain(tmp_pa
     # The nominal stress on 40 x 40 mm; faces that only slide along their neighbours are free of force.
     force = 1.075843e6 * 0.04**2
     assert model.reactions["force_z_max"].value(mu)[0] == pytest.approx([0.0, 0.0, force], abs=1e-4 * force)
-    assert set(model.reactions) == {
-        f"{kind}_{end}" for kind in ("force", "moment") for end in ("z_min", "z_max")
-    }
+    assert set(model.reactions) == {f"{kind}_{end}" for kind in ("force", "moment") for end in ("z_min", "z_max")}
     assert model.certificate["reaction_force_z_max"]["largest_N"] > force
     assert model.certificate["reaction_force_z_max"]["relative_l2"] < 1e-4
 
@@ -224,27 +212,11 @@ MISTAKES = {
     "negative modulus": ('young = "3 MPa"', 'young = "-3 MPa"', r"young = -3e\+06 must be positive"),
     "unknown law": ('"neo_hookean"', '"neo_hooke"', r"not a known material law; known are neo_hookean"),
     "unknown constant": ("poisson = 0.45", 'poisson = 0.45\nshear = "1 MPa"', r"has no constant 'shear'"),
-    "unknown key": (
-        "[solver]",
-        "[solver]\nspeed = 3",
-        r"unknown key solver\.speed; known here: workers, thr",
-    ),
-    "unknown mesh key": (
-        "divisions =",
-        "division =",
-        r"unknown key mesh\.division; known here: generator, size",
-    ),
+    "unknown key": ("[solver]", "[solver]\nspeed = 3", r"unknown key solver\.speed; known here: workers, thr"),
+    "unknown mesh key": ("divisions =", "division =", r"unknown key mesh\.division; known here: generator, size"),
     "unknown support": ('kind = "rotation"', 'kind = "spin"', r"supports\.1.*'spin'"),
-    "unknown parameter": (
-        'angle = "bend"',
-        'angle = "bent"',
-        r"names 'bent', which is no parameter; the par",
-    ),
-    "parameter of another quantity": (
-        'angle = "bend"',
-        'angle = "squash"',
-        r"squash is of length, and angle",
-    ),
+    "unknown parameter": ('angle = "bend"', 'angle = "bent"', r"names 'bent', which is no parameter; the par"),
+    "parameter of another quantity": ('angle = "bend"', 'angle = "squash"', r"squash is of length, and angle"),
     "falling range": ('["0 mm", "8 mm"]', '["8 mm", "0 mm"]', r"range must rise"),
 }
 
@@ -263,15 +235,9 @@ def test_a_mistake_in_a_study_is_one_message(tmp_path, capsys, mistake):
 def test_an_inverted_mesh_is_one_message(tmp_path, capsys):
     inverted = "0 1 3 2 4 5 6 7"  # the top face crosses itself
     lines = ["*NODE"] + [
-        f"{1 + i + 2 * j + 4 * k}, {10 * i}, {10 * j}, {10 * k}"
-        for k in (0, 1)
-        for j in (0, 1)
-        for i in (0, 1)
+        f"{1 + i + 2 * j + 4 * k}, {10 * i}, {10 * j}, {10 * k}" for k in (0, 1) for j in (0, 1) for i in (0, 1)
     ]
-    lines += [
-        "*ELEMENT, TYPE=C3D8, ELSET=all_of_it",
-        "1, " + ", ".join(str(1 + int(n)) for n in inverted.split()),
-    ]
+    lines += ["*ELEMENT, TYPE=C3D8, ELSET=all_of_it", "1, " + ", ".join(str(1 + int(n)) for n in inverted.split())]
     lines += ["*NSET, NSET=z_min", "1, 2, 3, 4", "*NSET, NSET=z_max", "5, 6, 7, 8"]
     (tmp_path / "cube.inp").write_text("\n".join(lines) + "\n")
     start, end = BLOCK.index("generator"), BLOCK.index("[materials")
@@ -293,9 +259,7 @@ def test_a_load_past_its_limit_point_names_the_last_value_that_converged(tmp_pat
     (tmp_path / "study.toml").write_text(text)
     assert cli.main(["build", str(tmp_path / "study.toml"), "-o", str(tmp_path / "x.morph")]) == 2
     message = capsys.readouterr().err.splitlines()[-1]
-    found = re.search(
-        r"inside could only be followed from 0 to ([\d.]+) kPa: no equilibrium found beyond", message
-    )
+    found = re.search(r"inside could only be followed from 0 to ([\d.]+) kPa: no equilibrium found beyond", message)
     assert found
     limit = 100.0 * 3e6 / 2.9 * 1e-6
     assert 0.9 * limit < float(found[1]) < 1.05 * limit

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from morph_dslam import cli, load_model
+from morph_dslam import load_model
+from morph_dslam.cli import app as cli
 from morph_dslam.model import Parameter
-from morph_dslam.offline.stability import stability_report, stability_warnings
+from morph_dslam.reduction.certificate import stability_report, stability_warnings
 
 COLUMN = """
 name = "column"
@@ -67,11 +68,7 @@ def test_neighbours_are_those_of_the_sweep_tree() -> None:
     """Two branches from the first sample; one of them ends beyond a critical point."""
     report = stability_report([SHIFT], SAMPLES, {0: 0, 1: 0, 2: 2, 3: None}, [-1, 0, 0, 2])
     assert report["passed"] == [
-        {
-            "between": ["shift = 1 mm", "shift = 3 mm"],
-            "coordinates": [[0.001], [0.003]],
-            "negative_pivots": [0, 2],
-        }
+        {"between": ["shift = 1 mm", "shift = 3 mm"], "coordinates": [[0.001], [0.003]], "negative_pivots": [0, 2]}
     ]
     assert (report["stable"], report["unstable"], report["unknown"]) == (2, 1, 1)
     assert stability_warnings({"stability": report}) == [
@@ -82,9 +79,7 @@ def test_neighbours_are_those_of_the_sweep_tree() -> None:
 
 def test_what_the_solver_cannot_tell_is_said() -> None:
     unknown = stability_report([SHIFT], SAMPLES, dict.fromkeys(range(4)), [-1, 0, 1, 2])
-    assert stability_warnings({"stability": unknown}) == [
-        "the solver cannot tell whether the solutions are stable"
-    ]
+    assert stability_warnings({"stability": unknown}) == ["the solver cannot tell whether the solutions are stable"]
     stable = stability_report([SHIFT], SAMPLES, dict.fromkeys(range(4), 0), [-1, 0, 1, 2])
     assert stable["statement"] == "all 4 solutions are stable"
     assert stability_warnings({"stability": stable}) == []

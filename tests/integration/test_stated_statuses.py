@@ -6,28 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morph_dslam.cli import main
+from morph_dslam.cli.app import main
 from morph_dslam.errors import RegistrationError
-from morph_dslam.io.calibration import save_camera
+from morph_dslam.geometry import SimilarityTransform
+from morph_dslam.io.camera_files import save_camera
 from morph_dslam.model import save_model
-from morph_dslam.online.mesh_registration.register import register_mesh
-from morph_dslam.online.mesh_registration.scene import scene_of_map
-from morph_dslam.online.mesh_registration.unit_check import register_in_unit
-from morph_dslam.online.slam.map_file import save_map
-from morph_dslam.online.slam.rigid_map import GOOD, Keyframe, RigidMap
-from morph_dslam.online.start.registration import register
-from morph_dslam.similarity import SimilarityTransform
+from morph_dslam.registration.landmarks import register
+from morph_dslam.registration.mesh import register_in_unit, register_mesh
+from morph_dslam.registration.scene import scene_of_map
+from morph_dslam.slam.map_files import save_map
+from morph_dslam.slam.rigid_map import GOOD, Keyframe, RigidMap
 from tests.support.rendered_object import CAMERA, scanned, wedge
 from tests.support.shown_frames import behind_a_thing, covered, crossing, exchanged, moving, passing
 from tests.support.staged_scenes import SCENES, bending_wedge, drawn_out, is_beyond, is_doubted, mean_error
-from tests.support.stated_cases import (
-    Shown,
-    in_unit,
-    landmarks,
-    placed_by_landmarks,
-    run_case,
-    stated,
-)
+from tests.support.stated_cases import Shown, in_unit, landmarks, placed_by_landmarks, run_case, stated
 
 WORLD = SimilarityTransform(1.0, np.eye(3), np.array([0.1, -0.2, 0.3]))
 

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
+from morph_dslam.meshing.generators import block
 from morph_dslam.model import load_model
-from morph_dslam.offline.build import build
-from morph_dslam.offline.meshing.mesh_generators import block
-from morph_dslam.offline.studies.study import make_study
-from morph_dslam.online.track import TrackOptions, track
 from morph_dslam.render.simulation import simulate
+from morph_dslam.studies.build import build
+from morph_dslam.studies.study import make_study
+from morph_dslam.tracking.track import TrackOptions, track
 
 SIZE, CELLS = (0.16, 0.05, 0.006), (16, 4, 1)
 RATIO = 2.2
@@ -22,17 +22,10 @@ STUDY = {
         "root": {"law": "neo_hookean", "young": "1 MPa", "poisson": 0.45, "on": "root"},
         "tip": {"law": "neo_hookean", "young": "1 MPa * ratio", "poisson": 0.45, "on": "tip"},
     },
-    "supports": [
-        {"kind": "fixed", "on": "held"},
-        {"kind": "displacement", "on": "moved", "z": "lift"},
-    ],
+    "supports": [{"kind": "fixed", "on": "held"}, {"kind": "displacement", "on": "moved", "z": "lift"}],
     "parameters": {
         "lift": {"range": ["-60 mm", "60 mm"]},
-        "ratio": {
-            "range": [0.25, 4.0],
-            "default": 1.0,
-            "description": "stiffness of the tip over the root's",
-        },
+        "ratio": {"range": [0.25, 4.0], "default": 1.0, "description": "stiffness of the tip over the root's"},
     },
     "sampling": {"scheme": "grid", "points": [7, 6], "held_out": 4, "seed": 1},
     "reduction": {"method": "pod", "tolerance": 1e-4},

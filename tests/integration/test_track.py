@@ -11,13 +11,13 @@ import pytest
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import CameraError, RegistrationError, SourceError, TrackingError
 from morph_dslam.evaluation.run_folder import load_run
-from morph_dslam.io.calibration import save_camera
-from morph_dslam.io.landmarks import Landmarks, save_landmarks
+from morph_dslam.io.camera_files import save_camera
+from morph_dslam.io.tables import Landmarks, save_landmarks
 from morph_dslam.model import save_model
-from morph_dslam.online.frame_result import STAGES
-from morph_dslam.online.pipeline import Tracker
-from morph_dslam.online.start.registration import RegistrationOptions
-from morph_dslam.online.track import TrackOptions, track
+from morph_dslam.registration.landmarks import RegistrationOptions
+from morph_dslam.tracking.result import STAGES
+from morph_dslam.tracking.track import TrackOptions, track
+from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state
 
@@ -45,12 +45,7 @@ def inputs(tmp_path_factory):
 
 
 def options(inputs, output, **changes):
-    files = {
-        "frames": "frames",
-        "model": "sheet.morph",
-        "camera": "camera.yaml",
-        "landmarks": "landmarks.csv",
-    }
+    files = {"frames": "frames", "model": "sheet.morph", "camera": "camera.yaml", "landmarks": "landmarks.csv"}
     # The landmarks are exact but for rounding.
     changes = {"registration": RegistrationOptions(click_px=0.01), **changes}
     return TrackOptions(**{name: inputs / path for name, path in files.items()}, output=output, **changes)
@@ -230,10 +225,7 @@ def test_random_walk_and_start_are_named(inputs, tmp_path):
 
 def test_parameter_that_is_one_over_the_sequence_is_named(inputs, finished, tmp_path):
     summary = track(options(inputs, tmp_path / "run", last=23, per_sequence=("twist",), overlay=False))
-    assert (
-        summary["temporal_prior"]
-        == "one over the sequence, from all frames so far: twist; none on the others"
-    )
+    assert summary["temporal_prior"] == "one over the sequence, from all frames so far: twist; none on the others"
     (twist,) = summary["one_over_the_sequence"]
     low, high = twist["interval_95"]
     assert (twist["name"], twist["unit"]) == ("twist", "deg")

@@ -7,10 +7,10 @@ import pytest
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.online.estimation.estimator import State
-from morph_dslam.online.frame_result import STAGES
-from morph_dslam.online.measuring.binding import draw_view, view_of
-from morph_dslam.online.pipeline import Tracker
+from morph_dslam.tracking.binding import draw_view, view_of
+from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.result import STAGES
+from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, mean_error, sheet_state
 
@@ -37,9 +37,7 @@ def test_moving_bending_sheet_is_followed_within_a_fraction_of_a_millimetre(mode
         result = tracker.process_frame(film.frame(truth, light=1.0 - 0.25 * time))
         assert result.status == "tracked", result.reason
         errors.append(mean_error(model, result.estimate.state, truth))
-        deviations.append(
-            np.abs(result.estimate.state.parameters - truth.parameters) / result.estimate.parameter_std
-        )
+        deviations.append(np.abs(result.estimate.state.parameters - truth.parameters) / result.estimate.parameter_std)
         assert set(result.timings_ms) == set(STAGES)
     assert np.mean(errors) < 0.15e-3
     assert errors[-1] < 0.3e-3  # nothing has accumulated
@@ -79,9 +77,7 @@ def test_lost_object_says_why_and_is_recovered_elsewhere(model, film):
     assert result.status == "tracked", result.reason
     assert result.recovered
     assert mean_error(model, result.estimate.state, truth) < 1.5e-3
-    following = State(
-        away.parameters, RigidTransform(moved.rotation, moved.translation + np.array([0.004, 0.0, 0.0]))
-    )
+    following = State(away.parameters, RigidTransform(moved.rotation, moved.translation + np.array([0.004, 0.0, 0.0])))
     result = tracker.process_frame(film.frame(following))
     assert (result.status, result.recovered) == ("tracked", False)
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from morph_dslam import cli, load_model
+from morph_dslam import load_model
+from morph_dslam.cli import app as cli
 from morph_dslam.model import ReducedModel
 
 BAR = """

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from morph_dslam.meshing.generators import tube
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.offline.meshing.mesh_generators import tube
 
 AXIS = np.array([0.0, 0.0, 1.0])
 
@@ -12,9 +12,7 @@ AXIS = np.array([0.0, 0.0, 1.0])
 def polynomial(coefficients):
     """Functions of one parameter in [0, 2], by their Chebyshev coefficients (terms, functions)."""
     degrees = np.arange(len(coefficients))[:, None]
-    return ParameterFunctions(
-        np.array([0.0]), np.array([2.0]), degrees, np.asarray(coefficients, dtype=float)
-    )
+    return ParameterFunctions(np.array([0.0]), np.array([2.0]), degrees, np.asarray(coefficients, dtype=float))
 
 
 def bent_tube(mesh=None):

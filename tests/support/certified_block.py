@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from morph_dslam.offline.certificate import certify, compression_percent
-from morph_dslam.offline.problem import Snapshot
+from morph_dslam.reduction.certificate import certify, compression_percent
+from morph_dslam.studies.problem import Snapshot
 from tests.support.stretched_block import stretched_block_model
 
 FAILED = {"coordinates": [0.1, -0.004], "reason": "no equilibrium <found>"}

@@ -109,9 +109,7 @@ class Page:
         for kind, (x, y), held in (
             ("mousePressed", start, 1), ("mouseMoved", end, 1), ("mouseReleased", end, 0),
         ):  # fmt: skip
-            self.send(
-                "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=held, clickCount=1
-            )
+            self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=held, clickCount=1)
 
     def screenshot(self):
         """The page as an image (h, w, 3), blue, green, red."""

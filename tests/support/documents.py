@@ -15,7 +15,5 @@ def samples(page: str, language: str) -> list[str]:
 def code_words(page: str) -> set[str]:
     """Words that a page shows as code, in a line or in a block."""
     blocks = re.findall(r"^```.*?^```$", PAGES[page], flags=re.DOTALL | re.MULTILINE)
-    spans = re.findall(
-        r"`([^`\n]+)`", re.sub(r"^```.*?^```$", "", PAGES[page], flags=re.DOTALL | re.MULTILINE)
-    )
+    spans = re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```$", "", PAGES[page], flags=re.DOTALL | re.MULTILINE))
     return set(re.findall(r"\w+", " ".join([*blocks, *spans])))

@@ -20,11 +20,7 @@ FORMATS = ("polynomial", "cp", "tucker", "tensor_train")
 LOWER, UPPER = np.array([-1.0, 0.0, 0.0]), np.array([1.0, 1.0, 2.0])
 
 #: C1 bases on the box; the last row has those that are not C1 or have no outside.
-SMOOTH = (
-    cubic_spline_basis(np.linspace(-1.0, 1.0, 6)),
-    chebyshev_basis(0.0, 1.0, 4),
-    p_spline_basis(0.0, 2.0, 7),
-)
+SMOOTH = (cubic_spline_basis(np.linspace(-1.0, 1.0, 6)), chebyshev_basis(0.0, 1.0, 4), p_spline_basis(0.0, 2.0, 7))
 OTHERS = (
     hat_basis(np.linspace(-1.0, 1.0, 5)),
     fourier_basis(0.0, 1.0, 2),
@@ -32,9 +28,7 @@ OTHERS = (
 )
 
 
-def make_functions(
-    form: str, n_functions: int = 7, bases: tuple[Basis, ...] = SMOOTH, seed: int = 0
-) -> Functions:
+def make_functions(form: str, n_functions: int = 7, bases: tuple[Basis, ...] = SMOOTH, seed: int = 0) -> Functions:
     """Functions of a format with random coefficients of size one; polynomials have their own basis."""
     rng = np.random.default_rng(seed)
     ranks = (2, 3, 2)

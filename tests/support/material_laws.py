@@ -7,16 +7,18 @@ from functools import partial
 import ngsolve as ngs
 import numpy as np
 
-from morph_dslam.offline.materials.anisotropic import (
-    HolzapfelGasserOgden,
-    Orthotropic,
-    TransverselyIsotropic,
+from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden, Orthotropic, TransverselyIsotropic
+from morph_dslam.mechanics.materials.base import evaluate
+from morph_dslam.mechanics.materials.isotropic import (
+    Gent,
+    LinearElastic,
+    MooneyRivlin,
+    NeoHookean,
+    Ogden,
+    StVenantKirchhoff,
+    Yeoh,
 )
-from morph_dslam.offline.materials.base import evaluate
-from morph_dslam.offline.materials.isotropic import LinearElastic, NeoHookean, StVenantKirchhoff
-from morph_dslam.offline.materials.ogden import Ogden
-from morph_dslam.offline.materials.rubber import Gent, MooneyRivlin, Yeoh
-from morph_dslam.offline.materials.user import UserMaterial
+from morph_dslam.mechanics.materials.library import UserMaterial
 from tests.support import closed_form_stress as exact
 
 
@@ -46,9 +48,7 @@ def user_energy(F, c10, c01):
 def fibre_moduli(along, across, n_along, n_across, g_along):
     """The law's lambda, mu, alpha, beta, gamma from the inverse of its compliance at small strain."""
     mu = across / (2.0 * (1.0 + n_across))
-    c = exact.orthotropic_stiffness(
-        (along, across, across), (n_along, n_along, n_across), (g_along, g_along, mu)
-    )
+    c = exact.orthotropic_stiffness((along, across, across), (n_along, n_along, n_across), (g_along, g_along, mu))
     lam, alpha, beta = c[1, 2], mu - g_along, 0.5 * (c[0, 1] - c[1, 2])
     gamma = (c[0, 0] - lam - 2.0 * mu - 4.0 * beta + 4.0 * alpha) / 8.0
     return {"lam": lam, "mu": mu, "alpha": alpha, "beta": beta, "gamma": gamma}

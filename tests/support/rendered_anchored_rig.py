@@ -17,16 +17,15 @@ import numpy as np
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, cross_matrix, rotation_exp
-from morph_dslam.io.calibration import save_camera
+from morph_dslam.io.camera_files import save_camera
 from morph_dslam.model import ReducedModel, load_model, save_model
-from morph_dslam.online.several.rig import RigCamera
-from morph_dslam.online.slam.map_file import save_map
-from morph_dslam.online.slam.slam import Slam
-from morph_dslam.render.environment import StaticScene
-from morph_dslam.render.motion import Motion, plan_motion
+from morph_dslam.render.environment import Motion, StaticScene, plan_motion
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.scene_file import Scene, load_scene_file
 from morph_dslam.render.scene_renderer import SceneRenderer, supersampled
+from morph_dslam.slam.map_files import save_map
+from morph_dslam.slam.slam import Slam
+from morph_dslam.tracking.multi_camera import RigCamera
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.camchain import write_camchain
 from tests.support.rendered_anchored import write_registration
@@ -119,10 +118,7 @@ class _Film:
 
 
 _SCAN_AND_BEND = _Film(
-    FRAMES,
-    {0: "-200, -560, 340", 16: "0, -480, 440", 35: "120, -560, 330", 47: "40, -560, 360"},
-    SCAN,
-    FRAMES - 1,
+    FRAMES, {0: "-200, -560, 340", 16: "0, -480, 440", 35: "120, -560, 330", 47: "40, -560, 360"}, SCAN, FRAMES - 1
 )
 #: From where the scan began, and farther round, where the last keyframes show little of the wedge.
 _LEFT = _Film(LEFT_FRAMES, {0: "-200, -560, 340", LEFT_FRAMES - 1: "-420, -420, 320"}, 0, LEFT_FRAMES - 1)
@@ -155,10 +151,7 @@ def make_rig_recording(folder: Path) -> dict[str, dict[str, np.ndarray]]:
     for name, model in models.items():
         save_model(folder / f"{name}.morph", model)
     parts = {name: _part(folder, name, model, _SCAN_AND_BEND) for name, model in models.items()}
-    for camera, name, frames in (
-        (RIG[0], "front", range(FRAMES)),
-        (RIG[1], "aside", range(FIRST_BESIDE, FRAMES)),
-    ):
+    for camera, name, frames in ((RIG[0], "front", range(FRAMES)), (RIG[1], "aside", range(FIRST_BESIDE, FRAMES))):
         _write_film(folder, name, parts, camera, frames)
     truth = _truth(parts)
     save_camera(folder / "camera.yaml", _CAMERA)
@@ -198,8 +191,7 @@ def make_mirrored_recording(folder: Path, keyframes: Sequence[int]) -> dict[str,
     write_camchain(folder / "camchain_mirrored.yaml", MIRRORED_RIG)
     scan, left = _truth(films[_SCAN_AND_BEND]), _truth(films[_LEFT])
     return {
-        name: {key: np.concatenate([scan[name][key][:SCAN], left[name][key]]) for key in scan[name]}
-        for name in scan
+        name: {key: np.concatenate([scan[name][key][:SCAN], left[name][key]]) for key in scan[name]} for name in scan
     }
 
 
@@ -235,12 +227,7 @@ def _film(folder, parts, part, frames):
     places = np.array([pose.inverse.translation for pose in poses])
     light = np.array(sheet.scene.light.direction)
     around = StaticScene(
-        sheet.scene.environment,
-        folder,
-        supersampled(part.camera, 2),
-        places,
-        light,
-        sheet.scene.light.ambient,
+        sheet.scene.environment, folder, supersampled(part.camera, 2), places, light, sheet.scene.light.ambient
     )
     with_table = SceneRenderer(sheet.scene, sheet.model, part.camera, folder, 0.3, around)
     alone = SceneRenderer(wedge.scene, wedge.model, part.camera, folder, 0.3)
@@ -285,15 +272,15 @@ def _write_adjusted(path, truth, centre):
     for keyframe in content["keyframes"]:
         exact = truth["camera_from_object"][keyframe["frame"]]
         turn = exact[:3, :3]
-        causes = np.zeros((6, 6))
-        causes[:3, :3] = causes[3:, 3:] = turn
-        causes[3:, :3] = cross_matrix(turn @ centre) @ turn
-        step = causes @ error
+        error_factors = np.zeros((6, 6))
+        error_factors[:3, :3] = error_factors[3:, 3:] = turn
+        error_factors[3:, :3] = cross_matrix(turn @ centre) @ turn
+        step = error_factors @ error
         pose = RigidTransform(rotation_exp(step[:3]) @ turn, exact[:3, 3] + step[3:])
-        causes *= KEYFRAME_DEVIATIONS
+        error_factors *= KEYFRAME_DEVIATIONS
         keyframe |= {
             "camera_from_object": pose.matrix.tolist(),
-            "causes": causes.tolist(),
-            "covariance": (causes @ causes.T).tolist(),
+            "error_factors": error_factors.tolist(),
+            "covariance": (error_factors @ error_factors.T).tolist(),
         }
     path.with_name("adjusted.json").write_text(json.dumps(content))

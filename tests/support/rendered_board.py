@@ -62,9 +62,7 @@ def board_poses(camera, board, n_views, largest_tilt, seed=0, fill=0.45):
         axis = np.array([np.cos(direction), np.sin(direction), 0.0])
         turn = Rotation.from_rotvec(tilt * axis) * Rotation.from_euler("z", rng.uniform(-0.6, 0.6))
         depth = camera.fx * board.square * board.columns / (fill * camera.width) * rng.uniform(0.8, 1.5)
-        centre = depth * np.array(
-            [*rng.uniform(-0.5, 0.5, 2) * [camera.width, camera.height] / camera.fx, 1.0]
-        )
+        centre = depth * np.array([*rng.uniform(-0.5, 0.5, 2) * [camera.width, camera.height] / camera.fx, 1.0])
         pose = RigidTransform(turn.as_matrix(), centre - turn.as_matrix() @ middle)
         pixels = camera.project_recorded(pose.apply(outline))
         if ((pixels > 2.0) & (pixels < np.array([camera.width, camera.height]) - 3.0)).all():

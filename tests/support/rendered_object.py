@@ -6,11 +6,11 @@ import numpy as np
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.online.measuring.flow import flatten
-from morph_dslam.online.mesh_registration.scene import MapPoints, View
+from morph_dslam.registration.scene import MapPoints, View
 from morph_dslam.render.model_view import looking_at
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
+from morph_dslam.tracking.patches import flatten
 from tests.support.rendered_sequence import printed_texture
 
 CAMERA = PinholeCamera(480, 360, 420.0, 420.0, 239.5, 179.5)
@@ -35,9 +35,7 @@ def wedge(cells=8):
         weights = np.column_stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b])
         nodes.append(weights @ c)
         triangles.append(np.concatenate([np.column_stack([p, q, r]), np.column_stack([p, r, s])]) + offset)
-        coordinates.append(
-            np.column_stack([a, b]) * 150.0 + [150.0 * (number % 3) + 20, 160.0 * (number // 3) + 20]
-        )
+        coordinates.append(np.column_stack([a, b]) * 150.0 + [150.0 * (number % 3) + 20, 160.0 * (number // 3) + 20])
         offset += len(a)
     nodes, triangles = np.concatenate(nodes), np.concatenate(triangles)
     # Nodes on shared edges are one, so that the surface is closed; textures may tear there.
@@ -96,9 +94,7 @@ def scanned(world_from_object, objects=ONE, noise=3e-4, seed=0, with_images=Fals
         flat = np.full((CAMERA.height, CAMERA.width), 128, dtype=np.uint8)
         if with_images:
             local = pose.apply(scene)
-            drawn = rasterise(
-                CAMERA.project(local), local[:, 2], scene_triangles, CAMERA.height, CAMERA.width
-            )
+            drawn = rasterise(CAMERA.project(local), local[:, 2], scene_triangles, CAMERA.height, CAMERA.width)
             image = render_textured(drawn, scene_triangles, np.tile(coordinates, (len(objects), 1)), texture)
             flat = np.where(drawn.covered, image, np.uint8(128)).astype(np.uint8)
         camera_from_world = _camera_from_world(pose, world_from_object)
@@ -108,13 +104,7 @@ def scanned(world_from_object, objects=ONE, noise=3e-4, seed=0, with_images=Fals
     kept = count >= 2
     rows = np.cumsum(kept) - 1
     views = [
-        View(
-            v.frame,
-            v.flat,
-            v.camera_from_world,
-            rows[v.point_ids[kept[v.point_ids]]],
-            v.pixels[kept[v.point_ids]],
-        )
+        View(v.frame, v.flat, v.camera_from_world, rows[v.point_ids[kept[v.point_ids]]], v.pixels[kept[v.point_ids]])
         for v in views
     ]
     noisy = points + noise * rng.standard_normal(points.shape)

@@ -7,9 +7,9 @@ import numpy as np
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.online.estimation.estimator import State
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
+from morph_dslam.tracking.estimator import State
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
 UPRIGHT = np.diag([1.0, -1.0, -1.0])
@@ -56,9 +56,7 @@ class SheetFilm:
         """One image (h, w, 3) uint8; ``light`` scales the sheet only, ``occluder`` is (x, y, w, h)."""
         nodes = state.camera_from_object.apply(self.model.positions(state.parameters))
         camera = self.camera
-        buffers = rasterise(
-            camera.project(nodes), nodes[:, 2], self.model.triangles, camera.height, camera.width
-        )
+        buffers = rasterise(camera.project(nodes), nodes[:, 2], self.model.triangles, camera.height, camera.width)
         sheet = render_textured(buffers, self.model.triangles, self.coordinates, self.texture)
         image = np.where(buffers.covered, light * sheet, self.background)
         if occluder is not None:

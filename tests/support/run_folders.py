@@ -7,7 +7,7 @@ import numpy as np
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.io.calibration import save_camera
+from morph_dslam.io.camera_files import save_camera
 from morph_dslam.model import SurfacePoints, save_model
 from tests.support.bent_sheet import bent_sheet_model
 
@@ -58,15 +58,12 @@ def write_run(folder, status=None, frames=FRAMES):
 def exact_truth(model, n_points=60, frames=FRAMES, seed=1):
     """Truth arrays (frame, points_mm, pixels) of random surface points that move exactly as `states` says."""
     rng = np.random.default_rng(seed)
-    points = SurfacePoints(
-        rng.integers(len(model.triangles), size=n_points), rng.dirichlet(np.ones(3), n_points)
-    )
+    points = SurfacePoints(rng.integers(len(model.triangles), size=n_points), rng.dirichlet(np.ones(3), n_points))
     corners = model.triangles[points.triangles]
     parameters, poses = states(len(frames))
     positions = np.array(
         [
-            np.einsum("pc,pcx->px", points.weights, model.positions(mu)[corners]) @ pose[:3, :3].T
-            + pose[:3, 3]
+            np.einsum("pc,pcx->px", points.weights, model.positions(mu)[corners]) @ pose[:3, :3].T + pose[:3, 3]
             for mu, pose in zip(parameters, poses, strict=True)
         ]
     )

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from morph_dslam.online.estimation.estimator import State
+from morph_dslam.tracking.estimator import State
 from tests.support.staged_scenes import Scene, aside
 from tests.support.stated_cases import FRAMES, Shown
 
@@ -120,9 +120,7 @@ def strange(scene: Scene, n: int = 30) -> list[Shown]:
 
 def in_place(shown: list[Shown], scene: Scene) -> list[Shown]:
     """The same frames with the place that a map has the object in, for a scene whose camera alone moves."""
-    return [
-        replace(view, place=scene.state((k + 1) / FRAMES).camera_from_object) for k, view in enumerate(shown)
-    ]
+    return [replace(view, place=scene.state((k + 1) / FRAMES).camera_from_object) for k, view in enumerate(shown)]
 
 
 def carried_off(scene: Scene, n: int = 60, offset: float = 0.15) -> list[Shown]:

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-from dataclasses import asdict
-
-import h5py
 import numpy as np
 
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.model.basis_functions import Basis
-from morph_dslam.model.compact_modes import GridModes
-from morph_dslam.model.stacked_functions import stack_components
+from morph_dslam.model.separated import GridModes
+from morph_dslam.model.tensor_functions import stack_components
 from tests.support.function_formats import SMOOTH, make_functions
 
 PARAMETERS = (
@@ -40,10 +35,7 @@ def block_model(form: str, bases: tuple[Basis, ...] = SMOOTH) -> ReducedModel:
     if form == "by_component":
         parts = [("cp", 1), ("tucker", 2), ("tensor_train", 3)]
         displacement = stack_components(
-            [
-                SeparatedField(rng.normal(size=(n, N**3, 1)), make_functions(part, n, bases))
-                for part, n in parts
-            ]
+            [SeparatedField(rng.normal(size=(n, N**3, 1)), make_functions(part, n, bases)) for part, n in parts]
         )
     elif form == "grid":
         axes = tuple(rng.normal(size=(6, N)) for _ in range(3))
@@ -63,27 +55,3 @@ def block_model(form: str, bases: tuple[Basis, ...] = SMOOTH) -> ReducedModel:
         certificate={"displacement": {"mean_mm": 0.01}},
         provenance={"study": "a block"},
     )
-
-
-def save_version_2(path, model) -> None:
-    """Write a model with polynomials as releases up to version 2 of the file did."""
-    with h5py.File(path, "w") as file:
-        file.attrs["format"], file.attrs["version"] = "morph-dslam reduced model", 2
-        file.attrs["name"] = model.name
-        file.attrs["parameters"] = json.dumps([asdict(parameter) for parameter in model.parameters])
-        file.attrs["certificate"] = json.dumps(model.certificate)
-        file.attrs["provenance"] = json.dumps(model.provenance)
-        file["nodes"], file["triangles"] = model.nodes, model.triangles.astype(np.int32)
-        for name, field in model.fields.items():
-            file[f"fields/{name}/modes"] = field.modes.astype(np.float32)
-            file[f"fields/{name}/multi_indices"] = field.functions.multi_indices.astype(np.uint8)
-            file[f"fields/{name}/coefficients"] = field.functions.coefficients
-        names = []
-        file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
-        digest = hashlib.sha256()
-        for name in sorted(names):
-            digest.update(f"{name}{file[name].shape}{file[name].dtype.str}".encode())
-            digest.update(file[name][()].tobytes())
-        for name in ("name", "parameters", "certificate", "provenance"):
-            digest.update(file.attrs[name].encode())
-        file.attrs["content_sha256"] = digest.hexdigest()

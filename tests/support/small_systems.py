@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import scipy.sparse as sp
 
-from morph_dslam.offline.solvers.linear_solver import AssembledLinearisation, LinearSolver
+from morph_dslam.mechanics.solvers.linear_solver import AssembledLinearisation, LinearSolver
 
 Function = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -24,12 +24,7 @@ class SmallSystem:
     """
 
     def __init__(
-        self,
-        n_dofs: int,
-        residual: Function,
-        tangent: Function,
-        slopes: Function,
-        prescribed_dof: int | None = None,
+        self, n_dofs: int, residual: Function, tangent: Function, slopes: Function, prescribed_dof: int | None = None
     ) -> None:
         self.n_dofs, self.scale = n_dofs, 1.0
         self.free = np.ones(n_dofs, dtype=bool)

@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.mechanics.materials.isotropic import NeoHookean
+from morph_dslam.mechanics.parameters import ParameterSymbols
+from morph_dslam.mechanics.solid import SolidProblem
+from morph_dslam.mechanics.solvers.newton import State, advance
+from morph_dslam.mechanics.supports import AffineMotion
+from morph_dslam.meshing.generators import block
+from morph_dslam.meshing.meshes import CellBlock, Mesh
 from morph_dslam.model import Parameter
-from morph_dslam.offline.materials.isotropic import NeoHookean
-from morph_dslam.offline.mechanics.parameters import ParameterSymbols
-from morph_dslam.offline.mechanics.solid import SolidProblem
-from morph_dslam.offline.mechanics.supports import AffineMotion
-from morph_dslam.offline.meshing.mesh_generators import block
-from morph_dslam.offline.meshing.meshes import CellBlock, Mesh
-from morph_dslam.offline.solvers.newton import State, advance
 
 Array = NDArray[np.float64]
 
@@ -76,10 +76,7 @@ def merged(meshes: list[Mesh]) -> Mesh:
     nodes = np.concatenate([mesh.nodes for mesh in meshes])
     _, first, number = np.unique(np.round(nodes, 9), axis=0, return_index=True, return_inverse=True)
     connectivity = np.concatenate(
-        [
-            number.ravel()[mesh.blocks[0].connectivity + start]
-            for mesh, start in zip(meshes, starts, strict=False)
-        ]
+        [number.ravel()[mesh.blocks[0].connectivity + start] for mesh, start in zip(meshes, starts, strict=False)]
     )
     cells = np.cumsum([0] + [mesh.n_cells for mesh in meshes])
     surfaces = {}

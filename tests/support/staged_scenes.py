@@ -17,8 +17,12 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.online.estimation.estimator import State
-from morph_dslam.online.frame_result import (
+from morph_dslam.render.model_view import looking_at
+from morph_dslam.render.rasteriser import rasterise
+from morph_dslam.render.texture import render_textured
+from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.observability import position_std
+from morph_dslam.tracking.result import (
     DIMENSIONS_OFF,
     FEW_AGREE,
     HAS_MOVED,
@@ -27,10 +31,6 @@ from morph_dslam.online.frame_result import (
     UNCHECKED,
     UNEXPLAINED,
 )
-from morph_dslam.online.uncertainty.confidence import position_std
-from morph_dslam.render.model_view import looking_at
-from morph_dslam.render.rasteriser import rasterise
-from morph_dslam.render.texture import render_textured
 from tests.support.bent_sheet import LENGTH, WIDTH, _separated, bent_sheet_model, deflection_terms
 from tests.support.rendered_object import wedge
 from tests.support.rendered_sequence import CAMERA, UPRIGHT, printed_texture
@@ -57,9 +57,7 @@ def bending_wedge(turned: bool = False, power: float = 2.0) -> ReducedModel:
         modes = np.array([[-y * rise, x * rise, zero], [zero, zero, rise]]) * [[[25.0]], [[1.0]]]
     names = ("twist", "raise") if turned else ("push_x", "push_y")
     parameters = tuple(Parameter(name, "length", "mm", -REACH, REACH, 0.0, "") for name in names)
-    functions = ParameterFunctions(
-        np.full(2, -REACH), np.full(2, REACH), np.eye(2, dtype=np.int64), REACH * np.eye(2)
-    )
+    functions = ParameterFunctions(np.full(2, -REACH), np.full(2, REACH), np.eye(2, dtype=np.int64), REACH * np.eye(2))
     field = SeparatedField(np.ascontiguousarray(modes.transpose(0, 2, 1)), functions)
     return ReducedModel("wedge", nodes, triangles, parameters, field, {})
 
@@ -221,9 +219,7 @@ def _wedge(seed: int, around: bool) -> Scene:
         direction = np.array([np.cos(angle), np.sin(angle), -0.6])
         pose = looking_at(middle, direction, 0.22 + 0.01 * w[3])
         if not around:
-            pose = RigidTransform(
-                rotation_exp(0.1 * w[3:6]) @ pose.rotation, pose.translation + w[5:8] * 0.01
-            )
+            pose = RigidTransform(rotation_exp(0.1 * w[3:6]) @ pose.rotation, pose.translation + w[5:8] * 0.01)
         ramp = min(4.0 * time, 1.0)
         return State(ramp * 0.012 * w[:2], pose)
 

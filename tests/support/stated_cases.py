@@ -11,13 +11,11 @@ import numpy as np
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import ReducedModel
-from morph_dslam.online.anchored.known_pose import KnownPose
-from morph_dslam.online.estimation.estimator import State
-from morph_dslam.online.pipeline import Tracker
-from morph_dslam.online.runs.results import RunResults
-from morph_dslam.online.runs.run_flags import flags
-from morph_dslam.online.start.placement import Placement
-from morph_dslam.online.start.registration import register
+from morph_dslam.registration.landmarks import register
+from morph_dslam.registration.registration import PosePrior, Registration
+from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.run_folder import RunResults, flags
+from morph_dslam.tracking.tracker import Tracker
 from tests.support.staged_scenes import Scene, is_beyond, is_doubted, mean_error
 
 #: Frames of a recording at 30 a second that show one unit of a scene's time.
@@ -90,10 +88,10 @@ def _seen(scene: Scene, positions, pixels):
     return visible_points(pixels, positions[:, 2], buffers.depth, 1e-3)
 
 
-def placed_by_landmarks(scene: Scene, model: ReducedModel, seed: int) -> Placement:
-    """As `place_by_landmarks` does it, in the scene's first frame."""
+def placed_by_landmarks(scene: Scene, model: ReducedModel, seed: int) -> Registration:
+    """As `register_by_landmarks` does it, in the scene's first frame."""
     found = register(model, scene.stage.camera, *landmarks(scene, model, seed=seed))
-    return Placement(model, None, found.state, {}, found.flags, covariance=found.covariance)
+    return Registration(model, None, found.state, {}, found.flags, covariance=found.covariance)
 
 
 class InMap:
@@ -108,18 +106,18 @@ class InMap:
         self._scene, self._model, self._rng = scene, model, np.random.default_rng(seed)
         self._off = LASTING * self._rng.standard_normal(6)
 
-    def placement(self) -> Placement:
+    def placement(self) -> Registration:
         """In the scene's first frame, as a keyframe of the map has it."""
         model, truth = self._model, self._scene.state(0.0).camera_from_object
         covariance = np.zeros((len(model.parameters) + 6,) * 2)
         covariance[-6:, -6:] = np.diag(LASTING**2)
         state = State(model.default, _off_by(truth, self._off))
-        return Placement(model, None, state, {}, (), covariance=covariance)
+        return Registration(model, None, state, {}, (), covariance=covariance)
 
-    def known(self, place: RigidTransform) -> KnownPose:
+    def known(self, place: RigidTransform) -> PosePrior:
         """Where the map has the object in a frame whose camera sees it at ``place``."""
         error = self._off + FROM_CAMERA * self._rng.standard_normal(6)
-        return KnownPose(_off_by(place, error), np.diag(FROM_CAMERA**2), np.diag(LASTING))
+        return PosePrior(_off_by(place, error), np.diag(FROM_CAMERA**2), np.diag(LASTING))
 
 
 def _off_by(pose: RigidTransform, error) -> RigidTransform:
@@ -128,7 +126,7 @@ def _off_by(pose: RigidTransform, error) -> RigidTransform:
 
 def run_case(
     scene: Scene,
-    placement: Placement,
+    placement: Registration,
     shown: Iterable[Shown],
     back_at: int | None = None,
     in_map: InMap | None = None,

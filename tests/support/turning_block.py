@@ -9,9 +9,9 @@ import numpy as np
 
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import Parameter, ReducedModel
-from morph_dslam.online.estimation.estimator import State
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
+from morph_dslam.tracking.estimator import State
 from tests.support.bent_sheet import _separated
 from tests.support.rendered_sequence import CAMERA, UPRIGHT, printed_texture
 
@@ -43,10 +43,7 @@ def _faces(cells):
     nodes = [weights @ (0.5 * SIZE * np.array(face)) for face in _FACES]
     squares = np.concatenate([np.column_stack([p, q, r]), np.column_stack([p, r, s])])
     triangles = [squares + k * len(a) for k in range(len(_FACES))]
-    places = [
-        np.column_stack([a + k % 3, b + k // 3]) * (_PRINT - 1.0) + [k % 3, k // 3]
-        for k in range(len(_FACES))
-    ]
+    places = [np.column_stack([a + k % 3, b + k // 3]) * (_PRINT - 1.0) + [k % 3, k // 3] for k in range(len(_FACES))]
     return np.concatenate(nodes), np.concatenate(triangles), np.concatenate(places)
 
 
@@ -57,13 +54,8 @@ def turning_block(cells=12):
     rows = rows.ravel()
     x, y, z = nodes.T
     along, none = 2.0 * y / SIZE[1], np.zeros(len(nodes))
-    terms = {
-        (1, 0): np.column_stack([none, none, along**2]),
-        (0, 1): np.column_stack([along * z, none, -along * x]),
-    }
-    model = ReducedModel(
-        "turning block", nodes, rows[triangles], PARAMETERS, _separated(terms, PARAMETERS), {}
-    )
+    terms = {(1, 0): np.column_stack([none, none, along**2]), (0, 1): np.column_stack([along * z, none, -along * x])}
+    model = ReducedModel("turning block", nodes, rows[triangles], PARAMETERS, _separated(terms, PARAMETERS), {})
     return model, rows
 
 
@@ -71,9 +63,7 @@ def block_state(turn, time):
     """Turned about y by ``turn``, radians, and deformed; both deformations are zero at ``time`` 0 and 1."""
     parameters = np.array([0.008 * np.sin(np.pi * time), radians(8) * np.sin(2 * np.pi * time)])
     tilt = rotation_exp(np.array([0.25, 0.0, 0.0]))
-    pose = RigidTransform(
-        tilt @ UPRIGHT @ rotation_exp(np.array([0.0, turn, 0.0])), np.array([0.0, 0.0, 0.33])
-    )
+    pose = RigidTransform(tilt @ UPRIGHT @ rotation_exp(np.array([0.0, turn, 0.0])), np.array([0.0, 0.0, 0.33]))
     return State(parameters, pose)
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from morph_dslam.errors import StudyError
 from morph_dslam.model import Parameter
-from morph_dslam.offline.studies.affine import read_affine
+from morph_dslam.studies.affine import read_affine
 
 PARAMETERS = (
     Parameter("load", "pressure", "kPa", 0.0, 5e3, 0.0),

@@ -9,7 +9,7 @@ import pytest
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import SurfacePoints
-from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, State, moved
+from morph_dslam.tracking.estimator import BoundPoints, Estimator, State, moved
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.real_data import ROOT
 
@@ -32,9 +32,7 @@ def test_differences_of_the_field_are_its_derivatives(alternatives):
     np.testing.assert_allclose(found, FUNCTIONS.rows(MU), rtol=1e-4, atol=1e-7)
     # Also at the end of the box, where there are values on one side only.
     end = MODEL.upper
-    np.testing.assert_allclose(
-        alternatives.Differenced(FUNCTIONS).rows(end), FUNCTIONS.rows(end), rtol=1e-3, atol=1e-6
-    )
+    np.testing.assert_allclose(alternatives.Differenced(FUNCTIONS).rows(end), FUNCTIONS.rows(end), rtol=1e-3, atol=1e-6)
 
 
 def test_linear_elastic_model_is_the_tangent(alternatives):

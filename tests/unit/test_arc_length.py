@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import SolverError
-from morph_dslam.offline.solvers.arc_length import ArcLength, ArcOptions, missed_bifurcations
-from morph_dslam.offline.solvers.buckling import buckling_modes
-from morph_dslam.offline.solvers.newton import State
+from morph_dslam.mechanics.solvers.arc_length import ArcLength, ArcOptions, buckling_modes, missed_bifurcations
+from morph_dslam.mechanics.solvers.newton import State
 from tests.support.small_systems import SmallSystem, link_chain, spring_column, von_mises_truss
 
 HEIGHT = 0.3

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from morph_dslam.online.mesh_registration.attitudes import TURNS, attitudes
-from morph_dslam.online.mesh_registration.regions import find_planes
-from morph_dslam.online.mesh_registration.surface import Axis
+from morph_dslam.registration.icp import Axis, find_planes
+from morph_dslam.registration.mesh import TURNS, attitudes
 
 NORMAL = np.array([2.0, -3.0, 6.0]) / 7.0
 

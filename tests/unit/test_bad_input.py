@@ -9,18 +9,18 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam import cli
+from morph_dslam.cli import app as cli
 from morph_dslam.errors import EvaluationError, MorphError, RegistrationError, TrackingError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.evaluation.run_report import write_run_report
-from morph_dslam.io.calibration import load_camera
-from morph_dslam.io.landmarks import load_landmarks
+from morph_dslam.io.camera_files import load_camera
+from morph_dslam.io.tables import load_landmarks
 from morph_dslam.io.trajectory import load_trajectory
 from morph_dslam.model import save_model
-from morph_dslam.online.aids.board import load_board
-from morph_dslam.online.runs.output_folders import check_run_folder, write_registration
-from morph_dslam.online.start.placement import load_placement
-from morph_dslam.online.start.reregistration import Reregistration
+from morph_dslam.registration.board import load_board
+from morph_dslam.registration.registration import load_registration
+from morph_dslam.tracking.run_folder import check_run_folder, write_registration
+from morph_dslam.tracking.setup import Reregistration
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.block_study import write_study
 from tests.support.run_folders import write_run
@@ -88,17 +88,13 @@ def test_an_inner_structure_that_cannot_be_written(folder, capsys, name):
 @pytest.mark.parametrize("name", ["board", "board.jpg", "", "absent/board.png", "file/board.pdf"])
 def test_a_board_that_cannot_be_written(folder, capsys, name):
     before = sorted(folder.parent.iterdir())
-    assert "cannot write the board to" in message_of(
-        capsys, "board", folder / "board.toml", "-o", folder / name
-    )
+    assert "cannot write the board to" in message_of(capsys, "board", folder / "board.toml", "-o", folder / name)
     assert sorted(folder.parent.iterdir()) == before
 
 
 def test_a_board_in_the_wrong_unit(folder, capsys):
     (folder / "board.toml").write_text(BOARD.replace("30", "3e9"))
-    assert "sizes are in millimetres" in message_of(
-        capsys, "board", folder / "board.toml", "-o", folder / "board.png"
-    )
+    assert "sizes are in millimetres" in message_of(capsys, "board", folder / "board.toml", "-o", folder / "board.png")
     (folder / "board.toml").write_text(BOARD + "[object]\nposition_mm = [1e300, 0, 0]\n")
     with pytest.raises(RegistrationError, match="position_mm"):
         load_board(folder / "board.toml")
@@ -132,9 +128,7 @@ def test_nothing_but_our_message_is_printed_of_a_damaged_video(folder):
     whole = (folder / "film.mp4").read_bytes()
     (folder / "film.mp4").write_bytes(whole[: len(whole) // 2])
     arguments = ["calibrate", str(folder / "film.mp4"), "--board", "9x6", "--square", "25 mm", "-o"]
-    program = (
-        f"from morph_dslam.cli import main; raise SystemExit(main({[*arguments, str(folder / 'c.yaml')]}))"
-    )
+    program = f"from morph_dslam.cli import main; raise SystemExit(main({[*arguments, str(folder / 'c.yaml')]}))"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
@@ -176,9 +170,7 @@ def test_frames_to_place_the_object_anew_in_that_cannot_be(tmp_path):
     setup, placement = SimpleNamespace(aid=object()), SimpleNamespace()
     with pytest.raises(RegistrationError, match=r"absent\.csv"):
         Reregistration(setup, placement, [(7, tmp_path / "absent.csv")])
-    assert Reregistration(setup, placement, [(7, None)]).notes == [
-        "not placed anew in frame 7: it was not tracked"
-    ]
+    assert Reregistration(setup, placement, [(7, None)]).notes == ["not placed anew in frame 7: it was not tracked"]
 
 
 def test_a_damaged_summary_is_named(tmp_path):
@@ -207,7 +199,7 @@ REGISTRATION = {
 def test_a_registration_with_parts_of_another_shape(tmp_path):
     path, model = tmp_path / "registration.json", bent_sheet_model(7, 5)
     path.write_text(json.dumps(REGISTRATION))
-    assert load_placement(path, model).frame == 3
+    assert load_registration(path, model).frame == 3
     keyframe = REGISTRATION["keyframes"][0]
     for wrong in (
         {"world_from_object": [1, 2]},
@@ -226,17 +218,17 @@ def test_a_registration_with_parts_of_another_shape(tmp_path):
     ):
         path.write_text(json.dumps(REGISTRATION | wrong))
         with pytest.raises(RegistrationError, match="is not a registration"):
-            load_placement(path, model)
+            load_registration(path, model)
 
 
 def test_a_registration_of_another_object(tmp_path):
     path, model = tmp_path / "registration.json", bent_sheet_model(7, 5)
     size = np.linalg.norm(np.ptp(model.nodes, axis=0))
     path.write_text(json.dumps(REGISTRATION | {"mean_node_m": [0.08 * size, 0.0, 0.0]}))
-    assert load_placement(path, model).frame == 3
+    assert load_registration(path, model).frame == 3
     path.write_text(json.dumps(REGISTRATION | {"mean_node_m": [0.0, 0.2 * size, 0.0]}))
     with pytest.raises(RegistrationError, match=rf"places another object .* are {200 * size:.1f} mm apart"):
-        load_placement(path, model)
+        load_registration(path, model)
 
 
 def test_a_folder_that_holds_a_run_or_cannot_be_made(tmp_path):

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from morph_dslam.diagnostics.statements import BestTold
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.online.estimation.estimator import Estimate, State
-from morph_dslam.online.uncertainty.best_told import BestTold
+from morph_dslam.tracking.estimator import Estimate, State
 
 
 def estimate(value, deviation):
@@ -16,8 +16,8 @@ def estimate(value, deviation):
     return Estimate(state, 0.0, np.empty((0, 2)), 0.0, covariance, np.zeros(2, dtype=bool), 1, True)
 
 
-def told(best, value, deviation, untold=False):
-    found = best.stated(estimate(value, deviation), np.array([untold])).covariance
+def told(best, value, deviation, unobservable=False):
+    found = best.stated(estimate(value, deviation), np.array([unobservable])).covariance
     # Others' deviations, and the correlations, stay as they are.
     np.testing.assert_allclose(np.diag(found)[1:], 1.0)
     np.testing.assert_allclose(found[0, 1], 0.5 * np.sqrt(found[0, 0]))
@@ -32,7 +32,7 @@ def test_a_frame_that_tells_little_states_what_the_best_one_did_and_the_change_s
 
 def test_a_small_deviation_of_a_frame_that_tells_nothing_is_not_kept():
     best = BestTold(np.array([0]))
-    found = [told(best, 2.0, 0.3), told(best, 2.0, 0.01, untold=True), told(best, 2.0, 4.0)]
+    found = [told(best, 2.0, 0.3), told(best, 2.0, 0.01, unobservable=True), told(best, 2.0, 4.0)]
     np.testing.assert_allclose(found, [0.3, 0.01, 0.3])
 
 

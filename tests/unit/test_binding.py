@@ -9,21 +9,12 @@ from scipy.spatial import ConvexHull
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel, SeparatedField
-from morph_dslam.online.estimation.estimator import BoundPoints, State
-from morph_dslam.online.measuring.binding import (
-    DrawnSurface,
-    bind_pixels,
-    draw_view,
-    facing,
-    nearest_surface_points,
-    view_of,
-)
+from morph_dslam.tracking.binding import DrawnSurface, bind_pixels, draw_view, facing, nearest_surface_points, view_of
+from morph_dslam.tracking.estimator import BoundPoints, State
 from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
-STATE = State(
-    np.array([0.03, 0.2, 0.1]), RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
-)
+STATE = State(np.array([0.03, 0.2, 0.1]), RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6])))
 
 
 def test_nearest_surface_point_agrees_with_a_minimiser():
@@ -49,9 +40,7 @@ def test_nearest_point_of_the_sheet_is_the_foot_of_the_normal():
     points, distances = nearest_surface_points(
         model.nodes, model.triangles, np.array([[0.05, -0.03, 0.004], [0.3, 0.0, 0.0]])
     )
-    np.testing.assert_allclose(
-        model.rest_positions(points), [[0.05, -0.03, 0.0], [0.21, 0.0, 0.0]], atol=1e-12
-    )
+    np.testing.assert_allclose(model.rest_positions(points), [[0.05, -0.03, 0.0], [0.21, 0.0, 0.0]], atol=1e-12)
     np.testing.assert_allclose(distances, [0.004, 0.09], atol=1e-12)
 
 

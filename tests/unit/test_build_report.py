@@ -13,13 +13,17 @@ import pytest
 
 from morph_dslam.errors import StudyError
 from morph_dslam.evaluation.report import Picture
-from morph_dslam.offline.report import build_report
-from morph_dslam.offline.report.build_report import report_path, write_build_report
-from morph_dslam.offline.report.chosen_states import half_way_out, states_to_show
-from morph_dslam.offline.report.mode_curves import plot_convergence
-from morph_dslam.offline.report.reference_curve import ReferenceCurve, read_reference_curve
-from morph_dslam.render.colour_maps import colour_table
+from morph_dslam.reduction import report as build_report
+from morph_dslam.reduction.report import report_path, write_build_report
+from morph_dslam.reduction.report_pictures import (
+    ReferenceCurve,
+    half_way_out,
+    plot_convergence,
+    read_reference_curve,
+    states_to_show,
+)
 from morph_dslam.render.model_view import draw_shapes
+from morph_dslam.render.shading import colour_table
 from tests.support.certified_block import certified_block_model
 from tests.support.stretched_block import PARAMETERS
 
@@ -133,16 +137,7 @@ def test_a_reference_curve_is_drawn_with_its_name(tmp_path, model):
 
 
 @pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "modes,a\n",
-        "modes,a\n1,x\n",
-        "modes,a\n1\n",
-        "modes,a\n1,-2\n",
-        "modes\n1,2\n",
-        "modes,a\n1,nan\n",
-    ],
+    "text", ["", "modes,a\n", "modes,a\n1,x\n", "modes,a\n1\n", "modes,a\n1,-2\n", "modes\n1,2\n", "modes,a\n1,nan\n"]
 )
 def test_what_is_no_reference_curve_is_refused(tmp_path, text):
     (tmp_path / "curve.csv").write_text(text)
@@ -172,12 +167,7 @@ def test_shapes_fill_their_pictures_in_the_colours_of_their_values():
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]], dtype=float)
     triangles = np.array([[0, 1, 2], [0, 2, 3]])
     low, high = draw_shapes(
-        triangles,
-        [square, square],
-        [np.zeros(4), np.ones(4)],
-        (0.0, 1.0),
-        np.array([0.0, 1.0, 0.0]),
-        (200, 100),
+        triangles, [square, square], [np.zeros(4), np.ones(4)], (0.0, 1.0), np.array([0.0, 1.0, 0.0]), (200, 100)
     )
     for image, colour in ((low, colour_table("turbo")[0]), (high, colour_table("turbo")[255])):
         assert image.shape == (100, 200, 3)

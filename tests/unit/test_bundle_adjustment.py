@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.online.slam.bundle_adjustment import Observations, adjust, total_cost
+from morph_dslam.slam.bundle_adjustment import Observations, adjust, total_cost
 
 INTRINSICS = np.array([520.0, 515.0, 321.0, 238.0])
 BASELINE_PX = 50.0

@@ -4,7 +4,7 @@ import pytest
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import CameraError
-from morph_dslam.io.calibration import load_camera, save_camera
+from morph_dslam.io.camera_files import load_camera, save_camera
 
 GOOD = "width: 640\nheight: 480\nfx: 528.0\nfy: 527.5\ncx: 320\ncy: 239.5\n"
 

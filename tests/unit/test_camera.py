@@ -80,9 +80,7 @@ def test_recorded_jacobian_by_central_differences(camera):
     jacobian = camera.recorded_jacobian(points)
     for axis in range(3):
         offset = step * np.eye(3)[axis]
-        difference = (camera.project_recorded(points + offset) - camera.project_recorded(points - offset)) / (
-            2 * step
-        )
+        difference = (camera.project_recorded(points + offset) - camera.project_recorded(points - offset)) / (2 * step)
         np.testing.assert_allclose(jacobian[:, :, axis], difference, rtol=1e-5, atol=1e-4)
 
 
@@ -112,9 +110,7 @@ def test_undistortion_maps_are_opencvs(camera):
     arguments = (camera.matrix, coefficients, np.eye(3), camera.matrix, size, cv2.CV_32FC1)
     make = cv2.fisheye.initUndistortRectifyMap if camera is FISHEYE else cv2.initUndistortRectifyMap
     image = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (480, 640), np.uint8), (0, 0), 3.0)
-    ours, theirs = (
-        cv2.remap(image, *m, cv2.INTER_LINEAR) for m in (camera.undistortion_maps(), make(*arguments))
-    )
+    ours, theirs = (cv2.remap(image, *m, cv2.INTER_LINEAR) for m in (camera.undistortion_maps(), make(*arguments)))
     # The maps are stored to 1/32 pixel.
     assert np.abs(ours.astype(int) - theirs)[5:-5, 5:-5].max() <= 2
 

@@ -9,7 +9,7 @@ import pytest
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import CameraError
-from morph_dslam.io.calibration import load_camera, save_camera
+from morph_dslam.io.camera_files import load_camera, save_camera
 from tests.support.real_data import real_data
 
 ROS = """image_width: 640
@@ -110,9 +110,7 @@ BROWN = (-0.28, 0.07, 0.0002, 1.76e-05)
         (ORB_SLAM2, PinholeCamera(752, 480, 458.654, 457.296, 367.215, 248.375, BROWN)),
         (
             ORB_SLAM3,
-            PinholeCamera(
-                512, 512, 190.97, 190.97, 254.93, 256.89, (0.0034, 0.0007, -0.002, 0.0002), "fisheye"
-            ),
+            PinholeCamera(512, 512, 190.97, 190.97, 254.93, 256.89, (0.0034, 0.0007, -0.002, 0.0002), "fisheye"),
         ),
         (EUROC, (458.654, (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05))),
     ],
@@ -169,11 +167,7 @@ def test_what_opencv_writes(tmp_path, n_coefficients):
         ("SIMPLE_RADIAL 640 480 500 320 240 -0.1", (-0.1, 0, 0, 0), "radial-tangential"),
         ("RADIAL 640 480 500 320 240 -0.1 0.02", (-0.1, 0.02, 0, 0), "radial-tangential"),
         ("OPENCV 640 480 500 500 320 240 -0.1 0.02 3e-4 4e-4", (-0.1, 0.02, 3e-4, 4e-4), "radial-tangential"),
-        (
-            "FULL_OPENCV 640 480 500 500 320 240 1 2 3 4 5 6 7 8",
-            (1, 2, 3, 4, 5, 6, 7, 8),
-            "radial-tangential",
-        ),
+        ("FULL_OPENCV 640 480 500 500 320 240 1 2 3 4 5 6 7 8", (1, 2, 3, 4, 5, 6, 7, 8), "radial-tangential"),
         ("OPENCV_FISHEYE 640 480 500 500 320 240 1 2 3 4", (1, 2, 3, 4), "fisheye"),
         ("RADIAL_FISHEYE 640 480 500 320 240 0.1 0.2", (0.1, 0.2, 0, 0), "fisheye"),
     ],

@@ -5,10 +5,9 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.online.slam.initialisation import turn_residual_px
-from morph_dslam.online.slam.pose import find_pose, refine_pose
-from morph_dslam.online.slam.small_algebra import cholesky_solve, inverse_3x3, orthonormal
-from morph_dslam.online.slam.two_view import camera_centre, ray_angles, triangulate, two_view_hypotheses
+from morph_dslam.slam.bundle_adjustment import cholesky_solve, inverse_3x3, orthonormal
+from morph_dslam.slam.initialization import turn_residual_px
+from morph_dslam.slam.pose import camera_centre, find_pose, ray_angles, refine_pose, triangulate, two_view_hypotheses
 
 INTRINSICS = np.array([520.0, 515.0, 321.0, 238.0])
 

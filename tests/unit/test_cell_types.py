@@ -5,7 +5,7 @@ from math import factorial
 import numpy as np
 import pytest
 
-from morph_dslam.offline.meshing.cell_types import CELL_TYPES, cell_type
+from morph_dslam.meshing.cell_types import CELL_TYPES, cell_type
 
 VOLUMES = {"tri": 1 / 2, "quad": 1.0, "tet": 1 / 6, "prism": 1 / 2, "hex": 1.0}
 SOLIDS = [name for name in CELL_TYPES if cell_type(name).dimension == 3]

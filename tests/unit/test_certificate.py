@@ -8,14 +8,14 @@ from scipy.stats import binom
 
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.offline.certificate import (
+from morph_dslam.reduction.certificate import (
     certify,
     compression_percent,
     confidence_statement,
     covered_share,
     errors_by_modes,
 )
-from morph_dslam.offline.problem import Snapshot
+from morph_dslam.studies.problem import Snapshot
 
 PULL = Parameter("pull", "length", "mm", -0.01, 0.01, 0.0)
 

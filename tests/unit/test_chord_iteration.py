@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from morph_dslam.offline.solvers.chord_iteration import solve_with_kept_tangent
+from morph_dslam.mechanics.solvers.newton import solve_with_kept_tangent
 
 
 @dataclass
@@ -74,6 +74,4 @@ def test_an_iteration_that_leads_away_is_given_up():
     """With the sign of the tangent wrong, then values that are not numbers."""
     equations = Cubic()
     equations.residual = lambda x, mu: np.full(1, np.nan) if abs(x[0]) > 3.0 else x**3 + x - mu
-    assert (
-        solve_with_kept_tangent(equations, np.array([2.2]), np.array([0.5]), Slope(-0.5, np.zeros(1))) is None
-    )
+    assert solve_with_kept_tangent(equations, np.array([2.2]), np.array([0.5]), Slope(-0.5, np.zeros(1))) is None

@@ -8,15 +8,14 @@ import pytest
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.model.turned_model import turned_model
-from morph_dslam.online.estimation.clear_effect import without_clear_effect
-from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, State
-from morph_dslam.online.estimation.sequence_filter import SequenceFilter
-from morph_dslam.online.uncertainty.measurement_noise import Measured
+from morph_dslam.model.reduced_model import with_revolution_angle
+from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
+from morph_dslam.tracking.noise import Observations
+from morph_dslam.tracking.sequence_filter import SequenceFilter, without_clear_effect
 from tests.support.bent_tube import AXIS, bent_tube
 
 CAMERA = PinholeCamera(640, 480, 560.0, 560.0, 320.0, 240.0)
-MODEL = turned_model(bent_tube(), AXIS)
+MODEL = with_revolution_angle(bent_tube(), AXIS)
 ESTIMATOR = Estimator(MODEL, CAMERA)
 POSE = RigidTransform(rotation_exp(np.array([2.2, 0.1, 0.0])), np.array([0.0, 0.04, 0.4]))
 TURN, SIDE = 1, 2.1
@@ -33,7 +32,7 @@ def bound():
 
 def measured(points, state, errors):
     pixels = CAMERA.project(points.in_camera(state)) + errors
-    return Measured(points, pixels, np.ones(COUNT), np.zeros((COUNT, 2)), np.eye(COUNT))
+    return Observations(points, pixels, np.ones(COUNT), np.zeros((COUNT, 2)), np.eye(COUNT))
 
 
 def followed(seed):
@@ -44,9 +43,7 @@ def followed(seed):
         errors = np.sqrt(0.5) * SIGMA * (stays + rng.standard_normal((COUNT, 2)))
         seen = measured(points, State(np.array([load, SIDE]), POSE), errors)
         starts = [State(np.array([0.1, side]), POSE) for side in (-2.0, 0.0, 2.0)]
-        alone = min(
-            (ESTIMATOR.fit(seen, one) for one in (start, *starts)), key=lambda estimate: estimate.cost
-        )
+        alone = min((ESTIMATOR.fit(seen, one) for one in (start, *starts)), key=lambda estimate: estimate.cost)
         estimate = filtered.fuse(seen, alone)
         start = estimate.state
         off = (start.parameters[TURN] - SIDE + np.pi) % (2.0 * np.pi) - np.pi

@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from morph_dslam import cli
-from morph_dslam.command_arguments import frame_range
+from morph_dslam.cli import app as cli
+from morph_dslam.cli.arguments import frame_range
 from morph_dslam.errors import StudyError
 from morph_dslam.model import save_model
 from tests.support.bent_sheet import bent_sheet_model
@@ -74,9 +74,7 @@ def test_a_broken_pipe_elsewhere_is_not_hidden(monkeypatch):
         cli.main(["info", "model.morph"])
 
 
-@pytest.mark.parametrize(
-    "arguments", [[], ["dance"], ["info"], ["evaluate", "run"], ["info", "a", "--wrong"]]
-)
+@pytest.mark.parametrize("arguments", [[], ["dance"], ["info"], ["evaluate", "run"], ["info", "a", "--wrong"]])
 def test_wrong_usage_exits_2(arguments, capsys):
     with pytest.raises(SystemExit) as caught:
         cli.main(arguments)
@@ -86,10 +84,7 @@ def test_wrong_usage_exits_2(arguments, capsys):
 
 @pytest.mark.parametrize(
     ("error", "status", "message"),
-    [
-        (StudyError("mend it so"), 2, "morph: mend it so"),
-        (KeyboardInterrupt(), 130, "interrupted; nothing was"),
-    ],
+    [(StudyError("mend it so"), 2, "morph: mend it so"), (KeyboardInterrupt(), 130, "interrupted; nothing was")],
 )
 def test_errors_and_interrupts_become_statuses(monkeypatch, capsys, error, status, message):
     def fail(arguments):
@@ -126,9 +121,7 @@ def test_wrong_frame_ranges(text, capsys):
 
 def test_info_says_what_a_model_holds(tmp_path, capsys):
     model = bent_sheet_model(7, 5)
-    model.certificate.update(
-        {"displacement": {"mean_mm": 0.21, "n_held_out": 32}, "compression_percent": 98.7}
-    )
+    model.certificate.update({"displacement": {"mean_mm": 0.21, "n_held_out": 32}, "compression_percent": 98.7})
     model.provenance.update({"morph_dslam": "0.1.0", "study": "name = 'x'\n" * 50})
     save_model(tmp_path / "sheet.morph", model)
     assert cli.main(["info", str(tmp_path / "sheet.morph")]) == 0

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.io.calibration import load_camera
-from morph_dslam.io.colmap_model import ColmapImage, write_colmap_model
+from morph_dslam.io.camera_files import load_camera
+from morph_dslam.io.colmap import ColmapImage, write_colmap_model
 from morph_dslam.io.trajectory import load_trajectory
 
 CAMERA = PinholeCamera(640, 480, 500.0, 510.0, 320.5, 238.0)
@@ -47,11 +47,7 @@ def test_points_project_to_their_pixels_by_the_written_numbers(model):
     for head, body in zip(lines[::2], lines[1::2], strict=True):
         words = head.split()
         quaternion, shift = np.array(words[1:5], float), np.array(words[5:8], float)
-        views[int(words[0])] = (
-            Rotation.from_quat(np.roll(quaternion, -1)),
-            shift,
-            np.array(body.split(), float),
-        )
+        views[int(words[0])] = (Rotation.from_quat(np.roll(quaternion, -1)), shift, np.array(body.split(), float))
     rows = [line.split() for line in (folder / "points3D.txt").read_text().splitlines()]
     # Two of the eight points are seen by no image.
     assert [int(row[0]) for row in rows] == [1, 2, 3, 4, 6, 8]

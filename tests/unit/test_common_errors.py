@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from morph_dslam.online.uncertainty.common_errors import (
+from morph_dslam.tracking.covariance import (
     ALIKE_SHARE,
     FACTOR_TOLERANCE,
     MOST_COMPARED,
     PAIR_SHARE,
-    CommonErrors,
+    SharedErrors,
     gaussian_factor,
 )
 
@@ -53,7 +53,7 @@ def case():
 
 def test_what_pairs_have_in_common_is_the_mean_over_them(case):
     points, used, jacobian, _ = case
-    common, (_, pairs) = CommonErrors(points, WINDOW), covariance_and_pairs(points)
+    common, (_, pairs) = SharedErrors(points, WINDOW), covariance_and_pairs(points)
     chosen = [(i, j) for i, j in np.argwhere(pairs) if used[i] and used[j]]
     assert common.n_pairs(used) == len(chosen)
     mean = sum(jacobian[i].T @ jacobian[j] for i, j in chosen) / (2 * len(chosen))
@@ -62,7 +62,7 @@ def test_what_pairs_have_in_common_is_the_mean_over_them(case):
 
 def test_the_gradient_of_an_alike_error_and_what_is_left_of_it(case):
     points, used, jacobian, scores = case
-    common, (alike, pairs) = CommonErrors(points, WINDOW), covariance_and_pairs(points)
+    common, (alike, pairs) = SharedErrors(points, WINDOW), covariance_and_pairs(points)
     both = np.kron(alike, np.eye(2))  # alike in the same coordinate of others
     rows, weighted = jacobian.reshape(-1, 4), scores.reshape(-1, 4)
     gradients = common.gradients(scores)
@@ -78,7 +78,7 @@ def test_the_gradient_of_an_alike_error_and_what_is_left_of_it(case):
 def test_of_many_points_some_tell_what_all_have_in_common():
     points = places(4 * MOST_COMPARED)
     wave = np.column_stack([np.sin(points[:, 0] / 200.0), np.cos(points[:, 1] / 150.0)])[:, :, None]
-    common, used = CommonErrors(points, WINDOW), np.ones(len(points), dtype=bool)
+    common, used = SharedErrors(points, WINDOW), np.ones(len(points), dtype=bool)
     spread = np.sqrt(np.sum(np.var(points, axis=0)))
     apart = points[:, None] - points[None]
     pairs = np.linalg.norm(apart, axis=2) < PAIR_SHARE * spread

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.recovery import material_points
 from morph_dslam.model import SeparatedField
 from morph_dslam.model.basis_functions import hat_basis
-from morph_dslam.model.compact_modes import ComponentModes, GridModes
-from morph_dslam.model.stacked_functions import StackedFunctions, stack_components
-from morph_dslam.model.tensor_functions import CPFunctions
-from morph_dslam.offline.material_points import material_points
-from morph_dslam.offline.reduction.grid_separation import separate_grid
+from morph_dslam.model.separated import ComponentModes, GridModes
+from morph_dslam.model.tensor_functions import CPFunctions, StackedFunctions, stack_components
+from morph_dslam.reduction.grid_functions import separate_grid
 from tests.support.function_formats import FORMATS, LOWER, UPPER, make_functions
 from tests.support.small_models import block_model
 
@@ -141,7 +140,5 @@ def test_points_inside_of_cells_follow_the_interpolated_field():
 
 
 def test_points_outside_of_the_solid_are_refused():
-    with pytest.raises(
-        StudyError, match=r"1 of 2 points lie outside of the solid, the first at \(120, 0, 0\)"
-    ):
+    with pytest.raises(StudyError, match=r"1 of 2 points lie outside of the solid, the first at \(120, 0, 0\)"):
         material_points(block_model("tucker"), np.array([[0.05, 0.05, 0.05], [0.12, 0.0, 0.0]]))

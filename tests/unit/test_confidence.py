@@ -5,13 +5,8 @@ import pytest
 
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model.reduced_model import von_mises
-from morph_dslam.online.estimation.estimator import Estimate, State
-from morph_dslam.online.uncertainty.confidence import (
-    displacement_std,
-    largest_displacement,
-    largest_von_mises,
-    von_mises_std,
-)
+from morph_dslam.tracking.estimator import Estimate, State
+from morph_dslam.tracking.observability import displacement_std, largest_displacement, largest_von_mises, von_mises_std
 from tests.support.bent_sheet import bent_sheet_model
 
 MODEL = bent_sheet_model(22, 16)

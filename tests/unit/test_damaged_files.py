@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from morph_dslam import cli
+from morph_dslam.cli import app as cli
 from morph_dslam.errors import ModelFileError
 from morph_dslam.model import load_model, save_model
 from tests.support.function_formats import FORMATS
@@ -87,9 +87,7 @@ def assert_exactly_the_same(loaded, model) -> None:
     middle = (model.lower + model.upper) / 2.0
     for name, field in model.fields.items():
         for one, other in zip(
-            loaded.fields[name].value_and_sensitivities(middle),
-            field.value_and_sensitivities(middle),
-            strict=True,
+            loaded.fields[name].value_and_sensitivities(middle), field.value_and_sensitivities(middle), strict=True
         ):
             np.testing.assert_array_equal(one, other)
 

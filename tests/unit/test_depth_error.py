@@ -7,8 +7,8 @@ import h5py
 import numpy as np
 import pytest
 
-from morph_dslam.cli import main
-from morph_dslam.evaluation.depth_error import RIM_PX, depth_error
+from morph_dslam.cli.app import main
+from morph_dslam.evaluation.depth import RIM_PX, depth_error
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.render.rasteriser import rasterise_numpy
 from tests.support.run_folders import CAMERA, write_run
@@ -46,9 +46,7 @@ def test_distances_are_those_of_the_sensor_and_what_is_in_front_is_left_out(fold
     assert error.compared.max() <= 0.003 * longest_ray
     assert np.median(error.compared) == pytest.approx(0.003, rel=0.05)
     covered = surface_depth(load_run(folder), 1) > 0.0
-    inside = cv2.erode(
-        covered.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * RIM_PX + 1,) * 2)
-    )
+    inside = cv2.erode(covered.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * RIM_PX + 1,) * 2))
     assert error.left_out[1] == pytest.approx(60 * 60 / np.count_nonzero(inside), rel=0.1)
     assert error.left_out[0] == 0.0
 
@@ -63,9 +61,7 @@ def test_means_at_nodes_are_of_the_points_around_them(folder):
 
 
 def test_the_command_prints_the_base_beside_the_error(folder, capsys):
-    assert (
-        main(["evaluate", str(folder), "--depth", str(folder.parent / "depth.h5"), "--base-frame", "10"]) == 0
-    )
+    assert main(["evaluate", str(folder), "--depth", str(folder.parent / "depth.h5"), "--base-frame", "10"]) == 0
     line = capsys.readouterr().out.splitlines()[-1]
     values = dict(part.split("=") for part in line.split())
     assert float(values["surface_median_mm"]) == pytest.approx(3.0, rel=0.05)

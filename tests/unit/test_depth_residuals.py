@@ -6,15 +6,10 @@ import pytest
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.online.estimation.depth_residuals import (
-    DepthOptions,
-    PointDepths,
-    linearise_depths,
-    linearise_depths_numpy,
-)
-from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, State, moved
-from morph_dslam.online.estimation.sequence_filter import SequenceFilter
-from morph_dslam.online.uncertainty.measurement_noise import Measured
+from morph_dslam.tracking.depth import DepthOptions, PointDepths, linearise_depths, linearise_depths_numpy
+from morph_dslam.tracking.estimator import BoundPoints, Estimator, State, moved
+from morph_dslam.tracking.noise import Observations
+from morph_dslam.tracking.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
@@ -86,11 +81,9 @@ def test_depth_helps_along_the_sight_line_and_deviations_say_how_much():
         for with_depth in (True, False):
             depths = measured_depths(points, rng, 0.6e-3) if with_depth else None
             alone = estimator.estimate(points, pixels, weights, TRUTH, depths=depths)
-            measured = Measured(points, pixels, weights, normals, np.eye(80), depths)
+            measured = Observations(points, pixels, weights, normals, np.eye(80), depths)
             estimate = SequenceFilter(estimator, []).fuse(measured, alone)
-            found[with_depth].append(
-                [*estimate.state.parameters, *estimate.state.camera_from_object.translation]
-            )
+            found[with_depth].append([*estimate.state.parameters, *estimate.state.camera_from_object.translation])
             stated[with_depth].append([*estimate.parameter_std, *estimate.pose_std[3:]])
     spread = {key: np.std(values, axis=0) for key, values in found.items()}
     assert spread[True][5] < 0.6 * spread[False][5]

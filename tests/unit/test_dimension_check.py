@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morph_dslam.online.estimation.estimator import BoundPoints, EstimationOptions, Estimator
-from morph_dslam.online.measuring.binding import bind_pixels, view_of
-from morph_dslam.online.uncertainty.bound_part import BoundPart
-from morph_dslam.online.uncertainty.confidence import position_std
-from morph_dslam.online.uncertainty.dimension_check import AS_BEST, NUMBERS, DimensionCheck
-from morph_dslam.online.uncertainty.reference_misfit import FLOOR_PX
-from morph_dslam.online.uncertainty.stretch_evidence import TOLERANCE
+from morph_dslam.diagnostics.dimensions import AS_BEST, NUMBERS, TOLERANCE, DimensionCheck
+from morph_dslam.diagnostics.reference_misfit import FLOOR_PX
+from morph_dslam.tracking.binding import bind_pixels, view_of
+from morph_dslam.tracking.covariance import BoundPart
+from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator
+from morph_dslam.tracking.observability import position_std
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.one_view import errors_of
 from tests.support.rendered_sequence import CAMERA, sheet_state
@@ -164,17 +163,18 @@ def check():
     return Stretched(np.zeros(3)).errors._dimensions
 
 
-def frames(count, scale=1.0, n_causes=4, stretch=0.03, causes=0.5, seed=0):
-    """Residuals (p, 2) and what one stretch and the causes leave (p, 2, 1 + c), of frames of 50 points."""
+def frames(count, scale=1.0, n_causes=4, stretch=0.03, error_factors=0.5, seed=0):
+    """Residuals (p, 2) and what one stretch and the error factors leave (p, 2, 1 + c), of frames of 50
+    points."""
     rng = np.random.default_rng(seed)
     size = np.array([20.0 * scale, *np.full(n_causes, 0.3)])
-    truth = np.array([stretch, *causes * rng.standard_normal(n_causes)])
+    truth = np.array([stretch, *error_factors * rng.standard_normal(n_causes)])
     lefts = [size * rng.standard_normal((50, 2, 1 + n_causes)) for _ in range(count)]
     return [(left @ truth + 0.1 * rng.standard_normal((50, 2)), left) for left in lefts]
 
 
 def test_the_estimate_is_that_of_least_squares(check):
-    """Minimised at once, with all frames' residuals and the causes' own size among the rows."""
+    """Minimised at once, with all frames' residuals and the error factors' own size among the rows."""
     rng, shown = np.random.default_rng(1), frames(3)
     rows, numbers = [np.eye(5)], [np.zeros(5)]
     for residuals, left in shown:
@@ -207,9 +207,9 @@ def test_many_frames_count_as_a_few_of_the_best(check):
 def test_causes_that_are_larger_than_stated_make_the_stretch_less_sure(check):
     weights = np.ones(50)
     deviations = []
-    for causes in (0.5, 20.0):
+    for error_factors in (0.5, 20.0):
         check._information, check._product, check._best = np.zeros((0, 0)), np.zeros(0), 0.0
-        for residuals, left in frames(3, causes=causes):
+        for residuals, left in frames(3, error_factors=error_factors):
             shared = left.copy()
             shared[:, :, 0] += 30.0 * left[:, :, 1]  # a cause that leaves nearly what the stretch leaves
             check.learn(residuals, shared, weights)

@@ -16,11 +16,10 @@ from morph_dslam.model.discrepancy import (
     load_discrepancies,
     save_discrepancies,
 )
-from morph_dslam.online.estimation.discrepancy import DiscrepancyFit, DiscrepancyOptions
-from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, State
-from morph_dslam.online.reference.discrepancy_refinement import Reference, refine_discrepancy
-from morph_dslam.online.reference.reference_refinement import Keyframe
-from morph_dslam.online.uncertainty.measurement_noise import Measured
+from morph_dslam.tracking.discrepancy import DiscrepancyFit, DiscrepancyOptions, Reference, refine_discrepancy
+from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
+from morph_dslam.tracking.noise import Observations
+from morph_dslam.tracking.refinement import Keyframe
 from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
@@ -109,12 +108,12 @@ def test_a_shape_that_the_model_does_not_have_is_found_from_one_image(radius, an
     normals = np.zeros((200, 2))
     state = Estimator(MODEL, CAMERA).estimate(points, pixels, weights, State(np.array([0.01]), POSE)).state
     fit = DiscrepancyFit(MODEL, CAMERA, DiscrepancyOptions(steps=4))
-    found = fit.fit(Measured(points, pixels, weights, normals, np.zeros((0, 0))), state)
+    found = fit.fit(Observations(points, pixels, weights, normals, np.zeros((0, 0))), state)
     by_model = mean_distance(state, None, truth)
     assert by_model > 4e-3
     assert mean_distance(state, found, truth) < 0.4 * by_model
     # From the discrepancy of the frame before one step leads to the same.
-    again = fit.fit(Measured(points, pixels, weights, normals, np.zeros((0, 0))), state, found)
+    again = fit.fit(Observations(points, pixels, weights, normals, np.zeros((0, 0))), state, found)
     np.testing.assert_allclose(again.values, found.values, atol=3e-4)
 
 
@@ -124,7 +123,7 @@ def test_where_the_model_is_right_nothing_is_added():
     exact = CAMERA.project(points.in_camera(state))
     pixels, none = exact + NOISE_PX * rng.standard_normal((200, 2)), np.zeros((200, 2))
     fit = DiscrepancyFit(MODEL, CAMERA, DiscrepancyOptions())
-    found = fit.fit(Measured(points, pixels, np.ones(200), none, np.zeros((0, 0))), state)
+    found = fit.fit(Observations(points, pixels, np.ones(200), none, np.zeros((0, 0))), state)
     assert mean_distance(state, found, MODEL.positions(state.parameters)) < 0.7e-3
 
 

@@ -9,17 +9,16 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.materials.isotropic import NeoHookean
-from morph_dslam.offline.mechanics.displacement_space import DisplacementSpace
-from morph_dslam.offline.mechanics.loads import DeadTraction
-from morph_dslam.offline.mechanics.ngsolve_mesh import NgsolveMesh, reference_points
-from morph_dslam.offline.mechanics.point_location import locate
-from morph_dslam.offline.mechanics.solid import SolidOptions, SolidProblem
-from morph_dslam.offline.mechanics.supports import fixed
-from morph_dslam.offline.meshing.mesh_generators import block, tube
-from morph_dslam.offline.meshing.mesh_geometry import cell_volumes
-from morph_dslam.offline.meshing.meshes import CellBlock, Mesh
-from morph_dslam.offline.solvers.newton import solve
+from morph_dslam.mechanics.loads import DeadTraction
+from morph_dslam.mechanics.materials.isotropic import NeoHookean
+from morph_dslam.mechanics.ngsolve_mesh import NgsolveMesh, reference_points
+from morph_dslam.mechanics.recovery import locate
+from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.mechanics.solvers.newton import solve
+from morph_dslam.mechanics.spaces import DisplacementSpace
+from morph_dslam.mechanics.supports import fixed
+from morph_dslam.meshing.generators import block, tube
+from morph_dslam.meshing.meshes import CellBlock, Mesh, cell_volumes
 from tests.support.solids import SOLID_CELLS, distorted
 
 
@@ -88,19 +87,13 @@ def test_overlapping_sets_become_regions() -> None:
     mesh = block((3.0, 1.0, 1.0), (3, 1, 1), "hex8")
     faces = mesh.surfaces["z_max"]
     mesh = replace(
-        mesh,
-        cell_sets={"a": np.array([0, 1]), "b": np.array([1, 2])},
-        surfaces={**mesh.surfaces, "part": faces[:1]},
+        mesh, cell_sets={"a": np.array([0, 1]), "b": np.array([1, 2])}, surfaces={**mesh.surfaces, "part": faces[:1]}
     )
     geometry = NgsolveMesh(mesh)
     for name, volume in (("a", 2.0), ("b", 2.0), ("all", 3.0)):
-        assert ngs.Integrate(ngs.CF(1.0) * ngs.dx(geometry.region(name)), geometry.ngs) == pytest.approx(
-            volume
-        )
+        assert ngs.Integrate(ngs.CF(1.0) * ngs.dx(geometry.region(name)), geometry.ngs) == pytest.approx(volume)
     for name, area in (("part", 1.0), ("z_max", 3.0), ("x_min", 1.0)):
-        assert ngs.Integrate(ngs.CF(1.0) * ngs.ds(geometry.boundary(name)), geometry.ngs) == pytest.approx(
-            area
-        )
+        assert ngs.Integrate(ngs.CF(1.0) * ngs.ds(geometry.boundary(name)), geometry.ngs) == pytest.approx(area)
     numbers = geometry.cell_field(np.array([1.0, 10.0, 100.0]))
     found = [ngs.Integrate(numbers, geometry.ngs, definedon=geometry.region(name)) for name in "ab"]
     assert found == pytest.approx([11.0, 110.0])

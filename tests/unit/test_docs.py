@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
-from morph_dslam import cli
+from morph_dslam.cli import app as cli
 from morph_dslam.model import SeparatedField, load_model, save_model
 from morph_dslam.model.basis_functions import chebyshev_basis
 from morph_dslam.model.tensor_functions import TuckerFunctions
@@ -19,10 +19,7 @@ from tests.support.function_formats import FORMATS
 from tests.support.small_models import block_model
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGES = [
-    *DOCS.glob("*.md"),
-    *(DOCS.parent / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG")),
-]
+PAGES = [*DOCS.glob("*.md"), *(DOCS.parent / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG"))]
 
 
 def documented_readers():
@@ -56,9 +53,7 @@ def test_the_short_reader_reads_what_studies_make(tmp_path):
         with h5py.File(tmp_path / "sheet.morph") as file:
             found = short(file, "displacement", mu)
         # modes are kept in single precision
-        scale = (
-            np.abs(model.displacement.modes).max() * np.abs(model.displacement.functions.rows(mu)[0]).sum()
-        )
+        scale = np.abs(model.displacement.modes).max() * np.abs(model.displacement.functions.rows(mu)[0]).sum()
         np.testing.assert_allclose(found, model.displacement.value(mu), rtol=0.0, atol=1e-7 * scale)
 
 
@@ -106,9 +101,7 @@ def check_that_the_certificate_is_documented(model):
     keys -= {*model.fields, *(parameter.name for parameter in model.parameters)}
     named = code_words("certificate")
     assert len(keys) > 30
-    assert {
-        key for key in keys if not {key, re.sub(r"(_N|_Nmm|_mm|_MPa)?$", "_", key, count=1)} & named
-    } == set()
+    assert {key for key in keys if not {key, re.sub(r"(_N|_Nmm|_mm|_MPa)?$", "_", key, count=1)} & named} == set()
 
 
 def anchor(heading: str) -> str:
@@ -144,9 +137,7 @@ def test_commands_in_documents_have_these_options():
 def test_programs_and_files_in_documents_exist():
     n_files = 0
     for page in PAGES:
-        for name in re.findall(
-            r"(?<![\w/.])(?:examples|benchmarks|tests|docs)/[\w/-]+\.\w+", page.read_text()
-        ):
+        for name in re.findall(r"(?<![\w/.])(?:examples|benchmarks|tests|docs)/[\w/-]+\.\w+", page.read_text()):
             if "output/" not in name and "/NAME/" not in name:
                 assert (DOCS.parent / name).exists(), f"{page.name}: {name}"
                 n_files += 1
@@ -164,8 +155,6 @@ def test_pages_that_messages_and_programs_name_exist():
 
 def test_targets_of_make_exist():
     targets = set(re.findall(r"^([a-z-]+):", (DOCS.parent / "Makefile").read_text(), flags=re.MULTILINE))
-    named = {
-        t for page in PAGES for t in re.findall(r"(?:^|`)make ([a-z-]+)", page.read_text(), re.MULTILINE)
-    }
+    named = {t for page in PAGES for t in re.findall(r"(?:^|`)make ([a-z-]+)", page.read_text(), re.MULTILINE)}
     assert {"demo", "test", "test-all"} <= named
     assert named <= targets

@@ -11,20 +11,19 @@ import numpy as np
 import pytest
 from pydantic import BaseModel
 
-from morph_dslam import cli
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.io.calibration import _CameraFile
-from morph_dslam.offline.external import ExternalStudy
-from morph_dslam.offline.materials.table import LAWS, constant_quantities
-from morph_dslam.offline.studies.sheet_study import SheetStudy
-from morph_dslam.offline.studies.solid_study import SolidStudy
-from morph_dslam.online.aids.board import BoardFile
-from morph_dslam.online.aids.guess import GuessFile
-from morph_dslam.online.aids.picture import PictureFile
-from morph_dslam.online.runs.results import RunResults, summarise, write_csv, write_hdf5
-from morph_dslam.online.slam.output import write_run as write_slam_run
-from morph_dslam.online.slam.slam import Slam
+from morph_dslam.cli import app as cli
+from morph_dslam.io.camera_files import _CameraFile
+from morph_dslam.mechanics.materials.library import LAWS, constant_quantities
+from morph_dslam.registration.board import BoardFile
+from morph_dslam.registration.guess import GuessFile, PictureFile
 from morph_dslam.render.scene_file import Scene
+from morph_dslam.slam.output import write_run as write_slam_run
+from morph_dslam.slam.slam import Slam
+from morph_dslam.studies.external import ExternalStudy
+from morph_dslam.studies.sheet_study import SheetStudy
+from morph_dslam.studies.solid_study import SolidStudy
+from morph_dslam.tracking.run_folder import RunResults, summarise, write_csv, write_hdf5
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.documents import PAGES, PROJECT, code_words
 from tests.support.small_models import block_model
@@ -138,15 +137,16 @@ def test_options_that_pages_name_exist():
 
 
 def test_modules_and_names_in_pages_exist():
-    """Dotted names in code, `offline.reduction.pod` say, are modules or what they hold; a `model` is one."""
-    n_names, a_model = 0, block_model("tucker")
+    """Dotted names in code, `reduction.pod` say, are modules or what they hold; a `model` is one."""
+    n_names, a_model, keys = 0, block_model("tucker"), keys_of(SheetStudy, SolidStudy)
     for page, text in PAGES.items():
-        for name in re.findall(r"`((?:morph_dslam|offline|online|model|materials)\.[\w.]+\w)[`(]", text):
+        packages = "morph_dslam|mechanics|meshing|studies|reduction|tracking|model|materials"
+        for name in re.findall(rf"`((?:{packages})\.[\w.]+\w)[`(]", text):
             first, _, rest = name.partition(".")
-            package = {"morph_dslam": "morph_dslam", "materials": "morph_dslam.offline.materials"}
+            package = {"morph_dslam": "morph_dslam", "materials": "morph_dslam.mechanics.materials"}
             full = f"{package.get(first, f'morph_dslam.{first}')}.{rest}"
             of_a_model = first == "model" and hasattr(a_model, rest.partition(".")[0])
-            assert of_a_model or name == "model.morph" or exists(full), f"{page}: {name}"
+            assert of_a_model or rest in keys or name == "model.morph" or exists(full), f"{page}: {name}"
             n_names += 1
     assert n_names > 25
 
@@ -171,11 +171,9 @@ def exists(dotted: str) -> bool:
 
 def test_flags_in_the_table_are_those_of_the_program():
     """Every phrase in the table stands in the source, across the lines that a text is broken into."""
-    source = " ".join(path.read_text() for path in (PROJECT / "src/morph_dslam/online").rglob("*.py"))
+    source = " ".join(path.read_text() for path in (PROJECT / "src/morph_dslam").rglob("*.py"))
     source = re.sub(r'"\s*\n\s*f?"', "", source)
-    source = re.sub(
-        r"\{HAS_MOVED\}|\{MAY_BE_ANOTHER\}|\{REFERENCE_WORSE\}|\{DIMENSIONS_OFF\}|\{UN\w+\}", "", source
-    )
+    source = re.sub(r"\{HAS_MOVED\}|\{MAY_BE_ANOTHER\}|\{REFERENCE_WORSE\}|\{DIMENSIONS_OFF\}|\{UN\w+\}", "", source)
     table = PAGES["run-folder"].partition("### Flags")[2].partition("\n\n[")[0]
     phrases = re.findall(r"`([^`]+)`", " ".join(row.split("|")[1] for row in table.splitlines() if row))
     assert len(phrases) > 20

@@ -11,22 +11,21 @@ import pytest
 
 from morph_dslam import make_study
 from morph_dslam.errors import StudyError
-from morph_dslam.export.export import StateChoice
-from morph_dslam.io.calibration import load_camera
-from morph_dslam.io.landmarks import load_landmarks
+from morph_dslam.export import StateChoice
+from morph_dslam.io.camera_files import load_camera
+from morph_dslam.io.tables import load_landmarks
+from morph_dslam.mechanics.materials.library import UserMaterial
 from morph_dslam.model import Parameter, load_model, save_model
 from morph_dslam.model.inner_structure import save_inner_structure
-from morph_dslam.offline.external import ExternalStudy, read_table
-from morph_dslam.offline.inner_structures import place_inner_structure
-from morph_dslam.offline.materials.user import UserMaterial
-from morph_dslam.offline.report.reference_curve import read_reference_curve
-from morph_dslam.offline.studies.affine import read_affine
-from morph_dslam.offline.studies.sheet_study import SheetStudy
-from morph_dslam.offline.studies.solid_study import SolidStudy
-from morph_dslam.online.aids.board import load_board
-from morph_dslam.online.aids.guess import load_guess
-from morph_dslam.online.aids.picture import load_picture
+from morph_dslam.reduction.report_pictures import read_reference_curve
+from morph_dslam.registration.board import load_board
+from morph_dslam.registration.guess import load_guess, load_picture
 from morph_dslam.render.scene_file import load_scene_file
+from morph_dslam.studies.affine import read_affine
+from morph_dslam.studies.build import place_inner_structure
+from morph_dslam.studies.external import ExternalStudy, read_table
+from morph_dslam.studies.sheet_study import SheetStudy
+from morph_dslam.studies.solid_study import SolidStudy
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.documents import PAGES, samples
 from tests.support.small_models import block_model

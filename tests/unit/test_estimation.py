@@ -7,22 +7,20 @@ from scipy.optimize import least_squares
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.online.estimation.bounded_step import bounded_step, bounded_step_numpy
-from morph_dslam.online.estimation.estimator import (
+from morph_dslam.tracking.covariance import huber_covariance, huber_covariance_numpy
+from morph_dslam.tracking.estimator import (
     BoundPoints,
     EstimationOptions,
     Estimator,
     Prior,
     State,
-    moved,
-)
-from morph_dslam.online.estimation.reprojection import (
     linearise,
     linearise_numpy,
+    moved,
     project_with_jacobian,
     project_with_jacobian_numpy,
 )
-from morph_dslam.online.estimation.robust_covariance import huber_covariance, huber_covariance_numpy
+from morph_dslam.tracking.levenberg_marquardt import bounded_step, bounded_step_numpy
 from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 528.0, 520.0, 320.0, 240.0)
@@ -145,9 +143,7 @@ def test_normals_alone_determine_the_state(model, points):
     slid = observed(points, TRUTH, 0.0, rng) + rng.normal(size=(len(points), 1)) * np.column_stack(
         [-normals[:, 1], normals[:, 0]]
     )
-    found = Estimator(model, CAMERA).estimate(
-        points, slid, np.ones(len(points)), start_near(rng, 0.3), normals
-    )
+    found = Estimator(model, CAMERA).estimate(points, slid, np.ones(len(points)), start_near(rng, 0.3), normals)
     np.testing.assert_allclose(found.state.parameters, TRUTH.parameters, atol=1e-6)
 
 
@@ -275,8 +271,7 @@ def test_covariance_agrees_with_monte_carlo(model, points, huber):
     estimator = Estimator(model, CAMERA, EstimationOptions(huber_px=huber))
     rng = np.random.default_rng(10)
     estimates = [
-        estimator.estimate(points, observed(points, TRUTH, 0.8, rng), np.ones(len(points)), TRUTH)
-        for _ in range(300)
+        estimator.estimate(points, observed(points, TRUTH, 0.8, rng), np.ones(len(points)), TRUTH) for _ in range(300)
     ]
     parameters = np.array([estimate.state.parameters for estimate in estimates])
     translations = np.array([estimate.state.camera_from_object.translation for estimate in estimates])
@@ -306,9 +301,7 @@ def test_bounded_step_solves_the_bounded_quadratic():
         gradient = rng.standard_normal(4)
         hessian = root.T @ root + 0.1 * np.eye(4)
         lower, upper = np.full(4, -10.0), np.full(4, 10.0)
-        np.testing.assert_allclose(
-            bounded_step(hessian, gradient, lower, upper), np.linalg.solve(hessian, -gradient)
-        )
+        np.testing.assert_allclose(bounded_step(hessian, gradient, lower, upper), np.linalg.solve(hessian, -gradient))
     held = bounded_step(np.eye(2), np.array([-5.0, 0.3]), np.array([-1.0, 0.0]), np.array([1.0, 1.0]))
     np.testing.assert_allclose(held, [1.0, 0.0])
 
@@ -384,9 +377,7 @@ def test_weak_prior_of_the_pose_is_weighed_against_the_images(model, points):
     away = np.array([0, 0, 0, 0, 0, 0, 0, 0, 2e-4])
     expected = np.linalg.solve(images + known, known @ away)
     estimator = Estimator(model, CAMERA, EstimationOptions(tolerance=1e-13))
-    found = estimator.estimate(
-        points, pixels, weights, TRUTH, prior=pose_prior(known[3:, 3:], away[3:])
-    ).state
+    found = estimator.estimate(points, pixels, weights, TRUTH, prior=pose_prior(known[3:, 3:], away[3:])).state
     np.testing.assert_allclose(found.parameters - TRUTH.parameters, expected[:3], rtol=0.05, atol=1e-6)
     moved_by = found.camera_from_object.translation - POSE.translation
     assert 1e-5 < moved_by[2] < 1.9e-4

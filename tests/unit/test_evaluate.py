@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from morph_dslam.cli import main
+from morph_dslam.cli.app import main
 from tests.support.run_folders import exact_truth, write_run
 
 
@@ -17,11 +17,7 @@ def run_and_truth(tmp_path):
     truth = exact_truth(model)
     truth["points_mm"] = truth["points_mm"] + np.array([0.0, 3.0, 4.0])
     np.savez(tmp_path / "truth.npz", **truth)
-    flags = {
-        "flags": ["the object may be <outside> the model"],
-        "n_recovered": 3,
-        "versions": {"numpy": "9.9"},
-    }
+    flags = {"flags": ["the object may be <outside> the model"], "n_recovered": 3, "versions": {"numpy": "9.9"}}
     (run / "summary.json").write_text(json.dumps(flags))
     return run, tmp_path / "truth.npz"
 
@@ -48,8 +44,7 @@ def test_evaluate_writes_figures_pictures_and_report_and_ends_with_the_result(ru
 
 
 @pytest.mark.parametrize(
-    ("frame", "message"),
-    [("12", "frame 12 was not tracked (too few points)"), ("77", "the truth has no frame 77")],
+    ("frame", "message"), [("12", "frame 12 was not tracked (too few points)"), ("77", "the truth has no frame 77")]
 )
 def test_a_frame_that_cannot_bind_is_one_message(run_and_truth, capsys, frame, message):
     run, truth = run_and_truth

@@ -10,14 +10,13 @@ import pygltflib
 import pytest
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.explore.surface import ModelSurface
-from morph_dslam.export.export import StateChoice, export
+from morph_dslam.explore.server import ModelSurface
+from morph_dslam.export import StateChoice, export
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SeparatedField, SurfacePoints, load_model, save_model
 from morph_dslam.model.basis_functions import cubic_spline_basis
-from morph_dslam.model.stacked_functions import stack_components
-from morph_dslam.model.tensor_functions import CPFunctions, TensorTrainFunctions, TuckerFunctions
-from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, State, moved
+from morph_dslam.model.tensor_functions import CPFunctions, TensorTrainFunctions, TuckerFunctions, stack_components
+from morph_dslam.tracking.estimator import BoundPoints, Estimator, State, moved
 from tests.support.stretched_block import PARAMETERS, SIZE, YOUNG_MODULUS, stretched_block_model
 
 

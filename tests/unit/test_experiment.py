@@ -44,8 +44,7 @@ def test_a_product_whose_making_failed_is_made_again(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("wanted", "expected"),
-    [((None, None), 9), ((9, 100), 9), ((10, None), 17), ((None, 20), 9), ((20, 40), 25)],
+    ("wanted", "expected"), [((None, None), 9), ((9, 100), 9), ((10, None), 17), ((None, 20), 9), ((20, 40), 25)]
 )
 def test_truth_is_bound_in_the_first_frame_of_the_range(tmp_path, wanted, expected):
     path = tmp_path / "truth.npz"

@@ -13,7 +13,7 @@ import threading
 import numpy as np
 import pytest
 
-from morph_dslam import cli
+from morph_dslam.cli import app as cli
 from morph_dslam.explore.server import HOST, make_server
 from morph_dslam.model import save_model
 from tests.support.bent_sheet import bent_sheet_model

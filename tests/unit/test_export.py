@@ -8,12 +8,11 @@ import numpy as np
 import pygltflib
 import pytest
 
-from morph_dslam import cli
+from morph_dslam.cli import app as cli
 from morph_dslam.errors import ExportError
-from morph_dslam.export.export import StateChoice, export
-from morph_dslam.export.gltf import FRAMES_PER_SECOND
+from morph_dslam.export import FRAMES_PER_SECOND, StateChoice, export
+from morph_dslam.meshing.generators import block
 from morph_dslam.model import save_model
-from morph_dslam.offline.meshing.mesh_generators import block
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.stretched_block import SHEAR_MODULUS, SIZE, YOUNG_MODULUS, stretched_block_model
 

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from morph_dslam.online.estimation.filter_memory import PointChange
-from morph_dslam.online.estimation.sequence_filter import SequenceFilter
-from morph_dslam.online.uncertainty.measurement_noise import Measured
+from morph_dslam.tracking.noise import Observations
+from morph_dslam.tracking.sequence_filter import PointChange, SequenceFilter
 from tests.unit.test_sequence_filter import CAMERA, ESTIMATOR, SIGMA, TWIST, bound, truth, twist_errors
 
 COUNT = 60
@@ -32,7 +31,7 @@ def followed(seed, views, lasting=0.8):
         error = of_points[view] + np.sqrt(1.0 - lasting) * SIGMA * rng.standard_normal((COUNT, 2))
         pixels, weights = CAMERA.project(points.in_camera(state)) + error, np.ones(COUNT)
         alone = ESTIMATOR.estimate(points, pixels, weights, state)
-        measured = Measured(points, pixels, weights, np.zeros_like(pixels), np.eye(COUNT))
+        measured = Observations(points, pixels, weights, np.zeros_like(pixels), np.eye(COUNT))
         estimates.append(filtered.fuse(measured, alone))
         states.append(state)
     return (*twist_errors(estimates, states), filtered)
@@ -69,7 +68,7 @@ def test_points_of_a_view_that_cannot_come_back_keep_their_part_of_the_covarianc
         filtered.change_points(change(0, 1, still_there))
         state, points = truth(6), VIEWS[1]
         pixels = CAMERA.project(points.in_camera(state))
-        measured = Measured(points, pixels, np.ones(COUNT), np.zeros_like(pixels), np.eye(COUNT))
+        measured = Observations(points, pixels, np.ones(COUNT), np.zeros_like(pixels), np.eye(COUNT))
         alone = ESTIMATOR.estimate(points, pixels + 0.3, np.ones(COUNT), state)
         stated.append(filtered.fuse(measured, alone).covariance)
     np.testing.assert_allclose(stated[1], stated[0], rtol=1e-9)

@@ -5,17 +5,19 @@ import numpy as np
 import pytest
 
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.online.estimation.estimator import State
-from morph_dslam.online.measuring.appearance import ReferenceAppearance
-from morph_dslam.online.measuring.binding import view_of
-from morph_dslam.online.measuring.features import detect_orb, interior, match_descriptors, spread_corners
-from morph_dslam.online.measuring.flow import (
+from morph_dslam.tracking.binding import view_of
+from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.measurement import ReferenceAppearance, draw_textured, draw_textured_numpy
+from morph_dslam.tracking.patches import (
     NEUTRAL,
     FlowOptions,
+    detect_orb,
     flatten,
     follow,
+    interior,
+    match_descriptors,
+    spread_corners,
 )
-from morph_dslam.online.measuring.textured_view import draw_textured, draw_textured_numpy
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, printed_texture, sheet_state
 

@@ -4,9 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from morph_dslam.online.frame_result import DIMENSIONS_OFF, UNCHECKED
-from morph_dslam.online.frame_statement import FrameStatements
-from morph_dslam.online.uncertainty.stretch_evidence import StretchEvidence, keeping_the_mean
+from morph_dslam.diagnostics.dimensions import StretchEvidence, keeping_the_mean
+from morph_dslam.diagnostics.statements import FrameStatements
+from morph_dslam.tracking.result import DIMENSIONS_OFF, UNCHECKED
 
 SHEET = np.array([True, True, False])
 

@@ -4,10 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import eval_chebyt
 
-from morph_dslam.model.functions import (
-    ParameterFunctions,
-    total_degree_indices,
-)
+from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
 
 
 def random_functions(dimension, degree, n_functions=7, seed=0):
@@ -41,9 +38,7 @@ def test_gradient_by_central_differences():
         gradient = functions.evaluate(mu)[1]
         for k in range(4):
             offset = step * np.eye(4)[k]
-            difference = (functions.evaluate(mu + offset)[0] - functions.evaluate(mu - offset)[0]) / (
-                2 * step
-            )
+            difference = (functions.evaluate(mu + offset)[0] - functions.evaluate(mu - offset)[0]) / (2 * step)
             np.testing.assert_allclose(gradient[k], difference, rtol=1e-5, atol=1e-5)
 
 

@@ -5,14 +5,14 @@ import pytest
 from scipy.optimize import root
 from scipy.sparse import csr_matrix
 
-from morph_dslam.offline.reduction.galerkin import GalerkinEquations, galerkin_modes, newton_correction
-from morph_dslam.offline.solvers.linear_solver import AssembledLinearisation, LinearSolver
-from morph_dslam.offline.solvers.newton import State, advance, sensitivities, solve
+from morph_dslam.mechanics.solvers.linear_solver import AssembledLinearisation, LinearSolver
+from morph_dslam.mechanics.solvers.newton import State, advance, sensitivities, solve
+from morph_dslam.reduction.galerkin import GalerkinEquations, galerkin_modes, newton_correction
 
 SPRINGS = 30
 
 
-class Chain:
+class AnchoredTracker:
     """Springs of force e + b e^3, stiffer towards the right; parameters: end displacement, b, body force."""
 
     def __init__(self):
@@ -63,7 +63,7 @@ class Chain:
         return slopes
 
 
-CHAIN = Chain()
+CHAIN = AnchoredTracker()
 REST = State(np.array([0.0, 20.0, 0.0]), np.zeros(CHAIN.n_dofs))
 UPPER = np.array([3.0, 60.0, 8.0])
 

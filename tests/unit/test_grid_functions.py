@@ -4,19 +4,16 @@ import numpy as np
 import pytest
 
 from morph_dslam.model import Parameter
-from morph_dslam.offline.reduction.bases import parameter_bases
-from morph_dslam.offline.reduction.even_grid import EvenGrid
-from morph_dslam.offline.reduction.grid_functions import (
+from morph_dslam.reduction.grid_functions import (
+    EvenGrid,
     functions_on_grid,
     interpolation_nodes,
     sizes_along_lines,
     values_on_grid,
 )
+from morph_dslam.reduction.task import parameter_bases
 
-PARAMETERS = (
-    Parameter("stretch", "ratio", "1", 1.0, 3.0, 1.0),
-    Parameter("force", "force", "N", -2.0, 2.0, 0.0),
-)
+PARAMETERS = (Parameter("stretch", "ratio", "1", 1.0, 3.0, 1.0), Parameter("force", "force", "N", -2.0, 2.0, 0.0))
 BOX = np.array([[1.0, 3.0], [-2.0, 2.0]])
 
 
@@ -43,9 +40,7 @@ def test_functions_are_as_good_as_lines_ask(basis, form):
 
 
 def test_samples_on_a_grid_are_recognised_in_any_order():
-    points = np.stack(np.meshgrid(np.linspace(1, 3, 5), np.linspace(-2, 2, 4), indexing="ij"), -1).reshape(
-        -1, 2
-    )
+    points = np.stack(np.meshgrid(np.linspace(1, 3, 5), np.linspace(-2, 2, 4), indexing="ij"), -1).reshape(-1, 2)
     shuffled = points[np.random.default_rng(3).permutation(20)]
     grid = EvenGrid.of(shuffled, BOX)
     assert grid is not None

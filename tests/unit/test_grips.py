@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.offline.mechanics.gripped_sheet import mesh_lines
-from morph_dslam.offline.mechanics.grips import ARC_SLOPE, Grips
+from morph_dslam.mechanics.gripped_sheet import mesh_lines
+from morph_dslam.mechanics.supports import ARC_SLOPE, Grips
 
 GRIPS = Grips(length=0.42, depth=0.012, height=0.034, centre_left=0.05, centre_right=0.06)
 
@@ -27,10 +27,7 @@ def test_prescribed_motion_gradient_matches_differences() -> None:
     for k in range(4):
         step = np.zeros(4)
         step[k] = 1e-6
-        forward, backward = (
-            GRIPS.prescribed_motion(coordinates + step),
-            GRIPS.prescribed_motion(coordinates - step),
-        )
+        forward, backward = (GRIPS.prescribed_motion(coordinates + step), GRIPS.prescribed_motion(coordinates - step))
         assert gradient[:, k] == pytest.approx((forward - backward) / 2e-6, abs=1e-8)
 
 
@@ -40,14 +37,10 @@ def test_grips_move_rigidly_about_their_inner_edges() -> None:
     motion = np.array([0.3, 0.2, 0.4, 0.01, 0.05])
     moved = GRIPS.positions(motion, left, right)
     # Arching to +z: the left grip's slope rises towards the middle.
-    rotation = (
-        Rotation.from_euler("x", -0.2) * Rotation.from_euler("z", 0.05) * Rotation.from_euler("y", -0.3)
-    )
+    rotation = Rotation.from_euler("x", -0.2) * Rotation.from_euler("z", 0.05) * Rotation.from_euler("y", -0.3)
     centre = np.array([-0.198, 0.05, 0.0])
     assert moved[:2] == pytest.approx(rotation.apply(left - centre) + centre + [0.005, 0.0, 0.0], abs=1e-14)
-    assert np.linalg.norm(moved[3] - moved[2]) == pytest.approx(
-        np.linalg.norm(right[1] - right[0]), rel=1e-12
-    )
+    assert np.linalg.norm(moved[3] - moved[2]) == pytest.approx(np.linalg.norm(right[1] - right[0]), rel=1e-12)
 
 
 def test_grips_approach_each_other() -> None:

@@ -6,16 +6,16 @@ import h5py
 import numpy as np
 import pytest
 
-from morph_dslam.cli import main
+from morph_dslam.cli.app import main
 from morph_dslam.errors import ModelFileError, StudyError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import ReducedModel, SeparatedField, save_model
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.model.inner_structure import load_inner_structure, save_inner_structure
-from morph_dslam.offline.inner_structures import place_inner_structure
-from morph_dslam.online.estimation.estimator import Estimate, State, moved
-from morph_dslam.online.runs.inner_positions import centre_and_std
 from morph_dslam.render.overlay import draw_inner_surface, draw_overlay
+from morph_dslam.studies.build import place_inner_structure
+from morph_dslam.tracking.estimator import Estimate, State, moved
+from morph_dslam.tracking.run_folder import centre_and_std
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.small_models import block_model
 
@@ -72,8 +72,7 @@ def test_models_of_another_mesh_are_refused():
 
 def test_points_outside_and_sheets_are_refused():
     with pytest.raises(
-        StudyError,
-        match=r"'rib' does not fit into 'block': 1 of 4 points lie outside .* reaches from \(0.0, ",
+        StudyError, match=r"'rib' does not fit into 'block': 1 of 4 points lie outside .* reaches from \(0.0, "
     ):
         place_inner_structure(affine_block(), "rib", NODES + np.array([0.0, 0.0, 0.03]), TRIANGLES)
     with pytest.raises(StudyError, match="the model of a sheet: it has no inside for 'rib'"):
@@ -124,9 +123,7 @@ def test_what_lies_behind_the_surface_is_drawn_through_it():
     grey = np.full((120, 160, 3), 90, dtype=np.uint8)
     square = np.array([[20.0, 20.0], [119.0, 20.0], [119.0, 99.0], [20.0, 99.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    surface = draw_overlay(
-        grey, square, np.ones(4), faces, np.ones(4), (0.0, 1.0), label="stress [MPa]", alpha=0.4
-    )
+    surface = draw_overlay(grey, square, np.ones(4), faces, np.ones(4), (0.0, 1.0), label="stress [MPa]", alpha=0.4)
     before = surface.copy()
     inner = 0.25 * (square - 60.0) + 60.0
     drawn = draw_inner_surface(surface, inner, np.full(4, 2.0), faces, (200, 40, 220), alpha=0.6)

@@ -5,11 +5,11 @@ import pytest
 
 from morph_dslam.errors import StudyError
 from morph_dslam.model import Parameter
-from morph_dslam.offline.problem import ModelMesh
-from morph_dslam.offline.reduction.kept_modes import keep_modes
-from morph_dslam.offline.reduction.task import ReductionTask
-from morph_dslam.offline.studies.solid_study import SolidStudy
-from morph_dslam.offline.studies.study_sections import ReductionSection
+from morph_dslam.reduction.pod import keep_modes
+from morph_dslam.reduction.task import ReductionTask
+from morph_dslam.studies.problem import ModelMesh
+from morph_dslam.studies.sections import ReductionSection
+from morph_dslam.studies.solid_study import SolidStudy
 from tests.unit.test_reduced_solver import BLOCK
 
 RNG = np.random.default_rng(4)

@@ -6,22 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.geometry import RigidTransform, rotation_log
-from morph_dslam.online.mesh_registration.keyframe_adjustment import AdjustedKeyframes, KeyframeAdjustment
-from morph_dslam.online.mesh_registration.scene import camera_from_object
-from morph_dslam.online.mesh_registration.similarity_of_path import similarity_of_path
-from morph_dslam.online.mesh_registration.surface import Axis
-from morph_dslam.online.mesh_registration.texture_alignment import (
-    moved_similarity,
-    similarity_jacobian,
-)
-from morph_dslam.online.mesh_registration.texture_comparison import moved_pose, pose_jacobian
-from morph_dslam.similarity import SimilarityTransform
+from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_log
+from morph_dslam.registration.icp import Axis
+from morph_dslam.registration.keyframe_adjustment import AdjustedKeyframes, KeyframeAdjustment, similarity_of_path
+from morph_dslam.registration.scene import camera_from_object
+from morph_dslam.registration.texture import moved_pose, pose_jacobian
+from morph_dslam.registration.texture_alignment import moved_similarity, similarity_jacobian
 from tests.support.rendered_object import CAMERA, cameras, scanned, wedge
 
-WORLD = SimilarityTransform(
-    3.7, Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix(), np.array([0.5, -1.2, 2.0])
-)
+WORLD = SimilarityTransform(3.7, Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix(), np.array([0.5, -1.2, 2.0]))
 
 
 @pytest.fixture(scope="module")
@@ -54,9 +47,7 @@ def pose_errors(found, true):
 def test_poses_of_a_path_that_is_off_are_found_by_the_images(disturbed, adjusted):
     _, views = disturbed
     truth = cameras()
-    before = [
-        pose_errors(camera_from_object(view, WORLD), true) for view, true in zip(views, truth, strict=True)
-    ]
+    before = [pose_errors(camera_from_object(view, WORLD), true) for view, true in zip(views, truth, strict=True)]
     after = np.array([pose_errors(found, true) for found, true in zip(adjusted.poses, truth, strict=True)])
     assert np.sqrt(np.mean(np.square(before)[:, 3:])) > 4e-4
     assert np.sqrt(np.mean(after[:, 3:] ** 2)) < 1.5e-4
@@ -98,9 +89,7 @@ def test_an_axis_of_revolution_leaves_its_turn_alone(disturbed):
     # All poses turned together is what no image can tell.
     units = np.tile([1.0] * 3 + [np.linalg.norm(np.ptp(nodes, axis=0))] * 3, len(found.poses))
     along = (turn / units) @ (found.covariance / np.outer(units, units)) @ (turn / units)
-    assert along < 1e-6 * np.trace(found.covariance / np.outer(units, units)) * (turn / units) @ (
-        turn / units
-    )
+    assert along < 1e-6 * np.trace(found.covariance / np.outer(units, units)) * (turn / units) @ (turn / units)
 
 
 def test_nothing_to_compare_is_no_adjustment():
@@ -125,19 +114,19 @@ def test_derivatives_of_points_and_poses_are_those_of_differences():
 
 
 def test_the_causes_that_keyframes_share_make_up_each_covariance_and_what_two_have_in_common():
-    """Poses of eight keyframes err by seven causes in common, and each a little by itself."""
+    """Poses of eight keyframes err by seven error factors in common, and each a little by itself."""
     rng = np.random.default_rng(5)
     scale = np.tile([1e-3, 1e-3, 1e-3, 3e-4, 3e-4, 3e-4], 8)
     common = scale[:, None] * rng.standard_normal((48, 7))
     own = 0.2 * scale
     covariance = common @ common.T + np.diag(own**2)
     adjusted = AdjustedKeyframes([], [RigidTransform(np.eye(3), np.zeros(3))] * 8, covariance, 0.1)
-    causes = adjusted.causes()
-    assert causes.shape == (8, 6, 8)
+    error_factors = adjusted.error_factors()
+    assert error_factors.shape == (8, 6, 8)
     for k in range(8):
         expected = adjusted.covariance_of(k)
-        np.testing.assert_allclose(causes[k] @ causes[k].T, expected, atol=1e-6 * np.abs(expected).max())
-    between = causes[1] @ causes[6].T / np.outer(scale[:6], scale[:6])
+        np.testing.assert_allclose(error_factors[k] @ error_factors[k].T, expected, atol=1e-6 * np.abs(expected).max())
+    between = error_factors[1] @ error_factors[6].T / np.outer(scale[:6], scale[:6])
     expected = (common[6:12] @ common[36:42].T) / np.outer(scale[:6], scale[:6])
     assert np.abs(between - expected).max() < 0.15 * np.abs(expected).max()
 
@@ -147,7 +136,7 @@ def test_causes_of_a_body_of_revolution_hold_nothing_of_its_turn():
     rows = rng.standard_normal((24, 9))
     rows[[2, 8, 14, 20]] = 0.0
     adjusted = AdjustedKeyframes([], [RigidTransform(np.eye(3), np.zeros(3))] * 4, rows @ rows.T, 0.1)
-    causes = adjusted.causes()
-    assert np.abs(causes[:, 2]).max() < 1e-6
+    error_factors = adjusted.error_factors()
+    assert np.abs(error_factors[:, 2]).max() < 1e-6
     for k in range(4):
-        np.testing.assert_allclose(causes[k] @ causes[k].T, adjusted.covariance_of(k), atol=1e-6)
+        np.testing.assert_allclose(error_factors[k] @ error_factors[k].T, adjusted.covariance_of(k), atol=1e-6)

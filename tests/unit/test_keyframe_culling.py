@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.online.slam.keyframe_culling import ENOUGH_KEYFRAMES, MOST_AT_ONCE, RECENT, cull_keyframes
-from morph_dslam.online.slam.map_file import load_map, save_map
-from morph_dslam.online.slam.rigid_map import CANDIDATE, GOOD, REMOVED, Keyframe, RigidMap
+from morph_dslam.slam.map_files import load_map, save_map
+from morph_dslam.slam.mapping import ENOUGH_KEYFRAMES, MOST_AT_ONCE, RECENT, cull_keyframes
+from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, REMOVED, Keyframe, RigidMap
 from tests.support.rendered_room import pose
 
 CAMERA = PinholeCamera(4, 4, 5.0, 5.0, 1.5, 1.5)

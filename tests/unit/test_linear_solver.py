@@ -7,13 +7,14 @@ import pytest
 import scipy.sparse as sp
 
 from morph_dslam.errors import SolverError
-from morph_dslam.offline.solvers.linear_solver import (
+from morph_dslam.mechanics.solvers.linear_solver import (
+    ANALYSE,
     ENVIRONMENT_VARIABLE,
     AssembledLinearisation,
     LinearSolver,
+    Pardiso,
     default_engine,
 )
-from morph_dslam.offline.solvers.sparse_engines import ANALYSE, Pardiso
 
 ENGINES = ["pardiso", "sparsecholesky"]
 
@@ -84,9 +85,7 @@ def test_pardiso_analyses_a_pattern_once(monkeypatch) -> None:
     pytest.importorskip("pypardiso", reason="pypardiso is not installed")
     phases = []
     call = Pardiso._call
-    monkeypatch.setattr(
-        Pardiso, "_call", lambda self, phase, right: phases.append(phase) or call(self, phase, right)
-    )
+    monkeypatch.setattr(Pardiso, "_call", lambda self, phase, right: phases.append(phase) or call(self, phase, right))
     free = np.ones(9, dtype=bool)
     solver = LinearSolver(free, True, engine="pardiso")
     for scale in (1.0, 2.0, 3.0):
@@ -147,9 +146,7 @@ def test_older_linearisations_are_factorised_again(engine) -> None:
     free = np.array([True, True, True, False])
     solver = LinearSolver(free, True, engine=engine)
     stiff, soft = random_symmetric(4, 0, 1), random_symmetric(4, 0, 2)
-    first, second = (
-        AssembledLinearisation(np.zeros(4), sp.csr_matrix(np.tril(k)), solver) for k in (stiff, soft)
-    )
+    first, second = (AssembledLinearisation(np.zeros(4), sp.csr_matrix(np.tril(k)), solver) for k in (stiff, soft))
     right = np.array([1.0, 2.0, 3.0, 0.0])
     second.solve(right)
     expected = np.linalg.solve(stiff[:3, :3], right[:3])

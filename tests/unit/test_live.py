@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import SourceError
-from morph_dslam.online.side_by_side import threads_side_by_side
 from morph_dslam.sources import open_source, open_stream
 from morph_dslam.sources.frames import Frame
-from morph_dslam.sources.live import LiveCamera, PacedRecording
-from morph_dslam.sources.newest import Newest
+from morph_dslam.sources.live import LiveCamera, Newest, PacedRecording
+from morph_dslam.threads import threads_side_by_side
 
 
 class FakeCapture:

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import TrackingError
-from morph_dslam.online.live.session import LiveTimes
-from morph_dslam.online.live.sinks import BrowserSink, VideoSink
 from morph_dslam.sources import Frame
+from morph_dslam.tracking.live import BrowserSink, LiveTimes, VideoSink
 
 BLUE = np.full((40, 60, 3), (200, 30, 20), dtype=np.uint8)
 

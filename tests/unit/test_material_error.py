@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import EvaluationError
-from morph_dslam.evaluation.alignment import summarise_alignment
-from morph_dslam.evaluation.material_error import bind_truth, material_error, summarise
+from morph_dslam.evaluation.points import bind_truth, load_truth, material_error, summarise
 from morph_dslam.evaluation.run_folder import load_run
-from morph_dslam.evaluation.truth import load_truth
+from morph_dslam.evaluation.trajectory import summarise_alignment
 from morph_dslam.geometry import rotation_exp
 from tests.support.run_folders import exact_truth, write_run
 
@@ -97,9 +96,7 @@ def test_unmeasured_points_are_left_out_and_counted(tracked, tmp_path):
     assert figures["mean_mm"] < 1e-4
 
 
-@pytest.mark.parametrize(
-    ("frame", "message"), [(8, "truth has no frame 8"), (12, r"not tracked \(too few points\)")]
-)
+@pytest.mark.parametrize(("frame", "message"), [(8, "truth has no frame 8"), (12, r"not tracked \(too few points\)")])
 def test_binding_frame_must_be_known(tmp_path, frame, message):
     model = write_run(tmp_path, ["tracked", "tracked", "lost", "tracked", "tracked", "tracked"])
     truth = saved(tmp_path / "truth.npz", exact_truth(model))

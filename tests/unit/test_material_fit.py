@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.materials.fit import fit_law
-from morph_dslam.offline.materials.rubber import Gent, MooneyRivlin, Yeoh
-from morph_dslam.offline.materials.uniaxial import TensionTest, relative_error, relaxed_stress
+from morph_dslam.mechanics.materials.fit import TensionTest, fit_law, relative_error, relaxed_stress
+from morph_dslam.mechanics.materials.isotropic import Gent, MooneyRivlin, Yeoh
 from tests.support.real_data import real_data
 
 MPA = 1e6
@@ -61,9 +60,7 @@ def test_relative_error_is_rms_over_rms():
 
 @pytest.fixture
 def treloar():
-    table = np.loadtxt(
-        real_data("fem_reference") / "hyperelastics_jl" / "uniaxial.csv", delimiter=",", skiprows=1
-    )
+    table = np.loadtxt(real_data("fem_reference") / "hyperelastics_jl" / "uniaxial.csv", delimiter=",", skiprows=1)
     return [TensionTest("Treloar", table[:, 0], table[:, 1] * MPA)]
 
 

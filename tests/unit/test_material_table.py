@@ -7,14 +7,10 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.io.inp_cards import read_cards
-from morph_dslam.io.inp_materials import read_materials
-from morph_dslam.offline.materials.anisotropic import HolzapfelGasserOgden, Orthotropic
-from morph_dslam.offline.materials.cards import material_from_card
-from morph_dslam.offline.materials.isotropic import NeoHookean, StVenantKirchhoff
-from morph_dslam.offline.materials.ogden import Ogden
-from morph_dslam.offline.materials.rubber import MooneyRivlin, Yeoh
-from morph_dslam.offline.materials.table import LAWS, constant_quantities, material_from_table
+from morph_dslam.io.inp_cards import read_cards, read_materials
+from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden, Orthotropic
+from morph_dslam.mechanics.materials.isotropic import MooneyRivlin, NeoHookean, Ogden, StVenantKirchhoff, Yeoh
+from morph_dslam.mechanics.materials.library import LAWS, constant_quantities, material_from_card, material_from_table
 from tests.support.material_laws import stress
 from tests.support.real_data import ROOT
 
@@ -30,9 +26,7 @@ def test_every_law_has_its_name():
 
 def test_a_table_becomes_its_material():
     prony = {"relative_moduli": [0.5], "times": [2.0]}
-    law = material_from_table(
-        {"law": "neo_hookean", "young": 3.0, "poisson": 0.3, "density": 9.0, "prony": prony}
-    )
+    law = material_from_table({"law": "neo_hookean", "young": 3.0, "poisson": 0.3, "density": 9.0, "prony": prony})
     assert isinstance(law, NeoHookean)
     assert (law.density, law.prony.times, law.prony.bulk) == (9.0, (2.0,), (0.5,))
     np.testing.assert_array_equal(stress(law, F), stress(NeoHookean(young=3.0, poisson=0.3), F))
@@ -101,10 +95,7 @@ def test_a_users_function_without_its_constant_is_one_message(tmp_path):
         ({"law": "neo_hookean", "young": 3.0, "poison": 0.3}, "has no constant 'poison'; it has .*poisson"),
         ({"law": "neo_hookean", "young": "3 MPa", "poisson": 0.3}, "young = 3 MPa is not a number"),
         ({"law": "ogden", "moduli": 0.4, "exponents": [2.0], "bulk": 7.0}, "moduli = 0.4 must be a list"),
-        (
-            {"law": "gent", "shear": 1, "limit": 5, "bulk": 7, "prony": {"times": [1]}},
-            "needs relative_moduli",
-        ),
+        ({"law": "gent", "shear": 1, "limit": 5, "bulk": 7, "prony": {"times": [1]}}, "needs relative_moduli"),
         ({"law": "user_material"}, "lacks its function"),
         (
             {"law": "holzapfel_gasser_ogden", "shear": 1, "k1": 1, "k2": 1, "bulk": 7, "fibre": {"angle": 1}},

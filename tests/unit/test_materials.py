@@ -6,18 +6,19 @@ import pytest
 from ngsolve.meshes import MakeStructured3DMesh
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.materials.anisotropic import (
-    HolzapfelGasserOgden,
-    Orthotropic,
-    TransverselyIsotropic,
+from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden, Orthotropic, TransverselyIsotropic
+from morph_dslam.mechanics.materials.base import cell_directions, evaluate, isotropic_average, turned_direction
+from morph_dslam.mechanics.materials.isotropic import (
+    Gent,
+    LinearElastic,
+    MooneyRivlin,
+    NeoHookean,
+    Ogden,
+    StVenantKirchhoff,
+    Yeoh,
 )
-from morph_dslam.offline.materials.base import evaluate, isotropic_average
-from morph_dslam.offline.materials.directions import cell_directions, turned_direction
-from morph_dslam.offline.materials.isotropic import LinearElastic, NeoHookean, StVenantKirchhoff
-from morph_dslam.offline.materials.ogden import Ogden
-from morph_dslam.offline.materials.rubber import Gent, MooneyRivlin, Yeoh
-from morph_dslam.offline.materials.user import UserMaterial
-from morph_dslam.offline.materials.viscoelastic import Prony
+from morph_dslam.mechanics.materials.library import UserMaterial
+from morph_dslam.mechanics.materials.viscoelastic import Prony
 from tests.support.closed_form_stress import orthotropic_stiffness
 from tests.support.material_laws import AXES, LAWS, energy, rotation, stress, tangent, tensor
 
@@ -38,9 +39,7 @@ laws = pytest.mark.parametrize("name", LAWS)
 def test_the_stress_is_that_of_the_closed_form(name, state):
     material, exact = LAWS[name]
     expected = exact(STATES[state])
-    np.testing.assert_allclose(
-        stress(material, STATES[state]), expected, rtol=0, atol=1e-12 * abs(expected).max()
-    )
+    np.testing.assert_allclose(stress(material, STATES[state]), expected, rtol=0, atol=1e-12 * abs(expected).max())
 
 
 @laws
@@ -63,9 +62,7 @@ def test_a_rotation_of_the_deformed_solid_turns_the_stress_and_keeps_the_energy(
     assert energy(material, Q @ BULGED) == pytest.approx(energy(material, BULGED), rel=1e-12)
     assert energy(material, Q) == pytest.approx(0.0, abs=1e-14)
     expected = Q @ stress(material, BULGED)
-    np.testing.assert_allclose(
-        stress(material, Q @ BULGED), expected, rtol=0, atol=1e-12 * abs(expected).max()
-    )
+    np.testing.assert_allclose(stress(material, Q @ BULGED), expected, rtol=0, atol=1e-12 * abs(expected).max())
 
 
 def test_linear_elasticity_takes_a_rotation_for_strain():

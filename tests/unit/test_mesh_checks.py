@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.meshing.mesh_checks import check_mesh
-from morph_dslam.offline.meshing.mesh_generators import block, sheet
-from morph_dslam.offline.meshing.meshes import CellBlock, Mesh
+from morph_dslam.meshing.generators import block, sheet
+from morph_dslam.meshing.mesh_checks import check_mesh
+from morph_dslam.meshing.meshes import CellBlock, Mesh
 
 
 def cube(name="hex8", size=0.1):
@@ -23,8 +23,7 @@ def two_parts():
     one, gap = cube(), np.array([0.3, 0.0, 0.0])
     cells = one.blocks[0].connectivity
     return Mesh(
-        np.vstack([one.nodes, one.nodes[:] + gap]),
-        (CellBlock("hex8", np.vstack([cells, cells + one.n_nodes])),),
+        np.vstack([one.nodes, one.nodes[:] + gap]), (CellBlock("hex8", np.vstack([cells, cells + one.n_nodes])),)
     )
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.meshing.mesh_checks import check_mesh
-from morph_dslam.offline.meshing.mesh_files import load_mesh
-from morph_dslam.offline.meshing.mesh_generators import block
-from morph_dslam.offline.meshing.mesh_geometry import cell_volumes, surface_area
+from morph_dslam.meshing.generators import block
+from morph_dslam.meshing.mesh_checks import check_mesh
+from morph_dslam.meshing.mesh_files import load_mesh
+from morph_dslam.meshing.meshes import cell_volumes, surface_area
 from tests.support.real_data import real_data
 
 ABAQUS = {
@@ -71,9 +71,7 @@ def inp_text(name):
     lines.append(f"*ELEMENT, TYPE={ABAQUS[name]}, ELSET=body")
     for i, cell in enumerate(cells.tolist()):
         row = [str(7 + 2 * i), *(str(5 + 3 * node) for node in cell)]
-        lines += [
-            ", ".join(row[k : k + 12]) + ("," if k + 12 < len(row) else "") for k in range(0, len(row), 12)
-        ]
+        lines += [", ".join(row[k : k + 12]) + ("," if k + 12 < len(row) else "") for k in range(0, len(row), 12)]
     for surface, faces in mesh.surfaces.items():
         lines += [f"*SURFACE, NAME={surface}", *(f"{7 + 2 * c}, S{f + 1}" for c, f in faces.tolist())]
     return "\n".join([*lines, "*SURFACE, NAME=skin", "body,", ""]), mesh
@@ -108,9 +106,7 @@ def test_the_documented_program_reads_a_mesh(tmp_path, monkeypatch):
 def test_a_face_that_an_element_does_not_have_is_named_with_its_line(tmp_path):
     text, _ = inp_text("tet4")
     (tmp_path / "block.inp").write_text(text + "*SURFACE, NAME=wrong\nbody, S6\n")
-    with pytest.raises(
-        StudyError, match=r"block\.inp, line \d+: a tet4 element has no face S6; use S1, S2, S3, S4"
-    ):
+    with pytest.raises(StudyError, match=r"block\.inp, line \d+: a tet4 element has no face S6; use S1, S2, S3, S4"):
         load_mesh(tmp_path / "block.inp", "mm")
 
 
@@ -216,16 +212,10 @@ def test_cells_that_meshio_would_leave_out_in_silence_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            GMSH[: GMSH.index("$EndElements")],
-            r"line 26: the section \$Elements is not closed; the file is cut",
-        ),
+        (GMSH[: GMSH.index("$EndElements")], r"line 26: the section \$Elements is not closed; the file is cut"),
         (GMSH[:200], r"the section \$Nodes is not closed"),
         (GMSH.replace("3 6 12 9", "1 6 12 9"), "1 faces of group 'grip' are faces of no solid cell"),
-        (
-            GMSH.replace("4 5 2 2 2 2 3 6 5 8 9 12 11", "4 7 2 2 2 2 3 6 5 8"),
-            "pyramid cells, which are not known",
-        ),
+        (GMSH.replace("4 5 2 2 2 2 3 6 5 8 9 12 11", "4 7 2 2 2 2 3 6 5 8"), "pyramid cells, which are not known"),
         (GMSH.replace("4 5 2 2 2 2 3", "4 5 2 2 2 2 77"), "damaged, cut short|nodes which it does not hold"),
         ("$MeshFormat\n2.2 0 8\n$EndMeshFormat\n", "holds no solid or sheet cells"),
         ("not a mesh", "damaged, cut short, or no .msh file"),
@@ -320,10 +310,7 @@ def test_a_cube_of_twelve_triangles_is_meshed_anew_where_a_cell_size_is_given(tm
     ("change", "message"),
     [
         (lambda faces: faces[:-1], "not watertight: 3 edges have a triangle on one side only"),
-        (
-            lambda faces: np.vstack([faces, faces[:1]]),
-            "bounds no volume: 3 edges have more than two triangles",
-        ),
+        (lambda faces: np.vstack([faces, faces[:1]]), "bounds no volume: 3 edges have more than two triangles"),
         (lambda faces: np.vstack([faces[:-1], faces[-1:, ::-1]]), "do not all turn the same way"),
         (lambda faces: faces[:, ::-1], "face inwards; flip its normals"),
         (lambda faces: faces[:0], "holds no faces"),

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.meshing.mesh_checks import check_mesh
-from morph_dslam.offline.meshing.mesh_generators import Collar, block, revolution, sheet, tube
-from morph_dslam.offline.meshing.mesh_geometry import cell_volumes, centroid, surface_area
-from morph_dslam.offline.meshing.structured_grid import SOLIDS
+from morph_dslam.meshing.generators import SOLIDS, Collar, block, revolution, sheet, tube
+from morph_dslam.meshing.mesh_checks import check_mesh
+from morph_dslam.meshing.meshes import cell_volumes, centroid, surface_area
 
 #: A boot of a gear lever: cuff, four round folds, neck; radius and height in millimetres.
 BOOT = [
@@ -137,9 +136,7 @@ def test_the_boot_seal_has_the_papers_nodes_and_cells(name, nodes):
 
 def test_a_collar_adds_its_ring_of_material():
     plain = revolution([(0.03, 0.0), (0.03, 0.04)], 0.002, (8, 2, 60), "hex20")
-    cuffed = revolution(
-        [(0.03, 0.0), (0.03, 0.04)], 0.002, (8, 2, 60), "hex20", collars=[Collar(0.0, 0.25, 0.001, 2)]
-    )
+    cuffed = revolution([(0.03, 0.0), (0.03, 0.04)], 0.002, (8, 2, 60), "hex20", collars=[Collar(0.0, 0.25, 0.001, 2)])
     check_mesh(cuffed)
     added = cell_volumes(cuffed).sum() - cell_volumes(plain).sum()
     assert added == pytest.approx(pi * (0.032**2 - 0.031**2) * 0.01, rel=1e-5)
@@ -151,9 +148,7 @@ def test_a_half_sphere_shell_has_its_volume_though_its_poles_are_cut_off():
     mesh = revolution(0.05 * np.column_stack([np.cos(angles), np.sin(angles)]), 0.01, (20, 1, 60), "hex27")
     check_mesh(mesh)
     # Between two cones of half-angle 30 degrees: 4/3 pi (b^3 - a^3) sin 60.
-    assert cell_volumes(mesh).sum() == pytest.approx(
-        4 / 3 * pi * (0.055**3 - 0.045**3) * sqrt(3) / 2, rel=1e-4
-    )
+    assert cell_volumes(mesh).sum() == pytest.approx(4 / 3 * pi * (0.055**3 - 0.045**3) * sqrt(3) / 2, rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -170,10 +165,7 @@ def test_a_half_sphere_shell_has_its_volume_though_its_poles_are_cut_off():
         (lambda: revolution([(0.003, 0), (0.003, 1)], 0.01, (1, 1, 8)), "past the axis"),
         (lambda: revolution([(0.03, 0), (0.03, 1)], (1, 2, 3), (1, 1, 8)), "3 values for a profile of 2"),
         (lambda: revolution([(0.03, 0), (0.03, 1)], -0.001, (1, 1, 8)), "thickness positive"),
-        (
-            lambda: revolution([(0.03, 0), (0.03, 1)], 0.001, (4, 1, 8), collars=[Collar(0.5, 0.5, 0.1)]),
-            "start < stop",
-        ),
+        (lambda: revolution([(0.03, 0), (0.03, 1)], 0.001, (4, 1, 8), collars=[Collar(0.5, 0.5, 0.1)]), "start < stop"),
         (
             lambda: revolution(
                 [(0.03, 0), (0.03, 1)], 0.001, (4, 1, 8), collars=[Collar(0, 0.5, 0.1), Collar(0.5, 1, 0.1)]

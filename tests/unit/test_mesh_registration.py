@@ -7,22 +7,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.errors import RegistrationError
-from morph_dslam.offline.meshing.mesh_generators import tube
-from morph_dslam.online.mesh_registration.register import register_mesh
-from morph_dslam.online.mesh_registration.scaled_icp import (
-    fit_surface,
-    normal_equations,
-    normal_equations_numpy,
-)
-from morph_dslam.online.mesh_registration.scene import MapPoints
-from morph_dslam.online.mesh_registration.surface import Surface
-from morph_dslam.online.mesh_registration.texture_alignment import TextureAlignment
-from morph_dslam.similarity import SimilarityTransform
+from morph_dslam.geometry import SimilarityTransform
+from morph_dslam.meshing.generators import tube
+from morph_dslam.registration.icp import Surface, fit_surface, normal_equations, normal_equations_numpy
+from morph_dslam.registration.mesh import register_mesh
+from morph_dslam.registration.scene import MapPoints
+from morph_dslam.registration.texture_alignment import TextureAlignment
 from tests.support.rendered_object import CAMERA, scanned, wedge
 
-WORLD = SimilarityTransform(
-    3.7, Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix(), np.array([0.5, -1.2, 2.0])
-)
+WORLD = SimilarityTransform(3.7, Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix(), np.array([0.5, -1.2, 2.0]))
 #: The same in a map whose unit is the metre.
 METRIC = SimilarityTransform(1.0, WORLD.rotation, WORLD.translation)
 
@@ -59,9 +52,7 @@ def test_images_refine_what_the_points_leave_open():
     nodes, triangles, _ = wedge()
     _, views = scanned(WORLD, with_images=True)
     # 2 % of scale, a degree and a millimetre off
-    off = SimilarityTransform(
-        1.02, Rotation.from_rotvec([0.0, 0.018, 0.0]).as_matrix(), np.array([1e-3, 0.0, -5e-4])
-    )
+    off = SimilarityTransform(1.02, Rotation.from_rotvec([0.0, 0.018, 0.0]).as_matrix(), np.array([1e-3, 0.0, -5e-4]))
     result = TextureAlignment(nodes, triangles, CAMERA, views).refine(WORLD @ off)
     assert result is not None
     assert result.world_from_object.scale == pytest.approx(WORLD.scale, rel=1e-3)
@@ -119,9 +110,7 @@ def test_exact_points_lead_back_from_a_disturbed_place():
     some = surface.points[::20]
     outside = some + surface.normals[::20]
     points = MapPoints(WORLD.apply(some), WORLD.apply(outside))
-    start = WORLD @ SimilarityTransform(
-        0.95, Rotation.from_rotvec([0.1, 0.05, -0.08]).as_matrix(), np.full(3, 2e-3)
-    )
+    start = WORLD @ SimilarityTransform(0.95, Rotation.from_rotvec([0.1, 0.05, -0.08]).as_matrix(), np.full(3, 2e-3))
     widths = WORLD.scale * surface.size * np.array([0.2] * 5 + [0.1] * 10 + [0.03] * 15)
     fit = fit_surface(points, surface, start, widths)
     assert apart(fit.world_from_object, WORLD, nodes) < 1e-6

@@ -6,19 +6,10 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.meshing.face_lookup import find_faces
-from morph_dslam.offline.meshing.mesh_checks import check_mesh
-from morph_dslam.offline.meshing.mesh_conversion import (
-    FIRST_ORDER,
-    SECOND_ORDER,
-    to_first_order,
-    to_second_order,
-)
-from morph_dslam.offline.meshing.mesh_generators import block, sheet, tube
-from morph_dslam.offline.meshing.mesh_geometry import cell_volumes
-from morph_dslam.offline.meshing.mesh_repair import reoriented, without_collapsed_cells
-from morph_dslam.offline.meshing.meshes import CellBlock, Mesh
-from morph_dslam.offline.meshing.structured_grid import SOLIDS
+from morph_dslam.meshing.generators import SOLIDS, block, sheet, tube
+from morph_dslam.meshing.mesh_checks import check_mesh, reoriented, without_collapsed_cells
+from morph_dslam.meshing.mesh_files import FIRST_ORDER, SECOND_ORDER, to_first_order, to_second_order
+from morph_dslam.meshing.meshes import CellBlock, Mesh, cell_volumes, find_faces
 
 
 def enclosed_volume(mesh):
@@ -158,10 +149,7 @@ def test_hexahedra_collapsed_onto_an_axis_become_prisms(axis):
         check_mesh(mesh)
     mended = reoriented(without_collapsed_cells(mesh))
     check_mesh(mended)
-    assert [(part.cell_type, len(part.connectivity)) for part in mended.blocks] == [
-        ("hex8", 48),
-        ("prism6", 48),
-    ]
+    assert [(part.cell_type, len(part.connectivity)) for part in mended.blocks] == [("hex8", 48), ("prism6", 48)]
     # 16-sided polygon of radius 30 mm, 0.1 m long.
     assert cell_volumes(mended).sum() == pytest.approx(8 * np.sin(np.pi / 8) * 0.03**2 * 0.1, rel=1e-6)
     np.testing.assert_allclose(np.hypot(*mended.nodes[mended.set_nodes("outer"), :2].T), 0.03, rtol=1e-6)

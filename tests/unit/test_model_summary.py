@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morph_dslam import cli
-from morph_dslam.evaluation.error_tables import error_table, sensitivity_table
-from morph_dslam.evaluation.field_names import field_title
+from morph_dslam.cli import app as cli
 from morph_dslam.evaluation.model_summary import describe_point, summarise_model
+from morph_dslam.evaluation.points import error_table, field_title, sensitivity_table
 from morph_dslam.evaluation.report import Table
 from morph_dslam.model import Parameter, save_model
 from morph_dslam.model.basis_functions import chebyshev_basis
@@ -73,16 +72,11 @@ def test_errors_have_three_digits(value, text):
 
 
 def test_sensitivities_have_both_measures():
-    assert sensitivity_table(CERTIFICATE).rows == [
-        ["stretch", "2.00e-02", "1.23e-02"],
-        ["slide", "–", "5.00e-01"],
-    ]
+    assert sensitivity_table(CERTIFICATE).rows == [["stretch", "2.00e-02", "1.23e-02"], ["slide", "–", "5.00e-01"]]
 
 
 def test_the_faces_of_a_sheet_have_a_von_mises_stress_each():
-    certificate = {
-        f"stress_{face}": errors("_MPa") | {"von_mises": errors("_MPa")} for face in ("top", "bottom")
-    }
+    certificate = {f"stress_{face}": errors("_MPa") | {"von_mises": errors("_MPa")} for face in ("top", "bottom")}
     assert [row[0] for row in error_table(certificate).rows] == [
         "stress, top face",
         "von Mises stress, top face",
@@ -151,8 +145,7 @@ def test_points_are_described_in_the_units_of_reports():
 
 
 @pytest.mark.parametrize(
-    ("name", "title"),
-    [("reaction_moment_rim_top", "moment on rim_top"), ("stress_bottom", "stress, bottom face")],
+    ("name", "title"), [("reaction_moment_rim_top", "moment on rim_top"), ("stress_bottom", "stress, bottom face")]
 )
 def test_field_names_in_words(name, title):
     assert field_title(name) == title

@@ -6,22 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.online.attempt import Picture
-from morph_dslam.online.estimation.estimator import Estimator
-from morph_dslam.online.frame_estimation import FrameEstimation
-from morph_dslam.online.frame_result import STAGES
-from morph_dslam.online.measuring.flow import flatten
-from morph_dslam.online.reference.new_view import (
-    is_known_well,
-    is_sharp,
-    seen_part,
-    sharpness,
-    surface_spread,
-)
-from morph_dslam.online.reference.reference_view import KnownView, ReferenceView
-from morph_dslam.online.reference.surface_coverage import SurfaceSamples
-from morph_dslam.online.timing import StageClock
-from morph_dslam.online.tracker_options import TrackerOptions
+from morph_dslam.timing import StageClock
+from morph_dslam.tracking.estimator import Estimator
+from morph_dslam.tracking.frame_estimation import FrameEstimation
+from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.patches import flatten
+from morph_dslam.tracking.reference import PosedImage, ReferenceView, SurfaceSamples
+from morph_dslam.tracking.result import STAGES, Image
+from morph_dslam.tracking.views import is_known_well, is_sharp, seen_part, sharpness, surface_spread
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state
 
@@ -30,7 +22,7 @@ OPTIONS, NOW = TrackerOptions(), sheet_state(0.1)
 
 def picture(image, **others):
     grey = np.ascontiguousarray(image[:, :, 0])
-    return Picture(grey, flatten(grey, OPTIONS.flow.flatten_window), **others)
+    return Image(grey, flatten(grey, OPTIONS.flow.flatten_window), **others)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +30,7 @@ def scene():
     """The first view, and an attempt at the picture of a later frame."""
     film = SheetFilm(bent_sheet_model(43, 31))
     estimator = Estimator(film.model, CAMERA)
-    known = KnownView(picture(film.frame(sheet_state(0.0))), sheet_state(0.0))
+    known = PosedImage(picture(film.frame(sheet_state(0.0))), sheet_state(0.0))
     view = ReferenceView(estimator, [known], OPTIONS)
     estimation = FrameEstimation(estimator, view, OPTIONS)
 
@@ -107,8 +99,8 @@ def test_nothing_is_bound_around_points_that_disagree_or_behind_another_object(s
     assert hidden[inside].mean() > 0.8
     assert hidden[300:400, 400:500].mean() < 0.1
     depths = np.where(inside, np.float32(0.3), np.float32(np.inf))
-    assert not seen_part(replace(made, in_front=depths), tried, should_be, view)[inside].any()
-    found = KnownView(made, tried.estimate.state, seen=seen)
+    assert not seen_part(replace(made, occluder_depth=depths), tried, should_be, view)[inside].any()
+    found = PosedImage(made, tried.estimate.state, seen=seen)
     new = ReferenceView(Estimator(film.model, CAMERA), [found], OPTIONS, view.surface)
     places = np.rint(new.pixels).astype(int)
     assert seen[places[:, 1], places[:, 0]].all()

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import brentq
 
 from morph_dslam.errors import SolverError
-from morph_dslam.offline.solvers.newton import PathError, State, advance, sensitivities, solve
+from morph_dslam.mechanics.solvers.newton import PathError, State, advance, sensitivities, solve
 from tests.support.small_systems import SmallSystem, spring_column, von_mises_truss
 
 HEIGHT = 0.3
@@ -103,9 +103,7 @@ def test_divergence_is_noticed_early() -> None:
     with pytest.raises(SolverError, match="diverges"):
         solve(runaway, np.array([0.0]), State(np.zeros(1), np.array([20.0])))
     # From 1.5 undamped steps run away too (the classical example); damped ones come back.
-    assert solve(runaway, np.array([0.0]), State(np.zeros(1), np.array([1.5]))).dofs[0] == pytest.approx(
-        0.0, abs=1e-8
-    )
+    assert solve(runaway, np.array([0.0]), State(np.zeros(1), np.array([1.5]))).dofs[0] == pytest.approx(0.0, abs=1e-8)
 
 
 class Ratchet(SmallSystem):

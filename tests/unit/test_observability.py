@@ -7,12 +7,12 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField, SurfacePoints
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, State
-from morph_dslam.online.estimation.sequence_filter import SequenceFilter
-from morph_dslam.online.frame_result import STAGES, FrameResult
-from morph_dslam.online.runs.results import RunResults, summarise
-from morph_dslam.online.uncertainty.measurement_noise import Measured
-from morph_dslam.online.uncertainty.observability import one_value, statement, untold, value_line
+from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
+from morph_dslam.tracking.noise import Observations
+from morph_dslam.tracking.observability import one_value, statement, unobservable, value_line
+from morph_dslam.tracking.result import STAGES, FrameResult
+from morph_dslam.tracking.run_folder import RunResults, summarise
+from morph_dslam.tracking.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import sheet_mesh
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
@@ -34,9 +34,7 @@ def beam_model():
     indices = np.eye(4, dtype=np.int64)[:3]
     rows = np.array([[1.0, 0.0], [-2.0, 0.0], [0.0, 1.0]])
     functions = ParameterFunctions(-np.ones(4), np.ones(4), indices, rows)
-    return ReducedModel(
-        "beam", nodes, triangles, parameters, SeparatedField(np.stack([bend, shear]), functions)
-    )
+    return ReducedModel("beam", nodes, triangles, parameters, SeparatedField(np.stack([bend, shear]), functions))
 
 
 MODEL = beam_model()
@@ -55,7 +53,7 @@ def run_of(per_sequence, frames=3):
         pixels = CAMERA.project(points.in_camera(truth)) + 0.3 * rng.standard_normal((80, 2))
         weights, normals = np.ones(80), np.zeros((80, 2))
         alone = estimator.estimate(points, pixels, weights, truth)
-        estimate = filtered.fuse(Measured(points, pixels, weights, normals, np.eye(80)), alone)
+        estimate = filtered.fuse(Observations(points, pixels, weights, normals, np.eye(80)), alone)
         times = dict.fromkeys(STAGES, 1.0)
         run.add(number, 0.1 * number, FrameResult("tracked", "", estimate, 0.4, 80, 80, times, 9.0))
     return run
@@ -64,9 +62,7 @@ def run_of(per_sequence, frames=3):
 def test_parameters_without_effect_and_those_that_act_alike_are_named():
     told = summarise(run_of(()))["flags"]
     assert told[0] == "parameter 'colour' cannot be told from the images in 3 frames"
-    assert told[1].startswith(
-        "parameters 'load' and 'stiffness' cannot be told apart from the images in 3 frames"
-    )
+    assert told[1].startswith("parameters 'load' and 'stiffness' cannot be told apart from the images in 3 frames")
     # 2 stiffness - load stays the same: twice as much of the load as of the stiffness, both in shares of 2.
     assert "'load' is 0.179 larger and 'stiffness' is 0.0894 larger" in told[1]
     assert len(told) == 2
@@ -97,7 +93,7 @@ def test_combinations_that_share_a_parameter_come_together():
     """Three angles of which only the sum counts: two directions are open."""
     seen = np.ones(3) / np.sqrt(3.0)
     covariance = np.linalg.inv(1e4 * np.outer(seen, seen) + 1e-6 * np.eye(3))
-    (part,) = untold(covariance, np.ones(3))
+    (part,) = unobservable(covariance, np.ones(3))
     assert part.indices == (0, 1, 2)
     assert len(part.directions) == 2
     np.testing.assert_allclose(part.directions @ seen, 0.0, atol=1e-6)
@@ -108,5 +104,5 @@ def test_combinations_that_share_a_parameter_come_together():
 
 
 def test_all_told_and_nothing_told():
-    assert untold(np.diag([0.01, 0.02]) ** 2, np.ones(2)) == []
-    assert [part.indices for part in untold(np.full((2, 2), np.inf), np.ones(2))] == [(0,), (1,)]
+    assert unobservable(np.diag([0.01, 0.02]) ** 2, np.ones(2)) == []
+    assert [part.indices for part in unobservable(np.full((2, 2), np.inf), np.ones(2))] == [(0,), (1,)]

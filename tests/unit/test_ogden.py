@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from morph_dslam.offline.materials.base import evaluate
-from morph_dslam.offline.materials.ogden import Ogden, Spectrum
+from morph_dslam.mechanics.materials.base import evaluate
+from morph_dslam.mechanics.materials.isotropic import Ogden, Spectrum
 from tests.support.closed_form_stress import from_invariants, volumetric
 from tests.support.material_laws import rotation, stress, tangent, tensor
 

@@ -8,14 +8,8 @@ import pytest
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.online.estimation.estimator import State, moved
-from morph_dslam.online.measuring.outline import (
-    Outline,
-    OutlineOptions,
-    rim,
-    search_outline,
-    search_outline_numpy,
-)
+from morph_dslam.tracking.estimator import State, moved
+from morph_dslam.tracking.outline import Outline, OutlineOptions, rim, search_outline, search_outline_numpy
 from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 520.0, 520.0, 320.0, 240.0)
@@ -43,9 +37,7 @@ def drawn(model, state, inner=210, outer=70) -> np.ndarray:
 def test_rim_of_a_grid_is_its_boundary(model):
     edges = rim(model.triangles)
     lower, upper = model.nodes.min(axis=0), model.nodes.max(axis=0)
-    on_side = [
-        (model.nodes[edges][:, :, k] == side[k]).all(axis=1) for k in range(2) for side in (lower, upper)
-    ]
+    on_side = [(model.nodes[edges][:, :, k] == side[k]).all(axis=1) for k in range(2) for side in (lower, upper)]
     assert np.any(on_side, axis=0).all()
     length = np.linalg.norm(np.diff(model.nodes[edges], axis=1), axis=2).sum()
     assert length == pytest.approx(2.0 * (upper - lower)[:2].sum(), rel=1e-12)

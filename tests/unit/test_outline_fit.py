@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morph_dslam.online.mesh_registration.outline_fit import clearest_cut, outline_fit
-from morph_dslam.similarity import SimilarityTransform
+from morph_dslam.geometry import SimilarityTransform
+from morph_dslam.registration.outline_fit import clearest_cut, outline_fit
 from tests.support.rendered_object import CAMERA, scanned, wedge
 from tests.support.rendered_sequence import printed_texture
 
@@ -35,9 +35,7 @@ def views(request):
 def scaled(factor):
     """`WORLD`, the object in another size about its middle."""
     middle = WORLD.apply(NODES.mean(axis=0)[None])[0]
-    return SimilarityTransform(
-        WORLD.scale * factor, WORLD.rotation, middle + factor * (WORLD.translation - middle)
-    )
+    return SimilarityTransform(WORLD.scale * factor, WORLD.rotation, middle + factor * (WORLD.translation - middle))
 
 
 def test_the_right_place_fits(views):

@@ -4,10 +4,9 @@ import matplotlib
 import numpy as np
 import pytest
 
-from morph_dslam.render.colour_maps import colour_bar, colour_table
 from morph_dslam.render.overlay import blend_surface, blend_surface_numpy, draw_overlay, paint_surface
 from morph_dslam.render.rasteriser import rasterise
-from morph_dslam.render.shading import lambert, vertex_normals, vertex_normals_numpy
+from morph_dslam.render.shading import colour_bar, colour_table, lambert, vertex_normals, vertex_normals_numpy
 from tests.support.bent_sheet import LENGTH, bent_sheet_model
 
 PIXELS = np.array([[20.0, 40.0], [119.0, 40.0], [119.0, 139.0], [20.0, 139.0]])

@@ -9,9 +9,7 @@ import pytest
 PROJECT = Path(__file__).parents[2]
 
 
-@pytest.mark.skipif(
-    shutil.which("git") is None or not (PROJECT / ".git").exists(), reason="this is no git checkout"
-)
+@pytest.mark.skipif(shutil.which("git") is None or not (PROJECT / ".git").exists(), reason="this is no git checkout")
 def test_no_file_of_the_project_is_ignored():
     """`runs/` in .gitignore, without a slash before it, once left `online/runs` out of the wheel."""
     command = ["git", "ls-files", "--cached", "--ignored", "--exclude-standard"]

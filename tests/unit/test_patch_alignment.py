@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 
-from morph_dslam.online.mesh_registration.patch_alignment import (
-    align_patches,
-    align_patches_numpy,
-    carry,
-    carry_numpy,
-)
+from morph_dslam.registration.texture import align_patches, align_patches_numpy, carry, carry_numpy
 from morph_dslam.render.rasteriser import rasterise
 from tests.support.rendered_object import CAMERA, cameras, scanned, wedge
 from tests.unit.test_keyframe_adjustment import WORLD
@@ -16,12 +11,7 @@ from tests.unit.test_keyframe_adjustment import WORLD
 
 def pattern(x, y):
     """A smooth texture between 0 and 255."""
-    return (
-        128.0
-        + 40.0 * np.sin(0.31 * x + 0.17 * y)
-        + 35.0 * np.cos(0.23 * y - 0.11 * x)
-        + 20.0 * np.sin(0.4 * y)
-    )
+    return 128.0 + 40.0 * np.sin(0.31 * x + 0.17 * y) + 35.0 * np.cos(0.23 * y - 0.11 * x) + 20.0 * np.sin(0.4 * y)
 
 
 ROWS, COLUMNS = np.mgrid[0:120, 0:160].astype(float)
@@ -53,13 +43,9 @@ def test_pixels_that_are_not_shown_do_not_count():
 def test_patches_agree_with_the_plain_twin():
     rng = np.random.default_rng(1)
     carried = (pattern(COLUMNS, ROWS) + rng.normal(0.0, 2.0, ROWS.shape)).astype(np.float32)
-    image = np.clip(pattern(COLUMNS - 0.8, ROWS - 0.3) + rng.normal(0.0, 2.0, ROWS.shape), 0, 255).astype(
-        np.uint8
-    )
+    image = np.clip(pattern(COLUMNS - 0.8, ROWS - 0.3) + rng.normal(0.0, 2.0, ROWS.shape), 0, 255).astype(np.uint8)
     shown = (COLUMNS - 75.0) ** 2 + (ROWS - 60.0) ** 2 < 45.0**2
-    compiled, plain = (
-        function(carried, shown, image, CENTRES, 8) for function in (align_patches, align_patches_numpy)
-    )
+    compiled, plain = (function(carried, shown, image, CENTRES, 8) for function in (align_patches, align_patches_numpy))
     np.testing.assert_allclose(compiled[0], plain[0], atol=1e-6)
     np.testing.assert_allclose(compiled[1], plain[1], atol=1e-6)
     assert (plain[1] > 0.9).any()
@@ -73,18 +59,14 @@ def two_views():
     for pose in (cameras()[1], cameras()[4]):
         local = pose.apply(nodes)
         pixels = CAMERA.project(local)
-        drawn.append(
-            (pixels, local[:, 2], rasterise(pixels, local[:, 2], triangles, CAMERA.height, CAMERA.width))
-        )
+        drawn.append((pixels, local[:, 2], rasterise(pixels, local[:, 2], triangles, CAMERA.height, CAMERA.width)))
     return triangles, drawn, views[1].flat, views[4].flat
 
 
 def carried_by(function, two_views):
     triangles, ((pixels, depths, first), (_, _, second)), flat, _ = two_views
     carried, shown = np.zeros(flat.shape, np.float32), np.zeros(flat.shape, dtype=bool)
-    function(
-        second.triangle_ids, second.weights, triangles, pixels, depths, first.depth, flat, carried, shown
-    )
+    function(second.triangle_ids, second.weights, triangles, pixels, depths, first.depth, flat, carried, shown)
     return carried, shown
 
 

@@ -5,13 +5,15 @@ import numpy as np
 import pytest
 from scipy.ndimage import shift
 
-from morph_dslam.online.measuring.features import spread_corners
-from morph_dslam.online.measuring.flow import FlowOptions, flatten, follow
-from morph_dslam.online.measuring.patches import (
+from morph_dslam.tracking.patches import (
+    FlowOptions,
     compare_patches,
     compare_patches_numpy,
+    flatten,
+    follow,
     patch_correlation,
     patch_correlation_numpy,
+    spread_corners,
 )
 from tests.support.rendered_sequence import printed_texture
 
@@ -120,7 +122,4 @@ def test_correlation_ignores_gain_and_offset_and_sees_difference(image):
     darker = (0.5 * image + 20).astype(np.uint8)
     assert patch_correlation(image, darker, centre, centre, 7).min() > 0.99
     assert patch_correlation(image, image, centre, centre + 35.0, 7).max() < 0.6
-    assert patch_correlation(image, image, centre, np.array([[-3.0, 5.0], [639.0, 5.0]]), 7).tolist() == [
-        -1,
-        -1,
-    ]
+    assert patch_correlation(image, image, centre, np.array([[-3.0, 5.0], [639.0, 5.0]]), 7).tolist() == [-1, -1]

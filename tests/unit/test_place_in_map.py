@@ -7,15 +7,14 @@ import pytest
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
-from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_exp
 from morph_dslam.model import SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.online.anchored.anchor import Anchor, points_on_object
-from morph_dslam.online.anchored.place_in_map import PlaceInMap
-from morph_dslam.online.estimation.state import State, moved
-from morph_dslam.online.slam.pose import PoseEstimate
-from morph_dslam.online.slam.rigid_map import GOOD, Keyframe, RigidMap
-from morph_dslam.similarity import SimilarityTransform
+from morph_dslam.registration.registration import MapRegistration
+from morph_dslam.slam.pose import PoseEstimate
+from morph_dslam.slam.rigid_map import GOOD, Keyframe, RigidMap
+from morph_dslam.tracking.anchoring import Anchor, points_on_object
+from morph_dslam.tracking.state import State, moved
 from tests.support.bent_sheet import bent_sheet_model
 
 CENTRE = np.array([0.01, 0.02, 0.05])
@@ -35,8 +34,8 @@ def test_a_point_of_the_object_is_seen_where_the_map_has_it():
     """Its direction in the camera is that of its place in the map; its distance is that in metres."""
     rng = np.random.default_rng(0)
     placed, pose = similarity(rng), camera_pose(rng)
-    place = PlaceInMap(placed, CENTRE, np.eye(7) * 1e-8)
-    known = place.known_pose(PoseEstimate(pose, np.eye(6) * 1e-8, np.ones(5, dtype=bool), 0.3))
+    place = MapRegistration(placed, CENTRE, np.eye(7) * 1e-8)
+    known = place.pose_prior(PoseEstimate(pose, np.eye(6) * 1e-8, np.ones(5, dtype=bool), 0.3))
     points = 0.1 * rng.normal(size=(6, 3))
     in_map_units = placed.apply(points) @ pose[:3, :3].T + pose[:3, 3]
     np.testing.assert_allclose(known.pose.apply(points), in_map_units / 2.3, atol=1e-12)
@@ -50,7 +49,7 @@ def test_the_covariance_is_that_of_samples():
     of_place[0, 3] = of_place[3, 0] = 0.8e-8
     of_camera = np.diag(rng.uniform(1.0, 3.0, 6)) * 1e-8
     found = PoseEstimate(pose, of_camera, np.ones(5, dtype=bool), 0.3)
-    known = PlaceInMap(placed, CENTRE, of_place).known_pose(found)
+    known = MapRegistration(placed, CENTRE, of_place).pose_prior(found)
     middle, away = placed.apply(CENTRE), []
     for place_error, camera_error in zip(
         rng.multivariate_normal(np.zeros(7), of_place, 30_000),
@@ -73,7 +72,7 @@ def test_the_covariance_is_that_of_samples():
 
 def test_the_increment_to_another_pose_is_the_one_that_leads_there():
     rng = np.random.default_rng(2)
-    known = PlaceInMap(similarity(rng), CENTRE, np.eye(7) * 1e-8).known_pose(
+    known = MapRegistration(similarity(rng), CENTRE, np.eye(7) * 1e-8).pose_prior(
         PoseEstimate(camera_pose(rng), np.eye(6) * 1e-8, np.ones(5, dtype=bool), 0.3)
     )
     step = 0.1 * rng.normal(size=6)
@@ -92,7 +91,7 @@ def sheet_map():
     model = replace(sheet, displacement=SeparatedField(lift, functions), parameters=parameters)
     x = np.concatenate([np.linspace(-0.2, 0.2, 41), np.linspace(-0.2, 0.2, 10)])
     points = np.column_stack([x, np.zeros(51), np.r_[np.zeros(41), np.full(10, -0.03)]])
-    place = PlaceInMap(
+    place = MapRegistration(
         SimilarityTransform(3.0, rotation_exp(np.array([0.3, -0.2, 0.5])), np.array([1.0, 2.0, 3.0])),
         np.zeros(3),
         np.eye(7) * 1e-8,
@@ -119,7 +118,7 @@ def test_an_anchor_keeps_the_scene_and_needs_to_know_how_well_the_place_is_known
     flat = np.full((240, 320), 128, dtype=np.uint8)
     rigid_map.add_keyframe(Keyframe(0, 0.0, flat, np.eye(4), ids, np.zeros((51, 2))))
     expected = points_on_object(positions, place, model)[1]
-    blind = PlaceInMap(place.world_from_object, place.centre, None)
+    blind = MapRegistration(place.world_from_object, place.centre, None)
     with pytest.raises(RegistrationError, match="does not say how well the object's place is known"):
         Anchor(rigid_map, camera, {"sheet": (blind, model)})
     assert blind.pose_covariance(RigidTransform.identity()) is None

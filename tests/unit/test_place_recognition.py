@@ -5,16 +5,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.online.slam.descriptors import describe, least_distances, match_points, orientations
-from morph_dslam.online.slam.place_recognition import PlaceIndex, Vocabulary, bit_counts
-from morph_dslam.online.slam.rigid_map import Keyframe, RigidMap
-from morph_dslam.online.slam.view_warp import (
-    WarpedViews,
-    is_small,
-    local_change,
-    plane_homography,
-    warp_pixels,
-)
+from morph_dslam.slam.frame_images import describe, least_distances, match_points, orientations
+from morph_dslam.slam.relocalization import PlaceIndex, Vocabulary, bit_counts
+from morph_dslam.slam.rigid_map import Keyframe, RigidMap
+from morph_dslam.slam.tracking import WarpedViews, is_small, local_change, plane_homography, warp_pixels
 from tests.support.rendered_sequence import printed_texture
 
 INTRINSICS = np.array([500.0, 510.0, 200.0, 190.0])
@@ -125,10 +119,7 @@ def project(pose, points):
 
 
 def test_the_homography_of_a_plane_moves_pixels_as_projection_does():
-    keyframe, now = (
-        pose_matrix([0.1, 0.2, 0.0], [0.3, 0.0, 0.1]),
-        pose_matrix([0, 0.1, 0.5], [0.2, -0.3, 0.4]),
-    )
+    keyframe, now = (pose_matrix([0.1, 0.2, 0.0], [0.3, 0.0, 0.1]), pose_matrix([0, 0.1, 0.5], [0.2, -0.3, 0.4]))
     local = np.column_stack([np.random.default_rng(3).uniform(-0.5, 0.5, (30, 2)), np.full(30, 2.5)])
     points = (local - keyframe[:3, 3]) @ keyframe[:3, :3]
     homography = plane_homography(keyframe, now, 2.5, INTRINSICS)
@@ -142,10 +133,7 @@ def test_the_homography_of_a_plane_moves_pixels_as_projection_does():
 
 def test_only_views_that_look_much_different_are_warped():
     image = printed_texture(380, 400)
-    keyframe, views = (
-        Keyframe(0, 0.0, image, np.eye(4), np.arange(0), np.empty((0, 2))),
-        WarpedViews(INTRINSICS),
-    )
+    keyframe, views = (Keyframe(0, 0.0, image, np.eye(4), np.arange(0), np.empty((0, 2))), WarpedViews(INTRINSICS))
     near, homography = views.view(0, keyframe, pose_matrix([0, 0, 0.1], [0.1, 0, 0]), 2.0)
     assert near is image
     assert homography is None

@@ -7,10 +7,10 @@ import pytest
 import scipy.linalg
 import scipy.sparse
 
-from morph_dslam.offline.problem import Snapshot
-from morph_dslam.offline.reduction.fields import FieldRows
-from morph_dslam.offline.reduction.pod import compute_pod, hierarchical_pod
-from morph_dslam.offline.snapshots import load_snapshot, save_snapshot
+from morph_dslam.reduction.pod import compute_pod, hierarchical_pod
+from morph_dslam.reduction.task import FieldRows
+from morph_dslam.studies.problem import Snapshot
+from morph_dslam.studies.snapshots import load_snapshot, save_snapshot
 
 N = 300
 

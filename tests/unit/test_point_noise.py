@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from morph_dslam.online.uncertainty.point_noise import LARGEST_POWER, LEAST_SPREAD_PX, PointNoise
+from morph_dslam.tracking.noise import LARGEST_POWER, LEAST_SPREAD_PX, PointNoise
 
 
 def learnt(factor, common_px, frames=60, count=300, seed=0):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from morph_dslam.offline.problem import Snapshot
-from morph_dslam.offline.reactions import reaction_names, with_reactions
+from morph_dslam.mechanics.loads import reaction_names, with_reactions
+from morph_dslam.studies.problem import Snapshot
 
 
 def solve(pull, **outputs):

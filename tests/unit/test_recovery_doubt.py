@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from morph_dslam.online.attempt import refusal
-from morph_dslam.online.recovering.recovery import Recovery
-from morph_dslam.online.tracker_options import TrackerOptions
+from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.recovery import Recovery
+from morph_dslam.tracking.result import refusal
 
 
 def attempt(share, sigma_px, prior=None, visible=1.0) -> Any:
@@ -35,9 +35,7 @@ def test_a_frame_before_anything_was_followed_is_not_doubted():
     assert new().doubt(attempt(0.2, 2.0)) == 0.0
 
 
-@pytest.mark.parametrize(
-    ("share", "sigma_px", "visible"), [(0.8, 2.0, 1.0), (0.6, 2.0, 0.7), (0.3, 0.44, 1.0)]
-)
+@pytest.mark.parametrize(("share", "sigma_px", "visible"), [(0.8, 2.0, 1.0), (0.6, 2.0, 0.7), (0.3, 0.44, 1.0)])
 def test_most_points_or_close_ones_are_not_doubted(recovery, share, sigma_px, visible):
     assert recovery.doubt(attempt(share, sigma_px, visible=visible)) == 0.0
 
@@ -62,8 +60,6 @@ def test_with_a_pose_from_the_map_fewer_points_will_do(recovery):
     assert recovery.doubt(attempt(0.2, 0.5, prior=object())) == pytest.approx(0.4)
 
 
-@pytest.mark.parametrize(
-    ("share", "sigma_px", "believed"), [(0.4, 0.9, True), (0.4, 2.5, False), (0.6, 2.5, True)]
-)
+@pytest.mark.parametrize(("share", "sigma_px", "believed"), [(0.4, 0.9, True), (0.4, 2.5, False), (0.6, 2.5, True)])
 def test_few_points_that_do_not_agree_closely_agree_by_chance(share, sigma_px, believed):
     assert (refusal(attempt(share, sigma_px), TrackerOptions()) == "") == believed

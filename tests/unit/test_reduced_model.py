@@ -47,16 +47,12 @@ def test_restriction_interpolates_the_full_field(model):
     restricted = model.restrict(points)
     full_value, full_sensitivities = model.displacement.value_and_sensitivities(MU)
     value, sensitivities = restricted.value_and_sensitivities(MU)
-    np.testing.assert_allclose(
-        value, np.einsum("pc,pcx->px", points.weights, full_value[corners]), atol=1e-14
-    )
+    np.testing.assert_allclose(value, np.einsum("pc,pcx->px", points.weights, full_value[corners]), atol=1e-14)
     expected = np.einsum("pc,dpcx->dpx", points.weights, full_sensitivities[:, corners])
     np.testing.assert_allclose(sensitivities, expected, atol=1e-12)
     rest = model.rest_positions(points)
     assert np.abs(rest[:, 0]).max() <= LENGTH / 2
-    np.testing.assert_allclose(
-        rest, np.einsum("pc,pcx->px", points.weights, model.nodes[corners]), atol=1e-16
-    )
+    np.testing.assert_allclose(rest, np.einsum("pc,pcx->px", points.weights, model.nodes[corners]), atol=1e-16)
 
 
 def test_points_can_be_chosen_by_index_and_by_mask():

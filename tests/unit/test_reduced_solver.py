@@ -4,22 +4,12 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.reduction.reduced_solver import (
-    FullSolutions,
-    ReducedSolver,
-    balancing_weights,
-    solid_equations,
-)
-from morph_dslam.offline.studies.solid_study import SolidStudy
+from morph_dslam.reduction.galerkin import FullSolutions, ReducedSolver, balancing_weights, solid_equations
+from morph_dslam.studies.solid_study import SolidStudy
 
 BLOCK = {
     "name": "block",
-    "mesh": {
-        "generator": "block",
-        "size": ["20 mm", "20 mm", "40 mm"],
-        "divisions": [2, 2, 4],
-        "cells": "hex8",
-    },
+    "mesh": {"generator": "block", "size": ["20 mm", "20 mm", "40 mm"], "divisions": [2, 2, 4], "cells": "hex8"},
     "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.45}},
     "supports": [
         {"kind": "fixed", "on": "z_min"},
@@ -31,10 +21,7 @@ BLOCK = {
             "translation": ["0 mm", "0 mm", "-1 * squash"],
         },
     ],
-    "parameters": {
-        "bend": {"range": ["-30 deg", "30 deg"]},
-        "squash": {"range": ["0 mm", "5 mm"]},
-    },
+    "parameters": {"bend": {"range": ["-30 deg", "30 deg"]}, "squash": {"range": ["0 mm", "5 mm"]}},
     "solver": {"threads": 1},
 }
 BOX = np.array([[-np.pi / 6, np.pi / 6], [0.0, 0.005]])

@@ -5,9 +5,9 @@ import pytest
 
 from morph_dslam.errors import RegistrationError
 from morph_dslam.model import SurfacePoints
-from morph_dslam.online.estimation.depth_residuals import DepthOptions
-from morph_dslam.online.estimation.estimator import BoundPoints, Estimator
-from morph_dslam.online.reference.reference_depth import refine_by_depth
+from morph_dslam.tracking.depth import DepthOptions
+from morph_dslam.tracking.estimator import BoundPoints, Estimator
+from morph_dslam.tracking.refinement import refine_by_depth
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, sheet_depth, sheet_state
 
@@ -36,9 +36,7 @@ def test_depth_places_the_object_along_the_sight_line():
     for seed in range(4):
         landmarks, pixels, start = by_landmarks(seed)
         image = sheet_depth(MODEL, TRUTH, np.random.default_rng(seed))
-        found = refine_by_depth(
-            Estimator(MODEL, CAMERA), landmarks, pixels, start.state, 1.5, image, DepthOptions()
-        )
+        found = refine_by_depth(Estimator(MODEL, CAMERA), landmarks, pixels, start.state, 1.5, image, DepthOptions())
         before.append(along_the_sight_line(start.state))
         after.append(along_the_sight_line(found.state))
         assert (found.pose_std < start.pose_std).all()

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morph_dslam.online.estimation.estimator import BoundPoints, EstimationOptions, Estimator
-from morph_dslam.online.estimation.state import moved
-from morph_dslam.online.measuring.binding import bind_pixels, view_of
-from morph_dslam.online.uncertainty.reference_misfit import FLOOR_PX, ReferenceMisfit
+from morph_dslam.diagnostics.reference_misfit import FLOOR_PX, ReferenceMisfit
+from morph_dslam.tracking.binding import bind_pixels, view_of
+from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator
+from morph_dslam.tracking.state import moved
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.one_view import errors_of
 from tests.support.rendered_sequence import CAMERA, sheet_state
@@ -43,8 +43,7 @@ def test_a_reference_that_is_off_more_than_stated_is_found_to_be(times):
     nodes = np.random.default_rng(0).choice(len(model.nodes), 160, replace=False)
     nodes = nodes[(np.abs(model.nodes[nodes]) < [0.19, 0.13, 1.0]).all(axis=1)]
     seen = [
-        CAMERA.project(s.camera_from_object.apply(model.positions(s.parameters)))[nodes]
-        for s in (REFERENCE, LATER)
+        CAMERA.project(s.camera_from_object.apply(model.positions(s.parameters)))[nodes] for s in (REFERENCE, LATER)
     ]
     used, rng, found = np.ones(len(nodes), dtype=bool), np.random.default_rng(1), []
     n_widened = 0

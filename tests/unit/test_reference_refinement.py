@@ -5,15 +5,10 @@ import numpy as np
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, State
-from morph_dslam.online.measuring.binding import nearest_surface_points
-from morph_dslam.online.reference.reference_refinement import (
-    Keyframe,
-    RefinementOptions,
-    choose_keyframes,
-    refine_reference,
-)
-from morph_dslam.online.start.registration import register
+from morph_dslam.registration.landmarks import register
+from morph_dslam.tracking.binding import nearest_surface_points
+from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
+from morph_dslam.tracking.refinement import Keyframe, RefinementOptions, choose_keyframes, refine_reference
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import mean_error, sheet_state
 
@@ -34,9 +29,7 @@ def test_other_frames_correct_a_reference_that_bad_landmarks_spoiled():
     keyframes = [keyframe(points, sheet_state(time), rng) for time in np.linspace(0.1, 0.9, 8)]
     # Ten landmarks, each a pixel and a half off.
     object_points = model.nodes[rng.choice(len(model.nodes), 10, replace=False)]
-    landmarks = BoundPoints.from_surface(
-        model, nearest_surface_points(model.nodes, model.triangles, object_points)[0]
-    )
+    landmarks = BoundPoints.from_surface(model, nearest_surface_points(model.nodes, model.triangles, object_points)[0])
     clicked = CAMERA.project(landmarks.in_camera(truth)) + 1.5 * rng.standard_normal((10, 2))
     registered = register(model, CAMERA, object_points, clicked).state
     refined = refine_reference(
@@ -58,9 +51,7 @@ def test_a_right_reference_is_left_where_it_is():
     rng = np.random.default_rng(1)
     truth = State(
         np.array([0.02, 0.1, 0.05]),
-        RigidTransform(
-            rotation_exp(np.array([0.2, 0.1, 0.0])) @ np.diag([1.0, -1.0, -1.0]), np.array([0, 0, 0.6])
-        ),
+        RigidTransform(rotation_exp(np.array([0.2, 0.1, 0.0])) @ np.diag([1.0, -1.0, -1.0]), np.array([0, 0, 0.6])),
     )
     surface = SurfacePoints(rng.integers(0, len(model.triangles), 80), rng.dirichlet(np.ones(3), 80))
     points = BoundPoints.from_surface(model, surface)

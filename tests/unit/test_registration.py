@@ -7,8 +7,8 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.online.estimation.estimator import BoundPoints, State
-from morph_dslam.online.start.registration import register, shape_starts, solve_pnp
+from morph_dslam.registration.landmarks import register, shape_starts, solve_pnp
+from morph_dslam.tracking.estimator import BoundPoints, State
 from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
@@ -70,9 +70,7 @@ def test_landmark_off_the_object_is_named(model):
 def test_pixel_outside_the_image_is_named(model):
     points, pixels = landmarks(model, BENT, spread_nodes(model))
     pixels[2] = [700.0, 100.0]
-    with pytest.raises(
-        RegistrationError, match=r"landmark 3 has the pixel \(700, 100\), outside the 640x480"
-    ):
+    with pytest.raises(RegistrationError, match=r"landmark 3 has the pixel \(700, 100\), outside the 640x480"):
         register(model, CAMERA, points, pixels)
 
 

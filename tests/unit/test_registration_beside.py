@@ -7,16 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.errors import RegistrationError
+from morph_dslam.geometry import SimilarityTransform
 from morph_dslam.model import save_model
-from morph_dslam.online.mesh_registration.beside import left_by_others
-from morph_dslam.online.mesh_registration.register import register_mesh
-from morph_dslam.similarity import SimilarityTransform
+from morph_dslam.registration.mesh import register_mesh
+from morph_dslam.registration.run import left_by_others
 from tests.support.rendered_object import CAMERA, scanned, wedge
 from tests.support.staged_scenes import bending_wedge
 
-WORLD = SimilarityTransform(
-    1.0, Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix(), np.array([0.5, -1.2, 2.0])
-)
+WORLD = SimilarityTransform(1.0, Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix(), np.array([0.5, -1.2, 2.0]))
 PLACES = (np.array([-0.08, 0.0, 0.0]), np.array([0.08, 0.03, 0.0]))
 
 
@@ -71,12 +69,8 @@ def test_the_points_on_an_object_are_left_to_it_and_no_others(tmp_path):
     # All raised points are gone that lie in the first one's box, and none of the second's.
     assert (rest[:, 2] > 5e-3).sum() == (raised & ~of_first).sum()
     for view, before in zip(seen, views, strict=True):
-        kept = np.isin(
-            before.point_ids, np.flatnonzero(np.isin(points.positions, left.positions).all(axis=1))
-        )
-        np.testing.assert_array_equal(
-            left.positions[view.point_ids], points.positions[before.point_ids[kept]]
-        )
+        kept = np.isin(before.point_ids, np.flatnonzero(np.isin(points.positions, left.positions).all(axis=1)))
+        np.testing.assert_array_equal(left.positions[view.point_ids], points.positions[before.point_ids[kept]])
         np.testing.assert_array_equal(view.pixels, before.pixels[kept])
 
 

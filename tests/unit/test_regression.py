@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morph_dslam.offline.reduction.pod import compute_pod
-from morph_dslam.offline.reduction.regression import fit_functions
+from morph_dslam.reduction.pod import compute_pod
+from morph_dslam.reduction.regression import fit_functions
 
 LOWER, UPPER = np.array([-2.0, 0.5, 10.0]), np.array([1.0, 1.5, 40.0])
 
@@ -17,9 +17,7 @@ def smooth(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     values = np.column_stack([np.sin(a) * b, np.exp(-c / 30.0) * a**2])
     gradients = np.empty((len(x), 3, 2))
     gradients[:, :, 0] = np.column_stack([np.cos(a) * b, np.sin(a), 0.0 * c])
-    gradients[:, :, 1] = np.column_stack(
-        [2.0 * a * np.exp(-c / 30.0), 0.0 * b, -np.exp(-c / 30.0) * a**2 / 30.0]
-    )
+    gradients[:, :, 1] = np.column_stack([2.0 * a * np.exp(-c / 30.0), 0.0 * b, -np.exp(-c / 30.0) * a**2 / 30.0])
     return values, gradients
 
 
@@ -52,9 +50,7 @@ def test_smooth_functions_converge_with_the_degree() -> None:
     for i, mu in enumerate(new):
         value, gradient = functions.evaluate(mu)
         assert value == pytest.approx(expected[i], abs=2e-4)
-        assert gradient * (UPPER - LOWER)[:, None] == pytest.approx(
-            slopes[i] * (UPPER - LOWER)[:, None], abs=5e-3
-        )
+        assert gradient * (UPPER - LOWER)[:, None] == pytest.approx(slopes[i] * (UPPER - LOWER)[:, None], abs=5e-3)
 
 
 def test_a_parameter_that_needs_it_gets_a_higher_degree_than_the_others() -> None:
@@ -75,8 +71,7 @@ def test_a_parameter_that_needs_it_gets_a_higher_degree_than_the_others() -> Non
     assert degrees[1:].max() <= 8
     _, expected = narrow(new)
     missed = [
-        np.linalg.norm([fit.evaluate(mu)[1] - slope for mu, slope in zip(new, expected, strict=True)])
-        for fit in fits
+        np.linalg.norm([fit.evaluate(mu)[1] - slope for mu, slope in zip(new, expected, strict=True)]) for fit in fits
     ]
     assert missed[1] < 0.3 * missed[0]
 

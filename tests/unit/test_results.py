@@ -9,14 +9,12 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel, SeparatedField, SurfacePoints
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.online.drawing.augmented_view import AugmentedView
-from morph_dslam.online.estimation.estimator import BoundPoints, Estimate, State
-from morph_dslam.online.frame_result import STAGES, FrameResult
-from morph_dslam.online.measuring.appearance import ReferenceAppearance
-from morph_dslam.online.measuring.binding import view_of
-from morph_dslam.online.measuring.measurement import visible_surface
-from morph_dslam.online.runs.results import RunResults, summarise
-from morph_dslam.online.runs.run_flags import flags
+from morph_dslam.tracking.binding import view_of
+from morph_dslam.tracking.drawing import AugmentedView
+from morph_dslam.tracking.estimator import BoundPoints, Estimate, State
+from morph_dslam.tracking.measurement import ReferenceAppearance, visible_surface
+from morph_dslam.tracking.result import STAGES, FrameResult
+from morph_dslam.tracking.run_folder import RunResults, flags, summarise
 from tests.support.bent_sheet import PARAMETERS, bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
@@ -47,9 +45,7 @@ def test_summary_counts_and_flags():
     assert summary["median_n_inliers"] == 280
     told = flags(run)
     assert "1 of 3 frames were lost" in told[0]
-    assert (
-        "'arch' is at the upper bound of its range (60 mm) in 1 frames: the object may be outside" in told[1]
-    )
+    assert "'arch' is at the upper bound of its range (60 mm) in 1 frames: the object may be outside" in told[1]
     assert "'skew' cannot be told from the images in 1 frames" in told[2]
     assert len(told) == 3
 
@@ -57,9 +53,7 @@ def test_summary_counts_and_flags():
 def test_dimensions_that_frames_show_to_be_off_are_flagged_as_the_last_of_them_has_it():
     run = RunResults(bent_sheet_model(22, 16), reference_frame=0)
     plain = frame_result([0.01, 0.1, 0.0], [1e-3, 0.05, 0.01], [False, False, False])
-    for number, off in enumerate(
-        ("", "by about 5 % along x against y", "by about 3 % along x against y", "")
-    ):
+    for number, off in enumerate(("", "by about 5 % along x against y", "by about 3 % along x against y", "")):
         run.add(number, 0.1 * number, replace(plain, dimensions_off=off))
     told = [flag for flag in flags(run) if "dimensions" in flag]
     assert len(told) == 1
@@ -73,10 +67,7 @@ def test_bound_where_the_undeformed_object_rests_is_told_from_one_that_it_reache
     run.add(0, 0.0, frame_result([0.0, 0.1, 0.0], [1e-3, 0.05, 0.01], [True, False, False]))
     run.add(1, 0.1, frame_result([0.06, 0.1, 0.0], [1e-3, 0.05, 0.01], [True, False, False]))
     resting, reached = flags(run)
-    assert (
-        "'arch' is at the lower bound of its range (0 mm) in 1 frames: the object rests there, or is"
-        in resting
-    )
+    assert "'arch' is at the lower bound of its range (0 mm) in 1 frames: the object rests there, or is" in resting
     assert "'arch' is at the upper bound of its range (60 mm) in 1 frames: the object may be" in reached
 
 

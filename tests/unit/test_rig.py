@@ -7,13 +7,13 @@ import yaml
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import CameraError
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.io.stereo_calibration import load_rig
+from morph_dslam.io.camera_files import load_rig
 from morph_dslam.model import SurfacePoints
-from morph_dslam.online.anchored.known_pose import KnownPose
-from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, Prior, State, moved
-from morph_dslam.online.estimation.sequence_filter import SequenceFilter
-from morph_dslam.online.several.rig import RigCamera, RigEstimator
-from morph_dslam.online.uncertainty.measurement_noise import Measured, RigMeasured
+from morph_dslam.registration.registration import PosePrior
+from morph_dslam.tracking.estimator import BoundPoints, Estimator, Prior, State, moved
+from morph_dslam.tracking.multi_camera import RigCamera, RigEstimator
+from morph_dslam.tracking.noise import Observations, RigObservations
+from morph_dslam.tracking.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model
 
 MODEL = bent_sheet_model(22, 16)
@@ -25,9 +25,7 @@ ASIDE = RigCamera(
 )
 TRUTH = State(
     np.array([0.035, 0.3, 0.1]),
-    RigidTransform(
-        rotation_exp(np.array([0.2, -0.3, 0.05])) @ np.diag([1.0, -1.0, -1.0]), np.array([0, 0, 0.6])
-    ),
+    RigidTransform(rotation_exp(np.array([0.2, -0.3, 0.05])) @ np.diag([1.0, -1.0, -1.0]), np.array([0, 0, 0.6])),
 )
 SIGMA = 0.4
 
@@ -45,7 +43,7 @@ def seen_by(part, points, rng, sigma=SIGMA):
     pixels = part.camera.project(points.in_camera(part.seen(TRUTH)))
     pixels = pixels + sigma * rng.standard_normal(pixels.shape)
     count = len(points)
-    return Measured(points, pixels, np.ones(count), np.zeros((count, 2)), np.eye(count))
+    return Observations(points, pixels, np.ones(count), np.zeros((count, 2)), np.eye(count))
 
 
 def test_a_pose_known_in_the_rig_is_known_as_well_in_each_camera():
@@ -53,7 +51,7 @@ def test_a_pose_known_in_the_rig_is_known_as_well_in_each_camera():
     rng = np.random.default_rng(4)
     root, lasting = rng.normal(size=(6, 6)) * 1e-3, rng.normal(size=(6, 2)) * 1e-3
     pose = TRUTH.camera_from_object
-    seen = ASIDE.seen_pose(KnownPose(pose, root @ root.T, lasting))
+    seen = ASIDE.seen_pose(PosePrior(pose, root @ root.T, lasting))
     np.testing.assert_allclose(seen.pose.matrix, ASIDE.seen(TRUTH).camera_from_object.matrix, atol=1e-12)
 
     def in_camera(error):
@@ -68,15 +66,13 @@ def test_a_pose_known_in_the_rig_is_known_as_well_in_each_camera():
 
 def test_gradient_and_cost_are_those_of_all_cameras():
     rng = np.random.default_rng(0)
-    views = RigMeasured((seen_by(LEFT, bound(40, 0), rng), seen_by(ASIDE, bound(50, 1), rng)))
+    views = RigObservations((seen_by(LEFT, bound(40, 0), rng), seen_by(ASIDE, bound(50, 1), rng)))
     estimator = RigEstimator(MODEL, [LEFT, ASIDE])
     state = moved(TRUTH, np.full(9, 3e-3))
     cost, hessian, gradient, residuals = estimator.evaluate(views, state)
     by_hand = 0.0
     for part, view in zip((LEFT, ASIDE), views.views, strict=True):
-        length = np.linalg.norm(
-            part.camera.project(view.points.in_camera(part.seen(state))) - view.pixels, axis=1
-        )
+        length = np.linalg.norm(part.camera.project(view.points.in_camera(part.seen(state))) - view.pixels, axis=1)
         by_hand += np.sum(np.where(length <= 3.0, 0.5 * length**2, 3.0 * (length - 1.5)))
     assert cost == pytest.approx(by_hand)
     assert residuals.shape == (90, 2)
@@ -89,7 +85,7 @@ def test_gradient_and_cost_are_those_of_all_cameras():
 def test_one_camera_in_a_rig_is_that_camera():
     view = seen_by(LEFT, bound(60, 2), np.random.default_rng(2))
     alone = Estimator(MODEL, LEFT.camera).fit(view, TRUTH)
-    rig = RigEstimator(MODEL, [LEFT]).fit(RigMeasured((view,)), TRUTH)
+    rig = RigEstimator(MODEL, [LEFT]).fit(RigObservations((view,)), TRUTH)
     np.testing.assert_allclose(rig.state.parameters, alone.state.parameters, rtol=1e-9)
     np.testing.assert_allclose(rig.covariance, alone.covariance, rtol=1e-6)
 
@@ -102,7 +98,7 @@ def test_both_cameras_are_better_than_one_and_deviations_say_so():
     for seed in range(80):
         rng = np.random.default_rng(seed)
         views = seen_by(LEFT, points[0], rng), seen_by(ASIDE, points[1], rng)
-        for name, measured in (("left", views[0]), ("rig", RigMeasured(views))):
+        for name, measured in (("left", views[0]), ("rig", RigObservations(views))):
             estimator = estimators[name]
             estimate = SequenceFilter(estimator, []).fuse(measured, estimator.fit(measured, TRUTH))
             found[name].append([*estimate.state.parameters, *estimate.state.camera_from_object.translation])
@@ -119,7 +115,7 @@ def test_what_one_camera_cannot_see_is_seen_by_the_other():
     rng = np.random.default_rng(5)
     middle, end = seen_by(LEFT, bound(60, 5, (-0.1, 0.1)), rng), seen_by(ASIDE, bound(60, 6, (0.2, 1.0)), rng)
     alone = Estimator(MODEL, LEFT.camera).fit(middle, TRUTH)
-    rig = RigEstimator(MODEL, [LEFT, ASIDE]).fit(RigMeasured((middle, end)), TRUTH)
+    rig = RigEstimator(MODEL, [LEFT, ASIDE]).fit(RigObservations((middle, end)), TRUTH)
     half = 0.5 * (MODEL.upper - MODEL.lower)
     assert alone.parameter_std[1] > half[1]
     assert (rig.parameter_std < 0.3 * half).all()
@@ -131,7 +127,7 @@ def test_parameter_over_the_sequence_sharpens_with_a_rig():
     filtered, deviations = SequenceFilter(estimator, [2]), []
     for seed in range(16):
         rng = np.random.default_rng(seed)
-        measured = RigMeasured((seen_by(LEFT, points[0], rng), seen_by(ASIDE, points[1], rng)))
+        measured = RigObservations((seen_by(LEFT, points[0], rng), seen_by(ASIDE, points[1], rng)))
         estimate = filtered.fuse(measured, estimator.fit(measured, TRUTH))
         deviations.append(estimate.parameter_std[2])
     assert deviations[-1] == pytest.approx(deviations[0] / 4.0, rel=0.35)
@@ -139,7 +135,7 @@ def test_parameter_over_the_sequence_sharpens_with_a_rig():
 
 
 def test_prior_of_the_pose_is_in_the_rigs_frame():
-    measured = RigMeasured((seen_by(ASIDE, bound(60, 9), np.random.default_rng(9)),))
+    measured = RigObservations((seen_by(ASIDE, bound(60, 9), np.random.default_rng(9)),))
     pose = moved(TRUTH, np.full(9, 0.01)).camera_from_object
     prior = Prior(np.zeros(3), np.zeros((3, 3)), pose, 1e12 * np.eye(6))
     found = RigEstimator(MODEL, [ASIDE]).fit(measured, TRUTH, prior)

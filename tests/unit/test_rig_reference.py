@@ -9,14 +9,13 @@ import pytest
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.online.estimation.estimator import BoundPoints, EstimationOptions
-from morph_dslam.online.estimation.state import moved
-from morph_dslam.online.measuring.binding import bind_pixels, view_of
-from morph_dslam.online.several.rig import RigCamera, RigEstimator
-from morph_dslam.online.several.rig_reference import RigReference
-from morph_dslam.online.tracker_options import TrackerOptions
-from morph_dslam.online.uncertainty.bound_part import BoundPart
-from morph_dslam.online.uncertainty.measurement_noise import Measured, RigMeasured
+from morph_dslam.tracking.binding import bind_pixels, view_of
+from morph_dslam.tracking.covariance import BoundPart
+from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions
+from morph_dslam.tracking.multi_camera import RigCamera, RigEstimator, RigReference
+from morph_dslam.tracking.noise import Observations, RigObservations
+from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.state import moved
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, sheet_state
 
@@ -57,7 +56,8 @@ def bound(model, part, reference, state):
 def estimated(model, pictures):
     """What exact measurements of a later frame lead to, and by what.
 
-    ``pictures`` : in each, the reference state, what it was taken for, and the causes (9, c) of that error.
+    ``pictures`` : in each, the reference state, what it was taken for, and the error_factors (9, c) of that
+        error.
     """
     views, trackers = [], []
     estimator = RigEstimator(model, RIG, EstimationOptions(huber_px=50.0, max_iterations=50, tolerance=1e-9))
@@ -67,14 +67,14 @@ def estimated(model, pictures):
         true_points, points = (reduce(BoundPoints.joined, parts) for parts in (every_true, every))
         count, options = len(points), TrackerOptions()
         pixels = part.camera.project(true_points.in_camera(part.seen(LATER)))
-        views.append(Measured(points, pixels, np.ones(count), np.zeros((count, 2)), np.eye(count)))
+        views.append(Observations(points, pixels, np.ones(count), np.zeros((count, 2)), np.eye(count)))
         ends, parts = np.cumsum([len(own) for own in every]), []
-        for own, end, (_, taken, causes) in zip(every, ends, pictures, strict=True):
-            seen = None if causes is None else part.chain(len(model.parameters)) @ causes
+        for own, end, (_, taken, error_factors) in zip(every, ends, pictures, strict=True):
+            seen = None if error_factors is None else part.chain(len(model.parameters)) @ error_factors
             parts.append(BoundPart(slice(end - len(own), end), part.seen(taken), seen))
         reference = SimpleNamespace(points=points, parts=parts)
         trackers.append(SimpleNamespace(estimator=single, reference=reference, options=options))
-    measured = RigMeasured(tuple(views))
+    measured = RigObservations(tuple(views))
     return estimator.fit(measured, LATER), measured, trackers
 
 

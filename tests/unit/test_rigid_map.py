@@ -3,9 +3,9 @@
 import meshio
 import numpy as np
 
-from morph_dslam.io.point_cloud import save_ply
-from morph_dslam.online.slam.rigid_map import CANDIDATE, GOOD, REMOVED, Followed, Keyframe, RigidMap
-from morph_dslam.online.slam.template_choice import FewTemplates
+from morph_dslam.io.tables import save_ply
+from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, REMOVED, Followed, Keyframe, RigidMap
+from morph_dslam.slam.tracking import FewTemplates
 
 
 def keyframe(ids, pixels, index=0):

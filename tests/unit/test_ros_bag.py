@@ -78,11 +78,7 @@ def sequence(types, n_frames=3, stamped=True):
 
 @pytest.mark.parametrize(
     ("name", "version", "storage"),
-    [
-        ("one.bag", 1, None),
-        ("two", 2, StoragePlugin.SQLITE3),
-        ("mcap", 2, StoragePlugin.MCAP),
-    ],
+    [("one.bag", 1, None), ("two", 2, StoragePlugin.SQLITE3), ("mcap", 2, StoragePlugin.MCAP)],
 )
 def test_bags_of_both_versions(tmp_path, name, version, storage):
     path = write_bag(tmp_path / name, version, sequence(ros_types(version)), storage)

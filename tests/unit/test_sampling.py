@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.problem import bounds
-from morph_dslam.offline.sampling import candidate_samples, held_out_samples, training_samples
-from morph_dslam.offline.studies.solid_study import SolidStudy
-from morph_dslam.offline.studies.study import make_study
+from morph_dslam.studies.problem import bounds
+from morph_dslam.studies.sampling import candidate_samples, held_out_samples, training_samples
+from morph_dslam.studies.solid_study import SolidStudy
+from morph_dslam.studies.study import make_study
 
 
 def study(sampling: dict[str, Any], parameters: int = 3) -> SolidStudy:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.model.basis_functions import chebyshev_basis
-from morph_dslam.offline.reduction.scattered_functions import (
+from morph_dslam.reduction.separation import (
     ScatteredValues,
     expansion_rows,
     expansion_train,
@@ -20,11 +20,7 @@ def smooth(mu):
     """Three functions that are no sums of products."""
     x = (mu - BOX[:, 0]) / np.diff(BOX, axis=1)[:, 0]
     return np.array(
-        [
-            np.exp(x @ [0.5, -0.3, 0.2, 0.1, 0.4]),
-            np.sin(x @ [1.0, 0.2, 0.5, 0.1, 0.3]),
-            1.0 / (2.0 + x[0] * x[4]),
-        ]
+        [np.exp(x @ [0.5, -0.3, 0.2, 0.1, 0.4]), np.sin(x @ [1.0, 0.2, 0.5, 0.1, 0.3]), 1.0 / (2.0 + x[0] * x[4])]
     )
 
 
@@ -50,9 +46,7 @@ def test_the_expansion_is_good_where_it_was_not_fitted(expansion):
 
 def test_the_train_is_the_expansion_up_to_its_tolerance(expansion):
     _, indices, coefficients, _ = expansion
-    bases = tuple(
-        chebyshev_basis(*ends, int(degree)) for ends, degree in zip(BOX, indices.max(axis=0), strict=True)
-    )
+    bases = tuple(chebyshev_basis(*ends, int(degree)) for ends, degree in zip(BOX, indices.max(axis=0), strict=True))
     polynomial = polynomial_functions(BOX, indices, coefficients)
     points = BOX[:, 0] + np.random.default_rng(1).random((40, 5)) * np.diff(BOX, axis=1).T
     exact, loose = (expansion_train(indices, coefficients, bases, tol) for tol in (1e-13, 1e-3))

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import CameraError, ModelFileError, SceneError
-from morph_dslam.render.key_frames import interpolate_key_frames
-from morph_dslam.render.photographs import crop_to_aspect, load_photograph, resize_to_fill
-from morph_dslam.render.scene_file import Surface, load_scene_file
+from morph_dslam.render.scene_file import Surface, interpolate_key_frames, load_scene_file
 from morph_dslam.render.scene_renderer import LARGEST_PRINT, print_texture
 from morph_dslam.render.simulation import simulate
+from morph_dslam.render.texture import crop_to_aspect, load_photograph, resize_to_fill
 from tests.support.scenes import CAMERA, write_scene, write_texture
 
 PROJECT = Path(__file__).parents[2]
@@ -128,9 +127,7 @@ def test_key_frame_at_the_bound_is_in_range(tmp_path):
 
 
 def test_curve_that_swings_out_of_range_between_key_frames(tmp_path):
-    keys = "".join(
-        f"[[parameters]]\nframe = {f}\narch = {a}\n" for f, a in ((0, 0), (10, 59), (12, 59), (22, 0))
-    )
+    keys = "".join(f"[[parameters]]\nframe = {f}\narch = {a}\n" for f, a in ((0, 0), (10, 59), (12, 59), (22, 0)))
     message = message_of(tmp_path, top="frames = 23\n", tail=POSE + keys)
     assert "parameter 'arch'" in message
     assert "in frame 11" in message
@@ -138,9 +135,7 @@ def test_curve_that_swings_out_of_range_between_key_frames(tmp_path):
 
 
 def test_sheet_behind_the_camera(tmp_path):
-    assert "frame 0 the object reaches behind the camera" in message_of(
-        tmp_path, tail=POSE.replace("620", "-620")
-    )
+    assert "frame 0 the object reaches behind the camera" in message_of(tmp_path, tail=POSE.replace("620", "-620"))
 
 
 def test_sheet_out_of_view(tmp_path):
@@ -179,7 +174,7 @@ def test_packaged_photograph(tmp_path):
 
 def test_packaged_photograph_without_the_package(tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "skimage", raising=False)
-    monkeypatch.setattr("morph_dslam.render.photographs.find_spec", lambda name: None)
+    monkeypatch.setattr("morph_dslam.render.texture.find_spec", lambda name: None)
     with pytest.raises(SceneError, match=r'pip install "morph-dslam\[demo\]"'):
         load_photograph("coffee", tmp_path)
 

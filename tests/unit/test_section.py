@@ -10,18 +10,15 @@ from morph_dslam.errors import TrackingError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.online.drawing.augmented_view import AugmentedView, DrawOptions
-from morph_dslam.online.drawing.section import SectionPlane, cut, surface_before
-from morph_dslam.online.estimation.estimator import State
+from morph_dslam.tracking.drawing import AugmentedView, DrawOptions, SectionPlane, cut, surface_before
+from morph_dslam.tracking.estimator import State
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.small_models import block_model
 
 SIDE = 0.1
 CAMERA = PinholeCamera(320, 240, 300.0, 300.0, 160.0, 120.0)
 #: The camera looks along +x of the object, z up in the image.
-ALONG_X = RigidTransform(
-    np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.array([-0.05, 0.05, 0.3])
-)
+ALONG_X = RigidTransform(np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.array([-0.05, 0.05, 0.3]))
 
 
 def stretching_block():
@@ -85,12 +82,7 @@ def test_a_cube_is_cut_in_squares_rectangles_and_hexagons(kind, normal, offset, 
 
 @pytest.mark.parametrize(
     ("text", "left"),
-    [
-        ("x=30", 2 + 4 * 0.3 - 1),
-        ("-x=30", 2 + 4 * 0.7 - 1),
-        ("y=50", 2 + 4 * 0.5 - 1),
-        ("-z=71", 2 + 4 * 0.29 - 1),
-    ],
+    [("x=30", 2 + 4 * 0.3 - 1), ("-x=30", 2 + 4 * 0.7 - 1), ("y=50", 2 + 4 * 0.5 - 1), ("-z=71", 2 + 4 * 0.29 - 1)],
 )
 def test_the_surface_ends_where_it_is_cut(text, left):
     """Of a cube's six faces, one and a part of four others; with the cut it is closed: no vector area."""

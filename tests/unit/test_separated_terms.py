@@ -7,13 +7,10 @@ import pytest
 
 from morph_dslam.model import Parameter
 from morph_dslam.model.basis_functions import cubic_spline_basis
-from morph_dslam.offline.reduction.separated_terms import Terms, multiplied, spline_terms
-from morph_dslam.offline.reduction.separation import separate
+from morph_dslam.reduction.separable_problem import Terms, multiplied, spline_terms
+from morph_dslam.reduction.separation import separate
 
-PARAMETERS = (
-    Parameter("force", "force", "N", -1.0, 2.0, 0.0),
-    Parameter("place", "length", "mm", 0.1, 0.4, 0.1),
-)
+PARAMETERS = (Parameter("force", "force", "N", -1.0, 2.0, 0.0), Parameter("place", "length", "mm", 0.1, 0.4, 0.1))
 BASES = tuple(cubic_spline_basis(np.linspace(p.lower, p.upper, 30)) for p in PARAMETERS)
 SPACE = np.linspace(0.0, 1.0, 8)
 WEIGHTS = np.linspace(1.0, 3.0, 4) / 8.0
@@ -68,10 +65,7 @@ def test_terms_are_multiplied_by_functions_of_the_parameters() -> None:
             b.interpolate(np.linspace(b.lower, b.upper, 30), np.column_stack(columns))
             for b, columns in zip(
                 BASES,
-                [
-                    (np.ones(30), np.linspace(-1.0, 2.0, 30)),
-                    (np.linspace(0.1, 0.4, 30), np.ones(30)),
-                ],
+                [(np.ones(30), np.linspace(-1.0, 2.0, 30)), (np.linspace(0.1, 0.4, 30), np.ones(30))],
                 strict=True,
             )
         ),

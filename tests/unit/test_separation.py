@@ -7,7 +7,7 @@ import pytest
 
 from morph_dslam.errors import StudyError
 from morph_dslam.model import Parameter
-from morph_dslam.offline.reduction.separation import separate
+from morph_dslam.reduction.separation import separate
 
 SPACE = np.linspace(0.0, 1.0, 200)
 PARTS = np.random.default_rng(0).standard_normal((4, 50))

@@ -6,14 +6,10 @@ import pytest
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.online.anchored.known_pose import KnownPose
-from morph_dslam.online.estimation.estimator import BoundPoints, Estimator, Prior, State, moved
-from morph_dslam.online.estimation.sequence_filter import SequenceFilter
-from morph_dslam.online.uncertainty.measurement_noise import (
-    Measured,
-    window_correlation,
-    window_correlation_numpy,
-)
+from morph_dslam.registration.registration import PosePrior
+from morph_dslam.tracking.estimator import BoundPoints, Estimator, Prior, State, moved
+from morph_dslam.tracking.noise import Observations, window_correlation, window_correlation_numpy
+from morph_dslam.tracking.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
@@ -42,7 +38,7 @@ def fused(filtered, points, errors, states, correlation):
     for state, error in zip(states, errors, strict=True):
         pixels, weights = CAMERA.project(points.in_camera(state)) + error, np.ones(len(points))
         alone = ESTIMATOR.estimate(points, pixels, weights, state)
-        measured = Measured(points, pixels, weights, np.zeros_like(pixels), correlation)
+        measured = Observations(points, pixels, weights, np.zeros_like(pixels), correlation)
         estimates.append(filtered.fuse(measured, alone))
     return estimates
 
@@ -101,7 +97,7 @@ def runs_with_known_poses(lasting, anew, frames=8, repeats=24, count=40):
             pixels = CAMERA.project(points.in_camera(state)) + SIGMA * rng.standard_normal((count, 2))
             weights, normals = np.ones(count), np.zeros((count, 2))
             alone = ESTIMATOR.estimate(points, pixels, weights, state, prior=known)
-            measured = Measured(points, pixels, weights, normals, np.eye(count))
+            measured = Observations(points, pixels, weights, normals, np.eye(count))
             fused = filtered.fuse(measured, alone, known)
             found.append((fused.state.parameters[0] - state.parameters[0], fused.parameter_std[0]))
     return np.array(found).reshape(repeats, frames, 2).transpose(2, 0, 1)
@@ -121,16 +117,14 @@ def test_errors_of_a_known_pose_are_stated_and_those_that_last_do_not_average_ou
 def test_pose_that_is_held_is_not_said_to_be_better_known():
     points, state, rng = bound(60), truth(0), np.random.default_rng(0)
     lasting, anew = np.diag([5e-3, 4e-3, 3e-3, 1e-3, 2e-3, 3e-3]), 1e-3 * np.eye(6)
-    known = KnownPose(state.camera_from_object, anew @ anew.T, lasting).prior(3, SIGMA**2, 1e6)
+    known = PosePrior(state.camera_from_object, anew @ anew.T, lasting).prior(3, SIGMA**2, 1e6)
     pixels = CAMERA.project(points.in_camera(state)) + SIGMA * rng.standard_normal((60, 2))
-    measured = Measured(points, pixels, np.ones(60), np.zeros((60, 2)), np.eye(60))
+    measured = Observations(points, pixels, np.ones(60), np.zeros((60, 2)), np.eye(60))
     filtered = SequenceFilter(ESTIMATOR, [TWIST])
     for _ in range(3):
         alone = ESTIMATOR.fit(measured, state, known)
         fused = filtered.fuse(measured, alone, known)
-        np.testing.assert_allclose(
-            fused.state.camera_from_object.matrix, state.camera_from_object.matrix, atol=1e-5
-        )
+        np.testing.assert_allclose(fused.state.camera_from_object.matrix, state.camera_from_object.matrix, atol=1e-5)
         np.testing.assert_allclose(fused.pose_std, np.sqrt(np.diag(lasting**2 + anew**2)), rtol=0.01)
         assert np.linalg.eigvalsh(fused.covariance)[0] > -1e-12
 
@@ -182,7 +176,7 @@ def test_frame_that_knows_little_does_not_overrule_many_that_know_much():
         state = truth(number, -18.0 if is_odd else 5.0)
         pixels = CAMERA.project(points.in_camera(state)) + SIGMA * rng.standard_normal((120, 2))
         weights = in_middle.astype(float) if is_odd else np.ones(120)
-        measured = Measured(points, pixels, weights, np.zeros((120, 2)), np.eye(120))
+        measured = Observations(points, pixels, weights, np.zeros((120, 2)), np.eye(120))
         alone = ESTIMATOR.fit(measured, state)
         twists = np.degrees([e.state.parameters[TWIST] for e in (alone, filtered.fuse(measured, alone))])
         if is_odd:
@@ -200,9 +194,7 @@ def test_covariance_of_one_frame_is_that_of_repeated_measurements_with_overlappi
     for _ in range(150):
         errors = SIGMA * np.einsum("ij,jc->ic", root, rng.standard_normal((150, 2)))
         (estimate,) = fused(SequenceFilter(ESTIMATOR, []), points, [errors], [state], correlation)
-        found.append(
-            np.concatenate([estimate.state.parameters, estimate.state.camera_from_object.translation])
-        )
+        found.append(np.concatenate([estimate.state.parameters, estimate.state.camera_from_object.translation]))
         stated.append(np.concatenate([estimate.parameter_std, estimate.pose_std[3:]]))
     spread = np.std(found, axis=0)
     # Residuals are smaller than the errors by what the estimate takes up of these.
@@ -231,7 +223,7 @@ def test_points_measured_less_exactly_count_by_their_weights():
     for _ in range(60):
         seen = pixels + sigma[:, None] * rng.standard_normal((150, 2))
         alone = ESTIMATOR.estimate(points, seen, weights, state)
-        measured = Measured(points, seen, weights, np.zeros_like(seen), np.eye(150))
+        measured = Observations(points, seen, weights, np.zeros_like(seen), np.eye(150))
         estimate = SequenceFilter(ESTIMATOR, []).fuse(measured, alone)
         found.append(estimate.state.parameters)
         stated.append(estimate.parameter_std)
@@ -252,7 +244,7 @@ def test_noise_is_not_taken_for_smaller_where_an_estimate_takes_up_much_of_it():
     for _ in range(200):
         seen = pixels + SIGMA * root @ rng.standard_normal((60, 2))
         alone = ESTIMATOR.estimate(points, seen, ones, state)
-        measured = Measured(points, seen, ones, np.zeros_like(seen), correlation)
+        measured = Observations(points, seen, ones, np.zeros_like(seen), correlation)
         estimate = SequenceFilter(ESTIMATOR, []).fuse(measured, alone)
         stated.append(estimate.parameter_std)
         found.append(estimate.state.parameters)

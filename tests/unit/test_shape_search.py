@@ -5,22 +5,16 @@ import numpy as np
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.model.turned_model import turned_model
-from morph_dslam.online.anchored.known_pose import KnownPose
-from morph_dslam.online.estimation.estimator import BoundPoints, EstimationOptions, Estimator, State
-from morph_dslam.online.estimation.shape_search import (
-    BoundSearch,
-    ShapeSearch,
-    with_undetermined_at_default,
-)
-from morph_dslam.online.start.registration import shape_starts
+from morph_dslam.model.reduced_model import with_revolution_angle
+from morph_dslam.registration.landmarks import shape_starts
+from morph_dslam.registration.registration import PosePrior
+from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, State
+from morph_dslam.tracking.shape_search import BoundSearch, ShapeSearch, with_undetermined_at_default
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.bent_tube import bent_tube
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
-POSE = RigidTransform(
-    rotation_exp(np.array([0.3, -0.2, 0.0])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6])
-)
+POSE = RigidTransform(rotation_exp(np.array([0.3, -0.2, 0.0])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
 
 
 def test_every_shape_is_handed_out_once_before_any_is_repeated():
@@ -64,13 +58,13 @@ def test_only_undetermined_parameters_return_to_their_default():
 
 def test_an_estimate_leaves_a_bound_that_it_reached_on_the_wrong_side():
     """A tube that is bent away from where its load is sought looks as if the load were less than none."""
-    model = turned_model(bent_tube(), np.array([0.0, 0.0, 1.0]))
+    model = with_revolution_angle(bent_tube(), np.array([0.0, 0.0, 1.0]))
     rng = np.random.default_rng(2)
     surface = SurfacePoints(rng.integers(0, len(model.triangles), 80), rng.dirichlet(np.ones(3), 80))
     points, weights = BoundPoints.from_surface(model, surface), np.ones(80)
     truth = State(np.array([0.5, np.pi - 0.1]), RigidTransform(POSE.rotation, np.array([0.0, 0.0, 0.4])))
     pixels = CAMERA.project(points.in_camera(truth)) + 0.1 * rng.standard_normal((80, 2))
-    known = KnownPose(truth.camera_from_object, 1e-8 * np.eye(6), np.zeros((6, 0))).prior(2, 0.01)
+    known = PosePrior(truth.camera_from_object, 1e-8 * np.eye(6), np.zeros((6, 0))).prior(2, 0.01)
     estimator, search = Estimator(model, CAMERA), BoundSearch(model, 2)
     start = State(np.array([0.1, 0.0]), truth.camera_from_object)
     stuck = estimator.estimate(points, pixels, weights, start, prior=known)

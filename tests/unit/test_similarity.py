@@ -4,12 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.geometry import RigidTransform
-from morph_dslam.similarity import SimilarityTransform, fit_similarity
+from morph_dslam.geometry import RigidTransform, SimilarityTransform, fit_similarity
 
-KNOWN = SimilarityTransform(
-    1.7, Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix(), np.array([0.3, -2.0, 5.0])
-)
+KNOWN = SimilarityTransform(1.7, Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix(), np.array([0.3, -2.0, 5.0]))
 
 
 def points(n=40, seed=0):
@@ -32,11 +29,7 @@ def test_rotation_of_noisy_points_is_scipys():
         np.testing.assert_allclose(found.rotation, expected.as_matrix(), atol=1e-7)
     # The scale is optimal: the sum of squares grows to both sides.
     sums = [
-        (
-            np.square(
-                target - target.mean(axis=0) - scale * (points() - points().mean(axis=0)) @ found.rotation.T
-            )
-        ).sum()
+        (np.square(target - target.mean(axis=0) - scale * (points() - points().mean(axis=0)) @ found.rotation.T)).sum()
         for scale in (found.scale - 1e-4, found.scale, found.scale + 1e-4)
     ]
     assert sums[1] < min(sums[0], sums[2])
@@ -53,9 +46,7 @@ def test_points_in_a_plane_are_not_mirrored():
 
 def test_composition_inverse_and_poses():
     other = SimilarityTransform(0.4, Rotation.from_euler("x", 1.0).as_matrix(), np.array([1.0, 2.0, 3.0]))
-    np.testing.assert_allclose(
-        (KNOWN @ other).apply(points()), KNOWN.apply(other.apply(points())), atol=1e-12
-    )
+    np.testing.assert_allclose((KNOWN @ other).apply(points()), KNOWN.apply(other.apply(points())), atol=1e-12)
     np.testing.assert_allclose(KNOWN.inverse.apply(KNOWN.apply(points())), points(), atol=1e-12)
     np.testing.assert_array_equal(SimilarityTransform.identity().apply(points()), points())
     np.testing.assert_allclose((KNOWN @ other).matrix, KNOWN.matrix @ other.matrix, atol=1e-12)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from morph_dslam.online.slam.consensus import Sight
-from morph_dslam.online.slam.options import SlamOptions
-from morph_dslam.online.slam.passing_views import PassingViews
-from morph_dslam.online.slam.rigid_map import GOOD, Followed, Keyframe, RigidMap
+from morph_dslam.slam.consensus import Sight
+from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.passing_views import PassingViews
+from morph_dslam.slam.rigid_map import GOOD, Followed, Keyframe, RigidMap
 
 INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5])
 NOISE_PX = 0.2
@@ -119,9 +119,7 @@ def test_frames_in_between_tell_which_points_moved(motion, agrees):
     points = box(np.random.default_rng(2), 30, [-0.5, -0.4, 1.5], [0.5, 0.4, 1.8])
     put = triangulated(points, motion)
     # Both ends agree on the places, whatever happened in between.
-    assert projected(put, [0.2, 0.0, 0.0]) == pytest.approx(
-        projected(points + motion(1.0), [0.2, 0.0, 0.0]), abs=1e-9
-    )
+    assert projected(put, [0.2, 0.0, 0.0]) == pytest.approx(projected(points + motion(1.0), [0.2, 0.0, 0.0]), abs=1e-9)
     fits = passing(points, motion).agree(np.arange(30), put, np.eye(4)[None], INTRINSICS, 1.5)
     assert fits.all() if agrees else not fits.any()
 

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.online.slam.depth import DepthImage, StereoImages, depth_of
-from morph_dslam.online.slam.options import SlamOptions
-from morph_dslam.online.slam.pose import refine_pose
+from morph_dslam.slam.depth import DepthImage, StereoImages, depth_of
+from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.pose import refine_pose
 from tests.support.rendered_sequence import printed_texture
 
 BASELINE_PX = 40.0

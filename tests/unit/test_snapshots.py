@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import WorkerError
-from morph_dslam.offline import snapshots
-from morph_dslam.offline.problem import Snapshot
-from morph_dslam.offline.sample_task import solve_sample
-from morph_dslam.offline.studies.study import load_study
+from morph_dslam.studies import snapshots
+from morph_dslam.studies.problem import Snapshot
+from morph_dslam.studies.sample_task import solve_sample
+from morph_dslam.studies.study import load_study
 from tests.support.block_study import write_study
 
 

@@ -11,24 +11,18 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.kinematics import ShapeField
+from morph_dslam.mechanics.loads import DeadTraction, FollowerPressure, MovingPatch, PointLoad
+from morph_dslam.mechanics.materials.isotropic import NeoHookean
+from morph_dslam.mechanics.parameters import ParameterSymbols
+from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning
+from morph_dslam.mechanics.solvers.newton import PathError
+from morph_dslam.mechanics.supports import ElasticFoundation, PrescribedDisplacement, RigidRotation, fixed
+from morph_dslam.meshing.generators import block, sheet
 from morph_dslam.model import Parameter
-from morph_dslam.offline.build_warnings import build_warnings
-from morph_dslam.offline.materials.isotropic import NeoHookean
-from morph_dslam.offline.mechanics.kinematics import ShapeField
-from morph_dslam.offline.mechanics.loads import DeadTraction, FollowerPressure, MovingPatch, PointLoad
-from morph_dslam.offline.mechanics.parameters import ParameterSymbols
-from morph_dslam.offline.mechanics.solid import SolidOptions, SolidProblem
-from morph_dslam.offline.mechanics.solid_materials import NearlyIncompressibleWarning
-from morph_dslam.offline.mechanics.supports import (
-    ElasticFoundation,
-    PrescribedDisplacement,
-    RigidRotation,
-    fixed,
-)
-from morph_dslam.offline.meshing.mesh_generators import block, sheet
-from morph_dslam.offline.solvers.newton import PathError
-from morph_dslam.offline.studies.locking import locking_warnings
-from morph_dslam.offline.studies.study import load_study, make_study
+from morph_dslam.studies.build import build_warnings
+from morph_dslam.studies.study import load_study, locking_warnings, make_study
 from tests.support.block_study import write_study
 from tests.support.solids import RUBBER, load_parameter, solved
 
@@ -136,9 +130,7 @@ def test_parameters_shapes_and_directions_are_checked() -> None:
 def test_a_point_outside_is_named() -> None:
     problem = SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")])
     with pytest.raises(StudyError, match=r"1 of 2 points lie outside .*\(1500, 0, 0\) mm"):
-        problem.recovery.at_points(
-            np.zeros(problem.n_dofs), np.zeros(0), np.array([[0.5, 0.5, 0.5], [1.5, 0, 0]])
-        )
+        problem.recovery.at_points(np.zeros(problem.n_dofs), np.zeros(0), np.array([[0.5, 0.5, 0.5], [1.5, 0, 0]]))
 
 
 def test_a_load_that_cannot_be_carried_keeps_what_converged() -> None:
@@ -159,10 +151,7 @@ def test_a_load_that_cannot_be_carried_keeps_what_converged() -> None:
     ("changes", "expected"),
     [
         ([], []),
-        (
-            [("poisson = 0.3", "poisson = 0.4995")],
-            ["'rubber' is nearly incompressible (Poisson's ratio 0.4995)"],
-        ),
+        ([("poisson = 0.3", "poisson = 0.4995")], ["'rubber' is nearly incompressible (Poisson's ratio 0.4995)"]),
         ([("poisson = 0.3", "poisson = 0.4995"), ("threads = 1", 'formulation = "mixed"')], []),
     ],
 )
@@ -187,10 +176,7 @@ def test_build_warns_of_elements_method_and_stability():
         (('"2 MPa"', '"1e300 MPa"'), "parameters.young: '1e300 MPa' cannot be meant"),
         (("poisson = 0.3", "poisson = nan"), "materials.rubber: poisson: 'nan' cannot be meant"),
         (('"20 mm", "20 mm", "60 mm"', '"20 mm", "20 mm", "1e300 mm"'), "mesh.size.2: '1e300 mm' cannot"),
-        (
-            ("divisions = [1, 1, 3]", "divisions = [500, 500, 500]"),
-            "mesh.divisions: these make 125000000 cells",
-        ),
+        (("divisions = [1, 1, 3]", "divisions = [500, 500, 500]"), "mesh.divisions: these make 125000000 cells"),
         (("training = 24", "training = 1000000000"), "sampling.training: "),
         (("training = 24", "training = 24\nseed = -1"), "sampling.seed: "),
     ],

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.mechanics.kinematics import ShapeField
-from morph_dslam.offline.mechanics.loads import BodyForce, DeadTraction, FollowerPressure, MovingPatch
-from morph_dslam.offline.mechanics.morphing import radius_field, thickness_field
-from morph_dslam.offline.mechanics.solid import SolidOptions, SolidProblem
-from morph_dslam.offline.mechanics.supports import ElasticFoundation, RigidRotation, fixed
-from morph_dslam.offline.meshing.mesh_generators import block, tube
-from morph_dslam.offline.meshing.mesh_geometry import cell_volumes
+from morph_dslam.mechanics.kinematics import ShapeField
+from morph_dslam.mechanics.loads import BodyForce, DeadTraction, FollowerPressure, MovingPatch
+from morph_dslam.mechanics.morphing import radius_field, thickness_field
+from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.mechanics.supports import ElasticFoundation, RigidRotation, fixed
+from morph_dslam.meshing.generators import block, tube
+from morph_dslam.meshing.meshes import cell_volumes
 from tests.support.solids import RUBBER, load_parameter, solved
 
 
@@ -39,9 +39,7 @@ def test_a_shape_parameter_moves_the_mesh(cell_type: str, mixed: bool, bend: flo
     ]
     symbols = load_parameter(a=0.0)
     options = SolidOptions(mixed=mixed)
-    morphed = SolidProblem(
-        mesh, {"all": RUBBER}, supports, loads, symbols, options, [ShapeField(symbols["a"], field)]
-    )
+    morphed = SolidProblem(mesh, {"all": RUBBER}, supports, loads, symbols, options, [ShapeField(symbols["a"], field)])
     moved = replace(mesh, nodes=mesh.nodes + 0.3 * field)
     plain = SolidProblem(moved, {"all": RUBBER}, supports, loads, options=options)
     one, other = solved(morphed, 0.3), solved(plain)
@@ -50,9 +48,7 @@ def test_a_shape_parameter_moves_the_mesh(cell_type: str, mixed: bool, bend: flo
     np.testing.assert_allclose(u, expected, atol=tolerance * np.abs(expected).max())
     for name in ("x_min", "x_max"):
         for a, b in zip(
-            morphed.reactions(one.dofs, one.mu, name),
-            plain.reactions(other.dofs, other.mu, name),
-            strict=True,
+            morphed.reactions(one.dofs, one.mu, name), plain.reactions(other.dofs, other.mu, name), strict=True
         ):
             np.testing.assert_allclose(a, b, atol=tolerance * np.abs(b).max())
     energy = plain.strain_energy(other.dofs, other.mu)

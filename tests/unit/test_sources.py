@@ -59,10 +59,7 @@ def test_video_frames_in_order(tmp_path):
     assert frames[0].timestamp == pytest.approx(2 / 25.0)
     # Frame k is the noise moved k pixels to the right.
     moved = np.roll(frames[0].image, 7, axis=1).astype(float)
-    assert (
-        np.abs(moved - frames[7].image).mean()
-        < np.abs(frames[0].image.astype(float) - frames[7].image).mean()
-    )
+    assert np.abs(moved - frames[7].image).mean() < np.abs(frames[0].image.astype(float) - frames[7].image).mean()
 
 
 def test_video_timestamps_are_the_containers(tmp_path, monkeypatch):
@@ -133,9 +130,7 @@ def test_range_turned_round(folder):
 def test_image_cut_short_is_named_after_the_frames_before_it(tmp_path, suffix):
     rng = np.random.default_rng(0)
     for number in range(3):
-        cv2.imwrite(
-            str(tmp_path / f"{number:03}.{suffix}"), rng.integers(0, 256, (64, 64, 3), dtype=np.uint8)
-        )
+        cv2.imwrite(str(tmp_path / f"{number:03}.{suffix}"), rng.integers(0, 256, (64, 64, 3), dtype=np.uint8))
     damaged = tmp_path / f"002.{suffix}"
     damaged.write_bytes(damaged.read_bytes()[:2000])
     frames = iter(open_source(tmp_path))

@@ -8,19 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import qmc
 
-from morph_dslam.model.basis_functions import (
-    chebyshev_basis,
-    hat_basis,
-    kriging_basis,
-    p_spline_basis,
-)
-from morph_dslam.offline.reduction.sparse_pgd import (
-    SamplingWarning,
-    SparsePgd,
-    SparsePgdOptions,
-    fit_sparse_pgd,
-    smoothed_fit,
-)
+from morph_dslam.model.basis_functions import chebyshev_basis, hat_basis, kriging_basis, p_spline_basis
+from morph_dslam.reduction.sparse_pgd import SamplingWarning, SparsePgd, SparsePgdOptions, fit_sparse_pgd, smoothed_fit
 
 SPACE = np.linspace(0.0, 1.0, 25)
 MODES = np.stack([np.sin(np.pi * SPACE), SPACE**2])

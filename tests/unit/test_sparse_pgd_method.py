@@ -11,10 +11,10 @@ from scipy.stats import qmc
 from morph_dslam.errors import StudyError
 from morph_dslam.model import Parameter
 from morph_dslam.model.tensor_functions import CPFunctions
-from morph_dslam.offline.problem import ModelMesh, Snapshot
-from morph_dslam.offline.reduction.sparse_pgd_method import reduce_by_sparse_pgd
-from morph_dslam.offline.reduction.task import ReductionTask
-from morph_dslam.offline.studies.study_sections import ReductionSection
+from morph_dslam.reduction.sparse_pgd import reduce_by_sparse_pgd
+from morph_dslam.reduction.task import ReductionTask
+from morph_dslam.studies.problem import ModelMesh, Snapshot
+from morph_dslam.studies.sections import ReductionSection
 
 NODES = np.random.default_rng(1).uniform(0.0, 0.1, (12, 3))
 MESH = ModelMesh(NODES, np.array([[0, 1, 2]]), np.linspace(1.0, 2.0, 12) / 18.0)
@@ -36,15 +36,9 @@ def stress(mu: np.ndarray) -> np.ndarray:
 def task(count: int, **options) -> ReductionTask:
     unit = qmc.Sobol(2, rng=0).random(count)
     samples = np.array([2.0, 0.0]) + unit * np.array([8.0, 2.0 * np.pi])
-    snapshots = [
-        Snapshot(mu, {"displacement": displacement(mu), "stress_solid": stress(mu)}) for mu in samples
-    ]
+    snapshots = [Snapshot(mu, {"displacement": displacement(mu), "stress_solid": stress(mu)}) for mu in samples]
     return ReductionTask(
-        MESH,
-        (FORCE, TURN),
-        [[s] for s in snapshots],
-        ReductionSection(method="sparse_pgd", **options),
-        "known",
+        MESH, (FORCE, TURN), [[s] for s in snapshots], ReductionSection(method="sparse_pgd", **options), "known"
     )
 
 

@@ -6,11 +6,10 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import PinholeCamera, StereoCamera
 from morph_dslam.errors import CameraError
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.io.stereo_calibration import load_stereo
-from morph_dslam.stereo import StereoCamera
+from morph_dslam.io.camera_files import load_stereo
 
 LEFT = PinholeCamera(320, 240, 210.0, 212.0, 161.0, 118.0, (-0.28, 0.07, 2e-4, 2e-5))
 FISHEYE = PinholeCamera(320, 240, 205.0, 204.0, 157.0, 121.0, (0.01, -0.02, 0.003, 0.0), "fisheye")
@@ -44,9 +43,7 @@ def test_rectified_images_share_rows_and_tell_depth(point):
     np.testing.assert_allclose(left, pair.camera.project(rectified[None])[0], atol=0.1)
     assert right[1] == pytest.approx(left[1], abs=0.1)
     disparity = left[0] - right[0]
-    assert disparity == pytest.approx(
-        pair.camera.fx * np.linalg.norm([0.11, 0.002, 0.001]) / rectified[2], abs=0.1
-    )
+    assert disparity == pytest.approx(pair.camera.fx * np.linalg.norm([0.11, 0.002, 0.001]) / rectified[2], abs=0.1)
     assert pair.depth(np.array([disparity]))[0] == pytest.approx(rectified[2], rel=0.02)
 
 
@@ -106,9 +103,7 @@ def test_a_kalibr_chain(tmp_path):
 
 
 def test_euroc_gives_both_poses_in_the_body(tmp_path):
-    body_from_left = RigidTransform(
-        Rotation.from_euler("zyx", [80, 3, -2], degrees=True).as_matrix(), np.ones(3)
-    )
+    body_from_left = RigidTransform(Rotation.from_euler("zyx", [80, 3, -2], degrees=True).as_matrix(), np.ones(3))
     body_from_right = body_from_left @ RIGHT_IN_LEFT
     for name, camera, pose in (("cam0", LEFT, body_from_left), ("cam1", FISHEYE, body_from_right)):
         folder = tmp_path / "mav0" / name

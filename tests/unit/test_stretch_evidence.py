@@ -3,14 +3,11 @@
 import numpy as np
 import pytest
 
-from morph_dslam.online.uncertainty.stretch_evidence import CLEAR, LIKELY, NOTED, StretchEvidence
+from morph_dslam.diagnostics.dimensions import CLEAR, LIKELY, NOTED, StretchEvidence
 
 FLAT, SOLID = np.array([True, True, False]), np.ones(3, dtype=bool)
 #: What takes the mean of the axes away.
-SHAPE = {
-    2: np.diag([1.0, 1.0, 0.0]) - np.array([[0.5, 0.5, 0], [0.5, 0.5, 0], [0, 0, 0]]),
-    3: np.eye(3) - 1 / 3,
-}
+SHAPE = {2: np.diag([1.0, 1.0, 0.0]) - np.array([[0.5, 0.5, 0], [0.5, 0.5, 0], [0, 0, 0]]), 3: np.eye(3) - 1 / 3}
 
 
 def evidence(axes, longer, deviation):
@@ -82,10 +79,7 @@ def test_what_is_shown_is_stated_as_deviation_less_what_chance_shows():
         if sigmas < NOTED:
             assert not found.any()
             continue
-        against, together = (
-            np.array([1.0, -1.0, 0.0]) / np.sqrt(2.0),
-            np.array([1.0, 1.0, 0.0]) / np.sqrt(2.0),
-        )
+        against, together = (np.array([1.0, -1.0, 0.0]) / np.sqrt(2.0), np.array([1.0, 1.0, 0.0]) / np.sqrt(2.0))
         # One camera cannot tell which axis is off: if it is x alone, all axes together are off by as much.
         for direction in (against, together):
             assert direction @ found @ direction == pytest.approx(15.0 * deviation**2)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.online.estimation.estimator import Estimator, State
-from morph_dslam.online.measuring.binding import DrawnSurface, draw_view, view_of
-from morph_dslam.online.reference.surface_coverage import SurfaceSamples, choose_view, covered_share
+from morph_dslam.tracking.binding import DrawnSurface, draw_view, view_of
+from morph_dslam.tracking.estimator import Estimator, State
+from morph_dslam.tracking.reference import SurfaceSamples, choose_view, covered_share
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, UPRIGHT
 from tests.support.turning_block import SIZE, block_state, turning_block

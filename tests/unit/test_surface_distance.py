@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from morph_dslam.evaluation.surface_distance import distances_to_surface, distances_to_surface_numpy
+from morph_dslam.evaluation.depth import distances_to_surface, distances_to_surface_numpy
 
 TRIANGLE = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
 

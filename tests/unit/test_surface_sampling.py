@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from morph_dslam.model.surface_sampling import spread_over, triangle_normals
+from morph_dslam.model.reduced_model import spread_over, triangle_normals
 
 #: A rectangle 4 by 1 in three triangles of areas 0.5, 1.5 and 2.
 NODES = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [4.0, 0.0, 0.0], [4.0, 1.0, 0.0], [0.0, 1.0, 0.0]])

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline import sweep
-from morph_dslam.offline.problem import Snapshot
-from morph_dslam.offline.sample_task import SampleResult
-from morph_dslam.offline.snapshots import encode_snapshot
-from morph_dslam.offline.studies.sheet_study import SheetStudy
+from morph_dslam.studies import sweep
+from morph_dslam.studies.problem import Snapshot
+from morph_dslam.studies.sample_task import SampleResult
+from morph_dslam.studies.sheet_study import SheetStudy
+from morph_dslam.studies.snapshots import encode_snapshot
 
 STUDY = SheetStudy.model_validate(
     {

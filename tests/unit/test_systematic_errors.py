@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morph_dslam.online.estimation.estimator import BoundPoints, EstimationOptions, Estimator
-from morph_dslam.online.estimation.state import moved
-from morph_dslam.online.measuring.binding import bind_pixels, view_of
-from morph_dslam.online.uncertainty.confidence import position_std
+from morph_dslam.tracking.binding import bind_pixels, view_of
+from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator
+from morph_dslam.tracking.observability import position_std
+from morph_dslam.tracking.state import moved
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.one_view import errors_of
 from tests.support.rendered_sequence import CAMERA, sheet_state
@@ -101,10 +101,7 @@ def test_a_failure_of_the_model_widens_the_deviations(model, estimator, pixels):
     np.testing.assert_allclose(narrow.covariance, found.covariance)
     # Errors that are alike over many points average out less than independent ones of the same size.
     independent = np.linalg.inv(estimator.evaluate(points, pixels, np.ones(len(pixels)), REFERENCE)[1])
-    assert (
-        position_std(model, wide).mean()
-        > 2.0 * position_std(model, replace(found, covariance=independent)).mean()
-    )
+    assert position_std(model, wide).mean() > 2.0 * position_std(model, replace(found, covariance=independent)).mean()
 
 
 def test_a_smooth_error_of_the_model_is_stated_as_large_as_it_is_though_the_fit_takes_most_of_it(

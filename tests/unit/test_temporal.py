@@ -6,9 +6,9 @@ import pytest
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import TrackingError
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.online.estimation.estimator import Estimator, State
-from morph_dslam.online.estimation.temporal import at_constant_velocity, new_filter, temporal_facts
-from morph_dslam.online.tracker_options import TrackerOptions
+from morph_dslam.tracking.estimator import Estimator, State
+from morph_dslam.tracking.frame_estimation import at_constant_velocity, new_filter, temporal_facts
+from morph_dslam.tracking.options import TrackerOptions
 from tests.support.bent_sheet import PARAMETERS, bent_sheet_model
 
 CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
@@ -17,10 +17,7 @@ CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            {"per_sequence": ("bend",)},
-            "'bend' cannot be one over the sequence: the model's parameters are arch",
-        ),
+        ({"per_sequence": ("bend",)}, "'bend' cannot be one over the sequence: the model's parameters are arch"),
         ({"random_walk": (("bend", 1.0),)}, "'bend' cannot walk"),
         ({"random_walk": (("skew", 1.0),), "per_sequence": ("skew",)}, "leave out one of both"),
         ({"random_walk": (("skew", 0.0),)}, "must be a positive number"),
@@ -35,17 +32,13 @@ def test_constant_velocity_repeats_the_last_motion():
     """A turn of 0.1 rad about a fixed axis, a shift, and a parameter that grows."""
 
     def state(time):
-        pose = RigidTransform(
-            rotation_exp(np.array([0.0, 0.1 * time, 0.0])), np.array([0.0, 0.02 * time, 0.6])
-        )
+        pose = RigidTransform(rotation_exp(np.array([0.0, 0.1 * time, 0.0])), np.array([0.0, 0.02 * time, 0.6]))
         return State(np.array([0.01 * time, 0.0, 0.1]), pose)
 
     # The turn is about the camera, so only the part across its axis goes on in a straight line.
     found = at_constant_velocity(state(1.0), state(2.0))
     np.testing.assert_allclose(found.parameters, state(3.0).parameters)
-    np.testing.assert_allclose(
-        found.camera_from_object.rotation, state(3.0).camera_from_object.rotation, atol=1e-12
-    )
+    np.testing.assert_allclose(found.camera_from_object.rotation, state(3.0).camera_from_object.rotation, atol=1e-12)
     assert found.camera_from_object.translation[1] == pytest.approx(0.06)
 
 

@@ -10,7 +10,7 @@ from tensorly.decomposition import tensor_train as tensorly_train
 from tensorly.decomposition import tucker as tensorly_tucker
 
 from morph_dslam.model.basis_functions import chebyshev_basis, cubic_spline_basis
-from morph_dslam.offline.reduction.tensor_formats import (
+from morph_dslam.reduction.tensor_formats import (
     cp,
     cp_functions,
     khatri_rao,
@@ -95,14 +95,10 @@ def test_at_equal_ranks_the_error_equals_tensorlys() -> None:
     train = tensor_train(tensor, 1e-3)
     ranks = [1, *(c.shape[2] for c in train.cores)]
     theirs = tensorly.tt_to_tensor(tensorly_train(tensor, ranks))
-    assert relative(train.full() - tensor, tensor) == pytest.approx(
-        relative(theirs - tensor, tensor), rel=1e-6
-    )
+    assert relative(train.full() - tensor, tensor) == pytest.approx(relative(theirs - tensor, tensor), rel=1e-6)
     ours = tucker(tensor, 1e-3, sweeps=30)
     theirs = tensorly.tucker_to_tensor(tensorly_tucker(tensor, ours.core.shape, n_iter_max=100, tol=1e-12))
-    assert relative(ours.full() - tensor, tensor) == pytest.approx(
-        relative(theirs - tensor, tensor), rel=1e-2
-    )
+    assert relative(ours.full() - tensor, tensor) == pytest.approx(relative(theirs - tensor, tensor), rel=1e-2)
 
 
 def test_orthogonal_iteration_improves_on_hosvd_where_nothing_is_small() -> None:

@@ -14,21 +14,12 @@ from morph_dslam.model.basis_functions import (
     p_spline_basis,
 )
 from morph_dslam.model.separated import SeparatedField
-from morph_dslam.model.tensor_functions import (
-    CPFunctions,
-    TensorFunctions,
-    TensorTrainFunctions,
-    TuckerFunctions,
-)
+from morph_dslam.model.tensor_functions import CPFunctions, TensorFunctions, TensorTrainFunctions, TuckerFunctions
 
 N_FUNCTIONS = 7
 BASES = {
     1: (cubic_spline_basis(np.linspace(-1.0, 1.0, 6)),),
-    3: (
-        cubic_spline_basis(np.linspace(-1.0, 1.0, 6)),
-        chebyshev_basis(0.0, 1.0, 4),
-        p_spline_basis(0.0, 2.0, 7),
-    ),
+    3: (cubic_spline_basis(np.linspace(-1.0, 1.0, 6)), chebyshev_basis(0.0, 1.0, 4), p_spline_basis(0.0, 2.0, 7)),
     4: (
         chebyshev_basis(0.0, 1.0, 3),
         fourier_basis(-np.pi, np.pi, 2),
@@ -36,20 +27,14 @@ BASES = {
         p_spline_basis(-1.0, 1.0, 6),
     ),
 }
-POINTS = {
-    1: [[0.3]],
-    3: [[0.1, 0.2, 0.3], [1.3, -0.2, 0.5]],
-    4: [[0.2, 1.1, 0.7, -0.6], [1.2, 4.0, -0.1, 1.5]],
-}
+POINTS = {1: [[0.3]], 3: [[0.1, 0.2, 0.3], [1.3, -0.2, 0.5]], 4: [[0.2, 1.1, 0.7, -0.6], [1.2, 4.0, -0.1, 1.5]]}
 
 
 def make(form: str, d: int) -> TensorFunctions:
     rng = np.random.default_rng(d)
     bases = BASES[d]
     if form == "cp":
-        return CPFunctions(
-            bases, tuple(rng.normal(size=(b.size, 5)) for b in bases), rng.normal(size=(5, N_FUNCTIONS))
-        )
+        return CPFunctions(bases, tuple(rng.normal(size=(b.size, 5)) for b in bases), rng.normal(size=(5, N_FUNCTIONS)))
     if form == "tucker":
         ranks = [2, 3, 2, 4][:d]
         factors = tuple(rng.normal(size=(b.size, r)) for b, r in zip(bases, ranks, strict=True))
@@ -86,9 +71,7 @@ def test_values_are_the_sums_that_define_the_format(form: str) -> None:
         full = np.einsum("iax,xby,ycz->iabc", *functions.cores)
     mu = POINTS[3][0]
     vectors = [evaluate_numpy(b, m)[0] for b, m in zip(functions.bases, mu, strict=True)]
-    np.testing.assert_allclose(
-        functions.evaluate(mu)[0], np.einsum("iabc,a,b,c->i", full, *vectors), rtol=1e-10
-    )
+    np.testing.assert_allclose(functions.evaluate(mu)[0], np.einsum("iabc,a,b,c->i", full, *vectors), rtol=1e-10)
     assert functions.n_functions == N_FUNCTIONS
     assert functions.n_floats < full.size or form == "cp"
 
@@ -111,9 +94,7 @@ def test_mixed_second_derivatives_follow_finite_differences(form: str) -> None:
     step = np.array([0.0, h, 0.0])
     up, down = functions.evaluate(mu + step)[1], functions.evaluate(mu - step)[1]
     for k, orders in enumerate([(1, 1, 0), (0, 2, 0), (0, 1, 1)]):
-        np.testing.assert_allclose(
-            functions.partial(mu, orders), (up[k] - down[k]) / (2.0 * h), rtol=1e-6, atol=1e-5
-        )
+        np.testing.assert_allclose(functions.partial(mu, orders), (up[k] - down[k]) / (2.0 * h), rtol=1e-6, atol=1e-5)
 
 
 @every_form

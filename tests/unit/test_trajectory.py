@@ -19,9 +19,7 @@ def write(path, text):
 def test_tum(tmp_path):
     path = write(
         tmp_path / "truth.txt",
-        "# timestamp tx ty tz qx qy qz qw\n"
-        f"1305031102.2 1 2 3 0 0 {HALF} {HALF}\n\n"
-        "1305031102.1 0 0 0 0 0 0 1\n",
+        f"# timestamp tx ty tz qx qy qz qw\n1305031102.2 1 2 3 0 0 {HALF} {HALF}\n\n1305031102.1 0 0 0 0 0 0 1\n",
     )
     trajectory = load_trajectory(path)
     np.testing.assert_array_equal(trajectory.timestamps, [1305031102.1, 1305031102.2])

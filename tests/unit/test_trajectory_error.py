@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from morph_dslam import cli
+from morph_dslam.cli import app as cli
 from morph_dslam.errors import EvaluationError
-from morph_dslam.evaluation.trajectory_error import (
-    Statistics,
-    absolute_error,
-    associate,
-    match,
-    relative_error,
-)
+from morph_dslam.evaluation.trajectory import Statistics, absolute_error, associate, match, relative_error
 from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
 from tests.support.real_data import real_data
 
@@ -98,9 +92,7 @@ def test_statistics():
 
 
 def test_clocks_that_do_not_meet():
-    with pytest.raises(
-        EvaluationError, match=r"only 0 poses .* spans 100\.000 to 106\.000 s, the truth 0\.000"
-    ):
+    with pytest.raises(EvaluationError, match=r"only 0 poses .* spans 100\.000 to 106\.000 s, the truth 0\.000"):
         match(helix(), helix(start=0.0))
 
 

@@ -7,13 +7,12 @@ import pytest
 
 from morph_dslam.errors import ModelFileError, RegistrationError
 from morph_dslam.evaluation.model_summary import summarise_model
+from morph_dslam.meshing.generators import block
 from morph_dslam.model import load_model, save_model
 from morph_dslam.model.basis_functions import chebyshev_basis, fourier_basis
-from morph_dslam.model.product_functions import ProductFunctions
-from morph_dslam.model.tensor_functions import CPFunctions
-from morph_dslam.model.turned_model import turned_model
-from morph_dslam.offline.meshing.mesh_generators import block
-from morph_dslam.online.start.placement import load_placement
+from morph_dslam.model.reduced_model import with_revolution_angle
+from morph_dslam.model.tensor_functions import CPFunctions, ProductFunctions
+from morph_dslam.registration.registration import load_registration
 from tests.support.bent_tube import AXIS, bent_tube, polynomial
 
 
@@ -30,7 +29,7 @@ def turned_stress(nodes, load, angle):
 
 @pytest.mark.parametrize("angle", [0.0, 0.4, -2.3, 2.0 * np.pi / 24 * 5])
 def test_displacement_and_stress_turn_with_the_load(angle):
-    turned = turned_model(bent_tube(), AXIS)
+    turned = with_revolution_angle(bent_tube(), AXIS)
     mu, z = np.array([1.3, angle]), turned.nodes[:, 2]
     expected = 1.3 * z[:, None] ** 2 * np.array([np.cos(angle), np.sin(angle), 0.0])
     np.testing.assert_allclose(turned.displacement.value(mu), expected, atol=1e-12)
@@ -40,7 +39,7 @@ def test_displacement_and_stress_turn_with_the_load(angle):
 
 
 def test_sensitivity_to_the_angle_is_that_of_finite_differences():
-    field = turned_model(bent_tube(), AXIS).displacement
+    field = with_revolution_angle(bent_tube(), AXIS).displacement
     mu, step = np.array([1.3, 0.7]), 1e-6
     _, slopes = field.value_and_sensitivities(mu)
     for k in range(2):
@@ -50,7 +49,7 @@ def test_sensitivity_to_the_angle_is_that_of_finite_differences():
 
 
 def test_a_turned_model_is_kept_in_a_file(tmp_path):
-    turned = turned_model(bent_tube(), AXIS)
+    turned = with_revolution_angle(bent_tube(), AXIS)
     save_model(tmp_path / "turned.morph", turned)
     loaded = load_model(tmp_path / "turned.morph")
     mu = np.array([0.6, 1.1])
@@ -60,7 +59,7 @@ def test_a_turned_model_is_kept_in_a_file(tmp_path):
 
 
 def test_a_turned_model_is_described_as_any_other():
-    turned = turned_model(bent_tube(), AXIS)
+    turned = with_revolution_angle(bent_tube(), AXIS)
     rows = {row[0]: row[1:] for row in summarise_model(turned)["fields"].rows}
     assert rows["displacement"][:2] == [str(turned.displacement.n_modes), "products"]
     assert rows["Cauchy stress"][1] == "products"
@@ -69,12 +68,12 @@ def test_a_turned_model_is_described_as_any_other():
 def test_a_block_cannot_be_turned():
     mesh = block((0.02, 0.03, 0.1), (2, 3, 4), "hex8")
     with pytest.raises(ModelFileError, match="body of revolution"):
-        turned_model(bent_tube(mesh), AXIS)
+        with_revolution_angle(bent_tube(mesh), AXIS)
 
 
 def test_an_angle_that_there_is_already_is_refused():
     with pytest.raises(ModelFileError, match="'load'"):
-        turned_model(bent_tube(), AXIS, name="load")
+        with_revolution_angle(bent_tube(), AXIS, name="load")
 
 
 def test_products_are_those_of_their_factors():
@@ -94,9 +93,7 @@ def test_products_are_those_of_their_factors():
     np.testing.assert_allclose(product.partial([x, a], (1, 1)), np.outer(dh, dk).ravel(), atol=1e-12)
     matrix = np.random.default_rng(0).standard_normal((6, 2))
     np.testing.assert_allclose(product.mixed(matrix).rows([x, a]), rows @ matrix)
-    np.testing.assert_allclose(
-        product.mixed(matrix).evaluate_numpy([x, a])[1], (rows @ matrix)[1:], atol=1e-12
-    )
+    np.testing.assert_allclose(product.mixed(matrix).evaluate_numpy([x, a])[1], (rows @ matrix)[1:], atol=1e-12)
     with pytest.raises(ValueError, match="mixed by a matrix"):
         ProductFunctions(first, CPFunctions((chebyshev_basis(0.0, 1.0, 2),), (unit,), unit), np.eye(4))
 
@@ -121,13 +118,13 @@ def test_a_registration_places_the_object_in_its_last_keyframe(tmp_path):
     }
     path = tmp_path / "registration.json"
     path.write_text(json.dumps(content))
-    placement = load_placement(path, bent_tube())
+    placement = load_registration(path, bent_tube())
     assert placement.frame == 7
     np.testing.assert_allclose(placement.state.camera_from_object.matrix, pose)
     assert placement.model.parameters[-1].name == "turn"
     assert any("ambiguous" in flag for flag in placement.flags)
     path.write_text("{}")
     with pytest.raises(RegistrationError, match=r"not a registration\.json"):
-        load_placement(path, bent_tube())
+        load_registration(path, bent_tube())
     with pytest.raises(RegistrationError, match="cannot read"):
-        load_placement(tmp_path / "none.json", bent_tube())
+        load_registration(tmp_path / "none.json", bent_tube())

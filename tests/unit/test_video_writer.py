@@ -52,8 +52,5 @@ def test_missing_folder(tmp_path):
 
 
 def test_frame_of_another_size_is_refused(tmp_path):
-    with (
-        VideoWriter(tmp_path / "out.mp4", 25.0, (128, 96)) as writer,
-        pytest.raises(ValueError, match="128x96"),
-    ):
+    with VideoWriter(tmp_path / "out.mp4", 25.0, (128, 96)) as writer, pytest.raises(ValueError, match="128x96"):
         writer.write(np.zeros((48, 64, 3), dtype=np.uint8))

@@ -7,10 +7,9 @@ from ngsolve.comp import IntegrationRuleSpace
 from ngsolve.meshes import MakeStructured3DMesh
 
 from morph_dslam.errors import StudyError
-from morph_dslam.offline.materials.isotropic import NeoHookean
-from morph_dslam.offline.materials.ogden import Ogden
-from morph_dslam.offline.materials.uniaxial import TensionStress, relaxed_stress
-from morph_dslam.offline.materials.viscoelastic import Prony, ViscousState
+from morph_dslam.mechanics.materials.fit import TensionStress, relaxed_stress
+from morph_dslam.mechanics.materials.isotropic import NeoHookean, Ogden
+from morph_dslam.mechanics.materials.viscoelastic import Prony, ViscousState
 from tests.support import closed_form_stress as exact
 
 SERIES = Prony((0.3, 0.2), (0.5, 4.0), (0.0, 0.0))
@@ -144,9 +143,7 @@ def test_a_tension_test_in_elements_and_at_a_point_agree():
 def test_an_elastic_tension_test_has_the_closed_form():
     stretch = np.array([0.8, 1.0, 1.7, 3.0])
     law = Ogden(moduli=(0.4, 0.1), exponents=(0.8, 2.5), bulk=50.0)
-    expected = sum(
-        2 * m / a * (stretch ** (a - 1) - stretch ** (-a / 2 - 1)) for m, a in ((0.4, 0.8), (0.1, 2.5))
-    )
+    expected = sum(2 * m / a * (stretch ** (a - 1) - stretch ** (-a / 2 - 1)) for m, a in ((0.4, 0.8), (0.1, 2.5)))
     np.testing.assert_allclose(TensionStress(law, stretch)(), expected, atol=1e-14)
 
 

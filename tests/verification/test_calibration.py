@@ -4,14 +4,13 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam import cli
 from morph_dslam.calibration.board import Board, find_corners, parse_board
 from morph_dslam.calibration.calibrate import calibrate
-from morph_dslam.calibration.solve import solve_intrinsics
-from morph_dslam.calibration.views import View, select_by_coverage
+from morph_dslam.calibration.solve import View, select_by_coverage, solve_intrinsics
 from morph_dslam.camera import PinholeCamera
+from morph_dslam.cli import app as cli
 from morph_dslam.errors import CameraError
-from morph_dslam.io.calibration import load_camera
+from morph_dslam.io.camera_files import load_camera
 from tests.support.real_data import real_data
 from tests.support.rendered_board import board_image, board_poses
 
@@ -92,9 +91,7 @@ def test_exact_corners_give_the_exact_camera(camera, lens):
     np.testing.assert_allclose(solution.camera.intrinsics, camera.intrinsics, rtol=2e-4)
     assert solution.rms < 2e-3
     np.testing.assert_allclose(
-        [pose.translation for pose in solution.camera_from_board],
-        [pose.translation for pose in poses],
-        atol=2e-4,
+        [pose.translation for pose in solution.camera_from_board], [pose.translation for pose in poses], atol=2e-4
     )
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import SolverError
-from morph_dslam.offline.mechanics.gripped_sheet import GrippedSheet
-from morph_dslam.offline.mechanics.grips import Grips
-from morph_dslam.offline.mechanics.shell import OrthotropicSheet
-from morph_dslam.offline.solvers.continuation import advance
+from morph_dslam.mechanics.gripped_sheet import GrippedSheet
+from morph_dslam.mechanics.shell import OrthotropicSheet
+from morph_dslam.mechanics.solvers.continuation import advance
+from morph_dslam.mechanics.supports import Grips
 
 LENGTH, WIDTH, DEPTH = 0.42, 0.297, 0.01
 YOUNG, THICKNESS = 5e9, 5e-4
@@ -80,9 +80,7 @@ def test_sensitivities_match_differences_of_solutions(held: GrippedSheet) -> Non
         backward = held.solve(coordinates - change, state)
         difference = (forward.dofs - backward.dofs)[displacements] / (2.0 * step)
         assert np.linalg.norm(slopes[k][displacements] - difference) < 1e-3 * np.linalg.norm(difference)
-        assert motions[k] == pytest.approx(
-            (forward.motion - backward.motion) / (2.0 * step), rel=1e-3, abs=1e-4
-        )
+        assert motions[k] == pytest.approx((forward.motion - backward.motion) / (2.0 * step), rel=1e-3, abs=1e-4)
 
 
 def test_unreachable_coordinates_are_named(held: GrippedSheet) -> None:

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from morph_dslam.camera import PinholeCamera
-from morph_dslam.evaluation.material_error import bind_truth, material_error
+from morph_dslam.evaluation.points import bind_truth, load_truth, material_error
 from morph_dslam.evaluation.run_folder import Run
-from morph_dslam.evaluation.truth import load_truth
 from morph_dslam.geometry import RigidTransform
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.real_data import real_data

@@ -12,7 +12,7 @@ import scipy.sparse.linalg as sla
 from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
 
-from morph_dslam.offline.mechanics.shell import KoiterSheet, OrthotropicSheet, rectangle_mesh
+from morph_dslam.mechanics.shell import KoiterSheet, OrthotropicSheet, rectangle_mesh
 from tests.support.real_data import real_data
 
 
@@ -61,9 +61,7 @@ def elastica_tip(load: float) -> tuple[float, float]:
 
     s = np.linspace(0.0, 1.0, 60)
     guess = np.vstack([s, 1.0 - s, s, s**2 / 2.0])
-    solution = solve_bvp(
-        slope, lambda a, b: np.array([a[0], b[1], a[2], a[3]]), s, guess, tol=1e-9, max_nodes=50_000
-    )
+    solution = solve_bvp(slope, lambda a, b: np.array([a[0], b[1], a[2], a[3]]), s, guess, tol=1e-9, max_nodes=50_000)
     return 1.0 - solution.y[2, -1], solution.y[3, -1]
 
 
@@ -92,9 +90,7 @@ def test_moment_free_strip_rolls_into_a_circle() -> None:
     hybrid = shell.space.TrialFunction()[4]
     moment = 0.5 * np.pi * young * thickness**3 / 12.0 / length / shell.energy_scale
     factor = shell.load_factor
-    shell.form += ngs.Variation(
-        factor * moment * (hybrid.Trace() * ngs.specialcf.normal(2)) * ngs.ds("right")
-    )
+    shell.form += ngs.Variation(factor * moment * (hybrid.Trace() * ngs.specialcf.normal(2)) * ngs.ds("right"))
     for load in np.linspace(0.125, 1.0, 8):
         equilibrate(shell, load)
     displacement, stress = shell.sample(shell.state_vector(), np.array([[length, 0.1], [0.4, 0.1]]))

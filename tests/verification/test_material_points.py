@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from ngsolve.meshes import MakeStructured3DMesh
 
-from morph_dslam.offline.materials.isotropic import NeoHookean, StVenantKirchhoff
-from morph_dslam.offline.materials.viscoelastic import Prony, ViscousState
+from morph_dslam.mechanics.materials.isotropic import NeoHookean, StVenantKirchhoff
+from morph_dslam.mechanics.materials.viscoelastic import Prony, ViscousState
 from tests.support.material_laws import LAWS, stress
 
 FACES = "back|front"  # x = 0 and x = 1
@@ -60,8 +60,7 @@ def elastic_bar(material):
 
 
 @pytest.mark.parametrize(
-    ("young", "poisson", "lateral", "nominal"),
-    [(3.0, 0.45, 0.830679, 1.075843), (2.8, 0.4, 0.846028, 1.022825)],
+    ("young", "poisson", "lateral", "nominal"), [(3.0, 0.45, 0.830679, 1.075843), (2.8, 0.4, 0.846028, 1.022825)]
 )
 def test_uniaxial_neo_hookean(young, poisson, lateral, nominal):
     # mu = 1 and lambda = 4 are E = 2.8 and nu = 0.4.
@@ -122,9 +121,7 @@ def test_the_assembled_tangent_is_the_difference_of_assembled_forces(name):
         difference.data = x + sign * h * direction
         bar.form.Apply(difference, force)
         sides.append(force.FV().NumPy().copy())
-    np.testing.assert_allclose(
-        slope, (sides[0] - sides[1]) / (2 * h), rtol=0, atol=1e-6 * np.abs(slope).max()
-    )
+    np.testing.assert_allclose(slope, (sides[0] - sides[1]) / (2 * h), rtol=0, atol=1e-6 * np.abs(slope).max())
 
 
 def test_forces_of_an_inverted_element_are_not_numbers():

@@ -9,14 +9,9 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from morph_dslam.model.basis_functions import chebyshev_basis, cubic_spline_basis, hat_basis
-from morph_dslam.offline.reduction.pgd import PgdOptions, PgdSolution, solve_pgd
-from morph_dslam.offline.reduction.separable_problem import (
-    ParameterAxis,
-    SeparableProblem,
-    collocation_axis,
-    galerkin_axis,
-)
-from morph_dslam.offline.reduction.tensor_formats import khatri_rao
+from morph_dslam.reduction.pgd import PgdOptions, PgdSolution, solve_pgd
+from morph_dslam.reduction.separable_problem import ParameterAxis, SeparableProblem, collocation_axis, galerkin_axis
+from morph_dslam.reduction.tensor_formats import khatri_rao
 
 
 def quiet(**options) -> PgdOptions:
@@ -27,9 +22,7 @@ def on_grid(solution: PgdSolution, *grids: np.ndarray) -> np.ndarray:
     """The separated solution (n, g_1, ..., g_d) at all points of the grids."""
     tables = tuple(
         basis.evaluate(grid) @ factor
-        for basis, factor, grid in zip(
-            solution.functions.bases, solution.functions.factors, grids, strict=True
-        )
+        for basis, factor, grid in zip(solution.functions.bases, solution.functions.factors, grids, strict=True)
     )
     return (solution.modes.T @ khatri_rao(tables).T).reshape(-1, *(len(grid) for grid in grids))
 
@@ -110,9 +103,7 @@ def test_a_stiffness_as_second_parameter_agrees_with_direct_solves() -> None:
     inner_half, outer_half = problem.matrices
     solution = solve_pgd(problem, quiet(max_modes=25, tolerance=0.0))
     samples = np.log([0.2, 0.37, 1.3, 2.9, 5.0])
-    exact = np.stack(
-        [splu(sp.csc_array(inner_half + np.exp(k) * outer_half)).solve(problem.loads) for k in samples], 2
-    )
+    exact = np.stack([splu(sp.csc_array(inner_half + np.exp(k) * outer_half)).solve(problem.loads) for k in samples], 2)
     found = on_grid(solution, s, samples)
     assert np.linalg.norm(found - exact) <= 1e-3 * np.linalg.norm(exact)
     mu, h = np.array([1.3, 0.4]), 1e-5
@@ -136,9 +127,7 @@ def test_every_enrichment_by_itself_lowers_the_residual_it_minimises() -> None:
 def advection_diffusion(nodes: int = 15) -> tuple[SeparableProblem, tuple[sp.csc_array, ...], np.ndarray]:
     """-laplace u + v (1, 2) . grad u = 1 on the unit square, upwind differences, v a parameter in [0, 50]."""
     h = 1.0 / (nodes + 1)
-    second = sp.diags_array(
-        [-np.ones(nodes - 1), 2.0 * np.ones(nodes), -np.ones(nodes - 1)], offsets=[-1, 0, 1]
-    )
+    second = sp.diags_array([-np.ones(nodes - 1), 2.0 * np.ones(nodes), -np.ones(nodes - 1)], offsets=[-1, 0, 1])
     upwind = sp.diags_array([-np.ones(nodes - 1), np.ones(nodes)], offsets=[-1, 0])
     unit = sp.eye_array(nodes)
     diffusion = sp.csc_array((sp.kron(second, unit) + sp.kron(unit, second)) / h**2)
@@ -158,9 +147,7 @@ def advection_diffusion(nodes: int = 15) -> tuple[SeparableProblem, tuple[sp.csc
 
 def test_advection_and_diffusion_converge_by_minimal_residual() -> None:
     problem, (diffusion, advection), speeds = advection_diffusion()
-    exact = np.stack(
-        [splu(sp.csc_array(diffusion + v * advection)).solve(problem.loads[:, 0]) for v in speeds], 1
-    )
+    exact = np.stack([splu(sp.csc_array(diffusion + v * advection)).solve(problem.loads[:, 0]) for v in speeds], 1)
     errors = {}
     for n_modes in (2, 4, 8, 16):
         solution = solve_pgd(problem, quiet(max_modes=n_modes, tolerance=0.0, method="minimal_residual"))
@@ -188,13 +175,10 @@ def test_time_is_a_coordinate_like_another() -> None:
     x = h * np.arange(1, nodes + 1)
     mass = sp.csc_array(sp.eye_array(nodes) * h)
     laplace = sp.csc_array(
-        sp.diags_array([-np.ones(nodes - 1), 2.0 * np.ones(nodes), -np.ones(nodes - 1)], offsets=[-1, 0, 1])
-        / h
+        sp.diags_array([-np.ones(nodes - 1), 2.0 * np.ones(nodes), -np.ones(nodes - 1)], offsets=[-1, 0, 1]) / h
     )
     start = np.sin(np.pi * x)
-    rate = (start @ (laplace @ start)) / (
-        start @ (mass @ start)
-    )  # the discrete pi^2: start is an eigenvector
+    rate = (start @ (laplace @ start)) / (start @ (mass @ start))  # the discrete pi^2: start is an eigenvector
     knots = np.linspace(0.0, 0.2, 14)
     time = galerkin_axis(cubic_spline_basis(knots), fixed=(0,))
     conductivity = galerkin_axis(chebyshev_basis(0.5, 2.0, 8))

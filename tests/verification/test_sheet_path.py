@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import SolverError
-from morph_dslam.offline.mechanics.sheet_buckling import (
+from morph_dslam.mechanics.sheet_buckling import (
     BuckledSheet,
     BucklingFolder,
+    SheetEquations,
     follow_path,
     positions_by_point,
     solve_positions,
     southwell_load,
 )
-from morph_dslam.offline.mechanics.sheet_equations import SheetEquations
-from morph_dslam.offline.mechanics.shell import KoiterSheet, OrthotropicSheet, rectangle_mesh
-from morph_dslam.offline.snapshots import load_snapshot
-from morph_dslam.offline.solvers.arc_length import ArcLength, ArcOptions, missed_bifurcations
-from morph_dslam.offline.solvers.newton import NewtonOptions, State, advance, sensitivities
+from morph_dslam.mechanics.shell import KoiterSheet, OrthotropicSheet, rectangle_mesh
+from morph_dslam.mechanics.solvers.arc_length import ArcLength, ArcOptions, missed_bifurcations
+from morph_dslam.mechanics.solvers.newton import NewtonOptions, State, advance, sensitivities
+from morph_dslam.studies.snapshots import load_snapshot
 
 #: For differences of solutions.
 PRECISE = NewtonOptions(tolerance=1e-12)
@@ -73,8 +73,7 @@ def test_sensitivities_match_differences() -> None:
         change = np.zeros(2)
         change[parameter] = step
         above, below = (
-            advance(equations, state, state.mu + sign * change, PRECISE).states[-1].dofs
-            for sign in (1.0, -1.0)
+            advance(equations, state, state.mu + sign * change, PRECISE).states[-1].dofs for sign in (1.0, -1.0)
         )
         difference = (above - below) / (2.0 * step)
         error = np.abs(slopes[parameter] - difference)[up].max()
@@ -183,9 +182,7 @@ def test_a_strip_pulled_off_its_middle_bends() -> None:
     material = isotropic(young, 0.0, thickness, offset=offset)
     load = {"right": np.array([pull, 0.0, 0.0])}
     equations = SheetEquations(KoiterSheet(mesh, material, 3, clamped="left", dead_load=load), {}, length)
-    state = advance(equations, State(np.zeros(2), np.zeros(equations.n_dofs)), np.array([0.0, 1.0])).states[
-        -1
-    ]
+    state = advance(equations, State(np.zeros(2), np.zeros(equations.n_dofs)), np.array([0.0, 1.0])).states[-1]
     displacement, stress = equations.shell.sample(state.dofs, np.array([[length, 0.01], [0.05, 0.01]]))
     stiffness = young * thickness**3 / 12.0
     # The middle lies above the pull, so that the tip turns up.

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morph_dslam.offline.materials.isotropic import NeoHookean
-from morph_dslam.offline.mechanics.loads import DeadTraction
-from morph_dslam.offline.mechanics.solid import SolidOptions, SolidProblem
-from morph_dslam.offline.mechanics.supports import PrescribedDisplacement
-from morph_dslam.offline.meshing.mesh_generators import block
+from morph_dslam.mechanics.loads import DeadTraction
+from morph_dslam.mechanics.materials.isotropic import NeoHookean
+from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.mechanics.supports import PrescribedDisplacement
+from morph_dslam.meshing.generators import block
 from tests.support.solids import FACES, RUBBER, AffineSupport, distorted, load_parameter, solved
 
 ROLLERS = (
@@ -25,15 +25,11 @@ STIFF = NeoHookean(young=2.8e6, poisson=0.4)
     ("material", "lateral", "stress"), [(RUBBER, 0.830679, 1.075843e6), (STIFF, 0.846028, 1.022825e6)]
 )
 @pytest.mark.parametrize(("cell_type", "mixed"), [("hex8", False), ("hex20", True), ("tet10", False)])
-def test_uniaxial_stretch(
-    material: NeoHookean, lateral: float, stress: float, cell_type: str, mixed: bool
-) -> None:
+def test_uniaxial_stretch(material: NeoHookean, lateral: float, stress: float, cell_type: str, mixed: bool) -> None:
     symbols = load_parameter(pull=0.0)
     mesh = distorted(block((1.0, 1.0, 1.0), (2, 2, 2), cell_type), 0.05)
     supports = [*ROLLERS, PrescribedDisplacement("x_max", x=symbols["pull"])]
-    problem = SolidProblem(
-        mesh, {"all": material}, supports, parameters=symbols, options=SolidOptions(mixed=mixed)
-    )
+    problem = SolidProblem(mesh, {"all": material}, supports, parameters=symbols, options=SolidOptions(mixed=mixed))
     state = solved(problem, 0.5)
     displacement = problem.nodal_displacement(state.dofs)
     np.testing.assert_allclose(displacement[:, 1], (lateral - 1.0) * mesh.nodes[:, 1], atol=1e-6)

@@ -7,11 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from morph_dslam.offline.materials.anisotropic import HolzapfelGasserOgden
-from morph_dslam.offline.materials.directions import turned_direction
-from morph_dslam.offline.materials.isotropic import NeoHookean
-from morph_dslam.offline.mechanics.kinematics import ShapeField
-from morph_dslam.offline.mechanics.loads import (
+from morph_dslam.mechanics.kinematics import ShapeField
+from morph_dslam.mechanics.loads import (
     BodyForce,
     DeadTraction,
     FollowerPressure,
@@ -20,17 +17,15 @@ from morph_dslam.offline.mechanics.loads import (
     MovingPatch,
     PointLoad,
 )
-from morph_dslam.offline.mechanics.parameters import ParameterSymbols
-from morph_dslam.offline.mechanics.solid import SolidOptions, SolidProblem
-from morph_dslam.offline.mechanics.supports import (
-    ElasticFoundation,
-    PrescribedDisplacement,
-    RigidRotation,
-    fixed,
-)
-from morph_dslam.offline.meshing.mesh_generators import block
-from morph_dslam.offline.solvers.linear_solver import default_engine
-from morph_dslam.offline.solvers.newton import NewtonOptions, advance, sensitivities, solve
+from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden
+from morph_dslam.mechanics.materials.base import turned_direction
+from morph_dslam.mechanics.materials.isotropic import NeoHookean
+from morph_dslam.mechanics.parameters import ParameterSymbols
+from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.mechanics.solvers.linear_solver import default_engine
+from morph_dslam.mechanics.solvers.newton import NewtonOptions, advance, sensitivities, solve
+from morph_dslam.mechanics.supports import ElasticFoundation, PrescribedDisplacement, RigidRotation, fixed
+from morph_dslam.meshing.generators import block
 from tests.support.solids import RUBBER, distorted, load_parameter
 
 EXACT = NewtonOptions(tolerance=1e-13)
@@ -83,9 +78,7 @@ def by_pressure_unknowns(mu: ParameterSymbols) -> SolidProblem:
     material = NeoHookean(young=3e6 * (1.0 + mu["p"]), poisson=0.4999)
     load = FollowerPressure("z_max", 1e5)
     mesh = block((1.0, 0.5, 0.5), (2, 1, 1), "hex20")
-    return SolidProblem(
-        mesh, {"all": material}, [fixed("x_min")], [load], mu, options=SolidOptions(mixed=True)
-    )
+    return SolidProblem(mesh, {"all": material}, [fixed("x_min")], [load], mu, options=SolidOptions(mixed=True))
 
 
 def by_fibre_angle(mu: ParameterSymbols) -> SolidProblem:
@@ -108,9 +101,7 @@ def by_shape(mu: ParameterSymbols) -> SolidProblem:
         RigidRotation("x_max", (0.0, 1.0, 0.0), 0.2),
         ElasticFoundation("z_min", 1e6, normal_only=True),
     ]
-    return SolidProblem(
-        MESH, {"all": RUBBER}, supports, loads, mu, shape=[ShapeField(mu["p"] - 0.1, thicker)]
-    )
+    return SolidProblem(MESH, {"all": RUBBER}, supports, loads, mu, shape=[ShapeField(mu["p"] - 0.1, thicker)])
 
 
 MAKERS = [value for name, value in sorted(globals().items()) if name.startswith("by_")]
@@ -199,8 +190,6 @@ def test_reactions_balance_the_loads() -> None:
     np.testing.assert_allclose(sum(force for force, _ in reactions), -applied, rtol=1e-8)
     faces = MESH.face_nodes(MESH.surface("y_max"))
     corners = (MESH.nodes + problem.nodal_displacement(state.dofs))[faces]
-    areas = np.linalg.norm(
-        np.cross(*(MESH.nodes[faces[:, i]] - MESH.nodes[faces[:, 0]] for i in (1, 3))), axis=1
-    )
+    areas = np.linalg.norm(np.cross(*(MESH.nodes[faces[:, i]] - MESH.nodes[faces[:, 0]] for i in (1, 3))), axis=1)
     moment = np.cross(areas @ corners.mean(axis=1) / 0.5 - about, applied)
     np.testing.assert_allclose(sum(moment for _, moment in reactions), -moment, rtol=1e-8)

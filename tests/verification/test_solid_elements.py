@@ -6,13 +6,13 @@ import ngsolve as ngs
 import numpy as np
 import pytest
 
-from morph_dslam.offline.materials.isotropic import NeoHookean
-from morph_dslam.offline.mechanics.loads import BodyForce, DeadTraction
-from morph_dslam.offline.mechanics.solid import SolidOptions, SolidProblem
-from morph_dslam.offline.mechanics.supports import PrescribedDisplacement, fixed
-from morph_dslam.offline.meshing.cell_types import cell_type as type_of
-from morph_dslam.offline.meshing.mesh_generators import block
-from morph_dslam.offline.solvers.newton import solve
+from morph_dslam.mechanics.loads import BodyForce, DeadTraction
+from morph_dslam.mechanics.materials.isotropic import NeoHookean
+from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.mechanics.solvers.newton import solve
+from morph_dslam.mechanics.supports import PrescribedDisplacement, fixed
+from morph_dslam.meshing.cell_types import cell_type as type_of
+from morph_dslam.meshing.generators import block
 from tests.support.solids import (
     FACES,
     RUBBER,
@@ -35,9 +35,7 @@ def test_patch_of_distorted_cells(cell_type: str, mixed: bool) -> None:
     symbols = load_parameter(share=0.0)
     mesh = distorted(block((1.0, 1.0, 1.0), (2, 2, 2), cell_type), 0.12, corners_only=True)
     supports = [AffineSupport(face, gradient, symbols["share"]) for face in FACES]
-    problem = SolidProblem(
-        mesh, {"all": RUBBER}, supports, parameters=symbols, options=SolidOptions(mixed=mixed)
-    )
+    problem = SolidProblem(mesh, {"all": RUBBER}, supports, parameters=symbols, options=SolidOptions(mixed=mixed))
     state = solved(problem, 1.0)
     np.testing.assert_allclose(problem.nodal_displacement(state.dofs), mesh.nodes @ gradient.T, atol=1e-10)
     F = np.eye(3) + gradient
@@ -109,10 +107,7 @@ def test_cooks_membrane(cell_type: str) -> None:
     problem = SolidProblem(
         mesh,
         {"all": NeoHookean(young=1.0, poisson=1.0 / 3.0)},
-        [
-            PrescribedDisplacement("x_min", x=0.0, y=0.0),
-            PrescribedDisplacement("z_min", z=0.0),
-        ],
+        [PrescribedDisplacement("x_min", x=0.0, y=0.0), PrescribedDisplacement("z_min", z=0.0)],
         [DeadTraction("x_max", (0.0, symbols["load"] / 16.0, 0.0))],
         symbols,
     )

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import SolverError, StudyError
-from morph_dslam.offline.materials.isotropic import NeoHookean
-from morph_dslam.offline.materials.viscoelastic import Prony
-from morph_dslam.offline.mechanics.solid import SolidProblem
-from morph_dslam.offline.mechanics.supports import PrescribedDisplacement, fixed
-from morph_dslam.offline.meshing.mesh_generators import block
-from morph_dslam.offline.solvers.newton import advance
+from morph_dslam.mechanics.materials.isotropic import NeoHookean
+from morph_dslam.mechanics.materials.viscoelastic import Prony
+from morph_dslam.mechanics.solid import SolidProblem
+from morph_dslam.mechanics.solvers.newton import advance
+from morph_dslam.mechanics.supports import PrescribedDisplacement, fixed
+from morph_dslam.meshing.generators import block
 from tests.support.solids import distorted, load_parameter
 
 #: g_inf = 0.4, g_1 = 0.6, tau = 2 s.

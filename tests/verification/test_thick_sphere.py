@@ -12,13 +12,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morph_dslam.offline.materials.isotropic import NeoHookean
-from morph_dslam.offline.mechanics.loads import FollowerPressure
-from morph_dslam.offline.mechanics.solid import SolidOptions, SolidProblem
-from morph_dslam.offline.mechanics.supports import PrescribedDisplacement
-from morph_dslam.offline.meshing.meshes import Mesh
-from morph_dslam.offline.solvers.arc_length import ArcLength, ArcOptions
-from morph_dslam.offline.solvers.newton import State
+from morph_dslam.mechanics.loads import FollowerPressure
+from morph_dslam.mechanics.materials.isotropic import NeoHookean
+from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.mechanics.solvers.arc_length import ArcLength, ArcOptions
+from morph_dslam.mechanics.solvers.newton import State
+from morph_dslam.mechanics.supports import PrescribedDisplacement
+from morph_dslam.meshing.meshes import Mesh
 from tests.support.solids import load_parameter, mapped_block, merged
 
 INNER, OUTER, SHEAR = 0.1, 0.2, 1e6

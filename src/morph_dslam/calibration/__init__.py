@@ -1,1 +1,1 @@
-"""Camera calibration from pictures of a checkerboard (Zhang 2000)."""
+"""Camera calibration from pictures of a checkerboard."""

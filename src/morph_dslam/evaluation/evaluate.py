@@ -8,18 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from morph_dslam.evaluation.alignment import summarise_alignment
-from morph_dslam.evaluation.depth_error import depth_error, summarise_depth
-from morph_dslam.evaluation.material_error import material_error, summarise
-from morph_dslam.evaluation.plots import (
+from morph_dslam.evaluation.depth import depth_error, summarise_depth
+from morph_dslam.evaluation.points import load_truth, material_error, summarise
+from morph_dslam.evaluation.run_folder import load_run
+from morph_dslam.evaluation.run_report import (
     plot_depth_error_map,
     plot_depth_errors_by_frame,
     plot_error_map,
     plot_errors_by_frame,
+    write_run_report,
 )
-from morph_dslam.evaluation.run_folder import load_run
-from morph_dslam.evaluation.run_report import write_run_report
-from morph_dslam.evaluation.truth import load_truth
+from morph_dslam.evaluation.trajectory import summarise_alignment
 
 
 def evaluate(folder: Path, truth_path: Path, bind_frame: int) -> dict[str, Any]:

@@ -8,19 +8,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from morph_dslam.evaluation.error_tables import error_table, sensitivity_table
-from morph_dslam.evaluation.field_names import field_title
+from morph_dslam.evaluation.points import error_table, field_title, sensitivity_table
 from morph_dslam.evaluation.report import Table
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.model.product_functions import ProductFunctions
-from morph_dslam.model.stacked_functions import StackedFunctions
-from morph_dslam.model.tensor_functions import CPFunctions, TensorTrainFunctions, TuckerFunctions
+from morph_dslam.model.tensor_functions import (
+    CPFunctions,
+    ProductFunctions,
+    StackedFunctions,
+    TensorTrainFunctions,
+    TuckerFunctions,
+)
 
 #: Endings of certificate keys and the unit they stand for.
 _UNITS = {"_mm": "mm", "_percent": "%", "_MPa": "MPa", "_seconds": "s", "_ms": "ms", "_deg": "°"}
+
 #: Texts longer than this (a study's) are for programs, not for a summary.
 _LONGEST_TEXT = 120
+
 _FORMATS = {
     ParameterFunctions: "polynomials",
     CPFunctions: "CP",
@@ -29,6 +34,7 @@ _FORMATS = {
     StackedFunctions: "by component",
     ProductFunctions: "products",
 }
+
 #: Long lists of the reduction, which the build's report draws.
 _DRAWN = ("singular_values", "cross_validation")
 
@@ -78,9 +84,7 @@ def summarise_model(model: ReducedModel) -> dict[str, Table]:
         "error estimator": Table.of(flatten(certificate.get("estimator", {}))),
         "reduction": Table.of(_reduction(certificate)),
         "stability": Table.of(_stability(certificate)),
-        "warnings": Table.of(
-            {f"{n}": line for n, line in enumerate(certificate.get("warnings", []), start=1)}
-        ),
+        "warnings": Table.of({f"{n}": line for n, line in enumerate(certificate.get("warnings", []), start=1)}),
         "made with": Table.of(flatten(_versions_last(model.provenance))),
     }
     return {heading: table for heading, table in summary.items() if table.rows}
@@ -145,12 +149,7 @@ def _mesh(model: ReducedModel) -> Facts:
 
 def _fields(model: ReducedModel) -> Table:
     rows = [
-        [
-            field_title(name),
-            str(field.n_modes),
-            _FORMATS[type(field.functions)],
-            str(field.n_floats),
-        ]
+        [field_title(name), str(field.n_modes), _FORMATS[type(field.functions)], str(field.n_floats)]
         for name, field in model.fields.items()
     ]
     return Table(rows, ("field", "modes", "format", "numbers stored"))
@@ -177,9 +176,7 @@ def _reduction(certificate: Mapping[str, Any]) -> Facts:
 
 def _stability(certificate: Mapping[str, Any]) -> Facts:
     report = certificate.get("stability", {})
-    facts = flatten(
-        {key: report[key] for key in ("statement", "stable", "unstable", "unknown") if key in report}
-    )
+    facts = flatten({key: report[key] for key in ("statement", "stable", "unstable", "unknown") if key in report})
     places = [" and ".join(place["between"]) for place in report.get("passed", [])]
     return facts | {f"change of stability {n}": f"between {place}" for n, place in enumerate(places, start=1)}
 

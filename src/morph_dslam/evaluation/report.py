@@ -51,9 +51,7 @@ class Text:
     warning: bool = False
 
     def html(self) -> str:
-        return (
-            f'<p class="warning">{escape(self.text)}</p>' if self.warning else f"<p>{escape(self.text)}</p>"
-        )
+        return f'<p class="warning">{escape(self.text)}</p>' if self.warning else f"<p>{escape(self.text)}</p>"
 
 
 @dataclass(frozen=True)
@@ -72,10 +70,7 @@ class Table:
         """The table in lines, columns aligned on their left."""
         rows = [self.header, *self.rows] if self.header else self.rows
         widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
-        return [
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-            for row in rows
-        ]
+        return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
     def html(self) -> str:
         lines = [_row(self.header, "th")] if self.header else []
@@ -91,8 +86,7 @@ class KeyFigures:
 
     def html(self) -> str:
         cards = [
-            f"<div><b>{escape(value)}</b><span>{escape(name)}</span></div>"
-            for name, value in self.figures.items()
+            f"<div><b>{escape(value)}</b><span>{escape(name)}</span></div>" for name, value in self.figures.items()
         ]
         return '<div class="figures">\n' + "\n".join(cards) + "\n</div>"
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -12,13 +14,14 @@ from numpy.typing import NDArray
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import EvaluationError
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.io.calibration import load_camera
+from morph_dslam.io.camera_files import load_camera
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.discrepancy import Discrepancy, load_discrepancies
 
 Array = NDArray[np.float64]
 
 FORMAT = "morph-dslam run"
+
 VERSION = 1
 
 
@@ -48,9 +51,7 @@ class Run:
     @property
     def tracked(self) -> NDArray[np.bool_]:
         """Frames (f,) whose pose and parameters are known."""
-        known = np.isfinite(self.camera_from_object).all(axis=(1, 2)) & np.isfinite(self.parameters).all(
-            axis=1
-        )
+        known = np.isfinite(self.camera_from_object).all(axis=(1, 2)) & np.isfinite(self.parameters).all(axis=1)
         return known & (np.array(self.status) == "tracked")
 
     @property
@@ -101,9 +102,7 @@ def load_run(folder: Path) -> Run:
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("format") != FORMAT or int(file.attrs["version"]) != VERSION:  # type: ignore[arg-type]
-                raise EvaluationError(
-                    f"{path} is not a run of version {VERSION}: track again with this release"
-                )
+                raise EvaluationError(f"{path} is not a run of version {VERSION}: track again with this release")
             names = np.atleast_1d(np.asarray(file["timings_ms"].attrs["names"], dtype=str)).tolist()
             run = Run(
                 folder=folder,
@@ -125,3 +124,62 @@ def load_run(folder: Path) -> Run:
     if not len(run.frames):
         raise EvaluationError(f"{path} holds no frames: track again")
     return run
+
+
+# The figures of an evaluation in words.
+
+
+def remarks(figures: Mapping[str, Any]) -> list[str]:
+    """What a reader of the figures must know: truth that could not be compared."""
+    lines = []
+    if figures["truth_frames_not_tracked"]:
+        lines.append(f"truth frames that were not tracked and so not compared: {figures['truth_frames_not_tracked']}")
+    if figures["truth_frames_outside_the_run"]:
+        lines.append(f"truth frames outside the run: {figures['truth_frames_outside_the_run']}")
+    if figures["points_not_bound"]:
+        unseen = figures["n_points_unseen"]
+        off = len(figures["points_not_bound"]) - unseen
+        why = [f"{unseen} are hidden or not measured"] * bool(unseen)
+        why += [f"{off} fall off the estimated surface"] * bool(off)
+        lines.append(
+            f"of {figures['n_points']} truth points {' and '.join(why)} in frame {figures['bind_frame']}: "
+            "these were not compared"
+        )
+    if figures["n_points_bound_at_outline"]:
+        lines.append(
+            f"{figures['n_points_bound_at_outline']} truth points missed the surface by up to "
+            f"{figures['outline_tolerance_px']:g} px and were bound to its outline"
+        )
+    return lines
+
+
+def alignment_line(figures: Mapping[str, Any]) -> str:
+    """How much of the error is one rigid motion between truth and estimate, as commands print it."""
+    together, single = figures["after_one_rigid_motion"], figures["after_one_in_each_frame"]
+    turn = ", ".join(f"{angle:.2f}" for angle in together["rotation_deg"])
+    return (
+        f"after one rigid motion of all truth points (rotation {turn} degrees about x, y, z): mean "
+        f"{together['mean_mm']:.3f} mm, median {together['median_mm']:.3f} mm; after one in each frame: mean "
+        f"{single['mean_mm']:.3f} mm, median {single['median_mm']:.3f} mm"
+    )
+
+
+def result_line(figures: Mapping[str, Any]) -> str:
+    """The last line that commands and examples print."""
+    return (
+        f"mean_mm={figures['mean_mm']:.3f} median_mm={figures['median_mm']:.3f} "
+        f"p95_mm={figures['p95_mm']:.3f} "
+        f"tracked={figures['n_frames_tracked']}/{figures['n_frames']} "
+        f"median_ms={figures['median_ms']:.2f} p95_ms={figures['p95_ms']:.2f}"
+    )
+
+
+def depth_line(figures: Mapping[str, Any]) -> str:
+    """The last line of an evaluation against depth images."""
+    base = figures["base"]
+    beside = f" base_mean_mm={base['mean_mm']:.3f}" if base and base["n_points"] else ""
+    return (
+        f"surface_mean_mm={figures['mean_mm']:.3f} surface_median_mm={figures['median_mm']:.3f} "
+        f"surface_p95_mm={figures['p95_mm']:.3f}{beside} left_out_percent={figures['left_out_percent']:.1f} "
+        f"frames={len(figures['frames_compared'])}/{figures['n_frames']}"
+    )

@@ -6,9 +6,12 @@ a keyword line that ends in a comma goes on in the next; the case of names and k
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
 
@@ -96,9 +99,7 @@ def _lines(path: Path, including: tuple[Path, ...] = ()) -> Iterator[tuple[Path,
             yield path, first, line
 
 
-def _included(
-    path: Path, number: int, line: str, including: tuple[Path, ...]
-) -> Iterator[tuple[Path, int, str]]:
+def _included(path: Path, number: int, line: str, including: tuple[Path, ...]) -> Iterator[tuple[Path, int, str]]:
     card = _card(path, number, line)
     target = path.parent / card.required("INPUT")
     if target.resolve() in (*including, path.resolve()):
@@ -137,3 +138,255 @@ def read_cards(path: Path) -> list[Card]:
             raise line.error("the file begins with data; an input file begins with a keyword such as *NODE")
         cards[-1].data.append(line)
     return cards
+
+
+# Named sets of labels in an input file: lists, GENERATE ranges, and sets within sets.
+
+
+Labels = NDArray[np.int64]
+
+
+@dataclass
+class _Set:
+    name: str
+    labels: list[int] = field(default_factory=list)
+    ranges: list[range] = field(default_factory=list)
+    #: Entries that were written in set lines: where, and the label or the name of another set.
+    entries: list[tuple[Line, int | str]] = field(default_factory=list)
+
+
+def _is_label(text: str) -> bool:
+    return text.lstrip("+-").isdigit()
+
+
+class LabelSets:
+    """The node sets, or the element sets, of one file; ``what`` is "node" or "element"."""
+
+    def __init__(self, what: str):
+        self._what = what
+        self._sets: dict[str, _Set] = {}
+
+    def _set(self, name: str) -> _Set:
+        return self._sets.setdefault(name.upper(), _Set(name))
+
+    def add(self, name: str | None, labels: Iterable[int]) -> None:
+        """Add labels that the file defines to a set; none where the name is missing."""
+        if name:
+            self._set(name).labels.extend(labels)
+
+    def add_card(self, card: Card, parameter: str) -> None:
+        """Add the data lines of a *NSET or *ELSET card to the set that ``parameter`` names."""
+        name = card.required(parameter)
+        self._set(name)
+        for line in card.data:
+            if "GENERATE" in card.parameters:
+                self.add_range(name, line)
+            else:
+                self.add_line(name, line)
+
+    def add_line(self, name: str, line: Line) -> None:
+        """Add every label and every name of a set on a line."""
+        entries = self._set(name).entries
+        for position, text in enumerate(line.fields):
+            if text:
+                entries.append((line, line.integer(position) if _is_label(text) else text))
+
+    def add_range(self, name: str, line: Line) -> None:
+        """Add first, last and step of a GENERATE line."""
+        if not 2 <= len([text for text in line.fields if text]) <= 3:
+            raise line.error("a GENERATE line needs a first label, a last one and, if not 1, a step")
+        first, last = line.integer(0), line.integer(1)
+        step = line.integer(2) if len(line.fields) > 2 and line.fields[2] else 1
+        if step <= 0 or last < first:
+            raise line.error(f"{first}, {last}, {step} is no range; give first <= last and a positive step")
+        self._set(name).ranges.append(range(first, last + 1, step))
+
+    def entry(self, line: Line, position: int, defined: Labels) -> Labels:
+        """Labels that a field stands for: itself, or a set's."""
+        text = line.text(position)
+        single = _Set(text, entries=[(line, line.integer(position) if _is_label(text) else text)])
+        return self._expand(single, defined, ())
+
+    def named(self, name: str, line: Line, defined: Labels) -> Labels:
+        """Sorted labels of a set; StudyError naming the line that refers to it if there is no such set."""
+        return self._expand(_Set(name, entries=[(line, name)]), defined, ())
+
+    def resolved(self, defined: Labels) -> dict[str, Labels]:
+        """Sorted labels of each set by name.
+
+        Parameters
+        ----------
+        defined : the labels that the file defines; a range keeps those of its labels that are among them.
+
+        Raises
+        ------
+        StudyError
+            If a line names a label that is not defined, a set that is not there, or one that holds itself.
+        """
+        return {entry.name: self._expand(entry, defined, ()) for entry in self._sets.values()}
+
+    def _expand(self, one: _Set, defined: Labels, within: tuple[str, ...]) -> Labels:
+        listed = [(line, entry) for line, entry in one.entries if isinstance(entry, int)]
+        labels = np.array([entry for _, entry in listed], dtype=np.int64)
+        for i in np.flatnonzero(~np.isin(labels, defined))[:1]:
+            line, label = listed[i]
+            raise line.error(f"{self._what} {label} in '{one.name}' is not defined in the file")
+        parts = [labels, np.array(one.labels, dtype=np.int64)]
+        parts += [np.intersect1d(np.arange(r.start, r.stop, r.step), defined) for r in one.ranges]
+        for line, entry in one.entries:
+            if isinstance(entry, str):
+                key = entry.upper()
+                if key not in self._sets:
+                    raise line.error(f"there is no {self._what} set '{entry}'")
+                if key in within:
+                    raise line.error(f"the {self._what} set '{entry}' holds itself")
+                parts.append(self._expand(self._sets[key], defined, (*within, key)))
+        return np.unique(np.concatenate(parts))
+
+
+# Material cards of an Abaqus or CalculiX input file as plain numbers in the file's units.
+
+
+#: Names of the constants of each elastic type, in the card's order.
+_ELASTIC = {
+    "ISOTROPIC": ("E", "nu"),
+    "ENGINEERING CONSTANTS": ("E1", "E2", "E3", "nu12", "nu13", "nu23", "G12", "G13", "G23"),
+    "ORTHOTROPIC": ("D1111", "D1122", "D2222", "D1133", "D2233", "D3333", "D1212", "D1313", "D2323"),
+}
+
+#: Names of the constants of each hyperelastic model, in the card's order; Ogden's follow from its N.
+_HYPERELASTIC = {
+    "NEO HOOKE": ("C10", "D1"),
+    "MOONEY-RIVLIN": ("C10", "C01", "D1"),
+    "YEOH": ("C10", "C20", "C30", "D1", "D2", "D3"),
+}
+
+
+@dataclass(frozen=True)
+class Constants:
+    """A law and its constants, named as the Abaqus manual names them, in file units.
+
+    ``law`` is an elastic type ("ISOTROPIC", "ENGINEERING CONSTANTS", "ORTHOTROPIC") or a hyperelastic model
+    ("NEO HOOKE", "MOONEY-RIVLIN", "YEOH", "OGDEN"). Constants that the card leaves out are 0. They hold in
+    the long term of a viscoelastic material unless ``instantaneous``.
+    """
+
+    law: str
+    values: dict[str, float]
+    line: Line
+    instantaneous: bool = False
+
+
+@dataclass(frozen=True)
+class MaterialCard:
+    """One *MATERIAL and the cards that belong to it.
+
+    Attributes
+    ----------
+    name : as the file spells it.
+    density : mass per volume, file units; None where it is not given.
+    elastic, hyperelastic : constants, or None.
+    prony : rows (g, k, tau): relative shear and bulk moduli, and the relaxation time.
+    """
+
+    name: str
+    line: Line
+    density: float | None = None
+    elastic: Constants | None = None
+    hyperelastic: Constants | None = None
+    prony: tuple[tuple[float, float, float], ...] = field(default=())
+
+
+def _single_row(card: Card, count: int) -> tuple[float, ...]:
+    """Constants of a card whose row may go on over lines of eight; refuses tables over temperature."""
+    if not card.data:
+        raise card.line.error(f"*{card.keyword} lacks its constants on the line below it")
+    values: list[float] = []
+    for line in card.data:
+        if len(values) >= count:
+            raise line.error(
+                f"*{card.keyword} takes {count} constants; a second row means that they depend on "
+                "temperature, which is not read: keep one row"
+            )
+        values += [line.real(i) for i in range(len(line.fields))]
+    return tuple(values)
+
+
+def _constants(card: Card, law: str, names: tuple[str, ...], needed: int) -> Constants:
+    values = _single_row(card, len(names))
+    if len(values) < needed:
+        raise card.data[-1].error(f"{law} needs at least {needed} constants ({', '.join(names)}); {len(values)} given")
+    padded = values + (0.0,) * len(names)
+    instantaneous = card.parameters.get("MODULI", "LONG TERM").upper() == "INSTANTANEOUS"
+    return Constants(law, dict(zip(names, padded, strict=False)), card.line, instantaneous)
+
+
+def _elastic(card: Card) -> Constants:
+    law = card.parameters.get("TYPE", "ISOTROPIC").upper()
+    law = {"ISO": "ISOTROPIC", "ORTHO": "ORTHOTROPIC"}.get(law, law)
+    if law not in _ELASTIC:
+        raise card.line.error(f"*ELASTIC, TYPE={law} is not read; use {', '.join(_ELASTIC)}")
+    return _constants(card, law, _ELASTIC[law], len(_ELASTIC[law]))
+
+
+def _hyperelastic(card: Card) -> Constants:
+    if "TEST DATA INPUT" in card.parameters:
+        raise card.line.error("*HYPERELASTIC with TEST DATA INPUT is not read; give fitted constants")
+    if "OGDEN" in card.parameters:
+        text = card.parameters.get("N", "1")
+        if not text.isdigit() or not 1 <= int(text) <= 6:
+            raise card.line.error(f"N={text} is no number of Ogden terms; give 1 to 6")
+        n = int(text)
+        names = tuple(name for i in range(1, n + 1) for name in (f"mu{i}", f"alpha{i}"))
+        return _constants(card, "OGDEN", names + tuple(f"D{i}" for i in range(1, n + 1)), 2 * n)
+    for law, names in _HYPERELASTIC.items():
+        if law in card.parameters:
+            return _constants(card, law, names, sum(name.startswith("C") for name in names))
+    given = ", ".join(card.parameters) or "no model"
+    raise card.line.error(f"*HYPERELASTIC with {given} is not read; use {', '.join(_HYPERELASTIC)} or OGDEN")
+
+
+def _prony(card: Card) -> tuple[tuple[float, float, float], ...]:
+    if card.parameters.get("TIME", "").upper() != "PRONY":
+        raise card.line.error("*VISCOELASTIC is read with TIME=PRONY only; give a Prony series")
+    rows = []
+    for line in card.data:
+        if len(line.fields) < 3:
+            raise line.error("a Prony term needs g, k and tau")
+        g, k, tau = line.real(0), line.real(1), line.real(2)
+        if tau <= 0.0:
+            raise line.error(f"a relaxation time of {tau} cannot be; give a positive one")
+        rows.append((g, k, tau))
+    return tuple(rows)
+
+
+def read_materials(cards: list[Card]) -> dict[str, MaterialCard]:
+    """Materials by name; each takes the cards up to the next *MATERIAL.
+
+    Raises
+    ------
+    StudyError
+        Naming file and line, if a card lacks constants, or its law is not known.
+    """
+    materials: dict[str, MaterialCard] = {}
+    current: MaterialCard | None = None
+    for card in cards:
+        if card.keyword == "MATERIAL":
+            current = MaterialCard(card.required("NAME"), card.line)
+        elif card.keyword in ("ELASTIC", "HYPERELASTIC", "DENSITY", "VISCOELASTIC"):
+            if current is None:
+                raise card.line.error(f"*{card.keyword} stands before any *MATERIAL, NAME=")
+            current = _with_card(current, card)
+        if current is not None:
+            materials[current.name] = current
+    return materials
+
+
+def _with_card(material: MaterialCard, card: Card) -> MaterialCard:
+    if card.keyword == "ELASTIC":
+        return replace(material, elastic=_elastic(card))
+    if card.keyword == "HYPERELASTIC":
+        return replace(material, hyperelastic=_hyperelastic(card))
+    if card.keyword == "DENSITY":
+        return replace(material, density=_single_row(card, 1)[0])
+    return replace(material, prony=_prony(card))

@@ -16,9 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
-from morph_dslam.io.inp_cards import Card, Line, read_cards
-from morph_dslam.io.inp_materials import MaterialCard, read_materials
-from morph_dslam.io.inp_sets import LabelSets
+from morph_dslam.io.inp_cards import Card, LabelSets, Line, MaterialCard, read_cards, read_materials
 
 Labels = NDArray[np.int64]
 
@@ -29,6 +27,7 @@ ELEMENTS = {
     "C3D15": ("prism15", 15), "C3D20": ("hex20", 20), "C3D27": ("hex27", 27),
     "S3": ("tri3", 3), "S4": ("quad4", 4),
 }  # fmt: skip
+
 _GENERATING = (
     "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "SUBMODEL", "SYMMETRIC MODEL GENERATION",
 )  # fmt: skip
@@ -105,9 +104,7 @@ def _read_nodes(cards: list[Card], sets: LabelSets) -> tuple[Labels, NDArray[np.
     places: dict[int, tuple[float, float, float]] = {}
     for card in cards:
         if card.parameters.get("SYSTEM", "R").upper() != "R" or "INPUT" in card.parameters:
-            raise card.line.error(
-                "*NODE with SYSTEM= or INPUT= is not read; list Cartesian coordinates below it"
-            )
+            raise card.line.error("*NODE with SYSTEM= or INPUT= is not read; list Cartesian coordinates below it")
         labels = []
         for line in card.data:
             if not 3 <= len(line.fields) <= 7:
@@ -163,9 +160,7 @@ def _check_references(elements: tuple[Elements, ...], node_labels: Labels) -> No
         missing = ~np.isin(part.connectivity, node_labels)
         for i in np.flatnonzero(missing.any(axis=1))[:1]:
             label, node = part.labels[i], part.connectivity[i][missing[i]][0]
-            raise part.lines[i].error(
-                f"element {label} refers to node {node}, which the file does not define"
-            )
+            raise part.lines[i].error(f"element {label} refers to node {node}, which the file does not define")
         for label, line in zip(part.labels.tolist(), part.lines, strict=True):
             if label in seen:
                 raise line.error(f"element {label} was defined before; give each label once")
@@ -210,15 +205,11 @@ def _read_section(card: Card) -> Section:
 def _refuse_what_moves_nodes(cards: list[Card]) -> None:
     for card in cards:
         if card.keyword in _GENERATING:
-            raise card.line.error(
-                f"*{card.keyword} is not read; write out the nodes and elements that it makes"
-            )
+            raise card.line.error(f"*{card.keyword} is not read; write out the nodes and elements that it makes")
     instances = [card for card in cards if card.keyword == "INSTANCE"]
     placed = [card for card in instances if card.data]
     for card in (*placed, *instances[1:]):
-        raise card.line.error(
-            "assemblies of placed instances are not read; write a flat input file of one part"
-        )
+        raise card.line.error("assemblies of placed instances are not read; write a flat input file of one part")
 
 
 def read_inp(path: Path) -> InpFile:
@@ -241,9 +232,7 @@ def read_inp(path: Path) -> InpFile:
     element_cards = by_keyword.get("ELEMENT", [])
     elements = tuple(_read_elements(card) for card in element_cards)
     if not len(labels) or not any(len(part.labels) for part in elements):
-        raise StudyError(
-            f"{path} holds no {'elements' if len(labels) else 'nodes'}; it is no mesh, or is cut short"
-        )
+        raise StudyError(f"{path} holds no {'elements' if len(labels) else 'nodes'}; it is no mesh, or is cut short")
     _check_references(elements, labels)
     for card, part in zip(element_cards, elements, strict=True):
         element_sets.add(card.parameters.get("ELSET"), part.labels.tolist())

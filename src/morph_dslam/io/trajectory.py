@@ -114,8 +114,7 @@ def _table_rows(path: Path, lines: list[str]) -> Iterator[tuple[float, Array]]:
             yield float(row), _rigid(values.reshape(3, 4), where)
         else:
             raise TrajectoryError(
-                f"{where} has {len(values)} numbers: a TUM file has timestamp tx ty tz qx qy qz qw, "
-                "a KITTI file twelve"
+                f"{where} has {len(values)} numbers: a TUM file has timestamp tx ty tz qx qy qz qw, a KITTI file twelve"
             )
         row += 1
 

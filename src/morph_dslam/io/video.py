@@ -67,9 +67,7 @@ class VideoWriter:
         if self._writer is None:
             raise RuntimeError("the video is not open: write inside its with block")
         if image.shape != (self._size[1], self._size[0], 3):
-            raise ValueError(
-                f"the frame has shape {image.shape}, the video is {self._size[0]}x{self._size[1]}"
-            )
+            raise ValueError(f"the frame has shape {image.shape}, the video is {self._size[0]}x{self._size[1]}")
         self._writer.write(np.ascontiguousarray(image))
         self.n_frames += 1
 

@@ -4,12 +4,4 @@ from morph_dslam.model.reduced_model import MaterialPoints, Parameter, ReducedMo
 from morph_dslam.model.separated import SeparatedField
 from morph_dslam.model.storage import load_model, save_model
 
-__all__ = [
-    "MaterialPoints",
-    "Parameter",
-    "ReducedModel",
-    "SeparatedField",
-    "SurfacePoints",
-    "load_model",
-    "save_model",
-]
+__all__ = ["MaterialPoints", "Parameter", "ReducedModel", "SeparatedField", "SurfacePoints", "load_model", "save_model"]

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from morph_dslam.model.array_reading import read_array
-from morph_dslam.similarity import fit_similarity
+from morph_dslam.geometry import fit_similarity
+from morph_dslam.model.field_storage import read_array
 
 Array = NDArray[np.float64]
 

@@ -19,8 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from morph_dslam.model.basis_functions import chebyshev_basis, evaluate_numpy
-from morph_dslam.model.basis_kernels import CHEBYSHEV, fill_basis
+from morph_dslam.model.basis_functions import CHEBYSHEV, chebyshev_basis, evaluate_numpy, fill_basis
 
 Array = NDArray[np.float64]
 
@@ -188,9 +187,7 @@ class ParameterFunctions(Functions):
 
     def partial(self, mu: ArrayLike, orders: tuple[int, ...]) -> Array:
         terms = np.ones(len(self.coefficients))
-        for x, basis, degrees, order in zip(
-            np.asarray(mu), self._bases, self.multi_indices.T, orders, strict=True
-        ):
+        for x, basis, degrees, order in zip(np.asarray(mu), self._bases, self.multi_indices.T, orders, strict=True):
             terms = terms * evaluate_numpy(basis, x, order)[0, degrees]
         return terms @ self.coefficients
 

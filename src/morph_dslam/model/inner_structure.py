@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from morph_dslam.errors import ModelFileError
-from morph_dslam.model.array_reading import read_array, read_text
+from morph_dslam.model.field_storage import read_array, read_text
 from morph_dslam.model.reduced_model import MaterialPoints, ReducedModel
 from morph_dslam.model.separated import SeparatedField
 
@@ -125,10 +125,7 @@ def load_inner_structure(path: Path) -> InnerStructure:
                 read_array(file, "corners", 2, np.int64), read_array(file, "weights", 2, np.float64)
             )
             structure = InnerStructure(
-                read_text(file, "name"),
-                read_array(file, "rest", 2),
-                read_array(file, "triangles", 2, np.int64),
-                points,
+                read_text(file, "name"), read_array(file, "rest", 2), read_array(file, "triangles", 2, np.int64), points
             )
         _check(structure)
     except Exception as error:

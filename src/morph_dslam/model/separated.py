@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from morph_dslam.model.compact_modes import CompactModes
 from morph_dslam.model.functions import Functions
 
 Array = NDArray[np.float64]
@@ -30,9 +29,7 @@ def combine_modes(rows, modes):
         for row in range(n_rows):
             a, b, c, d = rows[row, i], rows[row, i + 1], rows[row, i + 2], rows[row, i + 3]
             for p in range(n):
-                result[row, p] += (
-                    a * modes[i, p] + b * modes[i + 1, p] + c * modes[i + 2, p] + d * modes[i + 3, p]
-                )
+                result[row, p] += a * modes[i, p] + b * modes[i + 1, p] + c * modes[i + 2, p] + d * modes[i + 3, p]
     for i in range(whole, m):
         for row in range(n_rows):
             a = rows[row, i]
@@ -97,9 +94,7 @@ class SeparatedField:
         result = result.reshape(len(rows), *self.modes.shape[1:])
         return result[0], result[1:]
 
-    def value_and_sensitivities_numpy(
-        self, mu: ArrayLike, outside: Outside = "bounded"
-    ) -> tuple[Array, Array]:
+    def value_and_sensitivities_numpy(self, mu: ArrayLike, outside: Outside = "bounded") -> tuple[Array, Array]:
         """The plain twin of `value_and_sensitivities`."""
         values, gradient = self.functions.evaluate_numpy(self._state(mu, outside))
         return np.tensordot(values, self.modes, axes=1), np.tensordot(gradient, self.modes, axes=1)
@@ -116,3 +111,83 @@ class SeparatedField:
         corners : (p, c) node indices. weights : (p, c) interpolation weights.
         """
         return self.with_modes(np.einsum("pc,mpcx->mpx", weights, self.modes[:, corners]))
+
+
+# Modes kept in less space than their values at every point: by component, and on structured meshes.
+# A field works with the values of its modes, (n_modes, n_points, n_components). Where those have a structure
+# the field also knows the compact form, which the model file keeps and the compression factor counts.
+
+
+class CompactModes(Protocol):
+    """Modes in a compact form."""
+
+    @property
+    def n_floats(self) -> int:
+        """Numbers stored."""
+        ...
+
+    def expand(self) -> Array:
+        """The modes (n_modes, n_points, n_components) at every point."""
+        ...
+
+
+@dataclass(frozen=True)
+class ComponentModes:
+    """Modes that move one component each: all their other components are zero.
+
+    Attributes
+    ----------
+    values : (n_modes, n_points), the component that is not zero.
+    components : (n_modes,) which one that is.
+    n_components : of the field.
+    """
+
+    values: Array
+    components: NDArray[np.int64]
+    n_components: int
+
+    def __post_init__(self) -> None:
+        if self.values.ndim != 2 or self.components.shape != self.values.shape[:1]:
+            raise ValueError(f"{self.components.shape} components do not fit modes {self.values.shape}")
+        if self.components.min(initial=0) < 0 or self.components.max(initial=0) >= self.n_components:
+            raise ValueError(f"a mode's component is not one of {self.n_components}")
+
+    @property
+    def n_floats(self) -> int:
+        """The values, and the components: each is one byte of a number's four."""
+        return self.values.size + -(-len(self.components) // 4)
+
+    def expand(self) -> Array:
+        modes = np.zeros((*self.values.shape, self.n_components))
+        modes[np.arange(len(modes)), :, self.components] = self.values
+        return modes
+
+
+@dataclass(frozen=True)
+class GridModes:
+    """Modes on a structured mesh, separated in its directions: F_i = X_i(x) Y_i(y) a_i, and so on for Z.
+
+    Attributes
+    ----------
+    axes : for each direction (n_modes, n_k), the function at its n_k positions. The node at positions
+        (j, l) has the number j n_2 + l: the last direction runs fastest.
+    components : (n_modes, n_components), the vector a_i.
+    """
+
+    axes: tuple[Array, ...]
+    components: Array
+
+    def __post_init__(self) -> None:
+        shapes = [axis.shape for axis in (*self.axes, self.components)]
+        if not self.axes or any(len(shape) != 2 or shape[0] != shapes[0][0] for shape in shapes):
+            raise ValueError(f"arrays {shapes} are not the factors of the same modes")
+
+    @property
+    def n_floats(self) -> int:
+        return sum(axis.size for axis in self.axes) + self.components.size
+
+    def expand(self) -> Array:
+        modes = np.ones((len(self.components), 1))
+        for axis in (*self.axes, self.components):
+            modes = (modes[:, :, None] * axis[:, None, :]).reshape(len(modes), -1)
+        return modes.reshape(len(modes), -1, self.components.shape[1])

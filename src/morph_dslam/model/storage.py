@@ -1,33 +1,145 @@
-"""The `.morph` file: HDF5, versioned, without pickles, and checked in full when loaded.
-
-The layout is documented in docs/model-file.md. A file is sealed by a checksum over all its bytes, which is
-compared before HDF5 opens it (`file_seal`); then every array is checked by itself (`array_reading`) and
-against the others (`model_checks`), so that a file of a faulty writer is refused as well.
-"""
+"""Whether the parts of a reduced model fit together; asked before a model is written and after it is read."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import re
 from dataclasses import asdict
 from pathlib import Path
 from urllib.parse import quote, unquote
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from morph_dslam.errors import ModelFileError
-from morph_dslam.model import earlier_versions
-from morph_dslam.model.array_reading import names, read_array, read_group, read_text
-from morph_dslam.model.field_storage import read_field, write_field
-from morph_dslam.model.file_seal import BLOCK, check_seal, is_sealed, seal
-from morph_dslam.model.model_checks import check_model, check_parameters
+from morph_dslam.model.field_storage import names, read_array, read_field, read_group, read_text, write_field
 from morph_dslam.model.reduced_model import Parameter, ReducedModel
 from morph_dslam.model.separated import SeparatedField
+from morph_dslam.units import FACTORS
+
+#: Ranges of functions may differ from the parameters' by this share of the range: rounding.
+_ROUNDING = 1e-9
+
+
+def check_model(model: ReducedModel) -> None:
+    """Raise ValueError, which says what does not fit, if a part of the model contradicts another."""
+    check_parameters(model.parameters)
+    n_nodes = len(model.nodes)
+    if model.nodes.shape != (n_nodes, 3) or n_nodes == 0 or not np.isfinite(model.nodes).all():
+        raise ValueError("its nodes are not finite points")
+    _check_indices("triangles", model.triangles, 3, n_nodes)
+    for name, connectivity in model.cells.items():
+        matched = re.fullmatch(r"[a-z]+(\d+)", name)
+        if matched is None:
+            raise ValueError(f"'{name}' is not a type of cell")
+        _check_indices(f"{name} cells", connectivity, int(matched[1]), n_nodes)
+    for name, field in model.fields.items():
+        n_points = 1 if name.startswith("reaction_") else n_nodes
+        n_components = {"stress": (3, 6), "strain": (6,)}.get(name.split("_")[0], (3,))
+        _check_field(name, field, n_points, n_components, model)
+
+
+def check_parameters(parameters: tuple[Parameter, ...]) -> None:
+    """Raise ValueError where names are not distinct, units not known or a default not in its range."""
+    names = [p.name for p in parameters]
+    if not names or "" in names or len(set(names)) != len(names):
+        raise ValueError(f"its parameters' names are missing or not distinct: {names}")
+    for p in parameters:
+        if p.unit not in FACTORS.get(p.quantity, {}):
+            raise ValueError(f"parameter '{p.name}' is a {p.quantity} in '{p.unit}'")
+        bounds = (p.lower, p.default, p.upper)
+        if not (np.isfinite(bounds).all() and p.lower < p.upper and p.lower <= p.default <= p.upper):
+            raise ValueError(f"parameter '{p.name}' has the lower end, default and upper end {bounds}")
+
+
+def _check_indices(name: str, connectivity: NDArray[np.integer], size: int, n_nodes: int) -> None:
+    if connectivity.ndim != 2 or connectivity.shape[1] != size:
+        raise ValueError(f"its {name} do not have {size} nodes each")
+    if connectivity.min(initial=0) < 0 or connectivity.max(initial=0) >= n_nodes:
+        raise ValueError(f"its {name} name nodes that do not exist")
+
+
+def _check_field(
+    name: str, field: SeparatedField, n_points: int, n_components: tuple[int, ...], model: ReducedModel
+) -> None:
+    functions, shape = field.functions, field.modes.shape
+    if len(shape) != 3 or shape[1] != n_points or shape[2] not in n_components:
+        raise ValueError(f"field '{name}' has modes of shape {shape} on {n_points} points")
+    if (functions.n_functions, functions.dimension) != (shape[0], len(model.parameters)):
+        raise ValueError(
+            f"field '{name}' has {functions.n_functions} functions of {functions.dimension} parameters, "
+            f"but {shape[0]} modes and {len(model.parameters)} parameters"
+        )
+    lower, upper = functions.bounds
+    slack = _ROUNDING * (model.upper - model.lower)
+    if (lower > model.lower + slack).any() or (upper < model.upper - slack).any():
+        raise ValueError(f"the functions of field '{name}' do not cover the ranges of the parameters")
+    if not np.isfinite(field.modes).all():
+        raise ValueError(f"field '{name}' holds values that are not finite")
+
+
+# A checksum of all that follows, in the block that HDF5 leaves to its user.
+# HDF5 files may begin with a block of any content (HDF5 File Format Specification, "user block"). Ours holds
+# a line of text and the SHA-256 of the rest of the file. It is compared before the HDF5 library sees the
+# file, for that library can be led astray by damaged structures: endless allocations, and worse.
+
+
+#: Length of the block in bytes; HDF5 asks for a power of two from 512.
+BLOCK = 512
+
+_TITLE = b"morph-dslam reduced model\n"
+
+#: How every HDF5 file begins that has no block before it.
+HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+
+
+def _block(path: Path) -> bytes:
+    with path.open("rb") as file:
+        file.seek(BLOCK)
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return (_TITLE + f"sha256 {digest}\n".encode()).ljust(BLOCK, b"\0")
+
+
+def write_checksum(path: Path) -> None:
+    """Write the checksum into the block of a complete HDF5 file that begins with an empty one."""
+    block = _block(path)
+    with path.open("r+b") as file:
+        file.write(block)
+
+
+def check_checksum(path: Path) -> None:
+    """Compare a model file with its checksum.
+
+    Raises
+    ------
+    ModelFileError
+        If it is an HDF5 file of something else.
+    ValueError
+        If it begins otherwise, or a single byte differs from what was written.
+    """
+    with path.open("rb") as file:
+        found = file.read(BLOCK)
+    if found.startswith(HDF5_SIGNATURE):
+        raise ModelFileError(f"{path} is an HDF5 file but not a morph-dslam model")
+    if not found.startswith(_TITLE):
+        raise ValueError("it does not begin as a model file")
+    if found != _block(path):
+        raise ValueError("its content does not match its checksum")
+
+
+# The `.morph` file: HDF5, versioned, without pickles, and checked in full when loaded.
+# The layout is documented in docs/model-file.md. A checksum over all bytes is compared before HDF5
+# opens the file; then every array is checked by itself (`field_storage`) and against the others, so that a
+# file of a faulty writer is refused as well.
+
 
 FORMAT = "morph-dslam reduced model"
+
 VERSION = 3
-OLDEST_VERSION = 1
+
 #: What stays as it is in the name of a field's group; "/" would start another group.
 _PLAIN = " !#$&'()*+,:;=?@[]"
 
@@ -55,7 +167,7 @@ def save_model(path: Path, model: ReducedModel) -> None:
             file.create_dataset(f"cells/{cell_type}", data=connectivity.astype(np.int32))
         for name, field in model.fields.items():
             write_field(file.create_group(f"fields/{quote(name, safe=_PLAIN)}"), field)
-    seal(partial)
+    write_checksum(partial)
     os.replace(partial, path)
 
 
@@ -75,13 +187,12 @@ def _with_prefix(fields: dict[str, SeparatedField], prefix: str) -> dict[str, Se
     return {name.removeprefix(prefix): fields.pop(name) for name in found}
 
 
-def _read_model(file: h5py.File, version: int) -> ReducedModel:
+def _read_model(file: h5py.File) -> ReducedModel:
     parameters = _read_parameters(file)
     lower = np.array([p.lower for p in parameters], dtype=np.float64)
     upper = np.array([p.upper for p in parameters], dtype=np.float64)
-    read = read_field if version == VERSION else earlier_versions.read_field
     group = read_group(file, "fields")
-    fields = {unquote(name): read(read_group(group, name), lower, upper) for name in names(group)}
+    fields = {unquote(name): read_field(read_group(group, name), lower, upper) for name in names(group)}
     cells = read_group(file, "cells") if "cells" in file else None
     model = ReducedModel(
         name=read_text(file, "name"),
@@ -103,28 +214,21 @@ def _read_model(file: h5py.File, version: int) -> ReducedModel:
 
 
 def _open_and_read(path: Path) -> ReducedModel:
-    sealed = is_sealed(path)
-    if sealed:
-        check_seal(path)
+    check_checksum(path)
     with h5py.File(path, "r") as file:
         if file.attrs.get("format") != FORMAT:
             raise ModelFileError(f"{path} is an HDF5 file but not a morph-dslam model")
         version = int(file.attrs["version"])  # type: ignore[arg-type]
-        if not OLDEST_VERSION <= version <= VERSION:
+        if version != VERSION:
             advice = "update morph-dslam" if version > VERSION else "build it again with `morph build`"
             raise ModelFileError(
-                f"{path} has model file version {version}, this release reads versions {OLDEST_VERSION} "
-                f"to {VERSION}: {advice}"
+                f"{path} has model file version {version}, this release reads version {VERSION}: {advice}"
             )
-        if sealed != (version == VERSION):
-            raise ValueError(f"version {version} does not begin like that")
-        if not sealed:
-            earlier_versions.check_content(file)
-        return _read_model(file, version)
+        return _read_model(file)
 
 
 def load_model(path: Path) -> ReducedModel:
-    """Read and check a model file of this or an earlier version.
+    """Read and check a model file.
 
     Raises
     ------
@@ -132,9 +236,7 @@ def load_model(path: Path) -> ReducedModel:
         If the file is missing, cut short, damaged, not a model, or of another version.
     """
     if not path.is_file():
-        raise ModelFileError(
-            f"there is no model file {path}; `morph build study.toml -o {path.name}` makes one"
-        )
+        raise ModelFileError(f"there is no model file {path}; `morph build study.toml -o {path.name}` makes one")
     try:
         return _open_and_read(path)
     except ModelFileError:

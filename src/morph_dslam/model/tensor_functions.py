@@ -1,36 +1,161 @@
-"""Functions of several parameters in separated form: CP, Tucker and tensor-train coefficients.
-
-Each class holds ``n_functions`` functions H_i(mu), one per spatial mode, built from one-dimensional bases:
-
-- `CPFunctions`: H_i = sum_t C[t, i] prod_k (phi_k(mu_k) . A_k[:, t]), the paper's sum of products;
-- `TuckerFunctions`: H_i = sum_abc core[i, a, b, c] u_a(mu_1) v_b(mu_2) w_c(mu_3);
-- `TensorTrainFunctions`: H_i = [G_1(mu_1) G_2(mu_2) ... G_d(mu_d)]_i, a product of small matrices.
-
-Values and all first derivatives come from one compiled pass. `partial` gives any mixed derivative (up to the
-second in each parameter) by plain numpy, and is the twin that the compiled pass is tested against.
-"""
+"""Compiled evaluation of CP, Tucker and tensor-train functions: values and first derivatives in one pass."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from morph_dslam.model.basis_functions import Basis, evaluate_numpy
+from morph_dslam.model.basis_functions import KINDS, Basis, evaluate_numpy, fill_basis
 from morph_dslam.model.functions import Functions
-from morph_dslam.model.tensor_kernels import (
-    PackedBases,
-    evaluate_cp,
-    evaluate_tensor_train,
-    evaluate_tucker,
-    pack_bases,
-)
+from morph_dslam.model.separated import ComponentModes, SeparatedField
 
 Array = NDArray[np.float64]
+
+
+class PackedBases(NamedTuple):
+    """The bases of all parameters as plain arrays, for compiled code; ``starts`` delimit their functions."""
+
+    kinds: NDArray[np.int64]
+    degrees: NDArray[np.int64]
+    starts: NDArray[np.int64]
+    lower: Array
+    upper: Array
+    knots: Array
+    knot_starts: NDArray[np.int64]
+
+
+def pack_bases(bases: tuple[Basis, ...]) -> PackedBases:
+    """Arrays of the bases, in order."""
+    return PackedBases(
+        kinds=np.array([KINDS[b.kind] for b in bases]),
+        degrees=np.array([b.degree for b in bases]),
+        starts=np.concatenate([[0], np.cumsum([b.size for b in bases])]),
+        lower=np.array([b.lower for b in bases]),
+        upper=np.array([b.upper for b in bases]),
+        knots=np.concatenate([b.knots for b in bases]),
+        knot_starts=np.concatenate([[0], np.cumsum([len(b.knots) for b in bases])]),
+    )
+
+
+@njit(cache=True, nogil=True)
+def fill_bases(packed, mu):
+    """Values and slopes (3, total size) of the functions of all parameters at ``mu`` (d,)."""
+    out = np.empty((3, packed.starts[-1]))
+    for k in range(len(mu)):
+        a, b = packed.starts[k], packed.starts[k + 1]
+        knots = packed.knots[packed.knot_starts[k] : packed.knot_starts[k + 1]]
+        fill_basis(
+            packed.kinds[k], packed.degrees[k], b - a, packed.lower[k], packed.upper[k], knots, mu[k], out[:, a:b]
+        )
+    return out
+
+
+@njit(cache=True, nogil=True)
+def evaluate_cp(packed, mu, factors, mixing):
+    """Values and gradient (1 + d, n); ``factors`` (total size, n_terms), ``mixing`` (n_terms, n)."""
+    d, n_terms = len(mu), factors.shape[1]
+    table = fill_bases(packed, mu)
+    values, slopes = np.zeros((d, n_terms)), np.zeros((d, n_terms))
+    for k in range(d):
+        for j in range(packed.starts[k], packed.starts[k + 1]):
+            phi, dphi = table[0, j], table[1, j]
+            if phi != 0.0 or dphi != 0.0:  # most splines vanish here
+                for t in range(n_terms):
+                    values[k, t] += phi * factors[j, t]
+                    slopes[k, t] += dphi * factors[j, t]
+    rows = np.ones((1 + d, n_terms))
+    for k in range(d):
+        for row in range(1 + d):
+            for t in range(n_terms):
+                rows[row, t] *= slopes[k, t] if row == k + 1 else values[k, t]
+    result = np.zeros((1 + d, mixing.shape[1]))
+    for row in range(1 + d):
+        for t in range(n_terms):
+            for i in range(mixing.shape[1]):
+                result[row, i] += rows[row, t] * mixing[t, i]
+    return result
+
+
+@njit(cache=True, nogil=True)
+def evaluate_tucker(packed, mu, ranks, factors, core, n_functions):
+    """Values and gradient (1 + d, n_functions); ``factors`` and ``core`` flattened in C order."""
+    d = len(mu)
+    table = fill_bases(packed, mu)
+    below = core.reshape(1, core.size)
+    end = len(factors)
+    for k in range(d - 1, -1, -1):
+        rank, a, b = ranks[k], packed.starts[k], packed.starts[k + 1]
+        factor = factors[end - (b - a) * rank : end].reshape(b - a, rank)
+        end -= (b - a) * rank
+        value, slope = np.zeros(rank), np.zeros(rank)
+        for j in range(b - a):
+            if table[0, a + j] != 0.0 or table[1, a + j] != 0.0:
+                for q in range(rank):
+                    value[q] += table[0, a + j] * factor[j, q]
+                    slope[q] += table[1, a + j] * factor[j, q]
+        # rows of `next_`: value, derivative by parameter k, derivatives by the parameters after k
+        n_rows, length = below.shape[0], below.shape[1] // rank
+        next_ = np.zeros((n_rows + 1, length))
+        for i in range(length):
+            for q in range(rank):
+                next_[1, i] += below[0, i * rank + q] * slope[q]
+        for row in range(n_rows):
+            target = row if row == 0 else row + 1
+            for i in range(length):
+                for q in range(rank):
+                    next_[target, i] += below[row, i * rank + q] * value[q]
+        below = next_
+    return below.reshape(1 + d, n_functions)
+
+
+@njit(cache=True, nogil=True)
+def evaluate_tensor_train(packed, mu, ranks, cores):
+    """Values and gradient (1 + d, n_functions); core k, (ranks[k], size, ranks[k + 1]), flattened."""
+    d = len(mu)
+    table = fill_bases(packed, mu)
+    after = np.ones((1, 1))
+    end = len(cores)
+    for k in range(d - 1, -1, -1):
+        left, right = ranks[k], ranks[k + 1]
+        a, size = packed.starts[k], packed.starts[k + 1] - packed.starts[k]
+        core = cores[end - left * size * right : end].reshape(left, size, right)
+        end -= left * size * right
+        value, slope = np.zeros((left, right)), np.zeros((left, right))
+        for i in range(left):
+            for j in range(size):
+                phi, dphi = table[0, a + j], table[1, a + j]
+                if phi != 0.0 or dphi != 0.0:
+                    for q in range(right):
+                        value[i, q] += phi * core[i, j, q]
+                        slope[i, q] += dphi * core[i, j, q]
+        n_rows = after.shape[0]
+        next_ = np.zeros((n_rows + 1, left))
+        for i in range(left):
+            for q in range(right):
+                next_[1, i] += slope[i, q] * after[0, q]
+        for row in range(n_rows):
+            target = row if row == 0 else row + 1
+            for i in range(left):
+                for q in range(right):
+                    next_[target, i] += value[i, q] * after[row, q]
+        after = next_
+    return after
+
+
+# Functions of several parameters in separated form: CP, Tucker and tensor-train coefficients.
+# Each class holds ``n_functions`` functions H_i(mu), one per spatial mode, built from one-dimensional bases:
+# - `CPFunctions`: H_i = sum_t C[t, i] prod_k (phi_k(mu_k) . A_k[:, t]), the paper's sum of products; -
+# `TuckerFunctions`: H_i = sum_abc core[i, a, b, c] u_a(mu_1) v_b(mu_2) w_c(mu_3); - `TensorTrainFunctions`:
+# H_i = [G_1(mu_1) G_2(mu_2) ... G_d(mu_d)]_i, a product of small matrices.
+# Values and all first derivatives come from one compiled pass. `partial` gives any mixed derivative (up to
+# the second in each parameter) by plain numpy, and is the twin that the compiled pass is tested against.
 
 
 @dataclass(frozen=True)
@@ -200,3 +325,130 @@ class TensorTrainFunctions(TensorFunctions):
     def mixed(self, matrix: Array) -> Self:
         first = np.ascontiguousarray(np.tensordot(matrix.T, self.cores[0], axes=1))
         return replace(self, cores=(first, *self.cores[1:]))
+
+
+# Products of functions of some parameters with functions of others.
+
+
+@dataclass(frozen=True)
+class ProductFunctions(Functions):
+    """All products H_i(mu) K_j(nu), function i n_second + j, or linear combinations of them.
+
+    Attributes
+    ----------
+    first, second : functions of the first parameters and of those that follow.
+    mixing : (products, n_functions), or None where they stand as they are.
+    """
+
+    first: Functions
+    second: Functions
+    mixing: Array | None = None
+
+    def __post_init__(self) -> None:
+        if self.mixing is not None and len(self.mixing) != self._n_products:
+            raise ValueError(f"{self._n_products} products are mixed by a matrix {self.mixing.shape}")
+
+    @property
+    def _n_products(self) -> int:
+        return self.first.n_functions * self.second.n_functions
+
+    @property
+    def n_functions(self) -> int:
+        return self._n_products if self.mixing is None else self.mixing.shape[1]
+
+    @property
+    def n_floats(self) -> int:
+        mixing = 0 if self.mixing is None else self.mixing.size
+        return self.first.n_floats + self.second.n_floats + mixing
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        lower, upper = zip(self.first.bounds, self.second.bounds, strict=True)
+        return np.concatenate(lower), np.concatenate(upper)
+
+    def _compiled(self, mu: Array) -> Array:
+        split = self.first.dimension
+        first, second = self.first.rows(mu[:split]), self.second.rows(mu[split:])
+        by_first = np.einsum("ki,j->kij", first, second[0])
+        by_second = np.einsum("i,kj->kij", first[0], second[1:])
+        rows = np.concatenate([by_first, by_second]).reshape(1 + len(mu), -1)
+        return rows if self.mixing is None else rows @ self.mixing
+
+    def partial(self, mu: ArrayLike, orders: tuple[int, ...]) -> Array:
+        mu, split = np.asarray(mu, dtype=np.float64), self.first.dimension
+        first = self.first.partial(mu[:split], orders[:split])
+        values = np.outer(first, self.second.partial(mu[split:], orders[split:])).ravel()
+        return values if self.mixing is None else values @ self.mixing
+
+    def mixed(self, matrix: Array) -> Self:
+        return replace(self, mixing=matrix if self.mixing is None else self.mixing @ matrix)
+
+
+# Functions of several formats one after another, for fields whose components have modes of their own.
+
+
+@dataclass(frozen=True)
+class StackedFunctions(Functions):
+    """The functions of all ``parts`` in order, or linear combinations of them.
+
+    Attributes
+    ----------
+    parts : functions of the same parameters, each in a format of its own.
+    mixing : (functions of all parts, n_functions), or None where they stand as they are.
+    """
+
+    parts: tuple[Functions, ...]
+    mixing: Array | None = None
+
+    def __post_init__(self) -> None:
+        boxes = np.array([part.bounds for part in self.parts])
+        if not self.parts or (boxes != boxes[0]).any():
+            raise ValueError("stacked functions need the same ranges of the parameters")
+        if self.mixing is not None and len(self.mixing) != self._n_stacked:
+            raise ValueError(f"{self._n_stacked} functions are mixed by a matrix {self.mixing.shape}")
+
+    @property
+    def _n_stacked(self) -> int:
+        return sum(part.n_functions for part in self.parts)
+
+    @property
+    def n_functions(self) -> int:
+        return self._n_stacked if self.mixing is None else self.mixing.shape[1]
+
+    @property
+    def n_floats(self) -> int:
+        return sum(part.n_floats for part in self.parts) + (0 if self.mixing is None else self.mixing.size)
+
+    @cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        return self.parts[0].bounds
+
+    def _compiled(self, mu: Array) -> Array:
+        rows = np.concatenate([part.rows(mu) for part in self.parts], axis=1)
+        return rows if self.mixing is None else rows @ self.mixing
+
+    def partial(self, mu: ArrayLike, orders: tuple[int, ...]) -> Array:
+        values = np.concatenate([part.partial(mu, orders) for part in self.parts])
+        return values if self.mixing is None else values @ self.mixing
+
+    def mixed(self, matrix: Array) -> Self:
+        return replace(self, mixing=matrix if self.mixing is None else self.mixing @ matrix)
+
+
+def stack_components(fields: Sequence[SeparatedField]) -> SeparatedField:
+    """One field whose components are ``fields`` of one component each, with modes and functions of their own.
+
+    Each may have another number of modes and another format. The file keeps no zeros for it.
+
+    Raises
+    ------
+    ValueError
+        If a field has more than one component, or other points or ranges than the first.
+    """
+    shapes = [field.modes.shape[1:] for field in fields]
+    if any(shape != (shapes[0][0], 1) for shape in shapes):
+        raise ValueError(f"fields of shapes {shapes} are not components at the same points")
+    components = np.repeat(np.arange(len(fields)), [field.n_modes for field in fields])
+    values = np.concatenate([field.modes[:, :, 0] for field in fields])
+    compact = ComponentModes(values, components, len(fields))
+    return SeparatedField.from_compact(compact, StackedFunctions(tuple(f.functions for f in fields)))

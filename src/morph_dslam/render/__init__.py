@@ -1,0 +1,1 @@
+"""Rasteriser, overlays and simulated recordings."""

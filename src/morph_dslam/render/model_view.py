@@ -17,11 +17,14 @@ from morph_dslam.render.shading import lambert, vertex_normals
 
 Array = NDArray[np.float64]
 
-BACKGROUND = 245
+VIEW_BACKGROUND = 245
+
 #: Size of the object over that of the picture, and its distance from the camera over its size.
 FILLING, DISTANCE = 0.8, 4.0
+
 #: Size of what is drawn without letters over that of the picture.
 FILLED = 0.92
+
 #: Direction to the light, camera frame.
 LIGHT = np.array([-0.4, -0.6, -1.0])
 
@@ -137,7 +140,7 @@ def draw_states(
         brightness = lambert(vertex_normals(nodes, model.triangles), LIGHT, 0.4)
         pictures.append(
             draw_overlay(
-                np.full((height, width, 3), BACKGROUND, dtype=np.uint8),
+                np.full((height, width, 3), VIEW_BACKGROUND, dtype=np.uint8),
                 camera.project(nodes),
                 nodes[:, 2],
                 model.triangles,

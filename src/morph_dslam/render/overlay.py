@@ -9,8 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from morph_dslam.render.colour_maps import colour_bar, colour_table, text_patch
 from morph_dslam.render.rasteriser import image_region, rasterise
+from morph_dslam.render.shading import colour_bar, colour_table, text_patch
 
 Array = NDArray[np.float64]
 
@@ -47,9 +47,7 @@ def blend_surface_numpy(image, triangle_ids, weights, triangles, levels, brightn
     """The plain twin of `blend_surface`."""
     covered = triangle_ids >= 0
     corners = triangles[triangle_ids[covered]]
-    level, light = (
-        np.einsum("kc,kc->k", weights[covered], field[corners])[:, None] for field in (levels, brightness)
-    )
+    level, light = (np.einsum("kc,kc->k", weights[covered], field[corners])[:, None] for field in (levels, brightness))
     entry = (np.clip(level[:, 0], 0.0, 255.0) + 0.5).astype(int)
     colour = np.minimum(light * table[entry], 255.0)
     image[covered] = ((1.0 - alpha) * image[covered] + alpha * colour + 0.5).astype(np.uint8)
@@ -74,9 +72,7 @@ class Painted:
         return int(rows[0]) + top, int(rows[-1]) + top, int(columns[0]) + left, int(columns[-1]) + left
 
 
-def _draw_outline(
-    image: NDArray[np.uint8], painted: Painted, colour: tuple[int, int, int] = (245, 245, 245)
-) -> None:
+def _draw_outline(image: NDArray[np.uint8], painted: Painted, colour: tuple[int, int, int] = (245, 245, 245)) -> None:
     contours, _ = cv2.findContours(
         painted.covered.view(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE, offset=painted.corner
     )

@@ -122,8 +122,8 @@ def _nearest(nodes, triangles, rays, order, starts, corner, size):
 
 def pick_surface_numpy(camera_points: Array, triangles: NDArray[np.int64], rays: Array) -> SurfacePoints:
     """The plain twin of `pick_surface`: every ray with every triangle."""
-    in_front = np.flatnonzero((camera_points[triangles, 2] > 0.0).all(axis=1))
-    a, b, c = camera_points[triangles[in_front]].transpose(1, 0, 2)
+    occluder_depth = np.flatnonzero((camera_points[triangles, 2] > 0.0).all(axis=1))
+    a, b, c = camera_points[triangles[occluder_depth]].transpose(1, 0, 2)
     volume = np.einsum("mx,mx->m", a, np.cross(b, c))
     volume[volume == 0.0] = np.nan  # seen edge-on: NaN weights, which no comparison accepts
     dual = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)]) / volume[:, None]
@@ -136,7 +136,7 @@ def pick_surface_numpy(camera_points: Array, triangles: NDArray[np.int64], rays:
     inside = np.clip(scaled[:, rows[met], nearest[met]].T, 0.0, None)
     weights = np.full((len(rays), 3), np.nan)
     weights[met] = inside / inside.sum(axis=1, keepdims=True)
-    return SurfacePoints(np.where(met, in_front[nearest], -1), weights)
+    return SurfacePoints(np.where(met, occluder_depth[nearest], -1), weights)
 
 
 def nearest_on_outline(

@@ -1,28 +1,61 @@
-"""The scene file of a simulation: what moves how, how it looks, and what camera sees it."""
+"""Key frames: values given at a few frames, joined by a curve with continuous second derivative."""
 
 from __future__ import annotations
 
 import types
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from scipy.interpolate import CubicSpline
 
 from morph_dslam.errors import SceneError
-from morph_dslam.io.toml_file import read_toml
+from morph_dslam.io.tables import read_toml
+
+Array = NDArray[np.float64]
+
+
+def interpolate_key_frames(frames: Sequence[int] | NDArray, values: Array, wanted: NDArray) -> Array:
+    """Values at the ``wanted`` frames on a cubic spline through the key frames.
+
+    The spline rests at its ends: it starts and stops with no velocity, and holds its end values outside.
+
+    Parameters
+    ----------
+    frames : (k,) strictly increasing frame numbers. values : (k, ...) values there. wanted : (T,) frames.
+
+    Returns
+    -------
+    (T, ...).
+    """
+    if len(frames) == 1:
+        return np.repeat(np.asarray(values, dtype=float), len(wanted), axis=0)
+    spline = CubicSpline(frames, values, bc_type="clamped")
+    return spline(np.clip(wanted, frames[0], frames[-1]))
+
+
+# The scene file of a simulation: what moves how, how it looks, and what camera sees it.
+
 
 Colour = tuple[
-    Annotated[int, Field(ge=0, le=255)],
-    Annotated[int, Field(ge=0, le=255)],
-    Annotated[int, Field(ge=0, le=255)],
+    Annotated[int, Field(ge=0, le=255)], Annotated[int, Field(ge=0, le=255)], Annotated[int, Field(ge=0, le=255)]
 ]
+
 #: No number of a scene is meant where it is larger: a kilometre in millimetres, degrees, pixels, frames. What
 #: is computed with those below cannot overflow.
 LARGEST = 1_000_000
+
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+
 Vector = tuple[Number, Number, Number]
+
 FrameNumber = Annotated[int, Field(ge=0, le=LARGEST)]
+
 Side = Annotated[float, Field(ge=1e-3, le=LARGEST)]
+
 #: Standard deviation of a blur: OpenCV filters with a kernel some eight times as wide.
 Blur = Annotated[float, Field(ge=0.0, le=100.0)]
 
@@ -198,9 +231,7 @@ class Scene(_Section):
         for name, keys in lists.items():
             numbers = [key.frame for key in keys]
             if sorted(set(numbers)) != numbers:
-                raise ValueError(
-                    f"the key frames of {name} must have increasing frame numbers, not {numbers}"
-                )
+                raise ValueError(f"the key frames of {name} must have increasing frame numbers, not {numbers}")
         return self
 
 

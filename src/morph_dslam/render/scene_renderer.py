@@ -13,15 +13,25 @@ from morph_dslam.camera import PinholeCamera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
 from morph_dslam.render.environment import StaticScene
-from morph_dslam.render.photographs import crop_to_aspect, load_photograph, resize_to_fill
 from morph_dslam.render.rasteriser import Buffers, rasterise
 from morph_dslam.render.scene_file import Background, Scene, Sensor, Surface
 from morph_dslam.render.shading import lambert, vertex_normals
-from morph_dslam.render.sheet_points import is_sheet, sheet_bounds, texture_coordinates
-from morph_dslam.render.solid_points import TexturedSurface, box_projection, surface_size
-from morph_dslam.render.texture import interpolate, render_textured
+from morph_dslam.render.texture import (
+    TexturedSurface,
+    box_projection,
+    crop_to_aspect,
+    interpolate,
+    is_sheet,
+    load_photograph,
+    render_textured,
+    resize_to_fill,
+    sheet_bounds,
+    surface_size,
+    texture_coordinates,
+)
 
 Array = NDArray[np.float64]
+
 Image = NDArray[np.uint8]
 
 #: An object's print has at most so many pixels along its longer side.
@@ -92,9 +102,7 @@ def add_sensor_noise(image: Image, sensor: Sensor, seed: tuple[int, int]) -> Ima
     return np.clip(np.rint(image + np.float32(sensor.noise) * noise), 0, 255).astype(np.uint8)
 
 
-def _print(
-    surface: Surface, model: ReducedModel, folder: Path, density: float
-) -> tuple[Image, TexturedSurface]:
+def _print(surface: Surface, model: ReducedModel, folder: Path, density: float) -> tuple[Image, TexturedSurface]:
     """The texture of a sheet's rectangle, or of a solid's box, and how it lies on the surface."""
     if is_sheet(model):
         low, high = sheet_bounds(model)
@@ -179,11 +187,7 @@ class SceneRenderer:
         image[covered] = (lit + np.float32(0.5)).astype(np.uint8)
 
     def render(
-        self,
-        points: Array,
-        frame: int,
-        occluder_centre: Array | None,
-        camera_from_world: RigidTransform | None = None,
+        self, points: Array, frame: int, occluder_centre: Array | None, camera_from_world: RigidTransform | None = None
     ) -> Image:
         """The picture (h, w, 3) uint8, blue, green, red.
 
@@ -210,6 +214,4 @@ class SceneRenderer:
             image[disc] = occluder.colour[::-1]
         size = (camera.width // factor, camera.height // factor)
         averaged = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        return add_sensor_noise(
-            np.asarray(averaged, dtype=np.uint8), self._scene.sensor, (self._scene.seed, frame)
-        )
+        return add_sensor_noise(np.asarray(averaged, dtype=np.uint8), self._scene.sensor, (self._scene.seed, frame))

@@ -19,23 +19,21 @@ from tqdm import tqdm
 
 from morph_dslam.camera import PinholeCamera
 from morph_dslam.errors import SceneError
-from morph_dslam.io.calibration import load_camera, parse_camera, save_camera
-from morph_dslam.io.landmarks import Landmarks, save_landmarks
+from morph_dslam.io.camera_files import load_camera, parse_camera, save_camera
+from morph_dslam.io.tables import Landmarks, save_landmarks
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
 from morph_dslam.model import ReducedModel, SurfacePoints, load_model
-from morph_dslam.model.surface_sampling import spread_over
-from morph_dslam.render.depth_sensor import sensor_depth
-from morph_dslam.render.environment import StaticScene
-from morph_dslam.render.motion import Motion, plan_motion
+from morph_dslam.model.reduced_model import spread_over
+from morph_dslam.render.environment import Motion, StaticScene, plan_motion, sensor_depth
 from morph_dslam.render.rasteriser import rasterise, visible_points
 from morph_dslam.render.scene_file import Scene, load_scene_file
 from morph_dslam.render.scene_renderer import SceneRenderer, in_disc, pixel_axes, supersampled
-from morph_dslam.render.sheet_points import is_sheet, landmark_nodes, regular_points
-from morph_dslam.render.solid_points import spread_nodes
+from morph_dslam.render.texture import is_sheet, landmark_nodes, regular_points, spread_nodes
 
 Array = NDArray[np.float64]
 
 N_TRUTH_POINTS = 300
+
 MIN_LANDMARKS = 8
 
 #: A point so far behind the depth buffer is hidden; less may be the surface's own slope within a pixel.
@@ -55,9 +53,7 @@ class _World:
 
     def node_positions(self, frame: int) -> Array:
         """Nodes (n, 3) in the camera frame, metres."""
-        return self.motion.camera_from_object[frame].apply(
-            self.model.positions(self.motion.parameters[frame])
-        )
+        return self.motion.camera_from_object[frame].apply(self.model.positions(self.motion.parameters[frame]))
 
     def nearest_depth(self) -> float:
         """The least depth of any node in any frame, metres."""
@@ -66,9 +62,7 @@ class _World:
     def depth_image(self, points: Array) -> NDArray[np.float32]:
         """Depth (h, w) in metres of nodes (n, 3) in the camera frame, infinity where there is no surface."""
         pixels = self.camera.project(points)
-        return rasterise(
-            pixels, points[:, 2], self.model.triangles, self.camera.height, self.camera.width
-        ).depth
+        return rasterise(pixels, points[:, 2], self.model.triangles, self.camera.height, self.camera.width).depth
 
     def surroundings_depth(self, frame: int) -> NDArray[np.float32]:
         """Depth (h, w) in metres of what stands around the object, infinity where nothing does."""
@@ -100,9 +94,7 @@ def _load_world(scene_path: Path) -> _World:
     else:
         camera = parse_camera(scene.camera, f"{scene_path}: camera")
     if any(camera.distortion) or camera.lens_model == "fisheye":
-        raise SceneError(
-            f"{scene_path}: scenes are rendered without lens distortion; leave it out of the camera"
-        )
+        raise SceneError(f"{scene_path}: scenes are rendered without lens distortion; leave it out of the camera")
     model = load_model(folder / scene.model)
     try:
         motion = plan_motion(scene, model)
@@ -234,10 +226,7 @@ def _render_frames(
         for frame in tqdm(range(scene.frames), desc="rendering", unit="frame", disable=not progress):
             nodes = world.node_positions(frame)
             image = renderer.render(
-                nodes,
-                frame,
-                None if centres is None else centres[frame],
-                None if cameras is None else cameras[frame],
+                nodes, frame, None if centres is None else centres[frame], None if cameras is None else cameras[frame]
             )
             _write_image(output / "frames" / f"{frame:06}.{scene.image_format}", image)
             depth, behind = world.depth_image(nodes), world.surroundings_depth(frame)

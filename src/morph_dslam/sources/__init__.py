@@ -6,13 +6,18 @@ import re
 from pathlib import Path
 
 from morph_dslam.errors import SourceError
-from morph_dslam.sources.euroc import euroc_recording, is_euroc
-from morph_dslam.sources.folder import image_folder
 from morph_dslam.sources.frames import Frame, FrameSource, FrameStream
 from morph_dslam.sources.live import LiveStream, PacedRecording, open_webcam
+from morph_dslam.sources.recorded import (
+    euroc_recording,
+    image_folder,
+    is_euroc,
+    is_seven_scenes,
+    is_tum,
+    seven_scenes_recording,
+    tum_recording,
+)
 from morph_dslam.sources.ros_bag import RosBag, is_bag
-from morph_dslam.sources.seven_scenes import is_seven_scenes, seven_scenes_recording
-from morph_dslam.sources.tum import is_tum, tum_recording
 from morph_dslam.sources.video import VideoFile
 
 __all__ = ["Frame", "FrameSource", "FrameStream", "open_live", "open_source", "open_stream"]
@@ -67,9 +72,7 @@ def open_stream(source: str | Path, first: int | None = None, last: int | None =
     webcam = _WEBCAM.fullmatch(str(source))
     if webcam is None:
         if str(source).startswith("webcam") and not Path(source).exists():
-            raise SourceError(
-                f"'{source}' is no webcam: write webcam:0 for the first one, webcam:1 for the next"
-            )
+            raise SourceError(f"'{source}' is no webcam: write webcam:0 for the first one, webcam:1 for the next")
         return open_source(Path(source), first, last)
     if first is not None or last is not None:
         raise SourceError(f"{source} is live and has no range of frames to choose from")

@@ -1,4 +1,4 @@
-"""Live sources, which wait for nobody: of the frames that come during work on one the newest is kept."""
+"""Handing the newest item from one thread to another."""
 
 from __future__ import annotations
 
@@ -6,16 +6,63 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from types import TracebackType
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SourceError
-from morph_dslam.sources.capture import open_capture
-from morph_dslam.sources.frames import Frame, FrameStream
-from morph_dslam.sources.newest import Newest
+from morph_dslam.sources.frames import Frame, FrameStream, open_capture
+
+Item = TypeVar("Item")
+
+
+class Newest(Generic[Item]):
+    """A place for one item: who takes always gets the newest, and what nobody took in time is dropped.
+
+    Attributes
+    ----------
+    dropped : number of items so far that were replaced before anybody took them.
+    """
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        self._changed = threading.Condition()
+        self._item: Item | None = None
+        self._ended = False
+        self._error: BaseException | None = None
+
+    def put(self, item: Item) -> None:
+        """Leave an item, in place of one that is there still; never waits for a taker."""
+        with self._changed:
+            self.dropped += self._item is not None
+            self._item = item
+            self._changed.notify_all()
+
+    def end(self, error: BaseException | None = None) -> None:
+        """No more will come; takers get ``error``, if any, when nothing is left."""
+        with self._changed:
+            self._ended, self._error = True, error
+            self._changed.notify_all()
+
+    def take(self) -> Item | None:
+        """Wait for an item and take it; None when no more will come.
+
+        Raises
+        ------
+        BaseException
+            The error with which the items ended.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._item is not None or self._ended)
+            item, self._item = self._item, None
+            if item is None and self._error is not None:
+                raise self._error
+            return item
+
+
+# Live sources, which wait for nobody: of the frames that come during work on one the newest is kept.
 
 
 class Capture(Protocol):
@@ -112,9 +159,7 @@ class LiveCamera(LiveStream):
     Timestamps are seconds since the first frame.
     """
 
-    def __init__(
-        self, capture: Capture, name: str = "camera", clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, capture: Capture, name: str = "camera", clock: Callable[[], float] = time.monotonic) -> None:
         fps = capture.get(cv2.CAP_PROP_FPS)
         super().__init__(name, fps if np.isfinite(fps) and fps > 0 else 30.0)
         self._capture, self._clock = capture, clock

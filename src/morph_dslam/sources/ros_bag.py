@@ -49,15 +49,9 @@ def _reader(path: Path) -> Iterator[AnyReader]:
         from rosbags.highlevel import AnyReader, AnyReaderError
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise SourceError(
-            f'{path} is a ROS bag, which needs rosbags: pip install "morph-dslam[ros]"'
-        ) from error
+        raise SourceError(f'{path} is a ROS bag, which needs rosbags: pip install "morph-dslam[ros]"') from error
     # ROS 2 bags are folders; older ones do not carry the definitions of their messages.
-    folder = (
-        path.parent
-        if path.suffix in (".db3", ".mcap") and (path.parent / "metadata.yaml").is_file()
-        else path
-    )
+    folder = path.parent if path.suffix in (".db3", ".mcap") and (path.parent / "metadata.yaml").is_file() else path
     try:
         with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             yield reader
@@ -69,15 +63,12 @@ def _choose_topic(path: Path, reader: AnyReader, topic: str | None) -> Connectio
     """The connection of the wanted images."""
     images = {c.topic: c for c in reader.connections if c.msgtype in IMAGE_TYPES and c.msgcount}
     if not images:
-        raise SourceError(
-            f"{path} holds no images, but the topics {', '.join(sorted(reader.topics)) or 'none'}"
-        )
+        raise SourceError(f"{path} holds no images, but the topics {', '.join(sorted(reader.topics)) or 'none'}")
     if topic is None and len(images) == 1:
         return next(iter(images.values()))
     if topic not in images:
         raise SourceError(
-            f"{path} holds images of the topics {', '.join(sorted(images))}: choose one, "
-            f"{path}#{min(images)} say"
+            f"{path} holds images of the topics {', '.join(sorted(images))}: choose one, {path}#{min(images)} say"
         )
     return images[topic]
 
@@ -99,9 +90,7 @@ class RosBag:
         range. While iterating: if an image has an encoding that is not known, or changes size.
     """
 
-    def __init__(
-        self, path: Path, topic: str | None = None, first: int | None = None, last: int | None = None
-    ) -> None:
+    def __init__(self, path: Path, topic: str | None = None, first: int | None = None, last: int | None = None) -> None:
         self._path = path
         with _reader(path) as reader:
             connection = _choose_topic(path, reader, topic)
@@ -150,8 +139,7 @@ def _decode(message: Any, what: str) -> NDArray[np.uint8]:
         return np.asarray(image, dtype=np.uint8)
     if message.encoding not in ENCODINGS:
         raise SourceError(
-            f"{what} has the encoding {message.encoding}; known are compressed images and "
-            f"{', '.join(ENCODINGS)}"
+            f"{what} has the encoding {message.encoding}; known are compressed images and {', '.join(ENCODINGS)}"
         )
     channels, conversion = ENCODINGS[message.encoding]
     # Rows may be padded.

@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 
 from morph_dslam.errors import SourceError
-from morph_dslam.sources.capture import open_capture
-from morph_dslam.sources.folder import ASSUMED_FPS
-from morph_dslam.sources.frames import Frame, check_range
+from morph_dslam.sources.frames import Frame, check_range, open_capture
+from morph_dslam.sources.recorded import ASSUMED_FPS
 
 #: Containers that only estimate their length from its duration are off by so many frames without damage.
 LENGTH_TOLERANCE = 1

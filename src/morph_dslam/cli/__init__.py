@@ -1,0 +1,5 @@
+"""The command line."""
+
+from morph_dslam.cli.app import main, run_and_report_errors
+
+__all__ = ["main", "run_and_report_errors"]

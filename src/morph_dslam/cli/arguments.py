@@ -1,0 +1,80 @@
+"""Kinds of values that several commands take."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+#: No value in whatever unit is meant by what is larger: its square could overflow.
+LARGEST = 1e30
+
+
+def with_signed_sections(arguments: Sequence[str]) -> list[str]:
+    """The arguments with "--section -x=12" as one, because argparse takes "-x=12" alone for an option."""
+    joined: list[str] = []
+    for text in arguments:
+        if joined and joined[-1] == "--section" and text[:2] in ("-x", "-y", "-z"):
+            joined[-1] += f"={text}"
+        else:
+            joined.append(text)
+    return joined
+
+
+def frame_range(text: str) -> tuple[int | None, int | None]:
+    """Frame numbers "first-last", both included; "9-", "-100" and "9" are ranges too."""
+    first, dash, last = text.partition("-")
+    try:
+        numbers = (int(first) if first else None, int(last) if last else None)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a range of frames such as 9-100") from None
+    if not dash:
+        numbers = (numbers[0], numbers[0])
+    if text in ("", "-") or (None not in numbers and numbers[0] > numbers[1]):  # type: ignore[operator]
+        raise argparse.ArgumentTypeError(f"'{text}' is not a range of frames such as 9-100")
+    return numbers
+
+
+def positive_number(text: str) -> float:
+    """A number above zero, not infinite."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number above zero")
+    return value
+
+
+def positive_integer(text: str) -> int:
+    """A whole number above zero."""
+    if not text.isdecimal() or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number above zero")
+    return int(text)
+
+
+def frame_number(text: str) -> int:
+    """A frame number, from zero on."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"'{text}' is not a frame number")
+    return int(text)
+
+
+def named_value(text: str) -> tuple[str, float]:
+    """A name and a positive number, "NAME=VALUE"."""
+    name, _, number = text.partition("=")
+    try:
+        value = float(number)
+    except ValueError:
+        value = 0.0
+    if not name or not 0.0 < value < LARGEST:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a name and a positive number such as load=0.5")
+    return name, value
+
+
+def frame_and_file(text: str) -> tuple[int, Path | None]:
+    """A frame number, and a file that belongs to it: "120" or "120=landmarks.csv"."""
+    number, equals, name = text.partition("=")
+    if not number.isdecimal() or (equals and not name):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a frame, or a frame and a file, such as 120=new.csv")
+    return int(number), Path(name) if name else None

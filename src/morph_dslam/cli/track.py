@@ -1,0 +1,249 @@
+"""The command that follows an object in a recording, `morph track`, and what `morph live` shares with it."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from morph_dslam.cli.arguments import frame_and_file, frame_range, named_value
+from morph_dslam.errors import TrackingError
+
+if TYPE_CHECKING:
+    from morph_dslam.tracking.drawing import DrawOptions
+    from morph_dslam.tracking.multi_object import OtherObject
+
+
+def _track(arguments: argparse.Namespace) -> None:
+    from morph_dslam.tracking.multi_object import track_objects
+    from morph_dslam.tracking.track import TrackOptions, track
+    from morph_dslam.tracking.track_rig import track_rig
+
+    first, last = arguments.range
+    options = TrackOptions(
+        frames=arguments.frames,
+        output=arguments.output,
+        first=first,
+        last=last,
+        reference_frame=arguments.reference_frame,
+        reregister_at=tuple(arguments.reregister_at),
+        refine_reference=arguments.refine,
+        overlay=not arguments.no_video,
+        overwrite=arguments.overwrite,
+        drawing=drawing(arguments),
+        **object_arguments(arguments),
+    )
+    if arguments.other_cameras and arguments.also:
+        raise TrackingError("several objects and several cameras cannot go together: leave out --also or --with")
+    if arguments.other_cameras:
+        _say(options.output, track_rig(options, arguments.other_cameras))
+        return
+    if not arguments.also:
+        _say(options.output, track(options))
+        return
+    for folder, summary in track_objects(options, other_objects(arguments)).items():
+        _say(folder, summary)
+
+
+def _say(folder: Path, summary: dict[str, Any]) -> None:
+    """What the command line says of a run."""
+    from morph_dslam.tracking.observability import value_line
+
+    for flag in summary["flags"]:
+        print(f"note: {flag}")
+    for figures in summary["one_over_the_sequence"]:
+        print(value_line(figures))
+    print(f"wrote {folder}")
+    print(
+        f"tracked={summary['n_tracked']}/{summary['n_frames']} "
+        f"median_ms={summary['median_ms']:.2f} p95_ms={summary['p95_ms']:.2f}"
+    )
+
+
+def object_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What `add_object_arguments` asked for, by the names of `ObjectOptions`."""
+    from morph_dslam.registration.start import InitializerFiles
+    from morph_dslam.tracking.options import TrackerOptions
+
+    return {
+        "model": arguments.model,
+        "camera": arguments.camera,
+        "landmarks": arguments.landmarks,
+        "placement": arguments.place,
+        "aids": InitializerFiles(arguments.board, arguments.picture, arguments.guess),
+        "map_path": arguments.map,
+        "pose": arguments.pose,
+        "use_outline": arguments.outline,
+        "use_depth": arguments.depth,
+        "use_discrepancy": arguments.discrepancy,
+        "inner": tuple(arguments.inner),
+        "per_sequence": tuple(arguments.per_sequence),
+        "random_walk": tuple(arguments.random_walk),
+        "start": arguments.start,
+        "tracker": TrackerOptions(new_views=not arguments.one_view, further_views=not arguments.one_view),
+    }
+
+
+def other_objects(arguments: argparse.Namespace) -> tuple[OtherObject, ...]:
+    """The objects beside the first, of ``--also``."""
+    from morph_dslam.tracking.multi_object import OtherObject
+
+    return tuple(OtherObject(name, Path(model), Path(start)) for name, model, start in arguments.also)
+
+
+def drawing(arguments: argparse.Namespace) -> DrawOptions:
+    """What is to be drawn; raises TrackingError if the section is none, or nothing shows it."""
+    is_shown = not arguments.no_video or getattr(arguments, "serve", None) is not None
+    if not is_shown and (arguments.show, arguments.section) != (None, None):
+        raise TrackingError("--show and --section say what the video shows: leave them or --no-video out")
+    from morph_dslam.tracking.drawing import DrawOptions, SectionPlane
+
+    section = None if arguments.section is None else SectionPlane.parse(arguments.section)
+    return DrawOptions(arguments.show, section)
+
+
+def add_object_arguments(command: argparse.ArgumentParser) -> None:
+    """The arguments that say what is tracked, with what, and where it is at first."""
+    command.add_argument("--model", type=Path, required=True, help="model file of `morph build`")
+    command.add_argument("--camera", type=Path, required=True, help="camera file: size, intrinsics, distortion")
+    start = command.add_mutually_exclusive_group(required=True)
+    start.add_argument("--landmarks", type=Path, help="object points and their pixels in the reference frame")
+    start.add_argument("--place", type=Path, metavar="JSON", help="registration.json of `morph register` in a map")
+    start.add_argument(
+        "--board", type=Path, metavar="TOML", help="a printed board of markers, and where the object is on it"
+    )
+    start.add_argument(
+        "--picture", type=Path, metavar="TOML", help="a picture of the object's print, and where it is on it"
+    )
+    start.add_argument("--guess", type=Path, metavar="TOML", help="about where the object is in the reference frame")
+    command.add_argument(
+        "--map",
+        type=Path,
+        metavar="H5",
+        help="with --place: the map that the camera is found in (default: the one that was registered in)",
+    )
+    command.add_argument(
+        "--pose",
+        choices=("map", "fixed", "free"),
+        default="map",
+        help="the object's pose with --place: by map and points together, by the map alone, or by its points "
+        "alone (default: %(default)s)",
+    )
+    command.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="run folder to write")
+    command.add_argument("--overwrite", action="store_true", help="replace a run that is in the run folder")
+    command.add_argument(
+        "--outline",
+        action="store_true",
+        help="let the object's outline count too, where it stands out from the background",
+    )
+    command.add_argument(
+        "--discrepancy",
+        action="store_true",
+        help="look for what the object's shape has beyond the model's: small smooth displacements that "
+        "hardly stretch it; with --refine in the reference view too",
+    )
+    command.add_argument(
+        "--one-view",
+        action="store_true",
+        help="take one keyframe of the map as reference view, and make none when the object turns other "
+        "parts to the camera",
+    )
+    command.add_argument("--depth", action="store_true", help="let the depth images of an RGB-D recording count too")
+    command.add_argument(
+        "--inner",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="a structure inside of the object (`morph inner`) to draw and report; may be repeated",
+    )
+    command.add_argument(
+        "--per-sequence",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a parameter that is one over the whole sequence; may be repeated",
+    )
+    command.add_argument(
+        "--random-walk",
+        type=named_value,
+        action="append",
+        default=[],
+        metavar="NAME=STEP",
+        help="a prior on a parameter: the standard deviation of its change from frame to frame, in its own "
+        "unit; may be repeated (default: none)",
+    )
+    command.add_argument(
+        "--start",
+        choices=("previous", "constant-velocity"),
+        default="previous",
+        help="where the search for a frame's state starts (default: %(default)s state)",
+    )
+    command.add_argument(
+        "--reregister-at",
+        type=frame_and_file,
+        action="append",
+        default=[],
+        metavar="N[=FILE]",
+        help="place the object anew in frame N, by landmarks there or by the board, picture or guess that "
+        "the run starts from; may be repeated",
+    )
+    command.add_argument(
+        "--also",
+        nargs=3,
+        action="append",
+        default=[],
+        metavar=("NAME", "MODEL", "START"),
+        help="another object in the same frames, its results in RUN/NAME; START is its registration.json in "
+        "the same map or, with `morph track`, its file of landmarks; may be repeated",
+    )
+    command.add_argument(
+        "--show",
+        choices=("stress", "strain", "displacement"),
+        help="what colours the object: von Mises stress (the default), equivalent strain, displacement",
+    )
+    command.add_argument(
+        "--section",
+        metavar="PLANE",
+        help="draw a solid cut open: x=12 takes away all beyond x = 12 mm, -x=12 all before it; also y and z",
+    )
+
+
+def add_tracking_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
+    """Add the command; ``add(name, action, kept, text)`` makes its parser."""
+    track = add(
+        "track",
+        _track,
+        "the frames tracked so far are kept in the run folder",
+        "find an object's pose and parameters in every frame, and draw the stress over the video",
+    )
+    track.add_argument(
+        "frames",
+        type=Path,
+        metavar="FRAMES",
+        help="video file, folder of numbered images, or another recording (docs/sources.md)",
+    )
+    add_object_arguments(track)
+    track.add_argument("--range", type=frame_range, default=(None, None), metavar="FIRST-LAST", help="frames to track")
+    track.add_argument(
+        "--reference-frame",
+        type=int,
+        metavar="N",
+        help="frame that the landmarks, or another aid, belong to (default: the first one tracked); with "
+        "--place and --with: one in which the object is undeformed",
+    )
+    track.add_argument(
+        "--refine", action="store_true", help="refine the reference state over the whole sequence and track once more"
+    )
+    track.add_argument(
+        "--with",
+        type=Path,
+        action="append",
+        default=[],
+        dest="other_cameras",
+        metavar="FRAMES",
+        help="what the next camera of the rig saw; with --camera camchain.yaml#cam0, which a map is of too; "
+        "may be repeated",
+    )
+    track.add_argument("--no-video", action="store_true", help="do not draw the augmented video")

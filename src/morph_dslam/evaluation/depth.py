@@ -1,0 +1,438 @@
+"""Distance from measured points to a triangulated surface: the paper's error against a depth sensor.
+
+The triangles are put into a tree of boxes, neighbours in space beside each other (Lauterbach et al., Fast BVH
+construction on GPUs, 2009): sorted along a space-filling curve, a few to a leaf, each box around its two
+children's. A point looks only into boxes that are nearer than what it has found already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import EvaluationError, SourceError
+from morph_dslam.evaluation.run_folder import Run
+from morph_dslam.render.rasteriser import rasterise
+from morph_dslam.sources import open_source
+from morph_dslam.sources.frames import DepthScale, read_depth
+from morph_dslam.sources.recorded import numbered_images
+
+Array = NDArray[np.float64]
+
+#: Triangles in a leaf of the tree.
+LEAF = 4
+
+#: Steps of the space-filling curve along each axis: 2 to the power of this.
+CURVE_BITS = 10
+
+
+@njit(cache=True, nogil=True)
+def _minus(a, b):
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@njit(cache=True, nogil=True)
+def _along(a, b, share):
+    return a[0] - share * b[0], a[1] - share * b[1], a[2] - share * b[2]
+
+
+@njit(cache=True, nogil=True)
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True, nogil=True)
+def _square_distance_to_triangle(p, a, b, c):
+    """Squared distance of a point to a triangle (Ericson, Real-Time Collision Detection, 2005, 5.1.5).
+
+    Points are tuples of three numbers: arrays as small would cost more than what is computed with them.
+    """
+    ab, ac, ap = _minus(b, a), _minus(c, a), _minus(p, a)
+    d1, d2 = _dot(ab, ap), _dot(ac, ap)
+    if d1 <= 0.0 and d2 <= 0.0:
+        return _dot(ap, ap)
+    bp = _minus(p, b)
+    d3, d4 = _dot(ab, bp), _dot(ac, bp)
+    if d3 >= 0.0 and d4 <= d3:
+        return _dot(bp, bp)
+    cp = _minus(p, c)
+    d5, d6 = _dot(ab, cp), _dot(ac, cp)
+    if d6 >= 0.0 and d5 <= d6:
+        return _dot(cp, cp)
+    vc, vb, va = d1 * d4 - d3 * d2, d5 * d2 - d1 * d6, d3 * d6 - d5 * d4
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        off = _along(ap, ab, d1 / (d1 - d3))
+    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        off = _along(ap, ac, d2 / (d2 - d6))
+    elif va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+        off = _along(bp, _minus(c, b), (d4 - d3) / ((d4 - d3) + (d5 - d6)))
+    else:
+        scale = 1.0 / (va + vb + vc)
+        off = _along(_along(ap, ab, vb * scale), ac, vc * scale)
+    return _dot(off, off)
+
+
+def _along_curve(centres: Array) -> NDArray[np.intp]:
+    """Order of points (t, 3) along a Z-order curve: neighbours in it are neighbours in space."""
+    low, size = centres.min(axis=0), max(float(np.ptp(centres, axis=0).max()), 1e-300)
+    cells = np.minimum((centres - low) / size * 2**CURVE_BITS, 2**CURVE_BITS - 1).astype(np.int64)
+    codes = np.zeros(len(centres), dtype=np.int64)
+    for bit in range(CURVE_BITS):
+        for axis in range(3):
+            codes |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return np.argsort(codes, kind="stable")
+
+
+@njit(cache=True, nogil=True)
+def _tree_of_boxes(corners, leaf):
+    """Lowest and highest coordinates (2 l, 3) of boxes: the children of box i are 2 i and 2 i + 1.
+
+    The last l boxes are leaves. Leaf k holds the triangles from k * leaf on; one that has none is infinitely
+    far.
+    """
+    n_leaves = 1
+    while n_leaves * leaf < len(corners):
+        n_leaves *= 2
+    low, high = np.full((2 * n_leaves, 3), np.inf), np.full((2 * n_leaves, 3), -np.inf)
+    for t in range(len(corners)):
+        box = n_leaves + t // leaf
+        for corner in range(3):
+            for axis in range(3):
+                low[box, axis] = min(low[box, axis], corners[t, corner, axis])
+                high[box, axis] = max(high[box, axis], corners[t, corner, axis])
+    for box in range(n_leaves - 1, 0, -1):
+        for axis in range(3):
+            low[box, axis] = min(low[2 * box, axis], low[2 * box + 1, axis])
+            high[box, axis] = max(high[2 * box, axis], high[2 * box + 1, axis])
+    return low, high
+
+
+@njit(cache=True, nogil=True)
+def _square_distance_to_box(p, low, high):
+    square = 0.0
+    for axis in range(3):
+        off = max(low[axis] - p[axis], p[axis] - high[axis], 0.0)
+        square += off * off
+    return square
+
+
+@njit(cache=True, nogil=True)
+def _distances(points, corners, low, high, leaf):
+    n_leaves = len(low) // 2
+    boxes, squares = np.empty(64, dtype=np.int64), np.empty(64)
+    result = np.empty(len(points))
+    for i in range(len(points)):
+        p = (points[i, 0], points[i, 1], points[i, 2])
+        best, depth = np.inf, 1
+        boxes[0], squares[0] = 1, 0.0
+        while depth:
+            depth -= 1
+            box = boxes[depth]
+            if squares[depth] >= best:
+                continue
+            if box >= n_leaves:
+                first = (box - n_leaves) * leaf
+                for t in range(first, min(first + leaf, len(corners))):
+                    a = (corners[t, 0, 0], corners[t, 0, 1], corners[t, 0, 2])
+                    b = (corners[t, 1, 0], corners[t, 1, 1], corners[t, 1, 2])
+                    c = (corners[t, 2, 0], corners[t, 2, 1], corners[t, 2, 2])
+                    best = min(best, _square_distance_to_triangle(p, a, b, c))
+                continue
+            near, far = 2 * box, 2 * box + 1
+            to_near = _square_distance_to_box(p, low[near], high[near])
+            to_far = _square_distance_to_box(p, low[far], high[far])
+            if to_far < to_near:
+                near, far, to_near, to_far = far, near, to_far, to_near
+            # The nearer one is taken from the stack first.
+            boxes[depth], squares[depth] = far, to_far
+            boxes[depth + 1], squares[depth + 1] = near, to_near
+            depth += 2
+        result[i] = np.sqrt(best)
+    return result
+
+
+def distances_to_surface(points: Array, nodes: Array, triangles: NDArray[np.integer]) -> Array:
+    """Distance (p,) of each point (p, 3) to the nearest point of a surface, in the unit of the input.
+
+    Parameters
+    ----------
+    nodes : (n, 3). triangles : (t, 3) node indices.
+    """
+    corners = np.asarray(nodes, dtype=np.float64)[triangles]
+    corners = corners[_along_curve(corners.mean(axis=1))]
+    low, high = _tree_of_boxes(corners, LEAF)
+    return _distances(np.ascontiguousarray(points, dtype=np.float64), corners, low, high, LEAF)
+
+
+def distances_to_surface_numpy(points: Array, nodes: Array, triangles: NDArray[np.integer]) -> Array:
+    """The plain twin of `distances_to_surface`: the plane where its foot is inside, else the nearest edge."""
+    corners = nodes[triangles]
+    edges = [(corners[:, i], corners[:, (i + 1) % 3] - corners[:, i]) for i in range(3)]
+    normal = np.cross(edges[0][1], -edges[2][1])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    result = np.empty(len(points))
+    for i, point in enumerate(points):
+        height = np.abs(np.einsum("tx,tx->t", point - corners[:, 0], normal))
+        inside = np.ones(len(corners), dtype=bool)
+        nearest = np.full(len(corners), np.inf)
+        for start, edge in edges:
+            inside &= np.einsum("tx,tx->t", np.cross(edge, point - start), normal) >= 0.0
+            along = np.einsum("tx,tx->t", point - start, edge) / np.einsum("tx,tx->t", edge, edge)
+            foot = start + np.clip(along, 0.0, 1.0)[:, None] * edge
+            nearest = np.minimum(nearest, np.linalg.norm(point - foot, axis=1))
+        result[i] = np.where(inside, height, nearest).min()
+    return result
+
+
+# Depth images by frame number: what the surfaces of a run are measured against.
+
+
+DepthImage = NDArray[np.float32]
+
+
+def read_depths(
+    path: Path, frames: Sequence[int], values_per_metre: float | None = None
+) -> Iterator[tuple[int, DepthImage]]:
+    """Frame numbers among ``frames`` that have depth, each with its image (h, w): metres, NaN where unknown.
+
+    Parameters
+    ----------
+    path : a ``depth.h5`` of `morph simulate`; a folder of numbered 16-bit images; or a recording with depth
+        of its own, in the layout of TUM RGB-D or 7-Scenes.
+    values_per_metre : of the images of a folder, which is taken for a recording without it.
+
+    Raises
+    ------
+    EvaluationError
+        If there is nothing of the kind, it is damaged, or a file is given a unit.
+    """
+    wanted = sorted(frames)
+    try:
+        if path.is_file():
+            if values_per_metre is not None:
+                raise EvaluationError(
+                    f"--depth-per-metre is for a folder of depth images, and {path} is a file, whose depths "
+                    "are metres: leave it out"
+                )
+            yield from _from_file(path, wanted)
+        elif not path.is_dir():
+            raise EvaluationError(f"there are no depth images at {path}")
+        elif values_per_metre is not None:
+            yield from _from_folder(path, wanted, values_per_metre)
+        else:
+            yield from _from_recording(path, wanted)
+    except SourceError as error:
+        raise EvaluationError(f"the depth images cannot be read: {error}") from error
+
+
+def _from_file(path: Path, frames: Sequence[int]) -> Iterator[tuple[int, DepthImage]]:
+    """Of dataset ``depth_m`` (t, h, w), which is 0 where the object is not seen."""
+    try:
+        with h5py.File(path, "r") as file:
+            dataset = file["depth_m"]
+            assert isinstance(dataset, h5py.Dataset)
+            for frame in frames:
+                if 0 <= frame < len(dataset):
+                    depth = np.asarray(dataset[frame], dtype=np.float32)
+                    yield frame, np.where(depth > 0.0, depth, np.float32(np.nan))
+    except (OSError, KeyError, RuntimeError, AssertionError) as error:
+        raise EvaluationError(
+            f"{path} is not a depth.h5 of `morph simulate`, or damaged ({error}): simulate again"
+        ) from error
+
+
+def _from_folder(folder: Path, frames: Sequence[int], scale: float) -> Iterator[tuple[int, DepthImage]]:
+    if not scale > 0.0:
+        raise EvaluationError(f"depth images cannot have {scale:g} values a metre: give 1000 for millimetres")
+    images = numbered_images(folder)
+    for frame in frames:
+        if frame in images:
+            yield frame, read_depth(images[frame], f"frame {frame}", DepthScale(scale))
+
+
+def _from_recording(path: Path, frames: Sequence[int]) -> Iterator[tuple[int, DepthImage]]:
+    has_depth = False
+    for frame in open_source(path):
+        if frame.depth is not None:
+            has_depth = True
+            if frame.index in frames:
+                yield frame.index, frame.depth
+    if not has_depth:
+        raise EvaluationError(
+            f"{path} is no recording with depth; if it is a folder of depth images, say how many of their "
+            "values make a metre with --depth-per-metre (1000 for millimetres)"
+        )
+
+
+# Surface error: how far a depth sensor's points are from the estimated surface, as the paper measures it.
+# A depth image shows where the surface is, not which point of the material is where: a shape that slides
+# along itself passes here, and only `material_error` sees it. What the sensor itself gets wrong is measured
+# in a base frame, where the object is not deformed, and stands beside the figures; it is not taken off them.
+
+
+#: Depth within this many pixels of the estimated outline may belong to what is behind the object.
+RIM_PX = 4
+
+#: Sensor points farther from the surface than this part of the object's size are of something else, a hand
+#: before it say; how many they are is reported.
+LARGEST_DISTANCE = 0.1
+
+#: Points compared in a frame, spread evenly over those seen.
+MOST_POINTS = 4000
+
+
+@dataclass(frozen=True)
+class DepthError:
+    """Distances in metres.
+
+    Attributes
+    ----------
+    frames : (e,) frames compared. distances : by frame, (p,) of sensor points to the surface.
+    nodes : by frame, (p,) the mesh node nearest to each point. gate : larger distances are left out.
+    left_out : (e,) share of sensor points left out. base_frame : undeformed, or None.
+    """
+
+    frames: NDArray[np.int64]
+    distances: list[Array]
+    nodes: list[NDArray[np.int64]]
+    gate: float
+    left_out: Array
+    base_frame: int | None
+
+    @property
+    def compared(self) -> Array:
+        """Distances (n,) of all frames except the base frame, of all frames if there is no other."""
+        rows = [row for row, frame in enumerate(self.frames) if frame != self.base_frame]
+        return np.concatenate([self.distances[row] for row in rows or range(len(self.frames))])
+
+    @property
+    def base(self) -> Array | None:
+        """Distances in the base frame."""
+        rows = np.flatnonzero(self.frames == self.base_frame)
+        return self.distances[rows[0]] if rows.size else None
+
+    def node_means(self, n_nodes: int) -> Array:
+        """Mean distance (n_nodes,) of the points nearest to each mesh node, NaN where there are none."""
+        nodes, distances = np.concatenate(self.nodes), np.concatenate(self.distances)
+        count = np.bincount(nodes, minlength=n_nodes)
+        total = np.bincount(nodes, weights=distances, minlength=n_nodes)
+        return np.divide(total, count, out=np.full(n_nodes, np.nan), where=count > 0)
+
+
+def sensor_points(depth: DepthImage, mask: NDArray[np.bool_], camera: PinholeCamera) -> Array:
+    """Points (p, 3) in the camera frame, metres, of pixels that have depth (h, w), evenly spread.
+
+    ``mask`` (h, w) is of the undistorted image, ``depth`` of the image as recorded.
+    """
+    rows, columns = np.nonzero(np.isfinite(depth))
+    pixels = camera.undistort_pixels(np.column_stack([columns, rows]).astype(np.float64))
+    # A pixel that the lens does not map (NaN) becomes one outside of the image.
+    column, row = np.nan_to_num(np.rint(pixels), nan=-1.0).astype(np.int64).T
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    kept = np.flatnonzero(inside)
+    kept = kept[mask[row[kept], column[kept]]]
+    kept = kept[:: max(1, int(np.ceil(len(kept) / MOST_POINTS)))]
+    return camera.rays(pixels[kept]) * depth[rows[kept], columns[kept], None].astype(np.float64)
+
+
+def surface_mask(nodes: Array, triangles: NDArray[np.int64], camera: PinholeCamera) -> NDArray[np.bool_]:
+    """Pixels (h, w) that the surface covers, its rim left out."""
+    buffers = rasterise(camera.project(nodes), nodes[:, 2], triangles, camera.height, camera.width)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * RIM_PX + 1,) * 2)
+    return cv2.erode(buffers.covered.astype(np.uint8), disc).astype(bool)
+
+
+def depth_error(
+    run: Run, path: Path, base_frame: int | None = None, values_per_metre: float | None = None
+) -> DepthError:
+    """Compare every tracked frame that has depth with the run.
+
+    Parameters
+    ----------
+    path, values_per_metre : see `read_depths`; the depth images are as the run's camera sees them.
+    base_frame : a frame in which the object is not deformed.
+
+    Raises
+    ------
+    EvaluationError
+        If no tracked frame has depth on the object, the base frame is not among those that have, or the
+        images are of another size.
+    """
+    camera, triangles = run.camera, run.model.triangles
+    surface_nodes = np.unique(triangles)
+    gate = LARGEST_DISTANCE * float(np.linalg.norm(np.ptp(run.model.nodes, axis=0)))
+    tracked = run.frames[run.tracked].tolist()
+    frames, distances, nearest, left_out = [], [], [], []
+    for frame, depth in read_depths(path, tracked, values_per_metre):
+        if depth.shape != (camera.height, camera.width):
+            raise EvaluationError(
+                f"the depth image of frame {frame} is {depth.shape[1]}x{depth.shape[0]} pixels, the run's "
+                f"camera {camera.width}x{camera.height}: register the depth to the colour camera"
+            )
+        row = run.row(frame)
+        assert row is not None
+        surface = run.camera_points(row)
+        points = sensor_points(depth, surface_mask(surface, triangles, camera), camera)
+        if not len(points):
+            continue
+        distance = distances_to_surface(points, surface, triangles)
+        kept = distance <= gate
+        left_out.append(1.0 - kept.mean())
+        frames.append(frame)
+        distances.append(distance[kept])
+        # A new tree in each frame: one that is not balanced is made faster.
+        _, found = KDTree(surface[surface_nodes], balanced_tree=False).query(points[kept])
+        nearest.append(surface_nodes[found])
+    _check(frames, distances, base_frame, path)
+    return DepthError(np.array(frames), distances, nearest, gate, np.array(left_out), base_frame)
+
+
+def _check(frames: list[int], distances: list[Array], base_frame: int | None, path: Path) -> None:
+    if not any(len(distance) for distance in distances):
+        raise EvaluationError(
+            f"{path} has no depth on the estimated surface in any tracked frame: are its numbers those of "
+            "the run's frames, and its depths in the unit given?"
+        )
+    if base_frame is not None and base_frame not in frames:
+        raise EvaluationError(
+            f"the base frame {base_frame} was not tracked or has no depth; compared were {frames[0]} to {frames[-1]}"
+        )
+
+
+def _millimetres(distances: Array) -> dict[str, float]:
+    values = 1e3 * distances
+    if not len(values):
+        return {"n_points": 0}
+    return {
+        "mean_mm": float(values.mean()),
+        "median_mm": float(np.median(values)),
+        "p95_mm": float(np.percentile(values, 95)),
+        "max_mm": float(values.max()),
+        "n_points": len(values),
+    }
+
+
+def summarise_depth(error: DepthError) -> dict[str, Any]:
+    """The figures of ``depth_evaluation.json``, millimetres, plain JSON."""
+    return {
+        **_millimetres(error.compared),
+        "base_frame": error.base_frame,
+        "base": None if error.base is None else _millimetres(error.base),
+        "left_out_beyond_mm": 1e3 * error.gate,
+        "left_out_percent": 100.0 * float(error.left_out.mean()),
+        "frames_compared": error.frames.tolist(),
+        "per_frame": {
+            str(frame): {**_millimetres(distance), "left_out_percent": 100.0 * float(share)}
+            for frame, distance, share in zip(error.frames, error.distances, error.left_out, strict=True)
+        },
+    }

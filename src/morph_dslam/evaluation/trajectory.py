@@ -1,0 +1,328 @@
+"""How much of a material error is one rigid motion: a second figure, always beside the error as it is.
+
+A truth sensor whose place relative to the camera is not known exactly moves all truth points of a recording
+by one rigid motion, and so does a wrong reference state of the estimate. What is left after the best such
+motion is the error of shape and of the motion over the sequence. The figures do not say whose error the
+motion is.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from morph_dslam.errors import EvaluationError
+from morph_dslam.evaluation.points import MaterialError
+from morph_dslam.geometry import SimilarityTransform, fit_similarity, rotation_log
+from morph_dslam.io.trajectory import Trajectory, load_trajectory
+
+Array = NDArray[np.float64]
+
+
+def _statistics(distances: Array) -> dict[str, float]:
+    return {
+        "mean_mm": float(1e3 * np.mean(distances)),
+        "median_mm": float(1e3 * np.median(distances)),
+        "p95_mm": float(1e3 * np.percentile(distances, 95)),
+    }
+
+
+def _remaining(measured: Array, vectors: Array) -> Array:
+    """Lengths (k,) of the errors (k, 3) of points (k, 3) after their best rigid motion, metres."""
+    motion = fit_similarity(measured, measured + vectors, with_scale=False)
+    return np.linalg.norm(motion.apply(measured) - measured - vectors, axis=1)
+
+
+def summarise_alignment(error: MaterialError) -> dict[str, Any]:
+    """What remains of the error after rigid motions of the truth points, least squares over the points.
+
+    Returns
+    -------
+    ``after_one_rigid_motion`` : one for all frames together, with its rotation vector in degrees and the
+    shift of the points' centre in millimetres, camera frame. ``after_one_in_each_frame`` : each by itself.
+    """
+    known = np.isfinite(error.distances)
+    measured, predicted = error.measured[known], (error.measured + error.vectors)[known]
+    motion = fit_similarity(measured, predicted, with_scale=False)
+    shift = motion.apply(measured).mean(axis=0) - measured.mean(axis=0)
+    single = [
+        _remaining(error.measured[row][seen], error.vectors[row][seen]) for row, seen in enumerate(known) if seen.any()
+    ]
+    together = np.linalg.norm(motion.apply(measured) - predicted, axis=1)
+    return {
+        "after_one_rigid_motion": {
+            **_statistics(together),
+            "rotation_deg": np.degrees(rotation_log(motion.rotation)).tolist(),
+            "shift_of_centre_mm": (1e3 * shift).tolist(),
+        },
+        "after_one_in_each_frame": _statistics(np.concatenate(single)),
+    }
+
+
+# Errors of a camera trajectory against the truth (Sturm et al. 2012): absolute and relative.
+
+
+#: Poses of estimate and truth belong together if they are at most this far apart in time, seconds.
+MOST_TIME_DIFFERENCE = 0.01
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Statistics of errors, in their unit."""
+
+    rmse: float
+    mean: float
+    median: float
+    std: float
+    min: float
+    max: float
+
+    @classmethod
+    def of(cls, errors: Array) -> Statistics:
+        """Of errors (n,), at least one."""
+        return cls(
+            float(np.sqrt(np.mean(errors**2))),
+            float(errors.mean()),
+            float(np.median(errors)),
+            float(errors.std()),
+            float(errors.min()),
+            float(errors.max()),
+        )
+
+
+@dataclass(frozen=True)
+class AbsoluteError:
+    """Distances between the camera centres after the estimate was moved to the truth.
+
+    Attributes
+    ----------
+    truth_from_estimate : the alignment. aligned : (n, 3) estimated centres in the truth's world, metres.
+    distances : (n,) metres.
+    """
+
+    truth_from_estimate: SimilarityTransform
+    aligned: Array
+    distances: Array
+
+
+@dataclass(frozen=True)
+class RelativeError:
+    """Errors of the motion over an interval: drift.
+
+    Attributes
+    ----------
+    timestamps : (m,) when each motion begins, seconds.
+    translations : (m,) metres. rotations : (m,) radians.
+    """
+
+    timestamps: Array
+    translations: Array
+    rotations: Array
+
+
+def associate(first: Array, second: Array, most: float = MOST_TIME_DIFFERENCE) -> NDArray[np.int64]:
+    """Pairs (n, 2) of indices of timestamps (a,) and (b,), both ascending, that are close in time.
+
+    Each timestamp is used once; the closest pairs are made first (as the TUM benchmark's tools do).
+    """
+    low = np.searchsorted(second, first - most, side="left")
+    high = np.searchsorted(second, first + most, side="right")
+    rows = np.repeat(np.arange(len(first)), high - low)
+    columns = np.concatenate([np.arange(a, b) for a, b in zip(low, high, strict=True)] or [np.arange(0)])
+    order = np.argsort(np.abs(first[rows] - second[columns]), kind="stable")
+    free_rows, free_columns = np.ones(len(first), dtype=bool), np.ones(len(second), dtype=bool)
+    pairs = []
+    for row, column in zip(rows[order], columns[order], strict=True):
+        if free_rows[row] and free_columns[column]:
+            free_rows[row] = free_columns[column] = False
+            pairs.append((row, column))
+    return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
+
+
+def match(estimate: Trajectory, truth: Trajectory, most: float = MOST_TIME_DIFFERENCE) -> tuple[Trajectory, Trajectory]:
+    """The poses of both trajectories (n each) that belong together in time.
+
+    Raises
+    ------
+    EvaluationError
+        If there are fewer than three.
+    """
+    pairs = associate(estimate.timestamps, truth.timestamps, most)
+    if len(pairs) < 3:
+        spans = [f"{t.timestamps[0]:.3f} to {t.timestamps[-1]:.3f} s" for t in (estimate, truth)]
+        raise EvaluationError(
+            f"only {len(pairs)} poses of estimate and truth are within {most:g} s of each other; the "
+            f"estimate spans {spans[0]}, the truth {spans[1]}: give the truth of this recording, on its clock"
+        )
+    rows, columns = pairs.T
+    return (
+        Trajectory(estimate.timestamps[rows], estimate.world_from_camera[rows]),
+        Trajectory(truth.timestamps[columns], truth.world_from_camera[columns]),
+    )
+
+
+def absolute_error(estimate: Trajectory, truth: Trajectory, with_scale: bool) -> AbsoluteError:
+    """The absolute trajectory error of matched trajectories after SE(3), or ``with_scale`` Sim(3), alignment.
+
+    Raises
+    ------
+    EvaluationError
+        If the estimated centres coincide, so that no scale fits.
+    """
+    try:
+        alignment = fit_similarity(estimate.positions, truth.positions, with_scale)
+    except ValueError as error:
+        raise EvaluationError(f"the estimate cannot be aligned with the truth: {error}") from error
+    aligned = alignment.apply(estimate.positions)
+    return AbsoluteError(alignment, aligned, np.linalg.norm(aligned - truth.positions, axis=1))
+
+
+def relative_error(estimate: Trajectory, truth: Trajectory, interval: float, scale: float = 1.0) -> RelativeError:
+    """The relative pose error of matched trajectories over motions that last ``interval``.
+
+    Motions whose time is off by more than half the usual time between poses, over gaps, are left out.
+
+    Parameters
+    ----------
+    interval : seconds (frames where trajectories are stamped with frame numbers).
+    scale : of the truth over the estimate; multiplies the estimate's translations.
+
+    Raises
+    ------
+    EvaluationError
+        If no motion is that long.
+    """
+    times = estimate.timestamps
+    ends = np.searchsorted(times, times + interval)
+    # The neighbour that is nearer in time.
+    before, after = np.clip(ends - 1, 0, len(times) - 1), np.clip(ends, 0, len(times) - 1)
+    goal = times + interval
+    ends = np.where(np.abs(times[before] - goal) < np.abs(times[after] - goal), before, after)
+    starts = np.flatnonzero(np.abs(times[ends] - goal) <= 0.5 * np.median(np.diff(times)))
+    ends = ends[starts]
+    if not len(starts):
+        raise EvaluationError(f"no two poses of the estimate are {interval:g} s apart: choose another interval")
+    scaled = estimate.world_from_camera.copy()
+    scaled[:, :3, 3] *= scale
+    moved = np.linalg.inv(scaled[starts]) @ scaled[ends]
+    expected = np.linalg.inv(truth.world_from_camera[starts]) @ truth.world_from_camera[ends]
+    difference = np.linalg.inv(expected) @ moved
+    return RelativeError(times[starts], np.linalg.norm(difference[:, :3, 3], axis=1), _angles(difference[:, :3, :3]))
+
+
+def _angles(rotations: Array) -> Array:
+    """Angles (n,) of rotation matrices (n, 3, 3), radians; exact near zero and near pi."""
+    skew = 0.5 * (rotations - rotations.transpose(0, 2, 1))
+    sine = np.sqrt(skew[:, 2, 1] ** 2 + skew[:, 0, 2] ** 2 + skew[:, 1, 0] ** 2)
+    return np.arctan2(sine, 0.5 * (np.trace(rotations, axis1=1, axis2=2) - 1.0))
+
+
+# The evaluation of a trajectory: figures and a picture, written beside it.
+
+
+#: The relative error is taken over motions this long, seconds, where the trajectory allows it.
+INTERVAL = 1.0
+
+DPI = 110
+
+TRUTH, ESTIMATE = "#1b1f24", "#b4530a"
+
+
+def evaluate_trajectory(run: Path, truth_path: Path) -> dict[str, Any]:
+    """Compare the camera path of a run with the truth.
+
+    Writes ``trajectory_evaluation.json`` and ``trajectory_evaluation.png`` beside the trajectory.
+
+    Parameters
+    ----------
+    run : a run folder with ``trajectory.txt``, or any trajectory file. truth_path : a trajectory.
+
+    Returns
+    -------
+    The content of the JSON file; lengths in millimetres, angles in degrees.
+
+    Raises
+    ------
+    EvaluationError
+        If the run has no trajectory, or it and the truth do not overlap in time.
+    TrajectoryError
+        If one of them cannot be read.
+    """
+    path = run / "trajectory.txt" if run.is_dir() else run
+    if not path.is_file():
+        raise EvaluationError(f"there is no trajectory {path}: give a run folder with one, or a trajectory file")
+    loaded, loaded_truth = load_trajectory(path), load_trajectory(truth_path)
+    estimate, truth = match(loaded, loaded_truth)
+    figures: dict[str, Any] = {
+        "truth": str(truth_path),
+        "n_poses": len(loaded),
+        "n_pairs": len(estimate),
+        "truth_length_m": truth.length,
+        "relative_interval_s": _interval(estimate),
+    }
+    errors = {}
+    for name, with_scale in (("se3", False), ("sim3", True)):
+        absolute = absolute_error(estimate, truth, with_scale)
+        scale = absolute.truth_from_estimate.scale
+        relative = relative_error(estimate, truth, figures["relative_interval_s"], scale)
+        figures[name] = {
+            "scale": scale,
+            "absolute_mm": asdict(Statistics.of(1e3 * absolute.distances)),
+            "relative_mm": asdict(Statistics.of(1e3 * relative.translations)),
+            "relative_deg": asdict(Statistics.of(np.rad2deg(relative.rotations))),
+        }
+        errors[name] = absolute, relative
+    path.with_name(f"{path.stem}_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
+    plot_trajectory(path.with_name(f"{path.stem}_evaluation.png"), estimate, truth, *errors["sim3"])
+    return figures
+
+
+def _interval(trajectory: Trajectory) -> float:
+    """`INTERVAL`, less for a short trajectory, and at least the time between poses."""
+    times = trajectory.timestamps
+    return max(min(INTERVAL, 0.5 * float(times[-1] - times[0])), float(np.median(np.diff(times))))
+
+
+def trajectory_line(figures: dict[str, Any]) -> str:
+    """The one line that sums up an evaluation."""
+    rigid, similar = figures["se3"], figures["sim3"]
+    return (
+        f"pairs={figures['n_pairs']}/{figures['n_poses']} "
+        f"ate_se3_mm={rigid['absolute_mm']['rmse']:.2f} ate_sim3_mm={similar['absolute_mm']['rmse']:.2f} "
+        f"scale={similar['scale']:.4f} rpe_mm={similar['relative_mm']['rmse']:.2f} "
+        f"rpe_deg={similar['relative_deg']['rmse']:.3f}"
+    )
+
+
+def plot_trajectory(
+    path: Path, estimate: Trajectory, truth: Trajectory, absolute: AbsoluteError, relative: RelativeError
+) -> None:
+    """The path beside the truth, seen along its thinnest direction, and the errors over time."""
+    figure = Figure(figsize=(10.0, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.2])
+    first, second = sorted(np.argsort(np.ptp(truth.positions, axis=0))[-2:])
+    left.plot(*truth.positions[:, [first, second]].T, color=TRUTH, linewidth=1.0, label="truth")
+    left.plot(*absolute.aligned[:, [first, second]].T, color=ESTIMATE, linewidth=1.0, label="estimate, aligned")
+    left.set_aspect("equal", adjustable="datalim")
+    left.set_xlabel(f"{'xyz'[first]} [m]")
+    left.set_ylabel(f"{'xyz'[second]} [m]")
+    left.legend(fontsize=8, frameon=False)
+    start = estimate.timestamps[0]
+    right.plot(estimate.timestamps - start, 1e3 * absolute.distances, color=ESTIMATE, linewidth=1.0, label="absolute")
+    right.plot(
+        relative.timestamps - start, 1e3 * relative.translations, color="#8fb3d9", linewidth=1.0, label="relative"
+    )
+    right.set_xlabel("time [s]")
+    right.set_ylabel("error after Sim(3) alignment [mm]")
+    right.set_ylim(bottom=0.0)
+    right.legend(fontsize=8, frameon=False)
+    rmse = Statistics.of(1e3 * absolute.distances).rmse
+    scale = absolute.truth_from_estimate.scale
+    right.set_title(f"absolute RMSE {rmse:.2f} mm, scale {scale:.4f}, {len(estimate)} poses", fontsize=10)
+    figure.savefig(path, dpi=DPI)

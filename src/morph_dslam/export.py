@@ -1,0 +1,450 @@
+"""The states of an export: parameter values along a path or on a grid, and their table.
+
+Users give values in each parameter's own unit (that of `morph info`); arrays here are SI, (s, d) for s states
+of d parameters.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import h5py
+import meshio
+import numpy as np
+from meshio.xdmf import TimeSeriesWriter
+from numpy.typing import ArrayLike, NDArray
+from tqdm import tqdm
+
+from morph_dslam import __version__
+from morph_dslam.errors import ExportError
+from morph_dslam.model import Parameter, ReducedModel, load_model
+from morph_dslam.model.reduced_model import von_mises
+from morph_dslam.units import to_si
+
+Array = NDArray[np.float64]
+
+#: States that one export may have: beyond, a grid was meant to be coarser.
+MOST_STATES = 10_000
+
+#: Values may pass the end of a range by so much of its width: tables round.
+_ROUNDING = 1e-6
+
+#: States of a tour from the default to one end of a range; twice as many cross it.
+_QUARTER = 6
+
+
+def _index(model: ReducedModel, name: str) -> int:
+    names = [p.name for p in model.parameters]
+    if name not in names:
+        raise ExportError(f"the model has no parameter '{name}'; it has {', '.join(names)}")
+    return names.index(name)
+
+
+def _to_range(parameter: Parameter, value: float, where: str) -> float:
+    """A value in the parameter's unit as SI, checked to lie in its range."""
+    si = to_si(value, parameter.unit, parameter.quantity)
+    slack = _ROUNDING * (parameter.upper - parameter.lower)
+    if not parameter.lower - slack <= si <= parameter.upper + slack:  # NaN as well
+        low, high = (parameter.display(bound) for bound in (parameter.lower, parameter.upper))
+        raise ExportError(
+            f"{where}: {value:g} is outside the range of {parameter.name}, {low:g} to {high:g} {parameter.unit}"
+        )
+    return min(max(si, parameter.lower), parameter.upper)
+
+
+def fixed_values(model: ReducedModel, settings: Sequence[str]) -> Array:
+    """The parameters (d,) with some of them set by texts "name=value"; the others keep their defaults.
+
+    Raises
+    ------
+    ExportError
+        If a text is not of that form, or names no parameter, or its value is outside the range.
+    """
+    mu = model.default
+    for text in settings:
+        matched = re.fullmatch(r"(\w+)=([^:]+)", text)
+        try:
+            name, value = (matched[1], float(matched[2])) if matched else ("", math.nan)
+        except ValueError:
+            name = ""
+        if not name:
+            raise ExportError(f"--at {text} is not a parameter and its value, such as bend=12.5")
+        k = _index(model, name)
+        mu[k] = _to_range(model.parameters[k], value, f"--at {text}")
+    return mu
+
+
+def grid(model: ReducedModel, ranges: Sequence[str], base: Array) -> Array:
+    """All combinations (s, d) of ranges "name=from:to:count", the last one varying fastest.
+
+    Parameters
+    ----------
+    base : (d,) values of the parameters without a range, SI.
+
+    Raises
+    ------
+    ExportError
+        If a text is not of that form, names no parameter or one twice, leaves the box, or if the states
+        are more than `MOST_STATES`.
+    """
+    axes: dict[int, Array] = {}
+    for text in ranges:
+        try:
+            name, _, limits = text.partition("=")
+            first, last, count = limits.split(":")
+            ends, n = (float(first), float(last)), int(count)
+        except ValueError:
+            n, name, ends = 0, "", (0.0, 0.0)
+        if n < 1 or not name:
+            raise ExportError(f"--vary {text} is not a parameter and its values, such as bend=-10:10:21")
+        k = _index(model, name)
+        if k in axes:
+            raise ExportError(f"--vary {text}: parameter '{name}' has a range already")
+        low, high = (_to_range(model.parameters[k], end, f"--vary {text}") for end in ends)
+        if n > MOST_STATES:
+            raise ExportError(f"--vary {text} asks for {n} states, and {MOST_STATES} is the most")
+        axes[k] = np.linspace(low, high, n)
+    count = math.prod(len(axis) for axis in axes.values())
+    if count > MOST_STATES:
+        raise ExportError(f"these ranges make {count} states, and {MOST_STATES} is the most; ask for fewer")
+    states = np.tile(base, (count, 1))
+    for k, values in zip(axes, np.meshgrid(*axes.values(), indexing="ij"), strict=True):
+        states[:, k] = values.ravel()
+    return states
+
+
+def tour(model: ReducedModel, base: Array) -> Array:
+    """Each parameter in turn from ``base`` (d,) to the top of its range, to the bottom, and back (s, d)."""
+    states = [base]
+    for k, parameter in enumerate(model.parameters):
+        stops = [(base[k], parameter.upper), (parameter.upper, parameter.lower), (parameter.lower, base[k])]
+        for (start, end), count in zip(stops, (_QUARTER, 2 * _QUARTER, _QUARTER), strict=True):
+            leg = np.tile(base, (count, 1))
+            leg[:, k] = np.linspace(start, end, count + 1)[1:]
+            states.extend(leg)
+    return np.array(states)
+
+
+def read_path(model: ReducedModel, path: Path, base: Array) -> Array:
+    """The states (s, d) in the rows of a CSV table.
+
+    A column is headed "name [unit]", as in the table of an export, or "name_unit", as in the ``frames.csv``
+    of a run. Other columns are passed over, and so are rows without values: frames that were not tracked.
+    Parameters without a column keep their value in ``base``.
+
+    Raises
+    ------
+    ExportError
+        If the file cannot be read, has no column of a parameter, or holds a value outside its range.
+    """
+    try:
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+            header = list(rows[0]) if rows else []
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ExportError(f"cannot read the path {path}: {error}") from error
+    columns = {}
+    for k, p in enumerate(model.parameters):
+        found = [name for name in (f"{p.name} [{p.unit}]", f"{p.name}_{p.unit}") if name in header]
+        if found:
+            columns[k] = found[0]
+    if not columns:
+        wanted = ", ".join(f"'{p.name} [{p.unit}]'" for p in model.parameters)
+        raise ExportError(f"{path} has no column of a parameter; name the columns {wanted}")
+    states = []
+    for line, row in enumerate(rows, start=2):
+        texts = {k: (row[name] or "").strip() for k, name in columns.items()}
+        if not all(texts.values()):
+            continue
+        mu = base.copy()
+        for k, text in texts.items():
+            mu[k] = _number(model.parameters[k], text, f"{path}, line {line}")
+        states.append(mu)
+    if not 0 < len(states) <= MOST_STATES:
+        raise ExportError(f"{path} holds {len(states)} states, and 1 to {MOST_STATES} can be exported")
+    return np.array(states)
+
+
+def _number(parameter: Parameter, text: str, where: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise ExportError(f"{where}: '{text}' is not a value of {parameter.name}") from None
+    return _to_range(parameter, value, where)
+
+
+def write_table(path: Path, model: ReducedModel, states: Array, places: Sequence[dict[str, str | int]]) -> None:
+    """The parameters of each state (s, d, SI) as CSV, after the columns that say where it is.
+
+    The layout is that of tables of external solutions, so that a study can be made from an export.
+    """
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([*places[0], *(f"{p.name} [{p.unit}]" for p in model.parameters)])
+        for place, mu in zip(places, states, strict=True):
+            values = [f"{p.display(x):.9g}" for p, x in zip(model.parameters, mu, strict=True)]
+            writer.writerow([*place.values(), *values])
+
+
+# Binary glTF 2.0 (.glb): the visible surface, its modes as morph targets, the functions as an animation.
+# A separated displacement is what glTF calls morph targets: position = rest + sum_i weight_i target_i, with
+# the modes F_i as targets and the functions H_i(mu) as weights. Normals are left out on purpose: a viewer
+# then has to use those of the deformed triangles, where morphed normals would be wrong.
+# Source: Khronos Group, glTF 2.0 Specification, sections 3.7.2 (morph targets), 3.11 (animations), 4 (GLB).
+
+
+FRAMES_PER_SECOND = 12.0
+
+_FLOAT, _UNSIGNED_INT = 5126, 5125
+
+_VERTICES, _INDICES = 34962, 34963
+
+#: glTF's y points up and its z to the viewer; this turn makes our z point up, and Blender turns it back.
+_Z_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
+
+
+class _Buffer:
+    """Arrays of 4-byte numbers behind one another, with the accessors that describe them."""
+
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+        self.length = 0
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+
+    def add(self, array: NDArray, target: int | None = None) -> int:
+        """Append an array of floats or indices, (n,) or (n, 3); returns the number of its accessor."""
+        index = np.issubdtype(array.dtype, np.integer)
+        data = np.ascontiguousarray(array, dtype="<u4" if index else "<f4")
+        view: dict[str, Any] = {"buffer": 0, "byteOffset": self.length, "byteLength": data.nbytes}
+        if target is not None:
+            view["target"] = target
+        low, high = (np.atleast_1d(part).tolist() for part in (data.min(axis=0), data.max(axis=0)))
+        accessor = {
+            "bufferView": len(self.views),
+            "componentType": _UNSIGNED_INT if index else _FLOAT,
+            "count": len(data),
+            "type": "SCALAR" if data.ndim == 1 else "VEC3",
+            "min": low,
+            "max": high,
+        }
+        self.parts.append(data.tobytes())
+        self.length += data.nbytes
+        self.views.append(view)
+        self.accessors.append(accessor)
+        return len(self.accessors) - 1
+
+
+def _animation(buffer: _Buffer, weights: Array) -> dict[str, Any]:
+    times = np.arange(len(weights)) / FRAMES_PER_SECOND
+    sampler = {"input": buffer.add(times), "output": buffer.add(weights.ravel()), "interpolation": "LINEAR"}
+    channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
+    return {"name": "parameters", "samplers": [sampler], "channels": [channel]}
+
+
+def _document(model: ReducedModel, states: Array) -> tuple[dict[str, Any], bytes]:
+    """The JSON part and the binary part."""
+    buffer = _Buffer()
+    nodes, triangles = np.unique(model.triangles, return_inverse=True)
+    weights = np.array([model.displacement.functions.evaluate(mu)[0] for mu in states])
+    primitive = {
+        "attributes": {"POSITION": buffer.add(model.nodes[nodes], _VERTICES)},
+        "indices": buffer.add(triangles.ravel(), _INDICES),
+        "material": 0,
+        "targets": [{"POSITION": buffer.add(mode[nodes], _VERTICES)} for mode in model.displacement.modes],
+    }
+    names = [f"mode {i + 1}" for i in range(model.displacement.n_modes)]
+    mesh = {
+        "name": model.name,
+        "primitives": [primitive],
+        "weights": weights[0].astype(np.float32).tolist(),
+        "extras": {"targetNames": names},
+    }
+    grey = {"baseColorFactor": [0.62, 0.68, 0.74, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.7}
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": f"morph-dslam {__version__}"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": model.name, "mesh": 0, "rotation": _Z_UP}],
+        "meshes": [mesh],
+        "materials": [{"name": "surface", "pbrMetallicRoughness": grey, "doubleSided": True}],
+    }
+    if len(states) > 1:
+        document["animations"] = [_animation(buffer, weights)]
+    document |= {"buffers": [{"byteLength": buffer.length}], "bufferViews": buffer.views, "accessors": buffer.accessors}
+    return document, b"".join(buffer.parts)
+
+
+def write_glb(path: Path, model: ReducedModel, states: Array) -> None:
+    """Write the displacement of ``model`` along ``states`` (s, d); metres, z up in the object frame."""
+    document, binary = _document(model, states)
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    with path.open("wb") as file:
+        file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(binary)))
+        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+        file.write(struct.pack("<I4s", len(binary), b"BIN\0") + binary)
+
+
+# Series of VTU or XDMF files for ParaView, through meshio.
+# Points are the undeformed nodes; "Warp By Vector" with ``displacement`` draws the deformed shape. All values
+# are SI: metres and pascals. Tensors are written with nine components row by row, because VTK and XDMF order
+# six of them differently.
+
+
+#: meshio's name and number of nodes of each cell type; meshio has no prisms of 15 nodes: their corners stand.
+_MESHIO_CELLS = {
+    "hex8": ("hexahedron", 8), "hex20": ("hexahedron20", 20), "hex27": ("hexahedron27", 27),
+    "tet4": ("tetra", 4), "tet10": ("tetra10", 10),
+    "prism6": ("wedge", 6), "prism15": ("wedge", 6), "prism18": ("wedge18", 18),
+}  # fmt: skip
+
+#: Where the nine components of a symmetric tensor stand among xx, yy, zz, yz, xz, xy.
+_FULL_TENSOR = [0, 5, 4, 5, 1, 3, 4, 3, 2]
+
+
+def point_fields(model: ReducedModel, mu: Array) -> dict[str, ArrayLike]:
+    """Every field of the model at the nodes for the parameters ``mu`` (d,), under its name in the files.
+
+    Solids: ``stress`` (Cauchy), ``von_mises``, ``strain`` (Green-Lagrange). Sheets, for each face:
+    ``stress_top_11``, ``_22``, ``_12`` (second Piola-Kirchhoff, material axes) and ``von_mises_top``.
+    """
+    fields = {"displacement": model.displacement.value(mu)}
+    for place, field in model.stresses.items():
+        stress = field.value(mu)
+        suffix = "" if place == "solid" else f"_{place}"
+        if stress.shape[1] == 6:
+            fields[f"stress{suffix}"] = stress[:, _FULL_TENSOR]
+        else:
+            parts = zip(("11", "22", "12"), stress.T, strict=True)
+            fields |= {f"stress{suffix}_{name}": part for name, part in parts}
+        fields[f"von_mises{suffix}"] = von_mises(stress)
+    if model.strain is not None:
+        fields["strain"] = model.strain.value(mu)[:, _FULL_TENSOR]
+    return {name: values.astype(np.float32) for name, values in fields.items()}
+
+
+def _cells(model: ReducedModel) -> list[tuple[str, ArrayLike] | meshio.CellBlock]:
+    if not model.cells:
+        return [("triangle", model.triangles.astype(np.int32))]
+    result: list[tuple[str, ArrayLike] | meshio.CellBlock] = []
+    for cell_type, cells in model.cells.items():
+        name, size = _MESHIO_CELLS[cell_type]
+        result.append((name, cells[:, :size].astype(np.int32)))
+    return result
+
+
+def write_vtu_series(folder: Path, stem: str, model: ReducedModel, states: Array) -> Path:
+    """One ``stem_0000.vtu`` a state (s, d), ``stem.pvd`` to open all, ``states.csv``; returns the .pvd."""
+    root = ElementTree.Element("VTKFile", type="Collection", version="0.1")
+    collection = ElementTree.SubElement(root, "Collection")
+    cells, places = _cells(model), []
+    for i, mu in enumerate(tqdm(states, desc="states", unit="file")):
+        name = f"{stem}_{i:04d}.vtu"
+        meshio.Mesh(model.nodes, cells, point_data=point_fields(model, mu)).write(folder / name)
+        ElementTree.SubElement(collection, "DataSet", timestep=str(i), file=name)
+        places.append({"file": name})
+    write_table(folder / "states.csv", model, states, places)
+    series = folder / f"{stem}.pvd"
+    ElementTree.indent(root)
+    ElementTree.ElementTree(root).write(series, xml_declaration=True, encoding="utf-8")
+    return series
+
+
+class _SeriesWriter(TimeSeriesWriter):
+    """meshio's writer with the HDF5 file beside the XDMF file, where meshio takes the working folder."""
+
+    def __enter__(self) -> _SeriesWriter:
+        self.h5_filename = str(self.filename.with_suffix(".h5"))
+        self.h5_file = h5py.File(self.h5_filename, "w")
+        return self
+
+
+def write_xdmf_series(folder: Path, stem: str, model: ReducedModel, states: Array) -> Path:
+    """``stem.xdmf``, its data of states (s, d) in ``stem.h5``, and ``states.csv``; returns the .xdmf."""
+    series = folder / f"{stem}.xdmf"
+    with _SeriesWriter(series) as writer:
+        writer.write_points_cells(model.nodes, _cells(model))
+        for i, mu in enumerate(tqdm(states, desc="states", unit="state")):
+            writer.write_data(i, point_data=point_fields(model, mu))
+    places = [{"file": series.name, "step": i} for i in range(len(states))]
+    write_table(folder / "states.csv", model, states, places)
+    return series
+
+
+# `morph export`: choose the states, write them in one format.
+
+
+FORMATS = ("xdmf", "vtu", "gltf")
+
+
+@dataclass(frozen=True)
+class StateChoice:
+    """What the command line says about the states, in the parameters' units.
+
+    Attributes
+    ----------
+    vary : texts "name=from:to:count"; several make a grid.
+    path : CSV table with a state in each row, instead.
+    at : texts "name=value" for parameters that are not varied.
+    """
+
+    vary: Sequence[str] = ()
+    path: Path | None = None
+    at: Sequence[str] = ()
+
+    def states(self, model: ReducedModel) -> NDArray[np.float64]:
+        """The states (s, d), SI; with neither ranges nor a path, a tour of all parameters.
+
+        Raises
+        ------
+        ExportError
+            If the choices contradict each other, or do not fit the model.
+        """
+        twice = {text.partition("=")[0] for text in self.vary} & {text.partition("=")[0] for text in self.at}
+        if twice:
+            raise ExportError(f"'{min(twice)}' is both varied and fixed: leave out its --vary or its --at")
+        if self.path is not None and self.vary:
+            raise ExportError("--path and --vary both choose the states: give one of them")
+        base = fixed_values(model, self.at)
+        if self.path is not None:
+            return read_path(model, self.path, base)
+        return grid(model, self.vary, base) if self.vary else tour(model, base)
+
+
+def export(model_path: Path, folder: Path, file_format: str, choice: StateChoice) -> Path:
+    """Write a model's states into ``folder``; returns the file to open.
+
+    Parameters
+    ----------
+    file_format : one of `FORMATS`.
+
+    Raises
+    ------
+    ModelFileError
+        If the model cannot be read.
+    ExportError
+        If the states are not in the model's box, or the folder cannot be written.
+    """
+    model = load_model(model_path)
+    states = choice.states(model)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if file_format == "gltf":
+            target = folder / f"{model_path.stem}.glb"
+            write_glb(target, model, states)
+            write_table(folder / "states.csv", model, states, [{"frame": i} for i in range(len(states))])
+            return target
+        write = write_xdmf_series if file_format == "xdmf" else write_vtu_series
+        return write(folder, model_path.stem, model, states)
+    except OSError as error:
+        raise ExportError(f"cannot write to {folder}: {error.strerror or error}") from error

@@ -1,0 +1,1 @@
+"""Solid and shell mechanics: kinematics, supports, loads, and the solvers."""

@@ -1,0 +1,1 @@
+"""Hyperelastic and viscoelastic material laws."""

@@ -1,0 +1,79 @@
+"""A study's parameters as symbols, for use in materials, loads, supports and shapes alike.
+
+    symbols = ParameterSymbols((angle, young))
+    NeoHookean(young=symbols["young"], poisson=0.45)
+    RigidRotation("top", axis=(0.0, 1.0, 0.0), angle=2.0 * symbols["angle"])
+
+Any arithmetic on a symbol is an expression that NGSolve evaluates and differentiates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import ngsolve as ngs
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.materials.base import evaluate
+from morph_dslam.model import Parameter
+
+Array = NDArray[np.float64]
+
+#: A number, or an expression of parameter symbols.
+Scalar = Any
+
+
+class ParameterSymbols:
+    """The d parameters of a study with a present value each, at first the default."""
+
+    def __init__(self, parameters: Sequence[Parameter] = ()) -> None:
+        self.parameters = tuple(parameters)
+        self._symbols = {p.name: ngs.Parameter(p.default) for p in self.parameters}
+        if len(self._symbols) < len(self.parameters):
+            raise StudyError("two parameters have the same name; parameter names must differ")
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    def __getitem__(self, name: str) -> ngs.Parameter:
+        """The symbol of a parameter. Raises StudyError if there is none of this name."""
+        if name not in self._symbols:
+            known = ", ".join(self._symbols) or "none"
+            raise StudyError(f"there is no parameter '{name}'; there are: {known}")
+        return self._symbols[name]
+
+    @property
+    def default(self) -> Array:
+        """Values (d,) of the state that nothing is known about, SI."""
+        return np.array([p.default for p in self.parameters])
+
+    def set(self, mu: Array) -> None:
+        """Make ``mu`` (d,), SI, the present values."""
+        for symbol, value in zip(self._symbols.values(), np.atleast_1d(mu), strict=True):
+            symbol.Set(float(value))
+
+    def value(self, expression: Scalar) -> float:
+        """Value of an expression that does not vary in space, at the present parameters."""
+        return evaluate(expression)
+
+    def slopes(self, expression: Scalar) -> Array:
+        """Derivatives (d,) of an expression that does not vary in space, at the present parameters."""
+        result = np.zeros(len(self))
+        for index, derivative in self.derivatives(expression).items():
+            result[index] = evaluate(derivative)
+        return result
+
+    def derivatives(self, expression: Any) -> dict[int, Any]:
+        """Derivatives of an expression, as expressions, by the index of each parameter it depends on."""
+        if isinstance(expression, (int, float)):
+            return {}
+        slopes = {i: expression.Diff(symbol) for i, symbol in enumerate(self._symbols.values())}
+        return {i: slope for i, slope in slopes.items() if not is_zero(slope)}
+
+
+def is_zero(expression: Any) -> bool:
+    """Whether NGSolve has found an expression to vanish identically."""
+    return str(expression).lstrip().startswith("ZeroCoefficientFunction")

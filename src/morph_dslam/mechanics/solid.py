@@ -1,0 +1,295 @@
+"""Equilibrium of hyperelastic solids: total Lagrangian finite elements on NGSolve.
+
+A solid is its energy. With the kinematics of `kinematics`, the residual is the derivative of
+
+    int W(F) dV + foundations - dead loads
+
+plus the virtual work of loads without energy, and the tangent is the derivative of the residual, both taken
+by NGSolve; derivatives by parameters are taken of the same integrands. `SolidProblem` implements the
+`Equations` of `newton` and leaves solution paths to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import ngsolve as ngs
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.mechanics.kinematics import Kinematics, Shape, ShapeField
+from morph_dslam.mechanics.loads import BodyForce, FollowerPressure, Gravity, Load, NodalForces, PointLoad
+from morph_dslam.mechanics.materials.base import Material
+from morph_dslam.mechanics.ngsolve_mesh import NgsolveMesh
+from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
+from morph_dslam.mechanics.recovery import Recovery
+from morph_dslam.mechanics.solid_assembly import Assembly, Term
+from morph_dslam.mechanics.solid_materials import SolidHistory, owners_of_cells, place_materials
+from morph_dslam.mechanics.solvers.linear_solver import LinearSolver
+from morph_dslam.mechanics.solvers.newton import Linearisation, State
+from morph_dslam.mechanics.spaces import DisplacementSpace
+from morph_dslam.mechanics.supports import Constraints, ElasticFoundation, PrescribedMotion
+from morph_dslam.meshing.meshes import Mesh
+
+Array = NDArray[np.float64]
+
+Support = PrescribedMotion | ElasticFoundation
+
+
+@dataclass(frozen=True)
+class SolidOptions:
+    """How a solid is discretised.
+
+    Attributes
+    ----------
+    order : of the displacements, 1 or 2; None for that of the cells. Order 2 on first-order cells adds
+        functions on their edges, faces and inside.
+    mixed : give every material with a volumetric part pressures of its own, against locking near
+        incompressibility; see `pressure_space`. hex20 and prism15 then use all functions of second order.
+    threads : of PARDISO; None leaves MKL's choice.
+    """
+
+    order: int | None = None
+    mixed: bool = False
+    threads: int | None = None
+
+
+class SolidProblem:
+    """A solid with its materials, supports, loads and parameters.
+
+    Parameters
+    ----------
+    mesh : in metres.
+    materials : by cell set; "all" takes the cells that no other set names.
+    supports : see `supports`.
+    loads : see `loads`.
+    parameters : the symbols that materials, supports, loads and shapes were written with.
+    options : see `SolidOptions`.
+    shape : how the undeformed shape depends on parameters.
+    directions : fibre fields that materials name, a direction for each cell (n_cells, 3).
+    time : expression of the parameters that is the time, s; viscous materials need it.
+
+    Attributes
+    ----------
+    n_dofs, free, scale : see `newton.Equations`. The first 3 n_scalar dofs are displacements, those of x
+        first; pressures follow.
+    flags : what a result obtained with this discretisation must be doubted for; empty if nothing.
+
+    Raises
+    ------
+    StudyError
+        For unknown sets, cells with no material or with two, unstable materials, missing supports.
+    """
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        materials: Mapping[str, Material],
+        supports: Sequence[Support] = (),
+        loads: Sequence[Load] = (),
+        parameters: ParameterSymbols | None = None,
+        options: SolidOptions | None = None,
+        shape: Sequence[ShapeField] = (),
+        directions: Mapping[str, Array] | None = None,
+        time: Scalar | None = None,
+    ) -> None:
+        options = options or SolidOptions()
+        self.mesh, self.supports, self.loads, self.options = mesh, tuple(supports), tuple(loads), options
+        self.symbols = parameters or ParameterSymbols()
+        self.geometry = NgsolveMesh(mesh)
+        self.displacements = DisplacementSpace(self.geometry, options.order, full=options.mixed)
+        self.shape = Shape(self.displacements, shape)
+        self.length = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
+        self.cell_materials = owners_of_cells(mesh, materials)
+        self.regions = place_materials(
+            self.displacements, self.cell_materials, materials, directions or {}, options.mixed
+        )
+        self.history = self._make_history(time)
+        self.flags = tuple(region.flag for region in self.regions if region.flag)
+        self.space = self._product_space()
+        self.n_dofs: int = self.space.ndof
+        self.constraints = Constraints(self.displacements, self.shape, self.supports, self.symbols)
+        self.constraints.check_rigid_motions()
+        n_displacements = 3 * self.displacements.n_scalar
+        self.assembly = Assembly(self.space, self._terms(), self.symbols, n_displacements)
+        self.free: NDArray[np.bool_] = self._free_dofs()
+        scale = np.full(self.n_dofs, np.inf)
+        scale[:n_displacements] = self.length
+        self.scale: Array | float = scale
+        self._latest: tuple[Array, Array, Array] | None = None
+        points = [load for load in loads if isinstance(load, PointLoad)]
+        self._nodal_forces = NodalForces(self.displacements, points, self.symbols)
+
+    # -- set-up ---------------------------------------------------------------------------------------
+
+    def _make_history(self, time: Scalar | None) -> SolidHistory | None:
+        if all(region.material.prony is None for region in self.regions):
+            return None
+        history = SolidHistory(self.displacements, self.regions, time, self.symbols)
+        self.regions = history.regions
+        return history
+
+    def _product_space(self) -> ngs.FESpace:
+        spaces = [self.displacements.vector]
+        for region in self.regions:
+            spaces += region.pressures.spaces if region.pressures else []
+        return spaces[0] if len(spaces) == 1 else ngs.ProductSpace(*spaces)
+
+    def split(self, functions: Any) -> tuple[Any, list[list[Any]]]:
+        """Displacement, and for each material region its pressure unknowns, of the product space's parts."""
+        if not any(region.pressures for region in self.regions):
+            return functions, [[] for _ in self.regions]
+        displacement, *rest = functions
+        groups = []
+        for region in self.regions:
+            count = len(region.pressures.spaces) if region.pressures else 0
+            groups.append(rest[:count])
+            rest = rest[count:]
+        return displacement, groups
+
+    def _terms(self) -> list[Term]:
+        trial, pressures = self.split(self.space.TrialFunction())
+        test, _ = self.split(self.space.TestFunction())
+        kinematics = Kinematics(trial, self.shape)
+        F, ratio = kinematics.deformation_gradient, kinematics.volume_ratio
+        terms = [
+            Term(
+                region.energy(F, region.pressure(unknowns)) * ratio,
+                region.region,
+                self.shape.bonus_order,
+                rules=self.history.rules if self.history else {},
+            )
+            for region, unknowns in zip(self.regions, pressures, strict=True)
+        ]
+        for support in self.supports:
+            if isinstance(support, ElasticFoundation):
+                u = kinematics.displacement
+                u = u * kinematics.unit_normal if support.normal_only else u
+                energy = 0.5 * support.stiffness * (u * u) * kinematics.area_ratio
+                terms.append(Term(energy, self.geometry.boundary(support.on)))
+        for load in self.loads:
+            terms += self._load_terms(load, kinematics, test)
+        return terms
+
+    def _load_terms(self, load: Load, kinematics: Kinematics, test: Any) -> list[Term]:
+        if isinstance(load, PointLoad):
+            return []  # see `NodalForces`
+        u, ratio = kinematics.displacement, kinematics.volume_ratio
+        if isinstance(load, BodyForce):
+            return [Term(-(ngs.CF(load.force) * u) * ratio, self.geometry.region(load.on))]
+        if isinstance(load, Gravity):
+            weight = ngs.CF(load.acceleration) * u * ratio
+            return [Term(-region.material.density * weight, region.region) for region in self.regions]
+        boundary = self.geometry.boundary(load.on)
+        if isinstance(load, FollowerPressure):
+            work = load.virtual_work(kinematics, test)
+            return [Term(work, boundary, load.bonus_order, has_energy=False)]
+        return [Term(load.energy(kinematics), boundary, load.bonus_order)]
+
+    def _free_dofs(self) -> NDArray[np.bool_]:
+        free = np.array(self.space.FreeDofs(), dtype=bool)
+        free[: 3 * self.displacements.n_scalar] &= ~self.constraints.held
+        return free
+
+    @cached_property
+    def solver(self) -> LinearSolver:
+        """The linear solver, made when first needed."""
+        return LinearSolver(self.free & self.assembly.coupled, self.assembly.symmetric, threads=self.options.threads)
+
+    # -- the equations ----------------------------------------------------------------------------------
+
+    def initial_state(self) -> State:
+        """The undeformed solid at the parameters' defaults: where every path starts."""
+        return State(self.symbols.default, np.zeros(self.n_dofs))
+
+    def prescribed(self, mu: Array) -> Array:
+        self.symbols.set(mu)
+        return self._padded(self.constraints.values())
+
+    def prescribed_slopes(self, mu: Array) -> Array:
+        self.symbols.set(mu)
+        return self._padded(self.constraints.slopes())
+
+    def residual(self, x: Array, mu: Array) -> Array:
+        self._set(mu)
+        residual = self.assembly.residual(x) - self._padded(self._nodal_forces.values())
+        self._latest = x.copy(), np.array(mu), residual
+        return residual.copy()
+
+    def linearise(self, x: Array, mu: Array) -> Linearisation:
+        # Newton's method has mostly just asked for the residual at the same point.
+        known = self._latest
+        if known is None or not (np.array_equal(known[0], x) and np.array_equal(known[1], mu)):
+            self.residual(x, mu)
+            known = self._latest
+        assert known is not None
+        self._set(mu)
+        return self.assembly.linearise(x, mu, known[2], self.solver)
+
+    def residual_slopes(self, x: Array, mu: Array) -> Array:
+        self._set(mu)
+        return self.assembly.residual_slopes(x) - self._padded(self._nodal_forces.slopes())
+
+    def advance_history(self, x: Array, mu: Array) -> None:
+        """Accept a solution: viscous materials remember it. Derivatives are those at a fixed history."""
+        if self.history:
+            self._set(mu)
+            self.history.advance(self.recovery.deformation_gradient(x))
+            self._latest = None
+
+    def _set(self, mu: Array) -> None:
+        self.symbols.set(mu)
+        if self.history:
+            self.history.check_time()
+
+    def _padded(self, displacement_part: Array) -> Array:
+        """(..., 3 n_scalar) with zeros for the pressures."""
+        result = np.zeros((*displacement_part.shape[:-1], self.n_dofs))
+        result[..., : displacement_part.shape[-1]] = displacement_part
+        return result
+
+    # -- results ----------------------------------------------------------------------------------------
+
+    @cached_property
+    def recovery(self) -> Recovery:
+        """Fields at nodes and points, made when first needed."""
+        return Recovery(self)
+
+    def nodal_displacement(self, dofs: Array) -> Array:
+        """(n_nodes, 3), m; linear in ``dofs`` (n_dofs,), so it maps their derivatives too."""
+        parts = dofs[: 3 * self.displacements.n_scalar].reshape(3, -1)
+        return self.displacements.node_values @ parts.T
+
+    def sample(self, dofs: Array, mu: Array) -> dict[str, Array]:
+        """Displacement (n, 3) m, strain (n, 6), stress (n, 6) Pa and von_mises (n,) Pa at the nodes.
+
+        Green-Lagrange strain and Cauchy stress are in Voigt's order; `recovery` says how they come to nodes.
+        """
+        return self.recovery.at_nodes(dofs, mu)
+
+    def sample_slopes(self, dofs: Array, mu: Array, dof_slopes: Array) -> dict[str, Array]:
+        """Total derivatives (d, n, c) of displacement, strain and stress at the nodes by the parameters.
+
+        ``dof_slopes`` (d, n_dofs) are those of the solution: `newton.sensitivities`.
+        """
+        return self.recovery.slopes_at_nodes(dofs, mu, dof_slopes)
+
+    def reactions(self, dofs: Array, mu: Array, name: str, about: Array | None = None) -> tuple[Array, Array]:
+        """Force (3,) N and moment (3,) Nm that the supports of a set exert on the solid.
+
+        Parameters
+        ----------
+        name : node set or surface; only what prescribed motions hold of it counts.
+        about : point of the moment (3,), m; None for the centroid of the set's undeformed nodes.
+        """
+        n_scalar = self.displacements.n_scalar
+        forces = np.where(self.constraints.held, self.residual(dofs, mu)[: 3 * n_scalar], 0.0).reshape(3, -1)
+        return self.constraints.resultant(name, forces, dofs[: 3 * n_scalar].reshape(3, -1), about)
+
+    def strain_energy(self, dofs: Array, mu: Array) -> float:
+        """Elastic energy, J."""
+        self.symbols.set(mu)
+        return self.assembly.energy(dofs, len(self.regions))

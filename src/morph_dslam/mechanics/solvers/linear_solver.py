@@ -1,0 +1,462 @@
+"""The libraries behind `linear_solver`: PARDISO, NGSolve's sparse Cholesky, SuperLU.
+
+Symmetric matrices come as their upper triangle in CSR form with every diagonal entry stored.
+"""
+
+from __future__ import annotations
+
+import os
+import weakref
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.util import find_spec
+from typing import Any, Protocol
+
+import ngsolve as ngs
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg
+from numpy.typing import NDArray
+
+from morph_dslam.errors import SolverError
+
+Array = NDArray[np.float64]
+
+#: scipy.sparse.csr_matrix, which has no usable type stubs.
+Matrix = Any
+
+sla: Any = scipy.sparse.linalg
+
+#: PARDISO's settings, numbered from 1 as in its manual: own settings; METIS ordering; refinement only where
+#: pivots were perturbed (`linear_solver` refines where a residual asks for it);
+#: perturbation of zero pivots 1e-8; Bunch-Kaufman pivoting.
+PARDISO_SETTINGS = {1: 1, 2: 2, 8: 0, 10: 8, 21: 1}
+
+#: Scaling and weighted matching. Saddle points need them; where all diagonals are positive they cost a fifth
+#: of the time for nothing.
+SCALING, MATCHING = 11, 13
+
+REAL_SYMMETRIC_INDEFINITE, REAL_UNSYMMETRIC = -2, 11
+
+ANALYSE, FACTORISE, SOLVE = 11, 22, 33
+
+PERTURBED_PIVOTS, NEGATIVE_EIGENVALUES = 14, 23
+
+#: Without PARDISO, negative eigenvalues are counted among so many nearest to zero.
+LOOKED_AT = 6
+
+
+class Pardiso:
+    """Intel MKL's PARDISO through pypardiso; the analysis is kept while the pattern stays."""
+
+    def __init__(self, symmetric: bool, threads: int | None) -> None:
+        from pypardiso import PyPardisoSolver
+
+        self._symmetric = symmetric
+        self._handle: Any = PyPardisoSolver(REAL_SYMMETRIC_INDEFINITE if symmetric else REAL_UNSYMMETRIC)
+        for number, value in PARDISO_SETTINGS.items():
+            self._handle.set_iparm(number, value)
+        if threads is not None:
+            self._handle.libmkl.MKL_Set_Num_Threads(threads)
+        self._matrix: Matrix | None = None
+        self._matched = False
+        weakref.finalize(self, self._handle.free_memory, everything=True)
+
+    def _call(self, phase: int, right: Array) -> Array:
+        from pypardiso.pardiso_wrapper import PyPardisoError
+
+        self._handle.set_phase(phase)
+        try:
+            return self._handle._call_pardiso(self._matrix, right)
+        except PyPardisoError as error:
+            raise SolverError(f"PARDISO could not factorise the tangent matrix: {error}") from error
+
+    def factorise(self, matrix: Matrix) -> None:
+        known, self._matrix = self._matrix, matrix
+        nothing = np.zeros((matrix.shape[0], 1))
+        matched = not self._symmetric or bool(np.any(matrix.diagonal() <= 0.0))
+        if known is None or not _same_pattern(known, matrix) or (matched and not self._matched):
+            self._matched = matched
+            for setting in (SCALING, MATCHING):
+                self._handle.set_iparm(setting, int(matched))
+            self._call(ANALYSE, nothing)
+        self._call(FACTORISE, nothing)
+
+    def solve(self, right: Array) -> Array:
+        return self._call(SOLVE, np.asfortranarray(right))
+
+    @property
+    def negative_pivots(self) -> int | None:
+        """None where a pivot had to be perturbed, for then its sign means nothing."""
+        if not self._symmetric or self._handle.get_iparm(PERTURBED_PIVOTS):
+            return None
+        return int(self._handle.get_iparm(NEGATIVE_EIGENVALUES))
+
+    def release(self) -> None:
+        self._handle.free_memory(everything=True)
+        self._matrix = None
+
+
+def _same_pattern(one: Matrix, other: Matrix) -> bool:
+    return np.array_equal(one.indptr, other.indptr) and np.array_equal(one.indices, other.indices)
+
+
+class SparseCholesky:
+    """NGSolve's sparse L D L^T, without pivoting."""
+
+    def __init__(self) -> None:
+        self._inverse: Any = None
+        self._size = 0
+
+    def factorise(self, matrix: Matrix) -> None:
+        upper = matrix.tocoo()
+        strict = upper.row != upper.col
+        rows = np.concatenate([upper.row, upper.col[strict]])
+        columns = np.concatenate([upper.col, upper.row[strict]])
+        values = np.concatenate([upper.data, upper.data[strict]])
+        self._size = matrix.shape[0]
+        create: Any = ngs.la.SparseMatrixd.CreateFromCOO
+        whole = create(rows, columns, values, self._size, self._size)
+        self._inverse = whole.Inverse(inverse="sparsecholesky")
+
+    def solve(self, right: Array) -> Array:
+        vector, result = ngs.BaseVector(self._size), ngs.BaseVector(self._size)
+        solution = np.empty(right.shape)
+        for column in range(right.shape[1]):
+            vector.FV().NumPy()[:] = right[:, column]
+            result.data = self._inverse * vector
+            solution[:, column] = result.FV().NumPy()
+        return solution
+
+    @property
+    def negative_pivots(self) -> int | None:
+        """An estimate by Lanczos' method on the inverse, since NGSolve keeps its pivots to itself.
+
+        The eigenvalues nearest to zero are looked at: a structure that loses its stability shows it there.
+        None if all of them are negative, for then there may be more, or if they are not found.
+        """
+        if self._size <= 4 * LOOKED_AT:
+            inverse = self.solve(np.eye(self._size))
+            return int(np.count_nonzero(np.linalg.eigvalsh((inverse + inverse.T) / 2.0) < 0.0))
+        operator = sla.LinearOperator(
+            (self._size, self._size), matvec=lambda x: self.solve(x.reshape(-1, 1)).ravel(), dtype=float
+        )
+        start = np.random.default_rng(0).standard_normal(self._size)
+        try:
+            nearest = sla.eigsh(operator, LOOKED_AT, which="LM", v0=start, tol=1e-3, return_eigenvectors=False)
+        except sla.ArpackNoConvergence:
+            return None
+        negative = int(np.count_nonzero(nearest < 0.0))
+        return None if negative == LOOKED_AT else negative
+
+    def release(self) -> None:
+        self._inverse = None
+
+
+class SuperLU:
+    """Scipy's SuperLU, with partial pivoting: the slowest and the safest; it tells no inertia."""
+
+    negative_pivots = None
+
+    def __init__(self, triangular: bool) -> None:
+        self._triangular = triangular
+        self._factors: Any = None
+
+    def factorise(self, matrix: Matrix) -> None:
+        whole = matrix + sp.triu(matrix, 1).T if self._triangular else matrix
+        try:
+            self._factors = sla.splu(whole.tocsc())
+        except RuntimeError as error:
+            raise SolverError(
+                "the tangent matrix is singular: the body may lack supports, or be at a limit point"
+            ) from error
+
+    def solve(self, right: Array) -> Array:
+        assert self._factors is not None
+        return self._factors.solve(right)
+
+    def release(self) -> None:
+        self._factors = None
+
+
+# Sparse direct solution of K_ff x = b with the inertia of K_ff, every solve's residual checked.
+# PARDISO (Intel MKL, through the optional package pypardiso) where it is installed: its ordering and symbolic
+# factorisation are kept as long as the pattern stays. NGSolve's `sparsecholesky` otherwise. The environment
+# variable MORPH_LINEAR_SOLVER = pardiso | sparsecholesky overrides the choice. A solve whose residual
+# iterative refinement cannot mend is done again by SuperLU, whose pivoting is safer and slower.
+# PARDISO's settings matter: with its defaults a saddle-point matrix comes back with a relative residual of
+# 1e-3 and no warning. Scaling and weighted matching (iparm 11, 13) prevent that; `sparse_engines` sets them.
+
+
+Integers = NDArray[np.integer]
+
+#: A solve is good when its residual is below this part of the right-hand side ...
+RESIDUAL_TOLERANCE = 1e-9
+
+#: ... or below this part of |A| |x| + |b|, which double precision cannot improve (Rigal and Gaches, 1967).
+BACKWARD_ERROR = 1e-14
+
+REFINEMENTS = 4
+
+ENVIRONMENT_VARIABLE = "MORPH_LINEAR_SOLVER"
+
+
+class Engine(Protocol):
+    """One library's factorisation of a square matrix; `factorise` replaces the one before."""
+
+    def factorise(self, matrix: Matrix) -> None: ...
+    def solve(self, right: Array) -> Array: ...
+    @property
+    def negative_pivots(self) -> int | None: ...
+    def release(self) -> None: ...
+
+
+def default_engine() -> str:
+    """Name of the engine in use: the environment's choice, or PARDISO where it is installed.
+
+    Raises
+    ------
+    SolverError
+        If the environment asks for an engine that is unknown or not installed.
+    """
+    installed = find_spec("pypardiso") is not None
+    chosen = os.environ.get(ENVIRONMENT_VARIABLE, "pardiso" if installed else "sparsecholesky")
+    if chosen not in ("pardiso", "sparsecholesky"):
+        raise SolverError(f"{ENVIRONMENT_VARIABLE}={chosen} is unknown: use pardiso or sparsecholesky")
+    if chosen == "pardiso" and not installed:
+        raise SolverError(f"{ENVIRONMENT_VARIABLE}=pardiso needs pypardiso: pip install 'morph-dslam[pardiso]'")
+    return chosen
+
+
+@dataclass(frozen=True)
+class _FreeBlock:
+    """Pattern of K_ff in CSR form, and where its entries lie in the data of K.
+
+    Attributes
+    ----------
+    order : index into K's data with one zero appended (the diagonals that K does not store).
+    triangular : whether only the upper triangle is kept.
+    """
+
+    indptr: Integers
+    indices: Integers
+    order: Integers
+    triangular: bool
+
+    @staticmethod
+    def of(indices: Integers, indptr: Integers, free: NDArray[np.bool_], symmetric: bool) -> _FreeBlock:
+        # NGSolve's row pointers are unsigned.
+        rows = np.repeat(np.arange(len(free)), np.diff(np.asarray(indptr, dtype=np.int64)))
+        columns = np.asarray(indices, dtype=np.int64)
+        if symmetric and not np.any(columns > rows):
+            rows, columns = columns, rows  # only the lower triangle is stored: its transpose is the upper one
+        kept = free[rows] & free[columns]
+        if symmetric:
+            kept &= columns >= rows
+        order = np.flatnonzero(kept)
+        number, size = np.cumsum(free) - 1, int(np.count_nonzero(free))
+        rows, columns = number[rows[kept]], number[columns[kept]]
+        # PARDISO wants every diagonal entry of a symmetric matrix stored, zero or not.
+        missing = np.setdiff1d(np.arange(size), rows[rows == columns])
+        rows, columns = np.concatenate([rows, missing]), np.concatenate([columns, missing])
+        order = np.concatenate([order, np.full(len(missing), len(indices))])
+        sorting = np.lexsort((columns, rows))
+        starts = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=size))])
+        return _FreeBlock(starts.astype(np.int32), columns[sorting].astype(np.int32), order[sorting], symmetric)
+
+    def extract(self, data: Array) -> Matrix:
+        size = len(self.indptr) - 1
+        values = np.append(data, 0.0)[self.order]
+        return sp.csr_matrix((values, self.indices, self.indptr), shape=(size, size))
+
+
+def multiply(matrix: Matrix, vectors: Array, triangular: bool) -> Array:
+    """Matrix times ``vectors`` (n,) or (n, k), of a symmetric matrix stored as one triangle if so told."""
+    product = matrix @ vectors
+    if triangular:
+        diagonal = matrix.diagonal()
+        product += matrix.T @ vectors - (diagonal * vectors.T).T
+    return product
+
+
+class Factorisation:
+    """K_ff = L D L^T or L U of one matrix; good until its `LinearSolver` factorises the next."""
+
+    def __init__(self, solver: LinearSolver, matrix: Matrix, triangular: bool) -> None:
+        self._solver, self._matrix, self._triangular = solver, matrix, triangular
+
+    @cached_property
+    def _norm(self) -> float:
+        """Largest sum of a row's magnitudes; worked out only for solves that are not plainly good."""
+        ones = np.ones(self._matrix.shape[0])
+        return float(np.max(multiply(abs(self._matrix), ones, self._triangular), initial=0.0))
+
+    @property
+    def current(self) -> bool:
+        """Whether this is still the solver's latest factorisation; an older one must not be used."""
+        return self._solver.latest is self
+
+    @property
+    def negative_pivots(self) -> int | None:
+        """Number of negative eigenvalues of K_ff (Sylvester's law of inertia); None if it cannot be told."""
+        return self._solver.engine.negative_pivots if self._matrix.shape[0] else 0
+
+    def solve(self, right: Array) -> Array:
+        """K_ff^-1 right_f.
+
+        Parameters
+        ----------
+        right : (n,) or (k, n) over all dofs; what it holds at prescribed dofs does not matter.
+
+        Returns
+        -------
+        The same shape, zero at prescribed dofs.
+
+        Raises
+        ------
+        SolverError
+            If neither the engine nor SuperLU gives a small residual: the matrix is singular.
+        """
+        free = self._solver.free
+        solution = np.zeros(right.shape)
+        if self._matrix.shape[0]:
+            columns = np.atleast_2d(right)[:, free].T.copy()
+            solution[..., free] = self._solve_checked(columns).T.reshape(*right.shape[:-1], -1)
+        return solution
+
+    def _solve_checked(self, right: Array) -> Array:
+        if not np.all(np.isfinite(right)):
+            raise SolverError("the right-hand side of a linear solve is not finite")
+        for engine in self._solver.engines_to_try(self._matrix):
+            solution = np.zeros_like(right)
+            residual = right
+            for _ in range(1 + REFINEMENTS):
+                solution = solution + engine.solve(residual)
+                if not np.all(np.isfinite(solution)):
+                    break
+                residual = right - multiply(self._matrix, solution, self._triangular)
+                if self._good(residual, solution, right):
+                    return solution
+        raise SolverError("the tangent matrix is singular: the body may lack supports, or be at a limit point")
+
+    def _good(self, residual: Array, solution: Array, right: Array) -> bool:
+        remaining = np.abs(residual).max(axis=0)
+        size = np.abs(right).max(axis=0)
+        if np.all(remaining <= RESIDUAL_TOLERANCE * size):
+            return True
+        rounding = BACKWARD_ERROR * (self._norm * np.abs(solution).max(axis=0) + size)
+        return bool(np.all(remaining <= np.maximum(RESIDUAL_TOLERANCE * size, rounding)))
+
+
+class LinearSolver:
+    """Factorises matrices that share their free dofs, one at a time.
+
+    Parameters
+    ----------
+    free : (n,) dofs that are solved for.
+    symmetric : whether the matrices are (then one triangle of them is enough).
+    threads : of PARDISO; None leaves MKL's own choice.
+    engine : "pardiso" or "sparsecholesky"; None for `default_engine`. Unsymmetric matrices go to SuperLU
+        where PARDISO is not used, since `sparsecholesky` reads one triangle only.
+    """
+
+    def __init__(
+        self, free: NDArray[np.bool_], symmetric: bool, threads: int | None = None, engine: str | None = None
+    ) -> None:
+        self.free, self.symmetric = np.asarray(free, dtype=bool), symmetric
+        if (engine or default_engine()) == "pardiso":
+            self.engine: Engine = Pardiso(symmetric, threads)
+        else:
+            self.engine = SparseCholesky() if symmetric else SuperLU(triangular=False)
+        self._block: _FreeBlock | None = None
+        self._pattern: tuple[Integers, Integers] | None = None
+        self._triangle: tuple[Integers, bool] | None = None
+        self._substitute: SuperLU | None = None
+        self.latest: Factorisation | None = None
+
+    def factorise(self, data: Array, indices: Integers, indptr: Integers) -> Factorisation:
+        """Factorise the free block of K, given in CSR form with sorted indices.
+
+        A symmetric K may come whole or as its lower or upper triangle.
+
+        Raises
+        ------
+        SolverError
+            If an entry is not finite.
+        """
+        if not np.all(np.isfinite(data)):
+            raise SolverError("the tangent matrix is not finite: the deformation is too large or inside out")
+        block = self._block_of(indices, indptr)
+        matrix = block.extract(data)
+        self._substitute = None
+        if matrix.shape[0]:
+            self.engine.factorise(matrix)
+        self.latest = Factorisation(self, matrix, block.triangular)
+        return self.latest
+
+    def _block_of(self, indices: Integers, indptr: Integers) -> _FreeBlock:
+        """The free block's pattern, worked out again only when K's pattern has changed."""
+        known = self._pattern
+        if (
+            self._block is None
+            or known is None
+            or not (np.array_equal(known[0], indices) and np.array_equal(known[1], indptr))
+        ):
+            self._block = _FreeBlock.of(indices, indptr, self.free, self.symmetric)
+            self._pattern = np.array(indices), np.array(indptr)
+        return self._block
+
+    def is_triangle(self, matrix: Matrix) -> bool:
+        """Whether only one triangle of ``matrix`` is stored; looked at once for each array of columns."""
+        if self._triangle is None or not np.may_share_memory(self._triangle[0], matrix.indices):
+            one_sided = sp.triu(matrix, 1).nnz == 0 or sp.tril(matrix, -1).nnz == 0
+            self._triangle = matrix.indices, one_sided
+        return self._triangle[1]
+
+    def engines_to_try(self, matrix: Matrix) -> Iterator[Engine]:
+        """The engine, then (lazily, once for each matrix) SuperLU in its place."""
+        yield self.engine
+        if self._substitute is None:
+            self._substitute = SuperLU(triangular=self.symmetric)
+            self._substitute.factorise(matrix)
+        yield self._substitute
+
+    def release(self) -> None:
+        """Give the factorisation's memory back; the next `factorise` begins anew."""
+        self.engine.release()
+        self.latest = self._substitute = None
+
+
+class AssembledLinearisation:
+    """Residual and tangent in CSR form; factorised when first solved with, and again if need be.
+
+    Parameters
+    ----------
+    residual : (n,) internal minus external forces at all dofs.
+    matrix : K over all dofs, whole or, if symmetric, one triangle; its data must not change afterwards.
+    solver : shared by the linearisations of one problem, so that PARDISO's analysis is kept.
+    """
+
+    def __init__(self, residual: Array, matrix: Matrix, solver: LinearSolver) -> None:
+        self.residual, self._matrix, self._solver = residual, matrix, solver
+        self._factorisation: Factorisation | None = None
+        self._triangular = solver.symmetric and solver.is_triangle(matrix)
+
+    def _factorised(self) -> Factorisation:
+        if self._factorisation is None or not self._factorisation.current:
+            matrix = self._matrix
+            self._factorisation = self._solver.factorise(matrix.data, matrix.indices, matrix.indptr)
+        return self._factorisation
+
+    @property
+    def negative_pivots(self) -> int | None:
+        return self._factorised().negative_pivots
+
+    def solve(self, right: Array) -> Array:
+        """K_ff^-1 right_f for (n,) or (k, n), zero at prescribed dofs."""
+        return self._factorised().solve(right)
+
+    def apply(self, vectors: Array) -> Array:
+        """K times (n,) or (k, n), at all dofs."""
+        return multiply(self._matrix, vectors.T, self._triangular).T

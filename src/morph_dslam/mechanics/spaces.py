@@ -1,0 +1,255 @@
+"""The finite element space of the displacements of a solid, and its relation to the mesh's nodes.
+
+NGSolve's basis is hierarchical: vertex functions have nodal values for coefficients; edges, faces and cells
+add bubbles (Zaglmayr, High Order Finite Element Methods for Electromagnetic Field Computation, PhD thesis,
+Linz 2006, chapter 5). A solid knows nodes: this module translates in both directions, says which coefficients
+a set of nodes holds, and hands NGSolve the curved shape of second-order cells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import ngsolve as ngs
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.ngsolve_mesh import NgsolveMesh, reference_points
+from morph_dslam.meshing.cell_types import CellType, cell_type
+from morph_dslam.meshing.meshes import Mesh
+
+Array = NDArray[np.float64]
+
+Indices = NDArray[np.int64]
+
+#: The cell type of each shape that has a node for every function of second order.
+FULL_TYPE = {"tet": "tet10", "prism": "prism18", "hex": "hex27"}
+
+SERENDIPITY = {"prism15", "hex20"}
+
+#: Mid-side nodes nearer than this part of the mesh's size to the middle of straight edges count as straight.
+STRAIGHT = 1e-12
+
+
+@dataclass(frozen=True)
+class _BlockBasis:
+    """The space on one block of cells.
+
+    Attributes
+    ----------
+    dofs : (m, b) scalar dof numbers of each cell.
+    owner : (b,) node of the full second-order cell that each function belongs to, where it is largest.
+    values : (k, b) functions at the nodes of the block's own cell type.
+    """
+
+    type: CellType
+    connectivity: Indices
+    dofs: Indices
+    owner: Indices
+    values: Array
+
+
+class DisplacementSpace:
+    """Continuous displacements of first or second order.
+
+    Scalar dofs are numbered 0 ... n_scalar - 1; a displacement field has n_scalar of x, then of y, then of z.
+
+    Parameters
+    ----------
+    geometry : the mesh.
+    order : 1 or 2; None takes that of the cells.
+    full : use every function of second order even where hex20 or prism15 give the shape.
+
+    Attributes
+    ----------
+    scalar, vector : NGSolve's spaces.
+    node_values : sparse (n_nodes, n_scalar): values at nodes from coefficients.
+    coefficients : sparse (n_scalar, n_nodes): coefficients of the interpolation of nodal values.
+    coordinates : (n_scalar, 3) coefficients of the position X, m.
+    bonus_order : what integrals over cells need beyond NGSolve's own order of quadrature.
+
+    Raises
+    ------
+    StudyError
+        If cell types do not go together, or the order is below that of the cells.
+    """
+
+    def __init__(self, geometry: NgsolveMesh, order: int | None = None, full: bool = False) -> None:
+        self.geometry = geometry
+        mesh = geometry.mesh
+        types = {block.cell_type for block in mesh.blocks}
+        shape_order = max(block.type.order for block in mesh.blocks)
+        self.order = shape_order if order is None else order
+        if min(block.type.order for block in mesh.blocks) < shape_order:
+            raise StudyError(f"first- and second-order cells meet in one mesh: {', '.join(sorted(types))}")
+        if self.order not in (1, 2) or self.order < shape_order:
+            raise StudyError(f"elements of order {order} on cells of order {shape_order}: use {shape_order} or 2")
+        if types & SERENDIPITY and types & {"prism18", "hex27"}:
+            raise StudyError(f"cells with and without nodes on their faces meet: {', '.join(sorted(types))}")
+        self.scalar = ngs.H1(geometry.ngs, order=self.order)
+        if types & SERENDIPITY and not full:
+            self.scalar.SetOrder(ngs.QUAD, 1)
+            self.scalar.SetOrder(ngs.HEX, 1)
+            self.scalar.Update()
+        self.vector = ngs.VectorValued(self.scalar, 3)
+        self.n_scalar: int = self.scalar.ndof
+        self._blocks = self._make_blocks()
+        self._relate_nodes()
+        self.bonus_order = 0
+        self.coordinates: Array = self.coefficients @ mesh.nodes
+        self._curve()
+
+    def _make_blocks(self) -> list[_BlockBasis]:
+        mesh, blocks = self.geometry.mesh, []
+        for block, start in zip(mesh.blocks, mesh.block_starts()[:-1], strict=True):
+            elements = self.geometry.element_of_cell[start : start + len(block.connectivity)]
+            ids = [ngs.ElementId(ngs.VOL, int(e)) for e in elements]
+            dofs = np.array([self.scalar.GetDofNrs(i) for i in ids], dtype=np.int64)
+            # Functions of order 2 are even along edges and faces: the first cell's serve for all.
+            element = self.scalar.GetFE(ids[0])
+            full = cell_type(FULL_TYPE[block.type.shape])
+            points = reference_points(full.shape, full.nodes)
+            values = np.array([np.array(element.CalcShape(*map(float, p))).ravel() for p in points])
+            owner = np.argmax(np.abs(values), axis=0)
+            nodes = len(block.type.nodes)
+            blocks.append(_BlockBasis(block.type, block.connectivity, dofs, owner, values[:nodes]))
+        return blocks
+
+    def _relate_nodes(self) -> None:
+        n_nodes = self.geometry.mesh.n_nodes
+        self.node_values = sp.csr_matrix((n_nodes, self.n_scalar))
+        self.coefficients = sp.csr_matrix((self.n_scalar, n_nodes))
+        nodes_done, dofs_done = np.zeros(n_nodes, dtype=bool), np.zeros(self.n_scalar, dtype=bool)
+        for basis in self._blocks:
+            shape_functions = basis.owner < len(basis.type.nodes)
+            inverse = np.zeros(basis.values.T.shape)
+            inverse[shape_functions] = np.linalg.inv(basis.values[:, shape_functions])
+            self.node_values += _rows_once(
+                basis.connectivity, basis.dofs, basis.values, nodes_done, (n_nodes, self.n_scalar)
+            )
+            self.coefficients += _rows_once(
+                basis.dofs, basis.connectivity, inverse, dofs_done, (self.n_scalar, n_nodes)
+            )
+
+    def _curve(self) -> None:
+        """Give NGSolve the cells' true shape: coefficients of the position beyond the corners.
+
+        It goes on choosing quadrature for straight cells, which on tetrahedra is too low for curved ones.
+        """
+        bubbles = self.coordinates.copy()
+        bubbles[: self.geometry.ngs.nv] = 0.0
+        if np.abs(bubbles).max() > STRAIGHT * np.ptp(self.geometry.mesh.nodes, axis=0).max():
+            self._deformation = ngs.GridFunction(self.vector)
+            self._deformation.vec.FV().NumPy()[:] = bubbles.T.ravel()
+            self.geometry.ngs.SetDeformation(self._deformation)
+            self.bonus_order = self.curved_bonus_order
+
+    @property
+    def curved_bonus_order(self) -> int:
+        """`bonus_order` where cells are curved, by their nodes or by a shape parameter."""
+        return 2 if any(basis.type.shape == "tet" for basis in self._blocks) else 0
+
+    def dofs_on(self, nodes: Indices) -> Indices:
+        """Scalar dofs (sorted) that a set of nodes holds.
+
+        Those of its own nodes; and where elements have functions beyond the nodes of the cells, those on
+        edges and faces all of whose nodes are in the set. Functions inside of cells are never held.
+        """
+        inside = np.zeros(self.geometry.mesh.n_nodes, dtype=bool)
+        inside[nodes] = True
+        held = np.zeros(self.n_scalar, dtype=bool)
+        for basis in self._blocks:
+            full = cell_type(FULL_TYPE[basis.type.shape])
+            corner_sets = [{i} for i in range(full.corners)] + [set(p) for p in full.parents]
+            for column, owner in enumerate(basis.owner):
+                if len(corner_sets[owner]) == full.corners:
+                    continue
+                closure = (
+                    [owner]
+                    if owner < len(basis.type.nodes)
+                    else [i for i in range(len(basis.type.nodes)) if corner_sets[i] <= corner_sets[owner]]
+                )
+                rows = inside[basis.connectivity[:, closure]].all(axis=1)
+                held[basis.dofs[rows, column]] = True
+        return np.flatnonzero(held)
+
+
+def _rows_once(
+    rows: Indices, columns: Indices, values: Array, done: NDArray[np.bool_], shape: tuple[int, int]
+) -> sp.csr_matrix:
+    """Sparse matrix from cells' blocks ``values`` (r, c), each row written by the first cell that has it.
+
+    ``rows`` (m, r) and ``columns`` (m, c) number them; ``done`` marks rows written before and is updated.
+    """
+    numbers, first = np.unique(rows.ravel(), return_index=True)
+    new = ~done[numbers]
+    numbers, first = numbers[new], first[new]
+    done[numbers] = True
+    cell, local = np.divmod(first, rows.shape[1])
+    data = values[local]
+    i = np.repeat(numbers, values.shape[1])
+    matrix = sp.csr_matrix((data.ravel(), (i, columns[cell].ravel())), shape=shape)
+    matrix.eliminate_zeros()
+    return matrix
+
+
+# Pressures of nearly incompressible solids: the mixed form and the space that makes it stable.
+# The energy remainder(F) + p g(F) - p^2 / (2 K) (see `materials.base`) needs displacements rich enough for
+# the pressures (the inf-sup condition of Ladyzhenskaya, Babuska and Brezzi). Pairs used here:
+# hexahedra, second order 27 nodes with a linear pressure in each cell, discontinuous: stable (Boffi, Brezzi
+# and Fortin, Mixed Finite Element Methods and Applications, 2013, section 8.6), and condensed cell by cell so
+# that it costs next to nothing tetrahedra and prisms, Taylor and Hood's: pressures linear in each cell and
+# continuous within a material second order hexahedra, first order one pressure a cell (mean dilatation: Simo,
+# Taylor and Pister, 1985). Displacements are good; neighbouring pressures may alternate, and average out at
+# nodes
+
+
+def check_mixed(mesh: Mesh, order: int) -> None:
+    """Refuse cells that have no stable mixed element (StudyError)."""
+    shapes = {block.type.shape for block in mesh.blocks}
+    if order == 1 and shapes != {"hex"}:
+        raise StudyError(
+            "mixed elements of first order exist for hex8 only: use tet10 or prism18, or order = 2, "
+            "for a nearly incompressible material"
+        )
+
+
+class PressureSpace:
+    """Pressures on one region, as a combination of scalar unknowns.
+
+    Parameters
+    ----------
+    space : the displacements, of full order.
+    region : where the material is.
+
+    Attributes
+    ----------
+    spaces : NGSolve spaces of the unknowns; `combine` makes the pressure of their functions.
+    """
+
+    def __init__(self, space: DisplacementSpace, region: ngs.Region) -> None:
+        geometry = space.geometry
+        mesh, ngs_mesh = geometry.mesh, geometry.ngs
+        hexahedra = {block.type.shape for block in mesh.blocks} == {"hex"}
+        self._offsets: list[Any] = []
+        if not hexahedra:
+            self.spaces = [ngs.H1(ngs_mesh, order=1, definedon=region)]
+            return
+        count = 1 if space.order == 1 else 4
+        self.spaces = [ngs.L2(ngs_mesh, order=0, definedon=region) for _ in range(count)]
+        if count == 4:
+            corners = np.concatenate([mesh.nodes[b.connectivity[:, :8]] for b in mesh.blocks])
+            centre = geometry.cell_field(corners.mean(axis=1))
+            size = geometry.cell_field(np.ptp(corners, axis=1).max(axis=1))
+            offset = (ngs.CF((ngs.x, ngs.y, ngs.z)) - centre) / size
+            self._offsets = [offset[i] for i in range(3)]
+
+    def combine(self, unknowns: list[Any]) -> Any:
+        """Pressure of functions of `spaces`, in their unit."""
+        result = unknowns[0]
+        for offset, slope in zip(self._offsets, unknowns[1:], strict=True):
+            result = result + offset * slope
+        return result

@@ -1,0 +1,371 @@
+"""Cells of first order to second order and back: middle nodes added halfway between corners, or dropped."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import StudyError
+from morph_dslam.io.inp_file import InpFile, SurfacePart, read_inp
+from morph_dslam.meshing.cell_types import cell_type
+from morph_dslam.meshing.mesh_checks import reoriented, without_collapsed_cells
+from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces
+from morph_dslam.meshing.netgen_meshing import SURFACES, mesh_step_file, mesh_surface_file
+from morph_dslam.units import to_si
+
+Indices = NDArray[np.int64]
+
+#: Second-order types by the first-order type that they refine.
+SECOND_ORDER: dict[str, tuple[str, ...]] = {
+    "hex8": ("hex20", "hex27"),
+    "tet4": ("tet10",),
+    "prism6": ("prism15", "prism18"),
+}
+
+FIRST_ORDER = {name: linear for linear, names in SECOND_ORDER.items() for name in names}
+
+
+def _target(block: CellBlock, wanted: tuple[str, ...]) -> str:
+    known = SECOND_ORDER.get(block.cell_type, ())
+    if not known:
+        raise StudyError(f"{block.cell_type} cells cannot be given middle nodes; only {', '.join(SECOND_ORDER)} can")
+    return next((name for name in wanted if name in known), known[0])
+
+
+def _corners_around(connectivity: Indices, parents: tuple[tuple[int, ...], ...]) -> Indices:
+    """(m * len(parents), 8) sorted corners around each middle node; shorter rows begin with -1."""
+    around = np.full((len(connectivity), len(parents), 8), -1, dtype=np.int64)
+    for i, parent in enumerate(parents):
+        around[:, i, : len(parent)] = connectivity[:, parent]
+    return np.sort(around.reshape(-1, 8), axis=1)
+
+
+def to_second_order(mesh: Mesh, *wanted: str) -> Mesh:
+    """Give every cell its middle nodes, halfway between the corners around them.
+
+    A node set takes in the middle nodes all of whose corners it holds; one that bears the name of a surface
+    takes in that surface's. Surfaces and cell sets stay as they are.
+
+    Parameters
+    ----------
+    mesh : cells of first order only.
+    wanted : second-order types such as "hex20"; the first of each type in `SECOND_ORDER` where none is named.
+
+    Raises
+    ------
+    StudyError
+        If a cell has no second-order type (sheets), or is of second order already.
+    """
+    targets = [_target(block, wanted) for block in mesh.blocks]
+    around = [
+        _corners_around(block.connectivity, cell_type(name).parents)
+        for block, name in zip(mesh.blocks, targets, strict=True)
+    ]
+    corners, numbers = np.unique(np.concatenate(around), axis=0, return_inverse=True)
+    valid = corners >= 0
+    positions = np.where(valid[:, :, None], mesh.nodes[corners], 0.0).sum(axis=1) / valid.sum(axis=1)[:, None]
+    blocks, first = [], 0
+    for block, name, rows in zip(mesh.blocks, targets, around, strict=True):
+        middle = mesh.n_nodes + numbers.ravel()[first : first + len(rows)]
+        first += len(rows)
+        new = np.hstack([block.connectivity, middle.reshape(len(block.connectivity), -1)])
+        blocks.append(CellBlock(name, new))
+    sets = {}
+    for name, nodes in mesh.node_sets.items():
+        member = np.zeros(mesh.n_nodes, dtype=bool)
+        member[nodes] = True
+        added = mesh.n_nodes + np.flatnonzero((member[corners] | ~valid).all(axis=1))
+        sets[name] = np.concatenate([np.unique(nodes), added])
+    refined = replace(mesh, nodes=np.vstack([mesh.nodes, positions]), blocks=tuple(blocks), node_sets=sets)
+    on_surfaces = {name: refined.surface_nodes(name) for name in sets if name in mesh.surfaces}
+    return replace(refined, node_sets={**sets, **on_surfaces})
+
+
+def to_first_order(mesh: Mesh) -> Mesh:
+    """Drop the middle nodes of second-order cells; the corners keep their positions and their order."""
+    blocks = tuple(
+        CellBlock(FIRST_ORDER.get(block.cell_type, block.cell_type), block.connectivity[:, : block.type.corners])
+        for block in mesh.blocks
+    )
+    return replace(mesh, blocks=blocks).without_unused_nodes()
+
+
+# Gmsh, VTK and VTU files through meshio, with their physical groups and integer data as sets.
+
+
+#: Our cell types by meshio's names; its node order is VTK's, save that linear prisms are as Abaqus's.
+_CELLS = {
+    "tetra": "tet4", "tetra10": "tet10", "triangle": "tri3", "quad": "quad4",
+    "wedge": "prism6", "wedge18": "prism18",
+    "hexahedron": "hex8", "hexahedron20": "hex20", "hexahedron27": "hex27",
+}  # fmt: skip
+
+#: Dimension of the cells that may only bound others.
+_BOUNDING = {"vertex": 0, "line": 1, "line3": 1, "triangle6": 2, "quad8": 2, "quad9": 2}
+
+#: Integer data with more values than this number things rather than group them.
+_MOST_GROUPS = 256
+
+
+def read_with_meshio(path: Path) -> Mesh:
+    """Read a .msh, .vtk or .vtu file; nodes in file units.
+
+    Cells of the highest dimension make the mesh. Gmsh's physical groups of that dimension become cell sets;
+    those of faces of solids become surfaces, and all lower ones node sets. In VTK files integer cell data
+    named d with value v becomes the cell set "d_v", and integer point data the node set "d_v".
+
+    Raises
+    ------
+    StudyError
+        If the file cannot be read, is cut short, or holds cells that are not known.
+    """
+    content = _read(path)
+    dimension = max((_dimension(block.type, path) for block in content.cells), default=0)
+    if dimension < 2 or all(block.type not in _CELLS for block in content.cells):
+        raise StudyError(f"{path} holds no solid or sheet cells; mesh the volume (or the sheet) and save that")
+    top = [i for i, block in enumerate(content.cells) if _dimension(block.type, path) == dimension]
+    unknown = sorted({content.cells[i].type for i in top} - set(_CELLS))
+    if unknown:
+        raise StudyError(f"{path} holds {', '.join(unknown)} cells, which are not known; use {', '.join(_CELLS)}")
+    blocks = [CellBlock(_CELLS[content.cells[i].type], content.cells[i].data.astype(np.int64)) for i in top]
+    nodes = np.zeros((len(content.points), 3))
+    nodes[:, : content.points.shape[1]] = content.points
+    mesh = Mesh(nodes, tuple(blocks))
+    for block in blocks:
+        if block.connectivity.size and not 0 <= block.connectivity.min() <= block.connectivity.max() < len(nodes):
+            raise StudyError(f"{path} has cells that refer to nodes which it does not hold ({len(nodes)} are there)")
+    return _with_groups(mesh, content, top, dimension, path)
+
+
+def _read(path: Path) -> Any:
+    readers = {".msh": meshio.gmsh.read, ".vtk": meshio.vtk.read, ".vtu": meshio.vtu.read}
+    try:
+        if path.suffix.lower() == ".msh":
+            _check_sections_closed(path)
+        with redirect_stdout(StringIO()), redirect_stderr(StringIO()) as warnings:
+            content = readers[path.suffix.lower()](str(path))
+    except OSError as error:
+        raise StudyError(f"cannot read the mesh {path}: {error.strerror or error}") from error
+    except StudyError:
+        raise
+    except ValueError as error:
+        if "gmsh:physical" in str(error):  # meshio counts the groups wrongly where an entity has none
+            raise StudyError(
+                f"{path} holds cells of no physical group beside cells of some; put every entity that is "
+                "saved into a group, or save the groups alone (Mesh.SaveAll = 0)"
+            ) from error
+        raise _damaged(path, error) from error
+    except KeyError as error:  # a cell type without a place in meshio's tables, or a damaged file
+        if "wedge15" in error.args:
+            raise StudyError(f"{path} holds prisms of 15 nodes; save it as .inp, or with 18 nodes") from error
+        raise _damaged(path, error) from error
+    except Exception as error:  # a damaged file ends meshio's readers in errors of every kind
+        raise _damaged(path, error) from error
+    if "cannot handle" in warnings.getvalue():  # meshio leaves out cells that it does not know, such as voxels
+        raise StudyError(f"{path} holds cells that are not known; use {', '.join(_CELLS)}")
+    return content
+
+
+def _damaged(path: Path, error: Exception) -> StudyError:
+    return StudyError(f"{path} is damaged, cut short, or no {path.suffix} file ({type(error).__name__}: {error})")
+
+
+def _check_sections_closed(path: Path) -> None:
+    """Meshio only warns where a Gmsh file ends inside a section."""
+    content = path.read_bytes()
+    for name in re.findall(rb"^\$(MeshFormat|PhysicalNames|Entities|Nodes|Elements)\s*$", content, re.MULTILINE):
+        if not re.search(rb"^\$End" + name + rb"\s*$", content, re.MULTILINE):
+            line = content[: content.index(b"$" + name)].count(b"\n") + 1
+            raise StudyError(f"{path}, line {line}: the section ${name.decode()} is not closed; the file is cut short")
+
+
+def _dimension(name: str, path: Path) -> int:
+    if name in _CELLS:
+        return cell_type(_CELLS[name]).dimension
+    if name in _BOUNDING:
+        return _BOUNDING[name]
+    raise StudyError(f"{path} holds {name} cells, which are not known; use {', '.join(_CELLS)}")
+
+
+def _groups(content: Any) -> Iterator[tuple[str, list[Indices]]]:
+    """Names of groups, and for each block of the file the positions of the group's cells in it."""
+    physical = content.cell_data.get("gmsh:physical")
+    by_name = {name: part for name, part in content.cell_sets.items() if not name.startswith("gmsh:")}
+    if by_name:
+        for name, parts in by_name.items():
+            yield name, [np.asarray([] if part is None else part, dtype=np.int64) for part in parts]
+    elif physical is not None:
+        dimensions = {name: int(entry[1]) for name, entry in content.field_data.items()}
+        for name, entry in content.field_data.items():
+            yield (
+                name,
+                [
+                    np.flatnonzero((tags == entry[0]) & (_any_dimension(block.type) == dimensions[name]))
+                    for block, tags in zip(content.cells, physical, strict=True)
+                ],
+            )
+    for name, columns in content.cell_data.items():
+        parts = [_column(part) for part in columns]
+        if name.startswith("gmsh:") or not all(_is_one_integer_each(part) for part in parts):
+            continue
+        values = np.unique(np.concatenate(parts))
+        for value in values if len(values) <= _MOST_GROUPS else ():
+            yield f"{name}_{value}", [np.flatnonzero(part == value) for part in parts]
+
+
+def _any_dimension(name: str) -> int:
+    return cell_type(_CELLS[name]).dimension if name in _CELLS else _BOUNDING[name]
+
+
+def _with_groups(mesh: Mesh, content: Any, top: list[int], dimension: int, path: Path) -> Mesh:
+    starts = dict(zip(top, mesh.block_starts()[:-1], strict=True))
+    node_sets: dict[str, Indices] = {}
+    cell_sets: dict[str, Indices] = {}
+    surfaces: dict[str, Indices] = {}
+    for name, parts in _groups(content):
+        rows = [(i, part) for i, part in enumerate(parts) if len(part)]
+        cells = [starts[i] + part for i, part in rows if i in starts]
+        if cells:
+            cell_sets[name] = np.concatenate(cells)
+            continue
+        bounding = [content.cells[i].data[part] for i, part in rows]
+        if not bounding:
+            continue
+        node_sets[name] = np.unique(np.concatenate([part.ravel() for part in bounding])).astype(np.int64)
+        if dimension == 3 and all(_any_dimension(content.cells[i].type) == 2 for i, _ in rows):
+            surfaces[name] = _faces(mesh, content, rows, name, path)
+    node_sets |= dict(_point_groups(content))
+    return Mesh(mesh.nodes, mesh.blocks, node_sets, cell_sets, surfaces).without_unused_nodes()
+
+
+def _faces(mesh: Mesh, content: Any, rows: list[tuple[int, Indices]], name: str, path: Path) -> Indices:
+    parts = []
+    for i, part in rows:
+        corners = 3 if content.cells[i].type.startswith("triangle") else 4
+        parts.append(find_faces(mesh, content.cells[i].data[part][:, :corners]))
+    faces = np.concatenate(parts)
+    if (faces < 0).any():
+        raise StudyError(f"{path}: {(faces[:, 0] < 0).sum()} faces of group '{name}' are faces of no solid cell")
+    return faces
+
+
+def _point_groups(content: Any) -> Iterator[tuple[str, Indices]]:
+    for name, column in content.point_data.items():
+        values = _column(column)
+        if name.startswith("gmsh:") or not _is_one_integer_each(values):
+            continue
+        kinds = np.unique(values)
+        for value in kinds if len(kinds) <= _MOST_GROUPS else ():
+            yield f"{name}_{value}", np.flatnonzero(values == value)
+
+
+def _column(values: np.ndarray) -> np.ndarray:
+    """Legacy VTK that states its one component, `SCALARS part int 1`, is read as a column (n, 1)."""
+    return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
+
+
+def _is_one_integer_each(values: np.ndarray) -> bool:
+    return values.ndim == 1 and np.issubdtype(values.dtype, np.integer)
+
+
+# Mesh files of every kind that is read, by one function.
+
+
+#: Abaqus lists a C3D27's centre before the centres of its faces S1 to S6; VTK has opposite faces, then it.
+_HEX27_FROM_ABAQUS = [*range(20), 26, 24, 23, 25, 21, 22, 20]
+
+_VOLUMES = (".inp", ".msh", ".vtk", ".vtu", ".step", ".stp")
+
+
+def load_mesh(path: Path | str, unit: str, size: float | None = None) -> Mesh:
+    """Read a mesh file, or mesh the volume that a surface or a STEP file describes.
+
+    Parameters
+    ----------
+    path : .inp (Abaqus, CalculiX), .msh (Gmsh), .vtk, .vtu; .stl, .obj, .ply (closed surfaces); .step, .stp.
+    unit : the unit of length in which the file was drawn: "m", "cm" or "mm".
+    size : longest edge of a cell where Netgen meshes the volume, metres; other files take none.
+
+    Returns
+    -------
+    Mesh
+        In metres, without the nodes that no cell uses; see `mesh_repair` for what is mended. Not yet checked:
+        see `check_mesh`.
+
+    Raises
+    ------
+    StudyError
+        If the kind of file or the unit is not known, or the file is damaged.
+    """
+    path, scale = Path(path), to_si(1.0, unit, "length")
+    kind = path.suffix.lower()
+    if kind not in _VOLUMES + SURFACES:
+        raise StudyError(f"{path} is no mesh file that is read; use {', '.join(_VOLUMES + SURFACES)}")
+    if size is not None and size <= 0.0:
+        raise StudyError(f"a cell size of {size} m cannot be; give a positive length")
+    if size is not None and kind not in (*SURFACES, ".step", ".stp"):
+        raise StudyError(f"{path} is meshed already; a cell size is for surfaces and STEP files")
+    if kind in SURFACES:
+        return mesh_surface_file(path, None if size is None else size / scale).transformed(scale)
+    if kind in (".step", ".stp"):
+        return mesh_step_file(path, unit, None if size is None else size * 1e3).transformed(1e-3)
+    mesh = mesh_from_inp(read_inp(path)) if kind == ".inp" else read_with_meshio(path)
+    return reoriented(without_collapsed_cells(mesh)).transformed(scale)
+
+
+def _positions(labels: Indices, wanted: Indices) -> Indices:
+    """Positions of wanted labels in a list that holds them all."""
+    order = np.argsort(labels)
+    return order[np.searchsorted(labels, wanted, sorter=order)]
+
+
+def mesh_from_inp(file: InpFile) -> Mesh:
+    """The mesh of an input file, in file units; element sets become cell sets.
+
+    Raises
+    ------
+    StudyError
+        If a surface names a face that its elements do not have.
+    """
+    blocks = []
+    for part in file.elements:
+        connectivity = _positions(file.node_labels, part.connectivity)
+        if part.cell_type == "hex27":
+            connectivity = connectivity[:, _HEX27_FROM_ABAQUS]
+        blocks.append(CellBlock(part.cell_type, connectivity))
+    element_labels = np.concatenate([part.labels for part in file.elements])
+    mesh = Mesh(
+        nodes=file.nodes,
+        blocks=tuple(blocks),
+        node_sets={name: _positions(file.node_labels, nodes) for name, nodes in file.node_sets.items()},
+        cell_sets={name: _positions(element_labels, cells) for name, cells in file.element_sets.items()},
+    )
+    surfaces = {
+        name: np.concatenate([_part_faces(mesh, part, element_labels) for part in parts])
+        for name, parts in file.surfaces.items()
+    }
+    return replace(mesh, surfaces=surfaces).without_unused_nodes()
+
+
+def _part_faces(mesh: Mesh, part: SurfacePart, element_labels: Indices) -> Indices:
+    cells = _positions(element_labels, part.elements)
+    if not part.face:
+        boundary = mesh.boundary_faces()
+        return boundary[np.isin(boundary[:, 0], cells)]
+    starts = mesh.block_starts()
+    types = [mesh.blocks[i].type for i in np.unique(np.searchsorted(starts, cells, side="right") - 1)]
+    number = int(part.face[1:]) - 1 if part.face[1:].isdigit() else 0
+    for cell in types:
+        faces = ["SPOS"] if cell.dimension == 2 else [f"S{i + 1}" for i in range(len(cell.faces))]
+        if part.face not in faces:
+            raise part.line.error(f"a {cell.name} element has no face {part.face}; use {', '.join(faces)}")
+    return np.column_stack([cells, np.full(len(cells), number)])

@@ -1,0 +1,287 @@
+"""Meshes: nodes in metres, cells in blocks of one type, and the named sets that a study refers to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import StudyError
+from morph_dslam.meshing.cell_types import CELL_TYPES, CellType, cell_type
+from morph_dslam.studies.problem import ModelMesh
+
+Array = NDArray[np.float64]
+
+Indices = NDArray[np.int64]
+
+#: For each cell type the nodes of its faces; see `CellType.faces`.
+FACES: dict[str, tuple[tuple[int, ...], ...]] = {name: cell_type(name).faces for name in CELL_TYPES}
+
+#: Triangles that draw a face of so many nodes (corners, then middle nodes), turning as the face does.
+_FACE_TRIANGLES: dict[int, tuple[tuple[int, int, int], ...]] = {
+    3: ((0, 1, 2),),
+    4: ((0, 1, 2), (0, 2, 3)),
+    6: ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)),
+    8: ((0, 4, 7), (4, 1, 5), (5, 2, 6), (6, 3, 7), (4, 5, 7), (5, 6, 7)),
+    9: ((0, 4, 7), (4, 1, 5), (5, 2, 6), (6, 3, 7), (4, 5, 8), (5, 6, 8), (6, 7, 8), (7, 4, 8)),
+}
+
+
+@dataclass(frozen=True)
+class CellBlock:
+    """Cells of one type.
+
+    Attributes
+    ----------
+    cell_type : "hex8", "hex20", "hex27", "tet4", "tet10", "prism6", "prism15", "prism18"; for
+        sheets "tri3", "quad4".
+    connectivity : (m, k) node indices in VTK's order.
+    """
+
+    cell_type: str
+    connectivity: Indices
+
+    @property
+    def type(self) -> CellType:
+        return cell_type(self.cell_type)
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A mesh with named sets.
+
+    Attributes
+    ----------
+    nodes : (n, 3) coordinates, metres.
+    blocks : the cells, numbered through all blocks in order.
+    node_sets : node indices by name.
+    cell_sets : cell indices by name; materials are given by cell set, and "all" always means every cell.
+    surfaces : faces by name, (f, 2): cell index and local face number (the position in ``FACES[cell_type]``).
+    """
+
+    nodes: Array
+    blocks: tuple[CellBlock, ...]
+    node_sets: Mapping[str, Indices] = field(default_factory=dict)
+    cell_sets: Mapping[str, Indices] = field(default_factory=dict)
+    surfaces: Mapping[str, Indices] = field(default_factory=dict)
+
+    @property
+    def n_nodes(self) -> int:
+        return len(self.nodes)
+
+    @property
+    def n_cells(self) -> int:
+        return sum(len(block.connectivity) for block in self.blocks)
+
+    def block_starts(self) -> Indices:
+        """Index of each block's first cell, and the number of cells at the end."""
+        return np.cumsum([0, *(len(block.connectivity) for block in self.blocks)])
+
+    def cells(self, name: str) -> Indices:
+        """Indices of the cells of a set; "all" is every cell. Raises StudyError if there is no such set."""
+        if name == "all":
+            return np.arange(self.n_cells)
+        return self._named(self.cell_sets, name, "cell set")
+
+    def set_nodes(self, name: str) -> Indices:
+        """Sorted nodes of the node set, or else of the surface, of this name.
+
+        Raises
+        ------
+        StudyError
+            If the mesh has neither.
+        """
+        if name not in self.node_sets and name in self.surfaces:
+            return self.surface_nodes(name)
+        return np.unique(self._named(self.node_sets, name, "node set or surface", self.surfaces))
+
+    def surface(self, name: str) -> Indices:
+        """Faces (f, 2) of a surface. Raises StudyError if there is none of this name."""
+        return self._named(self.surfaces, name, "surface")
+
+    def surface_nodes(self, name: str) -> Indices:
+        """Sorted nodes of a surface, the middle nodes of its faces included; raises as `surface` does."""
+        nodes = np.unique(self.face_nodes(self.surface(name)))
+        return nodes[nodes >= 0]
+
+    def _named(self, sets: Mapping[str, Indices], name: str, what: str, more: Mapping = {}) -> Indices:
+        if name not in sets:
+            known = ", ".join(sorted({*sets, *more})) or "none"
+            raise StudyError(f"the mesh has no {what} '{name}'; it has: {known}")
+        return sets[name]
+
+    def all_faces(self) -> Indices:
+        """Every face of every cell, (f, 2): cell index and local face number."""
+        parts = []
+        for block, start in zip(self.blocks, self.block_starts()[:-1], strict=True):
+            m, n_faces = len(block.connectivity), len(block.type.faces)
+            cells = np.repeat(np.arange(start, start + m), n_faces)
+            parts.append(np.column_stack([cells, np.tile(np.arange(n_faces), m)]))
+        return np.concatenate(parts) if parts else np.empty((0, 2), dtype=np.int64)
+
+    def face_nodes(self, faces: Indices, corners_only: bool = False) -> Indices:
+        """Nodes (f, k) of faces (f, 2), in the order of `CellType.faces`; shorter rows end in -1."""
+        faces = np.asarray(faces, dtype=np.int64).reshape(-1, 2)
+        result = np.full((len(faces), 9), -1, dtype=np.int64)
+        starts = self.block_starts()
+        for block, start, stop in zip(self.blocks, starts[:-1], starts[1:], strict=True):
+            in_block = (faces[:, 0] >= start) & (faces[:, 0] < stop)
+            for number, local in enumerate(block.type.faces):
+                rows = np.flatnonzero(in_block & (faces[:, 1] == number))
+                nodes = np.array(local)
+                if corners_only:
+                    nodes = nodes[nodes < block.type.corners]
+                result[rows, : len(nodes)] = block.connectivity[np.ix_(faces[rows, 0] - start, nodes)]
+        return result[:, : int((result >= 0).any(axis=0).sum())]
+
+    def boundary_faces(self) -> Indices:
+        """Faces (f, 2) that belong to one cell alone: the outer surface; for sheets, every cell."""
+        faces = self.all_faces()
+        keys = np.sort(self.face_nodes(faces, corners_only=True), axis=1)
+        _, inverse, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+        return faces[counts[inverse.ravel()] == 1]
+
+    def face_triangles(self, faces: Indices) -> Indices:
+        """Triangles (t, 3) of node indices over faces (f, 2), through middle nodes, turning as they do."""
+        nodes = self.face_nodes(faces)
+        sizes = (nodes >= 0).sum(axis=1)
+        parts = [
+            nodes[sizes == size][:, np.array(triangles)].reshape(-1, 3)
+            for size, triangles in _FACE_TRIANGLES.items()
+            if (sizes == size).any()
+        ]
+        return np.concatenate(parts) if parts else np.empty((0, 3), dtype=np.int64)
+
+    def surface_triangles(self) -> Indices:
+        """Outward triangles (t, 3) of the outer surface, through corner and middle nodes; for drawing."""
+        return self.face_triangles(self.boundary_faces())
+
+    def transformed(self, scale: float = 1.0, rotation: Array | None = None, translation: Array | None = None) -> Mesh:
+        """The mesh with nodes at ``scale * rotation @ node + translation`` (metres)."""
+        nodes = self.nodes * scale
+        if rotation is not None:
+            nodes = nodes @ np.asarray(rotation).T
+        if translation is not None:
+            nodes = nodes + np.asarray(translation)
+        return replace(self, nodes=nodes)
+
+    def renumbered(self, new_index: Indices, nodes: Array) -> Mesh:
+        """The mesh on other ``nodes``: old node i becomes ``new_index[i]``; -1 drops it from all sets."""
+
+        def moved(old: Indices) -> Indices:
+            new = np.unique(new_index[old])
+            return new[new >= 0]
+
+        blocks = tuple(CellBlock(block.cell_type, new_index[block.connectivity]) for block in self.blocks)
+        sets = {name: moved(old) for name, old in self.node_sets.items()}
+        return replace(self, nodes=nodes, blocks=blocks, node_sets=sets)
+
+    def without_unused_nodes(self) -> Mesh:
+        """The mesh without the nodes that belong to no cell."""
+        used = np.zeros(self.n_nodes, dtype=bool)
+        for block in self.blocks:
+            used[block.connectivity] = True
+        return self.renumbered(np.where(used, np.cumsum(used) - 1, -1), self.nodes[used])
+
+
+# From a finite element mesh to that of a model file: visible surface, cells, and weights of the nodes.
+
+
+#: Cells whose Jacobians are held at once.
+_CHUNK = 4096
+
+
+def model_mesh_of(mesh: Mesh) -> ModelMesh:
+    """All nodes, the outer surface in triangles, and, for solids, the cells."""
+    solid = all(block.type.dimension == 3 for block in mesh.blocks)
+    return ModelMesh(
+        nodes=mesh.nodes,
+        triangles=mesh.surface_triangles(),
+        weights=lumped_weights(mesh),
+        cells={block.cell_type: block.connectivity for block in mesh.blocks} if solid else {},
+    )
+
+
+def lumped_weights(mesh: Mesh) -> Array:
+    """Share (n,) of each node in the volume (area, of sheets), each cell's split evenly among its nodes."""
+    weights = np.zeros(mesh.n_nodes)
+    for block in mesh.blocks:
+        points, quadrature = block.type.quadrature()
+        gradients = block.type.shape_gradients(points)
+        for cells in np.array_split(block.connectivity, max(1, len(block.connectivity) // _CHUNK)):
+            jacobians = np.einsum("mka,pkb->mpab", mesh.nodes[cells], gradients)
+            # sqrt(det J'J) is |det J| in solids and the area ratio in sheets.
+            metric = np.einsum("mpab,mpac->mpbc", jacobians, jacobians)
+            sizes = np.sqrt(np.linalg.det(metric)) @ quadrature
+            np.add.at(weights, cells, (sizes / cells.shape[1])[:, None])
+    return weights / weights.sum()
+
+
+# Finding the cell face that has given corner nodes.
+
+
+def _packed(corners: Indices) -> NDArray[np.void]:
+    """Rows of sorted corners as single comparable values; rows of three corners end in -1."""
+    padded = np.full((len(corners), 4), -1, dtype=np.int64)
+    padded[:, : corners.shape[1]] = corners
+    padded = np.ascontiguousarray(np.sort(padded, axis=1))
+    return padded.view(np.dtype((np.void, padded.dtype.itemsize * 4))).ravel()
+
+
+def find_faces(mesh: Mesh, corners: Indices) -> Indices:
+    """Faces (f, 2), cell and local face number, that have the given corners (f, 3 or 4) in any order.
+
+    Between two cells it is the first one's face; where no cell has such a face the row is -1.
+    """
+    faces = mesh.all_faces()
+    known = _packed(mesh.face_nodes(faces, corners_only=True))
+    wanted = _packed(np.asarray(corners, dtype=np.int64))
+    values, first = np.unique(known, return_index=True)
+    if not len(values):
+        return np.full((len(wanted), 2), -1, dtype=np.int64)
+    place = np.minimum(np.searchsorted(values, wanted), len(values) - 1)
+    found = values[place] == wanted
+    return np.where(found[:, None], faces[first[place]], -1)
+
+
+# Measures of a mesh by quadrature on its cells: volumes, centroids, areas, Jacobians.
+
+
+def jacobian_determinants(mesh: Mesh, block: CellBlock) -> Array:
+    """Volume (sheets: area) stretch (m, p) of each cell of a block at its quadrature points; SI.
+
+    Negative where a solid cell is turned inside out.
+    """
+    points, _ = block.type.quadrature()
+    gradients = block.type.shape_gradients(points)
+    jacobians = np.einsum("mka,pkb->mpab", mesh.nodes[block.connectivity], gradients, optimize=True)
+    if block.type.dimension == 2:
+        return np.linalg.norm(np.cross(jacobians[..., 0], jacobians[..., 1]), axis=-1)
+    return np.linalg.det(jacobians)
+
+
+def cell_volumes(mesh: Mesh) -> Array:
+    """Volume (m^3) of each cell, (n_cells,); of a sheet's cells the area (m^2)."""
+    parts = [jacobian_determinants(mesh, block) @ block.type.quadrature()[1] for block in mesh.blocks]
+    return np.concatenate(parts) if parts else np.empty(0)
+
+
+def centroid(mesh: Mesh) -> Array:
+    """Centre of volume (3,) of the mesh (of area, for sheets), metres."""
+    moment, volume = np.zeros(3), 0.0
+    for block in mesh.blocks:
+        points, weights = block.type.quadrature()
+        measures = jacobian_determinants(mesh, block) * weights
+        places = np.einsum("pk,mka->mpa", block.type.shape_functions(points), mesh.nodes[block.connectivity])
+        moment += np.einsum("mp,mpa->a", measures, places)
+        volume += measures.sum()
+    return moment / volume
+
+
+def surface_area(mesh: Mesh, name: str) -> float:
+    """Area (m^2) of a named surface, drawn through corner and middle nodes; raises StudyError if unknown."""
+    corners = mesh.nodes[mesh.face_triangles(mesh.surface(name))]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return float(0.5 * np.linalg.norm(normals, axis=1).sum())

@@ -1,0 +1,272 @@
+"""Triangulated surfaces from STL, OBJ and PLY files, and whether they close a volume."""
+
+# Netgen's Python modules are filled at run time by its C++ library, out of pyright's sight.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+from netgen import meshing, occ, stl
+from numpy.typing import NDArray
+
+from morph_dslam.errors import StudyError
+from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces
+
+Array = NDArray[np.float64]
+
+Indices = NDArray[np.int64]
+
+#: Endings of the files that are read.
+SURFACES = (".stl", ".obj", ".ply")
+
+
+@dataclass(frozen=True)
+class TriangleSurface:
+    """Points (n, 3) in file units and outward triangles (t, 3) of point indices."""
+
+    points: Array
+    triangles: Indices
+
+
+def read_surface(path: Path) -> TriangleSurface:
+    """Read a surface; polygons are cut into triangles and coincident points made one.
+
+    Raises
+    ------
+    StudyError
+        If it is a file of another kind, cannot be read, or holds no faces.
+    """
+    if path.suffix.lower() not in SURFACES:
+        raise StudyError(f"{path} is no surface file that is read; use {', '.join(SURFACES)}")
+    try:
+        points, triangles = _read_obj(path) if path.suffix.lower() == ".obj" else _read_stl_or_ply(path)
+    except OSError as error:
+        raise StudyError(f"cannot read the surface {path}: {error.strerror or error}") from error
+    if not len(triangles):
+        raise StudyError(f"{path} holds no faces; it is no closed surface, or is cut short")
+    if not np.isfinite(points).all():
+        raise StudyError(f"{path} holds coordinates that are not finite")
+    if not 0 <= triangles.min() <= triangles.max() < len(points):
+        raise StudyError(f"{path} has faces that refer to points which it does not hold ({len(points)} are there)")
+    points, merged = np.unique(points, axis=0, return_inverse=True)
+    triangles = merged.ravel()[triangles]
+    flat = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
+    return TriangleSurface(points, triangles[~flat])
+
+
+def _fans(polygons: Indices) -> Indices:
+    """Polygons (m, k) cut into triangles around their first corner."""
+    return np.concatenate([polygons[:, [0, i, i + 1]] for i in range(1, polygons.shape[1] - 1)])
+
+
+def _read_obj(path: Path) -> tuple[Array, Indices]:
+    """Vertices and faces alone; meshio refuses files whose texture coordinates outnumber the vertices."""
+    points: list[list[float]] = []
+    triangles: list[tuple[int, int, int]] = []
+    for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
+        kind, *rest = line.split() or [""]
+        try:
+            if kind == "v":
+                x, y, z = (float(text) for text in rest[:3])
+                points.append([x, y, z])
+            elif kind == "f":
+                corners = [int(text.split("/")[0]) for text in rest]
+                ids = [c - 1 if c > 0 else len(points) + c for c in corners]
+                first, *others = ids
+                triangles += [(first, a, b) for a, b in pairwise(others)]
+        except ValueError:
+            raise StudyError(f"{path}, line {number}: '{line.strip()}' is no vertex or face") from None
+    return np.array(points).reshape(-1, 3), np.array(triangles, dtype=np.int64).reshape(-1, 3)
+
+
+def _read_stl_or_ply(path: Path) -> tuple[Array, Indices]:
+    reader = meshio.stl.read if path.suffix.lower() == ".stl" else meshio.ply.read
+    try:
+        with np.errstate(over="ignore"):  # meshio takes the text of an ASCII file for a count of triangles
+            content = reader(str(path))
+    except OSError:
+        raise
+    except Exception as error:  # a damaged file ends meshio's readers in errors of every kind
+        raise StudyError(
+            f"{path} is damaged, cut short, or no {path.suffix} file ({type(error).__name__}: {error})"
+        ) from error
+    faces = [_fans(np.asarray(b.data)) for b in content.cells if b.type in ("triangle", "quad", "polygon")]
+    triangles = np.concatenate(faces) if faces else np.empty((0, 3))
+    return np.asarray(content.points, dtype=np.float64), triangles.astype(np.int64)
+
+
+def check_watertight(surface: TriangleSurface, path: Path) -> None:
+    """Raise StudyError unless every edge joins two triangles that turn alike, with the inside within."""
+    t = surface.triangles
+    directed = np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]])
+    edges, inverse, counts = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True)
+
+    def at(edge: int) -> str:
+        return "(" + ", ".join(f"{x:.6g}" for x in surface.points[edges[edge]].mean(axis=0)) + ")"
+
+    open_edges, crowded = np.flatnonzero(counts == 1), np.flatnonzero(counts > 2)
+    if len(open_edges):
+        raise StudyError(
+            f"the surface {path} is not watertight: {len(open_edges)} edges have a triangle on one side "
+            f"only, the first around {at(open_edges[0])} in file units; close its holes"
+        )
+    if len(crowded):
+        raise StudyError(
+            f"the surface {path} bounds no volume: {len(crowded)} edges have more than two triangles, the "
+            f"first around {at(crowded[0])} in file units; remove inner walls and doubled faces"
+        )
+    forwards = np.bincount(inverse.ravel(), weights=directed[:, 0] < directed[:, 1])
+    turned = np.flatnonzero(forwards != 1)
+    if len(turned):
+        raise StudyError(
+            f"the triangles of {path} do not all turn the same way, first around {at(turned[0])} in file "
+            "units; make its normals consistent"
+        )
+    a, b, c = (surface.points[t[:, i]] for i in range(3))
+    if np.einsum("ti,ti->", a, np.cross(b, c)) <= 0.0:
+        raise StudyError(f"the triangles of {path} face inwards; flip its normals")
+
+
+# Volumes meshed by Netgen: from closed triangulated surfaces (STL, OBJ, PLY) and from STEP solids.
+
+
+#: STEP length units as the file names them, by ours.
+_STEP_UNITS = {"mm": r"\.MILLI\.", "cm": r"\.CENTI\.", "m": r"\$"}
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep what Netgen's C++ code prints off the terminal."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    saved = [os.dup(1), os.dup(2)]
+    with open(os.devnull, "w") as sink:
+        for stream in (1, 2):
+            os.dup2(sink.fileno(), stream)
+        try:
+            yield
+        finally:
+            for stream, original in enumerate(saved, start=1):
+                os.dup2(original, stream)
+                os.close(original)
+
+
+def _volume_mesh(content: Any, path: Path) -> Mesh:
+    """A Netgen mesh as ours: cell sets by material name, surfaces "face_1", ... by face number."""
+    elements = content.Elements3D().NumPy()
+    if not len(elements):
+        raise StudyError(
+            f"Netgen could not fill {path}: the surface cuts through itself or is too coarse for "
+            "its details; mend it in a modelling program, or choose another cell size"
+        )
+    nodes = np.array(content.Coordinates(), dtype=np.float64)
+    cells = elements["nodes"][:, [0, 2, 1, 3]].astype(np.int64) - 1  # Netgen's tetrahedra are mirrored to VTK's
+    mesh = Mesh(nodes, (CellBlock("tet4", cells),))
+    skin = content.Elements2D().NumPy()
+    faces = find_faces(mesh, skin["nodes"][:, :3].astype(np.int64) - 1)
+    surfaces = {f"face_{i}": faces[skin["index"] == i] for i in np.unique(skin["index"])}
+    names = {int(i): content.GetMaterial(int(i)) for i in np.unique(elements["index"])}
+    cell_sets = {
+        name: np.flatnonzero(np.isin(elements["index"], [i for i, other in names.items() if other == name]))
+        for name in set(names.values())
+        if name and name != "default"
+    }
+    return Mesh(nodes, mesh.blocks, cell_sets=cell_sets, surfaces=surfaces).without_unused_nodes()
+
+
+def mesh_surface_file(path: Path, size: float | None) -> Mesh:
+    """Fill a closed surface with tetrahedra; file units.
+
+    Parameters
+    ----------
+    path : .stl, .obj or .ply file.
+    size : longest edge of a cell, file units: the surface is meshed anew between its sharp edges. None keeps
+        the triangles of the file, as scans and sculpted surfaces want it.
+
+    Returns
+    -------
+    Mesh
+        Surfaces "face_1", ..., one for each smooth part of a surface meshed anew.
+
+    Raises
+    ------
+    StudyError
+        If the surface is unreadable, not closed, or cannot be filled.
+    """
+    surface = read_surface(path)
+    check_watertight(surface, path)
+    with _quiet():
+        content = _filled(surface) if size is None else _meshed_anew(surface, size)
+    return _volume_mesh(content, path)
+
+
+def _filled(surface: TriangleSurface) -> Any:
+    content = meshing.Mesh()
+    content.dim = 3
+    numbers = [content.Add(meshing.MeshPoint(meshing.Pnt(*point))) for point in surface.points.tolist()]
+    face = content.Add(meshing.FaceDescriptor(bc=1, domin=1, domout=0, surfnr=1))
+    for a, b, c in surface.triangles.tolist():
+        content.Add(meshing.Element2D(face, [numbers[a], numbers[b], numbers[c]]))
+    content.GenerateVolumeMesh()
+    return content
+
+
+def _meshed_anew(surface: TriangleSurface, size: float) -> Any:
+    """Netgen reads the surface from a file only; STL is the one format that its mesher takes."""
+    corners = surface.points[surface.triangles]
+    facets = (
+        "facet normal 0 0 0\nouter loop\n"
+        + "".join("vertex {!r} {!r} {!r}\n".format(*corner) for corner in triangle)
+        + "endloop\nendfacet\n"
+        for triangle in corners.tolist()
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "surface.stl"
+        file.write_text("solid surface\n" + "".join(facets) + "endsolid surface\n")
+        geometry = stl.LoadSTLGeometry(str(file))
+    return geometry.GenerateMesh(maxh=size)
+
+
+def mesh_step_file(path: Path, unit: str, size: float | None) -> Mesh:
+    """Mesh the solids of a STEP file with tetrahedra; in millimetres, which the STEP reader converts to.
+
+    Parameters
+    ----------
+    unit : the declared unit; it must be the one that the file itself states.
+    size : longest edge of a cell, millimetres; a tenth of the solids' diagonal by default.
+
+    Raises
+    ------
+    StudyError
+        If the file cannot be read or states another unit, or its solids cannot be meshed.
+    """
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise StudyError(f"cannot read the mesh {path}: {error.strerror}") from error
+    if "ISO-10303-21" not in text or "END-ISO-10303-21" not in text:
+        raise StudyError(f"{path} is no STEP file, or is cut short: it does not end with END-ISO-10303-21")
+    stated = [u for u, prefix in _STEP_UNITS.items() if re.search(rf"SI_UNIT\s*\(\s*{prefix}\s*,\s*\.METRE\.", text)]
+    if stated and unit not in stated:
+        raise StudyError(f"{path} states that its unit of length is {stated[0]}, but '{unit}' is declared")
+    with _quiet():
+        try:
+            geometry = occ.OCCGeometry(str(path))
+            low, high = geometry.shape.bounding_box
+            diagonal = float(np.linalg.norm(np.array([high[i] - low[i] for i in range(3)])))
+            content = geometry.GenerateMesh(maxh=size or diagonal / 10.0)
+        except Exception as error:  # Netgen and Open CASCADE raise plain Exception
+            raise StudyError(f"Netgen could not mesh the solids of {path}: {error}") from error
+    return _volume_mesh(content, path)

@@ -1,1 +1,0 @@
-"""Materials as strain-energy densities: each law is written once and differentiated by NGSolve."""

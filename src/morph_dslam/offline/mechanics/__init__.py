@@ -1,1 +1,0 @@
-"""Solids and shells on NGSolve: spaces, energies, supports, loads, and recovery of fields."""

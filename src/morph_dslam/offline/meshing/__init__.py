@@ -1,1 +1,0 @@
-"""Meshes of cells with named sets: their types, generators, files and checks."""

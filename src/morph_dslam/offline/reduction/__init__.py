@@ -1,1 +1,0 @@
-"""From snapshots or operators to separated representations: POD, regression, Galerkin, PGD."""

@@ -1,1 +1,0 @@
-"""Solution of discretised equilibrium: linear solver, Newton, load stepping, arc length, buckling."""

@@ -1,1 +1,0 @@
-"""Objects that stay in their place in the map of the scene."""

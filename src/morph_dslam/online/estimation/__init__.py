@@ -1,1 +1,0 @@
-"""The state of a frame from its measurements."""

@@ -1,1 +1,0 @@
-"""Live tracking: capture, localisation, tracking and drawing side by side."""

@@ -1,1 +1,0 @@
-"""Where a frame shows the points of the object."""

@@ -1,1 +1,0 @@
-"""Lost objects, and those that look like them."""

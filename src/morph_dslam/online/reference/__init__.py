@@ -1,1 +1,0 @@
-"""The views that frames are compared with."""

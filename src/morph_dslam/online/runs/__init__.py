@@ -1,1 +1,0 @@
-"""What a run leaves: its folder, tables, plots and flags."""

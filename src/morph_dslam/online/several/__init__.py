@@ -1,1 +1,0 @@
-"""Several cameras, and several objects."""

@@ -1,1 +1,0 @@
-"""Camera localisation in, and mapping of, the rigid scene around the object."""

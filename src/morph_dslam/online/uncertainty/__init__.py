@@ -1,1 +1,0 @@
-"""How sure an estimate is, and what the images cannot tell."""

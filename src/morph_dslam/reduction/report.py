@@ -1,0 +1,157 @@
+"""`NAME.report.html`: everything a build says of its model, on one page without any other file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from morph_dslam.errors import StudyError
+from morph_dslam.evaluation.model_summary import describe_point, held_out_facts, parameter_table, summarise_model
+from morph_dslam.evaluation.points import error_table, sensitivity_table
+from morph_dslam.evaluation.report import Block, KeyFigures, Listing, Section, Table, Text, write_report
+from morph_dslam.model import ReducedModel
+from morph_dslam.reduction.report_pictures import (
+    ReferenceCurve,
+    draw_model_states,
+    draw_modes,
+    plot_convergence,
+    plot_error_maps,
+    plot_errors_by_parameter,
+    plot_parameter_functions,
+)
+from morph_dslam.studies.build import build_warnings
+
+#: Parts of the model's summary that the report repeats as they are.
+_REPEATED = ("fields", "memory and samples", "error estimator", "reduction", "made with")
+
+Part = tuple[str, list[Callable[[], Block]]]
+
+
+def report_path(model_file: Path) -> Path:
+    """Where the report of a model file is: "seal.report.html" beside "seal.morph"."""
+    return model_file.with_name(f"{model_file.name.removesuffix('.morph')}.report.html")
+
+
+def write_build_report(path: Path, model: ReducedModel, reference: ReferenceCurve | None = None) -> None:
+    """Write the report of a certified model.
+
+    It is made from the model alone, so it can be written again at any time. A plot that cannot be drawn is
+    replaced by a sentence that says why.
+
+    Parameters
+    ----------
+    reference : a published curve, drawn beside the error against the number of modes.
+
+    Raises
+    ------
+    StudyError
+        If the page cannot be written.
+    """
+    parts = _parts(model, reference)
+    sections = []
+    with tqdm(total=sum(len(blocks) for _, blocks in parts), desc="report", unit="part") as progress:
+        for heading, makers in parts:
+            blocks = []
+            for make in makers:
+                blocks.append(_made(make))
+                progress.update()
+            sections.append(Section(heading, blocks))
+    try:
+        write_report(path, f"{model.name}: report of the reduced model", sections)
+    except OSError as error:
+        raise StudyError(f"the model is complete, but its report cannot be written: {error}") from error
+
+
+def _made(make: Callable[[], Block]) -> Block:
+    try:
+        return make()
+    except Exception as error:
+        # Whatever goes wrong in a picture, hours of solves and the rest of the page must not be lost for it.
+        return Text(f"This part could not be made: {type(error).__name__}: {error}", warning=True)
+
+
+def _parts(model: ReducedModel, reference: ReferenceCurve | None) -> list[Part]:
+    """Headings and what makes the blocks under each."""
+    certificate, several = model.certificate, len(model.parameters) > 1
+    maps = [lambda: plot_error_maps(model)] if several else []
+    summary = summarise_model(model)
+    repeated: list[Part] = [
+        (name.capitalize(), [lambda name=name: summary[name]]) for name in _REPEATED if name in summary
+    ]
+    return [
+        ("In short", [lambda: _key_figures(model), *_warnings(certificate)]),
+        ("Parameters", [lambda: parameter_table(model.parameters)]),
+        ("States", [lambda: draw_model_states(model)]),
+        ("Errors on held-out solves", [lambda: error_table(certificate), lambda: Table.of(held_out_facts(model))]),
+        ("Errors of the displacement's sensitivities", _sensitivities(certificate)),
+        ("Error against number of modes", [lambda: plot_convergence(model, reference)]),
+        ("Errors over the parameter box", [lambda: plot_errors_by_parameter(model), *maps]),
+        ("Modes in space", [lambda: draw_modes(model)]),
+        ("Functions of the parameters", [lambda: plot_parameter_functions(model)]),
+        ("Stability", _stability(certificate)),
+        ("Samples that failed", _failed(model)),
+        *repeated,
+        ("Study", _study(model)),
+    ]
+
+
+def _key_figures(model: ReducedModel) -> KeyFigures:
+    """The figures that are looked for first."""
+    certificate = model.certificate
+    errors = certificate["displacement"]
+    figures = {
+        "mean displacement error": f"{errors['mean_mm']:.2g} mm",
+        "largest error of any node": f"{errors['max_mm']:.2g} mm",
+        "largest displacement": f"{errors['largest_mm']:.3g} mm",
+    }
+    stresses = [entry["von_mises"] for name, entry in certificate.items() if name.startswith("stress_")]
+    figures |= _largest_relative("von Mises stress error", stresses)
+    figures |= _largest_relative("error of sensitivities", certificate.get("sensitivity", {}).values())
+    figures["displacement modes"] = str(model.displacement.n_modes)
+    if "compression_percent" in certificate:
+        figures["compression"] = f"{certificate['compression_percent']:.2f} %"
+    return KeyFigures(figures | {"held-out solves": str(errors["n_held_out"])})
+
+
+def _largest_relative(name: str, entries: Iterable[dict[str, Any]]) -> dict[str, str]:
+    """The largest relative L2 error, if there is any, under its name."""
+    errors = [entry["relative_l2"] for entry in entries if entry["relative_l2"] is not None]
+    return {name: f"{100.0 * max(errors):.2g} %"} if errors else {}
+
+
+def _warnings(certificate: dict[str, Any]) -> list[Callable[[], Block]]:
+    return [lambda line=line: Text(line, warning=True) for line in build_warnings(certificate)]
+
+
+def _sensitivities(certificate: dict[str, Any]) -> list[Callable[[], Block]]:
+    if "sensitivity" not in certificate:
+        return [lambda: Text("The solutions came without derivatives by the parameters.")]
+    return [lambda: sensitivity_table(certificate)]
+
+
+def _stability(certificate: dict[str, Any]) -> list[Callable[[], Block]]:
+    report = certificate.get("stability")
+    if report is None:
+        return []
+    rows = [
+        [" and ".join(place["between"]), " to ".join(str(count) for count in place["negative_pivots"])]
+        for place in report["passed"]
+    ]
+    table = [lambda: Table(rows, ("between", "negative pivots"))] if rows else []
+    return [lambda: Text(report["statement"][:1].upper() + report["statement"][1:] + "."), *table]
+
+
+def _failed(model: ReducedModel) -> list[Callable[[], Block]]:
+    rows = [
+        [describe_point(model.parameters, entry["coordinates"]), entry["reason"]]
+        for entry in model.certificate.get("samples", {}).get("failed", [])
+    ]
+    return [lambda: Table(rows, ("sample", "why"))] if rows else []
+
+
+def _study(model: ReducedModel) -> list[Callable[[], Block]]:
+    text = model.provenance.get("study")
+    return [] if text is None else [lambda: Listing("The study as it was built", text)]

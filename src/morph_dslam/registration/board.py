@@ -1,0 +1,389 @@
+"""Corners of square markers to a tenth of a pixel: where the lines through their four edges meet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+from scipy.spatial.transform import Rotation
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import RegistrationError
+from morph_dslam.geometry import RigidTransform, cross_matrix
+from morph_dslam.model import ReducedModel
+from morph_dslam.registration.guess import Section, Vector, read_aid
+from morph_dslam.registration.landmarks import solve_pnp
+from morph_dslam.registration.registration import Registration
+from morph_dslam.tracking.state import State, moved
+
+Array = NDArray[np.float64]
+
+#: Places on an edge, the part of it they spread over, and how far across it its brightness is looked at, as a
+#: share of its length and pixels.
+N_PLACES, INNER, REACH_SHARE, REACHES_PX = 15, (0.12, 0.88), 0.08, (1.5, 4.0)
+
+ITERATIONS = 3
+
+
+def refined_corners(grey: NDArray[np.uint8], markers: Array) -> Array:
+    """Corners (m, 4, 2) of dark markers on white, in an image (h, w), from those of a detector.
+
+    A corner-shaped window is drawn inwards by blur; the steepest places of straight edges are not.
+    """
+    smooth = grey.astype(np.float32)
+    corners = markers.astype(np.float64)
+    for _ in range(ITERATIONS):
+        corners = _from_edges(smooth, corners)
+    # A detector's corner is never further off than that: an edge that went elsewhere was not the marker's.
+    kept = np.linalg.norm(corners - markers, axis=2, keepdims=True) < REACHES_PX[1]
+    return np.where(kept, corners, markers)
+
+
+def _from_edges(image: NDArray[np.float32], corners: Array) -> Array:
+    following = np.roll(corners, -1, axis=1)
+    along = following - corners
+    lengths = np.linalg.norm(along, axis=2, keepdims=True)
+    along = along / np.maximum(lengths, 1e-9)
+    outwards = np.stack([along[..., 1], -along[..., 0]], axis=2)
+    centre = corners.mean(axis=1, keepdims=True)
+    outwards *= np.sign(np.sum(outwards * (corners - centre), axis=2, keepdims=True))
+    places = (
+        corners[:, :, None] + np.linspace(*INNER, N_PLACES)[None, None, :, None] * (following - corners)[:, :, None]
+    )
+    steps = np.linspace(-1.0, 1.0, 17)
+    reach = np.clip(REACH_SHARE * lengths, *REACHES_PX)  # (m, 4, 1)
+    offsets = steps * reach  # (m, 4, s)
+    sampled = places[:, :, :, None] + offsets[:, :, None, :, None] * outwards[:, :, None, None]
+    flat = sampled.reshape(len(corners) * 4, -1, 2).astype(np.float32)
+    values = cv2.remap(image, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    values = np.asarray(values, dtype=np.float64).reshape(sampled.shape[:-1])
+    rise = np.maximum(np.diff(values, axis=3), 0.0) + 1e-6
+    between = 0.5 * (offsets[:, :, 1:] + offsets[:, :, :-1])[:, :, None]
+    shifts = np.sum(rise * between, axis=3) / rise.sum(axis=3)
+    edges = places + shifts[..., None] * outwards[:, :, None]
+    middle = edges.mean(axis=2)
+    _, _, axes = np.linalg.svd(edges - middle[:, :, None], full_matrices=False)
+    normals = axes[:, :, 1]
+    # A corner is where the edge before it meets the edge after it.
+    before_normals, before_middle = np.roll(normals, 1, axis=1), np.roll(middle, 1, axis=1)
+    rows = np.stack([before_normals, normals], axis=2)
+    right = np.stack([np.sum(before_normals * before_middle, axis=2), np.sum(normals * middle, axis=2)], axis=2)
+    straight = np.abs(np.linalg.det(rows)) > 0.05
+    rows = np.where(straight[..., None, None], rows, np.eye(2))
+    right = np.where(straight[..., None], right, corners)
+    return np.linalg.solve(rows, right[..., None])[..., 0]
+
+
+# Printed boards of square markers (ArUco, AprilTag), alone or in a chessboard: read, found, printed.
+# A board's frame has its origin in the upper left corner of the print, x to the right and y down along the
+# paper, z into it.
+
+
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+#: Names of the dictionaries of markers, as in OpenCV without its prefix, in lower case.
+DICTIONARIES = tuple(
+    sorted({name[5:].lower() for name in dir(cv2.aruco) if name.startswith("DICT_")})  # type: ignore[attr-defined]
+)
+
+#: Fewer corners are not believed: one marker has four.
+FEWEST_CORNERS = 4
+
+DOTS_PER_INCH = 300
+
+#: A side of a print is at most so long, metres: beyond it the unit was mistaken.
+LARGEST_SIDE = 10.0
+
+
+class Place(Section):
+    """Where the undeformed object's frame is on the board: origin, and turn about x, then y, then z."""
+
+    position_mm: Vector
+    rotation_deg: Vector = (0.0, 0.0, 0.0)
+
+
+class BoardFile(Section):
+    """A board file.
+
+    A "grid" has ``columns`` x ``rows`` markers of ``marker_mm``, ``gap_mm`` apart; a "charuco" board has so
+    many chessboard squares of ``square_mm`` with markers of ``marker_mm`` in the white ones.
+    """
+
+    kind: Literal["grid", "charuco"] = "grid"
+    dictionary: str
+    columns: int = Field(ge=1, le=50)
+    rows: int = Field(ge=1, le=50)
+    marker_mm: Positive
+    gap_mm: Positive | None = None
+    square_mm: Positive | None = None
+    object: Place | None = None
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> BoardFile:
+        if self.dictionary.lower() not in DICTIONARIES:
+            raise ValueError(f"dictionary must be one of {', '.join(DICTIONARIES)}, not '{self.dictionary}'")
+        if self.kind == "grid" and self.gap_mm is None:
+            raise ValueError("a grid needs gap_mm, the white between its markers")
+        if self.kind == "charuco" and (self.square_mm is None or self.square_mm <= self.marker_mm):
+            raise ValueError("a charuco board needs square_mm, larger than marker_mm")
+        if self.kind == "charuco" and min(self.columns, self.rows) < 3:
+            raise ValueError("a charuco board needs 3 x 3 squares at least")
+        other = "square_mm" if self.kind == "grid" else "gap_mm"
+        if getattr(self, other) is not None:
+            raise ValueError(f"{other} is for the other kind of board: leave it out of a {self.kind}")
+        pitch = self.marker_mm + (self.gap_mm or 0.0) if self.kind == "grid" else self.square_mm or 0.0
+        if 1e-3 * pitch * max(self.columns, self.rows) > LARGEST_SIDE:
+            raise ValueError(f"the board would be more than {LARGEST_SIDE:g} m long; sizes are in millimetres")
+        return self
+
+
+@dataclass(frozen=True)
+class FiducialBoard:
+    """A board as its file describes it."""
+
+    description: BoardFile
+
+    @property
+    def board_from_object(self) -> RigidTransform | None:
+        """Where the undeformed object is on it, metres; None for a board that only gives the scale."""
+        place = self.description.object
+        if place is None:
+            return None
+        turn = Rotation.from_euler("xyz", place.rotation_deg, degrees=True).as_matrix()
+        return RigidTransform(turn, 1e-3 * np.array(place.position_mm))
+
+    @property
+    def pitch(self) -> float:
+        """From one marker or square to the next, metres."""
+        d = self.description
+        return 1e-3 * (d.marker_mm + (d.gap_mm or 0.0) if d.kind == "grid" else d.square_mm or 0.0)
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height of the print without its margin, metres."""
+        d = self.description
+        gap = 1e-3 * (d.gap_mm or 0.0) if d.kind == "grid" else 0.0
+        return d.columns * self.pitch - gap, d.rows * self.pitch - gap
+
+    @cached_property
+    def _board(self) -> Any:
+        d, aruco = self.description, cv2.aruco  # type: ignore[attr-defined]
+        names = {name[5:].lower(): name for name in dir(aruco) if name.startswith("DICT_")}
+        dictionary = aruco.getPredefinedDictionary(getattr(aruco, names[d.dictionary.lower()]))
+        size, marker = (d.columns, d.rows), 1e-3 * d.marker_mm
+        if d.kind == "grid":
+            return aruco.GridBoard(size, marker, self.pitch - marker, dictionary)
+        return aruco.CharucoBoard(size, self.pitch, marker, dictionary)
+
+    def find(self, grey: NDArray[np.uint8]) -> tuple[Array, Array]:
+        """Corners of the board (k, 3), board frame, metres, and their pixels (k, 2) in an image (h, w)."""
+        aruco, board = cv2.aruco, self._board  # type: ignore[attr-defined]
+        if self.description.kind == "charuco":
+            corners, ids, _, _ = aruco.CharucoDetector(board).detectBoard(grey)
+        else:
+            detector = aruco.ArucoDetector(board.getDictionary(), aruco.DetectorParameters())
+            corners, ids, _ = detector.detectMarkers(grey)
+        if ids is None or not len(ids):
+            return np.empty((0, 3)), np.empty((0, 2))
+        if self.description.kind == "grid":
+            found = np.array(corners, dtype=np.float64).reshape(-1, 4, 2)
+            corners = [marker[None].astype(np.float32) for marker in refined_corners(grey, found)]
+        points, pixels = board.matchImagePoints(corners, ids)
+        if points is None or not len(points):
+            return np.empty((0, 3)), np.empty((0, 2))
+        return (
+            np.asarray(points, dtype=np.float64).reshape(-1, 3),
+            np.asarray(pixels, dtype=np.float64).reshape(-1, 2),
+        )
+
+    def image(self, pixels_per_metre: float) -> NDArray[np.uint8]:
+        """The print (h, w) without a margin, 0 black."""
+        width, height = (max(1, round(side * pixels_per_metre)) for side in self.size)
+        return np.asarray(self._board.generateImage((width, height), marginSize=0), dtype=np.uint8)
+
+
+def load_board(path: Path) -> FiducialBoard:
+    """Read a board file.
+
+    Raises
+    ------
+    RegistrationError
+        If it is missing, no TOML, or says something impossible.
+    """
+    description = read_aid(path, "board file", BoardFile)
+    board = FiducialBoard(description)
+    try:
+        _ = board._board
+    except cv2.error as error:
+        raise RegistrationError(
+            f"{path}: the dictionary '{description.dictionary}' has too few markers for "
+            f"{description.columns} x {description.rows}"
+        ) from error
+    return board
+
+
+def print_board(board: FiducialBoard, path: Path) -> None:
+    """Write the board in its true size as a PNG or PDF file, with a white margin and a line to measure.
+
+    Raises
+    ------
+    RegistrationError
+        If the file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    inch, margin = 0.0254, 0.015
+    width, height = board.size
+    total = (width + 2 * margin, height + 2 * margin + 0.01)
+    figure = Figure(figsize=(total[0] / inch, total[1] / inch))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set_xlim(0.0, total[0])
+    axes.set_ylim(total[1], 0.0)
+    axes.axis("off")
+    extent = (margin, margin + width, margin + height, margin)
+    axes.imshow(board.image(2.0 * DOTS_PER_INCH / inch), cmap="gray", extent=extent, interpolation="nearest")
+    axes.set_aspect("auto")
+    length = 0.1 if width > 0.1 else 0.01 * max(1, int(width / 0.01))
+    line = margin + height + 0.01
+    axes.plot([margin, margin + length], [line, line], "k|-", linewidth=0.6, markersize=8)
+    axes.text(margin + length + 0.003, line, f"{1e3 * length:.0f} mm", fontsize=8, va="center")
+    if path.suffix.lower() not in (".png", ".pdf"):
+        raise RegistrationError(f"cannot write the board to {path}: give it the ending .png or .pdf")
+    try:
+        figure.savefig(path, dpi=DOTS_PER_INCH)
+    except (OSError, ValueError) as error:
+        raise RegistrationError(f"cannot write the board to {path}: {error}") from error
+
+
+# An object's pose from a printed board that is fixed to it, or to the scene that it stands in.
+
+
+#: Standard deviation of a corner at the least, and residuals that speak against board or camera, pixels.
+LEAST_CORNER_PX, LARGEST_RESIDUAL_PX = 0.1, 2.0
+
+#: Another pose whose squared residuals are at most so many times as large cannot be told from the best.
+AMBIGUOUS = 4.0
+
+NO_PARAMETERS = np.empty(0)
+
+
+@dataclass(frozen=True)
+class BoardPose:
+    """A board in an image.
+
+    Attributes
+    ----------
+    camera_from_board : metres. covariance : (6, 6) of its increment, see `state.moved`.
+    n_corners : found. rms_px : of their residuals' lengths. ambiguous : another tilt fits nearly as well.
+    """
+
+    camera_from_board: RigidTransform
+    covariance: Array
+    n_corners: int
+    rms_px: float
+    ambiguous: bool
+
+    def of_object(self, board_from_object: RigidTransform) -> tuple[RigidTransform, Array]:
+        """camera_from_object, and the covariance (6, 6) of its increment."""
+        arm = self.camera_from_board.rotation @ board_from_object.translation
+        slopes = np.eye(6)
+        slopes[3:, :3] = -cross_matrix(arm)
+        return self.camera_from_board @ board_from_object, slopes @ self.covariance @ slopes.T
+
+
+def locate_board(board: FiducialBoard, camera: PinholeCamera, grey: NDArray[np.uint8]) -> BoardPose | None:
+    """The board in an undistorted image (h, w); None where too little of it is seen.
+
+    Raises
+    ------
+    RegistrationError
+        If its corners do not lie as on this board.
+    """
+    points, pixels = board.find(grey)
+    if len(points) < FEWEST_CORNERS:
+        return None
+    fits = sorted(
+        (_refined(start, points, pixels, camera) for start in solve_pnp(points, pixels, camera)), key=lambda fit: fit[1]
+    )
+    if not fits:
+        return None
+    pose, cost, information = fits[0]
+    freedom = max(2 * len(points) - 6, 1)
+    rms = float(np.sqrt(cost / len(points)))
+    if rms > LARGEST_RESIDUAL_PX:
+        raise RegistrationError(
+            f"the corners of the board do not lie as they should: they are {rms:.1f} px off; check the board "
+            "file (sizes, columns and rows), that the print is flat, and the camera file"
+        )
+    variance = max(cost / freedom, LEAST_CORNER_PX**2)
+    ambiguous = any(_turned(pose, other) > 0.05 and c < AMBIGUOUS * cost + 1.0 for other, c, _ in fits[1:])
+    return BoardPose(
+        pose, np.asarray(variance * np.linalg.pinv(information), dtype=np.float64), len(points), rms, ambiguous
+    )
+
+
+def _refined(
+    start: RigidTransform, points: Array, pixels: Array, camera: PinholeCamera
+) -> tuple[RigidTransform, float, Array]:
+    """The pose of least squared residuals near ``start``, their sum, and the information (6, 6)."""
+    state = State(NO_PARAMETERS, start)
+    for _ in range(10):
+        residuals, jacobian = _linear(state.camera_from_object, points, pixels, camera)
+        step, *_ = np.linalg.lstsq(jacobian, -residuals, rcond=None)
+        state = moved(state, np.asarray(step, dtype=np.float64))
+    residuals, jacobian = _linear(state.camera_from_object, points, pixels, camera)
+    return state.camera_from_object, float(residuals @ residuals), jacobian.T @ jacobian
+
+
+def _linear(pose: RigidTransform, points: Array, pixels: Array, camera: PinholeCamera) -> tuple[Array, Array]:
+    local = pose.apply(points)
+    of_pose = np.zeros((len(points), 3, 6))
+    of_pose[:, :, :3] = -cross_matrix(local - pose.translation)
+    of_pose[:, :, 3:] = np.eye(3)
+    jacobian = camera.projection_jacobian(local) @ of_pose
+    return (camera.project(local) - pixels).ravel(), jacobian.reshape(-1, 6)
+
+
+def _turned(one: RigidTransform, other: RigidTransform) -> float:
+    """Angle between two rotations, radians."""
+    return float(np.arccos(np.clip(0.5 * (np.trace(one.rotation.T @ other.rotation) - 1.0), -1.0, 1.0)))
+
+
+@dataclass(frozen=True)
+class BoardStart:
+    """Places the undeformed object by a board."""
+
+    board: FiducialBoard
+
+    def place(self, model: ReducedModel, camera: PinholeCamera, grey: NDArray[np.uint8]) -> Registration:
+        """The object in an undistorted image (h, w).
+
+        Raises
+        ------
+        RegistrationError
+            If the board is not seen, or its file does not say where the object is on it.
+        """
+        on_board = self.board.board_from_object
+        if on_board is None:
+            raise RegistrationError("the board file does not say where the object is: give it a section [object]")
+        found = locate_board(self.board, camera, grey)
+        if found is None:
+            raise RegistrationError(
+                "the board is not seen in the reference frame: choose one that shows it sharp and with its "
+                "white margin, and check its dictionary"
+            )
+        pose, of_pose = found.of_object(on_board)
+        d = len(model.parameters)
+        covariance = np.zeros((d + 6, d + 6))
+        covariance[d:, d:] = of_pose
+        flags = ["placed by a board: the object is taken to be undeformed in the reference frame"]
+        if found.ambiguous:
+            flags.append("registration ambiguous: the board can be tilted the other way; show it larger or aslant")
+        facts = {"from": "board", "n_corners": found.n_corners, "residual_rms_px": found.rms_px}
+        return Registration(model, None, State(model.default, pose), facts, tuple(flags), covariance=covariance)

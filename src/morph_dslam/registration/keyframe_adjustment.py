@@ -1,0 +1,314 @@
+"""The keyframes' poses about the registered object, adjusted together.
+
+A map's camera path has its own errors, and a similarity that lays the object into the map inherits them.
+So in the end each keyframe gets a pose of its own about the object, in metres: those with which the images
+agree on the mesh, and with which the map's points, which stand still beside it, agree as well. It is a bundle
+adjustment in which the object's points lie on its surface and the others are free.
+
+The covariance is a sandwich (Huber & Ronchetti, Robust Statistics, 6.3): neighbouring measurements share
+their errors, and so do all pairs of views that show one patch of the surface. So the scores are summed by
+patches, and by points, before their squares are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.geometry import RigidTransform, SimilarityTransform, cross_matrix, rotation_log
+from morph_dslam.registration.icp import Axis
+from morph_dslam.registration.scene import (
+    MapPoints,
+    PoseScores,
+    StaticPoints,
+    View,
+    camera_from_object,
+    huber_weights,
+    views_of,
+)
+from morph_dslam.registration.texture import WINDOW, PairDisplacements, TextureComparison, moved_pose
+from morph_dslam.registration.texture_alignment import moved_similarity, similarity_jacobian
+
+Array = NDArray[np.float64]
+
+ITERATIONS = 8
+
+#: Steps are prolonged by at most so many times.
+MOST_EXTRAPOLATED = 4.0
+
+#: Keyframes adjusted, spread over all that see the object.
+MOST_VIEWS = 24
+
+#: Fewer measurements for each view are no evidence.
+FEWEST = 30
+
+#: Windows as large as the patches reach into the next ones: the sum over a patch holds only (2 / 3)^2 of what
+#: they have in common.
+ACROSS_PATCHES = 9.0 / 4.0
+
+#: What else neighbouring patches and points have in common, in variance: so much larger were the errors in
+#: ten rendered scans with known truth (benchmarks/registration_seeds.py, the first ten seeds).
+IN_COMMON = 16.0 / 9.0
+
+#: Directions that are seen worse than this, over the best one, stay as they are.
+LEAST_SEEN = 1e-9
+
+#: Errors of all poses together are given by so many error factors: the registration's seven, and one more.
+N_CAUSES = 8
+
+
+@dataclass(frozen=True)
+class AdjustedKeyframes:
+    """Keyframes placed about the object.
+
+    Attributes
+    ----------
+    views : those adjusted. poses : camera_from_object of each, metres.
+    covariance : (6 K, 6 K) of all poses together, in the increments of `pose_jacobian`. The turn about an
+        axis of revolution is not in it.
+    rms_px : how far the images agree.
+    """
+
+    views: list[View]
+    poses: list[RigidTransform]
+    covariance: Array
+    rms_px: float
+
+    def covariance_of(self, view: int) -> Array:
+        """That of one pose, (6, 6)."""
+        part = slice(6 * view, 6 * view + 6)
+        return self.covariance[part, part]
+
+    def error_factors(self) -> Array:
+        """How each pose is off (K, 6, c) by the few error factors that most of the errors have in common.
+
+        What is a keyframe's own is added to that, in its own directions: a pose's rows times their transpose
+        are its whole covariance.
+        """
+        size = len(self.covariance)
+        scale = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
+        values, vectors = np.linalg.eigh(self.covariance / np.outer(scale, scale))
+        leading = np.arange(size) >= size - N_CAUSES
+        roots = vectors[:, leading] * np.sqrt(np.maximum(values[leading], 0.0))
+        error_factors = (scale[:, None] * roots).reshape(-1, 6, roots.shape[1])
+        return np.stack([_filled_up(part, self.covariance_of(view)) for view, part in enumerate(error_factors)])
+
+
+def _filled_up(error_factors: Array, covariance: Array) -> Array:
+    """Causes (6, c), c >= 6, changed as little as can be so that they make up a covariance (6, 6)."""
+    values, vectors = np.linalg.eigh(covariance)
+    roots = np.sqrt(np.maximum(values, 0.0))
+    # Nothing is known of the turn about an axis, and nothing of it is in either.
+    weights = np.where(roots > 1e-9 * roots[-1], 1.0 / np.maximum(roots, 1e-300), 0.0)
+    left, _, right = np.linalg.svd(weights[:, None] * (vectors.T @ error_factors), full_matrices=False)
+    return np.asarray((vectors * roots) @ left @ right, dtype=np.float64)
+
+
+class KeyframeAdjustment:
+    """Adjusts the keyframes of a map about an object.
+
+    Parameters
+    ----------
+    nodes : (n, 3) of the undeformed mesh, metres. triangles : (m, 3). camera : without distortion.
+    points, views : of the map. axis : about which the object may be turned without a difference.
+    """
+
+    def __init__(
+        self,
+        nodes: Array,
+        triangles: NDArray[np.int64],
+        camera: PinholeCamera,
+        points: MapPoints,
+        views: Sequence[View],
+        axis: Axis | None,
+    ) -> None:
+        self._nodes, self._camera, self._points, self._all_views = nodes, camera, points, views
+        self._comparison, self._axis = TextureComparison(nodes, triangles, camera), axis
+        self._size = float(np.linalg.norm(np.ptp(nodes, axis=0)))
+
+    def adjust(self, placed: SimilarityTransform) -> AdjustedKeyframes | None:
+        """Poses near those of a registration; None where too little can be compared."""
+        views = views_of(self._nodes, placed, self._all_views, self._camera, MOST_VIEWS)
+        if len(views) < 2:
+            return None
+        poses = [camera_from_object(view, placed) for view in views]
+        static = StaticPoints(placed.inverse.apply(self._points.positions), views, self._camera)
+        images, units = [view.flat for view in views], self._units(len(views))
+        mixing = _Mixing()
+        for _ in range(ITERATIONS):
+            measured = self._comparison.measure(images, poses)
+            if sum(len(pair.offsets) for pair in measured) < FEWEST * len(views):
+                return None
+            on_mesh, beside = self._mesh_scores(measured, poses), static.linearise(poses)
+            step, covariance = self._solved(on_mesh, beside, poses)
+            step = units * mixing.mixed(step / units)
+            poses = [moved_pose(pose, part) for pose, part in zip(poses, step.reshape(-1, 6), strict=True)]
+        return AdjustedKeyframes(views, poses, covariance, on_mesh.sigma_px)
+
+    def _mesh_scores(self, measured: list[PairDisplacements], poses: list[RigidTransform]) -> PoseScores:
+        """What the displacements on the mesh say, by patches of the surface as large as a window."""
+        offsets = np.concatenate([pair.offsets for pair in measured])
+        places = np.concatenate([pair.places for pair in measured])
+        views = np.concatenate([np.full(len(pair.offsets), pair.first) for pair in measured])
+        weights, sigma = huber_weights(offsets)
+        patch = WINDOW * self._pixel_size(poses)
+        cells = np.floor((places - places.min(axis=0)) / patch).astype(np.int64)
+        _, cell = np.unique(cells, axis=0, return_inverse=True)
+        cell = cell.ravel()
+        # Windows overlap, and each is compared with many others: as many of the measurements are independent
+        # as there are windows beside each other in all views.
+        independent = len(np.unique(np.column_stack([views, cell]), axis=0)) / len(offsets)
+        weights = weights * independent / sigma**2
+        n = len(poses)
+        information, scores = np.zeros((6 * n, 6 * n)), np.zeros((cell.max() + 1, n, 6))
+        row = 0
+        for pair in measured:
+            rows = slice(row, row + len(pair.offsets))
+            row = rows.stop
+            slopes = {pair.first: pair.by_first, pair.second: pair.by_second}
+            for i, by_i in slopes.items():
+                weighted = by_i * weights[rows, None, None]
+                np.add.at(scores[:, i], cell[rows], np.einsum("pij,pi->pj", weighted, pair.offsets))
+                for j, by_j in slopes.items():
+                    block = np.einsum("pij,pik->jk", weighted, by_j)
+                    information[6 * i : 6 * i + 6, 6 * j : 6 * j + 6] += block
+        return PoseScores(information, scores.reshape(-1, 6 * n), sigma)
+
+    def _pixel_size(self, poses: list[RigidTransform]) -> float:
+        """What a pixel covers on the object, metres."""
+        middle = self._nodes.mean(axis=0)
+        depth = float(np.median([pose.apply(middle)[2] for pose in poses]))
+        return depth / max(self._camera.fx, self._camera.fy)
+
+    def _solved(self, on_mesh: PoseScores, beside: PoseScores, poses: list[RigidTransform]) -> tuple[Array, Array]:
+        """The step (6 K,) of all poses, and their covariance (6 K, 6 K)."""
+        scores = np.concatenate([np.sqrt(ACROSS_PATCHES) * on_mesh.scores, beside.scores])
+        right = on_mesh.scores.sum(axis=0) + beside.scores.sum(axis=0)
+        units = self._units(len(poses))
+        information = (on_mesh.information + beside.information) * np.outer(units, units)
+        inverse = _inverse(information, self._turn(poses) / units)
+        step = inverse @ (right * units)
+        half = (scores * units) @ inverse
+        return step * units, IN_COMMON * half.T @ half * np.outer(units, units)
+
+    def _units(self, count: int) -> Array:
+        """What makes the increments (6 K,) of poses comparable."""
+        return np.tile([1.0] * 3 + [self._size] * 3, count)
+
+    def _turn(self, poses: list[RigidTransform]) -> Array:
+        """The increments (6 K,) that turn the object about its axis of revolution; zero without one."""
+        if self._axis is None:
+            return np.zeros(6 * len(poses))
+        parts = []
+        for pose in poses:
+            turn = pose.rotation @ self._axis.direction
+            parts.append(np.concatenate([turn, np.cross(turn, pose.translation - pose.apply(self._axis.point))]))
+        return np.concatenate(parts)
+
+
+class _Mixing:
+    """Steps of a fixed-point iteration mixed with the last ones (Anderson 1965, with a memory of one).
+
+    A window is as wide as a fold of an object, so its displacement is not quite that of its centre, and plain
+    steps take up only a part of what is left in the directions that are seen worst.
+    """
+
+    def __init__(self) -> None:
+        self._plain: Array | None = None
+        self._taken: Array | None = None
+
+    def mixed(self, step: Array) -> Array:
+        """The step (u,) to take instead of the plain one."""
+        taken = step
+        if self._plain is not None and self._taken is not None:
+            change = step - self._plain
+            share = float(np.clip(step @ change / max(change @ change, 1e-300), -MOST_EXTRAPOLATED, 1.0))
+            taken = step - share * (self._taken + change)
+        self._plain, self._taken = step, taken
+        return taken
+
+
+def _inverse(information: Array, fixed: Array) -> Array:
+    """Inverse of an information matrix (u, u) in which the direction ``fixed`` (u,), if not zero, stays."""
+    length = float(np.linalg.norm(fixed))
+    direction = fixed / length if length > 0.0 else fixed
+    keep = np.eye(len(fixed)) - np.outer(direction, direction)
+    values, vectors = np.linalg.eigh(keep @ information @ keep)
+    inverse = (vectors / np.maximum(values, LEAST_SEEN * values[-1])) @ vectors.T
+    return keep @ inverse @ keep
+
+
+# The similarity between an object's frame and a map, from the keyframes' poses in both.
+
+
+PATH_ITERATIONS = 5
+
+
+def similarity_of_path(
+    adjusted: AdjustedKeyframes, start: SimilarityTransform, centre: Array, metric: bool = False
+) -> tuple[SimilarityTransform, Array]:
+    """The world_from_object that brings the map's keyframes nearest to the adjusted ones.
+
+    It minimises the squares of what the cameras' places differ by, and of what the sights differ by at the
+    object's distance.
+
+    Parameters
+    ----------
+    start : near it. centre : (3,) the mean node, object frame. metric : keep the scale.
+
+    Returns
+    -------
+    The similarity, and the covariance (7, 7) of log scale, rotation vector and translation about the centre,
+    world. It holds that of the adjusted poses, what the fit makes of the path's own errors, and these errors
+    as they are in a single keyframe: a camera that is found in the map has them.
+    """
+    transform, free = start, slice(1 if metric else 0, 7)
+    size, count = start.scale, len(adjusted.poses)
+    units = np.array([1.0] * 4 + [size] * 3)[free]
+    covariance = np.zeros((7, 7))
+    for _ in range(PATH_ITERATIONS):
+        metrics, rows, misses = [], [], []
+        for view, pose in zip(adjusted.views, adjusted.poses, strict=True):
+            placed = camera_from_object(view, transform)
+            metric_of_view = _metric(placed, centre)
+            metrics.append(metric_of_view)
+            rows.append(metric_of_view @ similarity_jacobian(placed, transform, centre)[:, free] * units)
+            turn = rotation_log(pose.rotation @ placed.rotation.T)
+            misses.append(metric_of_view @ np.concatenate([turn, pose.translation - placed.translation]))
+        stacked = np.concatenate(rows)
+        inverse = np.linalg.pinv(stacked.T @ stacked, rcond=1e-12, hermitian=True)
+        solution = inverse @ stacked.T @ np.concatenate(misses)
+        step = np.zeros(7)
+        step[free] = solution * units
+        left = np.concatenate(misses) - stacked @ solution
+        scores = np.einsum("kij,ki->kj", stacked.reshape(count, 6, -1), left.reshape(count, 6))
+        gain = np.concatenate([row.T @ m for row, m in zip(rows, metrics, strict=True)], axis=1)
+        meat = scores.T @ scores + gain @ adjusted.covariance @ gain.T
+        covariance[free, free] = inverse @ meat @ inverse * np.outer(units, units)
+        transform = moved_similarity(transform, step, centre)
+    covariance[1:, 1:] += _scatter(adjusted, transform, centre)
+    return transform, covariance
+
+
+def _scatter(adjusted: AdjustedKeyframes, transform: SimilarityTransform, centre: Array) -> Array:
+    """Mean square (6, 6) of what the object is turned and moved by, in the world, between the two paths."""
+    misses = []
+    for view, pose in zip(adjusted.views, adjusted.poses, strict=True):
+        placed, world_from_camera = camera_from_object(view, transform), view.camera_from_world.rotation.T
+        turn = rotation_log(pose.rotation @ placed.rotation.T)
+        shift = transform.scale * (pose.apply(centre) - placed.apply(centre))
+        misses.append(np.concatenate([world_from_camera @ turn, world_from_camera @ shift]))
+    return np.array(misses).T @ np.array(misses) / len(misses)
+
+
+def _metric(pose: RigidTransform, centre: Array) -> Array:
+    """What a pose's increment (6,) does to the sight at the object's distance and the camera's place."""
+    result = np.zeros((6, 6))
+    result[:3, :3] = float(np.linalg.norm(pose.apply(centre))) * np.eye(3)
+    result[3:, :3] = cross_matrix(pose.translation)
+    result[3:, 3:] = np.eye(3)
+    return result

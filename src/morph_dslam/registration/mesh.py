@@ -1,0 +1,435 @@
+"""What keyframes say for and against an object in a place: points it explains, and points it would hide."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import RegistrationError
+from morph_dslam.geometry import SimilarityTransform
+from morph_dslam.registration.icp import Axis, Fit, Surface, candidate_regions, find_planes, fit_surface, plane_points
+from morph_dslam.registration.keyframe_adjustment import AdjustedKeyframes, KeyframeAdjustment, similarity_of_path
+from morph_dslam.registration.outline_fit import OutlineFit, outline_fit
+from morph_dslam.registration.scene import MapPoints, View, spread_views
+from morph_dslam.registration.texture_alignment import TextureAlignment
+from morph_dslam.render.rasteriser import rasterise
+
+Array = NDArray[np.float64]
+
+#: A point that the object would hide counts against it as much as so many that it explains.
+VIOLATION = 2.0
+
+#: The views are drawn this much smaller.
+SHRINK = 4
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What speaks for a place.
+
+    Attributes
+    ----------
+    explained : (n,) points that lie on the visible side of the object. hidden : (n,) those it would hide.
+    solid : (n,) points explained without those of the one plane that holds most of them. Any flat face fits
+        on any table or wall, in any size.
+    """
+
+    explained: NDArray[np.bool_]
+    hidden: NDArray[np.bool_]
+    solid: NDArray[np.bool_]
+
+    @property
+    def score(self) -> float:
+        """Points explained, but for one plane, less those hidden, these `VIOLATION` times."""
+        return float(self.solid.sum() - VIOLATION * self.hidden.sum())
+
+
+def gather_evidence(
+    world_from_object: SimilarityTransform,
+    nodes: Array,
+    triangles: NDArray[np.int64],
+    positions: Array,
+    views: Sequence[View],
+    camera: PinholeCamera,
+    tolerance: float,
+) -> Evidence:
+    """Draw the object into every view and compare its depth with that of the points seen there.
+
+    Parameters
+    ----------
+    nodes : (n, 3) of the mesh, object frame. positions : (p, 3) of all map points, world.
+    tolerance : how far from the surface a point may lie that it explains, world unit.
+    """
+    votes = np.zeros((2, len(positions)), dtype=np.int64)
+    small = _shrunk(camera)
+    world = world_from_object.apply(nodes)
+    for view in views:
+        local = view.camera_from_world.apply(world)
+        buffers = rasterise(small.project(local), local[:, 2], triangles, small.height, small.width)
+        depth = view.camera_from_world.apply(positions[view.point_ids])[:, 2]
+        columns, rows = np.rint((view.pixels + 0.5) / SHRINK - 0.5).astype(np.int64).T
+        inside = (columns >= 0) & (columns < small.width) & (rows >= 0) & (rows < small.height)
+        drawn = np.full(len(depth), np.inf)
+        drawn[inside] = buffers.depth[rows[inside], columns[inside]]
+        # A grazing surface changes its depth within a pixel: what is hidden must be so by more.
+        votes[0, view.point_ids] += np.abs(depth - drawn) <= 2.0 * tolerance
+        votes[1, view.point_ids] += drawn < depth - 4.0 * tolerance
+    explained, hidden = votes[0] > votes[1], votes[1] > votes[0]
+    solid = explained.copy()
+    found = np.flatnonzero(explained)
+    if len(found) >= 3:
+        solid[found] = ~plane_points(positions[found], tolerance, np.random.default_rng(0))
+    return Evidence(explained, hidden, solid)
+
+
+def _shrunk(camera: PinholeCamera) -> PinholeCamera:
+    return PinholeCamera(
+        camera.width // SHRINK,
+        camera.height // SHRINK,
+        camera.fx / SHRINK,
+        camera.fy / SHRINK,
+        (camera.cx + 0.5) / SHRINK - 0.5,
+        (camera.cy + 0.5) / SHRINK - 0.5,
+    )
+
+
+# Attitudes in which a surface starts when it is looked for in a map.
+
+
+#: Turns about the normal of a plane that a body may stand on.
+TURNS = 8
+
+#: Directions of an axis nearer to each other than this (rad) are one.
+ALIKE = 0.1
+
+
+def attitudes(axis: Axis | None, normal: Array | None) -> list[Array]:
+    """Rotations (3, 3), world from object: some spread over all, and those in which the body stands upright.
+
+    Spread over all are those of the icosahedron. A body stands on the plane when one of the six directions of
+    its frame's axes is along the plane's normal. Of a body of revolution only the direction of its axis
+    counts.
+
+    Parameters
+    ----------
+    axis : of a body of revolution. normal : (3,) of the plane that holds most of the map, if there is one.
+    """
+    rotations = list(Rotation.create_group("I").as_matrix())
+    if normal is not None:
+        rotations = [*_standing(normal, axis), *rotations]
+    if axis is None:
+        return rotations
+    kept: list[Array] = []
+    for rotation in rotations:
+        if all(np.linalg.norm((rotation - other) @ axis.direction) > ALIKE for other in kept):
+            kept.append(rotation)
+    return kept
+
+
+def _standing(normal: Array, axis: Axis | None) -> list[Array]:
+    """Rotations that lay a direction of the object along a plane's normal, either side up."""
+    if axis is not None:
+        return [_onto(axis.direction, sign * normal) for sign in (1.0, -1.0)]
+    turns = [Rotation.from_rotvec(2.0 * np.pi * k / TURNS * normal).as_matrix() for k in range(TURNS)]
+    upright = [_onto(direction, normal) for direction in (*np.eye(3), *-np.eye(3))]
+    return [turn @ rotation for rotation in upright for turn in turns]
+
+
+def _onto(direction: Array, target: Array) -> Array:
+    """A rotation that takes one direction to another; both of unit length."""
+    return Rotation.align_vectors(target[None], direction[None])[0].as_matrix()
+
+
+# Registration of a mesh to a sparse map: where the object is, how large the map's unit is, and how sure.
+# Regions of the map that stand out of its planes are tried in turn. In each the surface starts in many
+# attitudes and sizes, is laid through the points by scaled robust ICP, and every result is scored by the
+# keyframes: points that it explains count for it, points that it would hide against it. The best and the best
+# other one are kept, and the best is refined by comparing the keyframes' images on it. Last, these are asked
+# whether they show its outline there.
+
+
+#: Sizes at which the surface starts, over that of the region.
+START_SIZES = (0.85, 1.1, 1.45)
+
+#: How far its middle starts behind that of the points, which lie on the filmed side; over their spread.
+START_BEHIND = (0.0, 0.6)
+
+#: Points used while searching; starts of a region that are followed to their end, scored by few keyframes,
+#: and refined and scored by more.
+MOST_POINTS, N_FOLLOWED, N_SCORED, N_REFINED = 120, 120, 40, 5
+
+#: Samples of the surface while searching, and keyframes asked for evidence, first and then.
+ROUGH_SAMPLES, FIRST_ASKED, MOST_ASKED = 3000, 3, 10
+
+#: Widths of the robust weights over the surface's size: for all starts, for the better ones, to refine these.
+COARSE = np.array([0.3, 0.25, 0.2, 0.15])
+
+MIDDLE = np.array([0.15, 0.12, 0.1, 0.08, 0.07, 0.06, 0.05])
+
+FINE = np.array([0.05, 0.04, 0.04, 0.03, 0.03, 0.025, 0.025, 0.02, 0.02, 0.02])
+
+#: A point explained lies this near to the surface, over its size.
+TOLERANCE = 0.015
+
+#: A lower score is no evidence.
+FEWEST_EXPLAINED = 20
+
+#: Two places are one if the surfaces are this near to each other, over their size.
+SAME_PLACE = 0.05
+
+#: The runner-up's score over the best's above which the two cannot be told apart.
+AMBIGUOUS = 0.8
+
+#: So many of the best places are compared by the images on them, if they score at least this part of the
+#: best. Images that differ by more than this, pixels, or so many times as much as on another place, speak
+#: against a place.
+N_COMPARED, WORTH_COMPARING, POOR_AGREEMENT_PX, MUCH_WORSE = 4, 0.5, 0.35, 2.0
+
+
+@dataclass(frozen=True)
+class MeshRegistration:
+    """An object found in a map.
+
+    Attributes
+    ----------
+    world_from_object : metres to the map's unit.
+    covariance : (7, 7) of log scale, rotation vector and translation about the mean node, world.
+    score, runner_up : of `Evidence`, for this place and for the next best.
+    n_explained : points on the surface.
+    rms_px : how far the keyframes' images of the surface agree; None if there was too little to compare.
+    axis : about which the surface can be turned without a difference, so that this angle is not known.
+    keyframes : those with a pose of their own about the object; None if there was too little to compare.
+    outline : how much of its outline the keyframes show where it is.
+    unconfirmed : whether there are images, but nothing on the object could be compared in them: a floor and a
+        wall, say, that have its shape in another size.
+    """
+
+    world_from_object: SimilarityTransform
+    covariance: Array | None
+    score: float
+    runner_up: float
+    n_explained: int
+    rms_px: float | None
+    axis: Axis | None
+    keyframes: AdjustedKeyframes | None = None
+    outline: OutlineFit = field(default_factory=OutlineFit)
+    unconfirmed: bool = False
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether another place is nearly as good, or the images contradict this one or tell nothing."""
+        contradicted = self.rms_px is not None and self.rms_px > POOR_AGREEMENT_PX
+        contradicted |= self.outline.contradicts
+        return self.unconfirmed or contradicted or self.runner_up > AMBIGUOUS * self.score
+
+
+@dataclass(frozen=True)
+class _Place:
+    transform: SimilarityTransform
+    evidence: Evidence
+
+
+def register_mesh(
+    nodes: Array,
+    triangles: NDArray[np.int64],
+    points: MapPoints,
+    views: Sequence[View],
+    camera: PinholeCamera,
+    metric: bool = False,
+    progress: bool = False,
+) -> MeshRegistration:
+    """Find an undeformed object in a map.
+
+    Parameters
+    ----------
+    nodes : (n, 3) metres. triangles : (m, 3), outwards if the surface is closed.
+    points : of the map. views : its keyframes, whose ``point_ids`` are rows of ``points``.
+    camera : of the views, without distortion. metric : the map's unit is the metre.
+
+    Raises
+    ------
+    RegistrationError
+        If no place in the map explains enough points.
+    """
+    rough, surface = Surface.of_mesh(nodes, triangles, ROUGH_SAMPLES), Surface.of_mesh(nodes, triangles)
+    planes = find_planes(points.positions)
+    starts_in = attitudes(surface.axis_of_revolution, planes.largest_normal(points.positions))
+
+    def judged(place: SimilarityTransform, asked: Sequence[View]) -> _Place:
+        tolerance = TOLERANCE * surface.size * place.scale
+        return _Place(place, gather_evidence(place, nodes, triangles, points.positions, asked, camera, tolerance))
+
+    places: list[_Place] = []
+    few, more = spread_views(views, FIRST_ASKED), spread_views(views, MOST_ASKED)
+    for region in tqdm(
+        candidate_regions(points.positions, planes), desc="registering", unit="region", disable=not progress
+    ):
+        starts = [judged(place, few) for place in _searched(points[region], rough, starts_in, metric)]
+        for start in sorted(starts, key=lambda place: -place.evidence.score)[:N_REFINED]:
+            places.append(judged(_refined(start.transform, points, surface, metric), more))
+    candidates = _distinct(places, len(points), surface)
+    aligner = TextureAlignment(nodes, triangles, camera, views, metric)
+    found = _chosen(candidates, aligner, surface)
+    if found.rms_px is not None:
+        adjustment = KeyframeAdjustment(nodes, triangles, camera, points, views, surface.axis_of_revolution)
+        found = _adjusted(found, adjustment, nodes.mean(axis=0), metric)
+    outline = outline_fit(found.world_from_object, nodes, triangles, more, camera)
+    unconfirmed = found.rms_px is None and any(np.ptp(view.flat) > 0 for view in views)
+    return replace(found, outline=outline, unconfirmed=unconfirmed)
+
+
+def _adjusted(
+    found: MeshRegistration, adjustment: KeyframeAdjustment, mean_node: Array, metric: bool
+) -> MeshRegistration:
+    """The registration with keyframes placed about the object, where there is enough to compare."""
+    keyframes = adjustment.adjust(found.world_from_object)
+    if keyframes is None:
+        return found
+    placed, covariance = similarity_of_path(keyframes, found.world_from_object, mean_node, metric)
+    return replace(found, world_from_object=placed, covariance=covariance, keyframes=keyframes)
+
+
+def _refined(start: SimilarityTransform, points: MapPoints, surface: Surface, metric: bool) -> SimilarityTransform:
+    """The place near ``start`` that fits all points around it."""
+    size = surface.size * start.scale
+    near = np.linalg.norm(points.positions - start.apply(surface.centre), axis=1) < size
+    return fit_surface(points[near], surface, start, FINE * size, metric).world_from_object
+
+
+def _searched(points: MapPoints, surface: Surface, starts_in: list[Array], metric: bool) -> list[SimilarityTransform]:
+    """The best distinct fits to a region, before the keyframes have been asked."""
+    some = points[np.random.default_rng(0).permutation(len(points))[:MOST_POINTS]]
+    centre = np.median(points.positions, axis=0)
+    spread = float(np.sqrt(np.mean(np.sum((points.positions - centre) ** 2, axis=1))))
+    away = centre - points.viewpoints.mean(axis=0)
+    away *= spread / np.linalg.norm(away)
+    starts = []
+    for scale in (1.0,) if metric else np.array(START_SIZES) * spread / surface.radius:
+        for rotation, behind in product(starts_in, START_BEHIND):
+            place = centre + behind * away - scale * rotation @ surface.centre
+            start = SimilarityTransform(scale, rotation, place)
+            starts.append(fit_surface(some, surface, start, COARSE * surface.size * scale, metric, False))
+    fits = []
+    for rough in _by_weight(starts)[:N_FOLLOWED]:
+        begun = rough.world_from_object
+        fits.append(fit_surface(some, surface, begun, MIDDLE * surface.size * begun.scale, metric, False))
+    chosen: list[SimilarityTransform] = []
+    for fit in _by_weight(fits):
+        place = fit.world_from_object
+        if len(chosen) < N_SCORED and all(not _same_place(place, other, surface) for other in chosen):
+            chosen.append(place)
+    return chosen
+
+
+def _by_weight(fits: list[Fit]) -> list[Fit]:
+    return sorted(fits, key=lambda fit: -float(fit.weights.sum()))
+
+
+def _same_place(a: SimilarityTransform, b: SimilarityTransform, surface: Surface) -> bool:
+    """Whether two similarities lay the surface, as a set of points, in the same place."""
+    between = b.inverse @ a
+    if not abs(np.log(between.scale)) < 0.1:
+        return False
+    distances, _ = surface.tree.query(between.apply(surface.points[::20]))
+    return float(distances.mean()) < SAME_PLACE * surface.size
+
+
+def _distinct(places: list[_Place], n_points: int, surface: Surface) -> list[_Place]:
+    """The best places, no two of them the same, by their score."""
+    places = sorted(places, key=lambda place: -place.evidence.score)
+    if not places or places[0].evidence.score < FEWEST_EXPLAINED:
+        raise RegistrationError(
+            f"the object was not found in the map of {n_points} points: {_best_of(places)}. Film the "
+            "undeformed object closer and from more sides, and check the unit of its mesh"
+        )
+    kept: list[_Place] = []
+    for place in places:
+        if all(not _same_place(place.transform, other.transform, surface) for other in kept):
+            kept.append(place)
+    return kept
+
+
+def _best_of(places: list[_Place]) -> str:
+    """What speaks for the best of the places (by score, the best first), none of which is good enough."""
+    if not places:
+        return "no region of it has enough points"
+    explained, solid, hidden = (
+        int(kind.sum()) for kind in (places[0].evidence.explained, places[0].evidence.solid, places[0].evidence.hidden)
+    )
+    return (
+        f"the best place explains {explained} of them, but only {solid} outside of a single plane (a flat "
+        f"face fits anywhere), and would hide {hidden} that were seen; {FEWEST_EXPLAINED} outside of it are "
+        "needed, and two more for each that is hidden"
+    )
+
+
+def _chosen(candidates: list[_Place], aligner: TextureAlignment, surface: Surface) -> MeshRegistration:
+    """The candidate on which the images agree best, of those that score well."""
+    least = WORTH_COMPARING * candidates[0].evidence.score
+    compared = [place for place in candidates[:N_COMPARED] if place.evidence.score >= least]
+    aligned = [aligner.refine(place.transform) for place in compared]
+    misfits = np.array([np.inf if found is None else found.rms_px for found in aligned])
+    row = int(np.argmin(misfits))  # the first where no images can be compared
+    best, alignment = compared[row], aligned[row]
+    place = best.transform if alignment is None else alignment.world_from_object
+    others = [other.evidence.score for other in candidates[len(compared) :]]
+    for other, found, misfit in zip(compared, aligned, misfits, strict=True):
+        moved = other.transform if found is None else found.world_from_object
+        if misfit <= MUCH_WORSE * misfits[row] and not _same_place(moved, place, surface):
+            others.append(other.evidence.score)
+    return MeshRegistration(
+        place,
+        None,
+        best.evidence.score,
+        max([0.0, *others]),
+        int(best.evidence.explained.sum()),
+        None if alignment is None else alignment.rms_px,
+        surface.axis_of_revolution,
+    )
+
+
+# Whether an object that is not found in a metric map would be if its mesh were in another unit.
+
+
+def register_in_unit(
+    nodes: Array,
+    triangles: NDArray[np.int64],
+    points: MapPoints,
+    views: Sequence[View],
+    camera: PinholeCamera,
+    metric: bool,
+    progress: bool = False,
+) -> MeshRegistration:
+    """As `register_mesh`; an object that a metric map does not hold is looked for in other sizes.
+
+    A monocular map has no unit: there an object of another size is found, with another map_units_per_metre,
+    and nobody can tell.
+
+    Raises
+    ------
+    RegistrationError
+        If the object is not found; the message says in which size it would have been.
+    """
+    try:
+        return register_mesh(nodes, triangles, points, views, camera, metric, progress)
+    except RegistrationError as error:
+        if not metric:
+            raise
+        try:
+            found = register_mesh(nodes, triangles, points, views, camera, False, progress)
+        except RegistrationError:
+            raise error from None
+        if found.ambiguous:
+            raise
+        raise RegistrationError(
+            "the object was not found in its size, but one of its shape that is "
+            f"{found.world_from_object.scale:.4g} times as large is there, and the map is metric: mend the "
+            "unit of the study's mesh"
+        ) from None

@@ -1,0 +1,432 @@
+"""Comparing keyframes on a mesh: what one image shows on the surface, the others must show there too.
+
+A keyframe's image is laid on the mesh and rendered into another view. Where surface and cameras are not where
+they should be, the rendering is displaced; Lucas-Kanade measures by how much, to a fraction of a pixel, at
+hundreds of points of each pair of views. Each displacement depends on the two poses alone, because a point is
+where the first view's ray meets the mesh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import permutations
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.render.rasteriser import Buffers, rasterise
+
+Array = NDArray[np.float64]
+
+Image = NDArray[np.uint8]
+
+#: Views between which the object turns by more than this are not compared.
+LARGEST_TURN = np.radians(35.0)
+
+#: Points of each view, and the least cosine between the surface's normal and the sight lines.
+N_CORNERS, LEAST_COSINE = 150, 0.3
+
+#: Side of the patches compared, pixels, and their least correlation.
+WINDOW, LEAST_CORRELATION = 17, 0.8
+
+
+@dataclass(frozen=True)
+class PairDisplacements:
+    """How two views differ on the mesh.
+
+    Attributes
+    ----------
+    first, second : numbers of the views. places : (p, 3) points on the surface, object frame, metres.
+    offsets : (p, 2) from where the second view should show the points to where it does, pixels.
+    by_first, by_second : (p, 2, 6) how the expected pixel moves with each pose (`pose_jacobian`).
+    """
+
+    first: int
+    second: int
+    places: Array
+    offsets: Array
+    by_first: Array
+    by_second: Array
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """The mesh in one view: projected nodes (n, 2), depths (n,), all pixels, and corners (c, 2) on it."""
+
+    flat: Image
+    pose: RigidTransform
+    pixels: Array
+    depths: Array
+    buffers: Buffers
+    corners: Array
+
+
+def pose_jacobian(points: Array, pose: RigidTransform) -> Array:
+    """How points (p, 3) in the camera frame move with the pose, (p, 3, 6).
+
+    The pose's increment is that of `online.state.moved`: a rotation vector, by which the object turns about
+    its origin as the camera's axes stand, and a difference of translation.
+    """
+    x, y, z = (points - pose.translation).T
+    zero, one = np.zeros(len(points)), np.ones(len(points))
+    return np.stack(
+        [
+            np.column_stack([zero, z, -y, one, zero, zero]),
+            np.column_stack([-z, zero, x, zero, one, zero]),
+            np.column_stack([y, -x, zero, zero, zero, one]),
+        ],
+        axis=1,
+    )
+
+
+def moved_pose(pose: RigidTransform, step: Array) -> RigidTransform:
+    """The pose after such an increment (6,)."""
+    return RigidTransform(rotation_exp(step[:3]) @ pose.rotation, pose.translation + step[3:])
+
+
+class TextureComparison:
+    """Compares images of one mesh.
+
+    Parameters
+    ----------
+    nodes : (n, 3) of the undeformed mesh, metres. triangles : (m, 3). camera : without distortion.
+    """
+
+    def __init__(self, nodes: Array, triangles: NDArray[np.int64], camera: PinholeCamera) -> None:
+        self._nodes, self._triangles, self._camera = nodes, triangles, camera
+        self._centre = nodes.mean(axis=0)
+
+    def measure(self, images: Sequence[Image], poses: Sequence[RigidTransform]) -> list[PairDisplacements]:
+        """Displacements between all views from not too different sides.
+
+        Parameters
+        ----------
+        images : (h, w) flattened. poses : camera_from_object of each, metres.
+        """
+        drawn = [self._draw(image, pose) for image, pose in zip(images, poses, strict=True)]
+        sights = [self._centre - pose.inverse.translation for pose in poses]
+        sights = [sight / np.linalg.norm(sight) for sight in sights]
+        pairs = [
+            self._compare(drawn, a, b)
+            for a, b in permutations(range(len(drawn)), 2)
+            if sights[a] @ sights[b] >= np.cos(LARGEST_TURN)
+        ]
+        return [pair for pair in pairs if pair is not None]
+
+    def _draw(self, flat: Image, pose: RigidTransform) -> _Drawn:
+        local = pose.apply(self._nodes)
+        pixels = self._camera.project(local)
+        size = (self._camera.height, self._camera.width)
+        buffers = rasterise(pixels, local[:, 2], self._triangles, *size)
+        return _Drawn(flat, pose, pixels, local[:, 2], buffers, _corners(flat, buffers))
+
+    def _compare(self, drawn: Sequence[_Drawn], a: int, b: int) -> PairDisplacements | None:
+        """What the second view shows of the corners that the first one sees."""
+        first, second = drawn[a], drawn[b]
+        if not len(first.corners):
+            return None
+        points, rays, normals, along = self._on_surface(first)
+        between = second.pose @ first.pose.inverse
+        seen = between.apply(points)
+        expected = self._camera.project(seen)
+        kept = self._visible(second, expected, seen[:, 2])
+        for corner, normal in ((points, normals), (seen, normals @ between.rotation.T)):
+            cosine = np.abs(np.einsum("px,px->p", normal, corner)) / np.linalg.norm(corner, axis=1)
+            kept &= cosine >= LEAST_COSINE
+        if not kept.any():
+            return None
+        moves, found = self._displaced(first, second, expected[kept])
+        rows = np.flatnonzero(kept)[found]
+        # When the first camera moves, the point slides along its ray to stay on the surface.
+        slide = np.einsum("px,py->pxy", rays[rows], normals[rows] / along[rows, None]) - np.eye(3)
+        projected = self._camera.projection_jacobian(seen[rows])
+        return PairDisplacements(
+            a,
+            b,
+            first.pose.inverse.apply(points[rows]),
+            moves[found],
+            projected @ (between.rotation @ slide @ pose_jacobian(points[rows], first.pose)),
+            projected @ pose_jacobian(seen[rows], second.pose),
+        )
+
+    def _on_surface(self, drawn: _Drawn) -> tuple[Array, Array, Array, Array]:
+        """Points (c, 3) of the corners on the mesh, their rays, normals, and how steeply these meet (c,)."""
+        columns, rows = np.rint(drawn.corners).astype(int).T
+        nodes = drawn.pose.apply(self._nodes[self._triangles[drawn.buffers.triangle_ids[rows, columns]]])
+        normals = np.cross(nodes[:, 1] - nodes[:, 0], nodes[:, 2] - nodes[:, 0])
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        rays = self._camera.rays(drawn.corners)
+        along = np.einsum("px,px->p", normals, rays)
+        far = np.einsum("px,px->p", normals, nodes[:, 0]) / along
+        return far[:, None] * rays, rays, normals, along
+
+    def _visible(self, drawn: _Drawn, pixels: Array, depths: Array) -> NDArray[np.bool_]:
+        """Which points, at pixels (p, 2) and depths (p,), nothing hides in a view."""
+        columns, rows = np.rint(np.nan_to_num(pixels, nan=-1.0)).astype(int).T
+        inside = (columns >= 0) & (columns < self._camera.width) & (rows >= 0) & (rows < self._camera.height)
+        result = np.zeros(len(pixels), dtype=bool)
+        behind = drawn.buffers.depth[rows[inside], columns[inside]]
+        result[inside] = depths[inside] <= 1.01 * behind
+        return result & (depths > 0.0)
+
+    def _displaced(self, first: _Drawn, second: _Drawn, expected: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """How far (p, 2) from the expected pixels the second view shows what the first does; which are so."""
+        carried, shown = np.zeros(first.flat.shape, np.float32), np.zeros(first.flat.shape, dtype=np.bool_)
+        buffers, seen = second.buffers, first.buffers.depth
+        carry(
+            buffers.triangle_ids,
+            buffers.weights,
+            self._triangles,
+            first.pixels,
+            first.depths,
+            seen,
+            first.flat,
+            carried,
+            shown,
+        )
+        moves, alike = align_patches(carried, shown, second.flat, expected, WINDOW // 2)
+        return moves, alike >= LEAST_CORRELATION
+
+
+def _corners(flat: Image, buffers: Buffers) -> Array:
+    """Corners (c, 2) of a view's image on the object, away from its rim."""
+    mask = cv2.erode(buffers.covered.astype(np.uint8), np.ones((9, 9), np.uint8))
+    corners = cv2.goodFeaturesToTrack(flat, N_CORNERS, 0.01, 5.0, mask=mask)
+    return np.empty((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
+
+
+# One view's texture carried by the mesh into another view, and how far patches of it are displaced there.
+# Pixels that the first view does not show, behind a fold of the object or beyond its rim, take no part. So a
+# patch at a fold or at the rim is measured by what both views show of it, whatever is in front or behind.
+
+
+#: A pixel is hidden in the first view if it lies behind what is seen there by this part of its depth.
+HIDDEN_BY = 0.01
+
+#: Iterations of an alignment, the step at which it ends, and the farthest that a patch may go, pixels.
+ITERATIONS, LAST_STEP, FARTHEST = 25, 2e-3, 8.0
+
+#: At least this part of a patch must be seen in both views, and the gradients must be so different (the
+#: determinant of their squares over the trace's square).
+LEAST_SHARE, LEAST_STRUCTURE = 0.4, 1e-3
+
+
+@njit(cache=True, nogil=True)
+def _cubic(t, weights):
+    """Catmull-Rom weights (4,) of the pixels around a place that is ``t`` beyond the second one."""
+    weights[0] = t * (-0.5 + t * (1.0 - 0.5 * t))
+    weights[1] = 1.0 + t * t * (1.5 * t - 2.5)
+    weights[2] = t * (0.5 + t * (2.0 - 1.5 * t))
+    weights[3] = t * t * (0.5 * t - 0.5)
+
+
+@njit(cache=True, nogil=True)
+def _sample(image, x, y, across, along):
+    """Grey level at a place at least one pixel inside; ``across``, ``along`` (4,) are scratch."""
+    x0, y0 = int(x), int(y)
+    _cubic(x - x0, across)
+    _cubic(y - y0, along)
+    value = 0.0
+    for j in range(4):
+        line = 0.0
+        for i in range(4):
+            line += across[i] * image[y0 - 1 + j, x0 - 1 + i]
+        value += along[j] * line
+    return value
+
+
+def _sample_numpy(image, x, y):
+    """The plain twin of `_sample`, for places (p,)."""
+    x0, y0 = x.astype(int), y.astype(int)
+    across, along = np.empty((4, len(x))), np.empty((4, len(x)))
+    _cubic.py_func(x - x0, across)
+    _cubic.py_func(y - y0, along)
+    grey = image.astype(float)
+    around = [[grey[y0 + j - 1, x0 + i - 1] for i in range(4)] for j in range(4)]
+    return np.einsum("jp,ip,jip->p", along, across, np.array(around))
+
+
+@njit(cache=True, nogil=True)
+def carry(triangle_ids, weights, triangles, coordinates, depths, depth, image, carried, shown):
+    """Fill ``carried`` (h, w), and ``shown`` where the second view's pixels are seen in the first.
+
+    Parameters
+    ----------
+    triangle_ids, weights : (h, w), (h, w, 3) of the second view's buffers. triangles : (m, 3).
+    coordinates, depths : (n, 2), (n,) the nodes in the first view. depth, image : (h, w) of the first view.
+    carried : (h, w) float32. shown : (h, w) bool.
+    """
+    height, width = triangle_ids.shape
+    across, along = np.empty(4), np.empty(4)
+    for row in range(height):
+        for column in range(width):
+            shown[row, column] = False
+            t = triangle_ids[row, column]
+            if t < 0:
+                continue
+            x, y, z = 0.0, 0.0, 0.0
+            for corner in range(3):
+                node, weight = triangles[t, corner], weights[row, column, corner]
+                x += weight * coordinates[node, 0]
+                y += weight * coordinates[node, 1]
+                z += weight * depths[node]
+            x0, y0 = int(np.floor(x)), int(np.floor(y))
+            if x0 < 1 or y0 < 1 or x0 + 2 >= width or y0 + 2 >= height:
+                continue
+            around = depth[y0 : y0 + 2, x0 : x0 + 2]
+            if z > around.min() * (1.0 + HIDDEN_BY) or z < around.max() * (1.0 - HIDDEN_BY):
+                continue
+            carried[row, column] = _sample(image, x, y, across, along)
+            shown[row, column] = True
+
+
+def carry_numpy(triangle_ids, weights, triangles, coordinates, depths, depth, image, carried, shown):
+    """The plain twin of `carry`."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    rows, columns = np.nonzero(triangle_ids >= 0)
+    corners, shares = triangles[triangle_ids[rows, columns]], weights[rows, columns]
+    x, y = np.einsum("pc,pci->ip", shares, coordinates[corners])
+    z = np.einsum("pc,pc->p", shares, depths[corners])
+    x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
+    kept = (x0 >= 1) & (y0 >= 1) & (x0 + 2 < image.shape[1]) & (y0 + 2 < image.shape[0])
+    rows, columns, x, y, z, x0, y0 = (part[kept] for part in (rows, columns, x, y, z, x0, y0))
+    nearest = minimum_filter(depth, size=2, origin=-1)[y0, x0] * (1.0 + HIDDEN_BY)
+    farthest = maximum_filter(depth, size=2, origin=-1)[y0, x0] * (1.0 - HIDDEN_BY)
+    seen = (z <= nearest) & (z >= farthest)
+    shown[:] = False
+    shown[rows[seen], columns[seen]] = True
+    carried[rows[seen], columns[seen]] = _sample_numpy(image, x[seen], y[seen])
+
+
+@njit(cache=True, nogil=True)
+def _patch(carried, shown, column, row, half, xs, ys, values, slopes):
+    """Pixels of a patch that are shown with their neighbours, their values and gradients; how many."""
+    height, width = carried.shape
+    count = 0
+    for y in range(max(row - half, 1), min(row + half + 1, height - 1)):
+        for x in range(max(column - half, 1), min(column + half + 1, width - 1)):
+            inner = shown[y, x] and shown[y, x - 1] and shown[y, x + 1] and shown[y - 1, x]
+            if not (inner and shown[y + 1, x]):
+                continue
+            xs[count], ys[count], values[count] = x, y, carried[y, x]
+            slopes[count, 0] = 0.5 * (carried[y, x + 1] - carried[y, x - 1])
+            slopes[count, 1] = 0.5 * (carried[y + 1, x] - carried[y - 1, x])
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _sample_patch(image, xs, ys, x, y, count, seen):
+    """Grey levels of a displaced patch into ``seen``; whether all of it is inside the image."""
+    height, width = image.shape
+    across, along = np.empty(4), np.empty(4)
+    for i in range(count):
+        u, v = xs[i] + x, ys[i] + y
+        if u < 1.0 or v < 1.0 or u >= width - 2 or v >= height - 2:
+            return False
+        seen[i] = _sample(image, u, v, across, along)
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _align(image, xs, ys, values, slopes, count, seen):
+    """Displacement and correlation of one patch, whose values and slopes have no mean."""
+    a = b = c = power = 0.0
+    for i in range(count):
+        a += slopes[i, 0] * slopes[i, 0]
+        b += slopes[i, 0] * slopes[i, 1]
+        c += slopes[i, 1] * slopes[i, 1]
+        power += values[i] * values[i]
+    determinant = a * c - b * b
+    if determinant <= LEAST_STRUCTURE * (a + c) ** 2 or power == 0.0:
+        return 0.0, 0.0, -1.0
+    x = y = 0.0
+    for _ in range(ITERATIONS):
+        if not _sample_patch(image, xs, ys, x, y, count, seen):
+            break
+        mean = seen[:count].mean()
+        both = own = 0.0
+        for i in range(count):
+            both += values[i] * (seen[i] - mean)
+            own += (seen[i] - mean) ** 2
+        if both <= 0.0 or own == 0.0:
+            break
+        e = f = 0.0
+        for i in range(count):
+            left = values[i] - power / both * (seen[i] - mean)
+            e += slopes[i, 0] * left
+            f += slopes[i, 1] * left
+        step_x, step_y = (c * e - b * f) / determinant, (a * f - b * e) / determinant
+        x, y = x + step_x, y + step_y
+        if max(abs(x), abs(y)) > FARTHEST:
+            break
+        if max(abs(step_x), abs(step_y)) < LAST_STEP:
+            return x, y, both / np.sqrt(power * own)
+    return x, y, -1.0
+
+
+@njit(cache=True, nogil=True)
+def align_patches(carried, shown, image, centres, half):
+    """Displacements of patches from a carried image to the second view's own one, compiled.
+
+    Gauss-Newton on the grey levels, whose mean and contrast are free (Evangelidis and Psarakis, Parametric
+    image alignment using enhanced correlation coefficient maximization, 2008), over the shown pixels.
+
+    Parameters
+    ----------
+    carried, shown : (h, w) of `carry`. image : (h, w) the second view. centres : (p, 2) pixels.
+    half : patches are 2 half + 1 pixels wide.
+
+    Returns
+    -------
+    (p, 2) displacements, and (p,) the correlations there; -1 where nothing could be measured.
+    """
+    side = (2 * half + 1) ** 2
+    moves, alike = np.zeros((len(centres), 2)), np.full(len(centres), -1.0)
+    xs, ys, values = np.empty(side), np.empty(side), np.empty(side)
+    slopes, seen = np.empty((side, 2)), np.empty(side)
+    for p in range(len(centres)):
+        column, row = int(np.rint(centres[p, 0])), int(np.rint(centres[p, 1]))
+        count = _patch(carried, shown, column, row, half, xs, ys, values, slopes)
+        if count < LEAST_SHARE * side:
+            continue
+        values[:count] -= values[:count].mean()
+        slopes[:count, 0] -= slopes[:count, 0].mean()
+        slopes[:count, 1] -= slopes[:count, 1].mean()
+        moves[p, 0], moves[p, 1], alike[p] = _align(image, xs, ys, values, slopes, count, seen)
+    return moves, alike
+
+
+def align_patches_numpy(carried, shown, image, centres, half):
+    """The plain twin of `align_patches`."""
+    from scipy.ndimage import binary_erosion, generate_binary_structure
+
+    inner = binary_erosion(shown, generate_binary_structure(2, 1))
+    down, right = np.gradient(carried.astype(float))
+    moves, alike = np.zeros((len(centres), 2)), np.full(len(centres), -1.0)
+    for p, centre in enumerate(np.rint(centres).astype(int)):
+        rows, columns = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1) + centre[::-1, None]
+        inside = (rows >= 0) & (columns >= 0) & (rows < image.shape[0]) & (columns < image.shape[1])
+        rows, columns = rows[inside], columns[inside]
+        rows, columns = rows[inner[rows, columns]], columns[inner[rows, columns]]
+        if len(rows) < LEAST_SHARE * (2 * half + 1) ** 2:
+            continue
+        values = carried[rows, columns] - carried[rows, columns].mean()
+        slopes = np.column_stack([right[rows, columns], down[rows, columns]])
+        slopes = slopes - slopes.mean(axis=0)
+        for _ in range(ITERATIONS):
+            seen = _sample_numpy(image, columns + moves[p, 0], rows + moves[p, 1])
+            seen = seen - seen.mean()
+            left = values - values @ values / (values @ seen) * seen
+            step = np.linalg.solve(slopes.T @ slopes, slopes.T @ left)
+            moves[p] += step
+            if np.abs(step).max() < LAST_STEP:
+                alike[p] = values @ seen / np.sqrt((values @ values) * (seen @ seen))
+                break
+    return moves, alike

@@ -1,0 +1,1 @@
+"""Camera tracking and mapping of a rigid scene."""

@@ -1,0 +1,308 @@
+"""ORB descriptors at given points, and matching points that have several of them.
+
+Descriptors are turned upright by each patch's intensity centroid (Rublee et al. 2011) and computed at several
+scales, since the points did not come from ORB's detector. The image is the grey one: flattening, by a window
+of fixed size, makes the same surface look different from nearer or farther.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numba import njit, types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera, StereoCamera
+from morph_dslam.errors import CameraError
+from morph_dslam.slam.depth import DepthImage, FrameDepth, StereoImages
+from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.pose import PoseEstimate, inside
+from morph_dslam.slam.rigid_map import NOWHERE, Followed
+from morph_dslam.slam.tracking import Tracked
+from morph_dslam.tracking.patches import flatten
+
+Array = NDArray[np.float64]
+
+Indices = NDArray[np.int64]
+
+Image = NDArray[np.uint8]
+
+Descriptors = NDArray[np.uint8]
+
+#: ORB's patch radius in pixels, and what it needs around a keypoint at the first scale.
+PATCH_RADIUS, BORDER = 15, 32
+
+SCALE_STEP = 1.2
+
+#: Octaves that points are described at, for changes of scale between 0.6 and 1.6.
+OCTAVES = (0, 2, 4)
+
+#: Bits in a descriptor.
+N_BITS = 256
+
+
+@njit(cache=True, nogil=True)
+def orientations(image, points):
+    """Direction (n,), degrees, from each point (n, 2) to the centroid of grey of the disc around it."""
+    result = np.empty(len(points))
+    for j in range(len(points)):
+        column, row = round(points[j, 0]), round(points[j, 1])
+        along_x = along_y = 0
+        for dy in range(-PATCH_RADIUS, PATCH_RADIUS + 1):
+            half = int(np.sqrt(PATCH_RADIUS**2 - dy**2))
+            for dx in range(-half, half + 1):
+                grey = np.int64(image[row + dy, column + dx])
+                along_x += dx * grey
+                along_y += dy * grey
+        result[j] = np.degrees(np.arctan2(float(along_y), float(along_x))) % 360.0
+    return result
+
+
+def describe(grey: Image, points: Array, octaves: tuple[int, ...]) -> tuple[Indices, Descriptors]:
+    """ORB descriptors (k, 32) of points (n, 2), at several scales, and the row (k,) of each one's point."""
+    whole = np.flatnonzero(inside(points, grey.shape, BORDER))
+    if not len(whole):
+        return np.empty(0, dtype=np.int64), np.empty((0, 32), dtype=np.uint8)
+    angles = orientations(grey, points[whole])
+    orb = cv2.ORB_create(nlevels=max(octaves) + 1, scaleFactor=SCALE_STEP)  # type: ignore[attr-defined]
+    # OpenCV reorders keypoints and drops those too near the border at their scale: class_id says which stay.
+    keypoints = [
+        cv2.KeyPoint(x, y, 31.0 * SCALE_STEP**octave, angle, 1.0, octave, row)
+        for octave in octaves
+        for row, (x, y), angle in zip(whole.tolist(), points[whole].tolist(), angles.tolist(), strict=True)
+    ]
+    kept, described = orb.compute(grey, keypoints)
+    if described is None:
+        return np.empty(0, dtype=np.int64), np.empty((0, 32), dtype=np.uint8)
+    return np.array([k.class_id for k in kept], dtype=np.int64), described
+
+
+@intrinsic
+def _ones(_context, word):
+    """Bits that are set in a 64-bit word."""
+
+    def generate(_context, builder, _signature, arguments):
+        return builder.ctpop(arguments[0])
+
+    return types.uint64(word), generate
+
+
+@njit(cache=True, nogil=True)
+def _least_distances(first, first_points, second, second_points, out):
+    for i in range(len(first)):
+        a, b, c, d = first[i, 0], first[i, 1], first[i, 2], first[i, 3]
+        row = out[first_points[i]]
+        for j in range(len(second)):
+            distance = (
+                _ones(a ^ second[j, 0])  # type: ignore[call-arg]
+                + _ones(b ^ second[j, 1])  # type: ignore[call-arg]
+                + _ones(c ^ second[j, 2])  # type: ignore[call-arg]
+                + _ones(d ^ second[j, 3])  # type: ignore[call-arg]
+            )
+            point = second_points[j]
+            row[point] = min(row[point], distance)
+
+
+def least_distances(
+    first: Descriptors, first_points: Indices, second: Descriptors, second_points: Indices
+) -> NDArray[np.uint16]:
+    """Least Hamming distance (a, b) between any descriptors of points 0..a-1 and of points 0..b-1.
+
+    Parameters
+    ----------
+    first, second : (i, 32), (j, 32). first_points, second_points : (i,), (j,) whose each one is.
+    """
+    shape = (int(first_points.max(initial=-1)) + 1, int(second_points.max(initial=-1)) + 1)
+    result = np.full(shape, N_BITS, dtype=np.uint16)
+    words = [np.ascontiguousarray(d).view(np.uint64) for d in (first, second)]
+    _least_distances(words[0], first_points, words[1], second_points, result)
+    return result
+
+
+def match_points(distances: NDArray[np.uint16], ratio: float, most: int) -> tuple[Indices, Indices]:
+    """Rows and columns (k,) of distances (n, m) that are nearest to each other, nearer than ``most`` bits.
+
+    Either's second best has to be further away by 1 / ``ratio``.
+    """
+    if min(distances.shape) < 2:
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    rows = np.arange(len(distances))
+    columns = distances.argmin(axis=1)
+    best = distances[rows, columns]
+    clear = (best < most) & (distances[:, columns].argmin(axis=0) == rows)
+    clear &= best < ratio * np.partition(distances, 1, axis=1)[:, 1]
+    rows, columns, best = rows[clear], columns[clear], best[clear]
+    kept = best < ratio * np.partition(distances[:, columns], 1, axis=0)[1]
+    return rows[kept], columns[kept]
+
+
+# What camera tracking hands over for each frame.
+
+
+STAGES = ("prepare", "start", "track", "map", "relocalise")
+
+
+@dataclass(frozen=True)
+class SlamFrame:
+    """What one frame gave.
+
+    Attributes
+    ----------
+    status : "waiting" for a start, "tracked", "relocalised", or "lost". reason : why there is no pose.
+    pose : from the map points, None without one.
+    points : map points that agree with it, and their pixels.
+    candidates : (c, 2) pixels of corners without depth.
+    disagreeing : points that look like their map point but do not obey the rigid scene.
+    keyframe : number of the keyframe in whose frame ``from_keyframe`` (4, 4) has the camera.
+    map_number : how many maps had been given up before the one that the pose is in.
+    is_keyframe : whether the map kept this view. timings_ms : by stage. total_ms : the whole frame.
+    waited_ms : where the map is made beside the frames, the most that this one can have waited for it: the
+        time of stage "map", and all the time in which the frame's thread did not run while the mapper did.
+    n_points, n_candidates, n_disagreeing : how many there were.
+    """
+
+    index: int
+    timestamp: float
+    status: str
+    reason: str
+    pose: PoseEstimate | None = None
+    points: Followed = NOWHERE
+    candidates: Array = field(default_factory=lambda: np.empty((0, 2)))
+    disagreeing: Followed = NOWHERE
+    keyframe: int = -1
+    from_keyframe: Array | None = None
+    map_number: int = 0
+    is_keyframe: bool = False
+    timings_ms: dict[str, float] = field(default_factory=dict)
+    total_ms: float = 0.0
+    waited_ms: float = 0.0
+    n_points: int = 0
+    n_candidates: int = 0
+    n_disagreeing: int = 0
+
+    def record(self, is_final: bool) -> SlamFrame:
+        """What is worth keeping of a frame of a long recording; no points where its pose is final."""
+        pose = self.pose if self.pose is None else replace(self.pose, inliers=np.empty(0, dtype=bool))
+        points = NOWHERE if is_final else self.points.without_unmeasured()
+        return replace(self, pose=pose, points=points, candidates=NOWHERE.pixels, disagreeing=NOWHERE)
+
+
+def corners_of(pixels: Array) -> dict[str, Any]:
+    """Fields of a frame of which only corners (c, 2) without depth are known."""
+    return {"candidates": pixels, "n_candidates": len(pixels)}
+
+
+def points_of(tracked: Tracked, is_candidate: NDArray[np.bool_]) -> dict[str, Any]:
+    """Fields of what was followed, some of it without its depth being known (n,)."""
+    known = tracked.points[~is_candidate]
+    counts = {"n_points": len(known.ids), "n_disagreeing": len(tracked.disagreeing.ids)}
+    points = {"points": known, "disagreeing": tracked.disagreeing}
+    return points | counts | corners_of(tracked.points.pixels[is_candidate])
+
+
+# From a frame as recorded to what tracking and mapping work on: undistorted, flattened, and depth.
+
+
+#: Baseline, metres, that depth images are taken to have: structured light's noise is then half a pixel.
+VIRTUAL_BASELINE = 0.08
+
+
+@dataclass(frozen=True)
+class FrameView:
+    """A frame.
+
+    Attributes
+    ----------
+    grey : (h, w) undistorted. flat : (h, w) the same flattened. depth : None where nothing measured it.
+    """
+
+    index: int
+    timestamp: float
+    grey: Image
+    flat: Image
+    depth: FrameDepth | None = None
+
+
+class FrameImages:
+    """Prepares the frames of one camera, alone, with depth images, or in a stereo pair.
+
+    Attributes
+    ----------
+    camera : of the undistorted images. baseline_px : of the depth (`RigidMap`), 0 without depth.
+
+    Raises
+    ------
+    CameraError
+        If a stereo pair is to have depth images too, or cannot be rectified.
+    """
+
+    def __init__(self, camera: PinholeCamera | StereoCamera, options: SlamOptions, with_depth: bool = False) -> None:
+        self._options = options
+        if isinstance(camera, StereoCamera):
+            if with_depth:
+                raise CameraError("a stereo pair measures depth itself: give one camera for depth images")
+            pair = camera.rectify()
+            self.camera, self._maps, self._right_maps = pair.camera, pair.left_maps, pair.right_maps
+            self.baseline_px = pair.camera.fx * pair.baseline
+        else:
+            self.camera, self._maps, self._right_maps = camera, camera.undistortion_maps(), None
+            self.baseline_px = camera.fx * VIRTUAL_BASELINE if with_depth else 0.0
+
+    def undistort(self, image: Image) -> Image:
+        """The image (h, w[, 3]) as ``camera`` would have seen it."""
+        return self._remapped(image, self._maps)
+
+    def prepare(
+        self,
+        image: Image,
+        index: int,
+        timestamp: float,
+        depth: NDArray[np.float32] | None = None,
+        right: Image | None = None,
+    ) -> FrameView:
+        """The view of a frame; depth or right images that the camera does not use are left aside.
+
+        Raises
+        ------
+        CameraError
+            If an image has not the camera's size.
+        """
+        grey = self._grey(image, f"frame {index}", self._maps)
+        flat = self._flat(grey)
+        return FrameView(index, timestamp, grey, flat, self._depth(index, flat, depth, right))
+
+    def _depth(
+        self, index: int, flat: Image, depth: NDArray[np.float32] | None, right: Image | None
+    ) -> FrameDepth | None:
+        if not self.baseline_px:
+            return None
+        if self._right_maps is not None:
+            if right is None:
+                return None
+            right = self._grey(right, f"the right image of frame {index}", self._right_maps)
+            return StereoImages(flat, self._flat(right), self._options)
+        if depth is None:
+            return None
+        self.camera.check_image(depth, f"the depth image of frame {index}")
+        if self._maps is not None:
+            # Depths on both sides of an edge must not be blended.
+            depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST, borderValue=np.nan)  # type: ignore[assignment]
+        return DepthImage(np.asarray(depth, dtype=np.float32), self.baseline_px)
+
+    def _grey(self, image: Image, where: str, maps: tuple[NDArray, NDArray] | None) -> Image:
+        self.camera.check_image(image, where)
+        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        return self._remapped(np.asarray(grey, dtype=np.uint8), maps)
+
+    def _flat(self, grey: Image) -> Image:
+        return flatten(grey, self._options.flow.flatten_window)
+
+    @staticmethod
+    def _remapped(image: Image, maps: tuple[NDArray, NDArray] | None) -> Image:
+        if maps is None:
+            return image
+        return np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), dtype=np.uint8)

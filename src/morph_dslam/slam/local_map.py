@@ -1,0 +1,283 @@
+"""Points of a new keyframe: corners to follow, depth from a frame or from two views, points mapped twice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.slam.bundle_adjustment import Adjustment, Observations, adjust
+from morph_dslam.slam.depth import FrameDepth, depth_of
+from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.pose import check_points, project, rays, reprojection_errors, triangulate, world_points
+from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, Followed, Indices, Keyframe, RigidMap
+from morph_dslam.tracking.patches import spread_corners
+
+Array = NDArray[np.float64]
+
+#: Points that miss a view by more than this multiple of the usual error are at no place; bounds in pixels.
+NEW_POINT_MISS_RATIO, NEW_POINT_LEAST_MISS_PX, NEW_POINT_MOST_MISS_PX = 4.0, 1.5, 4.0
+
+#: Points of one place: this near in the image, pixels, and their depths alike to this part.
+SAME_PIXEL, SAME_DEPTH = 2.0, 0.1
+
+#: Fewer missing corners than this are not worth a search.
+LEAST_MISSING = 10
+
+
+def free_corners(flat: NDArray[np.uint8], taken: Array, options: SlamOptions) -> Array:
+    """Corners (c, 2) of a flattened image, as many as are missing, away from the pixels (n, 2) taken."""
+    missing = options.map_corners - len(taken)
+    if missing < LEAST_MISSING:
+        return np.empty((0, 2))
+    mask = np.full(flat.shape, 255, dtype=np.uint8)
+    columns, rows = np.rint(taken).astype(int).clip(0, np.array(mask.shape[::-1]) - 1).T
+    mask[rows, columns] = 0
+    reach = 2 * options.corner_distance_px + 1
+    mask = np.asarray(cv2.erode(mask, np.ones((reach, reach), np.uint8)), dtype=np.uint8)
+    border = options.flow.window
+    mask[:border], mask[-border:], mask[:, :border], mask[:, -border:] = 0, 0, 0, 0
+    return spread_corners(flat, mask, missing)
+
+
+class PointMaker:
+    """Adds the points that a keyframe makes known to a map."""
+
+    def __init__(self, rigid_map: RigidMap, intrinsics: Array, options: SlamOptions) -> None:
+        self._map, self._intrinsics, self._options = rigid_map, intrinsics, options
+
+    def add_candidates(self, number: int, corners: Array, depth: float) -> None:
+        """Follow corners (c, 2) of a keyframe; their depth is a guess until they are triangulated."""
+        pose = self._map.keyframes[number].camera_from_world
+        positions = world_points(pose, corners, depth, self._intrinsics)
+        ids = self._map.add_points(positions, corners, number, CANDIDATE)
+        self._map.extend_keyframe(number, Followed(ids, corners))
+
+    def place_by_depth(self, number: int, depth: FrameDepth | None) -> None:
+        """Make map points of the candidates of a view that are near enough for their depth to be measured."""
+        rigid_map, keyframe = self._map, self._map.keyframes[number]
+        if depth is None or not rigid_map.is_metric:
+            return
+        rows = np.flatnonzero(rigid_map.state[keyframe.point_ids] == CANDIDATE)
+        right = depth.right_columns(keyframe.pixels[rows])
+        near = keyframe.pixels[rows, 0] - right >= self._options.least_disparity_px
+        rows, right = rows[near], right[near]
+        columns = keyframe.right.copy()
+        columns[rows] = right
+        keyframe.right = columns
+        ids, pixels = keyframe.point_ids[rows], keyframe.pixels[rows]
+        depths = depth_of(pixels, right, rigid_map.baseline_px)
+        rigid_map.positions[ids] = world_points(keyframe.camera_from_world, pixels, depths, self._intrinsics)
+        rigid_map.state[ids] = GOOD
+
+    def triangulate(self, number: int) -> None:
+        """Turn candidates whose rays have opened into map points; drop those that fit none, or were lost."""
+        keyframe, rigid_map = self._map.keyframes[number], self._map
+        waiting = np.flatnonzero(rigid_map.state == CANDIDATE)
+        rows, seen = keyframe.rows_of(waiting)
+        lost = waiting[~seen]
+        waiting, pixels = waiting[seen], keyframe.pixels[rows[seen]]
+        wrong = []
+        for first in np.unique(rigid_map.first_keyframe[waiting]):
+            of_first = rigid_map.first_keyframe[waiting] == first
+            wrong.append(self._triangulate_from(int(first), waiting[of_first], keyframe, pixels[of_first]))
+        rigid_map.remove(np.concatenate([lost, *wrong]))
+
+    def _triangulate_from(self, first: int, ids: Indices, keyframe: Keyframe, pixels: Array) -> Indices:
+        """Triangulate between two keyframes; returns the points that fit no place."""
+        start = self._map.keyframes[first].camera_from_world
+        first_pixels, now = self._map.first_pixels[ids], keyframe.camera_from_world
+        first_rays, second_rays = rays(first_pixels, self._intrinsics), rays(pixels, self._intrinsics)
+        a, b = first_rays @ start[:3, :3], second_rays @ now[:3, :3]
+        cosine = np.einsum("nx,nx->n", a, b) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
+        open_enough = cosine < np.cos(np.radians(self._options.triangulation_deg))
+        if not open_enough.any():
+            return ids[:0]
+        points = triangulate(start, now, first_rays[open_enough], second_rays[open_enough])
+        seen = [first_pixels[open_enough], pixels[open_enough]]
+        most = min(max(NEW_POINT_MISS_RATIO * self._map.usual_rms_px, NEW_POINT_LEAST_MISS_PX), NEW_POINT_MOST_MISS_PX)
+        good = check_points(points, [start, now], seen, self._intrinsics, most)
+        chosen = ids[open_enough]
+        poses = np.array([self._map.pose_of(k) for k in range(len(self._map.keyframes))])
+        good &= self._map.passing.agree(chosen, points, poses, self._intrinsics, most)
+        self._map.positions[chosen[good]] = points[good]
+        self._map.state[chosen[good]] = GOOD
+        return chosen[~good]
+
+    def fuse(self, number: int) -> None:
+        """Make map points that this view sees at one place one; candidates there are dropped."""
+        keyframe, rigid_map = self._map.keyframes[number], self._map
+        pixels, ids = keyframe.pixels, keyframe.point_ids
+        order = np.argsort(pixels[:, 0], kind="stable")
+        ends = np.searchsorted(pixels[order, 0], pixels[order, 0] + SAME_PIXEL)
+        pairs = [
+            (ids[order[i]], ids[order[j]])
+            for i in range(len(order))
+            for j in range(i + 1, ends[i])
+            if np.abs(pixels[order[i], 1] - pixels[order[j], 1]) < SAME_PIXEL
+        ]
+        _, depths = project(keyframe.camera_from_world, rigid_map.positions, self._intrinsics)
+        for pair in pairs:
+            older, newer = min(pair), max(pair)
+            if rigid_map.state[older] == GOOD and rigid_map.state[newer] == CANDIDATE:
+                rigid_map.remove(np.array([newer]))
+            elif rigid_map.state[older] == CANDIDATE and rigid_map.state[newer] == GOOD:
+                rigid_map.remove(np.array([older]))
+            elif (
+                rigid_map.state[older] == GOOD
+                and rigid_map.state[newer] == GOOD
+                and abs(depths[older] / depths[newer] - 1.0) < SAME_DEPTH
+            ):
+                rigid_map.merge(int(older), int(newer))
+
+
+# Bundle adjustment of a part of the map: gathered from it, solved apart from it, and put back.
+# In between, a tracker may go on with the map as it was: only putting back changes it.
+
+
+#: Observations that miss by more than this multiple of the median error after adjustment are taken out, and
+#: those beyond a smaller multiple before it count linearly; within bounds, in pixels. With bounds alone a few
+#: wrong points would bend an otherwise exact map.
+MISS_RATIO, LEAST_MISS_PX, MOST_MISS_PX = 6.0, 1.5, 4.0
+
+HUBER_RATIO, LEAST_HUBER_PX, MOST_HUBER_PX = 2.0, 0.2, 1.5
+
+TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class MapProblem:
+    """Keyframes and points to adjust together.
+
+    Attributes
+    ----------
+    numbers : (k,) keyframes, of which ``held`` (k,) stay where they are. free : those whose points count.
+    ids : (n,) points. camera_from_world : (k, 4, 4). positions : (n, 3).
+    """
+
+    numbers: Indices
+    free: Indices
+    held: NDArray[np.bool_]
+    ids: Indices
+    camera_from_world: Array
+    positions: Array
+    observations: Observations
+    intrinsics: Array
+    baseline_px: float
+    iterations: int
+
+    def solve(self) -> Adjustment:
+        """Adjusted poses and points; touches no map."""
+        usual = usual_error(self.errors(self.camera_from_world, self.positions))
+        return adjust(
+            self.camera_from_world,
+            self.positions,
+            self.observations,
+            self.intrinsics,
+            self.held,
+            self.baseline_px,
+            huber_px=min(max(HUBER_RATIO * usual, LEAST_HUBER_PX), MOST_HUBER_PX),
+            iterations=self.iterations,
+            tolerance=TOLERANCE,
+        )
+
+    def errors(self, camera_from_world: Array, positions: Array) -> Array:
+        """Distances (o,) in pixels between the observations and the projected points."""
+        seen = self.observations
+        poses, points = camera_from_world[seen.camera_idx], positions[seen.point_idx]
+        local = np.einsum("oij,oj->oi", poses[:, :3, :3], points) + poses[:, :3, 3]
+        return reprojection_errors(np.eye(4), local, seen.pixels, self.intrinsics)
+
+
+def usual_error(errors: Array) -> float:
+    """Median of some errors (n,), which outliers do not raise; infinite without any."""
+    return float(np.median(errors)) if len(errors) else float("inf")
+
+
+def local_window(rigid_map: RigidMap, options: SlamOptions) -> tuple[Indices, Indices]:
+    """The newest keyframe and those that see the same points, to be adjusted, and others to hold them."""
+    newest = len(rigid_map.keyframes) - 1
+    ids = rigid_map.keyframes[newest].point_ids
+    shared = rigid_map.shared_points(ids[rigid_map.state[ids] == GOOD])
+    shared[newest] = np.iinfo(np.int64).max
+    window = np.argsort(-shared, kind="stable")[: options.window]
+    window = window[shared[window] > 0]
+    local = np.unique(np.concatenate([rigid_map.keyframes[k].point_ids for k in window]))
+    around = rigid_map.shared_points(local[rigid_map.state[local] == GOOD])
+    around[window] = 0
+    holders = np.argsort(-around, kind="stable")[: options.fixed_window]
+    return np.sort(window), np.sort(holders[around[holders] > 0])
+
+
+def gather(
+    rigid_map: RigidMap, intrinsics: Array, free: Indices, fixed: Indices, iterations: int, hold_poses: bool = False
+) -> MapProblem:
+    """The problem of ``free`` keyframes (numbers) and their points, held by ``fixed`` ones; intrinsics (4,).
+
+    Where nothing else is held, the oldest free one is; with ``hold_poses`` all are, and only points move.
+    """
+    numbers = np.concatenate([fixed, free])
+    held = np.arange(len(numbers)) < (len(numbers) if hold_poses else max(len(fixed), 1))
+    keyframes = [rigid_map.keyframes[k] for k in numbers]
+    wanted = np.zeros(len(rigid_map.state), dtype=bool)
+    for k in free:
+        wanted[rigid_map.keyframes[k].point_ids] = True
+    wanted &= rigid_map.state == GOOD
+    ids = np.flatnonzero(wanted)
+    local = np.full(len(wanted), -1)
+    local[ids] = np.arange(len(ids))
+    chosen = [wanted[keyframe.point_ids] for keyframe in keyframes]
+    observations = Observations(
+        np.repeat(np.arange(len(numbers)), [int(rows.sum()) for rows in chosen]),
+        np.concatenate([local[k.point_ids[rows]] for k, rows in zip(keyframes, chosen, strict=True)]),
+        np.concatenate([k.pixels[rows] for k, rows in zip(keyframes, chosen, strict=True)]),
+        np.concatenate([k.right[rows] for k, rows in zip(keyframes, chosen, strict=True)]),
+    )
+    return MapProblem(
+        numbers,
+        free,
+        held,
+        ids,
+        np.array([keyframe.camera_from_world for keyframe in keyframes]),
+        rigid_map.positions[ids],
+        observations,
+        intrinsics,
+        rigid_map.baseline_px,
+        iterations,
+    )
+
+
+def put_back(rigid_map: RigidMap, problem: MapProblem, result: Adjustment) -> None:
+    """Take over the adjusted poses and points, and take out what contradicts them."""
+    rigid_map.positions[problem.ids] = result.points
+    for k, pose in zip(problem.numbers, result.camera_from_world, strict=True):
+        rigid_map.keyframes[k].camera_from_world = pose
+    usual = usual_error(problem.errors(result.camera_from_world, result.points))
+    most = min(max(MISS_RATIO * usual, LEAST_MISS_PX), MOST_MISS_PX)
+    _drop_misses(rigid_map, problem.free, problem.intrinsics, most)
+
+
+def _drop_misses(rigid_map: RigidMap, numbers: Indices, intrinsics: Array, most_px: float) -> None:
+    """Take out the observations that contradict the map, then points that fewer than two views see."""
+    for k in numbers:
+        keyframe = rigid_map.keyframes[k]
+        ids = keyframe.point_ids
+        errors = reprojection_errors(keyframe.camera_from_world, rigid_map.positions[ids], keyframe.pixels, intrinsics)
+        keyframe.keep((errors < most_px) | (rigid_map.state[ids] != GOOD))
+        _drop_wrong_depths(rigid_map, keyframe, intrinsics)
+    seen = rigid_map.n_observations()
+    rigid_map.remove(np.flatnonzero((rigid_map.state == GOOD) & (seen < 2)))
+
+
+def _drop_wrong_depths(rigid_map: RigidMap, keyframe: Keyframe, intrinsics: Array) -> None:
+    """Forget the columns in the right image that contradict the map."""
+    if not rigid_map.is_metric:
+        return
+    points = rigid_map.positions[keyframe.point_ids]
+    pixels, depths = project(keyframe.camera_from_world, points, intrinsics)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        misses = np.abs(pixels[:, 0] - rigid_map.baseline_px / depths - keyframe.right)
+        wrong = (misses > MOST_MISS_PX) & (rigid_map.state[keyframe.point_ids] == GOOD)
+    keyframe.right = np.where(wrong, np.nan, keyframe.right)

@@ -1,0 +1,254 @@
+"""A map from frames whose poses are known, by whatever program: only its points have to be found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import MapError
+from morph_dslam.io.colmap import ColmapImage, ColmapModel
+from morph_dslam.io.trajectory import Trajectory
+from morph_dslam.slam.frame_images import OCTAVES, FrameImages, FrameView, describe
+from morph_dslam.slam.mapping import Mapper, do_all
+from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.pose import PoseEstimate, inside, inverse, reprojection_errors
+from morph_dslam.slam.rigid_map import GOOD, NOWHERE, POINT_ARRAYS, Followed, Keyframe, RigidMap
+from morph_dslam.slam.tracking import Tracked, Tracker
+from morph_dslam.sources import FrameSource
+from morph_dslam.tracking.patches import FlowOptions
+
+Array = NDArray[np.float64]
+
+#: Frames and poses belong together if they are at most this far apart in time, seconds.
+MOST_TIME_DIFFERENCE = 0.01
+
+#: Depth of points of which nothing is known, in lengths of the path: images then move by rotation alone.
+FAR = 100.0
+
+#: Points are found again where the poses have them in at least this share of frames: 0.9 with exact
+#: poses, 0.15 with poses that are a tenth of a second late.
+LEAST_FOUND = 0.4
+
+
+def map_from_trajectory(
+    trajectory: Trajectory, source: FrameSource, images: FrameImages, options: SlamOptions
+) -> RigidMap:
+    """Points triangulated from the frames of a recording that have a pose, with these poses.
+
+    Lengths are the trajectory's.
+
+    Raises
+    ------
+    MapError
+        If fewer than three frames have a pose, or too few points obey the poses.
+    """
+    rigid_map, intrinsics = RigidMap(), np.asarray(images.camera.intrinsics)
+    mapper = Mapper(rigid_map, intrinsics, options, hold_poses=True, unknown_depth=FAR * trajectory.length)
+    tracker = _PosedTracker(rigid_map, intrinsics, options)
+    times, n_posed = [], 0
+    for frame in source:
+        times.append(frame.timestamp)
+        nearest = int(np.abs(trajectory.timestamps - frame.timestamp).argmin())
+        if abs(trajectory.timestamps[nearest] - frame.timestamp) > MOST_TIME_DIFFERENCE:
+            continue
+        n_posed += 1
+        pose = inverse(trajectory.world_from_camera[nearest])
+        view = images.prepare(frame.image, frame.index, frame.timestamp)
+        if not rigid_map.keyframes:
+            mapper.begin_at(view, pose)
+            tracker.place(pose, rigid_map.keyframes[-1].seen)
+            continue
+        tracked = tracker.track_at(view.flat, pose)
+        if mapper.wants_keyframe(tracked, view.index):
+            do_all(mapper.insert(tracked, view))
+            tracker.points = rigid_map.keyframes[-1].seen
+    _check(trajectory, source, options, n_posed, times, rigid_map)
+    mapper.adjust_all()
+    return rigid_map
+
+
+def _check(
+    trajectory: Trajectory,
+    source: FrameSource,
+    options: SlamOptions,
+    n_posed: int,
+    times: list[float],
+    rigid_map: RigidMap,
+) -> None:
+    """Refuse what gives no map."""
+    if n_posed < 3:
+        raise MapError(
+            f"only {n_posed} of {len(times)} frames of {source.name} have a pose: they are from "
+            f"{times[0]:.3f} to {times[-1]:.3f} s, the trajectory's from {trajectory.timestamps[0]:.3f} to "
+            f"{trajectory.timestamps[-1]:.3f} s, and may differ by {1e3 * MOST_TIME_DIFFERENCE:.0f} ms"
+        )
+    share = float(rigid_map.n_found.sum() / max(rigid_map.n_expected.sum(), 1))
+    if share < LEAST_FOUND or len(rigid_map.good) < options.least_start_points:
+        raise MapError(
+            f"the poses of the trajectory do not fit the images of {source.name}: "
+            f"{len(rigid_map.good)} points were made, found again in {share:.0%} of the frames. Check that "
+            "poses are world from camera (x right, y down, z forward) at the frames' timestamps, that most "
+            "frames have one, and the camera file"
+        )
+
+
+class _PosedTracker(Tracker):
+    """Follows points through frames of known pose."""
+
+    def track_at(self, flat: NDArray[np.uint8], camera_from_world: Array) -> Tracked:
+        """The points of the next frame, at its pose (4, 4)."""
+        options = self._options
+        flow = FlowOptions(options.flow.window, options.flow.levels + 1)
+        found = self._follow(flat, camera_from_world, flow)
+        found = found.joined(self._search(flat, camera_from_world, found.ids))
+        known = self._map.state[found.ids] == GOOD
+        positions, pixels = self._map.positions[found.ids[known]], found.pixels[known]
+        errors = reprojection_errors(camera_from_world, positions, pixels, self._intrinsics)
+        rms = float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0
+        pose = PoseEstimate(camera_from_world, np.zeros((6, 6)), errors < options.inlier_px, rms)
+        result = self._tracked(flat, pose, found, NOWHERE)
+        self.camera_from_world, self.points = camera_from_world, result.points
+        return result
+
+
+# Saving a map of the rigid scene, and loading it for another run with the same camera.
+
+
+FORMAT, VERSION = "morph-dslam map", 2
+
+KEYFRAME_ARRAYS = ("flat", "camera_from_world", "point_ids", "pixels", "right", "described_ids", "descriptors")
+
+
+def save_map(path: Path, rigid_map: RigidMap, camera: PinholeCamera) -> None:
+    """Write points, keyframes with their flattened images, and the camera that they are of, as HDF5."""
+    with h5py.File(path, "w") as file:
+        file.attrs.update({"format": FORMAT, "version": VERSION, "usual_rms_px": rigid_map.usual_rms_px})
+        file.attrs["baseline_px"] = rigid_map.baseline_px
+        file.attrs.update({"intrinsics": camera.intrinsics, "size": (camera.width, camera.height)})
+        kept = rigid_map.kept_keyframes
+        # Keyframes that were taken out are left out; points that were refer to nothing.
+        renumbered = np.zeros(len(rigid_map.keyframes), dtype=np.int64)
+        renumbered[kept] = np.arange(len(kept))
+        for name in POINT_ARRAYS:
+            array = getattr(rigid_map, name)
+            file[f"points/{name}"] = renumbered[array] if name.endswith("keyframe") else array
+        for number, keyframe in enumerate(rigid_map.keyframes[k] for k in kept):
+            group = file.create_group(f"keyframes/{number:06d}")
+            group.attrs.update({"index": keyframe.index, "timestamp": keyframe.timestamp})
+            for name in KEYFRAME_ARRAYS:
+                packed = {"compression": "gzip", "compression_opts": 1} if name == "flat" else {}
+                group.create_dataset(name, data=getattr(keyframe, name), **packed)
+
+
+def load_map(path: Path, camera: PinholeCamera) -> RigidMap:
+    """Read a map.
+
+    Raises
+    ------
+    MapError
+        If it is missing, damaged, empty, of another version, or of a camera with other intrinsics.
+    """
+    if not path.is_file():
+        raise MapError(f"there is no map {path}")
+    try:
+        with h5py.File(path, "r") as file:
+            return _read(path, file, camera)
+    except (OSError, KeyError) as error:
+        raise MapError(f"{path} is no map of `morph slam`, or damaged: {error}") from error
+
+
+def _read(path: Path, file: h5py.File, camera: PinholeCamera) -> RigidMap:
+    if file.attrs.get("format") != FORMAT:
+        raise MapError(f"{path} is no map of `morph slam`; give the map.h5 of a run folder")
+    if file.attrs["version"] != VERSION:
+        raise MapError(f"{path} has version {file.attrs['version']}; this release reads {VERSION}: map again")
+    intrinsics, size = np.asarray(file.attrs["intrinsics"]), tuple(np.asarray(file.attrs["size"]).tolist())
+    if size != (camera.width, camera.height) or not np.allclose(intrinsics, camera.intrinsics, rtol=1e-6):
+        raise MapError(
+            f"{path} was made with fx, fy, cx, cy = {', '.join(f'{x:.2f}' for x in intrinsics)} at "
+            f"{size[0]}x{size[1]} pixels: use the camera file it was made with"
+        )
+    keyframes = file.get("keyframes")
+    if not isinstance(keyframes, h5py.Group):
+        raise MapError(f"{path} is empty: the run that wrote it never began a map")
+    rigid_map = RigidMap(float(np.asarray(file.attrs["baseline_px"])))
+    rigid_map.usual_rms_px = float(np.asarray(file.attrs["usual_rms_px"]))
+    for name in POINT_ARRAYS:
+        setattr(rigid_map, name, np.asarray(file[f"points/{name}"]))
+    rigid_map.merged_into = np.arange(len(rigid_map.state))
+    for name in keyframes:
+        arrays = [np.asarray(keyframes[f"{name}/{array}"]) for array in KEYFRAME_ARRAYS]
+        index, timestamp = (np.asarray(keyframes[name].attrs[key]).item() for key in ("index", "timestamp"))
+        rigid_map.keyframes.append(Keyframe(index, timestamp, *arrays))
+    return rigid_map
+
+
+# A map from a COLMAP model and the images that it was made from.
+
+
+#: Observations that miss their points by more are left out; if half of them do, the cameras differ.
+MOST_ERROR_PX = 4.0
+
+
+def map_from_colmap(model: ColmapModel, source: FrameSource, images: FrameImages, options: SlamOptions) -> RigidMap:
+    """The points of a model, with the frames of a recording that are its images as keyframes.
+
+    A frame is an image if its number is the last one in the image's name. Lengths are the model's.
+
+    Raises
+    ------
+    MapError
+        If none of the frames is an image of the model, or its points are not where the camera has them.
+    """
+    wanted = {image.number: image for image in model.images}
+    rigid_map, errors, numbers = RigidMap(), [], []
+    nowhere = np.zeros((len(model.points), 2))
+    rigid_map.add_points(model.points, nowhere, 0, GOOD)
+    for frame in source:
+        numbers.append(frame.index)
+        if frame.index in wanted:
+            view = images.prepare(frame.image, frame.index, frame.timestamp)
+            errors.append(_add_keyframe(rigid_map, wanted[frame.index], view, model, images, options))
+    if not rigid_map.keyframes:
+        raise MapError(
+            f"none of the {len(wanted)} images of the COLMAP model ({min(wanted)}-{max(wanted)}, by the "
+            f"numbers in their names) is among the frames {numbers[0]}-{numbers[-1]} of {source.name}: "
+            "give the recording that it was made from with --images"
+        )
+    typical = float(np.median(np.concatenate(errors)))
+    if not typical < MOST_ERROR_PX:
+        raise MapError(
+            f"the points of the COLMAP model miss their pixels by {typical:.1f} px in {source.name}: give "
+            "the camera that it was made with (--camera MODEL/cameras.txt), and its own images with --images"
+        )
+    rigid_map.remove(np.flatnonzero(rigid_map.n_observations() < 1))
+    return rigid_map
+
+
+def _add_keyframe(
+    rigid_map: RigidMap,
+    image: ColmapImage,
+    view: FrameView,
+    model: ColmapModel,
+    images: FrameImages,
+    options: SlamOptions,
+) -> Array:
+    """Add an image of the model; returns by how much its points (n, 3) miss their pixels (n,)."""
+    # A point may have several keypoints in an image: the first counts.
+    ids, rows = np.unique(image.point_ids, return_index=True)
+    pixels = images.camera.undistort_pixels(image.pixels[rows])
+    intrinsics = np.asarray(images.camera.intrinsics)
+    errors = reprojection_errors(image.camera_from_world, model.points[ids], pixels, intrinsics)
+    good = (errors < MOST_ERROR_PX) & inside(pixels, view.flat.shape, options.patch_half + 2)
+    seen = Followed(ids, pixels)[good]
+    keyframe = Keyframe(
+        view.index, view.timestamp, view.flat, image.camera_from_world, seen.ids, seen.pixels, seen.right
+    )
+    rigid_map.add_keyframe(keyframe)
+    described, keyframe.descriptors = describe(view.grey, keyframe.pixels, OCTAVES)
+    keyframe.described_ids = keyframe.point_ids[described]
+    return errors

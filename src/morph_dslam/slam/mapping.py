@@ -1,0 +1,356 @@
+"""Which views the map keeps."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from collections.abc import Callable, Generator
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.slam.frame_images import OCTAVES, FrameView, describe
+from morph_dslam.slam.initialization import MapStart
+from morph_dslam.slam.local_map import PointMaker, free_corners, gather, local_window, put_back
+from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.pose import camera_centre, inverse, project
+from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, NOWHERE, Followed, Indices, Keyframe, RigidMap
+from morph_dslam.slam.tracking import Tracked
+
+Array = NDArray[np.float64]
+
+
+def median_depth(rigid_map: RigidMap, pose: Array, ids: Indices, intrinsics: Array, unknown: float) -> float:
+    """Median depth of the map points among some, seen from a pose (4, 4); ``unknown`` without any."""
+    known = ids[rigid_map.state[ids] == GOOD]
+    _, depths = project(pose, rigid_map.positions[known], intrinsics)
+    return max(float(np.median(depths)), 1e-6) if len(depths) else unknown
+
+
+class KeyframeChoice:
+    """Tells when a view is worth keeping.
+
+    Attributes
+    ----------
+    unknown_depth : depth of a scene of which nothing is known.
+    """
+
+    def __init__(self, rigid_map: RigidMap, intrinsics: Array, options: SlamOptions, unknown_depth: float) -> None:
+        self._map, self._intrinsics, self._options = rigid_map, intrinsics, options
+        self.unknown_depth = unknown_depth
+        self._n_points, self._frame_index = 0, -options.least_frames_between
+
+    def kept(self, number: int, frame_index: int) -> int:
+        """Note a new keyframe; returns how many map points it sees."""
+        ids, self._frame_index = self._map.keyframes[number].point_ids, frame_index
+        self._n_points = int((self._map.state[ids] == GOOD).sum())
+        return self._n_points
+
+    def wants(self, tracked: Tracked, frame_index: int) -> bool:
+        """Whether the map should keep this view."""
+        options = self._options
+        if frame_index - self._frame_index < options.least_frames_between:
+            return False
+        if tracked.n_inliers < max(options.urgent_share * self._n_points, 4 * options.least_inliers):
+            return True
+        if tracked.image_motion_px > options.quiet_px:
+            return False
+        return tracked.n_inliers < options.keyframe_share * self._n_points or self._has_moved_on(tracked)
+
+    def _has_moved_on(self, tracked: Tracked) -> bool:
+        """Whether points, or the camera, have moved far since the last keyframe."""
+        options, last, pose = self._options, self._map.keyframes[-1], tracked.pose.camera_from_world
+        rows, seen = last.rows_of(tracked.points.ids)
+        if not seen.any():
+            return True
+        motion = np.linalg.norm(tracked.points.pixels[seen] - last.pixels[rows[seen]], axis=1)
+        baseline = np.linalg.norm(camera_centre(pose) - camera_centre(last.camera_from_world))
+        depth = median_depth(self._map, pose, tracked.points.ids, self._intrinsics, self.unknown_depth)
+        return bool(np.median(motion) > options.keyframe_motion_px or baseline / depth > options.keyframe_baseline)
+
+
+# Taking out keyframes that show hardly anything that others do not show.
+# Where the camera comes back to places that are mapped, it adds keyframes there as it does elsewhere. Those
+# whose points are seen often enough without them go (Mur-Artal, Montiel and Tardós, ORB-SLAM, 2015), so that
+# a map grows with the scene and not with time. Small maps are left whole.
+
+
+#: Maps of at most so many keyframes are left whole.
+ENOUGH_KEYFRAMES = 40
+
+#: A keyframe can go if at least this share of its points is seen by so many others.
+REDUNDANT_SHARE, ENOUGH_OTHERS = 0.9, 3
+
+#: The newest keyframes stay: what they show has not been seen often yet.
+RECENT = 8
+
+#: Keyframes that go at once: more than come, so that a map that has become too large shrinks again.
+MOST_AT_ONCE = 2
+
+
+def cull_keyframes(rigid_map: RigidMap) -> None:
+    """Take out the keyframes around the newest one that can go, the most redundant ones first."""
+    for _ in range(MOST_AT_ONCE):
+        if len(rigid_map.kept_keyframes) <= ENOUGH_KEYFRAMES:
+            return
+        newest = rigid_map.keyframes[-1].point_ids
+        shared = rigid_map.shared_points(newest[rigid_map.state[newest] == GOOD])
+        numbers = np.flatnonzero(shared[:-RECENT])
+        # The first keyframe holds the world; candidates get their depth from where they were first seen.
+        waited_for = rigid_map.first_keyframe[rigid_map.state == CANDIDATE]
+        numbers = numbers[(numbers > 0) & ~np.isin(numbers, waited_for)]
+        shares = redundancy(rigid_map, numbers)
+        if not len(numbers) or shares.max() < REDUNDANT_SHARE:
+            return
+        gone = int(numbers[shares.argmax()])
+        others = rigid_map.shared_points(_good(rigid_map, gone))
+        others[gone] = 0
+        rigid_map.remove_keyframe(gone, carrier=int(others.argmax()))
+
+
+def redundancy(rigid_map: RigidMap, numbers: Indices) -> NDArray[np.float64]:
+    """Share (n,) of each keyframe's map points that enough other keyframes see."""
+    counts = np.zeros(len(rigid_map.state), dtype=np.int64)
+    for keyframe in rigid_map.keyframes:
+        counts[keyframe.point_ids] += 1
+    known = [_good(rigid_map, k) for k in numbers]
+    return np.array([float((counts[ids] > ENOUGH_OTHERS).mean()) if len(ids) else 1.0 for ids in known])
+
+
+def _good(rigid_map: RigidMap, number: int) -> Indices:
+    ids = rigid_map.keyframes[number].point_ids
+    return ids[rigid_map.state[ids] == GOOD]
+
+
+# Building the map: a kept view's new points, culling, fusion, local bundle adjustment.
+# A view is worked in by steps, between which tracking goes on (`mapping_work`).
+
+
+#: Map points that are found in a smaller share of the frames that should show them are taken out.
+LEAST_FOUND = 0.1
+
+#: Iterations of local bundle adjustment.
+LOCAL_ITERATIONS = 10
+
+
+class Mapper:
+    """Adds views to a map and keeps it right.
+
+    Parameters
+    ----------
+    hold_poses : whether the keyframes' poses are given, and only points are adjusted.
+    unknown_depth : at which corners are taken to be while nothing else is known.
+    """
+
+    def __init__(
+        self,
+        rigid_map: RigidMap,
+        intrinsics: Array,
+        options: SlamOptions,
+        hold_poses: bool = False,
+        unknown_depth: float = 1.0,
+    ) -> None:
+        self._map, self._intrinsics, self._options = rigid_map, intrinsics, options
+        self._hold_poses = hold_poses
+        self._points = PointMaker(rigid_map, intrinsics, options)
+        self._choice = KeyframeChoice(rigid_map, intrinsics, options, unknown_depth)
+
+    def begin(self, start: MapStart) -> None:
+        """Fill the empty map from three views, median depth 1 in the first."""
+        scale = 1.0 / float(np.median(start.points[:, 2]))
+        ids = self._map.add_points(scale * start.points, start.views[0].pixels, 0, GOOD)
+        for view, pose in zip(start.views, start.poses, strict=True):
+            scaled = pose.copy()
+            scaled[:3, 3] *= scale
+            self._map.add_keyframe(_keyframe(view.frame, scaled, Followed(ids.copy(), view.pixels)))
+        self._adjust_locally()
+        for number in (0, 1):
+            self._describe(number, start.views[number].frame)
+        do_all(self._finish(2, start.views[2].frame))
+
+    def begin_at(self, view: FrameView, camera_from_world: Array) -> int:
+        """Fill the empty map from one view at a pose (4, 4); returns how many points have a depth."""
+        number = self._map.add_keyframe(_keyframe(view, camera_from_world, NOWHERE))
+        do_all(self._finish(number, view))
+        return int((self._map.state == GOOD).sum())
+
+    def wants_keyframe(self, tracked: Tracked, frame_index: int) -> bool:
+        """Whether the map should keep this view."""
+        return self._choice.wants(tracked, frame_index)
+
+    def insert(self, tracked: Tracked, view: FrameView) -> Work:
+        """Keep a view: its points and the adjustment, then new corners, then its description.
+
+        Points that have left the rigid scene are taken out: when an object comes back to where it was, its
+        points must not hold the camera.
+        """
+        self._map.remove(tracked.moved)
+        number = self._map.add_keyframe(_keyframe(view, tracked.pose.camera_from_world, tracked.points))
+        self._points.place_by_depth(number, view.depth)
+        self._points.triangulate(number)
+        self._points.fuse(number)
+        self._adjust_locally()
+        self._cull()
+        yield
+        cull_keyframes(self._map)
+        yield from self._finish(number, view)
+
+    def adjust_all(self, iterations: int = 20) -> None:
+        """Bundle adjustment of the whole map."""
+        self._adjust(self._map.kept_keyframes, np.empty(0, dtype=np.int64), iterations)
+
+    def _finish(self, number: int, view: FrameView) -> Work:
+        """New corners to follow, and a description of what the view sees, so that it can be recognised."""
+        keyframe = self._map.keyframes[number]
+        corners = free_corners(keyframe.flat, keyframe.pixels, self._options)
+        if len(corners):
+            depth = median_depth(
+                self._map, keyframe.camera_from_world, keyframe.point_ids, self._intrinsics, self._choice.unknown_depth
+            )
+            self._points.add_candidates(number, corners, depth)
+        self._points.place_by_depth(number, view.depth)
+        self._choice.kept(number, view.index)
+        yield
+        self._describe(number, view)
+
+    def _describe(self, number: int, view: FrameView) -> None:
+        keyframe = self._map.keyframes[number]
+        rows, descriptors = describe(view.grey, keyframe.pixels, OCTAVES)
+        keyframe.described_ids, keyframe.descriptors = keyframe.point_ids[rows], descriptors
+
+    def _adjust_locally(self) -> None:
+        """Bundle adjustment of the newest keyframes that see the same points, held by others that do."""
+        window, holders = local_window(self._map, self._options)
+        self._adjust(window, holders, LOCAL_ITERATIONS)
+
+    def _adjust(self, free: Indices, fixed: Indices, iterations: int) -> None:
+        problem = gather(self._map, self._intrinsics, free, fixed, iterations, self._hold_poses)
+        put_back(self._map, problem, problem.solve())
+
+    def _cull(self) -> None:
+        """Take out map points that are hardly ever found where they should be."""
+        rigid_map = self._map
+        rare = rigid_map.n_found < LEAST_FOUND * rigid_map.n_expected
+        rigid_map.remove(np.flatnonzero((rigid_map.state == GOOD) & rare & (rigid_map.n_expected >= 20)))
+
+
+def _keyframe(view: FrameView, pose: Array, seen: Followed) -> Keyframe:
+    return Keyframe(view.index, view.timestamp, view.flat, pose, seen.ids, seen.pixels, seen.right)
+
+
+def pose_in_keyframe(camera_from_world: Array, keyframe: Keyframe) -> Array:
+    """The camera in a keyframe's frame (4, 4), which later adjustments of the keyframe carry along."""
+    return camera_from_world @ inverse(keyframe.camera_from_world)
+
+
+# The mapper's work as steps, between which tracking goes on.
+# Work is a generator that pauses where what follows can wait for another frame. In step with the frames each
+# step changes the map itself, one step a frame, so that the same frames give the same map. Beside them, a
+# thread does each step on a copy of the map, which replaces the map when the step has ended: frames wait for
+# none.
+
+
+Work = Generator[None, None, None]
+
+#: By how much the thread's priority is lower, in steps of `nice`: with this it still gets a third of what
+#: another program gets. With far less it would be stopped for long while it holds the interpreter.
+STANDS_BACK = 5
+
+
+def do_all(work: Work) -> None:
+    """Do work from its beginning to its end."""
+    for _ in work:
+        pass
+
+
+def one_step(do: Callable[[], None]) -> Work:
+    """Work without a pause."""
+    do()
+    yield from ()
+
+
+def _stand_back() -> None:
+    """Let this thread run behind the one that tracks, where both want the same processor.
+
+    Where other programs run too, frames would else wait for whole slices of the scheduler, some milliseconds
+    each. On Linux each thread has a priority of its own.
+    """
+    if sys.platform == "linux":
+        own = os.getpriority(os.PRIO_PROCESS, 0)
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), own + STANDS_BACK)
+
+
+class MappingWork:
+    """Work under way, at most one at a time.
+
+    Parameters
+    ----------
+    threaded : whether steps are done in a thread beside the frames.
+    before : done there before each step. after : done after each, by who goes on with the work.
+    """
+
+    def __init__(
+        self, threaded: bool, before: Callable[[], None] = lambda: None, after: Callable[[], None] = lambda: None
+    ) -> None:
+        self._work: Work | None = None
+        self._running: Future[bool] | None = None
+        self._before, self._after = before, after
+        self._thread = ThreadPoolExecutor(1, "mapper", _stand_back) if threaded else None
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether nothing is under way."""
+        return self._work is None
+
+    @property
+    def is_running(self) -> bool:
+        """Whether a step is being done in the thread."""
+        return self._running is not None and not self._running.done()
+
+    def begin(self, work: Work) -> None:
+        """Begin new work: do its first step, or have it done."""
+        self._work = work
+        self._next_step()
+
+    def advance(self) -> None:
+        """Go on with the next step; do nothing while one is running in the thread."""
+        if self._running is None:
+            self._next_step()
+        elif self._running.done():
+            self._end_step(self._running.result())
+            self._next_step()
+
+    def finish(self) -> None:
+        """Do all that is left now."""
+        while self._work is not None:
+            if self._running is not None:
+                self._end_step(self._running.result())
+            self._next_step()
+
+    def drop(self) -> None:
+        """Leave what is under way; the map is as its last step left it."""
+        self._work, self._running = None, None
+
+    def _next_step(self) -> None:
+        if self._work is None:
+            return
+        if self._thread is None:
+            self._end_step(self._step(self._work))
+        else:
+            self._running = self._thread.submit(self._step, self._work)
+
+    def _step(self, work: Work) -> bool:
+        """Do work up to its next pause; whether that was its end."""
+        self._before()
+        return next(work, _END) is _END
+
+    def _end_step(self, is_end: bool) -> None:
+        self._running = None
+        if is_end:
+            self._work = None
+        self._after()
+
+
+_END = object()

@@ -1,0 +1,385 @@
+"""Map points in a camera, as arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from morph_dslam.geometry import rotation_exp
+from morph_dslam.slam.bundle_adjustment import cholesky_solve, orthonormal, turned_and_shifted
+
+Array = NDArray[np.float64]
+
+
+def project(camera_from_world: Array, points: Array, intrinsics: Array) -> tuple[Array, Array]:
+    """Pixels (n, 2) and depths (n,) of points (n, 3); pixels are NaN where a point is not in front."""
+    local = points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+    depth = np.where(local[:, 2] > 1e-6, local[:, 2], np.nan)
+    return local[:, :2] / depth[:, None] * intrinsics[:2] + intrinsics[2:], local[:, 2]
+
+
+def rays(pixels: Array, intrinsics: Array) -> Array:
+    """Directions (n, 3) with z = 1 of pixels (n, 2) in the camera frame."""
+    return np.column_stack([(pixels - intrinsics[2:]) / intrinsics[:2], np.ones(len(pixels))])
+
+
+def world_points(camera_from_world: Array, pixels: Array, depths: Array | float, intrinsics: Array) -> Array:
+    """Points (n, 3) in the world, seen at pixels (n, 2) at these depths."""
+    local = rays(pixels, intrinsics) * np.reshape(depths, (-1, 1))
+    return (local - camera_from_world[:3, 3]) @ camera_from_world[:3, :3]
+
+
+def inverse(pose: Array) -> Array:
+    """Inverse (4, 4) of a rigid transform."""
+    result = np.eye(4)
+    result[:3, :3] = pose[:3, :3].T
+    result[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return result
+
+
+def inside(pixels: Array, shape: tuple[int, ...], margin: float) -> NDArray[np.bool_]:
+    """Which pixels (n, 2) lie in an image (h, w) and this far from its border; NaN do not."""
+    height, width = shape[:2]
+    with np.errstate(invalid="ignore"):
+        return (
+            (pixels[:, 0] >= margin)
+            & (pixels[:, 1] >= margin)
+            & (pixels[:, 0] <= width - 1 - margin)
+            & (pixels[:, 1] <= height - 1 - margin)
+        )
+
+
+# The pose of one camera from known points: Huber-weighted Gauss-Newton, and RANSAC without a start.
+# Where depth was measured, the point's column in a right image is a third residual, as in
+# `bundle_adjustment`.
+
+
+#: Points nearer than this to the camera plane do not count.
+LEAST_DEPTH = 1e-6
+
+#: Points that miss by more than this multiple of the inliers' median do not count in the next round: without
+#: this a few points that move draw the pose along for as long as they stay below ``inlier_px``. Pixels below
+#: which all count.
+CORE_RATIO, LEAST_CORE_PX = 3.0, 0.6
+
+
+@njit(cache=True, nogil=True)
+def _normal_equations(pose, points, pixels, camera, width):
+    """Huber cost, J'WJ (6, 6) and -J'Wr (6,) by the pose's twist from the left (rotation, translation)."""
+    matrix, right, cost = np.zeros((6, 6)), np.zeros(6), 0.0
+    rows = np.zeros((3, 6))
+    for i in range(len(points)):
+        x = pose[0, 0] * points[i, 0] + pose[0, 1] * points[i, 1] + pose[0, 2] * points[i, 2] + pose[0, 3]
+        y = pose[1, 0] * points[i, 0] + pose[1, 1] * points[i, 1] + pose[1, 2] * points[i, 2] + pose[1, 3]
+        z = pose[2, 0] * points[i, 0] + pose[2, 1] * points[i, 1] + pose[2, 2] * points[i, 2] + pose[2, 3]
+        if z < LEAST_DEPTH:
+            cost += width * 1000.0
+            continue
+        ru = camera[0] * x / z + camera[2] - pixels[i, 0]
+        rv = camera[1] * y / z + camera[3] - pixels[i, 1]
+        square = ru * ru + rv * rv
+        has_depth, rd = not np.isnan(pixels[i, 2]), 0.0
+        if has_depth:
+            rd = ru + pixels[i, 0] - camera[4] / z - pixels[i, 2]
+            square += rd * rd
+        error = np.sqrt(square)
+        weight = 1.0 if error <= width else width / error
+        cost += 0.5 * error * error if error <= width else width * (error - 0.5 * width)
+        fx, fy = camera[0] / z, camera[1] / z
+        rows[0, 0], rows[0, 1], rows[0, 2] = -fx * x * y / z, fx * (z + x * x / z), -fx * y
+        rows[0, 3], rows[0, 4], rows[0, 5] = fx, 0.0, -fx * x / z
+        rows[1, 0], rows[1, 1], rows[1, 2] = -fy * (z + y * y / z), fy * x * y / z, fy * x
+        rows[1, 3], rows[1, 4], rows[1, 5] = 0.0, fy, -fy * y / z
+        for j in range(6):
+            right[j] -= weight * (rows[0, j] * ru + rows[1, j] * rv)
+            for k in range(6):
+                matrix[j, k] += weight * (rows[0, j] * rows[0, k] + rows[1, j] * rows[1, k])
+        if not has_depth:
+            continue
+        # The column in the right image moves as the one in the left, and with the disparity.
+        by_depth = camera[4] / (z * z)
+        for j in range(6):
+            rows[2, j] = rows[0, j]
+        rows[2, 0] += by_depth * y
+        rows[2, 1] -= by_depth * x
+        rows[2, 5] += by_depth
+        for j in range(6):
+            right[j] -= weight * rows[2, j] * rd
+            for k in range(6):
+                matrix[j, k] += weight * rows[2, j] * rows[2, k]
+    return cost, matrix, right
+
+
+@njit(cache=True, nogil=True)
+def _refine(pose, points, pixels, camera, width, iterations):
+    cost, matrix, right = _normal_equations(pose, points, pixels, camera, width)
+    damping = 1e-6
+    for _ in range(iterations):
+        damped = matrix.copy()
+        for j in range(6):
+            damped[j, j] += damping * matrix[j, j] + 1e-9
+        step = cholesky_solve(damped, right)
+        moved = pose.copy()
+        turned_and_shifted(pose, rotation_exp(step[:3]), step[3:], moved)
+        new_cost, new_matrix, new_right = _normal_equations(moved, points, pixels, camera, width)
+        if new_cost > cost:
+            damping = max(10.0 * damping, 1e-4)
+            continue
+        small = cost - new_cost < 1e-7 * cost
+        pose, cost, matrix, right = moved, new_cost, new_matrix, new_right
+        damping *= 0.1
+        if small:
+            break
+    return pose, matrix
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """A camera's pose.
+
+    Attributes
+    ----------
+    camera_from_world : (4, 4).
+    covariance : (6, 6) of the twist from the left (rotation rad, translation), for the measured pixel noise.
+    inliers : (n,) points that agree with it.
+    rms_px : root mean square error of the inliers.
+    """
+
+    camera_from_world: Array
+    covariance: Array
+    inliers: NDArray[np.bool_]
+    rms_px: float
+
+
+def reprojection_errors(camera_from_world: Array, points: Array, pixels: Array, intrinsics: Array) -> Array:
+    """Distances (n,) in pixels between projected points (n, 3) and pixels (n, 2); inf behind the camera."""
+    local = points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+    depth = np.where(local[:, 2] > LEAST_DEPTH, local[:, 2], np.nan)
+    projected = local[:, :2] / depth[:, None] * intrinsics[:2] + intrinsics[2:]
+    return np.nan_to_num(np.linalg.norm(projected - pixels, axis=1), nan=np.inf)
+
+
+def refine_pose(
+    start: Array,
+    points: Array,
+    pixels: Array,
+    intrinsics: Array,
+    huber_px: float = 1.5,
+    inlier_px: float = 3.0,
+    rounds: int = 2,
+    right: Array | None = None,
+    baseline_px: float = 0.0,
+    trusted: NDArray[np.bool_] | None = None,
+) -> PoseEstimate:
+    """Pose (4, 4) from points (n, 3) and their pixels (n, 2), started at ``start``.
+
+    ``right`` (n,) are columns in a right image at ``baseline_px``, NaN where depth was not measured. After
+    each round the points that miss by more than ``inlier_px``, or by much more than most inliers, are left
+    out of the next; the first one uses the ``trusted`` points (n,), all by default. Without four points that
+    fit there is no inlier and the covariance is infinite.
+    """
+    pose, used = np.ascontiguousarray(start, dtype=np.float64), np.ones(len(points), dtype=bool)
+    if trusted is not None:
+        used = trusted
+    matrix = np.eye(6)
+    columns = np.full(len(points), np.nan) if right is None else right
+    rows, camera = np.column_stack([pixels, columns]), np.append(intrinsics, baseline_px)
+    for _ in range(rounds):
+        if used.sum() < 4:
+            return PoseEstimate(pose, np.full((6, 6), np.inf), np.zeros(len(points), dtype=bool), float("inf"))
+        pose, matrix = _refine(
+            pose, np.ascontiguousarray(points[used]), np.ascontiguousarray(rows[used]), camera, huber_px, 10
+        )
+        pose = orthonormal(pose)
+        errors = reprojection_errors(pose, points, pixels, intrinsics)
+        used = np.asarray(errors < _core_px(errors, inlier_px))
+    used = np.asarray(errors < inlier_px)
+    if not used.any():
+        return PoseEstimate(pose, np.full((6, 6), np.inf), used, float("inf"))
+    rms = float(np.sqrt(np.mean(errors[used] ** 2)))
+    # Two residuals a point: the noise of one coordinate is the rms over sqrt(2).
+    covariance = np.asarray(np.linalg.pinv(matrix) * max(rms, 0.1) ** 2 / 2.0, dtype=float)
+    return PoseEstimate(pose, covariance, used, rms)
+
+
+def _core_px(errors: Array, inlier_px: float) -> float:
+    """How far the points (n,) that determine a pose may miss, at most ``inlier_px``."""
+    inliers = errors[errors < inlier_px]
+    return min(inlier_px, max(CORE_RATIO * float(np.median(inliers)), LEAST_CORE_PX)) if len(inliers) else 0.0
+
+
+def find_pose(
+    points: Array, pixels: Array, intrinsics: Array, inlier_px: float = 4.0, least: int = 15
+) -> PoseEstimate | None:
+    """Pose from matches among which many are wrong (P3P in RANSAC); None if fewer than ``least`` agree."""
+    if len(points) < least:
+        return None
+    matrix = np.array([[intrinsics[0], 0.0, intrinsics[2]], [0.0, intrinsics[1], intrinsics[3]], [0.0, 0.0, 1.0]])
+    cv2.setRNGSeed(0)
+    found, turn, shift, rows = cv2.solvePnPRansac(
+        points,
+        pixels,
+        matrix,
+        None,  # type: ignore[arg-type]
+        iterationsCount=1000,
+        reprojectionError=inlier_px,
+        confidence=0.999,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    if not found or rows is None or len(rows) < least:
+        return None
+    start = np.eye(4)
+    start[:3, :3], start[:3, 3] = rotation_exp(turn.ravel()), shift.ravel()
+    # The matches that RANSAC rejects are too many for a Huber weight.
+    agreeing = np.asarray(rows, dtype=np.int64).ravel()
+    start = refine_pose(start, points[agreeing], pixels[agreeing], intrinsics).camera_from_world
+    used = reprojection_errors(start, points, pixels, intrinsics) < inlier_px
+    estimate = refine_pose(start, points[used], pixels[used], intrinsics, inlier_px=inlier_px)
+    used[used] = estimate.inliers
+    estimate = replace(estimate, inliers=used)
+    return estimate if estimate.inliers.sum() >= least else None
+
+
+# Structure from two views: essential matrix or homography, whichever explains the motion, and triangulation.
+# The choice follows ORB-SLAM (Mur-Artal et al. 2015, IV-B): where a homography explains the matches about as
+# well as an essential matrix does, the scene is plane or the camera has only turned, and the motion is taken
+# from the homography's decomposition (Malis and Vargas 2007). A plane leaves two solutions; both are
+# returned, and a third view decides.
+
+
+#: Share of homography score above which the homography is believed (ORB-SLAM's value).
+PLANE_SHARE = 0.45
+
+#: Squared errors that 95 % of the inliers stay below, for one and two degrees of freedom, in pixel variances.
+CHI2_ONE, CHI2_TWO = 3.841, 5.991
+
+
+@dataclass(frozen=True)
+class TwoViewHypothesis:
+    """A relative pose and what it makes of the matches.
+
+    Attributes
+    ----------
+    second_from_first : (4, 4), translation of length 1.
+    points : (n, 3) in the first camera, NaN where triangulation failed.
+    parallax_deg : median angle between the rays of the good points.
+    """
+
+    second_from_first: Array
+    points: Array
+    parallax_deg: float
+
+    @property
+    def good(self) -> NDArray[np.bool_]:
+        """Matches (n,) that have a point."""
+        return np.isfinite(self.points[:, 0])
+
+
+def triangulate(first_from_world: Array, second_from_world: Array, first_rays: Array, second_rays: Array) -> Array:
+    """Points (n, 3) in the world from rays (n, 3) with z = 1 in two cameras (linear, Hartley and Sturm)."""
+    points = cv2.triangulatePoints(
+        first_from_world[:3], second_from_world[:3], first_rays[:, :2].T.copy(), second_rays[:, :2].T.copy()
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (points[:3] / points[3]).T
+
+
+def ray_angles(points: Array, first_centre: Array, second_centre: Array) -> Array:
+    """Angle (n,) at each point between the directions to two camera centres, degrees."""
+    a, b = first_centre - points, second_centre - points
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cosine = np.einsum("nx,nx->n", a, b) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def camera_centre(camera_from_world: Array) -> Array:
+    """Position (3,) of the camera in the world."""
+    return -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
+
+
+def check_points(
+    points: Array, poses: list[Array], pixels: list[Array], intrinsics: Array, max_px: float
+) -> NDArray[np.bool_]:
+    """Which points (n, 3) lie in front of every camera and project within ``max_px`` of their pixels."""
+    good = np.asarray(np.isfinite(points).all(axis=1))
+    for pose, seen in zip(poses, pixels, strict=True):
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            projected = local[:, :2] / local[:, 2:] * intrinsics[:2] + intrinsics[2:]
+            good &= (local[:, 2] > 0.0) & (np.linalg.norm(projected - seen, axis=1) < max_px)
+    return good
+
+
+def _score(squared_errors: Array, limit: float) -> float:
+    """ORB-SLAM's score: what each inlier gains over the largest error that two degrees of freedom allow."""
+    return float(np.sum(np.where(squared_errors < limit, CHI2_TWO - squared_errors, 0.0)))
+
+
+def _epipolar_errors(essential: Array, first: Array, second: Array, intrinsics: Array) -> tuple[Array, Array]:
+    """Squared distances (n,) to the epipolar lines in either image, px^2."""
+    inverse = np.diag([1.0 / intrinsics[0], 1.0 / intrinsics[1], 1.0])
+    inverse[:2, 2] = -intrinsics[2:] / intrinsics[:2]
+    fundamental = inverse.T @ essential @ inverse
+    a, b = np.column_stack([first, np.ones(len(first))]), np.column_stack([second, np.ones(len(second))])
+    in_second, in_first = a @ fundamental.T, b @ fundamental
+    product = np.einsum("nx,nx->n", b, in_second) ** 2
+    return product / (in_first[:, :2] ** 2).sum(axis=1), product / (in_second[:, :2] ** 2).sum(axis=1)
+
+
+def _transfer_errors(homography: Array, first: Array, second: Array) -> tuple[Array, Array]:
+    """Squared distances (n,) between mapped and seen pixels in either image, px^2."""
+
+    def map_by(matrix: Array, pixels: Array) -> Array:
+        mapped = np.column_stack([pixels, np.ones(len(pixels))]) @ matrix.T
+        return mapped[:, :2] / mapped[:, 2:]
+
+    forward = ((map_by(homography, first) - second) ** 2).sum(axis=1)
+    backward = ((map_by(np.asarray(np.linalg.inv(homography), dtype=float), second) - first) ** 2).sum(axis=1)
+    return backward, forward
+
+
+def two_view_hypotheses(
+    first: Array, second: Array, intrinsics: Array, noise_px: float = 1.0
+) -> list[TwoViewHypothesis]:
+    """Relative poses that matched pixels (n, 2) allow, most points in front first; empty if none is clear."""
+    matrix = np.array([[intrinsics[0], 0.0, intrinsics[2]], [0.0, intrinsics[1], intrinsics[3]], [0.0, 0.0, 1.0]])
+    cv2.setRNGSeed(0)
+    essential, _ = cv2.findEssentialMat(
+        first, second, matrix, method=cv2.USAC_MAGSAC, threshold=1.5 * noise_px, prob=0.9999
+    )
+    homography, _ = cv2.findHomography(first, second, cv2.USAC_MAGSAC, 2.0 * noise_px, None, 2000, 0.9999)
+    if essential is None or homography is None or essential.shape != (3, 3):
+        return []
+    essential, homography = np.asarray(essential, dtype=float), np.asarray(homography, dtype=float)
+    variance = noise_px**2
+    by_lines = sum(_score(e / variance, CHI2_ONE) for e in _epipolar_errors(essential, first, second, intrinsics))
+    by_plane = sum(_score(e / variance, CHI2_TWO) for e in _transfer_errors(homography, first, second))
+    if by_plane > PLANE_SHARE * (by_plane + by_lines):
+        _, rotations, shifts, _ = cv2.decomposeHomographyMat(homography, matrix)
+        motions = [(r, s.ravel()) for r, s in zip(rotations, shifts, strict=True) if np.linalg.norm(s) > 1e-9]
+    else:
+        one, other, shift = cv2.decomposeEssentialMat(essential)
+        motions = [(r, sign * shift.ravel()) for r in (one, other) for sign in (1.0, -1.0)]
+    hypotheses = [
+        _hypothesis(np.asarray(r, dtype=float), np.asarray(s, dtype=float), first, second, intrinsics, noise_px)
+        for r, s in motions
+    ]
+    hypotheses.sort(key=lambda hypothesis: -int(hypothesis.good.sum()))
+    return hypotheses
+
+
+def _hypothesis(
+    rotation: Array, shift: Array, first: Array, second: Array, intrinsics: Array, noise_px: float
+) -> TwoViewHypothesis:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, shift / np.linalg.norm(shift)
+    rays = [np.column_stack([(p - intrinsics[2:]) / intrinsics[:2], np.ones(len(p))]) for p in (first, second)]
+    points = triangulate(np.eye(4), pose, *rays)
+    good = check_points(points, [np.eye(4), pose], [first, second], intrinsics, 2.5 * noise_px)
+    points[~good] = np.nan
+    angles = ray_angles(points[good], np.zeros(3), camera_centre(pose))
+    return TwoViewHypothesis(pose, points, float(np.median(angles)) if good.any() else 0.0)

@@ -1,0 +1,250 @@
+"""Which keyframes show the place that an image shows: a bag of binary words, trained from the map itself.
+
+Descriptors are assigned to the nearest of some hundred words, and images are compared by how often each word
+occurs in them, rare words counting more (Sivic and Zisserman 2003; binary words as in Gálvez-López and Tardós
+2012). The words are cluster centres by k-majority (Grana et al. 2013): bits that most members have.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from morph_dslam.slam.frame_images import (
+    OCTAVES,
+    Descriptors,
+    FrameView,
+    Indices,
+    describe,
+    least_distances,
+    match_points,
+)
+from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.pose import PoseEstimate, find_pose, inside, project, refine_pose
+from morph_dslam.slam.rigid_map import GOOD, Followed, RigidMap
+from morph_dslam.slam.tracking import Tracker
+from morph_dslam.tracking.patches import FlowOptions, spread_corners
+
+Array = NDArray[np.float64]
+
+N_WORDS = 400
+
+#: Descriptors that words are trained from, and rounds of clustering.
+N_TRAINING, ROUNDS = 6000, 6
+
+#: Words are trained anew when there are this many times the keyframes that they were trained from.
+RETRAIN_AT = 1.5
+
+
+@njit(cache=True, nogil=True)
+def bit_counts(descriptors, members, n_words):
+    """How many of each word's members (n,), descriptors (n, 32), have each bit (w, 256).
+
+    numpy's sums over groups would hold the interpreter for milliseconds.
+    """
+    counts = np.zeros((n_words, 8 * descriptors.shape[1]), dtype=np.int64)
+    for row in range(len(descriptors)):
+        for column in range(descriptors.shape[1]):
+            for bit in range(8):
+                set_bit = (descriptors[row, column] >> (7 - bit)) & 1
+                counts[members[row], 8 * column + bit] += set_bit
+    return counts
+
+
+class Vocabulary:
+    """Binary words.
+
+    Attributes
+    ----------
+    words : (w, 32).
+    """
+
+    def __init__(self, descriptors: Descriptors, n_words: int = N_WORDS, seed: int = 0) -> None:
+        """Cluster descriptors (n, 32); the same ones give the same words."""
+        rng = np.random.default_rng(seed)
+        order = rng.permutation(len(descriptors))[:N_TRAINING]
+        sample = descriptors[order]
+        self.words = sample[:n_words].copy()
+        for _ in range(ROUNDS):
+            members = self.assign(sample)
+            counts = np.bincount(members, minlength=len(self.words))
+            majority = 2 * bit_counts(sample, members, len(self.words)) > counts[:, None]
+            self.words[counts > 0] = np.packbits(majority[counts > 0], axis=1)
+
+    def assign(self, descriptors: Descriptors) -> Indices:
+        """The nearest word (n,) of each descriptor (n, 32)."""
+        matches = cv2.BFMatcher(cv2.NORM_HAMMING).match(descriptors, self.words)
+        return np.array([match.trainIdx for match in matches], dtype=np.int64)
+
+    def histogram(self, descriptors: Descriptors) -> Array:
+        """How often each word (w,) occurs, as parts of one."""
+        counts = np.bincount(self.assign(descriptors), minlength=len(self.words)) if len(descriptors) else 0.0
+        return np.broadcast_to(counts / max(len(descriptors), 1), len(self.words)).astype(float)
+
+
+class PlaceIndex:
+    """The keyframes of a map by what they look like."""
+
+    def __init__(self, rigid_map: RigidMap) -> None:
+        self._map = rigid_map
+        self._vocabulary: Vocabulary | None = None
+        self._n_trained = 0
+        self._histograms = np.empty((0, N_WORDS))
+
+    def update(self) -> None:
+        """Take in the keyframes that are new."""
+        keyframes = self._map.keyframes
+        if self._vocabulary is None or len(keyframes) >= RETRAIN_AT * self._n_trained:
+            self._vocabulary = Vocabulary(np.concatenate([k.descriptors for k in keyframes]))
+            self._n_trained = len(keyframes)
+            self._histograms = np.empty((0, len(self._vocabulary.words)))
+        new = [self._vocabulary.histogram(k.descriptors) for k in keyframes[len(self._histograms) :]]
+        self._histograms = np.vstack([self._histograms, *new])
+
+    def similarities(self, descriptors: Descriptors) -> Array:
+        """How much an image with these descriptors (k, 32) resembles each keyframe (n,), from 0 to 1."""
+        assert self._vocabulary is not None
+        frequency = (self._histograms > 0.0).mean(axis=0)
+        weights = np.log((1.0 + len(self._histograms)) / (1.0 + frequency * len(self._histograms))) + 0.1
+        seen = weights * self._vocabulary.histogram(descriptors)
+        known = weights * self._histograms
+        common = np.minimum(known, seen).sum(axis=1)
+        # Keyframes that were taken out resemble nothing.
+        common[[not len(keyframe.descriptors) for keyframe in self._map.keyframes]] = 0.0
+        return common / np.maximum(np.maximum(known.sum(axis=1), seen.sum()), 1e-12)
+
+
+# Finding the camera again after it was lost: which keyframes look alike, and where their points are now.
+# Keyframes are ranked by `place_recognition`. The points of the likeliest one and of those that share most
+# points with it are matched with the image's corners; P3P in RANSAC gives a rough pose, which is believed
+# only if the points are found where it has them. Before that the place is tried at which the camera was lost.
+
+
+Image = NDArray[np.uint8]
+
+#: Corners of the image that are described.
+N_CORNERS = 600
+
+#: Keyframes tried in one frame: the one that looks most alike, and one more in turn of those that follow.
+N_IN_TURN = 10
+
+#: Keyframes whose points are matched together, and the fewest points that they share.
+GROUP, LEAST_SHARED = 4, 20
+
+#: Matches are nearer than this many bits, and clearly nearer than the second best.
+MOST_BITS, RATIO = 80, 0.95
+
+#: Matches that agree on a rough pose, within so many pixels.
+ROUGH_INLIERS, ROUGH_PX = 12, 6.0
+
+#: A pose is believed if this share of the group's points in view are found where it has them, most of these
+#: fit it, and their error is at most so many times the usual one, or this: repeated texture fits badly
+#: somewhere else, but beside all keyframes the map's own errors show.
+LEAST_SHARE, LEAST_FIT, MOST_ERROR_RATIO, MOST_ERROR_PX = 0.35, 0.7, 2.0, 2.0
+
+
+@dataclass(frozen=True)
+class _Corners:
+    """Corners (n, 2) of an image, their descriptors (k, 32), and the row (k,) of each one's corner."""
+
+    pixels: Array
+    rows: Indices
+    descriptors: Descriptors
+
+
+def _described_corners(view: FrameView) -> _Corners:
+    pixels = spread_corners(view.flat, np.full(view.flat.shape, 255, dtype=np.uint8), N_CORNERS)
+    return _Corners(pixels, *describe(view.grey, pixels, OCTAVES))
+
+
+class Relocalizer:
+    """Finds the camera from the keyframes of a map."""
+
+    def __init__(self, rigid_map: RigidMap, intrinsics: Array, options: SlamOptions) -> None:
+        self._map = rigid_map
+        self._intrinsics = intrinsics
+        self._options = options
+        self.places = PlaceIndex(rigid_map)
+        self._turn = 0
+
+    def find(self, view: FrameView, tracker: Tracker) -> tuple[PoseEstimate, Followed] | str:
+        """The pose and the points that support it, or why there is none."""
+        found = self._where_it_was(view, tracker)
+        if found is not None:
+            return found
+        corners = _described_corners(view)
+        if len(corners.rows) < self._options.least_inliers:
+            return f"too little texture: {len(corners.pixels)} corners"
+        self.places.update()
+        for number in self._candidates(corners.descriptors):
+            found = self._locate(view, corners, self.group(number), tracker)
+            if found is not None:
+                return found
+        return "the view resembles no keyframe"
+
+    def _where_it_was(self, view: FrameView, tracker: Tracker) -> tuple[PoseEstimate, Followed] | None:
+        """The pose if the camera is still near where it was lost: of places that look alike the likeliest."""
+        if not len(tracker.points.ids):
+            return None
+        number = int(np.bincount(self._map.template_keyframe[tracker.points.ids]).argmax())
+        return self._confirmed(self.group(number), view.flat, tracker.camera_from_world, tracker)
+
+    def locate(self, view: FrameView, group: Indices, tracker: Tracker) -> tuple[PoseEstimate, Followed] | None:
+        """The pose by the points of some keyframes, and the points that support it; None if they do not."""
+        return self._locate(view, _described_corners(view), group, tracker)
+
+    def _locate(
+        self, view: FrameView, corners: _Corners, group: Indices, tracker: Tracker
+    ) -> tuple[PoseEstimate, Followed] | None:
+        rough = self._rough_pose(group, corners)
+        return None if rough is None else self._confirmed(group, view.flat, rough.camera_from_world, tracker)
+
+    def _candidates(self, descriptors: Descriptors) -> list[int]:
+        order = np.argsort(-self.places.similarities(descriptors), kind="stable").tolist()
+        rest = order[1 : 1 + N_IN_TURN]
+        self._turn += 1
+        return [order[0], *rest[self._turn % max(len(rest), 1) :][:1]]
+
+    def group(self, number: int) -> Indices:
+        """A keyframe and those that share most of its points."""
+        ids = self._map.keyframes[number].point_ids
+        shared = self._map.shared_points(ids[self._map.state[ids] == GOOD])
+        shared[number] = np.iinfo(np.int64).max
+        best = np.argsort(-shared, kind="stable")[:GROUP]
+        return best[shared[best] >= LEAST_SHARED]
+
+    def _rough_pose(self, group: Indices, corners: _Corners) -> PoseEstimate | None:
+        """The pose that matches of descriptors agree on."""
+        keyframes = [self._map.keyframes[k] for k in group]
+        ids = np.concatenate([keyframe.described_ids for keyframe in keyframes])
+        described = np.concatenate([keyframe.descriptors for keyframe in keyframes])
+        good = self._map.state[ids] == GOOD
+        points, local = np.unique(ids[good], return_inverse=True)
+        distances = least_distances(corners.descriptors, corners.rows, described[good], local)
+        first, second = match_points(distances, RATIO, MOST_BITS)
+        positions = self._map.positions[points[second]]
+        return find_pose(positions, corners.pixels[first], self._intrinsics, ROUGH_PX, least=ROUGH_INLIERS)
+
+    def _confirmed(
+        self, group: Indices, flat: Image, pose: Array, tracker: Tracker
+    ) -> tuple[PoseEstimate, Followed] | None:
+        """The pose from all points of the group, found near a rough pose (4, 4); None if too few are."""
+        ids = np.unique(np.concatenate([self._map.keyframes[k].point_ids for k in group]))
+        ids = ids[self._map.state[ids] == GOOD]
+        guesses, depths = project(pose, self._map.positions[ids], self._intrinsics)
+        seen = inside(guesses, flat.shape, self._options.patch_half + 2)
+        seen &= tracker.looks_alike(ids, pose, depths)
+        flow = FlowOptions(self._options.flow.window, 2)
+        found = tracker.find(flat, Followed(ids[seen], guesses[seen]), pose, flow)
+        refined = refine_pose(
+            pose, self._map.positions[found.ids], found.pixels, self._intrinsics, inlier_px=self._options.inlier_px
+        )
+        enough = max(self._options.least_inliers, LEAST_FIT * len(found.ids), LEAST_SHARE * int(seen.sum()))
+        most = max(MOST_ERROR_RATIO * self._map.usual_rms_px, MOST_ERROR_PX)
+        if refined.inliers.sum() < enough or refined.rms_px > most:
+            return None
+        return refined, found[refined.inliers]

@@ -1,0 +1,301 @@
+"""The map of the rigid scene: points, keyframes, and which keyframe saw which point where.
+
+A point begins as a candidate: a corner that is followed without its depth being known. Once rays from two
+keyframes meet at a sufficient angle it becomes a map point. Numbers of points never change; removed ones
+keep theirs.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.slam.passing_views import PassingViews
+
+Array = NDArray[np.float64]
+
+Indices = NDArray[np.int64]
+
+CANDIDATE, GOOD, REMOVED = 0, 1, 2
+
+#: Arrays of a map with one row a point.
+POINT_ARRAYS = (
+    "positions",
+    "state",
+    "first_keyframe",
+    "first_pixels",
+    "template_keyframe",
+    "template_pixels",
+    "n_expected",
+    "n_found",
+)
+
+#: These and what is of no use to later runs, so not kept in files.
+_ALL_POINT_ARRAYS = (*POINT_ARRAYS, "merged_into")
+
+#: Error that poses are taken to have before there is any.
+FIRST_RMS_PX = 4.0
+
+
+@dataclass
+class Keyframe:
+    """A view that the map keeps.
+
+    Attributes
+    ----------
+    index, timestamp : of its frame. flat : (h, w) its flattened image.
+    camera_from_world : (4, 4). point_ids : (k,) points seen, ascending. pixels : (k, 2) where.
+    right : (k,) their columns in a right image (`Followed`); all unmeasured by default.
+    described_ids, descriptors : (d,), (d, 32) what points looked like, by `descriptors.describe`.
+    carrier : number of the keyframe that stands for this one since it was taken out, -1 before.
+    from_carrier : (4, 4) this one as seen from it.
+    """
+
+    index: int
+    timestamp: float
+    flat: NDArray[np.uint8]
+    camera_from_world: Array
+    point_ids: Indices
+    pixels: Array
+    right: Array = None  # type: ignore[assignment]
+    described_ids: Indices = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    descriptors: NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 32), dtype=np.uint8))
+    carrier: int = field(default=-1, kw_only=True)
+    from_carrier: Array = field(default_factory=lambda: np.eye(4), kw_only=True)
+
+    def __post_init__(self) -> None:
+        if self.right is None:
+            self.right = np.full(len(self.point_ids), np.nan)
+
+    @property
+    def seen(self) -> Followed:
+        """The points and where they are."""
+        return Followed(self.point_ids, self.pixels, self.right)
+
+    def keep(self, rows: NDArray) -> None:
+        """Keep the chosen observations only, in the chosen order."""
+        self.point_ids, self.pixels, self.right = self.point_ids[rows], self.pixels[rows], self.right[rows]
+
+    def rows_of(self, ids: Indices) -> tuple[Indices, NDArray[np.bool_]]:
+        """Rows of points (n,), and which of them (n,) were seen; the rows of the others mean nothing."""
+        if not len(self.point_ids):
+            return np.zeros(len(ids), dtype=np.int64), np.zeros(len(ids), dtype=bool)
+        rows = np.minimum(np.searchsorted(self.point_ids, ids), len(self.point_ids) - 1)
+        return rows, self.point_ids[rows] == ids
+
+
+class Followed:
+    """Points in a frame.
+
+    Attributes
+    ----------
+    ids : (n,) their numbers. pixels : (n, 2).
+    right : (n,) their columns in a right image at the map's baseline, NaN where depth was not measured.
+    """
+
+    __slots__ = ("ids", "pixels", "right")
+
+    def __init__(self, ids: Indices, pixels: Array, right: Array | None = None) -> None:
+        self.ids, self.pixels = ids, pixels
+        self.right = np.full(len(ids), np.nan) if right is None else right
+
+    def __getitem__(self, rows: NDArray) -> Followed:
+        return Followed(self.ids[rows], self.pixels[rows], self.right[rows])
+
+    def without_unmeasured(self) -> Followed:
+        """The same in less memory, where no depth was measured."""
+        unmeasured = np.broadcast_to(np.nan, len(self.ids))
+        return self if np.isfinite(self.right).any() else Followed(self.ids, self.pixels, unmeasured)
+
+    def joined(self, other: Followed) -> Followed:
+        """These points and others."""
+        return Followed(
+            np.concatenate([self.ids, other.ids]),
+            np.concatenate([self.pixels, other.pixels]),
+            np.concatenate([self.right, other.right]),
+        )
+
+
+NOWHERE = Followed(np.empty(0, dtype=np.int64), np.empty((0, 2)))
+
+
+class RigidMap:
+    """Points and keyframes.
+
+    Attributes
+    ----------
+    keyframes : in the order in which they came.
+    positions : (n, 3) in the world; provisional for candidates.
+    state : (n,) CANDIDATE, GOOD or REMOVED.
+    first_keyframe, first_pixels : (n,), (n, 2) where a point was first seen.
+    template_keyframe, template_pixels : (n,), (n, 2) the view whose patch stands for the point.
+    merged_into : (n,) the point that a point was made one with, by `merge`; its own number otherwise.
+    n_expected, n_found : (n,) frames in which it should have been seen, and in which it was.
+    usual_rms_px : running mean of the errors of the poses found in it.
+    baseline_px : focal length times the baseline that right columns refer to, px m; 0 where no depth is
+        measured, and lengths are in map units instead of metres.
+    passing : frames that are not kept, but tell which candidates move.
+    """
+
+    def __init__(self, baseline_px: float = 0.0) -> None:
+        self.baseline_px = baseline_px
+        self.keyframes: list[Keyframe] = []
+        self.usual_rms_px = FIRST_RMS_PX
+        self.passing = PassingViews()
+        self.positions = np.empty((0, 3))
+        self.state = np.empty(0, dtype=np.int8)
+        self.first_keyframe, self.first_pixels = np.empty(0, dtype=np.int64), np.empty((0, 2))
+        self.template_keyframe, self.template_pixels = np.empty(0, dtype=np.int64), np.empty((0, 2))
+        self.merged_into = np.empty(0, dtype=np.int64)
+        self.n_expected, self.n_found = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether lengths are metres."""
+        return self.baseline_px > 0.0
+
+    @property
+    def good(self) -> Indices:
+        """Numbers of the map points."""
+        return np.flatnonzero(self.state == GOOD)
+
+    def copy_of(self, other: RigidMap) -> None:
+        """Become what another map is now, and stay so while it changes."""
+        self.usual_rms_px, self.passing = other.usual_rms_px, other.passing.copy()
+        self.keyframes = [copy(keyframe) for keyframe in other.keyframes]
+        for name in _ALL_POINT_ARRAYS:
+            setattr(self, name, getattr(other, name).copy())
+
+    def share(self, other: RigidMap) -> None:
+        """Become what another map is now, at once: with the same arrays, which must not change any more."""
+        self.usual_rms_px, self.keyframes = other.usual_rms_px, other.keyframes
+        for name in _ALL_POINT_ARRAYS:
+            setattr(self, name, getattr(other, name))
+
+    def take_over(self, draft: RigidMap) -> None:
+        """Become what has been made of a copy of this map, at once; what tracking counted since stays."""
+        new = np.zeros(len(draft.state) - len(self.state), dtype=np.int64)
+        expected, found = (np.concatenate([count, new]) for count in (self.n_expected, self.n_found))
+        usual = self.usual_rms_px
+        self.share(draft)
+        self.n_expected, self.n_found, self.usual_rms_px = expected, found, usual
+
+    def add_points(self, positions: Array, pixels: Array, keyframe: int, state: int) -> Indices:
+        """New points (n, 3), first seen at ``pixels`` (n, 2) of a keyframe; returns their numbers (n,)."""
+        n, before = len(positions), len(self.positions)
+        views = np.full(n, keyframe, dtype=np.int64)
+        self.positions = np.concatenate([self.positions, positions])
+        self.state = np.concatenate([self.state, np.full(n, state, dtype=np.int8)])
+        self.first_keyframe = np.concatenate([self.first_keyframe, views])
+        self.first_pixels = np.concatenate([self.first_pixels, pixels])
+        self.template_keyframe = np.concatenate([self.template_keyframe, views])
+        self.template_pixels = np.concatenate([self.template_pixels, pixels])
+        self.n_expected = np.concatenate([self.n_expected, np.zeros(n, dtype=np.int64)])
+        self.n_found = np.concatenate([self.n_found, np.zeros(n, dtype=np.int64)])
+        numbers = np.arange(before, before + n)
+        self.merged_into = np.concatenate([self.merged_into, numbers])
+        return numbers
+
+    def add_keyframe(self, keyframe: Keyframe) -> int:
+        """Append a view, which becomes the template of the points it sees; returns its number."""
+        keyframe.keep(np.argsort(keyframe.point_ids))
+        self.keyframes.append(keyframe)
+        number = len(self.keyframes) - 1
+        self.template_keyframe[keyframe.point_ids] = number
+        self.template_pixels[keyframe.point_ids] = keyframe.pixels
+        return number
+
+    @property
+    def kept_keyframes(self) -> Indices:
+        """Numbers of the keyframes that have not been taken out."""
+        return np.array([k for k, keyframe in enumerate(self.keyframes) if keyframe.carrier < 0], dtype=int)
+
+    def pose_of(self, number: int) -> Array:
+        """camera_from_world (4, 4) of a keyframe; one that was taken out moves along with its carrier."""
+        keyframe, moved = self.keyframes[number], np.eye(4)
+        while keyframe.carrier >= 0:
+            moved = moved @ keyframe.from_carrier
+            keyframe = self.keyframes[keyframe.carrier]
+        return moved @ keyframe.camera_from_world
+
+    def remove_keyframe(self, number: int, carrier: int) -> None:
+        """Take a keyframe out; it keeps its number, and another one stands for it.
+
+        Its points go over to the newest keyframes that see them; map points that fewer than two see go too.
+        """
+        old = self.keyframes[number]
+        relative = old.camera_from_world @ np.linalg.inv(self.keyframes[carrier].camera_from_world)
+        self.keyframes[number] = Keyframe(
+            old.index,
+            old.timestamp,
+            np.empty((0, 0), dtype=np.uint8),
+            old.camera_from_world,
+            old.point_ids[:0],
+            old.pixels[:0],
+            carrier=carrier,
+            from_carrier=relative,
+        )
+        self.remove(np.flatnonzero((self.state == GOOD) & (self.n_observations() < 2)))
+        for views, pixels in ((self.template_keyframe, self.template_pixels), (self.first_keyframe, self.first_pixels)):
+            left = np.flatnonzero((views == number) & (self.state != REMOVED))
+            for k in range(len(self.keyframes) - 1, -1, -1):
+                if not len(left):
+                    break
+                rows, seen = self.keyframes[k].rows_of(left)
+                views[left[seen]], pixels[left[seen]] = k, self.keyframes[k].pixels[rows[seen]]
+                left = left[~seen]
+
+    def extend_keyframe(self, number: int, new: Followed) -> None:
+        """Add observations of points newer than all that the keyframe has."""
+        keyframe = self.keyframes[number]
+        seen = keyframe.seen.joined(new)
+        keyframe.point_ids, keyframe.pixels, keyframe.right = seen.ids, seen.pixels, seen.right
+
+    def remove(self, ids: Indices) -> None:
+        """Take points out, with their observations."""
+        self.state[ids] = REMOVED
+        gone = np.zeros(len(self.state), dtype=bool)
+        gone[ids] = True
+        for keyframe in self.keyframes:
+            rows = gone[keyframe.point_ids]
+            if rows.any():
+                keyframe.keep(~rows)
+
+    def merge(self, kept: int, dropped: int) -> None:
+        """Make two points that are one: ``kept`` takes the observations of ``dropped``."""
+        for keyframe in self.keyframes:
+            rows, seen = keyframe.rows_of(np.array([kept, dropped]))
+            if seen[1] and not seen[0]:
+                # Copies of the map may have the same array.
+                ids = keyframe.point_ids.copy()
+                ids[rows[1]] = kept
+                keyframe.point_ids = ids
+                keyframe.keep(np.argsort(ids))
+        self.remove(np.array([dropped]))
+        self.merged_into[dropped] = kept
+
+    def good_of(self, seen: Followed) -> Followed:
+        """Those of the points seen in a frame that are map points now, by the numbers that they have now."""
+        ids = seen.ids
+        while (self.merged_into[ids] != ids).any():
+            ids = self.merged_into[ids]
+        _, first = np.unique(ids, return_index=True)
+        rows = np.sort(first)
+        rows = rows[self.state[ids[rows]] == GOOD]
+        return Followed(ids[rows], seen.pixels[rows], seen.right[rows])
+
+    def shared_points(self, ids: Indices) -> Indices:
+        """How many of these points each keyframe (k,) saw: covisibility."""
+        wanted = np.zeros(len(self.state), dtype=bool)
+        wanted[ids] = True
+        return np.array([int(wanted[keyframe.point_ids].sum()) for keyframe in self.keyframes])
+
+    def n_observations(self) -> Indices:
+        """Keyframes (n,) that saw each point; one that measured its depth places it and counts twice."""
+        counts = np.zeros(len(self.state), dtype=np.int64)
+        for keyframe in self.keyframes:
+            counts[keyframe.point_ids] += 1 + np.isfinite(keyframe.right)
+        return counts

@@ -1,0 +1,422 @@
+"""From which keyframes to look for points, where any that saw them will do.
+
+Each keyframe costs as much as some hundred points: its image pyramid is built anew. In a map that grows the
+newest keyframe is the template of nearly all points in view; in one that is complete they come from many.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.slam.consensus import Sight
+from morph_dslam.slam.depth import FrameDepth
+from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.pose import (
+    LEAST_DEPTH,
+    PoseEstimate,
+    camera_centre,
+    inside,
+    inverse,
+    project,
+    reprojection_errors,
+)
+from morph_dslam.slam.rigid_map import (
+    CANDIDATE,
+    FIRST_RMS_PX,
+    GOOD,
+    NOWHERE,
+    REMOVED,
+    Followed,
+    Indices,
+    Keyframe,
+    RigidMap,
+)
+from morph_dslam.tracking.patches import NEUTRAL, FlowOptions, follow, patch_correlation
+
+Array = NDArray[np.float64]
+
+#: Keyframes chosen for most points; one that adds fewer points than this is not worth its image.
+MOST_VIEWS, LEAST_POINTS = 4, 10
+
+
+class FewTemplates:
+    """Chooses templates in a complete map."""
+
+    def __init__(self, rigid_map: RigidMap) -> None:
+        self._map = rigid_map
+        self._seen = np.concatenate([keyframe.point_ids for keyframe in rigid_map.keyframes])
+        counts = [len(keyframe.point_ids) for keyframe in rigid_map.keyframes]
+        self._seen_by = np.repeat(np.arange(len(counts)), counts)
+
+    def choose(self, ids: Indices) -> tuple[Indices, Array]:
+        """Keyframe (n,) and pixels (n, 2) there to look for each point from.
+
+        Keyframes that show most of the points left are taken one after the other; the last points keep the
+        map's templates.
+        """
+        views, pixels = self._map.template_keyframe[ids], self._map.template_pixels[ids]
+        left, n_keyframes = np.ones(len(ids), dtype=bool), len(self._map.keyframes)
+        wanted = np.zeros(len(self._map.state), dtype=bool)
+        for _ in range(MOST_VIEWS):
+            wanted[:] = False
+            wanted[ids[left]] = True
+            counts = np.bincount(self._seen_by[wanted[self._seen]], minlength=n_keyframes)
+            best = int(counts.argmax())
+            if counts[best] < LEAST_POINTS:
+                break
+            keyframe = self._map.keyframes[best]
+            rows, seen = keyframe.rows_of(ids)
+            seen &= left
+            views[seen], pixels[seen] = best, keyframe.pixels[rows[seen]]
+            left &= ~seen
+        return views, pixels
+
+
+# A keyframe's image as it would look from elsewhere, so that patches of it can be found there.
+# Lucas-Kanade follows shifts: between views that are turned about the optical axis, or nearer or farther, the
+# keyframe is first warped as if its scene were a plane at the points' median depth. What is left of parallax
+# is small within a patch (Klein and Murray 2007 warp each patch by itself).
+
+
+Image = NDArray[np.uint8]
+
+#: Patches that are turned by less and scaled by less, along either axis, are followed as they are.
+MOST_TURN_DEG, MOST_STRETCH = 14.0, 1.25
+
+#: A warped view is used again while what it lacks is this part of those.
+REUSE = 0.5
+
+
+def plane_homography(keyframe_pose: Array, pose: Array, depth: float, intrinsics: Array) -> Array:
+    """Pixels from a keyframe's pixels (3, 3), for a plane at a depth that is parallel to its image.
+
+    Poses (4, 4) are camera_from_world.
+    """
+    fx, fy, cx, cy = intrinsics
+    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    relative = pose @ inverse(keyframe_pose)
+    plane = relative[:3, :3].copy()
+    plane[:, 2] += relative[:3, 3] / depth
+    return matrix @ plane @ np.linalg.inv(matrix)
+
+
+def warp_pixels(homography: Array, pixels: Array) -> Array:
+    """Pixels (n, 2) moved by a homography (3, 3)."""
+    moved = pixels @ homography[:, :2].T + homography[:, 2]
+    return moved[:, :2] / moved[:, 2:]
+
+
+def local_change(homography: Array, pixel: Array) -> Array:
+    """Derivative (2, 2) of a homography at a pixel (2,)."""
+    x, y, w = homography @ [*pixel, 1.0]
+    return np.array([homography[0, :2] * w - x * homography[2, :2], homography[1, :2] * w - y * homography[2, :2]]) / (
+        w * w
+    )
+
+
+def is_small(change: Array, part: float = 1.0) -> bool:
+    """Whether patches changed by this matrix (2, 2) can be followed as they are."""
+    (a, b), (c, d) = change.tolist()
+    # The turn of the nearest rotation, and the singular values of a 2 x 2 matrix.
+    turn, sheared = math.hypot(a + d, c - b), math.hypot(a - d, c + b)
+    largest, smallest = 0.5 * (turn + sheared), 0.5 * (turn - sheared)
+    angle = abs(math.degrees(math.atan2(c - b, a + d)))
+    limit = MOST_STRETCH**part
+    return angle < part * MOST_TURN_DEG and largest < limit and smallest > 1.0 / limit
+
+
+class WarpedViews:
+    """Keyframes as seen from about where the camera is."""
+
+    def __init__(self, intrinsics: Array) -> None:
+        self._intrinsics = intrinsics
+        self._views: dict[int, tuple[Array, Image]] = {}
+
+    def view(self, number: int, keyframe: Keyframe, pose: Array, depth: float) -> tuple[Image, Array | None]:
+        """The image (h, w) to look for patches of, and the homography (3, 3) from the keyframe's pixels.
+
+        That is None where the keyframe itself will do. ``pose`` (4, 4) is camera from world, ``depth`` that
+        of the points before the keyframe, in the map's unit.
+        """
+        now = plane_homography(keyframe.camera_from_world, pose, depth, self._intrinsics)
+        centre = self._intrinsics[2:]
+        change = local_change(now, centre)
+        if is_small(change) or not np.isfinite(change).all() or np.linalg.det(change) <= 0.0:
+            return keyframe.flat, None
+        if number in self._views:
+            before, image = self._views[number]
+            if is_small(change @ np.linalg.inv(local_change(before, centre)), REUSE):
+                return image, before
+        image = cv2.warpPerspective(keyframe.flat, now, keyframe.flat.shape[::-1], borderValue=NEUTRAL)
+        self._views[number] = now, np.asarray(image, dtype=np.uint8)
+        return self._views[number][1], now
+
+
+# Following the map from frame to frame: where its points are now, and from them the camera's pose.
+# Each point is followed from the keyframe that last saw it, not from the previous frame, so that errors do
+# not add up between keyframes; the previous frame only says where to begin. Points lost from sight are looked
+# for again where the pose says they are. Points that leave the place where a rigid scene has them do not
+# count for the pose, but are followed on.
+
+
+Mask = NDArray[np.bool_]
+
+#: Points are looked for from a keyframe only if they are seen from there at about this angle and distance.
+MOST_VIEW_ANGLE_DEG = 35.0
+
+MOST_SCALE_CHANGE = 1.6
+
+#: A point not found in this share of the frames in which it was looked for is looked for after all others.
+DOUBTFUL_SHARE = 0.25
+
+#: Points that disagree have moved if they did so in the frame before, too, or if all at once they are more
+#: than this share of the points that agree.
+MOST_LEAVING = 0.1
+
+#: Weight of the newest frame in the usual error.
+USUAL_RATE = 0.1
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A frame's pose and points.
+
+    Attributes
+    ----------
+    pose : from the map points; its ``inliers`` belong to the rows of ``points`` that are map points.
+    points : inliers and candidates. disagreeing : points that look like their map point but are not where a
+        rigid scene would have them. moved : (m,) those that surely have moved.
+    image_motion_px : how far the points moved since the previous frame, median.
+    """
+
+    pose: PoseEstimate
+    points: Followed
+    n_inliers: int
+    disagreeing: Followed
+    moved: Indices = field(default_factory=lambda: NOWHERE.ids)
+    image_motion_px: float = 0.0
+
+
+class Tracker:
+    """Follows the points of a map.
+
+    Attributes
+    ----------
+    camera_from_world : (4, 4) the newest pose. points : what is followed.
+    """
+
+    def __init__(self, rigid_map: RigidMap, intrinsics: Array, options: SlamOptions) -> None:
+        self._map = rigid_map
+        self._intrinsics = intrinsics
+        self._options = options
+        self._motion = np.eye(4)
+        self._warped = WarpedViews(intrinsics)
+        self._templates: FewTemplates | None = None
+        self._astray = NOWHERE
+        self.camera_from_world = np.eye(4)
+        self.points = NOWHERE
+
+    def place(self, camera_from_world: Array, points: Followed) -> None:
+        """Go on from a pose found by other means, as if the camera had stood still."""
+        self.camera_from_world, self.points, self._motion = camera_from_world, points, np.eye(4)
+        self._astray = NOWHERE
+
+    def correct(self, before: Array, after: Array) -> None:
+        """Move along with the newest keyframe, whose pose (4, 4) was ``before`` and now is ``after``."""
+        self.camera_from_world = self.camera_from_world @ inverse(before) @ after
+
+    def take_up(self, ids: Indices) -> None:
+        """Follow further points, from where the newest pose has them."""
+        pixels, _ = project(self.camera_from_world, self._map.positions[ids], self._intrinsics)
+        followed = np.concatenate([self.points.ids, self._astray.ids])
+        new = Followed(ids, pixels)[np.isfinite(pixels[:, 0]) & ~np.isin(ids, followed)]
+        self.points = self.points.joined(new)
+
+    def drop_candidates(self) -> None:
+        """Follow map points only."""
+        self.points = self.points[self._map.state[self.points.ids] == GOOD]
+
+    def choose_templates(self) -> None:
+        """The map is complete: look for points from the few keyframes that show most of them."""
+        self._templates = FewTemplates(self._map)
+
+    def track(self, flat: Image, depth: FrameDepth | None = None) -> Tracked | str:
+        """Pose and points of the next frame, or why it is lost; then the newest pose stays what it was."""
+        reason = ""
+        deeper = FlowOptions(self._options.flow.window, self._options.flow.levels + 1)
+        # The prediction is that the motion goes on; if it has changed abruptly, that the camera stands still.
+        for predicted, flow in (
+            (self._motion @ self.camera_from_world, self._options.flow),
+            (self.camera_from_world, deeper),
+        ):
+            found = self._follow(flat, predicted, flow)
+            result = self._estimate(flat, depth, predicted, found)
+            if isinstance(result, Tracked):
+                self._motion = result.pose.camera_from_world @ inverse(self.camera_from_world)
+                self.camera_from_world = result.pose.camera_from_world
+                self.points, self._astray = result.points, result.disagreeing
+                rate = 1.0 if self._map.usual_rms_px == FIRST_RMS_PX else USUAL_RATE
+                self._map.usual_rms_px += rate * (result.pose.rms_px - self._map.usual_rms_px)
+                self._note_candidates(result.points)
+                return result
+            reason = reason or result
+        return reason
+
+    def _note_candidates(self, points: Followed) -> None:
+        """Let the map know where points without depth are."""
+        if self._templates is not None:
+            return
+        waiting = points[self._map.state[points.ids] == CANDIDATE]
+        newest = len(self._map.keyframes) - 1
+        at = self._map.keyframes[newest].camera_from_world
+        self._map.passing.note(newest, at, self.camera_from_world, waiting.ids, waiting.pixels)
+
+    def _follow(self, flat: Image, predicted: Array, flow: FlowOptions) -> Followed:
+        """Followed points, astray ones too, found again, begun where the predicted motion takes them."""
+        # A further keyframe costs as much as all points of one: those astray come along with others only.
+        views = self._map.template_keyframe
+        along = np.isin(views[self._astray.ids], views[self.points.ids])
+        points = self.points.joined(self._astray[along])
+        # The mapper may have taken some out, and the view with their patches too.
+        points = points[self._map.state[points.ids] != REMOVED]
+        positions = self._map.positions[points.ids]
+        before, _ = project(self.camera_from_world, positions, self._intrinsics)
+        after, _ = project(predicted, positions, self._intrinsics)
+        guesses = points.pixels + np.nan_to_num(after - before)
+        return self.find(flat, Followed(points.ids, guesses), predicted, flow)
+
+    def _still_astray(self, pose: Array, followed: Followed) -> Followed:
+        """Those of the points that had left the rigid scene that are still away from their places."""
+        followed = followed[self._map.state[followed.ids] == GOOD]
+        positions = self._map.positions[followed.ids]
+        errors = reprojection_errors(pose, positions, followed.pixels, self._intrinsics)
+        return followed[errors > self._options.inlier_px]
+
+    def find(self, flat: Image, guesses: Followed, pose: Array, flow: FlowOptions) -> Followed:
+        """Points found near their guessed pixels, by the patches of their keyframes as seen from a pose."""
+        ids = guesses.ids
+        if self._templates is not None:
+            views, templates = self._templates.choose(ids)
+        else:
+            views, templates = self._map.template_keyframe[ids], self._map.template_pixels[ids]
+        found, good = guesses.pixels.copy(), np.zeros(len(ids), dtype=bool)
+        for view in np.unique(views):
+            rows = np.flatnonzero((views == view) & inside(guesses.pixels, flat.shape, 0.0))
+            source, starts = self._seen_from(pose, int(view), ids[rows], templates[rows])
+            pixels, ok = follow(source, flat, starts, guesses.pixels[rows], flow)
+            likeness = patch_correlation(source, flat, starts, pixels, self._options.patch_half)
+            found[rows], good[rows] = pixels, ok & (likeness > self._options.least_correlation)
+        return Followed(ids, found)[good]
+
+    def _seen_from(self, pose: Array, number: int, ids: Indices, pixels: Array) -> tuple[Image, Array]:
+        """A keyframe's image, warped where it looks much different from the pose, and its pixels there."""
+        keyframe = self._map.keyframes[number]
+        if not len(ids):
+            return keyframe.flat, pixels
+        _, depths = project(keyframe.camera_from_world, self._map.positions[ids], self._intrinsics)
+        depth = max(float(np.median(depths)), LEAST_DEPTH)
+        image, homography = self._warped.view(number, keyframe, pose, depth)
+        return image, pixels if homography is None else warp_pixels(homography, pixels)
+
+    def measured(self, found: Followed, pose: Array, depth: FrameDepth | None) -> Followed:
+        """Map points with their columns in the right image, where those are near what the pose expects."""
+        baseline_px, known = self._map.baseline_px, np.flatnonzero(self._map.state[found.ids] == GOOD)
+        if depth is None or not baseline_px:
+            return found
+        expected, depths = project(pose, self._map.positions[found.ids[known]], self._intrinsics)
+        columns = expected[:, 0] - baseline_px / np.maximum(depths, LEAST_DEPTH)
+        right = np.full(len(found.ids), np.nan)
+        right[known] = depth.right_columns(found.pixels[known], columns)
+        return Followed(found.ids, found.pixels, right)
+
+    def _estimate(self, flat: Image, depth: FrameDepth | None, predicted: Array, found: Followed) -> Tracked | str:
+        """Pose from what was followed, then with the lost points that are found again."""
+        was_astray = np.isin(found.ids, self._astray.ids)
+        followed_astray, found = found[was_astray], self.measured(found[~was_astray], predicted, depth)
+        pose = self._pose(predicted, found)
+        if isinstance(pose, str):
+            return pose
+        astray = self._still_astray(pose.camera_from_world, followed_astray)
+        searched = self._search(flat, pose.camera_from_world, np.concatenate([found.ids, astray.ids]))
+        if len(searched.ids):
+            found = found.joined(self.measured(searched, pose.camera_from_world, depth))
+            pose = self._pose(pose.camera_from_world, found)
+            if isinstance(pose, str):
+                return pose
+        return self._tracked(flat, pose, found, astray)
+
+    def _tracked(self, flat: Image, pose: PoseEstimate, found: Followed, astray: Followed) -> Tracked:
+        """Which points obey a pose; counted in the map."""
+        known = self._map.state[found.ids] == GOOD
+        fits = np.zeros(len(found.ids), dtype=bool)
+        fits[known] = pose.inliers
+        wanted = self.points.ids[self._map.state[self.points.ids] == GOOD]
+        self._map.n_expected[np.union1d(np.union1d(wanted, found.ids[known]), astray.ids)] += 1
+        self._map.n_found[found.ids[fits]] += 1
+        keep = fits | (self._map.state[found.ids] == CANDIDATE)
+        keep &= inside(found.pixels, flat.shape, self._options.patch_half + 2)
+        before, _ = project(self.camera_from_world, self._map.positions[found.ids[fits]], self._intrinsics)
+        moved = np.linalg.norm(found.pixels[fits] - np.nan_to_num(before), axis=1)
+        leaving = found[known & ~fits]
+        left = astray.ids
+        if len(leaving.ids) > MOST_LEAVING * fits.sum():
+            left = np.concatenate([left, leaving.ids])
+        disagreeing = leaving.joined(astray)
+        return Tracked(
+            pose, found[keep], int(fits.sum()), disagreeing, left, float(np.median(moved)) if len(moved) else 0.0
+        )
+
+    def _pose(self, start: Array, found: Followed) -> PoseEstimate | str:
+        known = found[self._map.state[found.ids] == GOOD]
+        return Sight(self._map, known, self._intrinsics, self._options).pose(start)
+
+    def _search(self, flat: Image, pose: Array, followed: Indices) -> Followed:
+        """Map points that are not followed but in view, found where the pose says."""
+        options = self._options
+        # In a complete map points have no need to be seen again for their own sake.
+        most = options.search_points
+        if self._templates is not None:
+            most = min(options.enough_points - len(followed), most)
+            if most <= 0:
+                return NOWHERE
+        lost = self._map.state == GOOD
+        lost[followed] = False
+        ids = np.flatnonzero(lost)
+        pixels, depths = project(pose, self._map.positions[ids], self._intrinsics)
+        seen = inside(pixels, flat.shape, options.flow.window) & self.looks_alike(ids, pose, depths)
+        wanted = Followed(ids, pixels)[seen]
+        wanted = wanted[self._chosen(wanted.ids, most)]
+        if not len(wanted.ids):
+            return wanted
+        found = self.find(flat, wanted, pose, FlowOptions(options.flow.window, 1))
+        errors = reprojection_errors(pose, self._map.positions[found.ids], found.pixels, self._intrinsics)
+        self._map.n_expected[np.setdiff1d(wanted.ids, found.ids)] += 1
+        return found[errors < options.search_radius_px]
+
+    def looks_alike(self, ids: Indices, pose: Array, depths: Array) -> Mask:
+        """Whether points look from here about as from their keyframe."""
+        numbers, views = np.unique(self._map.template_keyframe[ids], return_inverse=True)
+        poses = np.array([self._map.keyframes[k].camera_from_world for k in numbers]).reshape(-1, 4, 4)
+        centres = -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])[views]
+        points = self._map.positions[ids]
+        there, here = centres - points, camera_centre(pose) - points
+        far_there, far_here = np.linalg.norm(there, axis=1), np.linalg.norm(here, axis=1)
+        cosine = np.einsum("nx,nx->n", there, here) / np.maximum(far_there * far_here, 1e-12)
+        ratio = far_here / np.maximum(far_there, 1e-12)
+        near = (ratio < MOST_SCALE_CHANGE) & (ratio > 1.0 / MOST_SCALE_CHANGE)
+        return near & (cosine > np.cos(np.radians(MOST_VIEW_ANGLE_DEG))) & (depths > 0.0)
+
+    def _chosen(self, ids: Indices, most: int) -> Indices:
+        """Rows of at most ``most`` points to look for: of keyframes that saw most, reliable ones first."""
+        views = self._map.template_keyframe[ids]
+        numbers, counts = np.unique(views, return_counts=True)
+        best = numbers[np.argsort(-counts, kind="stable")[: self._options.search_keyframes]]
+        rows = np.flatnonzero(np.isin(views, best))
+        expected, found = self._map.n_expected[ids[rows]], self._map.n_found[ids[rows]]
+        doubtful = (expected >= 8) & (found < DOUBTFUL_SHARE * expected)
+        return rows[np.argsort(doubtful, kind="stable")[:most]]

@@ -1,0 +1,1 @@
+"""Studies: a problem over a box of parameters, its samples, solved and kept."""

@@ -1,0 +1,171 @@
+"""Quantities that depend on the parameters: linear expressions as study files write them.
+
+"3 MPa" is a number, "pressure" the parameter of that name, "0.5 * pressure + 2 kPa" and "10 N * share" (of a
+parameter without unit) are sums of both. A parameter over a quantity of its own kind is a ratio, as in
+"5 kPa * held / 2 s".
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import StudyError
+from morph_dslam.model import Parameter
+from morph_dslam.units import FACTORS, quantity_of, to_si
+
+Array = NDArray[np.float64]
+
+#: No number of a study is meant where it is larger, in whatever unit: what follows from it could overflow.
+LARGEST = 1e30
+
+_NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+
+_WORD = r"[A-Za-z_][\w./]*"
+
+_TERM = re.compile(
+    rf"(?:(?P<number>{_NUMBER})(?:\s+(?P<unit>{_WORD}))?(?:\s*\*\s*(?P<factor>{_WORD}))?|(?P<name>{_WORD}))"
+    rf"(?:\s*/\s*(?P<divisor>{_NUMBER})\s+(?P<divisor_unit>{_WORD}))?"
+)
+
+
+@dataclass(frozen=True)
+class Affine:
+    """constant + slopes . mu.
+
+    Attributes
+    ----------
+    constant : SI. slopes : (d,) by the parameters, SI.
+    """
+
+    constant: float
+    slopes: tuple[float, ...]
+
+    def __call__(self, mu: Array) -> float:
+        return self.constant + float(np.dot(self.slopes, mu))
+
+    @property
+    def fixed(self) -> bool:
+        """Whether no parameter changes it."""
+        return not any(self.slopes)
+
+    def expression(self, parameters: Sequence[Any]) -> Any:
+        """The same in other variables, `ngs.Parameter` say: a number if fixed, else a sum over them."""
+        result: Any = self.constant
+        for slope, parameter in zip(self.slopes, parameters, strict=True):
+            if slope:
+                result = result + slope * parameter
+        return result
+
+
+def read_affine(value: Any, quantity: str | None, parameters: Sequence[Parameter]) -> Affine:
+    """An expression of a study file.
+
+    Parameters
+    ----------
+    value : a text; for ratios a number too.
+    quantity : a key of `morph_dslam.units.FACTORS` that it must measure; None: whatever its first term does.
+
+    Raises
+    ------
+    StudyError
+        If it cannot be read, names an unknown parameter, measures something else, or has a number that no
+        study means.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        raise StudyError(f"{value!r} is not a number with a unit, nor an expression of parameters")
+    if not isinstance(value, str):
+        if quantity not in ("ratio", None):
+            unit = next(iter(FACTORS[quantity]))
+            raise StudyError(f'write {value} with its unit, "{value} {unit}" for example')
+        return Affine(possible(float(value), str(value)), (0.0,) * len(parameters))
+    known = {parameter.name: index for index, parameter in enumerate(parameters)}
+    quantity = quantity or _own_quantity(value, known, parameters)
+    constant, slopes = 0.0, np.zeros(len(parameters))
+    for sign, term in _terms(value):
+        number, name = _read_term(term, value, quantity, known, parameters)
+        if name is None:
+            constant += sign * number
+        else:
+            slopes[known[name]] += sign * number
+    return Affine(constant, tuple(slopes.tolist()))
+
+
+def possible(number: float, text: str) -> float:
+    """The number; raises StudyError, naming the text, if it is not finite or larger than `LARGEST`."""
+    if not abs(number) <= LARGEST:
+        raise StudyError(f"'{text}' cannot be meant: numbers are finite, and at most {LARGEST:g}")
+    return number
+
+
+def _own_quantity(text: str, known: Mapping[str, int], parameters: Sequence[Parameter]) -> str:
+    """What the first term of an expression measures."""
+    _, term = _terms(text)[0]
+    if term["unit"] is not None:
+        return quantity_of(term["unit"])
+    name = term["factor"] or term["name"]
+    return parameters[known[name]].quantity if name in known and term["divisor"] is None else "ratio"
+
+
+def _terms(text: str) -> list[tuple[float, re.Match]]:
+    """The terms of a sum with their signs."""
+    result, position, rest = [], 0, text.strip()
+    while position < len(rest):
+        sign = re.compile(r"\s*([+-]?)\s*").match(rest, position)
+        assert sign is not None
+        term = _TERM.match(rest, sign.end())
+        if term is None or (result and not sign.group(1)):
+            raise StudyError(f"'{text}' is not a number with a unit, nor a sum such as \"0.5 * pressure + 2 kPa\"")
+        result.append((-1.0 if sign.group(1) == "-" else 1.0, term))
+        position = term.end()
+    if not result:
+        raise StudyError("an empty text is no quantity")
+    return result
+
+
+def _read_term(
+    term: re.Match, text: str, quantity: str, known: Mapping[str, int], parameters: Sequence[Parameter]
+) -> tuple[float, str | None]:
+    """Number (SI) and parameter's name, if any, of one term."""
+    unit = term["unit"]
+    number = 1.0 if term["number"] is None else possible(float(term["number"]), text)
+    name = term["factor"] or term["name"]
+    if name is not None and name not in known:
+        raise StudyError(f"'{text}' names '{name}', which is no parameter; {_listed(known)}")
+    measured = "ratio" if name is None else parameters[known[name]].quantity
+    share = 1.0
+    if term["divisor"] is not None:
+        share, measured = _share(term, text, measured, name), "ratio"
+    if unit is not None:
+        value = to_si(number, unit, quantity) * share
+        if name is not None and measured != "ratio":
+            raise StudyError(
+                f"'{text}': only a parameter without unit can be multiplied by {term['number']} {unit}; "
+                f'make it one with "{name} / 1 {parameters[known[name]].unit}"'
+            )
+        return value, name
+    value = number * share
+    if name is None:
+        if quantity != "ratio":
+            raise StudyError(f"'{text}' lacks a unit of {quantity}: {', '.join(FACTORS[quantity])}")
+        return value, None
+    if FACTORS[measured] is not FACTORS[quantity]:
+        raise StudyError(f"'{text}': the parameter {name} is of {measured}, and {quantity} is wanted here")
+    return value, name
+
+
+def _share(term: re.Match, text: str, measured: str, name: str | None) -> float:
+    """One over the quantity that a parameter, which measures the same, is divided by."""
+    divisor = possible(float(term["divisor"]), text)
+    if name is None or not divisor:
+        raise StudyError(f"'{text}': only a parameter can be divided, and not by zero")
+    return 1.0 / to_si(divisor, term["divisor_unit"], measured)
+
+
+def _listed(names: Mapping[str, int]) -> str:
+    return f"the parameters are {', '.join(names)}" if names else "the study has no parameters"

@@ -1,0 +1,378 @@
+"""The solutions that a model is made from and certified with: solved by a sweep, or read from files."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationInfo, field_validator
+
+from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.loads import reaction_names, with_reactions
+from morph_dslam.meshing.mesh_checks import check_size
+from morph_dslam.meshing.meshes import CellBlock, Mesh, model_mesh_of
+from morph_dslam.model import Parameter
+from morph_dslam.reduction.certificate import stability_report
+from morph_dslam.studies.problem import ModelMesh, ParametricStudy, Snapshot, SweepProblem, bounds
+from morph_dslam.studies.sample_task import neighbour_tree
+from morph_dslam.studies.sampling import held_out_samples, sample_adaptively, training_samples
+from morph_dslam.studies.sections import ReductionSection, Section
+from morph_dslam.studies.snapshots import load_outputs, load_snapshot
+from morph_dslam.studies.sweep import SweepResult
+from morph_dslam.units import quantity_of, to_si
+
+Array = NDArray[np.float64]
+
+#: Methods that make a model from the equations alone: only held-out samples are solved for them.
+WITHOUT_SOLUTIONS = ("pgd",)
+
+
+@dataclass(frozen=True)
+class Solutions:
+    """Snapshots of a study, solved or read.
+
+    Attributes
+    ----------
+    seen : to make the model from; mirror images of one solution form a group. unseen : to measure its error.
+    seen_files, unseen_files : where they are kept with the solver's states; empty for another program's.
+    problem : makes what they were solved with, once; None for another program's.
+    failed : coordinates and reason of each sample that could not be solved.
+    stability : see `stability_report`; None for solutions of another program.
+    rounds : number of solves and largest estimated error of each round of adaptive sampling.
+    """
+
+    mesh: ModelMesh
+    parameters: tuple[Parameter, ...]
+    seen: list[list[Snapshot]]
+    unseen: list[Snapshot]
+    seen_files: tuple[Path, ...] = ()
+    unseen_files: tuple[Path, ...] = ()
+    problem: Callable[[], SweepProblem] | None = None
+    failed: list[dict[str, Any]] = field(default_factory=list)
+    stability: dict[str, Any] | None = None
+    rounds: list[dict[str, Any]] = field(default_factory=list)
+
+
+def solve(
+    study: ParametricStudy, problem: Callable[[], SweepProblem], sweep: Callable[[Array], SweepResult]
+) -> Solutions:
+    """Solve the training and held-out samples of a study.
+
+    Parameters
+    ----------
+    problem : makes what the study is solved with. sweep : solves samples (n, d), or finds them on disk.
+    """
+    rounds: list[dict[str, Any]] = []
+    if study.reduction.method in WITHOUT_SOLUTIONS:
+        training = np.zeros((0, len(study.model_parameters())))
+    elif study.sampling.scheme == "adaptive":
+        training, rounds = sample_adaptively(study, problem(), sweep)
+    else:
+        training = training_samples(study)
+    samples = np.vstack([training, held_out_samples(study)])
+    result = sweep(samples)
+    mesh = study.model_mesh()
+    seen = _gather(study, samples, result, range(len(training)))
+    unseen = _gather(study, samples, result, range(len(training), len(samples)))
+    known = [group[0] for group in seen or unseen]
+    names = reaction_names(known, float(np.linalg.norm(np.ptp(mesh.nodes, axis=0))))
+    return Solutions(
+        mesh,
+        study.model_parameters(),
+        [[with_reactions(image, names) for image in images] for images in seen],
+        [with_reactions(images[0], names) for images in unseen],
+        tuple(path for index, path in sorted(result.solved.items()) if index < len(training)),
+        tuple(path for index, path in sorted(result.solved.items()) if index >= len(training)),
+        problem,
+        [{"coordinates": samples[index].tolist(), "reason": reason} for index, reason in sorted(result.failed.items())],
+        _stability(study, study.canonical(samples), result),
+        rounds,
+    )
+
+
+def _stability(study: ParametricStudy, samples: Array, result: SweepResult) -> dict[str, Any]:
+    """Stability of the solutions at ``samples`` (n, d), canonical, along the tree that joins them."""
+    outputs = {index: load_outputs(path) for index, path in result.solved.items()}
+    pivots = {
+        index: int(values["negative_pivots"]) if "negative_pivots" in values else None
+        for index, values in outputs.items()
+    }
+    _, parents = neighbour_tree(samples, study.scale(), study.root(), failed=result.failed)
+    return stability_report(study.model_parameters(), samples, pivots, parents)
+
+
+def _gather(study: ParametricStudy, samples: Array, result: SweepResult, which: Iterable[int]) -> list[list[Snapshot]]:
+    """For each solved sample its snapshot, followed by those mirror images that lie in the box too."""
+    lower, upper = bounds(study).T
+    tolerance = 1e-9 * (upper - lower)
+    groups = []
+    for index in which:
+        if index in result.solved:
+            images = study.images(load_snapshot(result.solved[index]))
+            images.sort(key=lambda image: float(np.abs(image.coordinates - samples[index]).max()))
+            groups.append(
+                [
+                    image
+                    for image in images
+                    if np.all(image.coordinates >= lower - tolerance) and np.all(image.coordinates <= upper + tolerance)
+                ]
+            )
+    return groups
+
+
+def read(study: ExternalStudy) -> Solutions:
+    """The solutions of another program, those that measure the error drawn by chance."""
+    mesh, parameters, snapshots = study.solutions()
+    training, held_out = study.split(len(snapshots))
+    return Solutions(
+        mesh, parameters, [[snapshots[index]] for index in training], [snapshots[index] for index in held_out]
+    )
+
+
+# Solutions of another program: a folder of VTU, VTK or XDMF files and a table of their parameters.
+# They go through the same reduction and certificate as this program's own. Their derivatives by the
+# parameters are not known, so the functions of the parameters are fitted to values only.
+
+
+#: Of meshio, by the ending of a file's name: `meshio.read` itself ends the program where a file is damaged.
+_READERS = {".vtu": meshio.vtu.read, ".vtk": meshio.vtk.read, ".xdmf": meshio.xdmf.read, ".xmf": meshio.xdmf.read}
+
+#: Cell types by the names that meshio gives them; the order of their nodes is VTK's.
+_CELL_TYPES = {
+    "hexahedron": "hex8",
+    "hexahedron20": "hex20",
+    "hexahedron27": "hex27",
+    "tetra": "tet4",
+    "tetra10": "tet10",
+    "wedge": "prism6",
+    "wedge15": "prism15",
+    "wedge18": "prism18",
+    "triangle": "tri3",
+    "quad": "quad4",
+}
+
+#: Where xx, yy, zz, yz, xz, xy stand among VTK's six components, and among nine row by row.
+_VOIGT = {6: [0, 1, 2, 4, 5, 3], 9: [0, 4, 8, 5, 2, 1]}
+
+#: Nodes may differ by so much of the mesh's size from file to file, which is written in single precision.
+_SAME = 1e-5
+
+_COLUMN = re.compile(r"\s*(?P<name>\w+)\s*(?:\[(?P<unit>[^\]]+)\])?\s*")
+
+
+class ExternalSection(Section):
+    """Where the solutions are.
+
+    ``table`` is a CSV file, relative to the study: a column ``file`` names each solution (relative to the
+    table), a column ``step`` picks one of an XDMF series, and every other column is a parameter, its unit in
+    brackets in the header, ``angle [deg]``. Files hold the undeformed mesh, coordinates and displacements in
+    ``length_unit``, and point data by the names given here; ``stress`` (Cauchy, in ``stress_unit``) and
+    ``strain`` (Green-Lagrange) have six components in VTK's order xx, yy, zz, xy, yz, xz, or nine.
+    """
+
+    table: Path
+    length_unit: str
+    displacement: str = "displacement"
+    stress: str | None = None
+    stress_unit: str = "Pa"
+    strain: str | None = None
+
+    @field_validator("table")
+    @classmethod
+    def _resolve(cls, table: Path, info: ValidationInfo) -> Path:
+        return Path((info.context or {}).get("folder", ".")) / table
+
+
+class HoldOutSection(Section):
+    """How many of the solutions only measure the error (a fifth, and at least 4, if absent), and which."""
+
+    held_out: int | None = Field(default=None, ge=4)
+    seed: int = Field(default=0, ge=0)
+
+
+class ExternalStudy(Section):
+    """Solutions that were computed elsewhere, to be reduced like this program's own."""
+
+    name: str
+    external: ExternalSection
+    sampling: HoldOutSection = HoldOutSection()
+    reduction: ReductionSection = ReductionSection()
+
+    def solutions(self) -> tuple[ModelMesh, tuple[Parameter, ...], list[Snapshot]]:
+        """The mesh, the parameters with the ranges of the table, and all snapshots.
+
+        Raises
+        ------
+        StudyError
+            If the table or a file cannot be read, lacks something, or has another mesh than the first.
+        """
+        parameters, coordinates, rows = read_table(self.external.table)
+        snapshots: list[Snapshot] = []
+        mesh: Mesh | None = None
+        for row, point in zip(rows, coordinates, strict=True):
+            path = self.external.table.parent / row["file"]
+            content = _read(path, row.get("step"))
+            here = _mesh(content, to_si(1.0, self.external.length_unit, "length"), path)
+            if mesh is None:
+                check_size(here)
+                mesh = here
+            _check_same(mesh, here, path)
+            snapshots.append(Snapshot(point, self._fields(content, path)))
+        assert mesh is not None
+        return model_mesh_of(mesh), parameters, snapshots
+
+    def _fields(self, content: meshio.Mesh, path: Path) -> dict[str, Array]:
+        section = self.external
+        length, stress = to_si(1.0, section.length_unit, "length"), to_si(1.0, section.stress_unit, "stress")
+        fields = {"displacement": length * _point_data(content, section.displacement, (3,), path)}
+        for name, key, factor in (("stress_solid", section.stress, stress), ("strain", section.strain, 1.0)):
+            if key is not None:
+                values = _point_data(content, key, tuple(_VOIGT), path)
+                fields[name] = factor * values[:, _VOIGT[values.shape[1]]]
+        return fields
+
+    def split(self, count: int) -> tuple[list[int], list[int]]:
+        """Training and held-out solutions, by index.
+
+        Raises
+        ------
+        StudyError
+            If too few are left to train on.
+        """
+        held_out = self.sampling.held_out or max(4, count // 5)
+        if count - held_out < 8:
+            raise StudyError(
+                f"{self.external.table} lists {count} solutions; at least {8 + held_out} are needed, "
+                f"{held_out} of them to measure the error"
+            )
+        order = np.random.default_rng(self.sampling.seed).permutation(count)
+        return sorted(order[held_out:].tolist()), sorted(order[:held_out].tolist())
+
+
+def read_table(path: Path) -> tuple[tuple[Parameter, ...], Array, list[dict[str, str]]]:
+    """The parameter table: parameters, their values (n, d) in SI, and the rows.
+
+    Raises
+    ------
+    StudyError
+        If it cannot be read, or a header or a value is wrong.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            header, rows = [name.strip() for name in reader.fieldnames or []], []
+            for row in reader:
+                rows.append({(key or "").strip(): value for key, value in row.items()})
+    except OSError as error:
+        raise StudyError(f"cannot read the table {path}: {error.strerror}") from error
+    if "file" not in header or not rows:
+        raise StudyError(f"{path} needs a column 'file' and a row for each solution")
+    _check_listed_once(path, rows)
+    columns = [_column(path, name) for name in header if name not in ("file", "step")]
+    if not columns:
+        raise StudyError(f"{path} has no parameter: add a column such as 'angle [deg]'")
+    values = np.array([[_number(path, n, row, key) for key, _, _ in columns] for n, row in enumerate(rows, 2)])
+    parameters = []
+    for (_, name, unit), column in zip(columns, values.T, strict=True):
+        quantity = quantity_of(unit)
+        column *= to_si(1.0, unit, quantity)
+        lower, upper = float(column.min()), float(column.max())
+        if not lower < upper:
+            raise StudyError(f"{path}: the parameter {name} is the same in all rows; leave the column out")
+        parameters.append(Parameter(name, quantity, unit, lower, upper, min(max(0.0, lower), upper)))
+    return tuple(parameters), values, rows
+
+
+def _check_listed_once(path: Path, rows: list[dict[str, str]]) -> None:
+    """One solution has one set of parameters."""
+    lines: dict[tuple[str | None, str | None], int] = {}
+    for line, row in enumerate(rows, 2):
+        solution = (row.get("file"), row.get("step"))
+        if solution in lines:
+            raise StudyError(
+                f"{path}, line {line}: '{solution[0]}' is in line {lines[solution]} already; list each solution once"
+            )
+        lines[solution] = line
+
+
+def _column(path: Path, header: str) -> tuple[str, str, str]:
+    """Header, name and unit of a parameter's column."""
+    match = _COLUMN.fullmatch(header)
+    if match is None:
+        raise StudyError(f"{path}: '{header}' is no parameter's header; write 'angle [deg]' for example")
+    return header, match["name"], match["unit"] or "1"
+
+
+def _number(path: Path, line: int, row: dict[str, str], key: str) -> float:
+    try:
+        return float(row[key])
+    except (TypeError, ValueError):
+        raise StudyError(f"{path}, line {line}: '{row.get(key)}' is no number for {key}") from None
+
+
+def _read(path: Path, step: str | None) -> meshio.Mesh:
+    """A file's mesh and point data; of an XDMF series those of one step."""
+    if not path.is_file():
+        raise StudyError(f"the solution {path} that the table names does not exist")
+    read = _READERS.get(path.suffix.lower())
+    if read is None:
+        raise StudyError(f"{path} is no solution that can be read; use {', '.join(_READERS)}")
+    try:
+        if step is None:
+            return read(str(path))
+        with meshio.xdmf.TimeSeriesReader(path) as reader:
+            points, cells = reader.read_points_cells()
+            _, point_data, _ = reader.read_data(int(step))
+            return meshio.Mesh(np.asarray(points), cells, point_data=point_data)
+    except Exception as error:  # meshio raises whatever its parsers meet
+        raise StudyError(f"cannot read the solution {path}: {error}") from error
+
+
+def _mesh(content: meshio.Mesh, unit: float, path: Path) -> Mesh:
+    """The cells of the highest dimension; other types are an error."""
+    blocks = [block for block in content.cells if block.type not in ("vertex", "line")]
+    unknown = {block.type for block in blocks} - set(_CELL_TYPES)
+    if unknown or not blocks:
+        raise StudyError(
+            f"{path} has {'cells of type ' + ', '.join(sorted(unknown)) if unknown else 'no cells'}; "
+            f"known are {', '.join(_CELL_TYPES)}"
+        )
+    made = [CellBlock(_CELL_TYPES[block.type], np.asarray(block.data, dtype=np.int64)) for block in blocks]
+    highest = max(block.type.dimension for block in made)
+    nodes = np.zeros((len(content.points), 3))
+    nodes[:, : content.points.shape[1]] = content.points
+    return Mesh(unit * nodes, tuple(block for block in made if block.type.dimension == highest))
+
+
+def _check_same(first: Mesh, other: Mesh, path: Path) -> None:
+    same = len(first.blocks) == len(other.blocks) and first.nodes.shape == other.nodes.shape
+    same = same and all(
+        np.array_equal(a.connectivity, b.connectivity) for a, b in zip(first.blocks, other.blocks, strict=True)
+    )
+    if not same or np.abs(first.nodes - other.nodes).max() > _SAME * np.ptp(first.nodes, axis=0).max():
+        raise StudyError(
+            f"{path} has another mesh than the first solution: all need the same undeformed nodes and cells, "
+            "with the displacement as point data"
+        )
+
+
+def _point_data(content: meshio.Mesh, name: str, widths: tuple[int, ...], path: Path) -> Array:
+    """Point data (n, c) with one of the given numbers of components."""
+    if name not in content.point_data:
+        known = ", ".join(content.point_data) or "none"
+        raise StudyError(f"{path} has no point data '{name}'; it has: {known}")
+    values: Any = np.asarray(content.point_data[name], dtype=np.float64)
+    values = values.reshape(len(content.points), -1)
+    if values.shape[1] not in widths:
+        wanted = " or ".join(str(width) for width in widths)
+        raise StudyError(f"{path}: '{name}' has {values.shape[1]} components in place of {wanted}")
+    if not np.isfinite(values).all():
+        raise StudyError(f"{path}: '{name}' holds values that are not finite")
+    return values

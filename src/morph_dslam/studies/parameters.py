@@ -1,0 +1,74 @@
+"""The [parameters.NAME] sections of a solid's study, and which of the parameters is the time."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from morph_dslam.errors import StudyError
+from morph_dslam.model import Parameter
+from morph_dslam.studies.affine import read_affine
+from morph_dslam.studies.sections import Section, quantity
+from morph_dslam.studies.solid_sections import Value
+from morph_dslam.units import quantity_of
+
+
+class ParameterSection(Section):
+    """A parameter of the study.
+
+    ``range`` are its ends, each a number with its unit, which says what it measures; plain numbers for a
+    ratio. ``default`` is the state that nothing is known about (the value nearest to zero if absent); every
+    path of solutions starts there.
+    """
+
+    range: tuple[Value, Value]
+    default: Value | None = None
+    description: str = ""
+
+    @model_validator(mode="after")
+    def _check(self) -> ParameterSection:
+        try:
+            self.parameter("parameter")
+        except StudyError as error:
+            raise ValueError(str(error)) from error
+        return self
+
+    def parameter(self, name: str) -> Parameter:
+        """The parameter as the model file states it.
+
+        Raises
+        ------
+        StudyError
+            If the ends measure different things, or are not in order.
+        """
+        unit = _unit(self.range[0])
+        measured = quantity_of(unit)
+        lower, upper = (read_affine(end, measured, ()).constant for end in self.range)
+        if not lower < upper:
+            raise StudyError("the range must rise: its lower end is not below its upper end")
+        default = min(max(0.0, lower), upper)
+        if self.default is not None:
+            default = read_affine(self.default, measured, ()).constant
+        if not lower <= default <= upper:
+            raise StudyError(f"the default {self.default} lies outside of the range")
+        return Parameter(name, measured, unit, lower, upper, default, self.description)
+
+
+def _unit(value: Value) -> str:
+    if not isinstance(value, str):
+        return "1"
+    parts = value.split()
+    if len(parts) != 2:
+        raise StudyError(f"'{value}' is not a number and a unit")
+    return parts[1]
+
+
+class TimeSection(Section):
+    """The parameter that is the time; at the lower end of its range the body is loaded in an instant.
+
+    ``step`` is the longest increment of time.
+    """
+
+    parameter: str
+    step: Annotated[float, quantity("time"), Field(gt=0, allow_inf_nan=False)]

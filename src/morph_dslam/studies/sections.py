@@ -1,0 +1,128 @@
+"""Sections that every study file may have, and how its quantities are read."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
+
+from morph_dslam.errors import StudyError
+from morph_dslam.studies.affine import LARGEST, possible
+from morph_dslam.units import to_si
+
+
+def quantity(kind: str) -> BeforeValidator:
+    """Reads "420 mm" as SI; refuses a bare number, so that no unit is ever guessed."""
+
+    def read(value: Any) -> float:
+        if not isinstance(value, str):
+            raise ValueError(f'write the value with its unit, "{value} mm" for example')
+        parts = value.split()
+        if len(parts) != 2:
+            raise ValueError(f"'{value}' is not a number and a unit")
+        try:
+            return to_si(possible(float(parts[0]), value), parts[1], kind)
+        except StudyError as error:
+            raise ValueError(str(error)) from error
+
+    return BeforeValidator(read)
+
+
+#: A plain number of a study: a ratio, a component of a direction.
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+
+Length = Annotated[float, quantity("length")]
+
+PositiveLength = Annotated[float, quantity("length"), Field(gt=0, allow_inf_nan=False)]
+
+Stress = Annotated[float, quantity("stress"), Field(gt=0, allow_inf_nan=False)]
+
+Angle = Annotated[float, quantity("angle")]
+
+
+class Section(BaseModel):
+    """A section of a study file: unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+#: More solves than these are a mistake.
+MOST_SAMPLES = 1_000_000
+
+
+class SamplingSection(Section):
+    """Numbers of training and held-out solves, where they lie, and the seed of their positions.
+
+    ``scheme`` places the training samples: "sobol" scatters ``training`` of them, denser towards the edges of
+    the box; "even" spaces them evenly with both ends included, for a single parameter; "grid" takes all
+    points of a full grid with ``points`` for each parameter, or one number for all; "adaptive" solves
+    ``first`` scattered ones and then adds where the model's error is estimated to be largest, up to
+    ``training``. The method of reduction chooses where it is absent. Held-out samples are always scattered.
+    """
+
+    training: int = Field(default=256, ge=8, le=MOST_SAMPLES)
+    held_out: int = Field(default=59, ge=4, le=MOST_SAMPLES)
+    scheme: Literal["sobol", "even", "grid", "adaptive"] | None = None
+    points: int | tuple[int, ...] | None = None
+    first: int = Field(default=16, ge=4)
+    seed: int = Field(default=0, ge=0)
+
+    @field_validator("points")
+    @classmethod
+    def _check_points(cls, points: int | tuple[int, ...] | None) -> int | tuple[int, ...] | None:
+        if any(count < 2 for count in ((points,) if isinstance(points, int) else points or ())):
+            raise ValueError("a grid needs at least 2 points along each parameter")
+        return points
+
+    @model_validator(mode="after")
+    def _check_scheme(self) -> SamplingSection:
+        given = self.model_fields_set
+        if self.scheme == "grid" and self.points is None:
+            raise ValueError('scheme = "grid" needs points: their number along each parameter, [9, 5] say')
+        if self.scheme == "grid" and "training" in given:
+            raise ValueError('with scheme = "grid" the points are the training samples: leave out training')
+        if self.scheme != "grid" and "points" in given:
+            raise ValueError('points are those of scheme = "grid": leave them out, or choose that scheme')
+        if self.scheme not in (None, "adaptive") and "first" in given:
+            raise ValueError('first is for scheme = "adaptive": leave it out, or choose that scheme')
+        if self.scheme == "adaptive" and self.first > self.training:
+            raise ValueError("first must be at most training: adaptive sampling starts with it and adds")
+        return self
+
+
+#: Names of the methods of reduction, of formats of several parameters, and of functions of one.
+MethodName = Literal["galerkin", "pod", "reduced_basis", "sparse_pgd", "pgd"]
+
+FormatName = Literal["tucker", "tensor_train", "cp", "polynomial"]
+
+BasisName = Literal["chebyshev", "cubic_spline", "p_spline", "kriging", "fourier", "hat"]
+
+
+class ReductionSection(Section):
+    """How solutions are reduced.
+
+    ``method`` finds the functions of the parameters, ``format`` is how those of several parameters are kept
+    and ``basis`` what those of a single one are made of; the study and the method choose where one is absent.
+    ``inner_product`` is that in which modes are orthogonal: "mass" counts nodes by their volume, "energy" by
+    the stiffness. ``components`` "separate" gives every component of a field modes of its own. Modes are kept
+    until the relative norm left out is below ``tolerance``, and at most ``max_modes``; ``max_degree`` is the
+    highest polynomial degree tried in the parameters. ``memory_gb`` is what a decomposition of snapshots may
+    take, in 1e9 bytes; more of them are decomposed in blocks.
+    """
+
+    method: MethodName | None = None
+    format: FormatName | None = None
+    basis: BasisName | None = None
+    inner_product: Literal["mass", "energy"] = "mass"
+    components: Literal["together", "separate"] = "together"
+    tolerance: float = Field(default=5e-4, gt=0, lt=1)
+    max_modes: int = Field(default=24, ge=1)
+    max_degree: int = Field(default=8, ge=1, le=40)
+    memory_gb: float = Field(default=4.0, gt=0, allow_inf_nan=False)
+
+
+class WorkSection(Section):
+    """How the solves share the machine: worker processes, and threads in each (every core if absent)."""
+
+    workers: int | None = Field(default=None, ge=1)
+    threads: int | None = Field(default=None, ge=1)

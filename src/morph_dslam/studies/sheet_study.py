@@ -1,0 +1,423 @@
+"""Snapshots of the gripped sheet: fields on the output grid, and their mirror images.
+
+A sheet does not know its two sides apart, so the mirror image of a solution is a solution; if its grips are
+at the same height, it does not know left from right either, and if that is half its width, nor top from
+bottom.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from morph_dslam.mechanics.gripped_sheet import EquilibriumState, GrippedSheet
+from morph_dslam.mechanics.shell import OrthotropicSheet
+from morph_dslam.mechanics.solvers.continuation import advance
+from morph_dslam.mechanics.supports import COORDINATES, Grips
+from morph_dslam.model import Parameter
+from morph_dslam.studies.problem import ModelMesh, Snapshot
+from morph_dslam.studies.sections import (
+    Angle,
+    Length,
+    Number,
+    PositiveLength,
+    ReductionSection,
+    SamplingSection,
+    Section,
+    Stress,
+    WorkSection,
+)
+from morph_dslam.studies.snapshots import SOLVER_VERSION
+
+Array = NDArray[np.float64]
+
+FACES = ("top", "bottom")
+
+#: Signs that the coordinates take when the sheet is mirrored in its own plane, in x = 0 and in y = 0.
+MIRROR_Z = np.array([-1.0, 1.0, -1.0, 1.0])
+
+MIRROR_X = np.array([1.0, 1.0, -1.0, -1.0])
+
+MIRROR_Y = np.array([1.0, 1.0, 1.0, -1.0])
+
+
+def output_points(length: float, width: float, grid: tuple[int, int]) -> Array:
+    """Points (n, 2) of a grid of cells over the sheet, x fastest, metres."""
+    nx, ny = grid
+    x = np.linspace(-length / 2.0, length / 2.0, nx + 1)
+    y = np.linspace(-width / 2.0, width / 2.0, ny + 1)
+    return np.column_stack([np.tile(x, ny + 1), np.repeat(y, nx + 1)])
+
+
+def take_snapshot(problem: GrippedSheet, state: EquilibriumState, points: Array, thickness_ratio: float) -> Snapshot:
+    """Displacement, stress and their derivatives at a solved state.
+
+    Parameters
+    ----------
+    points : (n, 2) material points. thickness_ratio : the sheet's thickness over that of ``problem``.
+    """
+    dof_slopes, _ = problem.sensitivities(state)
+    fields = _fields(problem, state.dofs, points, thickness_ratio)
+    slopes = [_fields(problem, slope, points, thickness_ratio) for slope in dof_slopes]
+    return Snapshot(
+        state.coordinates,
+        fields,
+        {name: np.array([slope[name] for slope in slopes]) for name in fields},
+        {"motion": state.motion},
+    )
+
+
+def _fields(problem: GrippedSheet, dofs: Array, points: Array, ratio: float) -> dict[str, Array]:
+    displacement, stress = problem.shell.sample(dofs, points)
+    # The membrane part of the stress goes with thickness squared, the bending part with thickness.
+    membrane = ratio**2 * (stress["top"] + stress["bottom"]) / 2.0
+    bending = ratio * (stress["bottom"] - stress["top"]) / 2.0
+    return {"displacement": displacement, "stress_top": membrane - bending, "stress_bottom": membrane + bending}
+
+
+def mirrored(snapshot: Snapshot) -> Snapshot:
+    """The mirror image z -> -z: another state of the same sheet, with its faces swapped."""
+    flip, z = MIRROR_Z[:, None, None], np.array([1.0, 1.0, -1.0])
+
+    def image(fields: dict[str, Array], sign: Array | float) -> dict[str, Array]:
+        return {
+            "displacement": fields["displacement"] * z * sign,
+            "stress_top": fields["stress_bottom"] * sign,
+            "stress_bottom": fields["stress_top"] * sign,
+        }
+
+    return Snapshot(
+        snapshot.coordinates * MIRROR_Z,
+        image(snapshot.fields, 1.0),
+        image(snapshot.sensitivities, flip),
+        {"motion": snapshot.outputs["motion"] * np.array([-1.0, -1.0, -1.0, 1.0, 1.0])},
+    )
+
+
+def reversed_ends(snapshot: Snapshot, columns: int) -> Snapshot:
+    """The mirror image x -> -x: another state of the same sheet if its grips are at the same height.
+
+    Parameters
+    ----------
+    columns : points along x of the output grid.
+    """
+    flip, x, shear = MIRROR_X[:, None, None], np.array([-1.0, 1.0, 1.0]), np.array([1.0, 1.0, -1.0])
+
+    def turned(field: Array) -> Array:
+        grid = field.reshape(*field.shape[:-2], -1, columns, 3)
+        return grid[..., ::-1, :].reshape(field.shape)
+
+    def image(fields: dict[str, Array], sign: Array | float) -> dict[str, Array]:
+        return {name: turned(field) * (x if name == "displacement" else shear) * sign for name, field in fields.items()}
+
+    left, right, twist, approach, turn = snapshot.outputs["motion"]
+    return Snapshot(
+        snapshot.coordinates * MIRROR_X,
+        image(snapshot.fields, 1.0),
+        image(snapshot.sensitivities, flip),
+        {"motion": np.array([right, left, -twist, approach, -turn])},
+    )
+
+
+def upside_down(snapshot: Snapshot, columns: int) -> Snapshot:
+    """The mirror image y -> -y: another state of the same sheet if its grips are at the middle of its edges.
+
+    Parameters
+    ----------
+    columns : points along x of the output grid.
+    """
+    flip, y, shear = MIRROR_Y[:, None, None], np.array([1.0, -1.0, 1.0]), np.array([1.0, 1.0, -1.0])
+
+    def turned(field: Array) -> Array:
+        grid = field.reshape(*field.shape[:-2], -1, columns, 3)
+        return grid[..., ::-1, :, :].reshape(field.shape)
+
+    def image(fields: dict[str, Array], sign: Array | float) -> dict[str, Array]:
+        return {name: turned(field) * (y if name == "displacement" else shear) * sign for name, field in fields.items()}
+
+    return Snapshot(
+        snapshot.coordinates * MIRROR_Y,
+        image(snapshot.fields, 1.0),
+        image(snapshot.sensitivities, flip),
+        {"motion": snapshot.outputs["motion"] * np.array([1.0, 1.0, -1.0, 1.0, -1.0])},
+    )
+
+
+# The study of a thin elastic sheet held by two rigid grips.
+
+
+#: Cells along a side of a sheet: more than these are a mistake.
+Count = Annotated[int, Field(ge=1, le=1000)]
+
+#: Smallest |bulge| that is solved, over the largest: in the flat state itself the equations are singular.
+SMALLEST_BULGE = 0.02
+
+
+class SheetSection(Section):
+    """The flat sheet: length along x, width along y, thickness."""
+
+    length: PositiveLength
+    width: PositiveLength
+    thickness: PositiveLength
+
+
+class SheetMaterialSection(Section):
+    """Orthotropic elasticity, fibres along x: Young's moduli along and across, nu_12, G_12."""
+
+    young_fibre: Stress
+    young_cross: Stress
+    poisson: float = Field(ge=0, lt=1)
+    shear: Stress
+
+
+class GripsSection(Section):
+    """Two rigid grips on the short edges: depth along x, height along y, y of their centres."""
+
+    depth: PositiveLength
+    height: PositiveLength
+    centre_left: Length = 0.0
+    centre_right: Length = 0.0
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether left and right are mirror images."""
+        return self.centre_left == self.centre_right
+
+    @property
+    def centred(self) -> bool:
+        """Whether the halves of the sheet above and below the grips' middles are mirror images too."""
+        return self.centre_left == self.centre_right == 0.0
+
+
+class SheetParametersSection(Section):
+    """Ranges of the four coordinates (`morph_dslam.mechanics.supports` says what they mean)."""
+
+    bulge: tuple[Length, Length]
+    bend: tuple[Number, Number]
+    skew: tuple[Angle, Angle]
+    slant: tuple[Number, Number]
+
+    @property
+    def bounds(self) -> Array:
+        """Ranges (4, 2) in the order of `morph_dslam.mechanics.supports.COORDINATES`, SI."""
+        return np.array([getattr(self, name) for name in COORDINATES])
+
+    @model_validator(mode="after")
+    def _check_order(self) -> SheetParametersSection:
+        for name in type(self).model_fields:
+            lower, upper = getattr(self, name)
+            if not lower < upper:
+                raise ValueError(f"the range of {name} must rise: its lower end is not below its upper end")
+        return self
+
+
+class SheetSolverSection(WorkSection):
+    """Discretisation.
+
+    ``thickness`` is the thickness at which equilibrium is solved, the sheet's own if absent. The shape of a
+    sheet that bends without stretching does not depend on it, and a thicker one needs fewer iterations;
+    bending stress is scaled back in proportion to thickness, membrane stress to its square.
+    """
+
+    divisions: tuple[Count, Count] = (12, 10)
+    order: int = Field(default=3, ge=2, le=4)
+    thickness: PositiveLength | None = None
+
+
+class SheetReductionSection(ReductionSection):
+    """Reduction, and the cells of the model's mesh along x and y."""
+
+    grid: tuple[Count, Count] = (60, 42)
+
+
+class SheetStudy(Section):
+    """A thin elastic sheet held by two rigid grips."""
+
+    name: str
+    sheet: SheetSection
+    material: SheetMaterialSection
+    grips: GripsSection
+    parameters: SheetParametersSection
+    solver: SheetSolverSection = SheetSolverSection()
+    sampling: SamplingSection = SamplingSection()
+    reduction: SheetReductionSection = SheetReductionSection()
+
+    @model_validator(mode="after")
+    def _check_sizes(self) -> SheetStudy:
+        sheet, grips = self.sheet, self.grips
+        if not 1e-3 <= sheet.length <= 10.0 or not 1e-3 <= sheet.width <= 10.0:
+            raise ValueError(
+                f"the sheet is {sheet.length:g} x {sheet.width:g} m; are the units right? "
+                "sizes from 1 mm to 10 m are expected"
+            )
+        if sheet.thickness > 0.05 * min(sheet.length, sheet.width):
+            raise ValueError("the sheet is thicker than 5 % of its size: shell theory does not hold")
+        if 4.0 * grips.depth > sheet.length:
+            raise ValueError("the grips cover half of the sheet's length: make grips.depth smaller")
+        for name in ("centre_left", "centre_right"):
+            if abs(getattr(grips, name)) + grips.height / 2.0 > sheet.width / 2.0 * (1.0 + 1e-9):
+                raise ValueError(f"grips.{name}: the grip reaches beyond the sheet's edge")
+        return self
+
+    @property
+    def solve_thickness(self) -> float:
+        """Thickness at which equilibrium is solved, m."""
+        return self.solver.thickness or self.sheet.thickness
+
+    @property
+    def work(self) -> WorkSection:
+        """One thread in each worker unless the study says otherwise: the workers fill the cores."""
+        return WorkSection(workers=self.solver.workers, threads=self.solver.threads or 1)
+
+    @property
+    def advice(self) -> str:
+        """What to change when the sheet cannot be solved."""
+        return "Narrow the ranges of the parameters, refine solver.divisions, or raise solver.thickness"
+
+    def problem(self) -> GrippedSheet:
+        """The discrete mechanical problem."""
+        material = OrthotropicSheet(
+            self.material.young_fibre,
+            self.material.young_cross,
+            self.material.poisson,
+            self.material.shear,
+            self.solve_thickness,
+        )
+        grips = Grips(
+            self.sheet.length, self.grips.depth, self.grips.height, self.grips.centre_left, self.grips.centre_right
+        )
+        return GrippedSheet(material, grips, self.sheet.width, self.solver.divisions, self.solver.order)
+
+    def sweep_problem(self) -> GrippedSheetSweep:
+        """What the sweep solves with."""
+        return GrippedSheetSweep(
+            self.problem(), self._output_points(), self.sheet.thickness / self.solve_thickness, self.root()
+        )
+
+    def fingerprint(self) -> str:
+        """Hash of the sheet, its grips, discretisation and output grid, and of the solver version."""
+        content = self.model_dump(include={"sheet", "material", "grips", "solver"})
+        for option in WorkSection.model_fields:
+            del content["solver"][option]
+        content["grid"] = self.reduction.grid
+        content["code"] = SOLVER_VERSION
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    def model_parameters(self) -> tuple[Parameter, ...]:
+        """The parameters as the model file states them; the default is the state nearest to flat."""
+        texts = {
+            "bulge": ("length", "mm", "mean height of the middle over the line between the grips"),
+            "bend": ("ratio", "1", "symmetric end slope over that of a circular arc with this bulge"),
+            "skew": ("angle", "deg", "half the difference of the end slopes"),
+            "slant": ("ratio", "1", "twist over twice the bend of that arc: lean of the rulings"),
+        }
+        result = []
+        for name, (quantity, unit, description) in texts.items():
+            lower, upper = getattr(self.parameters, name)
+            natural = 1.0 if name == "bend" else 0.0
+            default = min(max(natural, lower), upper)
+            result.append(Parameter(name, quantity, unit, lower, upper, default, description))
+        return tuple(result)
+
+    def root(self) -> Array:
+        """The gentle circular arch that every path starts from."""
+        bulge = min(0.03 * self.sheet.length, 0.5 * max(abs(b) for b in self.parameters.bulge))
+        return np.array([bulge, 1.0, 0.0, 0.0])
+
+    def scale(self) -> Array:
+        """The sizes of the ranges, for the bulge its largest value: both signs are one state."""
+        bounds = self.parameters.bounds
+        size = np.diff(bounds, axis=1).ravel()
+        size[0] = np.abs(bounds[0]).max()
+        return size
+
+    def admissible(self, samples: Array) -> Array:
+        """Samples (n, 4) with the bulge kept off zero."""
+        smallest = SMALLEST_BULGE * max(abs(b) for b in self.parameters.bulge)
+        result, bulge = samples.copy(), samples[:, 0]
+        result[:, 0] = np.where(np.abs(bulge) < smallest, np.copysign(smallest, bulge), bulge)
+        return result
+
+    def canonical(self, samples: Array) -> Array:
+        """The mirror image of each sample (n, 4) that is solved in its place.
+
+        The sheet does not know its sides apart, so bulge can be made positive; if its grips are at the same
+        height, slant too, and if that is the middle, skew as well.
+        """
+        samples = np.where(samples[:, :1] < 0.0, samples * MIRROR_Z, samples)
+        if self.grips.symmetric:
+            samples = np.where(samples[:, 3:] < 0.0, samples * MIRROR_X, samples)
+        if self.grips.centred:
+            samples = np.where(samples[:, 2:3] < 0.0, samples * MIRROR_X * MIRROR_Y, samples)
+        return samples
+
+    def images(self, snapshot: Snapshot) -> list[Snapshot]:
+        """This state and its mirror images that are states of the same sheet."""
+        result = [snapshot, mirrored(snapshot)]
+        columns = self.reduction.grid[0] + 1
+        if self.grips.symmetric:
+            result += [reversed_ends(image, columns) for image in result]
+        if self.grips.centred:
+            result += [upside_down(image, columns) for image in result]
+        return result
+
+    def model_mesh(self) -> ModelMesh:
+        """The output grid, two triangles a cell, with trapezoidal weights."""
+        nx, ny = self.reduction.grid
+        points = self._output_points()
+        x, y = np.ones(nx + 1), np.ones(ny + 1)
+        x[[0, -1]] = y[[0, -1]] = 0.5
+        return ModelMesh(
+            nodes=np.column_stack([points, np.zeros(len(points))]),
+            triangles=_grid_triangles(nx, ny),
+            weights=np.outer(y, x).ravel() / (nx * ny),
+        )
+
+    def _output_points(self) -> Array:
+        return output_points(self.sheet.length, self.sheet.width, self.reduction.grid)
+
+
+@dataclass(frozen=True)
+class GrippedSheetSweep:
+    """The gripped sheet as the sweep sees it (`morph_dslam.studies.problem.SweepProblem`).
+
+    Attributes
+    ----------
+    points : (n, 2) output grid. thickness_ratio : the sheet's thickness over the one it is solved at.
+    root : (4,) coordinates of the first state.
+    """
+
+    sheet: GrippedSheet
+    points: Array
+    thickness_ratio: float
+    root: Array
+
+    def first_state(self) -> EquilibriumState:
+        return self.sheet.first_state(self.root[0])
+
+    def pack(self, state: EquilibriumState) -> dict[str, Array]:
+        return {"coordinates": state.coordinates, "motion": state.motion, "dofs": state.dofs}
+
+    def unpack(self, arrays: dict[str, Array]) -> EquilibriumState:
+        return EquilibriumState(arrays["coordinates"], arrays["motion"], arrays["dofs"])
+
+    def advance(self, start: EquilibriumState, target: Array) -> EquilibriumState:
+        return advance(self.sheet, start, target)[0]
+
+    def take_snapshot(self, state: EquilibriumState) -> Snapshot:
+        return take_snapshot(self.sheet, state, self.points, self.thickness_ratio)
+
+
+def _grid_triangles(nx: int, ny: int) -> NDArray[np.int64]:
+    """Two triangles (2 nx ny, 3) for each grid cell, counter-clockwise seen from +z."""
+    corner = (np.arange(ny)[:, None] * (nx + 1) + np.arange(nx)).ravel()
+    right, above = corner + 1, corner + nx + 1
+    lower = np.column_stack([corner, right, above + 1])
+    upper = np.column_stack([corner, above + 1, above])
+    return np.stack([lower, upper], axis=1).reshape(-1, 3)

@@ -1,0 +1,448 @@
+"""The [mesh] section of a study: a file, or a structured generator and its arguments."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationInfo, field_validator
+
+from morph_dslam.errors import StudyError
+from morph_dslam.mechanics import loads, supports
+from morph_dslam.mechanics.kinematics import ShapeField
+from morph_dslam.mechanics.morphing import radius_field, thickness_field
+from morph_dslam.mechanics.parameters import ParameterSymbols
+from morph_dslam.meshing import generators as mesh_generators
+from morph_dslam.meshing.mesh_checks import check_mesh
+from morph_dslam.meshing.mesh_files import load_mesh
+from morph_dslam.meshing.meshes import Mesh
+from morph_dslam.model import Parameter
+from morph_dslam.studies.affine import Affine, read_affine
+from morph_dslam.studies.sections import Angle, Length, Number, PositiveLength, Section
+from morph_dslam.units import to_si
+
+CellName = Literal["hex8", "hex20", "hex27", "tet4", "tet10", "prism6", "prism15", "prism18"]
+
+Count = Annotated[int, Field(ge=1)]
+
+#: More cells than these are a mistake: no memory holds their factorisation.
+MOST_CELLS = 5_000_000
+
+
+def _few(divisions: tuple[int, int, int]) -> tuple[int, int, int]:
+    if math.prod(divisions) > MOST_CELLS:
+        raise ValueError(f"these make {math.prod(divisions)} cells, and {MOST_CELLS} are the most")
+    return divisions
+
+
+Divisions = Annotated[tuple[Count, Count, Count], AfterValidator(_few)]
+
+
+class FileMesh(Section):
+    """A mesh file: Abaqus or CalculiX .inp, Gmsh .msh, VTK, STL, OBJ, PLY or STEP.
+
+    ``file`` is relative to the study file; ``unit`` is that of its coordinates; ``size`` the longest edge of
+    a cell where the file has a surface only and its volume is meshed.
+    """
+
+    file: Path
+    unit: str
+    size: PositiveLength | None = None
+
+    @field_validator("file")
+    @classmethod
+    def _resolve(cls, file: Path, info: ValidationInfo) -> Path:
+        return Path((info.context or {}).get("folder", ".")) / file
+
+    def make(self) -> Mesh:
+        return load_mesh(self.file, self.unit, self.size)
+
+
+class BlockMesh(Section):
+    """A block from the origin along x, y and z; sets x_min, x_max, y_min, y_max, z_min, z_max."""
+
+    generator: Literal["block"]
+    size: tuple[PositiveLength, PositiveLength, PositiveLength]
+    divisions: Divisions
+    cells: CellName = "hex20"
+
+    def make(self) -> Mesh:
+        return mesh_generators.block(self.size, self.divisions, self.cells)
+
+
+class TubeMesh(Section):
+    """A tube around the z axis; divisions are along z, through the wall and around it.
+
+    Sets: inner, outer, bottom, top and, for less than a full turn, start and end.
+    """
+
+    generator: Literal["tube"]
+    inner_radius: PositiveLength
+    outer_radius: PositiveLength
+    length: PositiveLength
+    divisions: Divisions
+    cells: CellName = "hex20"
+    angles: tuple[Angle, Angle] = (0.0, 2.0 * np.pi)
+
+    def make(self) -> Mesh:
+        return mesh_generators.tube(
+            self.inner_radius, self.outer_radius, self.length, self.divisions, self.cells, self.angles
+        )
+
+
+class CollarSection(Section):
+    """A stretch of the wall, from ``start`` to ``stop`` of its length (0 to 1), thickened outside."""
+
+    start: float = Field(ge=0.0, le=1.0)
+    stop: float = Field(ge=0.0, le=1.0)
+    thickness: PositiveLength
+    layers: Count = 1
+
+
+class RevolutionMesh(Section):
+    """A wall of revolution around the z axis; divisions are along the profile, through the wall and around.
+
+    ``profile`` lists points [r, z] of the wall's middle from the bottom upwards, plain numbers in ``unit``.
+    Sets: inner, outer, bottom, top and, for less than a full turn, start and end.
+    """
+
+    generator: Literal["revolution"]
+    profile: tuple[tuple[Number, Number], ...]
+    unit: str
+    thickness: PositiveLength
+    divisions: Divisions
+    cells: CellName = "hex20"
+    angles: tuple[Angle, Angle] = (0.0, 2.0 * np.pi)
+    collars: tuple[CollarSection, ...] = ()
+
+    @field_validator("unit")
+    @classmethod
+    def _is_length(cls, unit: str) -> str:
+        try:
+            to_si(1.0, unit, "length")
+        except StudyError as error:
+            raise ValueError(str(error)) from error
+        return unit
+
+    def make(self) -> Mesh:
+        profile = np.array(self.profile) * to_si(1.0, self.unit, "length")
+        collars = [mesh_generators.Collar(c.start, c.stop, c.thickness, c.layers) for c in self.collars]
+        return mesh_generators.revolution(profile, self.thickness, self.divisions, self.cells, self.angles, collars)
+
+
+def _kind(value: Any) -> str:
+    if isinstance(value, Section):
+        return "file" if isinstance(value, FileMesh) else value.generator  # type: ignore[attr-defined]
+    return str(value.get("generator", "file")) if isinstance(value, dict) else "file"
+
+
+MeshSection = Annotated[
+    Annotated[FileMesh, Tag("file")]
+    | Annotated[BlockMesh, Tag("block")]
+    | Annotated[TubeMesh, Tag("tube")]
+    | Annotated[RevolutionMesh, Tag("revolution")],
+    Discriminator(_kind),
+]
+
+
+def file_stamp(path: Path) -> tuple[int, int]:
+    """What changes when a file is written again: time in nanoseconds, and size; zeros if there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return 0, 0
+    return found.st_mtime_ns, found.st_size
+
+
+def make_mesh(section: Any) -> Mesh:
+    """The mesh of a `MeshSection`, checked; made once, and again when its file has been written again.
+
+    Raises
+    ------
+    StudyError
+        If it cannot be made or read, or is not fit to be solved on.
+    """
+    return _made(section, file_stamp(section.file) if isinstance(section, FileMesh) else None)
+
+
+@lru_cache(maxsize=2)
+def _made(section: Any, stamp: tuple[int, int] | None) -> Mesh:
+    mesh = section.make()
+    check_mesh(mesh)
+    return mesh
+
+
+def mesh_fingerprint(mesh: Mesh) -> str:
+    """Hash of nodes, cells and sets."""
+    digest = hashlib.sha256(np.ascontiguousarray(mesh.nodes).tobytes())
+    for block in mesh.blocks:
+        digest.update(block.cell_type.encode() + np.ascontiguousarray(block.connectivity).tobytes())
+    for sets in (mesh.node_sets, mesh.cell_sets, mesh.surfaces):
+        for name in sorted(sets):
+            digest.update(name.encode() + np.ascontiguousarray(sets[name], dtype=np.int64).tobytes())
+    return digest.hexdigest()
+
+
+# The [[shape]] sections of a solid's study: how its undeformed shape varies from the mesh.
+# Each moves the mesh's nodes by an amplitude, a length that may name parameters, along a field of
+# `morph_dslam.mechanics.morphing`. Sections add up.
+
+
+Array = NDArray[np.float64]
+
+
+class _ShapeSection(Section):
+    amplitude: Value
+
+    def make(self, read: Reader) -> Any:
+        """The amplitude, m."""
+        return read(self.amplitude, "length")
+
+
+class ThicknessShape(_ShapeSection):
+    """A wall that is thicker by ``amplitude``: surface ``on`` moves outwards, surface ``kept`` stays."""
+
+    kind: Literal["thickness"]
+    on: str
+    kept: str
+
+    def field(self, mesh: Mesh) -> Array:
+        """How far each node (n, 3) moves for an amplitude of 1."""
+        return thickness_field(mesh, self.on, self.kept)
+
+
+class RadiusShape(_ShapeSection):
+    """A body that is wider by ``amplitude`` all around an axis, its wall as it was."""
+
+    kind: Literal["radius"]
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    centre: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
+
+    def field(self, mesh: Mesh) -> Array:
+        """How far each node (n, 3) moves for an amplitude of 1."""
+        return radius_field(mesh.nodes, np.array(self.centre), np.array(self.axis))
+
+
+ShapeSection = Annotated[ThicknessShape | RadiusShape, Field(discriminator="kind")]
+
+
+def shape_fields(
+    sections: Sequence[ThicknessShape | RadiusShape], mesh: Mesh, symbols: ParameterSymbols
+) -> list[ShapeField]:
+    """The shape as the solver takes it, checked at the ends of the parameters that it depends on.
+
+    Raises
+    ------
+    StudyError
+        If a surface is unknown, or cells are inverted where parameters are at an end of their range.
+    """
+    parameters = symbols.parameters
+    amplitudes = [read_affine(section.amplitude, "length", parameters) for section in sections]
+    fields = [section.field(mesh) for section in sections]
+    _check_ends(mesh, amplitudes, fields, parameters)
+    values = [symbols[parameter.name] for parameter in parameters]
+    return [
+        ShapeField(amplitude.expression(values), field) for amplitude, field in zip(amplitudes, fields, strict=True)
+    ]
+
+
+def _check_ends(
+    mesh: Mesh, amplitudes: Sequence[Affine], fields: Sequence[Array], parameters: Sequence[Parameter]
+) -> None:
+    varied = [any(a.slopes[i] for a in amplitudes) for i in range(len(parameters))]
+    ends = [(p.lower, p.upper) if used else (p.default,) for p, used in zip(parameters, varied, strict=True)]
+    for corner in product(*ends) if amplitudes else ():
+        moves = [a(np.array(corner)) * field for a, field in zip(amplitudes, fields, strict=True)]
+        try:
+            check_mesh(replace(mesh, nodes=mesh.nodes + sum(moves)))
+        except StudyError as error:
+            where = ", ".join(
+                f"{p.name} = {p.display(value):.4g} {p.unit}".removesuffix(" 1")
+                for p, value, used in zip(parameters, corner, varied, strict=True)
+                if used
+            )
+            raise StudyError(f"the shape at {where or 'its amplitude'}: {error}") from error
+
+
+# The [[supports]] and [[loads]] of a solid's study: each names a set of the mesh and what acts there.
+# A value is a number with its unit, the name of a parameter, or a linear expression of parameters
+# (`morph_dslam.studies.affine`). ``make`` turns a section into what the solver understands.
+
+
+#: A quantity in a study file.
+Value = str | float
+
+Triple = tuple[Value, Value, Value]
+
+#: Turns a value that measures a quantity (None: any) into a number or an expression of parameters, SI.
+Reader = Callable[[Value, str | None], Any]
+
+
+def _triple(values: Triple, quantity: str, read: Reader) -> tuple[Any, Any, Any]:
+    x, y, z = (read(value, quantity) for value in values)
+    return x, y, z
+
+
+class FixedSupport(Section):
+    """Holds a set in all three directions."""
+
+    kind: Literal["fixed"]
+    on: str
+
+    def make(self, read: Reader) -> supports.PrescribedDisplacement:
+        return supports.fixed(self.on)
+
+
+class DisplacementSupport(Section):
+    """Moves a set by given lengths; a direction that is left out stays free."""
+
+    kind: Literal["displacement"]
+    on: str
+    x: Value | None = None
+    y: Value | None = None
+    z: Value | None = None
+
+    def make(self, read: Reader) -> supports.PrescribedDisplacement:
+        values = [None if value is None else read(value, "length") for value in (self.x, self.y, self.z)]
+        return supports.PrescribedDisplacement(self.on, *values)
+
+
+class RotationSupport(Section):
+    """Turns a set as a rigid body about an axis, then shifts it.
+
+    ``axis`` gives the direction, right-handed; ``centre`` a point on it, or the set whose mean point it is
+    (this one if absent).
+    """
+
+    kind: Literal["rotation"]
+    on: str
+    axis: tuple[Number, Number, Number]
+    angle: Value
+    centre: Triple | str | None = None
+    translation: Triple = ("0 m", "0 m", "0 m")
+
+    def make(self, read: Reader) -> supports.RigidRotation:
+        centre = self.centre
+        return supports.RigidRotation(
+            self.on,
+            self.axis,
+            read(self.angle, "angle"),
+            _triple(centre, "length", read) if isinstance(centre, tuple) else centre,
+            _triple(self.translation, "length", read),
+        )
+
+
+class FoundationSupport(Section):
+    """Springs spread over a surface: ``stiffness`` is force per area and displacement."""
+
+    kind: Literal["foundation"]
+    on: str
+    stiffness: Value
+    normal_only: bool = False
+
+    def make(self, read: Reader) -> supports.ElasticFoundation:
+        return supports.ElasticFoundation(self.on, read(self.stiffness, "stiffness per area"), self.normal_only)
+
+
+class TractionLoad(Section):
+    """Force per undeformed area that keeps its direction."""
+
+    kind: Literal["traction"]
+    on: str
+    traction: Triple
+
+    def make(self, read: Reader) -> loads.DeadTraction:
+        return loads.DeadTraction(self.on, _triple(self.traction, "stress", read))
+
+
+class PressureLoad(Section):
+    """Pressure that follows the deformed surface; positive pushes inwards."""
+
+    kind: Literal["pressure"]
+    on: str
+    pressure: Value
+
+    def make(self, read: Reader) -> loads.FollowerPressure:
+        return loads.FollowerPressure(self.on, read(self.pressure, "pressure"))
+
+
+class BodyForceLoad(Section):
+    """Force per undeformed volume of a cell set."""
+
+    kind: Literal["body_force"]
+    on: str = "all"
+    force: Triple
+
+    def make(self, read: Reader) -> loads.BodyForce:
+        return loads.BodyForce(_triple(self.force, "force per volume", read), self.on)
+
+
+class GravityLoad(Section):
+    """Weight: materials need their density."""
+
+    kind: Literal["gravity"]
+    acceleration: Triple = ("0 m/s2", "0 m/s2", "-9.80665 m/s2")
+
+    def make(self, read: Reader) -> loads.Gravity:
+        return loads.Gravity(_triple(self.acceleration, "acceleration", read))
+
+
+class PointLoadSection(Section):
+    """A force shared equally by the nodes of a set."""
+
+    kind: Literal["point"]
+    on: str
+    force: Triple
+
+    def make(self, read: Reader) -> loads.PointLoad:
+        return loads.PointLoad(self.on, _triple(self.force, "force", read))
+
+
+class MovingPatchLoad(Section):
+    """A force spread over a round patch of a surface, whose ``centre`` may move with a parameter.
+
+    ``width`` is the standard deviation of its Gaussian density, at least about half an element.
+    """
+
+    kind: Literal["moving_patch"]
+    on: str
+    force: Triple
+    centre: Triple
+    width: PositiveLength
+
+    def make(self, read: Reader) -> loads.MovingPatch:
+        force, centre = _triple(self.force, "force", read), _triple(self.centre, "length", read)
+        return loads.MovingPatch(self.on, force, centre, self.width)
+
+
+class MovingLineLoad(Section):
+    """A force per length along a straight line over a surface; ``centre`` may move with a parameter."""
+
+    kind: Literal["moving_line"]
+    on: str
+    force: Triple
+    centre: Triple
+    direction: tuple[Number, Number, Number]
+    width: PositiveLength
+
+    def make(self, read: Reader) -> loads.MovingLine:
+        force, centre = _triple(self.force, "force per length", read), _triple(self.centre, "length", read)
+        return loads.MovingLine(self.on, force, centre, self.direction, self.width)
+
+
+SupportSection = Annotated[
+    FixedSupport | DisplacementSupport | RotationSupport | FoundationSupport, Field(discriminator="kind")
+]
+
+LoadSection = Annotated[
+    TractionLoad | PressureLoad | BodyForceLoad | GravityLoad | PointLoadSection | MovingPatchLoad | MovingLineLoad,
+    Field(discriminator="kind"),
+]

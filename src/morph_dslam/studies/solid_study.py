@@ -1,0 +1,260 @@
+"""The study of a solid: mesh, materials, supports, loads, and the parameters that any of them may name."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator, model_validator
+
+from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.materials.base import Material
+from morph_dslam.mechanics.parameters import ParameterSymbols
+from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.meshing.mesh_checks import check_mesh
+from morph_dslam.meshing.meshes import Mesh, model_mesh_of
+from morph_dslam.model import Parameter
+from morph_dslam.studies.affine import read_affine
+from morph_dslam.studies.file_materials import file_materials, require_materials
+from morph_dslam.studies.material_sections import MaterialSection
+from morph_dslam.studies.parameters import ParameterSection, TimeSection
+from morph_dslam.studies.problem import ModelMesh, Snapshot, SweepProblem
+from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section, WorkSection
+from morph_dslam.studies.snapshots import SOLVER_VERSION
+from morph_dslam.studies.solid_sections import (
+    BodyForceLoad,
+    GravityLoad,
+    LoadSection,
+    MeshSection,
+    Reader,
+    ShapeSection,
+    SupportSection,
+    Value,
+    make_mesh,
+    mesh_fingerprint,
+    shape_fields,
+)
+from morph_dslam.studies.solid_sweep import MorphedSweep, RepeatableSweep, ViscousSweep
+
+Array = NDArray[np.float64]
+
+
+class SolidSolverSection(WorkSection):
+    """Elements and how the machine is used.
+
+    ``order`` is that of the displacements, the cells' own if absent; ``formulation`` "mixed" gives nearly
+    incompressible materials pressures of their own. One worker with all cores as threads needs the least
+    memory; for small meshes more workers with one thread each are faster.
+    """
+
+    workers: int | None = Field(default=1, ge=1)
+    order: Literal[1, 2] | None = None
+    formulation: Literal["displacement", "mixed"] = "displacement"
+
+
+class SolidStudy(Section):
+    """A hyperelastic solid under supports and loads that depend on parameters.
+
+    Cells that ``materials`` leaves out have those of the mesh file's sections.
+    """
+
+    name: str
+    mesh: MeshSection
+    materials: dict[str, MaterialSection] = Field(default_factory=dict)
+    supports: tuple[SupportSection, ...] = ()
+    loads: tuple[LoadSection, ...] = ()
+    shape: tuple[ShapeSection, ...] = ()
+    parameters: dict[str, ParameterSection] = Field(min_length=1)
+    time: TimeSection | None = None
+    solver: SolidSolverSection = SolidSolverSection()
+    sampling: SamplingSection = SamplingSection()
+    reduction: ReductionSection = ReductionSection()
+
+    @field_validator("parameters")
+    @classmethod
+    def _names(cls, parameters: dict[str, ParameterSection]) -> dict[str, ParameterSection]:
+        for name in parameters:
+            if not name.isidentifier():
+                raise ValueError(f"'{name}' is no name for a parameter: use letters, digits and underscores")
+        return parameters
+
+    @model_validator(mode="after")
+    def _check_values(self) -> SolidStudy:
+        """Read every value once, so that a mistake is found before anything is solved."""
+        parameters = self.model_parameters()
+
+        def read(value: Value, quantity: str | None) -> float:
+            return read_affine(value, quantity, parameters)(np.array([p.default for p in parameters]))
+
+        for where, section in self._parts():
+            try:
+                section.make(read)
+            except StudyError as error:
+                raise ValueError(f"{where}: {error}") from error
+        if len({material.on for material in self.materials.values()}) < len(self.materials):
+            raise ValueError("two materials are on the same cell set: give each its own")
+        try:
+            from_file = self._file_materials()
+            require_materials(self.mesh, {**self.materials, **from_file})
+        except StudyError as error:
+            raise ValueError(str(error)) from error
+        self._check_time(parameters, [name for name, material in from_file.items() if material.prony])
+        self._check_weight(from_file)
+        return self
+
+    def _file_materials(self) -> dict[str, Material]:
+        """Materials of the mesh file by cell set."""
+        return file_materials(self.mesh, [material.on for material in self.materials.values()])
+
+    def _check_weight(self, from_file: dict[str, Material]) -> None:
+        """Gravity acts on densities; one that was forgotten would be a load that is not there."""
+        if not any(load.kind == "gravity" for load in self.loads):
+            return
+        weightless = [name for name, material in self.materials.items() if "density" not in material.constants]
+        weightless += [f"of '{cells}'" for cells, material in from_file.items() if material.density == 0.0]
+        if weightless:
+            raise ValueError(
+                f"gravity needs densities, and the material {weightless[0]} has none: add density, which is "
+                '"0 kg/m3" if it shall have no weight, or *DENSITY to a material of the mesh file'
+            )
+
+    def _check_time(self, parameters: tuple[Parameter, ...], viscous: list[str]) -> None:
+        """Viscous materials need a clock that starts at the lower end of its range.
+
+        ``viscous`` are cell sets of the mesh file that have such a material.
+        """
+        viscous = [name for name, material in self.materials.items() if "prony" in material.constants] + viscous
+        if self.time is None:
+            if viscous:
+                raise ValueError(
+                    f"the material {viscous[0]} is viscoelastic: say in [time] which parameter is the time"
+                )
+            return
+        clock = next((p for p in parameters if p.name == self.time.parameter), None)
+        if clock is None or clock.quantity != "time":
+            raise ValueError(f"time.parameter: '{self.time.parameter}' is no parameter that measures time")
+        if not viscous:
+            raise ValueError("[time] is for viscoelastic materials, and none has a prony series")
+        if clock.default != clock.lower:
+            raise ValueError(f"parameters.{clock.name}: time starts at the lower end; leave out the default")
+
+    def _parts(self) -> list[tuple[str, Any]]:
+        """Materials, supports, loads and shapes with what messages call them."""
+        parts: list[tuple[str, Any]] = [(f"materials.{name}", section) for name, section in self.materials.items()]
+        for kind, sections in (("support", self.supports), ("load", self.loads), ("shape", self.shape)):
+            parts += [(f"{kind} {number}", section) for number, section in enumerate(sections, start=1)]
+        return parts
+
+    def __hash__(self) -> int:
+        return hash(self.model_dump_json())
+
+    # -- what the sweep asks (`morph_dslam.studies.problem.ParametricStudy`) ---------------------------
+
+    @property
+    def work(self) -> WorkSection:
+        """Workers and threads."""
+        return self.solver
+
+    @property
+    def advice(self) -> str:
+        """What to change when the solid cannot be solved."""
+        return (
+            "Narrow the ranges of the parameters, refine the mesh, or prescribe a displacement in place of a "
+            "load past its limit point"
+        )
+
+    def model_parameters(self) -> tuple[Parameter, ...]:
+        """The parameters in the order of the file."""
+        return tuple(section.parameter(name) for name, section in self.parameters.items())
+
+    def solid_mesh(self) -> Mesh:
+        """The mesh, checked together with the sets that the study names.
+
+        Raises
+        ------
+        StudyError
+            If it cannot be made, is not fit to be solved on, or lacks a set.
+        """
+        mesh = make_mesh(self.mesh)  # type: ignore[arg-type]
+        held = [part.on for part in self.supports]
+        regions = [material.on for material in self.materials.values()]
+        for load in self.loads:
+            if isinstance(load, BodyForceLoad):
+                regions.append(load.on)
+            elif not isinstance(load, GravityLoad):
+                held.append(load.on)
+        check_mesh(mesh, held, regions)
+        return mesh
+
+    def fingerprint(self) -> str:
+        """Hash of mesh, shape, materials, supports, loads, parameters' names, elements and solver version."""
+        content: dict[str, Any] = self.model_dump(mode="json", include={"materials", "supports", "loads"})
+        content["functions"] = [material.source for material in self.materials.values()]
+        content["elements"] = self.solver.order, self.solver.formulation
+        content["parameters"] = list(self.parameters)
+        content["root"] = self.root().tolist() if self.time else None
+        content["time"] = self.time.model_dump() if self.time else None
+        content["mesh"] = mesh_fingerprint(self.solid_mesh())
+        content["code"] = SOLVER_VERSION
+        content |= {"shape": self.model_dump(mode="json")["shape"]} if self.shape else {}
+        content |= {f"material of {name}": repr(law) for name, law in self._file_materials().items()}
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    def root(self) -> Array:
+        """The parameters' defaults."""
+        return np.array([parameter.default for parameter in self.model_parameters()])
+
+    def scale(self) -> Array:
+        """The sizes of the ranges."""
+        return np.array([parameter.upper - parameter.lower for parameter in self.model_parameters()])
+
+    def admissible(self, samples: Array) -> Array:
+        """All samples are."""
+        return samples
+
+    def canonical(self, samples: Array) -> Array:
+        """A solid has no mirror images."""
+        return samples
+
+    def images(self, snapshot: Snapshot) -> list[Snapshot]:
+        """The snapshot alone."""
+        return [snapshot]
+
+    def problem(self) -> SolidProblem:
+        """The discretised solid."""
+        parameters, mesh = self.model_parameters(), self.solid_mesh()
+        symbols = ParameterSymbols(parameters)
+        values = [symbols[parameter.name] for parameter in parameters]
+
+        def read(value: Value, quantity: str | None) -> Any:
+            return read_affine(value, quantity, parameters).expression(values)
+
+        reader: Reader = read
+        return SolidProblem(
+            mesh,
+            {section.on: section.make(reader) for section in self.materials.values()} | self._file_materials(),
+            [section.make(reader) for section in self.supports],
+            [section.make(reader) for section in self.loads],
+            symbols,
+            SolidOptions(
+                order=self.solver.order, mixed=self.solver.formulation == "mixed", threads=self.solver.threads
+            ),
+            shape_fields(self.shape, mesh, symbols),
+            time=symbols[self.time.parameter] if self.time else None,
+        )
+
+    def sweep_problem(self) -> SweepProblem:
+        """What the sweep solves with."""
+        problem = self.problem()
+        if self.time is None:
+            sweep = RepeatableSweep(problem)
+        else:
+            sweep = ViscousSweep(problem, list(self.parameters).index(self.time.parameter), self.time.step)
+        return MorphedSweep(sweep, problem) if self.shape else sweep
+
+    def model_mesh(self) -> ModelMesh:
+        """The nodes of the mesh, its outer surface, its cells, and the volume of each node."""
+        return model_mesh_of(self.solid_mesh())

@@ -1,0 +1,1 @@
+"""Tracking: pose and parameters of a deformable object in every frame."""

@@ -1,0 +1,200 @@
+"""Anchored objects: the camera is found in the frozen map of the scene, and with it the objects' poses.
+
+This is the paper's main case: camera_from_object = camera_from_world world_from_object, in metres by the
+scale of the registration. What of an object can move under its model is taken out of the map, so that a
+deformation does not draw the camera along; what cannot stays with the scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import RegistrationError
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.model import ReducedModel
+from morph_dslam.model.reduced_model import spread_over
+from morph_dslam.registration.landmarks import shape_starts
+from morph_dslam.registration.registration import MapRegistration, PosePrior
+from morph_dslam.slam.frame_images import SlamFrame
+from morph_dslam.slam.rigid_map import RigidMap
+from morph_dslam.slam.slam import Slam
+from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR
+from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, moved
+from morph_dslam.tracking.noise import Observations
+from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.reference import ReferenceView
+from morph_dslam.tracking.result import PoseHypothesis
+
+Array = NDArray[np.float64]
+
+#: A map point this near to the surface, over the object's size, lies on it: that is what maps are good for.
+ON_SURFACE = 0.03
+
+#: Points that stand for the surface, much closer together than `ON_SURFACE`.
+N_SAMPLES = 10_000
+
+#: What moves by more than this part of the object's size over the parameter box is no part of the scene.
+MOVES = 0.005
+
+#: Two objects that share more than this part of one's movable points are in the same place.
+SHARED = 0.5
+
+
+def points_on_object(
+    positions: Array, place: MapRegistration, model: ReducedModel
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which map points (n, 3) lie on the object, and which of them (n,) where it can move under the model."""
+    samples = spread_over(model.nodes, model.triangles, N_SAMPLES)
+    size = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
+    field = model.restrict(samples)
+    reach, undeformed = np.zeros(len(samples)), field.value(model.default)
+    for shape in shape_starts(model):
+        reach = np.maximum(reach, np.linalg.norm(field.value(shape) - undeformed, axis=1))
+    in_object = place.world_from_object.inverse.apply(positions)
+    distances, nearest = KDTree(model.rest_positions(samples)).query(in_object)
+    on_object = distances < ON_SURFACE * size
+    return on_object, on_object & (reach[nearest] > MOVES * size)
+
+
+class Anchor:
+    """Finds the poses of anchored objects by finding the camera in the map, once a frame for all of them.
+
+    Parameters
+    ----------
+    rigid_map : of the scene with the undeformed objects; what can move is taken out of it.
+    objects : by name, the place in the map and the model.
+
+    Attributes
+    ----------
+    n_scene, n_movable : map points that stay, on an object or not, and those on one that were taken out.
+
+    Raises
+    ------
+    RegistrationError
+        If nobody knows how far a place is to be trusted, or two objects are in the same place.
+    """
+
+    def __init__(
+        self, rigid_map: RigidMap, camera: PinholeCamera, objects: Mapping[str, tuple[MapRegistration, ReducedModel]]
+    ) -> None:
+        if any(place.covariance is None for place, _ in objects.values()):
+            raise RegistrationError(
+                "the registration does not say how well the object's place is known, because the keyframes "
+                "show too little texture on it: track it as a free object (--pose free)"
+            )
+        self._places, good = {name: place for name, (place, _) in objects.items()}, rigid_map.good
+        positions = rigid_map.positions[good]
+        movable = {name: points_on_object(positions, *placed)[1] for name, placed in objects.items()}
+        _check_places(movable)
+        taken = np.logical_or.reduce(list(movable.values()))
+        self.n_movable, self.n_scene = int(taken.sum()), int((~taken).sum())
+        rigid_map.remove(good[taken])
+        self.slam = Slam(camera)
+        self.slam.use_map(rigid_map)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the objects."""
+        return tuple(self._places)
+
+    def locate(self, image: NDArray[np.uint8], index: int, timestamp: float) -> tuple[dict[str, PosePrior], SlamFrame]:
+        """The objects by name in a frame (h, w, 3), none where the camera is lost in the map; the camera."""
+        frame = self.slam.process_frame(image, index, timestamp)
+        if frame.pose is None:
+            return {}, frame
+        return {name: place.pose_prior(frame.pose) for name, place in self._places.items()}, frame
+
+
+def _check_places(movable: Mapping[str, NDArray[np.bool_]]) -> None:
+    """Raise RegistrationError if two objects have taken the same points (n,) of the map."""
+    for (one, points), (other, others) in combinations(movable.items(), 2):
+        fewest = min(int(points.sum()), int(others.sum()))
+        if fewest and (points & others).sum() > SHARED * fewest:
+            raise RegistrationError(
+                f"'{one}' and '{other}' are registered in the same place of the map: register the second "
+                "one beside the first (morph register --beside)"
+            )
+
+
+# Whether an object is still where the map has it, and how much its pose in the map counts.
+# An anchored object's pose comes from the camera's, and its points have to agree with it. Where they do not,
+# in several frames on end, the object has been moved: then its points alone say where it is, until they agree
+# with the map again.
+
+
+#: Spread of residuals, pixels, before any frame has shown one, and the least that is believed.
+FIRST_SIGMA_PX, LEAST_SIGMA_PX = 0.5, 0.1
+
+#: How much more a pose counts that is to be held.
+HELD = 1e6
+
+
+class Anchoring:
+    """Decides frame by frame.
+
+    Attributes
+    ----------
+    has_moved : whether the object is away from its place in the map.
+    reference : the view that frames are compared with.
+    """
+
+    def __init__(self, estimator: Estimator, reference: ReferenceView, options: TrackerOptions) -> None:
+        self._estimator, self.reference, self._options = estimator, reference, options
+        self._d = len(estimator.model.parameters)
+        self._size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
+        self._squared_px, self._n_other = reference.redundancy * FIRST_SIGMA_PX**2, 0
+        self.has_moved = False
+
+    def prior(self, known: PosePrior | None) -> Prior | None:
+        """What the map tells of the pose; None if the camera is lost or the object has moved."""
+        if known is None or self.has_moved:
+            return None
+        return known.prior(self._d, self._squared_px, HELD if self._options.hold_pose else 1.0)
+
+    def contradicts(self, known: PosePrior, attempt: PoseHypothesis) -> bool:
+        """Whether the points of a believable attempt show the object elsewhere than in the map.
+
+        Both must hold: it is farther off than the registration's usual error, and than the standard
+        deviations of both poses explain.
+        """
+        pose, covariance = self._by_points_alone(attempt)
+        points = self.reference.points.rest[attempt.inliers]
+        apart = np.sqrt(np.mean(np.sum((pose.apply(points) - known.pose.apply(points)) ** 2, axis=1)))
+        if not apart > self._options.moved_share * self._size:
+            return False
+        away, spread = known.away(pose), known.covariance + covariance
+        return float(np.sqrt(away @ np.linalg.solve(spread, away))) > self._options.moved_sigmas
+
+    def _by_points_alone(self, attempt: PoseHypothesis) -> tuple[RigidTransform, Array]:
+        """The pose by an attempt's points and its covariance (6, 6), to first order from where it is.
+
+        What the points do not tell at all stays as the attempt has it, with a very large variance.
+        """
+        estimate, points = attempt.estimate, self.reference.points
+        weights = attempt.weights
+        _, hessian, gradient, _ = self._estimator.evaluate(points, attempt.measurement.pixels, weights, estimate.state)
+        scale = self._estimator.scale
+        values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
+        vectors, floor = scale[:, None] * vectors, max(values[-1], 1e-30) * EIGENVALUE_FLOOR
+        along = np.where(values > floor, vectors.T @ gradient / np.maximum(values, floor), 0.0)
+        rows = vectors[self._d :]
+        covariance = (rows / np.maximum(values, floor)) @ rows.T
+        covariance *= self.reference.redundancy * max(estimate.sigma_px, LEAST_SIGMA_PX) ** 2
+        return moved(estimate.state, -vectors @ along).camera_from_object, covariance
+
+    def note(self, elsewhere: bool) -> None:
+        """Take in whether a frame showed the object elsewhere; several on end change the opinion."""
+        self._n_other = self._n_other + 1 if elsewhere != self.has_moved else 0
+        if self._n_other >= self._options.moved_patience:
+            self.has_moved, self._n_other = elsewhere, 0
+
+    def learn(self, estimate: Estimate, measured: Observations) -> None:
+        """Take in how well the points of an accepted frame agree, and how many count as one."""
+        if np.isfinite(estimate.sigma_px):
+            self._squared_px = measured.redundancy * max(estimate.sigma_px, LEAST_SIGMA_PX) ** 2

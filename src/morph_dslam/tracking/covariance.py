@@ -1,0 +1,214 @@
+"""Points that were bound in one reference picture, and how the object's state there may be off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from morph_dslam.tracking.state import State
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class BoundPart:
+    """Points that were bound in one reference picture.
+
+    Attributes
+    ----------
+    rows : of the points. state : of the object in the picture.
+    error_factors : (d + 6, c) how ``state`` is off by c error factors, the same for all parts, in their
+        standard deviations; None where nothing is known of its error.
+    """
+
+    rows: slice
+    state: State
+    error_factors: Array | None
+
+
+def error_factors_of(covariance: Array | None, scale: Array) -> Array | None:
+    """As many error_factors as unknowns (n, n) for a state of this covariance; None where it is not known.
+
+    ``scale`` (n,) of the unknowns makes them comparable.
+    """
+    if covariance is None or not np.isfinite(covariance).all():
+        return None
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64)
+
+
+# Errors that points have in common: how alike in each two of them, and what residuals show of them.
+# A model's errors are alike over parts of the surface much wider than the windows that are compared. Their
+# covariance is taken to fall with the points' distance as a Gaussian does; so smooth a covariance has few
+# directions, and a pivoted Cholesky factor of as many columns holds it (Harbrecht, Peters & Schneider 2012).
+# What residuals have in common is measured over pairs of points that lie near each other, but so far apart
+# that their windows do not overlap; of many points some hundreds tell it as well as all.
+
+
+#: Over these shares of the points' spread a model's errors are taken to be alike, and are pairs compared.
+ALIKE_SHARE, PAIR_SHARE = 0.75, 0.5
+
+#: The factor leaves no more than this of any point's variance.
+FACTOR_TOLERANCE = 0.01
+
+#: Pairs are made of no more points than these.
+MOST_COMPARED = 256
+
+#: An estimate that takes up more of the model's error leaves too little to tell how large it is.
+LEAST_LEFT = 0.02
+
+
+class SharedErrors:
+    """How alike errors are in points at these places, and what the same points' residuals show of them.
+
+    Parameters
+    ----------
+    places : (p, 3) of the points, pixels. window : side of the square that is compared around each, pixels.
+    """
+
+    def __init__(self, places: Array, window: int) -> None:
+        spread = float(np.sqrt(np.mean(np.sum((places - places.mean(axis=0)) ** 2, axis=1))))
+        self.factor = gaussian_factor(places, max(ALIKE_SHARE * spread, 1e-300))
+        self._compared = np.unique(np.linspace(0, len(places) - 1, MOST_COMPARED).astype(np.int64))
+        # Coordinate by coordinate: sums over a short axis cost numpy most of the time that a view takes.
+        apart = [np.abs(column[:, None] - column[None]) for column in places[self._compared].T]
+        near = apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2 < (PAIR_SHARE * spread) ** 2
+        beside = np.maximum(np.maximum(apart[0], apart[1]), apart[2]) >= window
+        # As numbers, to be multiplied by in every frame; points that do not count are zero in what it is.
+        self._pairs = (near & beside).astype(np.float64)
+        factor = self.factor[self._compared]
+        self._alike_pairs = (factor @ factor.T) * self._pairs
+
+    def n_pairs(self, used: NDArray[np.bool_]) -> float:
+        """How many pairs of the points ``used`` (p,) are compared, counted from both sides."""
+        some = used[self._compared]
+        return float(some @ self._pairs @ some)
+
+    def in_common(self, rows: Array, n_pairs: float) -> Array:
+        """Mean products (k, k), a coordinate, of what pairs of points have in (p, 2, k), zero if unused."""
+        some = rows[self._compared]
+        beside = (self._pairs @ some.reshape(len(some), -1)).reshape(some.shape)
+        found = np.tensordot(some, beside, axes=([0, 1], [0, 1])) / max(2.0 * n_pairs, 1.0)
+        return np.asarray(found, dtype=np.float64)
+
+    def gradients(self, scores: Array) -> Array:
+        """Gradients (2 r, n) by each direction of an error of one pixel, of scores (p, 2, n).
+
+        Their products are the gradient's covariance, each coordinate for itself.
+        """
+        n = scores.shape[2]
+        found = self.factor.T @ scores.reshape(len(scores), -1)
+        return np.asarray(found.reshape(-1, n), dtype=np.float64)
+
+    def share_left(self, used: NDArray[np.bool_], jacobian: Array, gradients: Array, gain: Array) -> float:
+        """How much of such an error's variance an estimate leaves in the residuals that show it.
+
+        With G = J H^-1 J' W what the estimate takes up, it leaves (I - G) K (I - G)' of a covariance K; this
+        is summed over the pairs of points that `in_common` sums over.
+
+        Parameters
+        ----------
+        used : (p,). jacobian : (p, 2, n), zero if unused. gradients : (2 r, n) as of `gradients`.
+        gain : (n, n) H^-1.
+        """
+        some, jacobian, factor = used[self._compared], jacobian[self._compared], self.factor[self._compared]
+        taken_up = (gradients @ gain).reshape(-1, 2, len(gain))
+        spread = (factor @ taken_up.reshape(len(taken_up), -1)).reshape(jacobian.shape)
+        beside = (self._pairs @ jacobian.reshape(len(jacobian), -1)).reshape(jacobian.shape)
+        whole = 2.0 * float(some @ self._alike_pairs @ some)
+        taken = 2.0 * float(np.sum(beside[some] * spread[some]))
+        products = np.tensordot(jacobian, beside, axes=([0, 1], [0, 1]))
+        twice = float(np.sum(products * (gain @ (gradients.T @ gradients) @ gain)))
+        return max((whole - taken + twice) / max(2.0 * self.n_pairs(used), 1.0), LEAST_LEFT)
+
+
+def gaussian_factor(places: Array, length: float) -> Array:
+    """A factor F (p, r) with F F' = exp(-d^2 / (2 length^2)) of the distances d of places (p, k), nearly.
+
+    By pivoted Cholesky decomposition, until `FACTOR_TOLERANCE` of the largest diagonal is left.
+    """
+    left, columns = np.ones(len(places)), np.empty((0, len(places)))
+    while left.max(initial=0.0) > FACTOR_TOLERANCE:
+        pivot = int(left.argmax())
+        squared = sum((column - column[pivot]) ** 2 for column in places.T)
+        rest = np.exp(-0.5 * squared / length**2) - columns[:, pivot] @ columns
+        column = rest / np.sqrt(left[pivot])
+        columns = np.vstack([columns, column])
+        left = left - column**2
+    return np.ascontiguousarray(columns.T)
+
+
+# Covariance of an estimate with Huber weights.
+
+
+#: Eigenvalue floor, relative to the best-seen direction.
+EIGENVALUE_FLOOR = 1e-12
+
+
+@njit(cache=True, nogil=True)
+def huber_covariance(hessian, residuals, weights, numbers, huber_px, scale):
+    """Standard deviation of a pixel coordinate and covariance of an M-estimator.
+
+    (sum psi² / (N - k)) / mean(psi')² (J'J)^-1; J'J is the Huber-weighted Hessian over its mean weight
+    (Huber & Ronchetti, Robust Statistics, 7.6).
+
+    Parameters
+    ----------
+    hessian : (k, k) of the Huber cost. residuals : (p, 2), pixels. weights : (p,), positive,
+        inverse variances up to a factor.
+    numbers : (p,) how many numbers each point gives: 1 along an outline's normal, else 2.
+    huber_px : residual length where the cost turns linear.
+    scale : (k,) of the unknowns: directions are compared in unknowns divided by it.
+
+    Returns
+    -------
+    sigma_px : robust standard deviation of a coordinate of a point of weight 1. covariance : (k, k); infinite
+        where there are no more numbers than unknowns, very large in directions that the residuals do not see.
+    """
+    size, count = len(hessian), numbers.sum()
+    freedom = count - size
+    if freedom <= 0:
+        return np.inf, np.full((size, size), np.inf)
+    length, is_pair = np.empty(len(numbers)), numbers == 2
+    psi_squared, slopes, factors = 0.0, 0.0, 0.0
+    for j in range(len(numbers)):
+        length[j] = np.hypot(residuals[j, 0], residuals[j, 1])
+        factor = min(1.0, huber_px / max(length[j], 1e-300))
+        psi_squared += weights[j] * (factor * length[j]) ** 2
+        slopes += 0.5 * (factor + (1.0 if length[j] <= huber_px else 0.0))
+        factors += factor
+    # The length of a Gaussian pair has the median 1.1774 sigma (Rayleigh).
+    sigma = np.inf
+    if is_pair.any():
+        sigma = np.median((np.sqrt(weights) * length)[is_pair]) / 1.1774 * np.sqrt(count / freedom)
+    mean_slope = max(slopes / len(numbers), 1e-3)
+    variance = psi_squared / freedom * (factors / len(numbers)) / mean_slope**2
+    values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
+    floored = np.maximum(values, max(values[-1], 1e-30) * EIGENVALUE_FLOOR)
+    return sigma, variance * ((vectors / floored) @ vectors.T) * np.outer(scale, scale)
+
+
+def huber_covariance_numpy(
+    hessian: Array, residuals: Array, weights: Array, numbers: NDArray[np.integer], huber_px: float, scale: Array
+) -> tuple[float, Array]:
+    """The plain twin of `huber_covariance`."""
+    size = len(hessian)
+    count = int(numbers.sum())
+    freedom = count - size
+    if freedom <= 0:
+        return float("inf"), np.full((size, size), np.inf)
+    length = np.linalg.norm(residuals, axis=1)
+    # The length of a Gaussian pair has the median 1.1774 sigma (Rayleigh).
+    pairs = (np.sqrt(weights) * length)[numbers == 2]
+    sigma = float(np.median(pairs) / 1.1774 * np.sqrt(count / freedom)) if len(pairs) else float("inf")
+    factor = np.minimum(1.0, huber_px / np.maximum(length, 1e-300))
+    psi_squared = float(np.sum(weights * (factor * length) ** 2)) / freedom
+    mean_slope = max(float(np.mean(0.5 * (factor + (length <= huber_px)))), 1e-3)
+    eigenvalues, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
+    floored = np.maximum(eigenvalues, max(eigenvalues[-1], 1e-30) * EIGENVALUE_FLOOR)
+    inverse = (vectors / floored) @ vectors.T
+    variance = psi_squared * float(factor.mean()) / mean_slope**2
+    return sigma, variance * inverse * np.outer(scale, scale)

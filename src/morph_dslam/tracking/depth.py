@@ -1,0 +1,209 @@
+"""Depth residuals: how far surface points are from what a depth camera measured, and their normal equations.
+
+The residual of a point is its depth along the optical axis minus the depth measured where it was seen, in
+pixels by a weight (pixels per metre) that makes both kinds of measurement comparable: the standard deviation
+of an image coordinate over that of the depth, which grows with the square of the distance (Khoshelham and
+Elberink, Sensors 2012). Huber's cost is that of single numbers, so that a wrong depth spares the pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.model.separated import combine_modes
+from morph_dslam.tracking.state import BoundPoints, State
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DepthOptions:
+    """What is taken for granted of the sensor.
+
+    Attributes
+    ----------
+    sigma_at_1m : standard deviation of one pixel's depth at 1 m, metres; it grows with the distance squared.
+    alike_px : neighbours nearer than this have the same error, as those of structured light have.
+    window : side of the square of pixels through which a plane is laid.
+    largest_step : depths in the square that differ by more than this share of the depth are of two surfaces.
+    huber_sigmas : residual in standard deviations where Huber's cost turns linear.
+    """
+
+    sigma_at_1m: float = 2.0e-3
+    alike_px: int = 3
+    window: int = 5
+    largest_step: float = 0.03
+    huber_sigmas: float = 2.0
+
+    def sigma(self, depths: Array) -> Array:
+        """Standard deviations (p,) of a plane through the square at these depths (p,), metres."""
+        return self.sigma_at_1m * depths**2 * min(self.alike_px / self.window, 1.0)
+
+
+@dataclass(frozen=True)
+class PointDepths:
+    """Depths measured where points were seen.
+
+    Attributes
+    ----------
+    depths : (p,) along the optical axis, metres; of any value where the weight is 0.
+    weights : (p,) pixels per metre, 0 where there is none.
+    squared_px : variance of a residual in pixels. huber_px : residual where the cost turns linear.
+    """
+
+    depths: Array
+    weights: Array
+    squared_px: float
+    huber_px: float
+
+    @classmethod
+    def sampled(
+        cls,
+        image: NDArray[np.float32],
+        pixels: Array,
+        used: NDArray[np.bool_],
+        camera: PinholeCamera,
+        squared_px: float,
+        options: DepthOptions,
+    ) -> PointDepths:
+        """From a depth image.
+
+        Parameters
+        ----------
+        image : (h, w) as recorded, metres, NaN where unknown. pixels : (p, 2) of the points in the
+            undistorted image. used : (p,) which of them count.
+        squared_px : variance of an image coordinate in the estimator's cost, against which depth is weighed.
+        """
+        depths = np.full(len(pixels), np.nan)
+        rows = np.flatnonzero(used & np.isfinite(pixels).all(axis=1))
+        depths[rows] = _plane_depth(image, camera.distort_pixels(pixels[rows]), options)
+        known = np.isfinite(depths)
+        depths = np.where(known, depths, 1.0)
+        sigma_px = float(np.sqrt(squared_px))
+        weights = np.where(known, sigma_px / options.sigma(depths), 0.0)
+        return cls(depths, weights, squared_px, options.huber_sigmas * sigma_px)
+
+    @property
+    def count(self) -> int:
+        """How many points have depth."""
+        return int((self.weights > 0.0).sum())
+
+    def variance_px(self, residuals: Array) -> float:
+        """Variance of the residuals (p,): as taken for granted, or what they show if that is more."""
+        bounded = np.clip(residuals, -self.huber_px, self.huber_px)
+        return max(self.squared_px, float(np.sum(bounded**2)) / max(self.count, 1))
+
+    def only(self, kept: NDArray[np.bool_]) -> PointDepths:
+        """These, without what is not ``kept`` (p,)."""
+        return PointDepths(self.depths, np.where(kept, self.weights, 0.0), self.squared_px, self.huber_px)
+
+    def padded(self, count: int) -> PointDepths:
+        """These, followed by points without depth, ``count`` in all."""
+        missing = np.zeros(count - len(self.depths))
+        depths, weights = (np.concatenate([a, missing]) for a in (self.depths, self.weights))
+        return PointDepths(depths, weights, self.squared_px, self.huber_px)
+
+    def terms(self, points: BoundPoints, state: State) -> tuple[float, Array, Array, Array]:
+        """Cost, Hessian (d + 6, d + 6), gradient and residuals (p,) in pixels at a state."""
+        pose = state.camera_from_object
+        return linearise_depths(
+            points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
+            points.field.modes, self.depths, self.weights, self.huber_px,
+        )  # fmt: skip
+
+
+def _plane_depth(image: NDArray[np.float32], pixels: Array, options: DepthOptions) -> Array:
+    """Depths (p,) at pixels (p, 2): of the plane through the square about each that fits best.
+
+    NaN at jumps, and where half of the square or more is unknown. A mean would be of another place where what
+    is unknown lies to one side.
+    """
+    half, (height, width) = options.window // 2, image.shape
+    places = np.nan_to_num(pixels, nan=-1.0)
+    columns, rows = np.rint(places).astype(int).T
+    inside = (columns >= half) & (rows >= half) & (columns < width - half) & (rows < height - half)
+    columns, rows, places = columns[inside], rows[inside], places[inside]
+    down, right = (grid.ravel() for grid in np.mgrid[-half : half + 1, -half : half + 1])
+    values = image[rows[:, None] + down, columns[:, None] + right].astype(float)
+    known = np.isfinite(values)
+    values = np.where(known, values, 0.0)
+    count = known.sum(axis=1)
+    step = np.max(values, axis=1) - np.min(np.where(known, values, np.inf), axis=1)
+    mean = values.sum(axis=1) / np.maximum(count, 1)
+    whole = (2 * count > len(down)) & (step < options.largest_step * mean)
+    offsets = np.stack([columns[:, None] + right, rows[:, None] + down], axis=2) - places[:, None]
+    design = known[:, :, None] * np.concatenate([np.ones_like(offsets[:, :, :1]), offsets], axis=2)
+    normal = np.einsum("pwa,pwb->pab", design, design)
+    normal[~whole] = np.eye(3)
+    plane = np.linalg.solve(normal, np.einsum("pwa,pw->pa", design, values)[:, :, None])[:, 0, 0]
+    result = np.full(len(pixels), np.nan)
+    result[inside] = np.where(whole, plane, np.nan)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def linearise_depths(functions, rotation, translation, rest, modes, depths, weights, huber):
+    """Huber cost of depth residuals, its gradient and Gauss-Newton Hessian, compiled.
+
+    Parameters
+    ----------
+    functions, rotation, translation, rest, modes : as in `reprojection.linearise`.
+    depths, weights : (p,) measured, metres, and pixels per metre; points of weight 0 do not count.
+    huber : residual in pixels beyond which the cost grows linearly.
+
+    Returns
+    -------
+    cost : sum of rho(weight * (depth of the point - measured depth)).
+    hessian, gradient : (d + 6, d + 6) and (d + 6,). residuals : (p,) pixels, 0 without weight.
+    """
+    n_points, d = rest.shape[0], functions.shape[0] - 1
+    fields = combine_modes(functions, modes.reshape(modes.shape[0], 3 * n_points)).reshape(1 + d, n_points, 3)
+    size, axis = d + 6, rotation[2]
+    hessian, gradient = np.zeros((size, size)), np.zeros(size)
+    residuals, slope = np.zeros(n_points), np.zeros(size)
+    cost = 0.0
+    for j in range(n_points):
+        if weights[j] == 0.0:
+            continue
+        p0, p1, p2 = rest[j, 0] + fields[0, j, 0], rest[j, 1] + fields[0, j, 1], rest[j, 2] + fields[0, j, 2]
+        residual = weights[j] * (axis[0] * p0 + axis[1] * p1 + axis[2] * p2 + translation[2] - depths[j])
+        residuals[j] = residual
+        length, weight = abs(residual), weights[j]
+        factor = 1.0
+        if length <= huber:
+            cost += 0.5 * length * length
+        else:
+            cost += huber * (length - 0.5 * huber)
+            factor = huber / length
+        for k in range(d):
+            s0, s1, s2 = fields[k + 1, j, 0], fields[k + 1, j, 1], fields[k + 1, j, 2]
+            slope[k] = weight * (axis[0] * s0 + axis[1] * s1 + axis[2] * s2)
+        slope[d] = weight * (rotation[1, 0] * p0 + rotation[1, 1] * p1 + rotation[1, 2] * p2)
+        slope[d + 1] = -weight * (rotation[0, 0] * p0 + rotation[0, 1] * p1 + rotation[0, 2] * p2)
+        slope[d + 5] = weight
+        for a in range(size):
+            gradient[a] += factor * slope[a] * residual
+            for b in range(size):
+                hessian[a, b] += factor * slope[a] * slope[b]
+    return cost, hessian, gradient, residuals
+
+
+def linearise_depths_numpy(functions, rotation, translation, rest, modes, depths, weights, huber):
+    """The plain twin of `linearise_depths`."""
+    fields = np.tensordot(functions, modes, axes=1)
+    turned = (rest + fields[0]) @ rotation.T
+    residuals = np.where(weights > 0.0, weights * (turned[:, 2] + translation[2] - depths), 0.0)
+    zero = np.zeros(len(rest))
+    slopes = weights[:, None] * np.column_stack(
+        [(fields[1:] @ rotation[2]).T, turned[:, 1], -turned[:, 0], zero, zero, zero, zero + 1.0]
+    )
+    length = np.abs(residuals)
+    outside = length > huber
+    cost = np.sum(np.where(outside, huber * (length - 0.5 * huber), 0.5 * length**2))
+    factor = np.where(outside, huber / np.maximum(length, 1e-300), 1.0)
+    return cost, (slopes.T * factor) @ slopes, slopes.T @ (factor * residuals), residuals

@@ -1,0 +1,367 @@
+"""The discrepancy between model and object in one frame: what moves the points beyond the model's shape.
+
+The state is estimated first, by the model alone. Then the smooth displacement is sought that explains what is
+left of the residuals, is as small as a Gaussian process makes it (`morph_dslam.model.discrepancy`), and
+stretches the surface as little as a given strain. It is found by Gauss-Newton steps on a quadratic of 3 m
+numbers. Pose and parameters stay as they are: a rigid part of what is left counts with the discrepancy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial import KDTree
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.model import ReducedModel, SurfacePoints
+from morph_dslam.model.discrepancy import Discrepancy, DiscrepancyBasis, farthest_points
+from morph_dslam.tracking.binding import bind_pixels, view_of
+from morph_dslam.tracking.estimator import Estimator
+from morph_dslam.tracking.noise import Observations
+from morph_dslam.tracking.outline import Outline
+from morph_dslam.tracking.refinement import Keyframe
+from morph_dslam.tracking.state import BoundPoints, State
+
+Array = NDArray[np.float64]
+
+#: Each sample of the surface counts for so many independent strains of the lines to its neighbours.
+STRAINS_A_SAMPLE = 0.2
+
+
+@dataclass(frozen=True)
+class DiscrepancyOptions:
+    """What is taken for likely before any image is seen.
+
+    Attributes
+    ----------
+    amplitude : standard deviation of the discrepancy, as a share of the object's diagonal.
+    length : its correlation length, as a share of the diagonal.
+    strain : standard deviation of the strain of the surface that it makes.
+    centres : points at which it is given.
+    samples, neighbours : points of the surface between which the strain is looked at, and lines from each.
+    point_px, outline_px : standard deviation of a point's pixels, neighbours of which have much in common,
+        and of the distance of the outline. huber_px : residual where the cost turns linear.
+    steps : Gauss-Newton steps in a frame; one will do from the discrepancy of the frame before.
+    """
+
+    amplitude: float = 0.02
+    length: float = 0.2
+    strain: float = 3e-3
+    centres: int = 30
+    samples: int = 100
+    neighbours: int = 6
+    point_px: float = 0.5
+    outline_px: float = 2.0
+    huber_px: float = 1.5
+    steps: int = 2
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """The cost of a step of the centres' displacements (m, 3), its numbers component by component.
+
+    Attributes
+    ----------
+    hessian : (3 m, 3 m). gradient : (3 m,).
+    """
+
+    hessian: Array
+    gradient: Array
+
+    def __add__(self, other: Quadratic) -> Quadratic:
+        return Quadratic(self.hessian + other.hessian, self.gradient + other.gradient)
+
+    @classmethod
+    def of_rows(cls, weights: Array, forces: Array, influence: Array) -> Quadratic:
+        """By the second derivatives (p, 3, 3) and the gradient (p, 3) by the displacements of p points.
+
+        ``influence`` (p, m) is the centres' on them.
+        """
+        return cls(weighted_gram(weights, influence), (influence.T @ forces).T.ravel())
+
+    @classmethod
+    def of_residuals(cls, rows: Array, residuals: Array, weights: Array, influence: Array) -> Quadratic:
+        """By residuals (p, k) with ``weights`` (p,) and their derivatives (p, k, 3) by p displacements."""
+        curvature = np.einsum("p,pka,pkb->pab", weights, rows, rows)
+        forces = np.einsum("p,pka,pk->pa", weights, rows, residuals)
+        return cls.of_rows(curvature, forces, influence)
+
+    def minimum(self) -> Array:
+        """The step (m, 3) that lowers the cost most."""
+        return as_displacements(-cho_solve(cho_factor(self.hessian), self.gradient))
+
+
+def as_displacements(numbers: Array) -> Array:
+    """Centres' displacements (m, 3) from their numbers (3 m,), component by component."""
+    return numbers.reshape(3, -1).T
+
+
+def weighted_gram(weights: Array, influence: Array) -> Array:
+    """Sums (3 m, 3 m) over p points of ``influence`` (p, m) times ``weights`` (p, 3, 3) times influence."""
+    rows, count = influence.shape
+    # One matrix product for all nine blocks.
+    weighted = (weights[..., None] * influence[:, None, None]).reshape(rows, 9 * count)
+    blocks = (influence.T @ weighted).reshape(count, 3, 3, count)
+    return blocks.transpose(1, 0, 2, 3).reshape(3 * count, 3 * count)
+
+
+class DiscrepancyFit:
+    """Finds the discrepancy of one object.
+
+    Parameters
+    ----------
+    camera : of undistorted images.
+
+    Attributes
+    ----------
+    basis : the centres on the model's surface.
+    """
+
+    def __init__(self, model: ReducedModel, camera: PinholeCamera, options: DiscrepancyOptions) -> None:
+        self.camera, self.options = camera, options
+        used, first = np.unique(model.triangles, return_index=True)
+        nodes = model.nodes[used]
+        diagonal = float(np.linalg.norm(np.ptp(nodes, axis=0)))
+        self.basis = DiscrepancyBasis.spread_over(nodes, options.centres, options.length * diagonal)
+        precision = self.basis.precision / (options.amplitude * diagonal) ** 2
+        self._precision: Array = np.kron(np.eye(3), precision).astype(np.float64)
+        rows = farthest_points(nodes, options.samples)
+        corners = first[rows]
+        weights = np.eye(3)[corners % 3]
+        self._samples = BoundPoints.from_surface(model, SurfacePoints(corners // 3, weights))
+        self._lines = _neighbour_lines(self._samples.rest, options.neighbours)
+        start, end = self._samples.rest[self._lines.T]
+        self._lengths = np.linalg.norm(start - end, axis=1)
+        self._influence = self.basis.influence(self._samples.rest)
+        self._stretching = self._influence[self._lines[:, 0]] - self._influence[self._lines[:, 1]]
+
+    def fit(self, measured: Observations, state: State, last: Discrepancy | None = None) -> Discrepancy:
+        """The discrepancy of the frame that was measured, with the model in the estimated state.
+
+        ``last`` is that of the frame before, to start from; None where it is not known.
+        """
+        influence = self.basis.influence(measured.points.rest)
+        values = np.zeros((len(self.basis.centres), 3)) if last is None else last.values
+        positions, shape = measured.points.in_camera(state), self._samples.in_camera(state)
+        rotation = state.camera_from_object.rotation
+        for _ in range(self.options.steps if last is None else 1):
+            there = positions + influence @ values @ rotation.T
+            derivatives, residuals, weights = self.seen(measured, there)
+            data = Quadratic.of_residuals(derivatives @ rotation, residuals, weights, influence)
+            values = values + (self.prior(shape, rotation, values) + data).minimum()
+        return Discrepancy(self.basis, values)
+
+    def seen(self, measured: Observations, positions: Array) -> tuple[Array, Array, Array]:
+        """Residuals at positions (p, 3) in the camera frame, with their derivatives and weights.
+
+        Returns
+        -------
+        derivatives : (p, 2, 3) of pixels by the position, or of the distance from the outline and 0.
+        residuals : (p, 2) pixels. weights : (p,) inverse variances with Huber's factor.
+        """
+        options, normals = self.options, measured.normals
+        derivatives = self.camera.projection_jacobian(positions)
+        residuals = self.camera.project(positions) - measured.pixels
+        across = (normals != 0.0).any(axis=1)
+        derivatives[across, 0] = np.einsum("pk,pka->pa", normals[across], derivatives[across])
+        residuals[across, 0] = np.einsum("pk,pk->p", normals[across], residuals[across])
+        derivatives[across, 1] = residuals[across, 1] = 0.0
+        used = (measured.weights > 0.0) & np.isfinite(residuals).all(axis=1)
+        derivatives[~used] = residuals[~used] = 0.0
+        length = np.linalg.norm(residuals, axis=1)
+        huber = np.minimum(1.0, options.huber_px / np.maximum(length, 1e-12))
+        sigma = np.where(across, options.outline_px, options.point_px)
+        # The outline has a deviation of its own here, whatever the estimate counts it by.
+        counts = np.where(across, 1.0, measured.weights)
+        return derivatives, residuals, np.where(used, counts * huber / sigma**2, 0.0)
+
+    def shape(self, state: State) -> Array:
+        """The samples (s, 3) of the surface in the camera frame, in a state of the model, metres."""
+        return self._samples.in_camera(state)
+
+    def prior(self, shape: Array, rotation: Array, values: Array) -> Quadratic:
+        """The cost of the process and of the strain beyond the model's at ``values`` (m, 3).
+
+        Parameters
+        ----------
+        shape : (s, 3) samples of the surface in the model's state, as `shape` has them.
+        rotation : (3, 3) of that state's pose.
+        """
+        process = Quadratic(self._precision, self._precision @ values.T.ravel())
+        start, end = self._lines.T
+        model = (shape[start] - shape[end]) @ rotation
+        now = model + self._stretching @ values
+        length = np.linalg.norm(now, axis=1)
+        strain = (length - np.linalg.norm(model, axis=1)) / self._lengths
+        gradient = now / (length * self._lengths)[:, None]
+        share = STRAINS_A_SAMPLE * len(shape) / len(strain) / self.options.strain**2
+        outer = share * gradient[:, :, None] * gradient[:, None, :]
+        return process + Quadratic.of_rows(outer, share * strain[:, None] * gradient, self._stretching)
+
+
+def _neighbour_lines(points: Array, count: int) -> NDArray[np.int64]:
+    """Pairs (e, 2) of each point and its ``count`` nearest others, each pair once."""
+    near = np.asarray(KDTree(points).query(points, min(count + 1, len(points)))[1])
+    pairs = np.column_stack([np.repeat(near[:, 0], near.shape[1] - 1), near[:, 1:].ravel()])
+    return np.unique(np.sort(pairs, axis=1), axis=0)
+
+
+# The discrepancy in the reference view, from a whole sequence.
+# Every followed point is bound to the mesh by the pixel in which the reference view shows it. Where the
+# object departs from the model there, the points are bound beside their places, and no shape of another frame
+# explains all of them. So the discrepancies of the reference view and of keyframes are sought together (a
+# bundle adjustment of a surface that hardly stretches): that of the reference moves the points along the
+# surface until they are in their pixels again. Those of the keyframes are eliminated by Schur complements.
+
+
+#: Gauss-Newton steps: after five the displacements change by less than a tenth of a millimetre.
+STEPS = 5
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The reference view and what is known of it.
+
+    Attributes
+    ----------
+    state : of the model in it. pixels : (p, 2) of the followed points.
+    landmarks, landmark_pixels : (k) points and where they are seen (k, 2), undistorted.
+    landmark_px : their standard deviation.
+    """
+
+    state: State
+    pixels: Array
+    landmarks: BoundPoints
+    landmark_pixels: Array
+    landmark_px: float
+
+
+def refine_discrepancy(
+    fit: DiscrepancyFit,
+    estimator: Estimator,
+    reference: Reference,
+    keyframes: Sequence[Keyframe],
+    outline: Outline | None = None,
+) -> Discrepancy:
+    """The discrepancy in the reference view that explains landmarks and keyframes best.
+
+    Parameters
+    ----------
+    fit : of the same model. outline : of the object, if the keyframes saw it.
+    """
+    adjustment = _Adjustment(fit, estimator, reference, keyframes, outline)
+    for _ in range(STEPS):
+        adjustment.step()
+    return Discrepancy(fit.basis, adjustment.values)
+
+
+@dataclass
+class _Frame:
+    """A keyframe.
+
+    Attributes
+    ----------
+    measured : in it. state : of the model. positions : (p, 3) of the points and shape : (s, 3) of the samples
+        of the surface in that state, camera frame.
+    sliding : (p, 3, 3) how the points move as the reference's discrepancy slides them along the surface.
+    influence : (p, m) of the centres on the points. values : (m, 3) the discrepancy.
+    """
+
+    measured: Observations
+    state: State
+    positions: Array
+    shape: Array
+    sliding: Array
+    influence: Array
+    values: Array
+
+
+class _Adjustment:
+    def __init__(
+        self,
+        fit: DiscrepancyFit,
+        estimator: Estimator,
+        reference: Reference,
+        keyframes: Sequence[Keyframe],
+        outline: Outline | None,
+    ) -> None:
+        self._fit, self._reference, self._estimator = fit, reference, estimator
+        model, camera = estimator.model, estimator.camera
+        surface, self._met = bind_pixels(model, camera, view_of(model, camera, reference.state), reference.pixels)
+        self._points = BoundPoints.from_surface(model, surface)
+        self.values = np.zeros((len(fit.basis.centres), 3))
+        self._along = self._moves_along_surface()
+        self._frames = [self._frame(keyframe, outline) for keyframe in keyframes]
+
+    def _moves_along_surface(self) -> Array:
+        """By how much a displacement slides the points (p, 2, 3) along two edges of their triangles.
+
+        They stay in their pixels: P (E b + R u) = 0 for projection P, edges E and displacement u.
+        """
+        state, camera = self._reference.state, self._estimator.camera
+        projection = camera.projection_jacobian(self._points.in_camera(state))
+        rotated = projection @ state.camera_from_object.rotation
+        return np.asarray(-np.linalg.solve(projection @ self._edges(state), rotated), dtype=np.float64)
+
+    def _edges(self, state: State) -> Array:
+        """Two edges (p, 3, 2) of the points' triangles in the camera frame."""
+        model = self._estimator.model
+        nodes = view_of(model, self._estimator.camera, state).nodes
+        corners = nodes[model.triangles[self._points.surface.triangles]]
+        return np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=2)
+
+    def _frame(self, keyframe: Keyframe, outline: Outline | None) -> _Frame:
+        points, pixels, weights, normals = keyframe.measured(self._points, self._met, outline)
+        state = self._estimator.estimate(points, pixels, weights, keyframe.state, normals).state
+        sliding = np.zeros((len(points), 3, 3))
+        sliding[: len(self._points)] = self._edges(state) @ self._along
+        measured = Observations(points, pixels, weights, normals, np.zeros((0, 0)))
+        influence, values = self._fit.basis.influence(points.rest), np.zeros_like(self.values)
+        shape = self._fit.shape(state)
+        return _Frame(measured, state, points.in_camera(state), shape, sliding, influence, values)
+
+    def step(self) -> None:
+        """One Gauss-Newton step of all discrepancies."""
+        total, frames = self._of_reference(), []
+        for frame in self._frames:
+            own, shared, coupling = self._costs(frame)
+            solved = cho_solve(cho_factor(own.hessian), np.column_stack([coupling, own.gradient]))
+            schur = Quadratic(coupling.T @ solved[:, :-1], coupling.T @ solved[:, -1])
+            total = Quadratic(
+                total.hessian + shared.hessian - schur.hessian, total.gradient + shared.gradient - schur.gradient
+            )
+            frames.append(solved)
+        step = -cho_solve(cho_factor(total.hessian), total.gradient)
+        self.values = self.values + as_displacements(step)
+        for frame, solved in zip(self._frames, frames, strict=True):
+            frame.values = frame.values - as_displacements(solved[:, -1] + solved[:, :-1] @ step)
+
+    def _of_reference(self) -> Quadratic:
+        """What is known of the reference view's discrepancy by itself: the prior and the landmarks."""
+        state, known, camera = self._reference.state, self._reference, self._estimator.camera
+        rotation = state.camera_from_object.rotation
+        influence = self._fit.basis.influence(known.landmarks.rest)
+        there = known.landmarks.in_camera(state) + influence @ self.values @ rotation.T
+        landmarks = Quadratic.of_residuals(
+            camera.projection_jacobian(there) @ rotation,
+            camera.project(there) - known.landmark_pixels,
+            np.full(len(there), known.landmark_px**-2),
+            influence,
+        )
+        return landmarks + self._fit.prior(self._fit.shape(state), rotation, self.values)
+
+    def _costs(self, frame: _Frame) -> tuple[Quadratic, Quadratic, Array]:
+        """A keyframe's cost by its own discrepancy and by the reference's, and the mixed derivatives."""
+        rotation, influence = frame.state.camera_from_object.rotation, frame.influence
+        slid = np.einsum("pxa,pa->px", frame.sliding, influence @ self.values)
+        there = frame.positions + slid + influence @ frame.values @ rotation.T
+        derivatives, residuals, weights = self._fit.seen(frame.measured, there)
+        own, shared = derivatives @ rotation, derivatives @ frame.sliding
+        prior = self._fit.prior(frame.shape, rotation, frame.values)
+        coupling = weighted_gram(np.einsum("p,pka,pkb->pab", weights, own, shared), influence)
+        by_own, by_shared = (Quadratic.of_residuals(rows, residuals, weights, influence) for rows in (own, shared))
+        return by_own + prior, by_shared, coupling

@@ -1,0 +1,400 @@
+"""Sections: what a plane through an undeformed solid cuts open, to be carried along as the solid deforms."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+from tqdm import tqdm
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.errors import TrackingError
+from morph_dslam.io.video import VideoWriter
+from morph_dslam.model import ReducedModel, SeparatedField
+from morph_dslam.model.discrepancy import Discrepancy
+from morph_dslam.model.inner_structure import CarriedStructure
+from morph_dslam.model.reduced_model import MaterialPoints, von_mises
+from morph_dslam.render.overlay import draw_inner_surface, draw_overlay
+from morph_dslam.render.shading import lambert, text_patch, vertex_normals
+from morph_dslam.sources import FrameSource
+from morph_dslam.tracking.binding import DrawnSurface, View, facing
+from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.run_folder import RunResults
+
+Array = NDArray[np.float64]
+
+#: A hexahedron as six tetrahedra around its diagonal 0-6, corners in VTK's order.
+_HEX = np.array([[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]])
+
+#: A prism as three tetrahedra.
+_PRISM = np.array([[0, 1, 2, 5], [0, 1, 5, 4], [0, 4, 5, 3]])
+
+_FORM = re.compile(r"([+-]?)([xyz])=(-?[0-9]*\.?[0-9]+)")
+
+
+@dataclass(frozen=True)
+class SectionPlane:
+    """The points x of the undeformed object with normal @ x = offset; what lies beyond is taken away.
+
+    Attributes
+    ----------
+    normal : (3,) unit vector, object frame. offset : metres.
+    """
+
+    normal: Array
+    offset: float
+
+    @classmethod
+    def parse(cls, text: str) -> SectionPlane:
+        """From "x=12" or "-x=12", millimetres: x > 12 mm, or x < 12 mm, is taken away.
+
+        Raises
+        ------
+        TrackingError
+            If the text is none of these.
+        """
+        found = _FORM.fullmatch(text.replace(" ", ""))
+        if found is None:
+            raise TrackingError(
+                f"'{text}' is no section: write x=12 to take away all beyond x = 12 mm, -x=12 for all before "
+                "it; y and z likewise, in the object's frame"
+            )
+        sign = -1.0 if found[1] == "-" else 1.0
+        normal = sign * np.eye(3)["xyz".index(found[2])]
+        return cls(normal, sign * 1e-3 * float(found[3]))
+
+    def beyond(self, points: Array) -> Array:
+        """How far (n,) points (n, 3) lie beyond the plane, metres."""
+        return points @ self.normal - self.offset
+
+
+def cut(model: ReducedModel, plane: SectionPlane) -> tuple[MaterialPoints, NDArray[np.int64]]:
+    """The section's nodes, as material points between two mesh nodes each, and its triangles (m, 3).
+
+    Each cell is cut as tetrahedra with straight edges.
+
+    Raises
+    ------
+    TrackingError
+        If the model is a sheet's, or the plane misses the object.
+    """
+    if not model.cells:
+        raise TrackingError(f"'{model.name}' is a sheet: it has no inside to show in a section")
+    tetrahedra, depth = _tetrahedra(model), _depth(model, plane)
+    below = depth[tetrahedra] < 0.0
+    count = below.sum(axis=1)
+    # Corners below the plane first.
+    ordered = np.take_along_axis(tetrahedra, np.argsort(~below, axis=1, kind="stable"), axis=1)
+    edges = [
+        _edges(ordered[count == 1], [(0, 1), (0, 2), (0, 3)]),
+        _edges(ordered[count == 3], [(0, 3), (1, 3), (2, 3)]),
+        _edges(ordered[count == 2], [(0, 2), (0, 3), (1, 3)]),
+        _edges(ordered[count == 2], [(0, 2), (1, 3), (1, 2)]),
+    ]
+    triangles = np.concatenate(edges)
+    if not len(triangles):
+        low, high = 1e3 * depth.min() + 1e3 * plane.offset, 1e3 * depth.max() + 1e3 * plane.offset
+        raise TrackingError(
+            f"the section misses the object: along its normal '{model.name}' reaches from {low:.1f} to {high:.1f} mm"
+        )
+    return _on_edges(triangles, depth)
+
+
+def surface_before(model: ReducedModel, plane: SectionPlane) -> tuple[MaterialPoints, NDArray[np.int64]]:
+    """What the plane leaves of the surface: its nodes, between two mesh nodes each, and its triangles (m, 3).
+
+    Triangles that the plane crosses are cut along it, and keep the direction in which they run.
+    """
+    depth = _depth(model, plane)
+    below = depth[model.triangles] < 0.0
+    count = below.sum(axis=1)
+    # First the one corner that is on its side of the plane alone.
+    alone = np.where(count == 1, below.argmax(axis=1), (~below).argmax(axis=1))
+    turned = np.take_along_axis(model.triangles, (alone[:, None] + np.arange(3)) % 3, axis=1)
+    one, two = turned[count == 1], turned[count == 2]
+    parts = [
+        _edges(model.triangles[count == 3], [(0, 0), (1, 1), (2, 2)]),
+        _edges(one, [(0, 0), (0, 1), (0, 2)]),
+        _edges(two, [(1, 0), (1, 1), (2, 2)]),
+        _edges(two, [(1, 0), (2, 2), (2, 0)]),
+    ]
+    return _on_edges(np.concatenate(parts), depth)
+
+
+def _depth(model: ReducedModel, plane: SectionPlane) -> Array:
+    """How far the nodes (n,) lie beyond the plane; one that lies in it belongs to one side, by a hair."""
+    depth = plane.beyond(model.nodes)
+    return np.where(np.abs(depth) < 1e-12, 1e-12, depth)
+
+
+def _on_edges(triangles: NDArray[np.int64], depth: Array) -> tuple[MaterialPoints, NDArray[np.int64]]:
+    """Triangles (t, 3, 2), each corner where the plane cuts the edge between two nodes, or a node itself."""
+    unique, corners = np.unique(triangles.reshape(-1, 2), axis=0, return_inverse=True)
+    here, there = depth[unique[:, 0]], depth[unique[:, 1]]
+    is_node = unique[:, 0] == unique[:, 1]
+    share = np.where(is_node, 0.0, here / np.where(is_node, 1.0, here - there))
+    return MaterialPoints(unique, np.column_stack([1.0 - share, share])), corners.reshape(-1, 3)
+
+
+def _tetrahedra(model: ReducedModel) -> NDArray[np.int64]:
+    """All cells by their corners as tetrahedra (k, 4)."""
+    parts = []
+    for cell_type, cells in model.cells.items():
+        if cell_type.startswith("hex"):
+            parts.append(cells[:, _HEX].reshape(-1, 4))
+        elif cell_type.startswith("prism"):
+            parts.append(cells[:, _PRISM].reshape(-1, 4))
+        else:
+            parts.append(cells[:, :4])
+    return np.concatenate(parts)
+
+
+def _edges(cells: NDArray[np.int64], pairs: list[tuple[int, int]]) -> NDArray[np.int64]:
+    """Three edges (t, 3, 2) of each tetrahedron or triangle, by its corners; they make a triangle."""
+    return np.stack([cells[:, list(pair)] for pair in pairs], axis=1)
+
+
+# The augmented view: the deformed object over a frame, coloured by a field, cut open or seen through.
+
+
+Shown = Literal["stress", "strain", "displacement"]
+
+#: Opacity of the object's surface, of one that shows what it has inside, and of one that is cut open.
+OPACITY, SEE_THROUGH, CUT_OPEN = 0.65, 0.4, 0.9
+
+#: Colours of inner structures in turn: violet, yellow, green, blue.
+INNER_COLOURS = ((235, 60, 235), (60, 220, 255), (90, 235, 90), (255, 190, 60))
+
+#: Direction to the light, camera frame, and what it leaves in the shade.
+LIGHT, AMBIENT = np.array([0.3, -0.4, -1.0]), 0.55
+
+#: Colours end at this percentile of the field: stress has narrow peaks.
+PERCENTILE = 99.5
+
+#: States of the parameter box from which the range of colours is taken (a power of two).
+SAMPLES = 32
+
+
+@dataclass(frozen=True)
+class DrawOptions:
+    """What is drawn.
+
+    Attributes
+    ----------
+    show : "stress" (von Mises), "strain" (equivalent) or "displacement"; None for stress where the model has
+        one, else the displacement. section : a plane that cuts the object open; None for none.
+    """
+
+    show: Shown | None = None
+    section: SectionPlane | None = None
+
+
+class AugmentedView:
+    """Draws one object.
+
+    Only the nodes that are drawn are moved, in single precision, which is as exact as the model file.
+
+    Raises
+    ------
+    TrackingError
+        If the model does not hold the field, or cannot be cut there.
+    """
+
+    def __init__(
+        self,
+        model: ReducedModel,
+        camera: PinholeCamera,
+        options: DrawOptions | None = None,
+        inner: Sequence[CarriedStructure] = (),
+    ) -> None:
+        options = options or DrawOptions()
+        self._camera, self._inner, self._model = camera, inner, model
+        self.show = _chosen(model, options.show)
+        self._points, self._triangles = _drawn_mesh(model, options.section)
+        self._closed = options.section is None and DrawnSurface.of(model).closed
+        self._alpha = SEE_THROUGH if inner else OPACITY if options.section is None else CUT_OPEN
+        self._rest = model.rest_positions(self._points)
+        self._displacement = self._restricted("displacement")
+        self._fields = {name: self._restricted(name) for name in _fields_of(model, self.show)}
+
+    def _restricted(self, name: str) -> SeparatedField:
+        field = self._model.restrict(self._points, name)
+        return field.with_modes(field.modes.astype(np.float32))  # type: ignore[arg-type]
+
+    @property
+    def label(self) -> str:
+        """Name and unit of the field."""
+        return {
+            "stress": "von Mises stress [MPa]",
+            "strain": "equivalent strain [%]",
+            "displacement": "displacement [mm]",
+        }[self.show]
+
+    def view(self, state: State) -> View:
+        """The drawn nodes in a state."""
+        return self._view(state, self._displacement.value(state.parameters))
+
+    def _view(self, state: State, displacement: Array) -> View:
+        nodes = state.camera_from_object.apply(self._rest + displacement)
+        return View(nodes, self._camera.project(nodes))
+
+    def distance(self, state: State) -> float:
+        """Depth of the middle of what is drawn, undeformed, metres."""
+        return float(state.camera_from_object.apply(self._rest.mean(axis=0))[2])
+
+    def values(self, state: State) -> Array:
+        """The field (n,) at the drawn nodes, in the unit of `label`; for a sheet on the side that is seen."""
+        return self._values(state.parameters, self._displacement.value(state.parameters), self.view(state))
+
+    def _values(self, parameters: Array, displacement: Array, view: View | None) -> Array:
+        if self.show == "displacement":
+            return 1e3 * np.linalg.norm(displacement, axis=1)
+        if self.show == "strain":
+            return 100.0 * _equivalent_strain(self._fields["strain"].value(parameters))
+        name = "stress_solid"
+        if name not in self._fields:
+            # Triangles run anticlockwise seen from their top face, that is clockwise in neither y-up nor
+            # y-down images: on the image's y-down axes a top face seen from the front has a negative area.
+            back = view is not None and facing(view, self._triangles).mean() > 0.5
+            name = "stress_bottom" if back else "stress_top"
+        return 1e-6 * von_mises(self._fields[name].value(parameters))
+
+    def range_of(self, states: Sequence[State]) -> tuple[float, float]:
+        """One range of colours for these states; from 0 to 1 where there are none."""
+        if not states:
+            return 0.0, 1.0
+        return self._range([self.values(state) for state in states])
+
+    def range_of_box(self) -> tuple[float, float]:
+        """One range of colours for all states of the parameter box, known before any is seen."""
+        model = self._model
+        shares = qmc.Sobol(len(model.parameters), scramble=False).random(SAMPLES)
+        shapes = [model.default, *(model.lower + shares * (model.upper - model.lower))]
+        return self._range([self._values(mu, self._displacement.value(mu), None) for mu in shapes])
+
+    def _range(self, fields: list[Array]) -> tuple[float, float]:
+        return 0.0, max(float(np.percentile(np.stack(fields), PERCENTILE)), 1e-6)
+
+    def draw(
+        self,
+        image: NDArray[np.uint8],
+        state: State,
+        limits: tuple[float, float],
+        caption: str,
+        discrepancy: Discrepancy | None = None,
+    ) -> NDArray[np.uint8]:
+        """An undistorted frame (h, w, 3) with the object over it, and in it its inner structures.
+
+        The object is drawn where ``discrepancy`` has it beyond the model; stress and strain are the model's.
+        """
+        displacement = self._displacement.value(state.parameters)
+        if discrepancy is not None:
+            displacement = displacement + discrepancy.displacement(self._rest)
+        view = self._view(state, displacement)
+        drawn = draw_overlay(
+            image,
+            view.pixels,
+            view.nodes[:, 2],
+            self._triangles,
+            self._values(state.parameters, displacement, view),
+            limits,
+            label=self.label,
+            alpha=self._alpha,
+            brightness=lambert(vertex_normals(view.nodes, self._triangles), LIGHT, AMBIENT),
+            caption=caption,
+            closed=self._closed,
+        )
+        for number, structure in enumerate(self._inner):
+            nodes = structure.nodes(state.parameters)
+            if discrepancy is not None:
+                nodes = nodes + discrepancy.displacement(structure.rest)
+            nodes = state.camera_from_object.apply(nodes)
+            drawn = draw_inner_surface(
+                drawn,
+                self._camera.project(nodes),
+                nodes[:, 2],
+                structure.triangles,
+                INNER_COLOURS[number % len(INNER_COLOURS)],
+                label=structure.name,
+                brightness=lambert(vertex_normals(nodes, structure.triangles), LIGHT, AMBIENT),
+            )
+        return drawn
+
+
+def with_caption(image: NDArray[np.uint8], caption: str) -> NDArray[np.uint8]:
+    """A frame (h, w, 3) without the object, and why."""
+    result = image.copy()
+    patch = text_patch(caption, 0.42 * max(image.shape[0] / 480.0, 0.6))[:, : image.shape[1]]
+    result[-patch.shape[0] :, : patch.shape[1]] = patch
+    return result
+
+
+def _chosen(model: ReducedModel, show: Shown | None) -> Shown:
+    has = {"stress": bool(model.stresses), "strain": model.strain is not None, "displacement": True}
+    if show is None:
+        return "stress" if has["stress"] else "displacement"
+    if not has[show]:
+        held = ", ".join(name for name, held in has.items() if held)
+        raise TrackingError(f"the model '{model.name}' holds no {show} to show; it has: {held}")
+    return show
+
+
+def _fields_of(model: ReducedModel, show: Shown) -> list[str]:
+    """Names of the fields that are shown, as in `ReducedModel.fields`."""
+    if show == "stress":
+        return [f"stress_{place}" for place in model.stresses]
+    return ["strain"] if show == "strain" else []
+
+
+def _equivalent_strain(strain: Array) -> Array:
+    """sqrt(2/3 e : e) (n,) of the deviator e of strains (n, 6): xx, yy, zz, yz, xz, xy with tensor shears."""
+    normal = strain[:, :3] - strain[:, :3].mean(axis=1, keepdims=True)
+    squared = np.sum(normal**2, axis=1) + 2.0 * np.sum(strain[:, 3:] ** 2, axis=1)
+    return np.sqrt(2.0 / 3.0 * squared)
+
+
+def _drawn_mesh(model: ReducedModel, section: SectionPlane | None) -> tuple[MaterialPoints, NDArray[np.int64]]:
+    """The nodes that are drawn and their triangles: the surface, or what a section leaves of it, and that."""
+    if section is None:
+        used, corners = np.unique(model.triangles, return_inverse=True)
+        pairs, weights = np.column_stack([used, used]), np.tile([1.0, 0.0], (len(used), 1))
+        return MaterialPoints(pairs, weights), corners.reshape(-1, 3)
+    inside, cut_open = cut(model, section)
+    left, triangles = surface_before(model, section)
+    points = MaterialPoints(
+        np.concatenate([left.corners, inside.corners]), np.concatenate([left.weights, inside.weights])
+    )
+    return points, np.concatenate([triangles, cut_open + len(left)])
+
+
+# The augmented video of a run: every frame with the object over it, in one range of colours.
+
+
+#: At most so many states are looked at for the range of colours.
+MOST_STATES = 60
+
+
+def write_video(path: Path, source: FrameSource, camera: PinholeCamera, run: RunResults, view: AugmentedView) -> None:
+    """Draw every frame of the run; hidden and lost frames are shown as they are, with the reason."""
+    states = run.states()
+    known = [state for state in states if state is not None]
+    limits = view.range_of(known[:: max(1, len(known) // MOST_STATES)])
+    maps = camera.undistortion_maps()
+    # The source comes last: zip then stops before it asks for a frame that may be missing.
+    rows = zip(states, run.results, source, strict=False)
+    with VideoWriter(path, source.fps, (camera.width, camera.height)) as video:
+        for state, result, frame in tqdm(rows, total=len(run), desc="drawing", unit="frame"):
+            image = frame.image
+            if maps is not None:
+                image = np.asarray(cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+            if state is None:
+                video.write(with_caption(image, f"frame {frame.index}: {result.reason}"))
+            else:
+                video.write(view.draw(image, state, limits, f"frame {frame.index}", result.discrepancy))

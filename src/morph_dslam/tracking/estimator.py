@@ -1,0 +1,465 @@
+"""Reprojection error of surface points and its normal equations: the estimator's inner loop.
+
+The unknowns are stacked as [parameters (d), rotation vector (3), translation (3)]; the pose increment acts on
+the left, R <- exp(w) R and t <- t + v. The derivative of a pixel with respect to a parameter is the product
+of the camera's, the pose's and the model's derivative (the paper's projected sensitivities).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.geometry import cross_matrix
+from morph_dslam.model import ReducedModel
+from morph_dslam.model.separated import combine_modes
+from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR, huber_covariance
+from morph_dslam.tracking.depth import PointDepths
+from morph_dslam.tracking.levenberg_marquardt import Box, Minimum, minimise
+from morph_dslam.tracking.noise import Observations
+from morph_dslam.tracking.state import BoundPoints, Prior, State, moved
+
+#: Points nearer to the camera plane than this, in metres, or behind it cannot be seen.
+MINIMUM_DEPTH = 1e-3
+
+#: Cost of a point that the state places behind the camera; large, so that such a step is refused.
+UNSEEN_COST = 1e9
+
+
+@njit(cache=True, nogil=True)
+def _point_jacobian(jacobian, fields, j, rotation, turned, inverse_depth, x, y, intrinsics):
+    """Fill the Jacobian (2, d + 6) of point ``j``: x, y are its normalised image coordinates."""
+    d = fields.shape[0] - 1
+    ax, ay = intrinsics[0] * inverse_depth, intrinsics[1] * inverse_depth
+    for k in range(d):
+        s0, s1, s2 = fields[k + 1, j, 0], fields[k + 1, j, 1], fields[k + 1, j, 2]
+        vx = rotation[0, 0] * s0 + rotation[0, 1] * s1 + rotation[0, 2] * s2
+        vy = rotation[1, 0] * s0 + rotation[1, 1] * s1 + rotation[1, 2] * s2
+        vz = rotation[2, 0] * s0 + rotation[2, 1] * s1 + rotation[2, 2] * s2
+        jacobian[0, k] = ax * (vx - x * vz)
+        jacobian[1, k] = ay * (vy - y * vz)
+    tx, ty, tz = turned[0], turned[1], turned[2]
+    jacobian[0, d], jacobian[1, d] = -ax * x * ty, -ay * (tz + y * ty)
+    jacobian[0, d + 1], jacobian[1, d + 1] = ax * (tz + x * tx), ay * y * tx
+    jacobian[0, d + 2], jacobian[1, d + 2] = -ax * ty, ay * tx
+    jacobian[0, d + 3], jacobian[1, d + 3] = ax, 0.0
+    jacobian[0, d + 4], jacobian[1, d + 4] = 0.0, ay
+    jacobian[0, d + 5], jacobian[1, d + 5] = -ax * x, -ay * y
+
+
+@njit(cache=True, nogil=True)
+def linearise(functions, rotation, translation, rest, modes, intrinsics, pixels, weights, normals, huber):
+    """Huber cost of the reprojection error, its gradient and Gauss-Newton Hessian, compiled.
+
+    Parameters
+    ----------
+    functions : (1 + d, m) values and derivatives of the parameter functions at the state, `Functions.rows`.
+    rotation, translation : (3, 3) and (3,) of camera_from_object, metres.
+    rest, modes : (p, 3) undeformed points and (m, p, 3) displacement modes at them, metres.
+    intrinsics : (4,) fx, fy, cx, cy in pixels.
+    pixels, weights : (p, 2) measurements in pixels and (p,) weights; points of weight 0 do not count.
+    normals : (p, 2) unit vectors; a point with one counts only along it (a point of an outline, which may
+        slide); (0, 0) for points that count in both directions.
+    huber : residual length in pixels beyond which the cost grows linearly.
+
+    Returns
+    -------
+    cost : sum of weight * rho(|r|), rho Huber's function.
+    hessian, gradient : (d + 6, d + 6) and (d + 6,) of the cost, Gauss-Newton with Huber weights.
+    residuals : (p, 2) projected minus measured, along the normal where there is one, pixels; NaN behind
+        the camera.
+    """
+    n_points, d = rest.shape[0], functions.shape[0] - 1
+    flat_modes = modes.reshape(modes.shape[0], 3 * n_points)
+    fields = combine_modes(functions, flat_modes).reshape(1 + d, n_points, 3)
+    size = d + 6
+    hessian, gradient = np.zeros((size, size)), np.zeros(size)
+    residuals, jacobian, turned = np.empty((n_points, 2)), np.zeros((2, size)), np.empty(3)
+    cost = 0.0
+    for j in range(n_points):
+        p0, p1, p2 = rest[j, 0] + fields[0, j, 0], rest[j, 1] + fields[0, j, 1], rest[j, 2] + fields[0, j, 2]
+        for c in range(3):
+            turned[c] = rotation[c, 0] * p0 + rotation[c, 1] * p1 + rotation[c, 2] * p2
+        depth = turned[2] + translation[2]
+        if depth < MINIMUM_DEPTH:
+            residuals[j] = np.nan
+            cost += UNSEEN_COST * weights[j]
+            continue
+        x, y = (turned[0] + translation[0]) / depth, (turned[1] + translation[1]) / depth
+        residuals[j, 0] = intrinsics[0] * x + intrinsics[2] - pixels[j, 0]
+        residuals[j, 1] = intrinsics[1] * y + intrinsics[3] - pixels[j, 1]
+        n0, n1 = normals[j, 0], normals[j, 1]
+        directed = n0 != 0.0 or n1 != 0.0
+        if directed:
+            along = n0 * residuals[j, 0] + n1 * residuals[j, 1]
+            residuals[j, 0], residuals[j, 1] = n0 * along, n1 * along
+        if weights[j] == 0.0:
+            continue
+        length = np.hypot(residuals[j, 0], residuals[j, 1])
+        weight = weights[j]
+        if length <= huber:
+            cost += weight * 0.5 * length * length
+        else:
+            cost += weight * huber * (length - 0.5 * huber)
+            weight *= huber / length
+        _point_jacobian(jacobian, fields, j, rotation, turned, 1.0 / depth, x, y, intrinsics)
+        if directed:
+            for a in range(size):
+                slope = n0 * jacobian[0, a] + n1 * jacobian[1, a]
+                jacobian[0, a], jacobian[1, a] = n0 * slope, n1 * slope
+        for a in range(size):
+            gradient[a] += weight * (jacobian[0, a] * residuals[j, 0] + jacobian[1, a] * residuals[j, 1])
+            for b in range(a + 1):
+                hessian[a, b] += weight * (jacobian[0, a] * jacobian[0, b] + jacobian[1, a] * jacobian[1, b])
+    for a in range(size):
+        for b in range(a):
+            hessian[b, a] = hessian[a, b]
+    return cost, hessian, gradient, residuals
+
+
+@njit(cache=True, nogil=True)
+def project_with_jacobian(functions, rotation, translation, rest, modes, intrinsics):
+    """Pixels (p, 2) and their Jacobian (p, 2, d + 6), compiled; NaN behind the camera.
+
+    The parameters are those of `linearise`.
+    """
+    n_points, d = rest.shape[0], functions.shape[0] - 1
+    fields = combine_modes(functions, modes.reshape(modes.shape[0], 3 * n_points)).reshape(1 + d, n_points, 3)
+    pixels, jacobian = np.full((n_points, 2), np.nan), np.full((n_points, 2, d + 6), np.nan)
+    turned = np.empty(3)
+    for j in range(n_points):
+        for c in range(3):
+            turned[c] = 0.0
+            for k in range(3):
+                turned[c] += rotation[c, k] * (rest[j, k] + fields[0, j, k])
+        depth = turned[2] + translation[2]
+        if depth < MINIMUM_DEPTH:
+            continue
+        x, y = (turned[0] + translation[0]) / depth, (turned[1] + translation[1]) / depth
+        pixels[j, 0] = intrinsics[0] * x + intrinsics[2]
+        pixels[j, 1] = intrinsics[1] * y + intrinsics[3]
+        _point_jacobian(jacobian[j], fields, j, rotation, turned, 1.0 / depth, x, y, intrinsics)
+    return pixels, jacobian
+
+
+def project_with_jacobian_numpy(functions, rotation, translation, rest, modes, intrinsics):
+    """The plain twin of `project_with_jacobian`."""
+    fields = np.tensordot(functions, modes, axes=1)
+    turned = (rest + fields[0]) @ rotation.T
+    x, y, z = (turned + translation).T
+    z = np.where(z < MINIMUM_DEPTH, np.nan, z)
+    fx, fy, cx, cy = intrinsics
+    pixels = np.column_stack([fx * x / z + cx, fy * y / z + cy])
+    d = len(functions) - 1
+    of_position = np.zeros((len(rest), 2, 3))
+    of_position[:, 0, 0], of_position[:, 0, 2] = fx / z, -fx * x / z**2
+    of_position[:, 1, 1], of_position[:, 1, 2] = fy / z, -fy * y / z**2
+    of_unknowns = np.zeros((len(rest), 3, d + 6))
+    of_unknowns[:, :, :d] = np.moveaxis(fields[1:] @ rotation.T, 0, 2)
+    of_unknowns[:, :, d : d + 3] = -cross_matrix(turned)
+    of_unknowns[:, :, d + 3 :] = np.eye(3)
+    return pixels, of_position @ of_unknowns
+
+
+def linearise_numpy(functions, rotation, translation, rest, modes, intrinsics, pixels, weights, normals, huber):
+    """The plain twin of `linearise`."""
+    projected, jacobian = project_with_jacobian_numpy(functions, rotation, translation, rest, modes, intrinsics)
+    residuals = projected - pixels
+    directed = (normals != 0.0).any(axis=1)
+    onto = np.where(directed[:, None, None], normals[:, :, None] * normals[:, None, :], np.eye(2))
+    residuals, jacobian = np.einsum("pab,pb->pa", onto, residuals), onto @ jacobian
+    length = np.linalg.norm(residuals, axis=1)
+    seen = np.isfinite(length)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        outside = length > huber
+        rho = np.where(outside, huber * (length - 0.5 * huber), 0.5 * length**2)
+        factor = np.where(outside, weights * huber / length, weights)
+    cost = np.sum(weights[seen] * rho[seen]) + UNSEEN_COST * weights[~seen].sum()
+    used, r, w = jacobian[seen], residuals[seen], factor[seen]
+    hessian = np.einsum("p,pca,pcb->ab", w, used, used, optimize=True)
+    gradient = np.einsum("p,pca,pc->a", w, used, r, optimize=True)
+    return cost, hessian, gradient, residuals
+
+
+# A cost about its minimum: how errors of measurements enter the estimate.
+
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LinearCost:
+    """A cost about its minimum.
+
+    Attributes
+    ----------
+    scores : (p, 2, n) by which an error of a pixel enters the gradient, in units of what a point of weight 1
+        is off by. of_depths : (n, n), covariance of the gradient from errors of depths. hessian : (n, n).
+    scale : (n,) of the unknowns.
+    """
+
+    scores: Array
+    of_depths: Array
+    hessian: Array
+    scale: Array
+
+    @classmethod
+    def about(
+        cls,
+        measured: Observations,
+        state: State,
+        residuals: Array,
+        camera: PinholeCamera,
+        huber_px: float,
+        scale: Array,
+    ) -> LinearCost:
+        """That of the measurements of a frame, about a state that leaves these residuals (p, 2)."""
+        points, pose = measured.points, state.camera_from_object
+        _, jacobian = project_with_jacobian(
+            points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
+            points.field.modes, camera.intrinsics,
+        )  # fmt: skip
+        directed = (measured.normals != 0.0).any(axis=1)
+        normals = measured.normals[directed]
+        jacobian[directed] = (normals[:, :, None] * normals[:, None, :]) @ jacobian[directed]
+        length = np.linalg.norm(residuals, axis=1)
+        used = (measured.weights > 0.0) & np.isfinite(length)
+        jacobian[~used] = 0.0
+        factor = np.minimum(1.0, huber_px / np.maximum(np.where(used, length, 0.0), 1e-300))
+        exactness = np.sqrt(measured.weights)[:, None, None]
+        scores = exactness * factor[:, None, None] * jacobian
+        hessian = np.tensordot(scores, exactness * jacobian, axes=([0, 1], [0, 1]))
+        of_depths = np.zeros_like(hessian)
+        if measured.depths is not None:
+            _, part, _, far = measured.depths.terms(points, state)
+            hessian, of_depths = hessian + part, measured.depths.variance_px(far) * part
+        return cls(scores, of_depths, hessian, scale)
+
+    def in_unknowns(self, chain: Array) -> LinearCost:
+        """The same cost of other unknowns, whose increments ``chain`` (n, m) turns into these."""
+        hessian, of_depths = (chain.T @ matrix @ chain for matrix in (self.hessian, self.of_depths))
+        return LinearCost(self.scores @ chain, of_depths, hessian, self.scale)
+
+    def holding(self, indices: NDArray[np.int64]) -> LinearCost:
+        """The same cost with the unknowns at ``indices`` (k,) known: how well the others are then."""
+        scores, of_depths, hessian = self.scores.copy(), self.of_depths.copy(), self.hessian.copy()
+        largest = float(np.max(np.diag(hessian) * self.scale**2))
+        scores[:, :, indices] = 0.0
+        for matrix in (of_depths, hessian):
+            matrix[indices], matrix[:, indices] = 0.0, 0.0
+        hessian[indices, indices] = max(largest, 1e-30) / self.scale[indices] ** 2
+        return LinearCost(scores, of_depths, hessian, self.scale)
+
+    @staticmethod
+    def joined(costs: Sequence[LinearCost]) -> LinearCost:
+        """The sum of costs of the same unknowns, their points one after the other."""
+        return LinearCost(
+            np.concatenate([cost.scores for cost in costs]),
+            np.sum([cost.of_depths for cost in costs], axis=0),
+            np.sum([cost.hessian for cost in costs], axis=0),
+            costs[0].scale,
+        )
+
+    @cached_property
+    def _spectrum(self) -> tuple[Array, Array, float]:
+        """Eigenvalues and eigenvectors in scaled unknowns, and the least value that counts."""
+        values, vectors = np.linalg.eigh(self.hessian * np.outer(self.scale, self.scale))
+        return values, self.scale[:, None] * vectors, max(values[-1], 1e-30) * EIGENVALUE_FLOOR
+
+    @cached_property
+    def inverse(self) -> Array:
+        """H^-1 (n, n); what is not seen at all gets the inverse of the least value."""
+        values, vectors, floor = self._spectrum
+        return (vectors / np.maximum(values, floor)) @ vectors.T
+
+    @property
+    def unseen(self) -> Array:
+        """The part (n, n) of `inverse` that is not seen at all."""
+        values, vectors, floor = self._spectrum
+        return (vectors * np.where(values > floor, 0.0, 1.0 / floor)) @ vectors.T
+
+
+# Parameters and pose from pixels: Levenberg-Marquardt with Huber weights inside the parameter box.
+
+
+__all__ = ["BoundPoints", "Estimate", "EstimationOptions", "Estimator", "Prior", "State", "moved"]
+
+#: A parameter nearer to its bound than this share of its range counts as being at the bound.
+BOUND_SHARE = 1e-3
+
+
+@dataclass(frozen=True)
+class EstimationOptions:
+    """When to stop, and what is too far off.
+
+    Attributes
+    ----------
+    huber_px : residual length where Huber's cost turns linear; above what a model that is a little off leaves
+        over wide parts of the surface, which are no outliers.
+    tolerance : relative decrease of the cost below which the iteration ends. With some hundred residuals
+        what is left to gain is then less than a tenth of a standard deviation.
+    """
+
+    huber_px: float = 3.0
+    max_iterations: int = 25
+    tolerance: float = 1e-5
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The minimum that was found.
+
+    Attributes
+    ----------
+    state : parameters and pose.
+    cost : Huber cost and that of the prior, pixels squared.
+    residuals : (p, 2) projected minus measured, pixels.
+    sigma_px : robust standard deviation of one pixel coordinate's residual.
+    covariance : (d + 6, d + 6) of [parameters, rotation vector, translation]; infinite when undetermined.
+    at_bound : (d,) parameters that ended at a bound of the box.
+    iterations, converged : how the iteration ended.
+    measured_covariance : the covariance without any prior on the parameters; None where there was none.
+    """
+
+    state: State
+    cost: float
+    residuals: Array
+    sigma_px: float
+    covariance: Array
+    at_bound: NDArray[np.bool_]
+    iterations: int
+    converged: bool
+    measured_covariance: Array | None = None
+
+    @property
+    def parameter_std(self) -> Array:
+        """Standard deviations of the parameters (d,), SI; very large where the images do not tell."""
+        return np.sqrt(np.diag(self.covariance)[: len(self.state.parameters)])
+
+    @property
+    def pose_std(self) -> Array:
+        """Standard deviations (6,) of the rotation vector (rad) and the translation (m)."""
+        return np.sqrt(np.diag(self.covariance)[len(self.state.parameters) :])
+
+
+class Estimator:
+    """Finds states from pixels of bound points, with one camera and one model.
+
+    ``linearise`` may be replaced by its numpy twin to compare them.
+    """
+
+    def __init__(
+        self,
+        model: ReducedModel,
+        camera: PinholeCamera,
+        options: EstimationOptions | None = None,
+        linearise: Callable = linearise,
+    ) -> None:
+        self.model, self.camera = model, camera
+        self.options = options or EstimationOptions()
+        self._linearise = linearise
+        self.box = Box.of(model)
+
+    @property
+    def scale(self) -> Array:
+        """Of the unknowns (d + 6,): half a parameter range, one radian, the object's size."""
+        return self.box.scale
+
+    def evaluate(
+        self,
+        points: BoundPoints,
+        pixels: Array,
+        weights: Array,
+        state: State,
+        normals: Array | None = None,
+        prior: Prior | None = None,
+        depths: PointDepths | None = None,
+    ) -> tuple[float, Array, Array, Array]:
+        """Cost, Hessian, gradient and residuals of pixels at a state; see `reprojection.linearise`.
+
+        Parameters
+        ----------
+        points : p of them. pixels : (p, 2). weights : (p,).
+        normals : (p, 2), zero but for points on an outline.
+
+        Returns
+        -------
+        Cost in squared pixels, Hessian (d + 6, d + 6), gradient (d + 6,), residuals (p, 2).
+        """
+        pose = state.camera_from_object
+        normals = np.zeros_like(pixels) if normals is None else normals
+        cost, hessian, gradient, residuals = self._linearise(
+            points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
+            points.field.modes, self.camera.intrinsics, pixels, weights, normals, self.options.huber_px,
+        )  # fmt: skip
+        others = [] if prior is None else [prior.terms(state)]
+        if depths is not None:
+            others.append(depths.terms(points, state)[:3])
+        for terms in others:
+            cost, hessian, gradient = cost + terms[0], hessian + terms[1], gradient + terms[2]
+        return cost, hessian, gradient, residuals
+
+    def estimate(
+        self,
+        points: BoundPoints,
+        pixels: Array,
+        weights: Array,
+        start: State,
+        normals: Array | None = None,
+        prior: Prior | None = None,
+        depths: PointDepths | None = None,
+    ) -> Estimate:
+        """Minimise the Huber cost from ``start``.
+
+        Parameters
+        ----------
+        pixels : (p, 2) measured, in the undistorted image.
+        weights : (p,) non-negative; points of weight 0 are ignored (their residuals are still reported).
+        normals : (p, 2), for points that count only along a direction; see `reprojection.linearise`.
+        prior : what is known of the parameters and the pose beforehand; nothing by default.
+        depths : of the p points, where a depth camera saw them.
+        """
+        normals = np.zeros_like(pixels) if normals is None else normals
+
+        def evaluate(state: State) -> tuple[float, Array, Array, Array]:
+            return self.evaluate(points, pixels, weights, state, normals, prior, depths)
+
+        found = minimise(evaluate, start, self.box, self.options.max_iterations, self.options.tolerance)
+        # A point on an outline gives one number, all others give two.
+        numbers = np.where((normals != 0.0).any(axis=1), 1, 2)
+        return self.finished(found, weights, numbers)
+
+    def fit(self, measured: Observations, start: State, prior: Prior | None = None) -> Estimate:
+        """`estimate` from all that was measured in a frame."""
+        return self.estimate(
+            measured.points, measured.pixels, measured.weights, start, measured.normals, prior, measured.depths
+        )
+
+    def linear(self, measured: Observations, estimate: Estimate) -> LinearCost:
+        """The cost of what was measured, about an estimate made from it."""
+        huber = self.options.huber_px
+        return LinearCost.about(measured, estimate.state, estimate.residuals, self.camera, huber, self.scale)
+
+    def estimate_from(
+        self, points: BoundPoints, pixels: Array, weights: Array, starts: Sequence[State]
+    ) -> list[Estimate]:
+        """Minimise, as `estimate` does, from several starts; the estimates in order of their cost."""
+        found = [self.estimate(points, pixels, weights, start) for start in starts]
+        return sorted(found, key=lambda estimate: estimate.cost)
+
+    def finished(self, found: Minimum, weights: Array, numbers: NDArray[np.integer]) -> Estimate:
+        """The estimate at a minimum; ``numbers`` (p,) says how many each point gives."""
+        model, state, residuals = self.model, found.state, found.residuals
+        used = (weights > 0.0) & np.isfinite(residuals).all(axis=1)
+        sigma, covariance = huber_covariance(
+            found.hessian, residuals[used], weights[used], numbers[used], self.options.huber_px, self.box.scale
+        )
+        margin = BOUND_SHARE * (model.upper - model.lower)
+        at_bound = (state.parameters < model.lower + margin) | (state.parameters > model.upper - margin)
+        return Estimate(state, found.cost, residuals, sigma, covariance, at_bound, found.iterations, found.converged)

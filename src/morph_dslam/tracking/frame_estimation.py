@@ -1,0 +1,203 @@
+"""Estimating the object's state in one frame from what is measured against the reference view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import TrackingError
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.model import Parameter
+from morph_dslam.timing import StageClock
+from morph_dslam.tracking.depth import PointDepths
+from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
+from morph_dslam.tracking.measurement import Measurement
+from morph_dslam.tracking.noise import Observations, PointNoise, RigObservations, window_correlation
+from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.reference import ReferenceView
+from morph_dslam.tracking.result import Image, PoseHypothesis
+from morph_dslam.tracking.sequence_filter import Fitter, SequenceFilter
+from morph_dslam.tracking.shape_search import BoundSearch, ShapeSearch
+
+#: Share of the cost below which another shape is a better explanation and not the same one.
+CLEARLY_BETTER = 0.95
+
+#: The least spread of residuals, pixels, that is believed when they are weighed against depths.
+LEAST_SIGMA_PX = 0.1
+
+
+class FrameEstimation:
+    """Makes attempts at one frame after the other; priors are what the map tells of the pose, if anything."""
+
+    def __init__(self, estimator: Estimator, reference: ReferenceView, options: TrackerOptions) -> None:
+        self._estimator, self._reference, self._options = estimator, reference, options
+        self._noise = PointNoise()
+        self._search = ShapeSearch(estimator.model, options.searches)
+        self._off_bound = BoundSearch(estimator.model, options.searches)
+        brief = replace(options.estimation, max_iterations=10, tolerance=1e-3)
+        self._scout = Estimator(estimator.model, estimator.camera, brief)
+
+    def rough(self, followed: Measurement, start: State, prior: Prior | None) -> State:
+        """The state by what was followed from the previous frame; only a start for `correct`."""
+        weights = followed.valid.astype(float)
+        return self._scout.estimate(self._reference.points, followed.pixels, weights, start, prior=prior).state
+
+    def correct(
+        self, picture: Image, state: State, followed: Measurement | None, prior: Prior | None, clock: StageClock
+    ) -> PoseHypothesis:
+        """Measure against the reference view rendered in ``state`` and estimate from these measurements."""
+        measurement = self._reference.measure(picture, state, followed, clock)
+        with clock.stage("estimate"):
+            return self._trimmed(measurement, state, prior)
+
+    def _trimmed(self, measurement: Measurement, start: State, prior: Prior | None) -> PoseHypothesis:
+        """Estimate from all valid measurements, then from those that agree with the first estimate."""
+        estimate, used = None, measurement.valid
+        for _ in range(2):
+            estimate = self._estimate(measurement, used, start, prior)
+            limit = np.clip(self._options.inlier_sigmas * estimate.sigma_px, *self._options.inlier_px)
+            with np.errstate(invalid="ignore"):
+                close = np.linalg.norm(estimate.residuals, axis=1) < limit
+            agreeing = measurement.valid & close
+            if (agreeing == used).all():
+                break
+            start, used = estimate.state, agreeing
+        assert estimate is not None
+        return PoseHypothesis(estimate, used, measurement, self._noise.weights(measurement.spread, used), prior)
+
+    def _estimate(
+        self, measurement: Measurement, used: NDArray[np.bool_], start: State, prior: Prior | None
+    ) -> Estimate:
+        weights = self._noise.weights(measurement.spread, used)
+        return self._estimator.estimate(self._reference.points, measurement.pixels, weights, start, prior=prior)
+
+    def learn(self, attempt: PoseHypothesis) -> None:
+        """Take in how well the points agreed in a frame that is believed."""
+        residuals = attempt.estimate.residuals[: len(attempt.inliers)]
+        self._noise.learn(attempt.measurement.spread, residuals, attempt.inliers)
+
+    def search_other_shapes(self, attempt: PoseHypothesis) -> PoseHypothesis:
+        """The attempt, or a clearly better explanation of its measurements reached from another shape."""
+        if not attempt.estimate.sigma_px < np.inf:
+            return attempt
+        starts = self._off_bound.next_starts(attempt.estimate)
+        if starts:
+            attempt = self.best_of(attempt, starts)
+        if not self._options.search_above_px < attempt.estimate.sigma_px:
+            return attempt
+        return self.best_of(attempt, self._search.next_starts(attempt.estimate.state.camera_from_object))
+
+    def best_of(self, attempt: PoseHypothesis, starts: list[State]) -> PoseHypothesis:
+        """The attempt, or a clearly better explanation of its measurements reached from one of the starts."""
+        measurement, estimate, prior = attempt.measurement, attempt.estimate, attempt.prior
+        points, weights = self._reference.points, self._noise.weights(measurement.spread, measurement.valid)
+        cost = self._estimator.evaluate(points, measurement.pixels, weights, estimate.state, prior=prior)[0]
+        found = [self._scout.estimate(points, measurement.pixels, weights, start, prior=prior) for start in starts]
+        best = min(found, key=lambda other: other.cost, default=estimate)
+        if best.cost > CLEARLY_BETTER * cost:
+            return attempt
+        return self._trimmed(measurement, best.state, prior)
+
+    def fit_outline(self, picture: Image, attempt: PoseHypothesis) -> PoseHypothesis:
+        """Estimate from the supporting points and the outline together; searched far first, then near."""
+        outline, options = self._reference.outline, self._options.outline
+        if outline is None:
+            return attempt
+        estimate, count, seen = attempt.estimate, len(self._reference.points), None
+        # After the first search the state only says where to look the second time: it need not be exact.
+        for reach, estimator in ((options.reach_px, self._scout), (options.reach_px // 2, self._estimator)):
+            seen = outline.measure(picture.grey, estimate.state, reach)
+            estimate = estimator.estimate(
+                self._reference.all_points,
+                np.concatenate([attempt.measurement.pixels, seen.pixels]),
+                np.concatenate([attempt.weights, np.where(seen.valid, options.weight, 0.0)]),
+                estimate.state,
+                np.concatenate([np.zeros((count, 2)), seen.normals]),
+                attempt.prior,
+            )
+        return replace(attempt, estimate=estimate, outline=seen)
+
+    def fit_depths(self, picture: Image, attempt: PoseHypothesis) -> PoseHypothesis:
+        """Estimate with the depths of the supporting points too, if a depth camera saw them."""
+        if picture.depth is None:
+            return attempt
+        # Points whose windows overlap err alike in the image, and each counts for less than its depth does.
+        squared_px = self._reference.redundancy * max(attempt.estimate.sigma_px, LEAST_SIGMA_PX) ** 2
+        pixels, camera, options = attempt.measurement.pixels, self._estimator.camera, self._options.depth
+        depths = PointDepths.sampled(picture.depth, pixels, attempt.inliers, camera, squared_px, options).padded(
+            len(self._reference.all_points)
+        )
+        attempt = replace(attempt, depths=depths)
+        seen = self.measured(attempt)
+        estimate = self._estimator.estimate(
+            seen.points, seen.pixels, seen.weights, attempt.estimate.state, seen.normals, attempt.prior, depths
+        )
+        return replace(attempt, estimate=estimate)
+
+    def measured(self, attempt: PoseHypothesis) -> Observations:
+        """All that an attempt was made from, the outline's points after the others."""
+        pixels, weights = attempt.measurement.pixels, attempt.weights
+        normals, seen = np.zeros_like(pixels), attempt.outline
+        if seen is not None:
+            pixels, normals = np.concatenate([pixels, seen.pixels]), np.concatenate([normals, seen.normals])
+            weights = np.concatenate([weights, np.where(seen.valid, self._options.outline.weight, 0.0)])
+        correlation = window_correlation(pixels, self._options.measurement.window)
+        return Observations(self._reference.all_points, pixels, weights, normals, correlation, attempt.depths)
+
+
+# What frames have to do with each other, by choice: parameters that are kept, that walk, and the start.
+
+
+Frame = TypeVar("Frame", Observations, RigObservations)
+
+
+def new_filter(estimator: Fitter[Frame], options: TrackerOptions) -> SequenceFilter[Frame]:
+    """The filter of what is one over the sequence and of what walks.
+
+    Raises
+    ------
+    TrackingError
+        If the model has not got such a parameter, one is to be both, or a step is not positive.
+    """
+    names = [parameter.name for parameter in estimator.model.parameters]
+    walking = dict(options.random_walk)
+    for name, what in [(n, "be one over the sequence") for n in options.per_sequence] + [(n, "walk") for n in walking]:
+        if name not in names:
+            raise TrackingError(f"'{name}' cannot {what}: the model's parameters are " + ", ".join(names))
+    for name, step in walking.items():
+        if name in options.per_sequence:
+            raise TrackingError(f"'{name}' is one over the sequence, so it cannot walk: leave out one of both")
+        if not 0.0 < step < float("inf"):
+            raise TrackingError(f"the step of the random walk of '{name}' must be a positive number")
+    kept = [names.index(name) for name in options.per_sequence]
+    steps = {names.index(name): step for name, step in walking.items()}
+    return SequenceFilter(estimator, kept, options.filter, steps)
+
+
+def at_constant_velocity(before: State, last: State) -> State:
+    """The state that follows two others if the change goes on."""
+    change = last.camera_from_object @ before.camera_from_object.inverse
+    pose = change @ last.camera_from_object
+    return State(2.0 * last.parameters - before.parameters, RigidTransform(pose.rotation, pose.translation))
+
+
+def temporal_facts(parameters: Sequence[Parameter], options: TrackerOptions) -> dict[str, str]:
+    """What the summary of a run says of this."""
+    by_name = {parameter.name: parameter for parameter in parameters}
+    walks = [f"{name} by {by_name[name].display(step):.4g} {by_name[name].unit}" for name, step in options.random_walk]
+    said = []
+    if options.per_sequence:
+        said.append(f"one over the sequence, from all frames so far: {', '.join(options.per_sequence)}")
+    if walks:
+        said.append(f"random walk, standard deviation of the change from frame to frame: {', '.join(walks)}")
+    start = "previous state; the first guess of image motion assumes constant velocity"
+    if options.start == "constant-velocity":
+        start = "the state that the last two lead to at constant velocity"
+    return {
+        "temporal_prior": "; ".join([*said, "none on the others"]) if said else "none",
+        "start_of_each_frame": start,
+    }

@@ -1,0 +1,303 @@
+"""What the object looks like: the reference pictures as its texture, rendered in any other state.
+
+Measurements against this rendering always refer to the reference pictures, so their errors do not accumulate
+from frame to frame, and points that were hidden come back by themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.model import ReducedModel, SurfacePoints
+from morph_dslam.render.rasteriser import (
+    is_inside,
+    load_triangle,
+    pixel_window,
+    rasterise,
+    visible_points,
+    weight_steps,
+    weights_at,
+)
+from morph_dslam.render.texture import render_textured
+from morph_dslam.tracking.binding import View, facing, signed_areas
+from morph_dslam.tracking.patches import NEUTRAL, FlowOptions, compare_patches, follow
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """A rendered view.
+
+    Attributes
+    ----------
+    image : (h, w) uint8, the flattened texture as it should appear; `NEUTRAL` off the object.
+    depth : (h, w) float32 metres, infinity off the object.
+    """
+
+    image: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+
+
+class ReferenceAppearance:
+    """Reference pictures as a texture.
+
+    Parameters
+    ----------
+    flats : (h, w) each, the flattened pictures. views : the mesh in each of them.
+    sources : (m,) the picture that gives each triangle its texture; the first by default.
+    closed : see `rasterise`.
+
+    Attributes
+    ----------
+    facing : (m,) which side of each triangle its picture shows; see `binding.facing`.
+    """
+
+    def __init__(
+        self,
+        model: ReducedModel,
+        camera: PinholeCamera,
+        flats: Sequence[NDArray[np.uint8]],
+        views: Sequence[View],
+        sources: NDArray[np.int64] | None = None,
+        closed: bool = False,
+    ) -> None:
+        self._triangles, self._closed = np.ascontiguousarray(model.triangles, dtype=np.int64), closed
+        self._camera = camera
+        sources = np.zeros(len(self._triangles), dtype=np.int64) if sources is None else sources
+        # One picture below the other, so that a triangle's place says which one it is from.
+        self._texture = np.ascontiguousarray(np.concatenate(flats))
+        self._coordinates = np.empty((len(self._triangles), 3, 2))
+        self.facing = np.empty(len(self._triangles), dtype=bool)
+        for number, view in enumerate(views):
+            rows = sources == number
+            below = np.array([0.0, number * camera.height])
+            self._coordinates[rows] = view.pixels[self._triangles[rows]] + below
+            self.facing[rows] = facing(view, self._triangles[rows])
+
+    def render(self, view: View) -> Rendering:
+        """The object alone, in another view of it."""
+        height, width = self._camera.height, self._camera.width
+        image = np.full((height, width), NEUTRAL, dtype=np.uint8)
+        depth = np.full((height, width), np.inf, dtype=np.float32)
+        draw_textured(
+            view.pixels,
+            np.ascontiguousarray(view.nodes[:, 2]),
+            self._triangles,
+            self._coordinates,
+            self._texture,
+            self._closed,
+            image,
+            depth,
+        )
+        return Rendering(image, depth)
+
+
+# Drawing a textured surface in one pass over its triangles: image and depth only, for every frame.
+# The same picture as `rasterise` followed by `render_textured`, at half the time: which triangle a pixel sees
+# and where on it need not be kept.
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _draw_triangle(area, u, v, q, x, y, texture, image, depth):
+    """Draw one triangle: twice its area, and its corners' pixels u, v, inverse depths q and texture
+    coordinates x, y, all (3,)."""
+    last_row, last_column = texture.shape[0] - 1, texture.shape[1] - 1
+    left, right, top, bottom = pixel_window(u, v, *depth.shape)
+    step0, step1 = weight_steps(v, area)
+    for row in range(top, bottom + 1):
+        first0, first1 = weights_at(u, v, area, left, row)
+        for column in range(left, right + 1):
+            b0, b1 = first0 + (column - left) * step0, first1 + (column - left) * step1
+            b2 = 1.0 - b0 - b1
+            if not is_inside(b0, b1, b2):
+                continue
+            w0, w1, w2 = b0 * q[0], b1 * q[1], b2 * q[2]
+            z = 1.0 / (w0 + w1 + w2)
+            if not z < depth[row, column]:
+                continue
+            depth[row, column] = z
+            s = min(max((w0 * x[0] + w1 * x[1] + w2 * x[2]) * z, 0.0), last_column)
+            t = min(max((w0 * y[0] + w1 * y[1] + w2 * y[2]) * z, 0.0), last_row)
+            s0, t0 = int(s), int(t)
+            s1, t1 = min(s0 + 1, last_column), min(t0 + 1, last_row)
+            a, b = s - s0, t - t0
+            above = (1.0 - a) * texture[t0, s0] + a * texture[t0, s1]
+            below = (1.0 - a) * texture[t1, s0] + a * texture[t1, s1]
+            image[row, column] = np.uint8((1.0 - b) * above + b * below + 0.5)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image, depth):
+    """Draw a textured surface over what is in ``image`` and ``depth`` already.
+
+    Parameters
+    ----------
+    pixels, depths, triangles, closed : see `rasterise`. coordinates : (m, 3, 2) column and row of each
+        triangle's corners in the texture, texture pixels; outside it is its border. texture : (H, W) uint8.
+    image, depth : (h, w) uint8 and float32, the unit of ``depths``; changed where the surface is nearest.
+    """
+    u, v, q, x, y = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for t in range(triangles.shape[0]):
+        area = load_triangle(pixels, depths, triangles, t, closed, u, v, q)
+        if area == 0.0:
+            continue
+        for corner in range(3):
+            x[corner], y[corner] = coordinates[t, corner, 0], coordinates[t, corner, 1]
+        _draw_triangle(area, u, v, q, x, y, texture, image, depth)
+
+
+def draw_textured_numpy(pixels, depths, triangles, coordinates, texture, closed, image, depth):
+    """The plain twin of `draw_textured`, in two passes."""
+    buffers = rasterise(pixels, depths, triangles, *depth.shape, closed=closed)
+    nearest = buffers.depth < depth
+    corners = np.arange(3 * len(triangles)).reshape(-1, 3)
+    image[nearest] = render_textured(buffers, corners, coordinates.reshape(-1, 2), texture)[nearest]
+    depth[nearest] = buffers.depth[nearest]
+
+
+# Where the object's bound points are seen in a frame, and which of these measurements to believe.
+
+
+#: Pyramid levels that reach as far as a correction may: a quarter of the size, with windows of 17 pixels.
+CORRECTION_LEVELS = 2
+
+#: A point this share of the object's depth behind the z-buffer counts as hidden.
+DEPTH_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class MeasurementOptions:
+    """What a measurement must satisfy.
+
+    Attributes
+    ----------
+    patch_half : patches compared are (2 patch_half + 1) pixels wide.
+    least_correlation : patches of the rendering and of the frame that agree less are rejected.
+    largest_correction_px : a point found farther from where the rendering shows it is rejected.
+    """
+
+    patch_half: int = 7
+    least_correlation: float = 0.6
+    largest_correction_px: float = 12.0
+
+    @property
+    def window(self) -> int:
+        """Side of the patches that tell where a point is, pixels."""
+        return 2 * self.patch_half + 1
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Points found in a frame.
+
+    Attributes
+    ----------
+    pixels : (p, 2) where they were found. valid : (p,) which to believe.
+    visible : (p,) which no other part of the object hides.
+    spread : (p,) how exactly by what the patches differ, pixels, up to a factor; see `compare_patches`.
+    depth : (h, w) metres, of the object as it was drawn for the comparison; None where it was not.
+    """
+
+    pixels: Array
+    valid: NDArray[np.bool_]
+    visible: NDArray[np.bool_]
+    spread: Array
+    depth: NDArray[np.float32] | None = None
+
+
+def visible_surface(
+    points: SurfacePoints,
+    positions: Array,
+    pixels: Array,
+    view: View,
+    triangles: NDArray[np.int64],
+    appearance: ReferenceAppearance,
+    rendering: Rendering,
+) -> NDArray[np.bool_]:
+    """Which surface points show the side that the reference view shows, with nothing of the object before it.
+
+    Parameters
+    ----------
+    positions : (p, 3) of the points in the camera frame. pixels : (p, 2) of them.
+    """
+    same_side = facing(view, triangles[points.triangles]) == appearance.facing[points.triangles]
+    depths = positions[:, 2]
+    tolerance = DEPTH_TOLERANCE * float(np.median(depths))
+    return same_side & visible_points(pixels, depths, rendering.depth, tolerance)
+
+
+def compare_with_rendering(
+    frame: NDArray[np.uint8],
+    rendering: Rendering,
+    predicted: Array,
+    guesses: Array,
+    visible: NDArray[np.bool_],
+    flow: FlowOptions,
+    options: MeasurementOptions,
+) -> Measurement:
+    """Follow points from the rendered reference view to the frame.
+
+    Parameters
+    ----------
+    frame : (h, w) the flattened frame. predicted : (p, 2) where the rendering shows the points.
+    guesses : (p, 2) where to start looking for them in the frame.
+    """
+    rows = np.flatnonzero(visible)
+    near = replace(flow, levels=min(flow.levels, CORRECTION_LEVELS))
+    found, ok = follow(rendering.image, frame, predicted[rows], guesses[rows], near)
+    found, correlation, exactness = compare_patches(rendering.image, frame, predicted[rows], found, options.patch_half)
+    correction = np.linalg.norm(found - predicted[rows], axis=1)
+    ok &= (correction < options.largest_correction_px) & np.isfinite(exactness)
+    ok &= correlation > options.least_correlation
+    pixels, valid = predicted.copy(), np.zeros(len(predicted), dtype=bool)
+    spread = np.full(len(predicted), np.inf)
+    pixels[rows], valid[rows], spread[rows] = found, ok, exactness
+    return Measurement(pixels, valid, visible, spread, rendering.depth)
+
+
+# Which of several pictures gives each part of the surface its texture.
+
+
+#: Another picture takes a triangle over from the first where it shows that much more area: seams are few, and
+#: the first picture's place is known best.
+PREFERENCE = 2.0
+
+
+def shown_areas(view: View, triangles: NDArray[np.int64], depth: NDArray[np.float32], closed: bool) -> Array:
+    """Area (m,) of triangles (m, 3) in a picture, squared pixels; 0 where they are not wholly seen.
+
+    Parameters
+    ----------
+    depth : (h, w) of the object in ``view``, metres. closed : whether only outer sides can be seen.
+    """
+    areas = signed_areas(view.pixels[triangles])
+    tolerance = DEPTH_TOLERANCE * float(np.nanmedian(view.nodes[:, 2]))
+    seen = visible_points(view.pixels, view.nodes[:, 2], depth, tolerance)
+    # A corner on the outline may be hidden by its own neighbour within a pixel; the middle may not.
+    middles = view.nodes[triangles].mean(axis=1)
+    pixels = view.pixels[triangles].mean(axis=1)
+    shown = seen[triangles].all(axis=1) & visible_points(pixels, middles[:, 2], depth, tolerance)
+    shown &= np.isfinite(areas) & ((areas < 0.0) | (not closed))
+    return np.where(shown, np.abs(areas), 0.0)
+
+
+def choose_sources(areas: Sequence[Array]) -> NDArray[np.int64]:
+    """The picture (m,) that shows each triangle largest, by the areas (m,) of all; the first in doubt."""
+    scores = np.stack(list(areas))
+    scores[0] *= PREFERENCE
+    return scores.argmax(axis=0)
+
+
+def part_from(number: int, triangle_ids: NDArray[np.int32], sources: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Pixels (h, w) that see a triangle whose texture is from picture ``number``.
+
+    ``triangle_ids`` (h, w) says which triangle each pixel sees, -1 for none.
+    """
+    return np.append(sources == number, False)[triangle_ids]

@@ -1,0 +1,238 @@
+"""What an estimate was made from, and how large and how alike the errors of its measurements are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse
+from numba import njit
+from numpy.typing import NDArray
+
+from morph_dslam.tracking.depth import PointDepths
+from morph_dslam.tracking.state import BoundPoints
+
+Array = NDArray[np.float64]
+
+#: Of errors: whole, or, of those that few others share, sparse.
+Correlation = Array | scipy.sparse.csr_array
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What an estimate was made from, in one frame.
+
+    Attributes
+    ----------
+    points : p of them. pixels : (p, 2) as measured. weights : (p,), inverse variances up to a factor.
+    normals : (p, 2), zero for points that count in both directions; see `reprojection.linearise`.
+    correlation : (p, p) of the errors of the points' measurements. depths : where a depth camera saw them.
+    """
+
+    points: BoundPoints
+    pixels: Array
+    weights: Array
+    normals: Array
+    correlation: Correlation
+    depths: PointDepths | None = None
+
+    @property
+    def numbers(self) -> NDArray[np.int64]:
+        """How many numbers each point (p,) gives: one on an outline, two otherwise."""
+        return np.where((self.normals != 0.0).any(axis=1), 1, 2)
+
+    @property
+    def redundancy(self) -> float:
+        """How many of the points count as one, because their windows overlap."""
+        exactness = np.sqrt(self.weights)
+        return float(exactness @ self.correlation @ exactness) / max(float(self.weights.sum()), 1e-300)
+
+
+@dataclass(frozen=True)
+class RigObservations:
+    """What several cameras measured at the same time, by camera; their points come one after the other."""
+
+    views: tuple[Observations, ...]
+
+    @cached_property
+    def weights(self) -> Array:
+        """(p,) of all points."""
+        return np.concatenate([view.weights for view in self.views])
+
+    @cached_property
+    def numbers(self) -> NDArray[np.int64]:
+        """(p,) as in `Observations`."""
+        return np.concatenate([view.numbers for view in self.views])
+
+    @cached_property
+    def correlation(self) -> Correlation:
+        """(p, p); the errors of different cameras have nothing in common."""
+        return scipy.sparse.csr_array(scipy.sparse.block_diag([view.correlation for view in self.views]))
+
+
+def window_correlation(pixels: Array, window: int) -> scipy.sparse.csr_array:
+    """Correlation (p, p) of measurements at ``pixels`` (p, 2): the share of their windows that is the same.
+
+    ``window`` is the side of the square that is compared, in pixels. Points at NaN have no window.
+    """
+    return scipy.sparse.csr_array(_overlaps(pixels, float(window)), shape=(len(pixels), len(pixels)))
+
+
+@njit(cache=True, nogil=True)
+def _overlaps(pixels, window):
+    """Values, columns and beginnings of the rows of the sparse matrix of shared windows."""
+    count = len(pixels)
+    from_left = np.argsort(np.where(np.isfinite(pixels[:, 0]), pixels[:, 0], np.inf))
+    found, begins = np.ones(count, np.int32), np.zeros(count + 1, np.int32)
+    for fill in (False, True):
+        if fill:
+            begins[1:] = np.cumsum(found)
+            values, columns = np.ones(begins[-1]), np.empty(begins[-1], np.int32)
+            columns[begins[:-1]] = np.arange(count)
+            found[:] = 1
+        for place, i in enumerate(from_left):
+            for j in from_left[place + 1 :]:
+                right, down = pixels[j, 0] - pixels[i, 0], abs(pixels[i, 1] - pixels[j, 1])
+                if not right < window:
+                    break
+                if down < window:
+                    if fill:
+                        share = (1.0 - right / window) * (1.0 - down / window)
+                        values[begins[i] + found[i]] = values[begins[j] + found[j]] = share
+                        columns[begins[i] + found[i]], columns[begins[j] + found[j]] = j, i
+                    found[i] += 1
+                    found[j] += 1
+    return values, columns, begins
+
+
+def window_correlation_numpy(pixels: Array, window: int) -> Array:
+    """The plain twin of `window_correlation`."""
+    overlap = np.ones((len(pixels), len(pixels)))
+    for column in pixels.T:
+        overlap *= np.fmax(0.0, 1.0 - np.abs(column[:, None] - column[None]) / window)
+    np.fill_diagonal(overlap, 1.0)
+    return overlap
+
+
+#: An estimate that takes up more of the variance leaves too little, as a share, to tell how large it is.
+LEAST_LEFT = 0.25
+
+
+class PixelNoise:
+    """The variance of a coordinate of a point of weight 1: what stays with the point, and what is new."""
+
+    def __init__(self, memory: float) -> None:
+        self._fade, self._count, self._product = np.exp(-1.0 / memory), 0.0, 0.0
+        self._before: Array | None = None
+        self.common, self.frame = 0.0, 0.0
+
+    def change_points(self) -> None:
+        """The next frame's residuals are of other points: they cannot be compared with the last ones."""
+        self._before = None
+
+    def add(self, residuals: Array, measured: Observations | RigObservations, taken: float) -> None:
+        """Learn from the residuals (p, 2) of a frame; those of the frame before tell what stays.
+
+        ``taken`` is how many numbers' worth of variance the estimate has taken up.
+        """
+        used = (measured.weights > 0.0) & np.isfinite(residuals).all(axis=1)
+        numbers = measured.numbers[used].sum()
+        # In what a point of weight 1 is off by.
+        residuals = np.where(used[:, None], np.sqrt(measured.weights)[:, None] * residuals, np.nan)
+        total = np.nansum(residuals**2) / max(numbers - taken, LEAST_LEFT * numbers, 1)
+        if self._before is not None:
+            products = residuals * self._before
+            pairs = np.isfinite(products)
+            self._count = self._fade * self._count + pairs.sum()
+            self._product = self._fade * self._product + np.nansum(products)
+        self._before = residuals
+        # As long as there is nothing to compare with, all of it is taken to stay.
+        stays = self._product / self._count if self._count else np.inf
+        self.common = float(np.clip(stays, 0.0, total))
+        self.frame = float(total - self.common)
+
+
+# How exactly each point is measured in a frame, and what it counts by that.
+# What patches of the rendered view and of the frame differ by, tells how exactly a point was found: something
+# else may be in a part of its window, or the surface may be seen much broader than in the reference view.
+# Apart from that, a model that is a little off leaves residuals that all points have alike. A residual's
+# variance is so taken to be f s² + t, with s what the patches tell; f and t are learnt from the residuals of
+# the frames. Where the model leaves nothing, points whose patches differ more err by more than in proportion,
+# because a part of a window that is covered moves what is found as a whole. The variance is then taken to be
+# f s^2p, and the power p >= 1 is learnt.
+
+
+#: Nothing is known better than by this, pixels, whatever the patches say.
+LEAST_SPREAD_PX = 0.01
+
+#: With differences that are independent from pixel to pixel f is 1; blur makes neighbours alike, so that they
+#: count as fewer. A larger f is no noise of the patches but what the model leaves, where it moves them most.
+LARGEST_FACTOR = 4.0
+
+#: Larger powers of what the patches tell would leave few points to decide.
+LARGEST_POWER = 1.5
+
+#: Share of the latest frame in what is learnt, and points that it must have to tell.
+LEARNING_RATE, LEAST_POINTS = 0.05, 20
+
+#: The length of a Gaussian pair has this median, in standard deviations of a coordinate (Rayleigh).
+MEDIAN_OF_PAIR = 1.1774
+
+
+class PointNoise:
+    """Weights of points; all the same until frames were learnt from."""
+
+    def __init__(self) -> None:
+        self._moments: Array | None = None
+
+    @property
+    def common(self) -> float:
+        """t / f in squared pixels; infinite where the patches do not tell how exact a point is."""
+        if self._moments is None:
+            return np.inf
+        told, squared = self._moments.T
+        factor = min((squared[1] - squared[0]) / max(told[1] - told[0], 1e-300), LARGEST_FACTOR)
+        if factor <= 0.0:
+            return np.inf
+        return max(float(squared.mean() / factor - told.mean()), LEAST_SPREAD_PX**2)
+
+    @property
+    def power(self) -> float:
+        """p; 1 where the patches tell too little, or the model leaves something."""
+        if self._moments is None or self.common > LEAST_SPREAD_PX**2:
+            return 1.0
+        told, squared = np.log(np.maximum(self._moments.T, 1e-300))
+        return float(np.clip((squared[1] - squared[0]) / (told[1] - told[0]), 1.0, LARGEST_POWER))
+
+    def weights(self, spread: Array, used: NDArray[np.bool_]) -> Array:
+        """Inverse variances (p,), in that of a typical point; zero for points that are not ``used`` (p,).
+
+        ``spread`` (p,) is what the patches tell, see `compare_patches`.
+        """
+        common = self.common
+        if np.isinf(common) or not used.any():
+            return used.astype(float)
+        variance = (spread**2 + common) ** self.power
+        return np.where(used, _middle(variance[used]) / variance, 0.0)
+
+    def learn(self, spread: Array, residuals: Array, used: NDArray[np.bool_]) -> None:
+        """Take in the residuals (p, 2) of a frame: of the better half of the points and of the other."""
+        used = used & np.isfinite(spread) & np.isfinite(residuals).all(axis=1)
+        if used.sum() < LEAST_POINTS:
+            return
+        spread, length = spread[used], np.linalg.norm(residuals[used], axis=1)
+        better = spread <= _middle(spread)
+        if better.all():
+            return
+        moments = np.array(
+            [[_middle(spread[half]) ** 2, (_middle(length[half]) / MEDIAN_OF_PAIR) ** 2] for half in (better, ~better)]
+        )
+        before = moments if self._moments is None else self._moments
+        self._moments = before + LEARNING_RATE * (moments - before)
+
+
+def _middle(values: Array) -> float:
+    """The upper median of numbers (n,); numpy's own takes five times as long for some hundred."""
+    half = len(values) // 2
+    return float(np.partition(values, half)[half])

@@ -1,0 +1,223 @@
+"""Which parameters the images tell, and how well: from the covariance without any prior on the parameters.
+
+A parameter, or a combination of several, is not told where the 95 % interval is as wide as its range: then
+the start, a bound or a prior decides on its value, not the images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.geometry import cross_matrix
+from morph_dslam.model import Parameter, ReducedModel
+from morph_dslam.model.reduced_model import von_mises
+from morph_dslam.model.separated import SeparatedField
+from morph_dslam.tracking.estimator import Estimate
+
+Array = NDArray[np.float64]
+
+#: A standard deviation of this share of a parameter's range makes the 95 % interval as wide as the range.
+UNTOLD_SHARE = 0.25
+
+#: A parameter takes part in a combination when its share of the direction is larger.
+PART = 0.2
+
+#: Half the width of a 95 % interval in standard deviations of a Gaussian.
+INTERVAL_95 = 1.96
+
+
+@dataclass(frozen=True)
+class Unobservable:
+    """Parameters that the images do not tell, or not apart.
+
+    Attributes
+    ----------
+    indices : of the parameters. directions : (k, d) combinations of them that are not told, of length one in
+        shares of the ranges.
+    """
+
+    indices: tuple[int, ...]
+    directions: Array
+
+
+def unobservable(covariance: Array, ranges: Array) -> list[Unobservable]:
+    """What a covariance (d, d) of parameters with these ranges (d,) leaves open.
+
+    Parameters that hardly matter, even if all others were known, come one by one; combinations of the rest
+    after them, those that share a parameter together.
+    """
+    d = len(ranges)
+    unit = np.eye(d)
+    if not np.isfinite(covariance).all():
+        return [Unobservable((k,), unit[k : k + 1]) for k in range(d)]
+    values, vectors = np.linalg.eigh(covariance / np.outer(ranges, ranges))
+    information = (vectors / np.maximum(values, 1e-300)) @ vectors.T
+    no_effect = np.diag(information) <= UNTOLD_SHARE**-2
+    found = [Unobservable((int(k),), unit[k : k + 1]) for k in np.flatnonzero(no_effect)]
+    rest = np.flatnonzero(~no_effect)
+    if len(rest):
+        found += _combinations(information[np.ix_(rest, rest)], unit[rest])
+    return found
+
+
+def _combinations(information: Array, axes: Array) -> list[Unobservable]:
+    """Directions of little information (r, r), in the unknowns with these ``axes`` (r, d)."""
+    values, vectors = np.linalg.eigh(information)
+    directions = (vectors[:, values <= UNTOLD_SHARE**-2].T) @ axes
+    groups: list[tuple[set[int], list[Array]]] = []
+    for direction in directions:
+        members = set(np.flatnonzero(np.abs(direction) > PART).tolist())
+        joined = [group for group in groups if group[0] & members]
+        groups = [group for group in groups if not group[0] & members]
+        groups.append((members.union(*(g[0] for g in joined)), [direction, *(v for g in joined for v in g[1])]))
+    return [Unobservable(tuple(sorted(members)), np.array(rows)) for members, rows in groups]
+
+
+def covariance_of_parameters(estimate: Estimate) -> Array:
+    """(d, d), from the images and what is known of the pose, without a prior on the parameters."""
+    d = len(estimate.state.parameters)
+    measured = estimate.measured_covariance
+    return (estimate.covariance if measured is None else measured)[:d, :d]
+
+
+def untold_in_run(
+    parameters: Sequence[Parameter], estimates: Sequence[Estimate]
+) -> dict[tuple[int, ...], tuple[int, Unobservable]]:
+    """What is not told in the frames of a run: by the parameters' indices in how many, and the last of it."""
+    ranges = np.array([p.upper - p.lower for p in parameters])
+    found: dict[tuple[int, ...], tuple[int, Unobservable]] = {}
+    for estimate in estimates:
+        for part in unobservable(covariance_of_parameters(estimate), ranges):
+            found[part.indices] = (found.get(part.indices, (0, part))[0] + 1, part)
+    return found
+
+
+def statement(parameters: Sequence[Parameter], part: Unobservable, where: str) -> str:
+    """A sentence on what is not told ``where``."""
+    names = [f"'{parameters[k].name}'" for k in part.indices]
+    if len(names) == 1:
+        return f"parameter {names[0]} cannot be told from the images {where}"
+    text = f"parameters {', '.join(names[:-1])} and {names[-1]} cannot be told apart from the images {where}"
+    if len(part.directions) > 1:
+        return text
+    along = part.directions[0] * np.sign(part.directions[0][part.indices[0]])
+    changes = [_change(parameters[k], along[k]) for k in part.indices]
+    return f"{text}: they stay the same when {' and '.join(changes)}"
+
+
+def _change(parameter: Parameter, share: float) -> str:
+    size = abs(share) * 0.1 * (parameter.display(parameter.upper) - parameter.display(parameter.lower))
+    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    return f"'{parameter.name}' is {size:.3g}{unit} {'larger' if share > 0 else 'smaller'}"
+
+
+def one_value(parameter: Parameter, value: float, deviation: float) -> dict[str, object]:
+    """The figures of a parameter that is one over the sequence, in its own unit."""
+    low, high = value - INTERVAL_95 * deviation, value + INTERVAL_95 * deviation
+    return {
+        "name": parameter.name,
+        "unit": parameter.unit,
+        "value": parameter.display(value),
+        "standard_deviation": parameter.display(deviation),
+        "interval_95": [parameter.display(low), parameter.display(high)],
+        "told_by_the_images": bool(deviation < UNTOLD_SHARE * (parameter.upper - parameter.lower)),
+    }
+
+
+def value_line(figures: dict) -> str:
+    """One line for the command line from `one_value`."""
+    unit = "" if figures["unit"] == "1" else f" {figures['unit']}"
+    low, high = figures["interval_95"]
+    text = f"{figures['name']} = {figures['value']:.4g}{unit} over the sequence"
+    if not figures["told_by_the_images"]:
+        return f"{text}, but the images do not tell"
+    return f"{text}, 95 % interval {low:.4g} to {high:.4g}{unit}"
+
+
+# How well an estimate tells displacements and stresses: the parameters' covariance through the modes.
+# A field F(X, mu) has to first order the covariance S C S' at each point, with its sensitivities S = dF/dmu
+# and the parameters' covariance C. It is what the images leave open; the model's own error comes on top.
+
+
+#: Von Mises stress is sqrt(s' Q s), of three plane or of six components of the stress.
+_PLANE = np.array([[1.0, -0.5, 0.0], [-0.5, 1.0, 0.0], [0.0, 0.0, 3.0]])
+
+_SOLID = np.zeros((6, 6))
+
+
+def displacement_std(model: ReducedModel, estimate: Estimate) -> Array:
+    """Standard deviation (n,) of the displacement of every node of ``model``, metres.
+
+    It is the root of the mean square distance, over all directions, in the object frame: the pose's
+    uncertainty is not in it.
+    """
+    _, slopes = model.displacement.value_and_sensitivities(estimate.state.parameters)
+    return np.sqrt(_variances(slopes, estimate).sum(axis=1))
+
+
+def position_std(model: ReducedModel, estimate: Estimate) -> Array:
+    """Standard deviation (n,) of the position of every node in the camera frame, metres.
+
+    It is the root of the mean square distance, over all directions, with the pose's uncertainty in it.
+    """
+    value, slopes = model.displacement.value_and_sensitivities(estimate.state.parameters)
+    rotation = estimate.state.camera_from_object.rotation
+    turned = (model.nodes + value) @ rotation.T
+    d = len(slopes)
+    jacobian = np.empty((len(turned), 3, d + 6))
+    jacobian[:, :, :d] = np.moveaxis(slopes @ rotation.T, 0, 2)
+    jacobian[:, :, d : d + 3] = -cross_matrix(turned)
+    jacobian[:, :, d + 3 :] = np.eye(3)
+    variances = np.einsum("nij,jk,nik->n", jacobian, estimate.covariance, jacobian, optimize=True)
+    return np.sqrt(np.maximum(variances, 0.0))
+
+
+def von_mises_std(model: ReducedModel, estimate: Estimate, place: str) -> Array:
+    """Standard deviation (n,) of the von Mises stress at ``place``, a key of ``model.stresses``, pascals."""
+    stress, slopes = model.stresses[place].value_and_sensitivities(estimate.state.parameters)
+    form = _PLANE if stress.shape[1] == 3 else _SOLID
+    turned = stress @ form
+    size = np.sqrt(np.einsum("nc,nc->n", turned, stress))
+    along = np.einsum("nc,dnc->dn", turned, slopes) / np.where(size > 0.0, size, 1.0)
+    return np.sqrt(_variances(along[:, :, None], estimate)[:, 0])
+
+
+def largest_displacement(model: ReducedModel, estimate: Estimate) -> tuple[float, float]:
+    """The largest length of a node's displacement, metres, and its standard deviation."""
+    value = model.displacement.value(estimate.state.parameters)
+    length = np.linalg.norm(value, axis=1)
+    node = int(length.argmax())
+    direction = value[node] / max(float(length[node]), 1e-300)
+    return float(length[node]), _deviation(model.displacement, node, direction, estimate)
+
+
+def largest_von_mises(model: ReducedModel, estimate: Estimate) -> tuple[float, float]:
+    """The largest von Mises stress of a node at any place, pascals, and its standard deviation; or NaN."""
+    found = (float("nan"), float("nan"))
+    for place in model.stresses:
+        stress = model.stresses[place].value(estimate.state.parameters)
+        sizes = von_mises(stress)
+        node = int(sizes.argmax())
+        if not sizes[node] <= found[0]:
+            form = _PLANE if stress.shape[1] == 3 else _SOLID
+            direction = form @ stress[node] / max(float(sizes[node]), 1e-300)
+            found = float(sizes[node]), _deviation(model.stresses[place], node, direction, estimate)
+    return found
+
+
+def _deviation(field: SeparatedField, node: int, direction: Array, estimate: Estimate) -> float:
+    """Standard deviation of a field's component along a direction (c,), at one of its points."""
+    there = field.with_modes(field.modes[:, [node]])
+    along = there.value_and_sensitivities(estimate.state.parameters)[1][:, 0] @ direction
+    return float(np.sqrt(_variances(along[:, None, None], estimate)[0, 0]))
+
+
+def _variances(slopes: Array, estimate: Estimate) -> Array:
+    """Variances (n, c) of what has the derivatives (d, n, c) by the parameters."""
+    d = len(slopes)
+    covariance = estimate.covariance[:d, :d]
+    return np.maximum(np.einsum("dnc,de,enc->nc", slopes, covariance, slopes, optimize=True), 0.0)

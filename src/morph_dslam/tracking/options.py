@@ -1,0 +1,83 @@
+"""What the tracker follows and what it demands before it believes a frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from morph_dslam.tracking.depth import DepthOptions
+from morph_dslam.tracking.discrepancy import DiscrepancyOptions
+from morph_dslam.tracking.estimator import EstimationOptions
+from morph_dslam.tracking.measurement import MeasurementOptions
+from morph_dslam.tracking.outline import OutlineOptions
+from morph_dslam.tracking.patches import FlowOptions
+from morph_dslam.tracking.sequence_filter import FilterOptions
+
+#: Where the search for a frame's state starts.
+StartFrom = Literal["previous", "constant-velocity"]
+
+
+@dataclass(frozen=True)
+class TrackerOptions:
+    """What the tracker follows and what it demands before it believes a frame.
+
+    Attributes
+    ----------
+    n_points : corners followed, spread over the reference view.
+    inlier_sigmas, inlier_px : a point supports the estimate when its residual is below so many robust
+        standard deviations, within these limits in pixels: a model that is a pixel off must not cost it good
+        points, and occluders that happen to look alike must not get in where it fits well.
+    search_above_px, searches : where the residuals' spread exceeds this, so many other shapes are tried in
+        the frame as starts, in turn, lest the estimate stay in a local minimum.
+    least_inliers, least_share : points that must support it, as a number or a share of all, if that is fewer.
+    few_sigma_px : where less than half of all points support it, their residuals must spread less than this.
+    least_anchored, anchored_share : where the map tells the pose, fewer points will do: at least this many,
+        if they are this share of the points found and agree as closely as few must.
+    hold_pose : take the pose from the map as exact, and estimate the parameters only.
+    moved_share, moved_sigmas, moved_patience : an anchored object has moved when its points show it farther
+        off than this share of its size, and than so many standard deviations, in so many frames on end.
+    look_every : a hidden object is looked for elsewhere in every so many frames.
+    use_outline : whether the object's outline counts too; it needs a background that it stands out from.
+    use_depth : whether the depth images of frames that have them count too.
+    discrepancy : look for what the object's shape has beyond the model's; None for the model alone.
+    per_sequence : names of the parameters that are one over the whole sequence.
+    random_walk : names of parameters that hardly change from frame to frame, each with the standard deviation
+        of the change, SI: a prior on them. None by default.
+    start : where the search for a frame's state starts: from the previous state, or from where the last two
+        lead at constant velocity.
+    new_views, max_views : whether frames in which the reference view shows too little of what is seen may
+        become reference views too, and how many are kept, the first one included.
+    further_views : whether other keyframes of the map of an anchored object are reference views with the one
+        that it is placed in.
+    """
+
+    n_points: int = 350
+    inlier_sigmas: float = 6.0
+    inlier_px: tuple[float, float] = (2.0, 8.0)
+    least_inliers: int = 30
+    least_share: float = 0.3
+    few_sigma_px: float = 1.0
+    least_anchored: int = 12
+    anchored_share: float = 0.7
+    hold_pose: bool = False
+    moved_share: float = 0.02
+    moved_sigmas: float = 5.0
+    moved_patience: int = 3
+    look_every: int = 5
+    search_above_px: float = 0.25
+    searches: int = 2
+    use_outline: bool = False
+    use_depth: bool = False
+    discrepancy: DiscrepancyOptions | None = None
+    per_sequence: tuple[str, ...] = ()
+    random_walk: tuple[tuple[str, float], ...] = ()
+    start: StartFrom = "previous"
+    new_views: bool = True
+    max_views: int = 12
+    further_views: bool = True
+    flow: FlowOptions = field(default_factory=FlowOptions)
+    measurement: MeasurementOptions = field(default_factory=MeasurementOptions)
+    outline: OutlineOptions = field(default_factory=OutlineOptions)
+    depth: DepthOptions = field(default_factory=DepthOptions)
+    estimation: EstimationOptions = field(default_factory=EstimationOptions)
+    filter: FilterOptions = field(default_factory=FilterOptions)

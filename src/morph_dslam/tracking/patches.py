@@ -1,0 +1,385 @@
+"""How well patches of two images agree, and where the second one is when light may have changed.
+
+Lucas and Kanade's least squares take two patches to differ by motion alone. What shades one of them, such as
+light on a bent surface, or the background that local contrast was measured against, moves their minimum by a
+tenth of a pixel, the same way over wide parts of an object. So their result is corrected by one step with
+gain, offset and slope of the brightness free (Jin, Favaro and Soatto, CVPR 2001, with the slopes of both
+patches as in Benhimane and Malis, IROS 2004).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+Array = NDArray[np.float64]
+
+#: A step longer than this, pixels, is no correction.
+LONGEST_STEP = 1.0
+
+#: Sums may be taken in any order: half the time.
+FAST = {"reassoc", "contract", "nsz"}
+
+
+@njit(cache=True, nogil=True)
+def _patch(image, x, y, patch):
+    """Fill a patch (n, n) with the image about it, its first pixel at (x, y), bilinearly."""
+    x0, y0 = int(x), int(y)
+    right, down = x - x0, y - y0
+    a, b = (1.0 - right) * (1.0 - down), right * (1.0 - down)
+    c, d = (1.0 - right) * down, right * down
+    for row in range(patch.shape[0]):
+        for column in range(patch.shape[1]):
+            u, v = x0 + column, y0 + row
+            patch[row, column] = a * image[v, u] + b * image[v, u + 1] + c * image[v + 1, u] + d * image[v + 1, u + 1]
+
+
+@njit(cache=True, nogil=True)
+def _both_patches(first, second, first_point, second_point, half, a, b):
+    """Fill both patches (2 half + 1)² about two points; False where one leaves its image."""
+    height, width = first.shape
+    x, y = first_point[0] - half, first_point[1] - half
+    u, v = second_point[0] - half, second_point[1] - half
+    inside = min(x, y, u, v) >= 0.0
+    inside &= max(x, u) + 2 * half < width - 1 and max(y, v) + 2 * half < height - 1
+    if inside:
+        _patch(first, x, y, a)
+        _patch(second, u, v, b)
+    return inside
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _products(a, b, first_row, first_column, size):
+    """Of parts (size, size) of two patches: sums of squares about their means, and of products."""
+    sum_a = sum_b = aa = bb = ab = 0.0
+    for row in range(first_row, first_row + size):
+        for column in range(first_column, first_column + size):
+            p, q = a[row, column] - 128.0, b[row, column] - 128.0
+            sum_a += p
+            sum_b += q
+            aa += p * p
+            bb += q * q
+            ab += p * q
+    count = float(size * size)
+    return aa - sum_a * sum_a / count, bb - sum_b * sum_b / count, ab - sum_a * sum_b / count
+
+
+@njit(cache=True, nogil=True)
+def patch_correlation(first, second, first_points, second_points, half):
+    """How alike square patches of two images are.
+
+    Parameters
+    ----------
+    first, second : (h, w) uint8. first_points, second_points : (p, 2) patch centres in each.
+    half : the patches are (2 half + 1) pixels wide.
+
+    Returns
+    -------
+    (p,) normalised, in [-1, 1]; -1 where a patch leaves its image, 0 where one has no contrast.
+    """
+    correlation, size = np.full(len(first_points), -1.0), 2 * half + 1
+    a, b = np.empty((size, size)), np.empty((size, size))
+    for j in range(len(first_points)):
+        if _both_patches(first, second, first_points[j], second_points[j], half, a, b):
+            aa, bb, ab = _products(a, b, 0, 0, size)
+            correlation[j] = ab / np.sqrt(aa * bb) if aa * bb > 1e-6 else 0.0
+    return correlation
+
+
+@njit(cache=True, nogil=True)
+def _worst_quarter(a, b, size):
+    """The largest mean square difference of a quarter of two patches (size, size), framed by a pixel."""
+    part, worst = size // 2, 0.0
+    for corner in range(4):
+        row = 1 if corner < 2 else 1 + size - part
+        column = 1 if corner % 2 == 0 else 1 + size - part
+        aa, bb, ab = _products(a, b, row, column, part)
+        worst = max(worst, (aa + bb - 2.0 * ab) / float(part * part))
+    return worst
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _normal_equations(a, b, half, sums, products):
+    """Sums over two patches, framed by a pixel, of what is to be fitted.
+
+    Of four signals, the slopes to the right and down, the first patch, and the second less the first:
+    ``sums`` (4, 3) of each times 1, x and y, and ``products`` (4, 4), the upper half.
+    """
+    sums[:] = 0.0
+    products[:] = 0.0
+    for row in range(1, 2 * half + 2):
+        y = float(row - half - 1)
+        for column in range(1, 2 * half + 2):
+            x = float(column - half - 1)
+            right = 0.25 * (a[row, column + 1] - a[row, column - 1] + b[row, column + 1] - b[row, column - 1])
+            down = 0.25 * (a[row + 1, column] - a[row - 1, column] + b[row + 1, column] - b[row - 1, column])
+            level = a[row, column] - 128.0
+            change = b[row, column] - a[row, column]
+            sums[0, 0] += right
+            sums[0, 1] += right * x
+            sums[0, 2] += right * y
+            sums[1, 0] += down
+            sums[1, 1] += down * x
+            sums[1, 2] += down * y
+            sums[2, 0] += level
+            sums[2, 1] += level * x
+            sums[2, 2] += level * y
+            sums[3, 0] += change
+            sums[3, 1] += change * x
+            sums[3, 2] += change * y
+            products[0, 0] += right * right
+            products[0, 1] += right * down
+            products[0, 2] += right * level
+            products[0, 3] += right * change
+            products[1, 1] += down * down
+            products[1, 2] += down * level
+            products[1, 3] += down * change
+            products[2, 2] += level * level
+            products[2, 3] += level * change
+            products[3, 3] += change * change
+
+
+@njit(cache=True, nogil=True)
+def _step(sums, products, half, step):
+    """The motion (2,) of the second patch, into ``step``; returns tr(G^-1) / 2, infinite if there is none.
+
+    Offset and slope of the brightness, which are orthogonal over the window, then the gain, are taken out of
+    all signals; what is left of the change is motion, with the normal matrix G.
+    """
+    size = 2 * half + 1
+    count, moment = float(size * size), float(size) * half * (half + 1) * size / 3.0
+    for i in range(4):
+        for j in range(i, 4):
+            products[i, j] -= sums[i, 0] * sums[j, 0] / count
+            products[i, j] -= (sums[i, 1] * sums[j, 1] + sums[i, 2] * sums[j, 2]) / moment
+    gain = products[2, 2]
+    if gain > 1e-6:
+        for i in range(2):
+            for j in (0, 1, 3):
+                if j >= i:
+                    # The gain's own column is the lower half's: products[2, 3] stands for [3, 2].
+                    other = products[2, 3] if j == 3 else products[j, 2]
+                    products[i, j] -= products[i, 2] * other / gain
+    xx, xy, yy = products[0, 0], products[0, 1], products[1, 1]
+    determinant = xx * yy - xy * xy
+    if not determinant > 1e-6 * (xx + yy) ** 2 + 1e-6:
+        return np.inf
+    step[0] = -(yy * products[0, 3] - xy * products[1, 3]) / determinant
+    step[1] = -(xx * products[1, 3] - xy * products[0, 3]) / determinant
+    if not step[0] ** 2 + step[1] ** 2 < LONGEST_STEP**2:
+        return np.inf
+    return 0.5 * (xx + yy) / determinant
+
+
+@njit(cache=True, nogil=True)
+def compare_patches(first, second, first_points, second_points, half):
+    """Where patches of one image are in another, light apart, and how exactly that is known.
+
+    What is left of the difference of the patches acts on the least squares like noise: with its mean square s
+    and the normal matrix G of the motion, the covariance of the place is s G^-1 (Foerstner, Image matching,
+    1993). The mean square is that of the quarter that differs most, about its means: what covers a corner of
+    a patch, or a corner that looks past the object, then counts in full.
+
+    Parameters
+    ----------
+    first, second : (h, w) uint8. first_points : (p, 2) patch centres in the first image.
+    second_points : (p, 2) in the second, by motion alone. half : the patches are (2 half + 1) pixels wide.
+
+    Returns
+    -------
+    places : (p, 2) in the second image. correlation : (p,) as of `patch_correlation`.
+    spread : (p,) standard deviation of a coordinate, pixels; infinite where it is not determined.
+    """
+    count, size = len(first_points), 2 * half + 1
+    places, correlation, spread = second_points.copy(), np.full(count, -1.0), np.full(count, np.inf)
+    a, b = np.empty((size + 2, size + 2)), np.empty((size + 2, size + 2))
+    sums, products, step = np.empty((4, 3)), np.empty((4, 4)), np.empty(2)
+    for j in range(count):
+        if not _both_patches(first, second, first_points[j], second_points[j], half + 1, a, b):
+            continue
+        aa, bb, ab = _products(a, b, 1, 1, size)
+        correlation[j] = ab / np.sqrt(aa * bb) if aa * bb > 1e-6 else 0.0
+        _normal_equations(a, b, half, sums, products)
+        inverse = _step(sums, products, half, step)
+        if inverse < np.inf:
+            places[j] += step
+            spread[j] = np.sqrt(_worst_quarter(a, b, size) * inverse)
+    return places, correlation, spread
+
+
+def _sampled(image: NDArray[np.uint8], centre: Array, half: int) -> Array | None:
+    """The patch (n, n) of an image about a point, bilinearly; None where it leaves the image."""
+    limit = np.array(image.shape[::-1]) - 1
+    if (centre - half < 0).any() or (centre + half >= limit).any():
+        return None
+    offsets = np.mgrid[-half : half + 1, -half : half + 1].astype(float)
+    return map_coordinates(image.astype(float), centre[::-1, None, None] + offsets, order=1)
+
+
+def _correlated(a: Array, b: Array) -> float:
+    a, b = a - a.mean(), b - b.mean()
+    squares = float((a * a).sum() * (b * b).sum())
+    return float((a * b).sum()) / np.sqrt(squares) if squares > 1e-6 else 0.0
+
+
+def patch_correlation_numpy(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], first_points: Array, second_points: Array, half: int
+) -> Array:
+    """The plain twin of `patch_correlation`, on scipy's bilinear sampling."""
+    found = np.full(len(first_points), -1.0)
+    for j, (p, q) in enumerate(zip(first_points, second_points, strict=True)):
+        a, b = _sampled(first, p, half), _sampled(second, q, half)
+        if a is not None and b is not None:
+            found[j] = _correlated(a, b)
+    return found
+
+
+def compare_patches_numpy(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], first_points: Array, second_points: Array, half: int
+) -> tuple[Array, Array, Array]:
+    """The plain twin of `compare_patches`: scipy's bilinear sampling, least squares of all six unknowns."""
+    count, n, inner = len(first_points), 2 * half + 1, slice(1, -1)
+    places, correlation, spread = second_points.astype(float), np.full(count, -1.0), np.full(count, np.inf)
+    y, x = np.mgrid[-half : half + 1, -half : half + 1].astype(float)
+    for j, (p, q) in enumerate(zip(first_points, second_points, strict=True)):
+        a, b = _sampled(first, p, half + 1), _sampled(second, q, half + 1)
+        if a is None or b is None:
+            continue
+        down, right = (np.asarray(np.gradient(0.5 * (a + b), axis=k))[inner, inner] for k in (0, 1))
+        a, b = a[inner, inner], b[inner, inner]
+        correlation[j] = _correlated(a, b)
+        rows = np.stack([-right, -down, np.ones_like(x), x, y, a - 128.0], axis=-1).reshape(-1, 6)
+        solution, _, rank, _ = np.linalg.lstsq(rows, (b - a).ravel(), rcond=1e-10)
+        if rank == 6 and np.linalg.norm(solution[:2]) < LONGEST_STEP:
+            places[j] += solution[:2]
+            ends = [slice(0, half), slice(n - half, n)]
+            worst = max(np.var((b - a)[part, side]) for part in ends for side in ends)
+            spread[j] = np.sqrt(0.5 * worst * np.trace(np.linalg.inv(rows.T @ rows)[:2, :2]))
+    return places, correlation, spread
+
+
+# Image motion: contrast-flattened images and pyramidal Lucas-Kanade.
+# Tracking works on flattened images (each pixel minus its neighbourhood's mean), so that shading, which
+# changes as the surface bends, does not count as motion.
+
+
+#: Grey level of a pixel that equals its neighbourhood's mean.
+NEUTRAL = 128
+
+
+@dataclass(frozen=True)
+class FlowOptions:
+    """Lucas-Kanade's window in pixels and pyramid levels above the image itself."""
+
+    window: int = 17
+    levels: int = 3
+    flatten_window: int = 31
+
+
+def flatten(grey: NDArray[np.uint8], window: int) -> NDArray[np.uint8]:
+    """Grey image (h, w) minus its mean over a square window, plus `NEUTRAL`; clipped to 0..255."""
+    mean = cv2.boxFilter(grey, -1, (window, window), borderType=cv2.BORDER_REFLECT)
+    return cv2.addWeighted(grey, 1.0, mean, -1.0, NEUTRAL)  # type: ignore[return-value]
+
+
+def follow(
+    source: NDArray[np.uint8], target: NDArray[np.uint8], points: Array, guesses: Array, options: FlowOptions
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Follow points from one flattened image to another (Bouguet's pyramidal Lucas-Kanade).
+
+    Parameters
+    ----------
+    points : (p, 2) in the source image, pixels. guesses : (p, 2) where to start in the target.
+
+    Returns
+    -------
+    (p, 2) positions in the target and (p,) which of them were found inside the image.
+    """
+    if not len(points):
+        return np.empty((0, 2)), np.empty(0, dtype=bool)
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        source,
+        target,
+        points.astype(np.float32),
+        guesses.astype(np.float32),
+        winSize=(options.window, options.window),
+        maxLevel=options.levels,
+        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.02),
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    return found.reshape(-1, 2).astype(float), status.ravel() == 1
+
+
+# Feature points of the reference view: evenly spread corners to follow, and descriptors to find it again.
+
+
+def interior(covered: NDArray[np.bool_], margin: int) -> NDArray[np.uint8]:
+    """Mask (h, w), 255 at pixels that the object covers at least ``margin`` pixels inside its outline."""
+    kernel = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
+    padded = cv2.copyMakeBorder(covered.astype(np.uint8) * 255, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+    return cv2.erode(padded, kernel)[1:-1, 1:-1]  # type: ignore[return-value]
+
+
+def spread_corners(flat: NDArray[np.uint8], mask: NDArray[np.uint8], count: int) -> Array:
+    """About ``count`` corners (p, 2) inside the mask, spread over it and the strongest of their surroundings.
+
+    Shi and Tomasi's corners are taken in order of strength, at most as many from each cell of a grid as an
+    even spread would put there, then the strongest of the rest until there are enough.
+    """
+    area = int(np.count_nonzero(mask))
+    if area == 0:
+        return np.empty((0, 2))
+    spacing = np.sqrt(area / count)
+    corners = cv2.goodFeaturesToTrack(
+        flat, maxCorners=8 * count, qualityLevel=0.005, minDistance=max(3.0, 0.4 * spacing), mask=mask
+    )
+    if corners is None:
+        return np.empty((0, 2))
+    corners = corners.reshape(-1, 2).astype(float)
+    cells = (corners // (3.0 * spacing)).astype(int)
+    share, taken = 9, {}
+    first, rest = [], []
+    for row, cell in enumerate(map(tuple, cells)):
+        taken[cell] = taken.get(cell, 0) + 1
+        (first if taken[cell] <= share else rest).append(row)
+    return corners[(first + rest)[:count]]
+
+
+def detect_orb(
+    grey: NDArray[np.uint8], count: int, mask: NDArray[np.uint8] | None = None
+) -> tuple[Array, NDArray[np.uint8]]:
+    """Positions (k, 2) and descriptors (k, 32) of at most ``count`` ORB features (Rublee et al. 2011)."""
+    keypoints, descriptors = cv2.ORB_create(nfeatures=count, fastThreshold=10).detectAndCompute(grey, mask)  # type: ignore[attr-defined]
+    if descriptors is None:
+        return np.empty((0, 2)), np.empty((0, 32), dtype=np.uint8)
+    return np.array([k.pt for k in keypoints]), descriptors
+
+
+def match_descriptors(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], ratio: float = 0.85
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows (k,) of descriptors that match one another: nearest both ways, clearly nearer than the second.
+
+    Parameters
+    ----------
+    first, second : (n, 32) and (m, 32) binary descriptors.
+    ratio : of the distances to the two nearest, at most.
+    """
+    if len(first) < 2 or len(second) < 2:
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
+    back = np.full(len(second), -1)
+    for match in matcher.match(second, first):
+        back[match.queryIdx] = match.trainIdx
+    pairs = [
+        (best.queryIdx, best.trainIdx)
+        for best, runner_up in matcher.knnMatch(first, second, k=2)
+        if best.distance < ratio * runner_up.distance and back[best.trainIdx] == best.queryIdx
+    ]
+    rows = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+    return rows[:, 0], rows[:, 1]

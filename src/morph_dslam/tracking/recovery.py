@@ -1,0 +1,176 @@
+"""Looking for a lost object by its features in the whole frame."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.model import ReducedModel
+from morph_dslam.registration.landmarks import shape_starts, solve_pnp
+from morph_dslam.timing import StageClock
+from morph_dslam.tracking.frame_estimation import FrameEstimation
+from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.reference import ReferenceView
+from morph_dslam.tracking.result import MOST_AGREE, Image, PoseHypothesis, refusal
+from morph_dslam.tracking.state import State
+
+Array = NDArray[np.float64]
+
+#: An object that is found anew is believed if half of its points agree, or if they agree as closely as this,
+#: pixels, or as so many times the usual spread of their residuals: what looks alike by chance does not, nor
+#: do windows that see the rim of what is before the object.
+CLOSE_PX, CLOSE_TO_USUAL = 0.25, 1.5
+
+#: Something is before the object where less than this share of the points that it does not hide itself agree.
+UNHIDDEN = 0.75
+
+#: Is said where another one like it is seen too.
+TWO_PLACES = "it could be in two places"
+
+#: At most about so many shapes are tried, lest a mirrored one that fits nearly as well is taken.
+MOST_SHAPES = 27
+
+#: Share of the latest frame in the usual spread.
+LEARNING_RATE = 0.05
+
+
+class Recovery:
+    """Finds the object again by the features of its reference view, unless it could be in two places."""
+
+    def __init__(
+        self,
+        model: ReducedModel,
+        camera: PinholeCamera,
+        reference: ReferenceView,
+        estimation: FrameEstimation,
+        options: TrackerOptions,
+    ) -> None:
+        self._model, self._reference, self._camera = model, reference, camera
+        self._estimation, self._options = estimation, options
+        self._usual_px = np.nan
+
+    def learn(self, attempt: PoseHypothesis) -> None:
+        """Take in how closely the points agreed in a frame in which the object was followed."""
+        spread = attempt.estimate.sigma_px
+        if not np.isfinite(spread):
+            return
+        if np.isnan(self._usual_px):
+            self._usual_px = spread
+        if self.partly_hidden(attempt):
+            return
+        self._usual_px += LEARNING_RATE * (spread - self._usual_px)
+
+    def doubt(self, attempt: PoseHypothesis) -> float:
+        """By how much, pixels, the points that agree may be off together; 0 where nothing is doubtful.
+
+        Where something hides part of the object, or less than half of the points agree, and those not as
+        closely as usual, something else is in the windows of many: what their residuals have more than usual
+        is no noise that averages out.
+        """
+        if np.isnan(self._usual_px):
+            return 0.0
+        if attempt.prior is not None:  # the pose is known, so that fewer points tell as much
+            if attempt.inliers.sum() >= self._options.least_share * len(attempt.inliers):
+                return 0.0
+        elif self.most_agree(attempt) and not self.partly_hidden(attempt):
+            return 0.0
+        spread = attempt.estimate.sigma_px
+        if spread < CLOSE_TO_USUAL * self._usual_px:
+            return 0.0
+        return float(np.sqrt(spread**2 - self._usual_px**2))
+
+    def refusal(self, attempt: PoseHypothesis) -> str:
+        """Why an object that was not seen in the frame before is not to be believed; empty when it is."""
+        why_not = refusal(attempt, self._options)
+        if why_not or attempt.prior is not None:
+            return why_not
+        count = int(attempt.inliers.sum())
+        if self.most_agree(attempt) or self._agrees_closely(attempt):
+            return ""
+        visible = int(attempt.measurement.visible.sum())
+        return f"{count} of {visible} points agree, but only by {attempt.estimate.sigma_px:.1f} px"
+
+    def most_agree(self, attempt: PoseHypothesis) -> bool:
+        """Whether half of all points agree."""
+        return int(attempt.inliers.sum()) >= MOST_AGREE * len(attempt.inliers)
+
+    def partly_hidden(self, attempt: PoseHypothesis) -> bool:
+        """Whether something else seems to be before the object."""
+        return int(attempt.inliers.sum()) < UNHIDDEN * int(attempt.measurement.visible.sum())
+
+    def _agrees_closely(self, attempt: PoseHypothesis) -> bool:
+        usual = np.nan_to_num(self._usual_px)  # 0 where it was never followed yet
+        return attempt.estimate.sigma_px < max(CLOSE_PX, CLOSE_TO_USUAL * usual)
+
+    def recover(
+        self, picture: Image, last_shape: Array, why_lost: str, clock: StageClock
+    ) -> tuple[PoseHypothesis | None, str]:
+        """The object somewhere in the frame, or None and why it is lost.
+
+        Parameters
+        ----------
+        last_shape : (d,) the parameters known last. why_lost : what is to be said before anything else.
+        """
+        shapes = self._shapes(last_shape)
+        found, matches = self._find(picture, shapes, None, clock)
+        if matches is not None:
+            return None, f"{why_lost}; only {matches} features of the reference view were found again"
+        if found is None:
+            return None, why_lost
+        other = self.another(picture, found, clock)
+        if other is not None:
+            counts = f"{int(found.inliers.sum())} and {int(other.inliers.sum())} points agree"
+            return None, f"{why_lost}; {TWO_PLACES}, where {counts}"
+        return found, ""
+
+    def another(self, picture: Image, found: PoseHypothesis, clock: StageClock) -> PoseHypothesis | None:
+        """Another one like the object that was found, elsewhere in the frame; None if there is none."""
+        with clock.stage("recover"):
+            covered = self._reference.covered(found.estimate.state)
+            elsewhere = np.where(covered, 0, 255).astype(np.uint8)
+        other, _ = self._find(picture, self._shapes(found.estimate.state.parameters), elsewhere, clock)
+        return other if other is not None and self._apart(found, other) else None
+
+    def _find(
+        self, picture: Image, shapes: list[Array], mask: NDArray[np.uint8] | None, clock: StageClock
+    ) -> tuple[PoseHypothesis | None, int | None]:
+        """A place where the object is to be believed, or None; and how many features agreed, if too few."""
+        with clock.stage("recover"):
+            state, matches = self._reference.relocaliser.find(picture.grey, shapes, mask)
+        if state is None:
+            return None, matches
+        candidate = self._estimation.correct(picture, state, None, None, clock)
+        candidate = self._estimation.correct(picture, candidate.estimate.state, None, None, clock)
+        if refusal(candidate, self._options):
+            return None, None
+        with clock.stage("search"):
+            better = self._estimation.best_of(candidate, self._starts(candidate))
+        candidate = self._estimation.correct(picture, better.estimate.state, None, None, clock)
+        return (None if self.refusal(candidate) else candidate), None
+
+    def _starts(self, candidate: PoseHypothesis) -> list[State]:
+        """Shapes spread over the box, each in the poses in which it fits the supporting points best."""
+        points, rows = self._reference.points, candidate.inliers
+        pixels = candidate.measurement.pixels[rows]
+        starts = []
+        for shape in shape_starts(self._model, MOST_SHAPES):
+            positions = (points.rest + points.field.value(shape))[rows]
+            starts += [State(shape, pose) for pose in solve_pnp(positions, pixels, self._camera)]
+        return starts
+
+    def _apart(self, found: PoseHypothesis, other: PoseHypothesis) -> bool:
+        """Whether two attempts are of different places in the image."""
+        between = np.linalg.norm(found.measurement.pixels - other.measurement.pixels, axis=1)
+        return float(np.nanmedian(between)) > self._options.measurement.largest_correction_px
+
+    def _shapes(self, last: Array) -> list[Array]:
+        """Parameters to look with: the last known, the default, each parameter near both ends."""
+        lower, upper, default = self._model.lower, self._model.upper, self._model.default
+        shapes = [last, default]
+        for k in range(len(default)):
+            for share in (1 / 6, 5 / 6):
+                shape = default.copy()
+                shape[k] = lower[k] + share * (upper[k] - lower[k])
+                shapes.append(shape)
+        return shapes

@@ -1,0 +1,231 @@
+"""Refinement of the reference state over a sequence (like the paper's parameters that are one per sequence).
+
+The landmarks of one view fix the reference state only to a few millimetres along the sight line, and every
+followed point is bound to the mesh by it. Other frames tell more: a wrong reference state binds the points
+wrongly, and no state of another frame then explains all of them. So the landmarks' residuals and those of
+keyframes, each at its own best state (variable projection), are minimised over the reference state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from morph_dslam.errors import RegistrationError
+from morph_dslam.tracking.binding import bind_pixels, draw_view, view_of
+from morph_dslam.tracking.depth import DepthOptions, PointDepths
+from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOptions, Estimator, State, moved
+from morph_dslam.tracking.outline import Outline, OutlineMeasurement
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """Where the points of the reference view were seen in another frame.
+
+    Attributes
+    ----------
+    pixels : (p, 2). weights : (p,), 0 for points that were not seen. state : estimated there.
+    sigma_px : robust standard deviation of the residuals in it.
+    outline : where the outline was seen, if it was looked for: it ties the texture to the object's edges.
+    """
+
+    pixels: Array
+    weights: Array
+    state: State
+    sigma_px: float
+    outline: OutlineMeasurement | None = None
+
+    def measured(
+        self, points: BoundPoints, met: NDArray[np.bool_], outline: Outline | None
+    ) -> tuple[BoundPoints, Array, Array, Array]:
+        """All that was measured, of ``points`` (those of the reference view that ``met``) and of the outline.
+
+        Returns
+        -------
+        points : p of them. pixels : (p, 2). weights : (p,). normals : (p, 2), zero but on the outline.
+        """
+        pixels, weights = self.pixels[met], self.weights[met].astype(np.float64)
+        normals = np.zeros_like(pixels)
+        if outline is not None and self.outline is not None:
+            seen = self.outline
+            points = points.joined(outline.points)
+            pixels = np.concatenate([pixels, seen.pixels])
+            weights = np.concatenate([weights, np.where(seen.valid, outline.options.weight, 0.0)])
+            normals = np.concatenate([normals, seen.normals])
+        return points, pixels, weights, normals
+
+
+@dataclass(frozen=True)
+class RefinementOptions:
+    """How much to trust what.
+
+    Attributes
+    ----------
+    landmark_px : standard deviation of a landmark; `track` takes it from the registration's residuals.
+    effective_points : how many independent points a keyframe counts for; its residuals are mostly the
+        model's, which are alike over wide parts of the surface.
+    least_sigma_px : residuals smaller than this tell no more.
+    n_keyframes : frames used, spread over the sequence.
+    """
+
+    landmark_px: float = 0.5
+    effective_points: float = 30.0
+    least_sigma_px: float = 0.3
+    n_keyframes: int = 25
+
+
+def choose_keyframes(keyframes: Sequence[Keyframe], count: int) -> list[Keyframe]:
+    """At most ``count`` of them, evenly spread over the sequence."""
+    rows = np.unique(np.linspace(0, len(keyframes) - 1, count).round().astype(int))
+    return [keyframes[row] for row in rows] if len(keyframes) else []
+
+
+def refine_reference(
+    estimator: Estimator,
+    landmarks: BoundPoints,
+    landmark_pixels: Array,
+    reference_pixels: Array,
+    start: State,
+    keyframes: Sequence[Keyframe],
+    options: RefinementOptions | None = None,
+    outline: Outline | None = None,
+) -> State:
+    """The reference state that explains the landmarks and the keyframes best.
+
+    Parameters
+    ----------
+    landmarks, landmark_pixels : (k) as registered; pixels (k, 2) undistorted.
+    reference_pixels : (p, 2) of the followed points in the reference view.
+    start : the registered state. outline : of the object, if the keyframes saw it.
+    """
+    options = options or RefinementOptions()
+    model, camera = estimator.model, estimator.camera
+    inner = Estimator(model, camera, EstimationOptions(max_iterations=8, tolerance=1e-5))
+    d = len(model.parameters)
+    half_ranges = 0.5 * (model.upper - model.lower)
+    scale = np.concatenate([0.05 * half_ranges, np.full(3, 0.01), np.full(3, 0.005)])
+
+    def reference(step: Array) -> State:
+        state = moved(start, step * scale)
+        return replace(state, parameters=np.clip(state.parameters, model.lower, model.upper))
+
+    def residuals(step: Array) -> Array:
+        state = reference(step)
+        seen = camera.project(landmarks.in_camera(state))
+        parts = [((seen - landmark_pixels) / options.landmark_px).ravel()]
+        surface, met = bind_pixels(model, camera, view_of(model, camera, state), reference_pixels)
+        points = BoundPoints.from_surface(model, surface)
+        for frame in keyframes:
+            parts.append(_frame_residuals(inner, points, met, frame, options, outline))
+        return np.concatenate(parts)
+
+    bounds = np.full((2, d + 6), np.inf) * [[-1.0], [1.0]]
+    bounds[0, :d] = (model.lower - start.parameters) / scale[:d] - 1e-6
+    bounds[1, :d] = (model.upper - start.parameters) / scale[:d] + 1e-6
+    found = least_squares(
+        residuals, np.zeros(d + 6), bounds=(bounds[0], bounds[1]), diff_step=1e-2, max_nfev=10, ftol=1e-4
+    )
+    return reference(found.x)
+
+
+def _frame_residuals(
+    inner: Estimator,
+    points: BoundPoints,
+    met: NDArray[np.bool_],
+    frame: Keyframe,
+    options: RefinementOptions,
+    outline: Outline | None,
+) -> Array:
+    """Scaled residuals of a keyframe at its best state, with Huber weights; 0 for points unused."""
+    points, pixels, weights, normals = frame.measured(points, met, outline)
+    estimate = inner.estimate(points, pixels, weights, frame.state, normals)
+    length = np.linalg.norm(estimate.residuals, axis=1)
+    huber = np.minimum(1.0, inner.options.huber_px / np.maximum(length, 1e-12))
+    sigma = max(frame.sigma_px, options.least_sigma_px)
+    share = np.sqrt(options.effective_points / max(weights.sum(), 1.0)) / sigma
+    found = (share * np.sqrt(weights * huber))[:, None] * np.nan_to_num(estimate.residuals)
+    scaled = np.zeros((len(met) + len(found) - int(met.sum()), 2))
+    scaled[: len(met)][met], scaled[len(met) :] = found[: met.sum()], found[met.sum() :]
+    return scaled.ravel()
+
+
+# The reference state refined by a depth image: landmarks of one view hardly tell how far the object is.
+# As in iterative closest points, surface points are paired with what the depth camera measured along their
+# own sight lines, and the pairs are made anew after each estimate.
+
+
+#: Points that are paired, how often, and how many are needed.
+POINTS, ROUNDS, LEAST = 600, 5, 30
+
+#: Depths farther from the surface than this share of the object's size are of something else.
+LARGEST_DISTANCE = 0.05
+
+#: Depth within this many pixels of the object's rim may belong to what is behind it.
+RIM_PX = 4
+
+
+def refine_by_depth(
+    estimator: Estimator,
+    landmarks: BoundPoints,
+    pixels: Array,
+    state: State,
+    sigma_px: float,
+    image: NDArray[np.float32],
+    options: DepthOptions,
+) -> Estimate:
+    """The state of an object from landmarks and a depth image of the same view.
+
+    Parameters
+    ----------
+    landmarks : p of them, bound. pixels : (p, 2) of them in the undistorted image.
+    state : as the landmarks have it. sigma_px : how exactly they were set.
+    image : (h, w) as recorded, metres, NaN where unknown.
+
+    Raises
+    ------
+    RegistrationError
+        If there is hardly any depth where the landmarks have the object.
+    """
+    found = None
+    for _ in range(ROUNDS):
+        points, places = _surface_in_view(estimator, state)
+        seen = np.ones(len(points), dtype=bool)
+        depths = PointDepths.sampled(image, places, seen, estimator.camera, sigma_px**2, options)
+        size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
+        near = np.abs(depths.depths - points.in_camera(state)[:, 2]) < LARGEST_DISTANCE * size
+        depths = depths.only(near)
+        if depths.count < LEAST:
+            raise RegistrationError(
+                f"only {depths.count} of {len(points)} points on the object have a depth near the one that "
+                "the landmarks give: is the depth registered to this camera, and in its unit?"
+            )
+        found = estimator.estimate(
+            points.joined(landmarks),
+            np.concatenate([places, pixels]),
+            np.concatenate([np.zeros(len(points)), np.ones(len(landmarks))]),
+            state,
+            depths=depths.padded(len(points) + len(landmarks)),
+        )
+        state = found.state
+    assert found is not None
+    return found
+
+
+def _surface_in_view(estimator: Estimator, state: State) -> tuple[BoundPoints, Array]:
+    """Points spread over what the camera sees of the surface, and their pixels (p, 2)."""
+    model, camera = estimator.model, estimator.camera
+    view = view_of(model, camera, state)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * RIM_PX + 1,) * 2)
+    covered = cv2.erode(draw_view(view, model.triangles, camera).covered.astype(np.uint8), disc)
+    rows, columns = np.nonzero(covered)
+    chosen = np.random.default_rng(0).permutation(len(rows))[:POINTS]
+    pixels = np.column_stack([columns[chosen], rows[chosen]]).astype(float)
+    surface, met = bind_pixels(model, camera, view, pixels)
+    return BoundPoints.from_surface(model, surface), pixels[met]

@@ -1,0 +1,128 @@
+"""Relocalisation: finding a lost object again from the features of its reference view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.model import ReducedModel
+from morph_dslam.tracking.binding import View, bind_pixels
+from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
+from morph_dslam.tracking.patches import detect_orb, match_descriptors
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RelocalizationOptions:
+    """``pnp_px``: reprojection error that a match may have before its shape is estimated; generous, because
+    the shape is only guessed then. ``least_matches``: fewer matches that agree are not believed."""
+
+    n_features: int = 1000
+    pnp_px: float = 8.0
+    least_matches: int = 12
+
+
+class Relocalizer:
+    """Descriptors of the reference view, bound to the mesh.
+
+    Parameters
+    ----------
+    drawn : the model as it is drawn. grey : the reference image (h, w). mask : 255 where the object is seen.
+    view : the drawn mesh in it.
+    """
+
+    def __init__(
+        self,
+        estimator: Estimator,
+        drawn: ReducedModel,
+        grey: NDArray[np.uint8],
+        mask: NDArray[np.uint8],
+        view: View,
+        options: RelocalizationOptions | None = None,
+    ) -> None:
+        self.options = options or RelocalizationOptions()
+        self._estimator = estimator
+        pixels, descriptors = detect_orb(grey, self.options.n_features, mask)
+        surface, met = bind_pixels(drawn, estimator.camera, view, pixels)
+        self._points = BoundPoints.from_surface(estimator.model, surface)
+        self._descriptors = descriptors[met]
+
+    def find(
+        self, grey: NDArray[np.uint8], shapes: list[Array], mask: NDArray[np.uint8] | None = None
+    ) -> tuple[State | None, int]:
+        """The object's state in a frame from matched features alone, and how many matches support it.
+
+        Parameters
+        ----------
+        grey : (h, w). shapes : parameters (d,) to try the first pose with.
+        mask : (h, w), 0 where not to look.
+
+        Returns
+        -------
+        None in place of the state when fewer matches than ``least_matches`` agree on one.
+        """
+        pixels, descriptors = detect_orb(grey, self.options.n_features, mask)
+        mine, theirs = match_descriptors(self._descriptors, descriptors)
+        if len(mine) < self.options.least_matches:
+            return None, len(mine)
+        points = BoundPoints.from_surface(self._estimator.model, self._points.surface.take(mine))
+        state, agreeing = state_from_matches(self._estimator, points, pixels[theirs], shapes, self.options)
+        return state, int(agreeing.sum())
+
+
+def state_from_matches(
+    estimator: Estimator, points: BoundPoints, pixels: Array, shapes: list[Array], options: RelocalizationOptions
+) -> tuple[State | None, NDArray[np.bool_]]:
+    """The object's state from matches of which many may be wrong, and which of them (k,) agree with it.
+
+    Parameters
+    ----------
+    points, pixels : (k) and (k, 2). shapes : parameters (d,) to try the first pose with.
+
+    Returns
+    -------
+    None in place of the state when fewer than ``least_matches`` agree on one.
+    """
+    best, inliers = None, np.zeros(len(points), dtype=bool)
+    for shape in shapes:
+        positions = points.rest + points.field.value(shape)
+        pose, agreeing = _ransac(positions, pixels, estimator.camera.matrix, options.pnp_px)
+        if pose is not None and agreeing.sum() > inliers.sum():
+            best, inliers = State(shape, pose), agreeing
+    if best is None or inliers.sum() < options.least_matches:
+        return None, inliers
+    # Estimated from the agreeing matches, then once more from all that agree with the result.
+    for _ in range(2):
+        estimate = estimator.estimate(points, pixels, inliers.astype(float), best)
+        best = estimate.state
+        inliers = np.linalg.norm(estimate.residuals, axis=1) < options.pnp_px
+    return (best if inliers.sum() >= options.least_matches else None), inliers
+
+
+def _ransac(
+    points: Array, pixels: Array, matrix: Array, limit_px: float
+) -> tuple[RigidTransform | None, NDArray[np.bool_]]:
+    """A pose (camera from object) with which most points (k, 3) are near their pixels, and which are."""
+    agreeing = np.zeros(len(points), dtype=bool)
+    try:
+        found, rotation, translation, rows = cv2.solvePnPRansac(
+            points,
+            pixels,
+            matrix,
+            None,  # type: ignore[arg-type]
+            iterationsCount=200,
+            reprojectionError=limit_px,
+            flags=cv2.SOLVEPNP_SQPNP,
+        )
+    except cv2.error:
+        return None, agreeing  # matches of nearly the same few points span no pose
+    if not found or rows is None:
+        return None, agreeing
+    agreeing[np.asarray(rows, dtype=np.int64).ravel()] = True
+    pose = RigidTransform(rotation_exp(rotation.ravel()), np.asarray(translation, dtype=float).ravel())
+    return pose, agreeing

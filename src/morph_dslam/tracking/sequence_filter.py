@@ -1,0 +1,453 @@
+"""What the sequence filter keeps from frame to frame, and how it goes over to the points of another view."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from morph_dslam.model import ReducedModel
+from morph_dslam.tracking.estimator import Estimate, LinearCost, Prior, State
+from morph_dslam.tracking.noise import Correlation, Observations, PixelNoise, RigObservations
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PointChange:
+    """Another reference view is followed from now on.
+
+    Attributes
+    ----------
+    left, taken : numbers of the view so far and of the next one. correlation : (p, p) of the points so far.
+    n_points : of the next view, with those of the outline. kept : numbers of the views that can come back.
+    besides : (n, n) covariance of the state so far from errors that the filter does not know of; zero where
+        no frame was taken in since the last change.
+    """
+
+    left: int
+    taken: int
+    correlation: Correlation
+    n_points: int
+    kept: Collection[int]
+    besides: Array
+
+
+@dataclass(frozen=True)
+class LeftPoints:
+    """How the lasting errors of a view's points had entered the past when the view was left.
+
+    Attributes
+    ----------
+    by_point : (p, 2, k), as in `Errors`. covariance : (k, k) from it.
+    """
+
+    by_point: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class Errors:
+    """How errors enter an estimate.
+
+    Attributes
+    ----------
+    by_point : (p, 2, n) derivative by the part that stays with a point, in its standard deviations.
+    by_frames : (n, n) covariance from what is new in each frame.
+    by_cause : (c, n) derivative by what is the same in all frames of a known pose; see `Prior.lasting`.
+    unseen : (n, n) covariance of what nothing tells of. covariance : (n, n) from all of it.
+    inverse : (n, n) of the cost's Hessian.
+    by_views : (k, n) by the number of a view that was left: derivative by what its points had put into the
+        k parameters then.
+    """
+
+    by_point: Array
+    by_frames: Array
+    by_cause: Array
+    unseen: Array
+    covariance: Array
+    inverse: Array
+    by_views: dict[int, Array] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Past:
+    """What the frames so far said of the k parameters that are one per sequence.
+
+    Attributes
+    ----------
+    mean : (k,), SI. covariance : (k, k). by_point, by_frames, by_cause, unseen, by_views : as in `Errors`,
+        (p, 2, k), (k, k), (c, k), (k, k) and (k, k) each.
+    left : the views of ``by_views``, by number.
+    """
+
+    mean: Array
+    covariance: Array
+    by_point: Array
+    by_frames: Array
+    by_cause: Array
+    unseen: Array
+    by_views: dict[int, Array] = field(default_factory=dict)
+    left: dict[int, LeftPoints] = field(default_factory=dict)
+
+    def with_points(self, change: PointChange, kept: NDArray[np.int64]) -> Past:
+        """The same past, for measurements of another view's points.
+
+        What the points so far have put into it is kept apart, so that their errors are known as the same when
+        their view comes back; of views that cannot, only the covariance is left. Errors that the filter does
+        not know of, such as the old view's own, are added as ones that no later frame tells of.
+
+        Parameters
+        ----------
+        kept : indices of the parameters (k,).
+        """
+        besides = change.besides[np.ix_(kept, kept)]
+        covariance = quadratic(self.by_point, change.correlation)
+        left = self.left | {change.left: LeftPoints(self.by_point, covariance)}
+        by_views = self.by_views | {change.left: np.eye(len(kept))}
+        by_point, unseen = np.zeros((change.n_points, 2, len(kept))), self.unseen + besides
+        if change.taken in left:
+            # Later frames have carried on, in the same way for all points, what these had put in.
+            by_point = left.pop(change.taken).by_point @ by_views.pop(change.taken)
+        for view in [view for view in left if view not in change.kept]:
+            rows = by_views.pop(view)
+            unseen = unseen + rows.T @ left.pop(view).covariance @ rows
+        return replace(
+            self, covariance=self.covariance + besides, by_point=by_point, unseen=unseen, by_views=by_views, left=left
+        )
+
+
+def quadratic(scores: Array, correlation: Correlation, others: Array | None = None) -> Array:
+    """sum_ij K_ij W_i' V_j (n, n) of scores (p, 2, n), twice the same or two, and correlation K (p, p)."""
+    others = scores if others is None else others
+    spread = np.asarray(correlation @ others.reshape(len(others), -1)).reshape(others.shape)
+    return np.tensordot(scores, spread, axes=([0, 1], [0, 1]))
+
+
+# Whether a frame can tell of a parameter at all: whether the parameter's effect is clearly there.
+# Some parameters act only while others do, as the side from which a lever is turned. While it is not, errors
+# of the lever's angle turn it, to a side of their own, and the curvature of the cost, which a covariance is
+# made from, takes this for a measured side. The error of the direction of a vector with independent errors is
+# about one over its length in standard deviations only where that length is some of them; below, the
+# direction may be any. So an effect counts only where it is so many times what the other parameters' errors
+# make it differ by.
+
+
+#: Of a plane vector that is at least so many standard deviations long, the direction's error is that of the
+#: linear theory but for some per cent: a vector that points the other way is then less likely than 0.001.
+CLEARLY = 4.0
+
+
+def without_clear_effect(
+    model: ReducedModel,
+    linear: LinearCost,
+    linear_at: Callable[[State], LinearCost],
+    state: State,
+    spread: Array,
+    indices: NDArray[np.int64],
+) -> NDArray[np.bool_]:
+    """Which of some parameters (k,) may have no effect on what was measured.
+
+    Parameters
+    ----------
+    linear : the cost of what was measured, about the ``state`` that was estimated. linear_at : about another.
+    spread : (d,) standard deviations of the parameters were those at ``indices`` (k,) known, SI.
+    """
+    effects = linear.scores[:, :, indices]
+    changes = np.zeros(len(indices))
+    half_ranges = 0.5 * (model.upper - model.lower)
+    for other in np.setdiff1d(np.arange(len(spread)), indices):
+        parameters = state.parameters.copy()
+        step = min(float(spread[other]), float(half_ranges[other]))
+        parameters[other] += step if parameters[other] + step <= model.upper[other] else -step
+        there = linear_at(replace(state, parameters=parameters)).scores[:, :, indices]
+        changes += np.sum((there - effects) ** 2, axis=(0, 1))
+    return np.sum(effects**2, axis=(0, 1)) <= CLEARLY**2 * changes
+
+
+# Parameters that are one over the whole sequence, and how sure an estimate is.
+# What a point's measurement is off by has two parts. One belongs to the point: its place was read off the
+# reference view once, and every frame is compared with that view. It is the same in all frames, and alike for
+# points whose windows overlap there. The other is new in every frame. Only the second averages out.
+# The filter keeps the estimate of the parameters that are one per sequence, from all frames so far, with its
+# covariance; in the next frame it is a prior, as in any Kalman filter in the information form. Parameters may
+# also walk: their variance then grows by that of a step from frame to frame. Beside it goes,
+# for every point, how its own error has entered the estimate. So the covariance holds the points' errors in
+# full, however many frames there are: they are "considered" but not estimated, as in Schmidt's filter
+# (Jazwinski, Stochastic Processes and Filtering Theory, 1970, ch. 8.4).
+
+
+#: The weight of the past in the mean of past and frame stays below this.
+LARGEST_WEIGHT = 0.999
+
+#: A past with this part of a frame's standard deviation is believed against it.
+FAR_SURER = 0.2
+
+#: What was measured in a frame.
+Frame = TypeVar("Frame", Observations, RigObservations)
+
+_Taken = TypeVar("_Taken", Observations, RigObservations, contravariant=True)
+
+
+class Fitter(Protocol[_Taken]):
+    """What makes estimates from what was measured: `Estimator`, or `RigEstimator`."""
+
+    @property
+    def model(self) -> ReducedModel: ...
+
+    def fit(self, measured: _Taken, start: State, prior: Prior | None = None) -> Estimate: ...
+
+    def linear(self, measured: _Taken, estimate: Estimate) -> LinearCost: ...
+
+
+@dataclass(frozen=True)
+class FilterOptions:
+    """How the filter trusts the past.
+
+    Attributes
+    ----------
+    memory : frames over which the past fades, by a factor e.
+    gate : a frame whose own estimate is so many standard deviations off the past's changes nothing of it.
+        It stands by itself, unless the past is far surer of what does not change.
+    patience : after so many such frames in a row the past was wrong and is forgotten.
+    """
+
+    memory: float = 600.0
+    gate: float = 5.0
+    patience: int = 3
+
+
+class SequenceFilter(Generic[Frame]):
+    """Fuses the estimates of the frames of one sequence.
+
+    Parameters
+    ----------
+    indices : of the parameters that are one per sequence; none is allowed, and only covariances are found.
+    steps : of parameters that walk, by index: the standard deviation of their change from frame to frame, SI.
+    """
+
+    def __init__(
+        self,
+        estimator: Fitter[Frame],
+        indices: Sequence[int],
+        options: FilterOptions | None = None,
+        steps: Mapping[int, float] | None = None,
+    ) -> None:
+        self.options = options or FilterOptions()
+        walking = dict(steps or {})
+        self._estimator, self._constant = estimator, np.array(indices, dtype=np.int64)
+        self._kept = np.concatenate([self._constant, np.array(list(walking), dtype=np.int64)])
+        self._step = np.diag([0.0] * len(indices) + [step**2 for step in walking.values()])
+        self._walks = bool(walking)
+        self._unknowns = len(estimator.model.parameters) + 6
+        self._noise = PixelNoise(self.options.memory)
+        self._past: Past | None = None
+        self._untold = np.zeros(len(self._constant))
+        self._conflicts = 0
+
+    @property
+    def constant(self) -> NDArray[np.int64]:
+        """Indices (k,) of the parameters that are one per sequence."""
+        return self._constant
+
+    @property
+    def unobservable(self) -> NDArray[np.bool_]:
+        """Of which of these (k,) the last frame told nothing by itself."""
+        return self._untold > 0.0
+
+    def change_points(self, change: PointChange) -> None:
+        """Go on with the points of another view; what those so far have put into the past stays in it."""
+        self._noise.change_points()
+        if self._past is not None:
+            self._past = self._past.with_points(change, self._kept)
+
+    def fuse(self, measured: Frame, alone: Estimate, known: Prior | None = None) -> Estimate:
+        """The estimate of a frame from its measurements and all frames before, with its covariance.
+
+        Parameters
+        ----------
+        alone : the estimate from the frame's measurements, and ``known``, only.
+        known : what is known of the frame's pose or parameters from elsewhere, if anything.
+        """
+        linear = self._estimator.linear(measured, alone)
+        self._noise.add(alone.residuals, measured, _taken(measured, linear, alone.state, known))
+        self._untold = self._without_effect(measured, linear, alone, known)
+        errors = self._errors(measured, linear, alone.state, known)
+        by_itself = self._with_covariance(alone, measured, linear, errors, known)
+        if not len(self._kept):
+            return by_itself
+        conflict = self._past is not None and self._contradicts(self._past, by_itself)
+        self._conflicts = self._conflicts + 1 if conflict else 0
+        if self._conflicts >= self.options.patience:
+            self._past, self._conflicts = None, 0
+        if self._past is None:
+            self._keep(by_itself, errors)
+            return by_itself
+        if conflict and (self._walks or not self._is_far_surer(self._past, by_itself)):
+            return by_itself
+        past = self._prior(self._past, measured, errors)
+        prior = past if known is None else past.joined(known)
+        fused = self._estimator.fit(measured, self._start(by_itself), prior)
+        linear = self._estimator.linear(measured, fused)
+        errors = self._errors(measured, linear, fused.state, known, past)
+        if not conflict:
+            self._keep(fused, errors)
+        fused = self._with_covariance(fused, measured, linear, errors, known, past)
+        return self._without_walk(fused, by_itself) if self._walks else fused
+
+    def _without_effect(self, measured: Frame, linear: LinearCost, alone: Estimate, known: Prior | None) -> Array:
+        """Variances (k,) of what is one per sequence where a frame tells nothing of it, else zero."""
+        model, d, constant = self._estimator.model, self._unknowns - 6, self._constant
+        nothing = np.zeros(len(constant))
+        if not 0 < len(constant) < d:
+            return nothing
+        self._untold = nothing
+        held = self._errors(measured, linear.holding(constant), alone.state, known).covariance
+        absent = without_clear_effect(
+            model,
+            linear,
+            lambda state: self._estimator.linear(measured, replace(alone, state=state)),
+            alone.state,
+            np.sqrt(np.diag(held)[:d]),
+            constant,
+        )
+        # Any value in the range is then as likely as any other.
+        return np.where(absent, (model.upper - model.lower)[constant] ** 2 / 12.0, 0.0)
+
+    def _with_covariance(
+        self,
+        estimate: Estimate,
+        measured: Frame,
+        linear: LinearCost,
+        errors: Errors,
+        known: Prior | None,
+        past: Prior | None = None,
+    ) -> Estimate:
+        """The estimate with its covariance, and what it would be without a prior on the parameters."""
+        told = None
+        if known is not None and known.information.any():
+            of_pose = replace(known, information=np.zeros_like(known.information))
+            told = self._errors(measured, linear, estimate.state, of_pose, past).covariance
+        return replace(estimate, covariance=errors.covariance, measured_covariance=told)
+
+    def _without_walk(self, fused: Estimate, by_itself: Estimate) -> Estimate:
+        """The estimate with the covariance that its frame alone gives what walks, and all frames the rest."""
+        own = by_itself.covariance
+        own = own if by_itself.measured_covariance is None else by_itself.measured_covariance
+        share = np.ones(len(own))
+        rows = self._constant
+        share[rows] = np.sqrt(np.minimum(np.diag(fused.covariance)[rows] / np.diag(own)[rows], 1.0))
+        return replace(fused, measured_covariance=own * np.outer(share, share))
+
+    def _of_kept(self, matrix: Array) -> Array:
+        return matrix[np.ix_(self._kept, self._kept)]
+
+    def _keep(self, estimate: Estimate, errors: Errors) -> None:
+        """Make the estimate's parameters that are one per sequence the past of the next frame."""
+        grown = np.exp(1.0 / self.options.memory)
+        self._past = Past(
+            estimate.state.parameters[self._kept],
+            grown * self._of_kept(errors.covariance) + self._step,
+            np.sqrt(grown) * errors.by_point[:, :, self._kept],
+            grown * self._of_kept(errors.by_frames) + self._step,
+            np.sqrt(grown) * errors.by_cause[:, self._kept],
+            grown * self._of_kept(errors.unseen),
+            {view: np.sqrt(grown) * rows[:, self._kept] for view, rows in errors.by_views.items()},
+            {} if self._past is None else self._past.left,
+        )
+
+    def _start(self, alone: Estimate) -> State:
+        """Where to look for the fused state: the frame's, with what the past is surer of."""
+        assert self._past is not None
+        parameters = alone.state.parameters.copy()
+        surer = np.diag(self._past.covariance) < np.diag(alone.covariance)[self._kept]
+        parameters[self._kept[surer]] = self._past.mean[surer]
+        return replace(alone.state, parameters=parameters)
+
+    def _prior(self, past: Past, measured: Frame, errors: Errors) -> Prior:
+        """The past as a term of the frame's cost, of the weight that makes the variance of both least.
+
+        In the basis in which the frame's covariance is 1 and the past's p, with the covariance c of both, the
+        weight of the past is (1 - c) / (1 + p - 2 c).
+        """
+        d, own = self._unknowns - 6, self._of_kept(errors.covariance)
+        squared_px = np.trace(np.linalg.solve(self._of_kept(errors.inverse), own)) / len(self._kept)
+        p, basis = scipy.linalg.eigh(past.covariance, own)
+        shared = quadratic(past.by_point, measured.correlation, errors.by_point[:, :, self._kept])
+        error_factors = min(len(past.by_cause), len(errors.by_cause))
+        shared += past.by_cause[:error_factors].T @ errors.by_cause[:error_factors, self._kept]
+        c = np.einsum("ik,ij,jk->k", basis, shared, basis)
+        weight = np.clip((1.0 - c) / np.maximum(1.0 + p - 2.0 * c, 1e-12), 0.0, LARGEST_WEIGHT)
+        root = basis * np.sqrt(squared_px * weight / (1.0 - weight))
+        mean, information = np.zeros(d), np.zeros((d, d))
+        mean[self._kept] = past.mean
+        information[np.ix_(self._kept, self._kept)] = root @ root.T
+        return Prior(mean, information)
+
+    def _contradicts(self, past: Past, estimate: Estimate) -> bool:
+        """Whether a frame by itself says something else than all those before."""
+        apart = estimate.state.parameters[self._kept] - past.mean
+        spread = self._of_kept(estimate.covariance) + past.covariance
+        return float(apart @ np.linalg.solve(spread, apart)) > self.options.gate**2
+
+    def _is_far_surer(self, past: Past, estimate: Estimate) -> bool:
+        """Whether the past knows far better than a frame by itself whatever both tell of."""
+        shares = scipy.linalg.eigvalsh(past.covariance, self._of_kept(estimate.covariance))
+        return float(shares.max()) < FAR_SURER**2
+
+    def _errors(
+        self, measured: Frame, linear: LinearCost, state: State, known: Prior | None, past: Prior | None = None
+    ) -> Errors:
+        """How the measurements' errors, and those of what is known otherwise, enter the estimate."""
+        d, kept = self._unknowns - 6, self._kept
+        common, frame = self._noise.common, self._noise.frame
+        by_point = np.sqrt(common) * linear.scores
+        by_frames = frame * quadratic(linear.scores, measured.correlation) + linear.of_depths
+        by_cause, unseen = np.zeros((0, self._unknowns)), np.zeros_like(linear.hessian)
+        by_views: dict[int, Array] = {}
+        hessian = linear.hessian.copy()
+        if known is not None:
+            information, by_cause = known.terms(state)[1], known.lasting_scores
+            hessian += information
+            by_frames += known.squared_px * information - by_cause.T @ by_cause
+        # What a frame does not tell is no better known by many: one more cause that stays the same.
+        by_cause = np.vstack([np.sqrt(self._untold)[:, None] * hessian[self._constant], by_cause])
+        if past is not None and self._past is not None:
+            hessian[:d, :d] += past.information
+            weight = self._of_kept(past.information)
+            by_point[:, :, kept] += self._past.by_point @ weight
+            by_frames[np.ix_(kept, kept)] += weight @ self._past.by_frames @ weight
+            by_cause = _longer(by_cause, len(self._past.by_cause))
+            by_cause[: len(self._past.by_cause), kept] += self._past.by_cause @ weight
+            unseen[np.ix_(kept, kept)] += weight @ self._past.unseen @ weight
+            by_views = {view: rows @ weight for view, rows in self._past.by_views.items()}
+        linear = replace(linear, hessian=hessian)
+        inverse = linear.inverse
+        by_point, by_frames, by_cause = by_point @ inverse, inverse @ by_frames @ inverse, by_cause @ inverse
+        unseen = inverse @ unseen @ inverse + (common + frame) * linear.unseen
+        covariance = quadratic(by_point, measured.correlation) + by_frames + by_cause.T @ by_cause + unseen
+        if past is not None and self._past is not None:
+            by_views = {view: rows @ inverse[kept] for view, rows in by_views.items()}
+            for view, rows in by_views.items():
+                covariance += rows.T @ self._past.left[view].covariance @ rows
+        return Errors(by_point, by_frames, by_cause, unseen, covariance, inverse, by_views)
+
+
+def _taken(measured: Observations | RigObservations, linear: LinearCost, state: State, known: Prior | None) -> float:
+    """How many numbers' worth of its measurements' variance an estimate takes up.
+
+    Of errors with the correlation K it is tr(H^-1 J' W^1/2 K W^1/2 J): the number of unknowns where they are
+    independent, and more where neighbours err alike.
+    """
+    hessian = linear.hessian if known is None else linear.hessian + known.terms(state)[1]
+    spread = quadratic(linear.scores, measured.correlation)
+    return float(np.trace(replace(linear, hessian=hessian).inverse @ spread))
+
+
+def _longer(rows: Array, count: int) -> Array:
+    """A copy with zeros below, so that there are at least ``count`` rows."""
+    return np.vstack([rows, np.zeros((max(count - len(rows), 0), rows.shape[1]))])

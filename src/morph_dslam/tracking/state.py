@@ -1,0 +1,150 @@
+"""What is estimated, and the surface points that it is estimated from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
+from morph_dslam.model import ReducedModel, SeparatedField, SurfacePoints
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class State:
+    """What is estimated in every frame: parameters (d,) in SI units and the object's pose."""
+
+    parameters: Array
+    camera_from_object: RigidTransform
+
+
+@dataclass(frozen=True)
+class BoundPoints:
+    """Surface points with the displacement field restricted to them.
+
+    Attributes
+    ----------
+    surface : where the p points are on the mesh.
+    rest : (p, 3) undeformed positions, metres.
+    field : displacement at the points only, metres.
+    """
+
+    surface: SurfacePoints
+    rest: Array
+    field: SeparatedField
+
+    @classmethod
+    def from_surface(cls, model: ReducedModel, surface: SurfacePoints) -> BoundPoints:
+        """Points of a model's surface."""
+        return cls(surface, model.rest_positions(surface), model.restrict(surface))
+
+    def __len__(self) -> int:
+        return len(self.rest)
+
+    def joined(self, other: BoundPoints) -> BoundPoints:
+        """These points followed by ``other`` ones of the same model."""
+        surface = SurfacePoints(
+            np.concatenate([self.surface.triangles, other.surface.triangles]),
+            np.concatenate([self.surface.weights, other.surface.weights]),
+        )
+        modes = np.concatenate([self.field.modes, other.field.modes], axis=1)
+        rest = np.concatenate([self.rest, other.rest])
+        return BoundPoints(surface, rest, self.field.with_modes(modes))
+
+    def in_camera(self, state: State) -> Array:
+        """Positions (p, 3) in the camera frame, metres."""
+        return state.camera_from_object.apply(self.rest + self.field.value(state.parameters))
+
+
+def moved(state: State, step: Array) -> State:
+    """The state after an increment (d + 6,): parameters added, pose increment on the left."""
+    d = len(state.parameters)
+    pose = state.camera_from_object
+    rotation = rotation_exp(step[d : d + 3]) @ pose.rotation
+    return State(state.parameters + step[:d], RigidTransform(rotation, pose.translation + step[d + 3 :]))
+
+
+# What is known of a state beforehand.
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of the parameters, and of the pose, beforehand, as one more term of the cost.
+
+    Attributes
+    ----------
+    mean : (d,), SI. information : (d, d), the Hessian of the cost (mu - mean)' I (mu - mean) / 2, in squared
+        pixels as the cost; zero for parameters of which nothing is known.
+    pose : camera_from_object as known beforehand; None if nothing is.
+    pose_information : (6, 6) in the same unit, of the increment (rotation vector, translation) that `moved`
+        applies to ``pose``; None if nothing is known.
+    lasting : (6, k), the part of that increment's error that is the same in all frames, by its k error
+        factors in their standard deviations; None if all of it is new in every frame.
+    squared_px : variance of an image coordinate by which covariances were turned into information.
+    """
+
+    mean: Array
+    information: Array
+    pose: RigidTransform | None = None
+    pose_information: Array | None = None
+    lasting: Array | None = None
+    squared_px: float = 1.0
+
+    def terms(self, state: State) -> tuple[float, Array, Array]:
+        """Cost, Hessian (d + 6, d + 6) and gradient (d + 6,) of the prior at a state."""
+        d = len(self.mean)
+        hessian, gradient = np.zeros((d + 6, d + 6)), np.zeros(d + 6)
+        away = state.parameters - self.mean
+        hessian[:d, :d], gradient[:d] = self.information, self.information @ away
+        cost = 0.5 * float(away @ gradient[:d])
+        if self.pose is not None and self.pose_information is not None:
+            pose = state.camera_from_object
+            turn = rotation_log(pose.rotation @ self.pose.rotation.T)
+            away = np.concatenate([turn, pose.translation - self.pose.translation])
+            slope = np.eye(6)
+            slope[:3, :3] = _log_slope(turn)
+            push = self.pose_information @ away
+            hessian[d:, d:], gradient[d:] = slope.T @ self.pose_information @ slope, slope.T @ push
+            cost += 0.5 * float(away @ push)
+        return cost, hessian, gradient
+
+    def placed(self, state: State) -> State:
+        """The state in the known pose, if there is one."""
+        return state if self.pose is None else replace(state, camera_from_object=self.pose)
+
+    @property
+    def lasting_scores(self) -> Array:
+        """How the lasting errors enter the gradient (k, d + 6)."""
+        d = len(self.mean)
+        if self.lasting is None or self.pose_information is None:
+            return np.zeros((0, d + 6))
+        return np.hstack([np.zeros((self.lasting.shape[1], d)), self.lasting.T @ self.pose_information])
+
+    def joined(self, other: Prior) -> Prior:
+        """Both together; ``other`` says what is known of the pose."""
+        information = self.information + other.information
+        pushed = self.information @ self.mean + other.information @ other.mean
+        # Parameters of different units differ by many powers of ten, so they are scaled before the inverse.
+        # Directions of which neither knows anything keep a mean of zero, with no weight.
+        diagonal = np.diag(information)
+        scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+        inverse = np.linalg.pinv(information * np.outer(scale, scale))
+        return replace(other, mean=scale * (inverse @ (scale * pushed)), information=information)
+
+
+@njit(cache=True, nogil=True)
+def _log_slope(turn):
+    """Derivative (3, 3) of log(exp(w) exp(turn)) by w at w = 0: the inverse left Jacobian of SO(3).
+
+    I - [turn]/2 + c [turn]² with c = 1/a² - 1 / (2 a tan(a/2)) (Barfoot, State Estimation for Robotics, 7.1).
+    """
+    angle = np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
+    cross = np.zeros((3, 3))
+    cross[0, 1], cross[0, 2], cross[1, 2] = -turn[2], turn[1], -turn[0]
+    cross[1, 0], cross[2, 0], cross[2, 1] = turn[2], -turn[1], turn[0]
+    c = 1.0 / 12.0 if angle < 1e-4 else 1.0 / angle**2 - 0.5 / (angle * np.tan(0.5 * angle))
+    return np.eye(3) - 0.5 * cross + c * cross @ cross

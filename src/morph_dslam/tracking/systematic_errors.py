@@ -1,0 +1,251 @@
+"""Errors that more points and more frames do not average out: of the reference state, and of the model.
+
+The points were bound to the mesh in the reference view, so an error of the object's state there moves them
+on the surface, and every frame's estimate with them. Let a pixel of the reference view move by J0 e where its
+state is off by e; the material point under a fixed pixel then moves so that its pixel moves by -J0 e, in
+another view by -M J0 e, with M the map between the images of the point's triangle. The frame's estimate takes
+this for motion, H^-1 J' W M J0 e, to first order. In the reference view itself that is e. What it cannot take
+up stays in the residuals; where they show more of it than the stated covariance of e explains,
+`ReferenceMisfit` says by how much that is too small.
+
+A model that cannot take the object's shape leaves residuals that are alike over parts of the surface much
+wider than the windows that are compared. Their covariance is measured from pairs of points whose windows do
+not overlap, and enters the estimate through the same H^-1 J' W. An estimate takes up most of such an error by
+a wrong pose and shape, so that its residuals show only the rest: what they show is divided by that share, as
+in restricted maximum likelihood (Patterson & Thompson 1971).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import PinholeCamera
+from morph_dslam.diagnostics.dimensions import DimensionCheck, StretchEvidence
+from morph_dslam.diagnostics.reference_misfit import ReferenceMisfit
+from morph_dslam.model import SurfacePoints
+from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR, BoundPart, SharedErrors
+from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, Prior, State, project_with_jacobian
+
+Array = NDArray[np.float64]
+
+#: More than this, pixels, and more than half of the residuals' variance, is stated as the model's failure.
+UNEXPLAINED_PX = 0.5
+
+#: A triangle seen so much flatter in the reference view than in another says nothing of the motion there.
+LARGEST_STRETCH = 5.0
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """What the model leaves of the residuals.
+
+    Attributes
+    ----------
+    px : standard deviation of a pixel coordinate that neighbours have in common. total_px : of all of it.
+    """
+
+    px: float
+    total_px: float
+
+    @property
+    def is_failure(self) -> bool:
+        """Whether the model, not noise, is what is left."""
+        return self.px > UNEXPLAINED_PX and self.px**2 > 0.5 * self.total_px**2
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """A frame's points about its estimate; all is zero for those that do not count.
+
+    Attributes
+    ----------
+    usable : (p,) those that count. weights : (p,) how much. residuals : (p, 2), pixels.
+    jacobian : (p, 2, d + 6) of the pixels. scores : (p, 2, d + 6) that times the weights.
+    """
+
+    usable: NDArray[np.bool_]
+    weights: Array
+    residuals: Array
+    jacobian: Array
+    scores: Array
+
+    def products(self, rows: Array) -> Array:
+        """Sums (d + 6, m) over all coordinates of the scores times ``rows`` (p, 2, m)."""
+        return self.scores.reshape(-1, self.scores.shape[2]).T @ rows.reshape(-1, rows.shape[2])
+
+    def left(self, moved: Array, gain: Array) -> Array:
+        """What an estimate of this ``gain`` (d + 6, d + 6) leaves of motions (p, 2, m) of the pixels."""
+        taken = self.jacobian.reshape(-1, len(gain)) @ (gain @ self.products(moved))
+        return np.where(self.usable[:, None, None], moved - taken.reshape(moved.shape), 0.0)
+
+
+class SystematicErrors:
+    """Adds to covariances what the reference and the model are off by.
+
+    Parameters
+    ----------
+    points : (p) the texture's points. parts : the reference pictures that they were bound in.
+    window : side of the square that is compared around a point, pixels.
+    """
+
+    def __init__(self, estimator: Estimator, points: BoundPoints, parts: Sequence[BoundPart], window: int) -> None:
+        self._estimator, self._points = estimator, points
+        self._misfit = ReferenceMisfit()
+        self._corners = _corners(estimator, points)
+        self._jacobian = self._by_parts(parts, lambda state: self._project(points, state)[1])
+        self._edges = self._by_parts(parts, lambda state: _edges(estimator.camera, self._corners, state))
+        self._moved = self._by_causes(parts)
+        self._dimensions = DimensionCheck(points, parts, self._jacobian, estimator.scale)
+        self._common = SharedErrors(self._places(parts[0].state), window)
+
+    def _by_parts(self, parts: Sequence[BoundPart], of_state: Callable[[State], Array]) -> Array:
+        """What ``of_state`` gives for all points (p, ...), of each part's points in its own state."""
+        return np.concatenate([of_state(part.state)[part.rows] for part in parts])
+
+    def _by_causes(self, parts: Sequence[BoundPart]) -> Array | None:
+        """By what each cause moves the points' pixels (p, 2, c) in their pictures; None where not known."""
+        moved = []
+        for part in parts:
+            if part.error_factors is None:
+                return None
+            moved.append(self._jacobian[part.rows] @ part.error_factors)
+        return np.concatenate(moved)
+
+    def _places(self, state: State) -> Array:
+        """Places (p, 3) of the points in an object of this state, in pixels at its depth."""
+        camera, positions = self._estimator.camera, self._points.in_camera(state)
+        return np.asarray(positions * 0.5 * (camera.fx + camera.fy) / np.median(positions[:, 2]))
+
+    def unexplained(self, estimate: Estimate, used: NDArray[np.bool_]) -> Unexplained:
+        """What the model leaves of the residuals of the points ``used`` (p,)."""
+        residuals = np.where(used[:, None], estimate.residuals[: len(used)], 0.0)
+        total = float(np.sum(residuals**2)) / max(2 * int(used.sum()), 1)
+        common = float(self._common.in_common(residuals[:, :, None], self._common.n_pairs(used))[0, 0])
+        return Unexplained(float(np.sqrt(max(common, 0.0))), float(np.sqrt(total)))
+
+    @property
+    def worse(self) -> float:
+        """By how much larger than stated the reference's deviation is, as the frames so far show it."""
+        return float(np.sqrt(self._misfit.factor))
+
+    @property
+    def stretch(self) -> StretchEvidence | None:
+        """What the frames so far tell of the object's dimensions; None where the reference is not known."""
+        return None if self._moved is None else self._dimensions.evidence
+
+    def added(
+        self,
+        estimate: Estimate,
+        weights: Array,
+        alike_px: float,
+        prior: Prior | None = None,
+        learns: bool = True,
+        elsewhere: Sequence[StretchEvidence] = (),
+    ) -> Estimate:
+        """The estimate with a covariance that holds both errors, and wrong dimensions that the frames show.
+
+        Parameters
+        ----------
+        weights : (p,) of the points, zero for those that do not support it. prior : that it was found with.
+        alike_px : standard deviation of a pixel coordinate that neighbours have in common in the residuals,
+            as of `unexplained`.
+        learns : whether the residuals are the object's, so that they tell how well the reference is known.
+        elsewhere : what frames that were compared with other views tell of the object's dimensions.
+        """
+        frame = self._linear(estimate, weights)
+        hessian = frame.products(frame.jacobian)
+        free = gain = inverse_of_seen(hessian, self._estimator.scale)
+        if prior is not None:
+            gain = inverse_of_seen(hessian + prior.terms(estimate.state)[1], self._estimator.scale)
+        covariance = estimate.covariance.copy()
+        if self._moved is not None:
+            warps = self._warps(estimate.state)
+            moved = warps @ self._moved
+            stretched = self._dimensions.moved(estimate.state, frame.jacobian, warps)
+            if learns:
+                self._learn_reference(frame, frame.left(moved, gain))
+                error_factors = np.concatenate([stretched @ self._dimensions.stretches, moved], axis=2)
+                self._dimensions.learn(frame.residuals, frame.left(error_factors, free), frame.weights)
+            transfer = gain @ frame.products(moved)
+            covariance += self._misfit.factor * transfer @ transfer.T
+            excess = self._dimensions.evidence.joined(elsewhere).excess
+            if excess.any():
+                taken = gain @ frame.products(stretched)
+                covariance += taken @ excess @ taken.T
+        gradients = self._common.gradients(frame.scores)
+        share = self._common.share_left(frame.usable, frame.jacobian, gradients, gain)
+        covariance += alike_px**2 / share * (gain @ (gradients.T @ gradients) @ gain)
+        return replace(estimate, covariance=covariance)
+
+    def _learn_reference(self, frame: _Linear, left: Array) -> None:
+        """Take in what a frame shows of the reference's error, which would leave ``left`` (p, 2, c) in it."""
+        n_pairs = self._common.n_pairs(frame.usable)
+        both = (frame.residuals[:, :, None], left)
+        shown, expected = (np.trace(self._common.in_common(rows, n_pairs)) for rows in both)
+        self._misfit.learn(float(shown), float(expected))
+
+    def pushed(self, estimate: Estimate, weights: Array) -> tuple[Array, Array]:
+        """How points of these ``weights`` (p,) determine the estimate, and how the reference's error enters.
+
+        J' W J, (d + 6, d + 6), and J' W M J0 times the error factors of the reference's error, (d + 6, c).
+        """
+        assert self._moved is not None
+        frame = self._linear(estimate, weights)
+        carried = self._warps(estimate.state) @ self._moved
+        return frame.products(frame.jacobian), frame.products(carried)
+
+    def _linear(self, estimate: Estimate, weights: Array) -> _Linear:
+        """The frame of an estimate whose points had these ``weights`` (p,)."""
+        _, jacobian = self._project(self._points, estimate.state)
+        residuals = estimate.residuals[: len(weights)]
+        length = np.linalg.norm(residuals, axis=1)
+        usable = (weights > 0.0) & np.isfinite(length) & np.isfinite(jacobian).all(axis=(1, 2))
+        huber = self._estimator.options.huber_px
+        weights = np.where(usable, weights * np.minimum(1.0, huber / np.maximum(length, 1e-300)), 0.0)
+        residuals = np.where(usable[:, None], residuals, 0.0)
+        jacobian = np.where(usable[:, None, None], jacobian, 0.0)
+        return _Linear(usable, weights, residuals, jacobian, weights[:, None, None] * jacobian)
+
+    def _project(self, points: BoundPoints, state: State) -> tuple[Array, Array]:
+        pose = state.camera_from_object
+        functions = points.field.functions.rows(state.parameters)
+        intrinsics = self._estimator.camera.intrinsics
+        return project_with_jacobian(
+            functions, pose.rotation, pose.translation, points.rest, points.field.modes, intrinsics
+        )
+
+    def _warps(self, state: State) -> Array:
+        """How pixels (p, 2, 2) move in a view where they move by one in the reference view."""
+        before, now = self._edges, _edges(self._estimator.camera, self._corners, state)
+        size = before[:, 0, 0] * before[:, 1, 1] - before[:, 0, 1] * before[:, 1, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            adjugate = np.stack([before[:, 1, 1], -before[:, 0, 1], -before[:, 1, 0], before[:, 0, 0]], axis=1)
+            warps = now @ (adjugate / size[:, None]).reshape(-1, 2, 2)
+            usable = np.abs(warps).max(axis=(1, 2)) < LARGEST_STRETCH
+        return np.where(usable[:, None, None], warps, 0.0)
+
+
+def inverse_of_seen(hessian: Array, scale: Array) -> Array:
+    """H^-1 (n, n); nothing moves along what neither the images nor a prior determine."""
+    values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
+    seen = values > max(values[-1], 1e-30) * EIGENVALUE_FLOOR
+    inverse = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T
+    return np.asarray(inverse * np.outer(scale, scale), dtype=np.float64)
+
+
+def _corners(estimator: Estimator, points: BoundPoints) -> BoundPoints:
+    """The three corners of each point's triangle, (3 p) points."""
+    surface = SurfacePoints(np.repeat(points.surface.triangles, 3), np.tile(np.eye(3), (len(points), 1)))
+    model = estimator.model
+    nodes = model.triangles[points.surface.triangles].ravel()
+    return BoundPoints(surface, model.nodes[nodes], model.displacement.with_modes(model.displacement.modes[:, nodes]))
+
+
+def _edges(camera: PinholeCamera, corners: BoundPoints, state: State) -> Array:
+    """Two edges of each triangle in the image, as the columns of (p, 2, 2)."""
+    pixels = camera.project(corners.in_camera(state)).reshape(-1, 3, 2)
+    return np.stack([pixels[:, 1] - pixels[:, 0], pixels[:, 2] - pixels[:, 0]], axis=2)
