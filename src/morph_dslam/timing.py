@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from time import perf_counter, thread_time
 
 
@@ -27,6 +28,31 @@ class StageClock:
             yield
         finally:
             self.milliseconds[name] += 1e3 * (perf_counter() - start)
+
+
+_CLOCK: ContextVar[StageClock | None] = ContextVar("frame_clock", default=None)
+
+
+@contextmanager
+def frame_clock(names: Sequence[str]) -> Iterator[StageClock]:
+    """Time one frame: `stage` adds to this clock within the block, in this thread only."""
+    clock = StageClock(names)
+    token = _CLOCK.set(clock)
+    try:
+        yield clock
+    finally:
+        _CLOCK.reset(token)
+
+
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    """Add the time that the block takes to a stage of the current frame's clock; without a clock do nothing."""
+    clock = _CLOCK.get()
+    if clock is None or name not in clock.milliseconds:
+        yield
+        return
+    with clock.stage(name):
+        yield
 
 
 class WaitClock:
