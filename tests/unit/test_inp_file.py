@@ -46,19 +46,9 @@ Upper, S2
 *SURFACE, TYPE=NODE, NAME=Held
 Bottom,
 *SOLID SECTION, ELSET=Lower, MATERIAL=rubber
-*SOLID SECTION, MATERIAL=steel, ELSET=Upper
-,
 *MATERIAL, NAME=rubber
 *HYPERELASTIC, MOONEY-RIVLIN
 0.5, 0.1, 2e-3
-*DENSITY
-1.1E-9,
-*VISCOELASTIC, TIME=PRONY
-0.3, 0.3, 0.1
-0.2, 0., 2.
-*MATERIAL, NAME=steel
-*ELASTIC
-210000., 0.3
 *STEP
 *STATIC
 *BOUNDARY
@@ -102,46 +92,10 @@ def test_sets_are_lists_ranges_sets_of_sets_and_the_nodes_of_elements(write):
     assert [(p.elements.tolist(), p.face) for p in part.surfaces["Pressed"]] == [([9], "S2"), ([7], "S1")]
 
 
-def test_sections_and_materials_are_read(write):
-    part = read_inp(write(CUBE + CARDS))
-    assert [(s.element_set, s.material, s.thickness) for s in part.sections] == [
-        ("Lower", "rubber", None), ("Upper", "steel", None),
-    ]  # fmt: skip
-    rubber, steel = part.materials["rubber"], part.materials["steel"]
-    assert rubber.hyperelastic.law == "MOONEY-RIVLIN"
-    assert rubber.hyperelastic.values == {"C10": 0.5, "C01": 0.1, "D1": 2e-3}
-    assert rubber.density == 1.1e-9
-    assert rubber.prony == ((0.3, 0.3, 0.1), (0.2, 0.0, 2.0))
-    assert (steel.elastic.law, steel.elastic.values) == ("ISOTROPIC", {"E": 210000.0, "nu": 0.3})
-    assert steel.hyperelastic is None
-
-
-@pytest.mark.parametrize(
-    ("card", "law", "values"),
-    [
-        ("*HYPERELASTIC, NEO HOOKE\n0.4, 0.01", "NEO HOOKE", {"C10": 0.4, "D1": 0.01}),
-        ("*HYPERELASTIC, neo hooke\n0.4", "NEO HOOKE", {"C10": 0.4, "D1": 0.0}),
-        (
-            "*HYPERELASTIC, YEOH\n1, 2, 3, 4, 5, 6",
-            "YEOH",
-            {"C10": 1.0, "C20": 2.0, "C30": 3.0, "D1": 4.0, "D2": 5.0, "D3": 6.0},
-        ),
-        (
-            "*HYPERELASTIC, OGDEN, N=3\n1, 2, 3, 4, 5, 6, 7, 8,\n9",
-            "OGDEN",
-            {"mu1": 1, "alpha1": 2, "mu2": 3, "alpha2": 4, "mu3": 5, "alpha3": 6, "D1": 7, "D2": 8, "D3": 9},
-        ),
-    ],
-)
-def test_hyperelastic_constants_have_their_names(write, card, law, values):
-    constants = read_inp(write(f"{CUBE}*MATERIAL, NAME=m\n{card}\n")).materials["m"].hyperelastic
-    assert (constants.law, constants.values) == (law, values)
-
-
-def test_shell_sections_have_their_thickness(write):
+def test_nodes_in_a_plane_have_height_zero(write):
     text = "*NODE\n1, 0, 0\n2, 1, 0\n3, 1, 1\n4, 0, 1\n*ELEMENT, TYPE=S4R, ELSET=E\n1, 1, 2, 3, 4\n"
-    part = read_inp(write(text + "*SHELL SECTION, ELSET=E, MATERIAL=paper\n0.1, 5\n"))
-    assert (part.elements[0].cell_type, part.sections[0].thickness) == ("quad4", 0.1)
+    part = read_inp(write(text))
+    assert part.elements[0].cell_type == "quad4"
     np.testing.assert_array_equal(part.nodes[2], [1, 1, 0])
 
 
@@ -185,15 +139,6 @@ def test_included_files_stand_in_place_and_are_named_in_errors(write):
         (CUBE + "*NSET, NSET=a, GENERATE\n5\n", "line 24: a GENERATE line needs"),
         (CUBE + "*SURFACE, NAME=s\nLower, S7\n", "line 24: 'S7' is no face"),
         (CUBE + "*SURFACE, NAME=s, TYPE=CUTTING SURFACE\nLower, S7\n", "line 23: a surface of type CUTTING"),
-        (CUBE + "*SHELL SECTION, ELSET=Lower, MATERIAL=m\n", "line 23: .*lacks the thickness"),
-        (CUBE + "*ELASTIC\n1, 0.3\n", r"line 23: \*ELASTIC stands before any \*MATERIAL"),
-        (CUBE + "*MATERIAL, NAME=m\n*ELASTIC\n", r"line 24: \*ELASTIC lacks its constants"),
-        (CUBE + "*MATERIAL, NAME=m\n*ELASTIC\n1.\n", "line 25: ISOTROPIC needs at least 2"),
-        (CUBE + "*MATERIAL, NAME=m\n*ELASTIC\n1., 0.3, 20.\n2., 0.3, 60.\n", "line 26: .*on temperature"),
-        (CUBE + "*MATERIAL, NAME=m\n*HYPERELASTIC, ARRUDA-BOYCE\n1., 0.3\n", "line 24: .*ARRUDA-BOYCE is"),
-        (CUBE + "*MATERIAL, NAME=m\n*HYPERELASTIC, OGDEN, N=x\n1., 0.3\n", "line 24: N=x is no number"),
-        (CUBE + "*MATERIAL, NAME=m\n*VISCOELASTIC, TIME=PRONY\n0.1, 0., -1\n", "line 25: a relaxation time"),
-        (CUBE + "*MATERIAL, NAME=m\n*VISCOELASTIC, TIME=CREEP TEST DATA\n", "line 24: .*TIME=PRONY only"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_named_with_file_and_line(write, text, message):

@@ -1,4 +1,4 @@
-"""Materials from a study's table and from Abaqus cards."""
+"""Materials from a study's table."""
 
 import re
 
@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.io.inp_cards import read_cards, read_materials
-from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden, Orthotropic
-from morph_dslam.mechanics.materials.isotropic import MooneyRivlin, NeoHookean, Ogden, StVenantKirchhoff, Yeoh
-from morph_dslam.mechanics.materials.library import LAWS, constant_quantities, material_from_card, material_from_table
+from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden
+from morph_dslam.mechanics.materials.isotropic import MooneyRivlin, NeoHookean, Ogden
+from morph_dslam.mechanics.materials.library import LAWS, constant_quantities, material_from_table
 from tests.support.material_laws import stress
 from tests.support.real_data import ROOT
 
@@ -117,74 +116,3 @@ def test_the_quantities_of_constants_are_told():
     assert set(constant_quantities("holzapfel_gasser_ogden")) == {
         "density", "bulk", "shear", "k1", "k2", "dispersion"
     }  # fmt: skip
-
-
-def card(tmp_path, text):
-    path = tmp_path / "deck.inp"
-    path.write_text("*MATERIAL, NAME=RUBBER\n" + text)
-    return read_materials(read_cards(path))["RUBBER"]
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("*HYPERELASTIC, NEO HOOKE\n0.3, 0.2\n", MooneyRivlin(c10=3e5, bulk=1e7)),
-        ("*HYPERELASTIC, MOONEY-RIVLIN\n0.3, 0.1, 0.2\n", MooneyRivlin(c10=3e5, c01=1e5, bulk=1e7)),
-        ("*HYPERELASTIC, YEOH\n0.3, -0.01, 0.001, 0.2\n", Yeoh(c10=3e5, c20=-1e4, c30=1e3, bulk=1e7)),
-        (
-            "*HYPERELASTIC, OGDEN, N=2\n0.4, 1.6, 0.1, -2., 0.2, 0.\n",
-            Ogden(moduli=(4e5, 1e5), exponents=(1.6, -2.0), bulk=1e7),
-        ),
-        ("*ELASTIC\n3., 0.3\n", StVenantKirchhoff(young=3e6, poisson=0.3)),
-    ],
-)
-def test_cards_in_millimetres_become_materials_in_si(tmp_path, text, expected):
-    material = material_from_card(card(tmp_path, text + "*DENSITY\n1.1e-9\n"), "mm")
-    assert type(material) is type(expected)
-    assert material.density == pytest.approx(1100.0)
-    np.testing.assert_allclose(stress(material, F), stress(expected, F), rtol=1e-12)
-
-
-def test_both_orthotropic_cards_state_the_same_solid(tmp_path):
-    constants = "9., 4., 2.5, 0.3, 0.25, 0.2, 1.7, 1.2,\n0.9\n"
-    law = material_from_card(card(tmp_path, "*ELASTIC, TYPE=ENGINEERING CONSTANTS\n" + constants), "m")
-    assert isinstance(law, Orthotropic)
-    c = law.small_strain_stiffness()
-    # Abaqus's order: D1111, D1122, D2222, D1133, D2233, D3333, D1212, D1313, D2323.
-    entries = [c[0, 0], c[0, 1], c[1, 1], c[0, 2], c[1, 2], c[2, 2], c[5, 5], c[4, 4], c[3, 3]]
-    text = ", ".join(f"{e!r}" for e in map(float, entries[:8])) + f",\n{float(entries[8])!r}\n"
-    other = material_from_card(card(tmp_path, "*ELASTIC, TYPE=ORTHOTROPIC\n" + text), "m")
-    np.testing.assert_allclose(other.small_strain_stiffness(), c, rtol=1e-12, atol=1e-13)
-
-
-def test_viscous_cards_give_long_term_constants_unless_they_say_otherwise(tmp_path):
-    prony = "*VISCOELASTIC, TIME=PRONY\n0.5, 0.2, 1.0\n0.1, 0.0, 10.\n"
-    law = material_from_card(card(tmp_path, "*HYPERELASTIC, NEO HOOKE\n0.3, 0.2\n" + prony), "m")
-    assert law.prony.relative_moduli == (0.5, 0.1)
-    assert law.prony.bulk == (0.2, 0.0)
-    assert law.prony.times == (1.0, 10.0)
-    assert law.c10 * (1.0 - 0.6) == pytest.approx(0.3)
-    assert law.bulk * (1.0 - 0.2) == pytest.approx(10.0)
-    text = "*HYPERELASTIC, NEO HOOKE, MODULI=INSTANTANEOUS\n0.3, 0.2\n"
-    law = material_from_card(card(tmp_path, text + prony), "m")
-    assert (law.c10, law.bulk) == (0.3, 10.0)
-
-
-def test_full_incompressibility_becomes_nearly_so(tmp_path):
-    law = material_from_card(card(tmp_path, "*HYPERELASTIC, NEO HOOKE\n0.3\n"), "m")
-    assert law.equivalent_poisson == pytest.approx(0.4999, abs=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("text", "unit", "message"),
-    [
-        ("*DENSITY\n1.\n", "m", "neither .ELASTIC nor .HYPERELASTIC"),
-        ("*ELASTIC\n3., 0.3\n", "cm", "not in cm"),
-        ("*HYPERELASTIC, YEOH\n0.3, 0., 0., 0.2, 0.1, 0.\n", "m", "D2, D3, ... other than 0"),
-        ("*ELASTIC\n3., 0.3\n*VISCOELASTIC, TIME=PRONY\n0.5, 0., 1.\n", "m", "k = g"),
-        ("*ELASTIC\n3., 0.3\n*VISCOELASTIC, TIME=PRONY\n1.5, 1.5, 1.\n", "m", "sum to less than 1"),
-    ],
-)
-def test_cards_without_a_counterpart_are_refused(tmp_path, text, unit, message):
-    with pytest.raises(StudyError, match=message):
-        material_from_card(card(tmp_path, text), unit)

@@ -1,8 +1,8 @@
-"""Abaqus and CalculiX input files: nodes, elements, sets, sections and material cards as plain data.
+"""Abaqus and CalculiX input files: nodes, elements, sets and surfaces as plain data.
 
-Numbers stay in the file's own units and labels. Cards that say nothing about mesh or material (steps,
-boundary conditions, output) are passed over; those that would generate or move nodes are refused, so that no
-part of a mesh is lost in silence.
+Numbers stay in the file's own units and labels. Cards that do not describe the mesh (materials, sections, steps,
+boundary conditions, output) are skipped; those that would generate or move nodes are refused, so that no part of a
+mesh is lost silently.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
-from morph_dslam.io.inp_cards import Card, LabelSets, Line, MaterialCard, read_cards, read_materials
+from morph_dslam.io.inp_cards import Card, LabelSets, Line, read_cards
 
 Labels = NDArray[np.int64]
 
@@ -52,21 +52,6 @@ class Elements:
 
 
 @dataclass(frozen=True)
-class Section:
-    """A *SOLID SECTION or *SHELL SECTION: which material an element set has.
-
-    ``thickness`` is in file units, None for solids; ``orientation`` names the material's axes if they are
-    turned.
-    """
-
-    element_set: str
-    material: str
-    thickness: float | None
-    line: Line
-    orientation: str = ""
-
-
-@dataclass(frozen=True)
 class SurfacePart:
     """Labels of elements and the face that each gives to a surface: S1 to S6, SPOS, SNEG, or "" for all."""
 
@@ -77,7 +62,7 @@ class SurfacePart:
 
 @dataclass(frozen=True)
 class InpFile:
-    """What an input file says of mesh and material.
+    """The mesh of an input file.
 
     Attributes
     ----------
@@ -85,8 +70,6 @@ class InpFile:
     elements : the elements, one entry for each *ELEMENT card.
     node_sets, element_sets : labels by name, as the file spells it first.
     surfaces : parts of each element surface by name.
-    sections : section cards.
-    materials : material cards by name.
     """
 
     path: Path
@@ -96,8 +79,6 @@ class InpFile:
     node_sets: Mapping[str, Labels] = field(default_factory=dict)
     element_sets: Mapping[str, Labels] = field(default_factory=dict)
     surfaces: Mapping[str, tuple[SurfacePart, ...]] = field(default_factory=dict)
-    sections: tuple[Section, ...] = ()
-    materials: Mapping[str, MaterialCard] = field(default_factory=dict)
 
 
 def _read_nodes(cards: list[Card], sets: LabelSets) -> tuple[Labels, NDArray[np.float64]]:
@@ -192,16 +173,6 @@ def _read_surface(
     return tuple(parts)
 
 
-def _read_section(card: Card) -> Section:
-    thickness = None
-    if card.keyword == "SHELL SECTION":
-        if not card.data:
-            raise card.line.error("*SHELL SECTION lacks the thickness on the line below it")
-        thickness = card.data[0].real(0)
-    orientation = card.parameters.get("ORIENTATION", "")
-    return Section(card.required("ELSET"), card.required("MATERIAL"), thickness, card.line, orientation)
-
-
 def _refuse_what_moves_nodes(cards: list[Card]) -> None:
     for card in cards:
         if card.keyword in _GENERATING:
@@ -249,7 +220,6 @@ def read_inp(path: Path) -> InpFile:
         card.required("NAME"): _read_surface(card, element_sets, node_sets, element_labels)
         for card in by_keyword.get("SURFACE", [])
     }
-    sections = by_keyword.get("SOLID SECTION", []) + by_keyword.get("SHELL SECTION", [])
     return InpFile(
         path=path,
         node_labels=labels,
@@ -258,6 +228,4 @@ def read_inp(path: Path) -> InpFile:
         node_sets=node_sets.resolved(labels),
         element_sets=element_sets.resolved(element_labels),
         surfaces={name: parts for name, parts in surfaces.items() if parts},
-        sections=tuple(_read_section(card) for card in sections),
-        materials=read_materials(cards),
     )

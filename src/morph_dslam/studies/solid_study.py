@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from morph_dslam.errors import StudyError
-from morph_dslam.mechanics.materials.base import Material
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.meshing.mesh_checks import check_mesh
 from morph_dslam.meshing.meshes import Mesh, model_mesh_of
 from morph_dslam.model import Parameter
 from morph_dslam.studies.affine import read_affine
-from morph_dslam.studies.file_materials import file_materials, require_materials
 from morph_dslam.studies.material_sections import MaterialSection
 from morph_dslam.studies.parameters import ParameterSection, TimeSection
 from morph_dslam.studies.problem import ModelMesh, Snapshot, SweepProblem
@@ -56,14 +54,11 @@ class SolidSolverSection(WorkSection):
 
 
 class SolidStudy(Section):
-    """A hyperelastic solid under supports and loads that depend on parameters.
-
-    Cells that ``materials`` leaves out have those of the mesh file's sections.
-    """
+    """A hyperelastic solid under supports and loads that depend on parameters."""
 
     name: str
     mesh: MeshSection
-    materials: dict[str, MaterialSection] = Field(default_factory=dict)
+    materials: dict[str, MaterialSection] = Field(min_length=1)
     supports: tuple[SupportSection, ...] = ()
     loads: tuple[LoadSection, ...] = ()
     shape: tuple[ShapeSection, ...] = ()
@@ -96,37 +91,24 @@ class SolidStudy(Section):
                 raise ValueError(f"{where}: {error}") from error
         if len({material.on for material in self.materials.values()}) < len(self.materials):
             raise ValueError("two materials are on the same cell set: give each its own")
-        try:
-            from_file = self._file_materials()
-            require_materials(self.mesh, {**self.materials, **from_file})
-        except StudyError as error:
-            raise ValueError(str(error)) from error
-        self._check_time(parameters, [name for name, material in from_file.items() if material.prony])
-        self._check_weight(from_file)
+        self._check_time(parameters)
+        self._check_weight()
         return self
 
-    def _file_materials(self) -> dict[str, Material]:
-        """Materials of the mesh file by cell set."""
-        return file_materials(self.mesh, [material.on for material in self.materials.values()])
-
-    def _check_weight(self, from_file: dict[str, Material]) -> None:
+    def _check_weight(self) -> None:
         """Gravity acts on densities; one that was forgotten would be a load that is not there."""
         if not any(load.kind == "gravity" for load in self.loads):
             return
         weightless = [name for name, material in self.materials.items() if "density" not in material.constants]
-        weightless += [f"of '{cells}'" for cells, material in from_file.items() if material.density == 0.0]
         if weightless:
             raise ValueError(
                 f"gravity needs densities, and the material {weightless[0]} has none: add density, which is "
-                '"0 kg/m3" if it shall have no weight, or *DENSITY to a material of the mesh file'
+                '"0 kg/m3" if it shall have no weight'
             )
 
-    def _check_time(self, parameters: tuple[Parameter, ...], viscous: list[str]) -> None:
-        """Viscous materials need a clock that starts at the lower end of its range.
-
-        ``viscous`` are cell sets of the mesh file that have such a material.
-        """
-        viscous = [name for name, material in self.materials.items() if "prony" in material.constants] + viscous
+    def _check_time(self, parameters: tuple[Parameter, ...]) -> None:
+        """Viscous materials need a clock that starts at the lower end of its range."""
+        viscous = [name for name, material in self.materials.items() if "prony" in material.constants]
         if self.time is None:
             if viscous:
                 raise ValueError(
@@ -200,7 +182,6 @@ class SolidStudy(Section):
         content["mesh"] = mesh_fingerprint(self.solid_mesh())
         content["code"] = SOLVER_VERSION
         content |= {"shape": self.model_dump(mode="json")["shape"]} if self.shape else {}
-        content |= {f"material of {name}": repr(law) for name, law in self._file_materials().items()}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def root(self) -> Array:
@@ -235,7 +216,7 @@ class SolidStudy(Section):
         reader: Reader = read
         return SolidProblem(
             mesh,
-            {section.on: section.make(reader) for section in self.materials.values()} | self._file_materials(),
+            {section.on: section.make(reader) for section in self.materials.values()},
             [section.make(reader) for section in self.supports],
             [section.make(reader) for section in self.loads],
             symbols,

@@ -21,7 +21,6 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.reduction.galerkin_method import MOST_GRID_PARAMETERS
 from morph_dslam.studies.affine import read_affine
 from morph_dslam.studies.external import ExternalStudy
-from morph_dslam.studies.file_materials import file_materials
 from morph_dslam.studies.sections import BasisName, FormatName, MethodName, ReductionSection, Section
 from morph_dslam.studies.sheet_study import SheetStudy
 from morph_dslam.studies.solid_study import SolidStudy
@@ -260,8 +259,6 @@ def locking_warnings(study: Study) -> list[str]:
         return read_affine(value, quantity, parameters)(defaults)
 
     materials = {f"'{name}'": section.make(read) for name, section in study.materials.items()}
-    given = [section.on for section in study.materials.values()]
-    materials |= {f"of '{cells}'": law for cells, law in file_materials(study.mesh, given).items()}
     mixed = study.solver.formulation == "mixed"
     return [
         f"the material {name} is nearly incompressible (Poisson's ratio {law.equivalent_poisson:.4f}) in "
