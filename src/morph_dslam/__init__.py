@@ -1,24 +1,84 @@
-"""morph-dslam: physics-based reduced models tracked in video.
+"""morph-dslam: physics-based reduced models of deformable solids, tracked in video.
 
-from morph_dslam import build, load_model, load_study, make_study, save_model
+    import morph_dslam as md
+
+Every public name is imported when it is first used, so that ``import morph_dslam`` alone is cheap. What those need
+who extend the program (material laws, sources, reduction methods, building blocks) is in `morph_dslam.extend`.
 """
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from morph_dslam._version import __version__ as __version__
 
-#: Where each public name is; loaded when first asked for, so that the command line answers at once.
-_PUBLIC = {
-    "build": "morph_dslam.studies.build",
-    "load_study": "morph_dslam.studies.study",
-    "make_study": "morph_dslam.studies.study",
-    "load_model": "morph_dslam.model",
-    "save_model": "morph_dslam.model",
+__all__ = [
+    "Frame",
+    "MorphError",
+    "Parameter",
+    "ReducedModel",
+    "SolidProblem",
+    "build",
+    "calibrate",
+    "evaluate",
+    "evaluate_depth",
+    "evaluate_trajectory",
+    "load_camera",
+    "load_model",
+    "load_study",
+    "make_study",
+    "open_live",
+    "open_source",
+    "save_model",
+    "simulate",
+    "write_build_report",
+]
+
+#: The module of each public name, as in the imports below.
+_MODULES = {
+    "Frame": "sources.frames",
+    "MorphError": "errors",
+    "Parameter": "model",
+    "ReducedModel": "model",
+    "SolidProblem": "mechanics.solid",
+    "build": "studies.build",
+    "calibrate": "calibration.calibrate",
+    "evaluate": "evaluation.evaluate",
+    "evaluate_depth": "evaluation.evaluate",
+    "evaluate_trajectory": "evaluation.trajectory",
+    "load_camera": "io.camera_files",
+    "load_model": "model",
+    "load_study": "studies.study",
+    "make_study": "studies.study",
+    "open_live": "sources",
+    "open_source": "sources",
+    "save_model": "model",
+    "simulate": "render.simulation",
+    "write_build_report": "reduction.report",
 }
+
+if TYPE_CHECKING:  # the same for editors and type checkers
+    from morph_dslam.calibration.calibrate import calibrate
+    from morph_dslam.errors import MorphError
+    from morph_dslam.evaluation.evaluate import evaluate, evaluate_depth
+    from morph_dslam.evaluation.trajectory import evaluate_trajectory
+    from morph_dslam.io.camera_files import load_camera
+    from morph_dslam.mechanics.solid import SolidProblem
+    from morph_dslam.model import Parameter, ReducedModel, load_model, save_model
+    from morph_dslam.reduction.report import write_build_report
+    from morph_dslam.render.simulation import simulate
+    from morph_dslam.sources import open_live, open_source
+    from morph_dslam.sources.frames import Frame
+    from morph_dslam.studies.build import build
+    from morph_dslam.studies.study import load_study, make_study
 
 
 def __getattr__(name: str) -> Any:
-    if name in _PUBLIC:
-        return getattr(import_module(_PUBLIC[name]), name)
-    raise AttributeError(f"module 'morph_dslam' has no attribute '{name}'")
+    if name not in _MODULES:
+        raise AttributeError(f"module 'morph_dslam' has no attribute '{name}'")
+    value = getattr(import_module(f"morph_dslam.{_MODULES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

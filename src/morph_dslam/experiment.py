@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from morph_dslam import __version__
+from morph_dslam._version import __version__
 
 FrameRange = tuple[int | None, int | None]
 

@@ -24,7 +24,7 @@ from meshio.xdmf import TimeSeriesWriter
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from morph_dslam import __version__
+from morph_dslam._version import __version__
 from morph_dslam.errors import ExportError
 from morph_dslam.model import Parameter, ReducedModel, load_model
 from morph_dslam.model.reduced_model import von_mises

@@ -17,7 +17,7 @@ from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 
-from morph_dslam import __version__
+from morph_dslam._version import __version__
 from morph_dslam.cli.arguments import positive_integer, with_signed_sections
 from morph_dslam.cli.cameras import add_camera_commands
 from morph_dslam.cli.live import add_live_commands

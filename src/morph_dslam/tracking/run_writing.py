@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from morph_dslam import __version__
+from morph_dslam._version import __version__
 from morph_dslam.io.camera_files import load_camera, save_camera
 from morph_dslam.model import save_model
 from morph_dslam.model.inner_structure import CarriedStructure

@@ -1,0 +1,33 @@
+"""What those need who extend the program or build experiments of their own, beside the names of `morph_dslam`.
+
+Here are what a command-line program needs, and the registries: a new law, source or method of reduction is one
+file that registers it. Building blocks stand in a module for each subject:
+
+=====================  ==========================================================================
+`extend.geometry`      rigid and similarity transforms, rotations
+`extend.mechanics`     meshes, hyperelastic laws, supports, loads, and what solves a `SolidProblem`
+`extend.reduction`     snapshots, methods of reduction, and separated functions
+`extend.rendering`     drawing of models: rasteriser, overlays, pictures of states
+`extend.reports`       the blocks of a report page, and the lines that sum up a run
+`extend.slam`          tracking and mapping of a rigid scene, frame by frame
+`extend.tracking`      points bound to a model, and the estimator of parameters and pose
+=====================  ==========================================================================
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__all__ = ["frame_range", "run_and_report_errors"]
+
+#: The module of each name, as in the imports below; imported when it is first used.
+_MODULES = {"frame_range": "cli.arguments", "run_and_report_errors": "cli.app"}
+
+if TYPE_CHECKING:
+    from morph_dslam.cli.app import run_and_report_errors
+    from morph_dslam.cli.arguments import frame_range
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module 'morph_dslam.extend' has no attribute '{name}'")
+    return getattr(import_module(f"morph_dslam.{_MODULES[name]}"), name)

@@ -1,0 +1,47 @@
+"""The names that scripts may rely on: they exist, say what they are, and cost nothing until they are used."""
+
+import ast
+import inspect
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import morph_dslam as md
+from morph_dslam import extend
+
+#: Packages that take long to load.
+HEAVY = ("ngsolve", "cv2", "numba", "numpy", "matplotlib")
+
+
+def test_there_are_few_public_names():
+    assert 15 <= len(md.__all__) <= 45
+    assert list(md.__all__) == sorted(md.__all__)
+    assert set(md.__all__) <= set(dir(md))
+    assert Path(md.__file__).with_name("py.typed").is_file()
+
+
+@pytest.mark.parametrize("package", [md, extend])
+def test_every_public_name_is_documented_and_known_to_type_checkers(package):
+    """The imports under TYPE_CHECKING name the same things from the same modules."""
+    for name in package.__all__:
+        assert inspect.getdoc(getattr(package, name)), name
+    (block,) = (node for node in ast.parse(Path(package.__file__).read_text()).body if isinstance(node, ast.If))
+    imports = [node for node in ast.walk(block) if isinstance(node, ast.ImportFrom)]
+    typed = {name.asname or name.name: node.module for node in imports for name in node.names}
+    assert typed == {name: f"morph_dslam.{module}" for name, module in package._MODULES.items()}
+    assert set(typed) == set(package.__all__)
+
+
+def test_a_name_that_does_not_exist_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no_such_name"):
+        md.no_such_name  # noqa: B018
+
+
+@pytest.mark.parametrize("module", ["morph_dslam", "morph_dslam.extend"])
+def test_importing_the_package_loads_nothing_heavy(module):
+    program = f"import sys, {module}; print(*[name for name in {HEAVY} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
