@@ -21,11 +21,18 @@ demo: $(INSTALLED)
 	@echo "make demo: builds a model, films it, tracks it; minutes the first time, later runs use what is there"
 	@$(BIN)/python examples/demo/run.py
 
-test: lint
-	@$(BIN)/pytest -q -m "not slow"
+# Each file of tests runs in one of two processes. What numba compiles for the tests outlives `make clean`.
+PYTEST := NUMBA_CACHE_DIR=$(CURDIR)/$(VENV)/numba $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
-test-all: lint
-	@$(BIN)/pytest -q
+# Lint runs beside the tests, which leave a core free now and then; what it finds is printed after them.
+TEST_AND_LINT = $(MAKE) --no-print-directory lint > $(VENV)/lint.log 2>&1 & lint=$$!; status=0; \
+	$(1) || status=$$?; wait $$lint || status=$$?; cat $(VENV)/lint.log; exit $$status
+
+test: $(INSTALLED)
+	@$(call TEST_AND_LINT,$(PYTEST) -m "not slow")
+
+test-all: $(INSTALLED)
+	@$(call TEST_AND_LINT,$(PYTEST))
 
 # The unit tests with the oldest versions that pyproject.toml allows, in an environment of their own.
 # The oldest Matplotlib calls pyparsing by names that newer ones warn of.
@@ -35,7 +42,7 @@ test-lowest:
 	@echo 'pyparsing<3.2' >> $(LOWEST)/lowest.txt
 	@$(LOWEST)/bin/python -m pip install --disable-pip-version-check --progress-bar off \
 		--constraint $(LOWEST)/lowest.txt --editable '.[dev]' | $(PIP_PROGRESS)
-	@NUMBA_CACHE_DIR=$(LOWEST)/numba $(LOWEST)/bin/pytest -q tests/unit
+	@NUMBA_CACHE_DIR=$(CURDIR)/$(LOWEST)/numba $(LOWEST)/bin/pytest -q -n 2 --dist loadfile tests/unit
 
 bench: $(INSTALLED)
 	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python "$$script"; done

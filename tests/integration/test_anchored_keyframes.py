@@ -15,25 +15,11 @@ from morph_dslam.tracking.multi_camera import keyframe_views_of_rig, pictures_fr
 from morph_dslam.tracking.multi_object import Known, seen_parts
 from morph_dslam.tracking.reference import SurfaceSamples
 from morph_dslam.tracking.setup import ObjectOptions, load_setup
-from tests.support.rendered_anchored_rig import (
-    FIRST_BESIDE,
-    LEFT_FRAMES,
-    MIRRORED_RIG,
-    RIG,
-    SCAN,
-    make_left_recording,
-    make_mirrored_recording,
-)
+from tests.support.rendered_anchored_rig import FIRST_BESIDE, LEFT_FRAMES, MIRRORED_RIG, RIG, SCAN
 from tests.support.tracked_rig import column, errors, exact_nodes
 
 NAMES = ("sheet", "wedge")
 CAMERA = RIG[0].camera
-
-
-@pytest.fixture(scope="module")
-def left(rig_recording):
-    """The truth of a recording from farther left than the last keyframe."""
-    return make_left_recording(rig_recording[0])
 
 
 def command(folder, output, *more):
@@ -43,9 +29,9 @@ def command(folder, output, *more):
     return ["track", *map(str, [*arguments, "-o", output, "--no-video", *more])]
 
 
-def test_objects_are_known_by_what_other_keyframes_show_of_them(rig_recording, left, tmp_path):
+def test_objects_are_known_by_what_other_keyframes_show_of_them(left_recording, tmp_path):
     """The last keyframe shows neither the side of the wedge that is filmed nor the sheet behind it."""
-    folder, mean = rig_recording[0], {}
+    (folder, left), mean = left_recording, {}
     for name, more in (("one", ["--one-view"]), ("several", [])):
         assert main(command(folder, tmp_path / name, *more)) == 0
         mean[name] = [
@@ -143,11 +129,10 @@ def test_what_is_hidden_does_not_count_as_shown_by_the_reference_view(rig_record
     assert abs(share - (1.0 - hidden.sum() / covered.sum())) < 0.08
 
 
-def test_each_camera_of_a_rig_knows_the_object_by_its_own_pictures_of_the_scan(rig_recording, left, tmp_path):
+def test_each_camera_of_a_rig_knows_the_object_by_its_own_pictures_of_the_scan(mirrored_recording, tmp_path):
     """In the last keyframe neither camera shows the side of the wedge that the first one films then."""
-    folder, mean = rig_recording[0], {}
+    (folder, truth), mean = mirrored_recording, {}
     setup = setups_of(folder)["wedge"]
-    truth = make_mirrored_recording(folder, sorted(setup.keyframes))
     for further, part in zip(
         keyframe_views_of_rig(setup, MIRRORED_RIG, [folder / "mirrored"]), MIRRORED_RIG, strict=True
     ):

@@ -75,14 +75,15 @@ def locate_ms(run_folder):
 
 
 @pytest.fixture(scope="module")
-def landmarks(recording):
+def landmarks(recording, tmp_path_factory):
     """Of the wedge, in the first frame tracked."""
     folder, truth = recording
     nodes = load_model(folder / "wedge.morph").nodes
     pixels = RIG[0].camera.project(exact_nodes(folder, truth, "wedge", SCAN - 1))
     chosen = np.random.default_rng(0).choice(len(nodes), 30, replace=False)
-    save_landmarks(folder / "wedge.csv", Landmarks(nodes[chosen], pixels[chosen]))
-    return folder / "wedge.csv"
+    path = tmp_path_factory.mktemp("landmarks") / "wedge.csv"
+    save_landmarks(path, Landmarks(nodes[chosen], pixels[chosen]))
+    return path
 
 
 @pytest.mark.parametrize("anchored_first", [True, False])

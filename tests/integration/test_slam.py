@@ -39,12 +39,6 @@ def errors_after_alignment(slam, frames, truth):
 
 
 @pytest.fixture(scope="module")
-def room_film():
-    film, truth = RoomFilm(seed=1), hand_held(N_FRAMES, seed=1)
-    return [film.frame(place) for place in truth], truth
-
-
-@pytest.fixture(scope="module")
 def room_run(room_film):
     return follow(room_film[0])
 

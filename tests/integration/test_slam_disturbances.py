@@ -21,9 +21,8 @@ from tests.support.rendered_room import CAMERA, RoomFilm, hand_held, wall
 
 
 @pytest.fixture(scope="module")
-def images():
-    film = RoomFilm(seed=1)
-    return [film.frame(place) for place in hand_held(80, seed=1)]
+def images(room_film):
+    return room_film[0]
 
 
 def follow(slam, images):

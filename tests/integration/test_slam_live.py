@@ -16,15 +16,9 @@ from morph_dslam.io.trajectory import load_trajectory
 from morph_dslam.slam.mapping import MappingWork, do_all
 from morph_dslam.slam.output import trajectory_of
 from morph_dslam.slam.slam import Slam
-from tests.support.rendered_room import CAMERA, RoomFilm, hand_held
+from tests.support.rendered_room import CAMERA
 
 N_FRAMES = 80
-
-
-@pytest.fixture(scope="module")
-def room_film():
-    film, truth = RoomFilm(seed=1), hand_held(N_FRAMES, seed=1)
-    return [film.frame(place) for place in truth], truth
 
 
 def steps(log, job=lambda: "done"):

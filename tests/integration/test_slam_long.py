@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.slam.slam import Slam
-from tests.support.rendered_room import CAMERA, RoomFilm, hand_held
+from tests.support.rendered_room import CAMERA
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "slam_long.py"
 
@@ -28,10 +28,8 @@ def test_noise_is_waited_out_with_a_reason(benchmark):
     assert benchmark.noise(60).startswith("noise_frames=60 noise_status=waiting:60 noise_mb=")
 
 
-def test_a_video_seen_forth_and_back_is_tracked_throughout(benchmark):
-    film = RoomFilm(seed=1)
-    images = [film.frame(place) for place in hand_held(80, seed=1)]
-    line = benchmark.video(images, CAMERA, 0.1)
+def test_a_video_seen_forth_and_back_is_tracked_throughout(benchmark, room_film):
+    line = benchmark.video(room_film[0], CAMERA, 0.1)
     figures = dict(part.split("=") for part in line.split())
     start = int(figures["start"])
     assert start <= 30
@@ -41,9 +39,9 @@ def test_a_video_seen_forth_and_back_is_tracked_throughout(benchmark):
     assert re.fullmatch(r"\d+\.\d/\d+\.\d", figures["localising_cpu_ms"])
 
 
-def test_records_of_frames_are_small_and_say_the_same():
-    film, slam = RoomFilm(seed=1), Slam(CAMERA)
-    frames = [slam.process_frame(film.frame(p), i, i / 30.0) for i, p in enumerate(hand_held(60, seed=1))]
+def test_records_of_frames_are_small_and_say_the_same(room_film):
+    slam = Slam(CAMERA)
+    frames = [slam.process_frame(image, i, i / 30.0) for i, image in enumerate(room_film[0][:60])]
     records = [frame.record(is_final=False) for frame in frames]
     slam.refine_map()
     for frame, record in zip(frames, records, strict=True):

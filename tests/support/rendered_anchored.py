@@ -66,7 +66,7 @@ target_mm = [0, 0, 0]
 
 
 def make_anchored_recording(folder):
-    """Write `sheet.morph`, `sequence/`, `map.h5` and `registration.json` in ``folder``; returns the truth."""
+    """Write `sheet.morph`, `sequence/`, `map.h5` and `registration.json` in ``folder``."""
     noise = np.random.default_rng(5).integers(20, 236, (150, 150, 3), dtype=np.uint8)
     table = cv2.resize(noise, (900, 900), interpolation=cv2.INTER_CUBIC)
     cv2.imwrite(str(folder / "table.png"), table)
@@ -82,7 +82,6 @@ def make_anchored_recording(folder):
     slam.refine_map()
     save_map(folder / "map.h5", slam.map, camera)
     write_registration(folder / "registration.json", slam, frames, truth)
-    return truth
 
 
 def write_registration(path, slam, frames, truth, centre=(0.0, 0.0, 0.0), names=None):

@@ -8,7 +8,6 @@ are nearly exact, as those that `morph register` adjusts by the images.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -137,11 +136,23 @@ class _Part:
         return seen.apply(self.model.positions(self.motion.parameters[frame]))
 
 
-def make_rig_recording(folder: Path) -> dict[str, dict[str, np.ndarray]]:
-    """Write models, `front/`, `aside/`, `camchain.yaml`, `camera.yaml`, `map.h5` and both registrations.
+def load_truth(folder: Path) -> dict[str, dict[str, np.ndarray]]:
+    """By object the parameters (T, d) and camera_from_object (T, 4, 4) in the first camera."""
+    truth: dict[str, dict[str, np.ndarray]] = {}
+    with np.load(folder / "truth.npz") as file:
+        for key, values in file.items():
+            name, _, quantity = key.partition("/")
+            truth.setdefault(name, {})[quantity] = values
+    return truth
 
-    Returns by object the parameters (T, d) and camera_from_object (T, 4, 4) in the first camera.
-    """
+
+def _save_truth(folder: Path, truth: dict[str, dict[str, np.ndarray]]) -> None:
+    values = {f"{name}/{quantity}": x for name, part in truth.items() for quantity, x in part.items()}
+    np.savez(folder / "truth.npz", **values)  # pyright: ignore[reportArgumentType]
+
+
+def make_rig_recording(folder: Path) -> None:
+    """Write models, `front/`, `aside/`, `camchain.yaml`, `camera.yaml`, `map.h5`, both registrations and the truth."""
     for seed, (name, cells) in enumerate((("sheet", 75), ("wedge", 75), ("table", 150))):
         noise = np.random.default_rng(seed).integers(20, 236, (cells, cells, 3), dtype=np.uint8)
         picture = cv2.resize(noise, (6 * cells, 6 * cells), interpolation=cv2.INTER_CUBIC)
@@ -157,23 +168,34 @@ def make_rig_recording(folder: Path) -> dict[str, dict[str, np.ndarray]]:
     save_camera(folder / "camera.yaml", _CAMERA)
     write_camchain(folder / "camchain.yaml", RIG)
     _scan(folder, models, truth)
-    return truth
+    _save_truth(folder, truth)
 
 
-def make_left_recording(folder: Path) -> dict[str, dict[str, np.ndarray]]:
-    """Write `left/` beside what `make_rig_recording` has written; returns its truth."""
+def _link_all(source: Path, folder: Path) -> None:
+    """Show in ``folder`` what ``source`` holds, but for its truth."""
+    for path in source.iterdir():
+        if path.name not in {"truth.npz", ".made"}:
+            (folder / path.name).symlink_to(path.resolve())
+
+
+def make_left_recording(rig: Path, folder: Path) -> None:
+    """Write `left/` and its truth, and links to what `make_rig_recording` has written in folder ``rig``."""
+    _link_all(rig, folder)
     models = {name: load_model(folder / f"{name}.morph") for name in ("sheet", "wedge")}
     parts = {name: _part(folder, name, model, _LEFT) for name, model in models.items()}
     _write_film(folder, "left", parts, RIG[0], range(LEFT_FRAMES))
-    return _truth(parts)
+    _save_truth(folder, _truth(parts))
 
 
-def make_mirrored_recording(folder: Path, keyframes: Sequence[int]) -> dict[str, dict[str, np.ndarray]]:
+def make_mirrored_recording(left: Path, folder: Path) -> None:
     """Write `both/` and `mirrored/`, the scan and what `left/` shows after it, and `camchain_mirrored.yaml`.
 
-    The second camera is to the left of the first, and has of the scan the ``keyframes`` alone. Returns
-    the truth.
+    The second camera is to the left of the first, and has of the scan the keyframes of the wedge's registration
+    alone. What `make_left_recording` has written in folder ``left`` is linked to.
     """
+    _link_all(left, folder)
+    registration = json.loads((folder / "wedge" / "adjusted.json").read_text())
+    keyframes = sorted(keyframe["frame"] for keyframe in registration["keyframes"])
     models = {name: load_model(folder / f"{name}.morph") for name in ("sheet", "wedge")}
     films = {
         film: {name: _part(folder, name, model, film) for name, model in models.items()}
@@ -189,10 +211,14 @@ def make_mirrored_recording(folder: Path, keyframes: Sequence[int]) -> dict[str,
             path = folder / "both" / f"{first + frame:06}.png"
             path.symlink_to(folder / source / f"{frame:06}.png")
     write_camchain(folder / "camchain_mirrored.yaml", MIRRORED_RIG)
-    scan, left = _truth(films[_SCAN_AND_BEND]), _truth(films[_LEFT])
-    return {
-        name: {key: np.concatenate([scan[name][key][:SCAN], left[name][key]]) for key in scan[name]} for name in scan
-    }
+    scan, there = _truth(films[_SCAN_AND_BEND]), _truth(films[_LEFT])
+    _save_truth(
+        folder,
+        {
+            name: {key: np.concatenate([scan[name][key][:SCAN], there[name][key]]) for key in scan[name]}
+            for name in scan
+        },
+    )
 
 
 def _truth(parts: dict[str, _Part]) -> dict[str, dict[str, np.ndarray]]:
@@ -206,7 +232,7 @@ def _truth(parts: dict[str, _Part]) -> dict[str, dict[str, np.ndarray]]:
 
 
 def _part(folder: Path, name: str, model: ReducedModel, film: _Film) -> _Part:
-    path = folder / f"{name}.toml"
+    path = folder / f"{name}_{film.frames}.toml"
     moves = {"sheet": _SHEET, "wedge": _WEDGE}[name].format(begin=film.begin, end=film.end)
     camera = [_PATH.format(frame=frame, position=position) for frame, position in film.path.items()]
     path.write_text(_HEAD.format(name=name, frames=film.frames) + "".join(camera) + moves)

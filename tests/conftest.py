@@ -1,0 +1,89 @@
+"""Recordings that several test files share, each made once in a run, whatever the number of workers.
+
+A shared folder is only read; what a test writes goes into its own ``tmp_path``.
+"""
+
+import fcntl
+import os
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.support.rendered_anchored import make_anchored_recording
+from tests.support.rendered_anchored_rig import (
+    load_truth,
+    make_left_recording,
+    make_mirrored_recording,
+    make_rig_recording,
+)
+from tests.support.rendered_room import RoomFilm, hand_held
+
+
+def pytest_configure(config):
+    cv2.setNumThreads(1)
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory):
+    """A function that returns folder ``name`` of this run, filled by ``make(folder)`` in the worker that asks first."""
+    root = tmp_path_factory.getbasetemp()
+    root = (root.parent if "PYTEST_XDIST_WORKER" in os.environ else root) / "shared"
+
+    def get(name, make) -> Path:
+        folder = root / name
+        root.mkdir(exist_ok=True)
+        with (root / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not (folder / ".made").exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                make(folder)
+                (folder / ".made").touch()
+        return folder
+
+    return get
+
+
+@pytest.fixture(scope="session")
+def room_film(made_once):
+    """80 grey images of a rendered room, and world_from_camera (80, 4, 4)."""
+
+    def make(folder):
+        film, path = RoomFilm(seed=1), hand_held(80, seed=1)
+        np.save(folder / "images.npy", np.array([film.frame(place) for place in path]))
+        np.save(folder / "path.npy", path)
+
+    folder = made_once("room", make)
+    return list(np.load(folder / "images.npy")), np.load(folder / "path.npy")
+
+
+@pytest.fixture(scope="session")
+def anchored_recording(made_once):
+    """Folder and truth of `make_anchored_recording`."""
+    folder = made_once("anchored", make_anchored_recording)
+    with np.load(folder / "sequence" / "truth.npz") as truth:
+        return folder, dict(truth)
+
+
+@pytest.fixture(scope="session")
+def rig_recording(made_once):
+    """Folder and truth of `make_rig_recording`."""
+    folder = made_once("rig", make_rig_recording)
+    return folder, load_truth(folder)
+
+
+@pytest.fixture(scope="session")
+def left_recording(rig_recording, made_once):
+    """Folder and truth of `make_left_recording`: all of the rig's recording, and `left/`."""
+    folder = made_once("left", lambda folder: make_left_recording(rig_recording[0], folder))
+    return folder, load_truth(folder)
+
+
+@pytest.fixture(scope="session")
+def mirrored_recording(left_recording, made_once):
+    """Folder and truth of `make_mirrored_recording`: all of the rig's recordings, `both/` and `mirrored/`."""
+    folder = made_once("mirrored", lambda folder: make_mirrored_recording(left_recording[0], folder))
+    return folder, load_truth(folder)
