@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alternative_functions import Differenced, Hats, Linearised
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import MorphError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.camera_files import load_camera
@@ -124,7 +124,7 @@ def variants(model: ReducedModel, hats: tuple[int, ...]) -> dict[str, tuple[Redu
     return rows
 
 
-def landmarks_at(folder: Path, frame: int, camera: PinholeCamera, model: ReducedModel) -> Landmarks:
+def landmarks_at(folder: Path, frame: int, camera: Camera, model: ReducedModel) -> Landmarks:
     """Material points that the camera sees in a frame, and their pixels."""
     truth, rng = np.load(folder / "truth.npz"), np.random.default_rng(0)
     state = true_state(truth, frame)
@@ -134,7 +134,7 @@ def landmarks_at(folder: Path, frame: int, camera: PinholeCamera, model: Reduced
     return Landmarks(points.rest[chosen], pixels + LANDMARK_PX * rng.standard_normal(pixels.shape))
 
 
-def _seen(model: ReducedModel, camera: PinholeCamera, state: State):
+def _seen(model: ReducedModel, camera: Camera, state: State):
     """Surface points of pixels that the object covers."""
     from morph_dslam.tracking.binding import bind_pixels, draw_view, view_of
 

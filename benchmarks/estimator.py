@@ -13,7 +13,7 @@ from time import perf_counter
 import numpy as np
 from scipy.optimize import least_squares
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, cross_matrix, rotation_exp
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField, SurfacePoints
 from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
@@ -27,7 +27,7 @@ from morph_dslam.tracking.estimator import (
 )
 
 N_POINTS, N_MODES, DEGREE = 500, 16, 7
-CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
+CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 
 
 def smooth_model() -> ReducedModel:

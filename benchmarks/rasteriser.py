@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.render.overlay import draw_overlay
 from morph_dslam.render.rasteriser import rasterise, rasterise_numpy
 from morph_dslam.render.texture import render_textured
 
-CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
+CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 COLUMNS, ROWS = 59, 44
 
 

@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import MorphError
 from morph_dslam.evaluation.trajectory import absolute_error, match
 from morph_dslam.io.trajectory import load_trajectory
@@ -41,7 +41,7 @@ from morph_dslam.threads import threads_side_by_side
 
 ROOT = Path(__file__).parents[2]
 FPS = 30.0
-CAMERA = PinholeCamera(640, 480, 525.0, 525.0, 320.0, 240.0)
+CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
 
 
 def default_data() -> Path:

@@ -34,7 +34,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.support.rendered_room import CAMERA, RoomFilm, closed_room, hand_held, round_trip
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import MorphError
 from morph_dslam.slam.frame_images import SlamFrame
 from morph_dslam.slam.run import warm_up
@@ -46,7 +46,7 @@ Image = NDArray[np.uint8]
 
 FPS = 30
 #: Of the round trip, in which drift then grows until there is a loop to close.
-SMALL_CAMERA = PinholeCamera(480, 360, 380.0, 380.0, 239.5, 179.5)
+SMALL_CAMERA = Camera(480, 360, 380.0, 380.0, 239.5, 179.5)
 #: Frames of the rendered film, and between two looks at the memory.
 FILM_FRAMES, LOOK_EVERY = 400, 50
 SCHEDULE = Path("/proc/thread-self/schedstat")
@@ -76,7 +76,7 @@ def noise(n: int) -> str:
     return f"noise_frames={n} noise_status={counts} noise_mb={settled[0]:.0f}..{settled[-1]:.0f}"
 
 
-def video(images: list[Image], camera: PinholeCamera, minutes: float) -> str:
+def video(images: list[Image], camera: Camera, minutes: float) -> str:
     """A growing map for half of the time, a frozen one for the other half."""
     n = int(60 * FPS * minutes)
     slam, records, times = Slam(camera), [], []

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField, SurfacePoints, load_model
 from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
@@ -36,7 +36,7 @@ from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.tracker import Tracker
 
 Array = NDArray[np.float64]
-CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
+CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 SEAL = Path(__file__).resolve().parents[1] / "examples/boot_seal/output/boot_seal.morph"
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import EvaluationError
 from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.tracking.binding import draw_view, facing, view_of
@@ -75,7 +75,7 @@ class Matches:
 
 
 def silhouette_points(
-    model: ReducedModel, camera: PinholeCamera, state: State, free: NDArray[np.bool_]
+    model: ReducedModel, camera: Camera, state: State, free: NDArray[np.bool_]
 ) -> tuple[BoundPoints, Array]:
     """Points of the model on its silhouette, and the image normals (p, 2) of their edges, outwards.
 
@@ -119,7 +119,7 @@ def _edges(triangles: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.
 
 
 def match(
-    model: ReducedModel, camera: PinholeCamera, state: State, free: NDArray[np.bool_], outline: Array, reach_px: float
+    model: ReducedModel, camera: Camera, state: State, free: NDArray[np.bool_], outline: Array, reach_px: float
 ) -> Matches:
     """Silhouette points of a state and the nearest of the outline's points (k, 2), within a reach."""
     points, normals = silhouette_points(model, camera, state, free)

@@ -224,7 +224,7 @@ def _solve(jacobian: Array, residual: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class PinholeCamera:
+class Camera:
     """The intrinsics of a camera, in pixels, and its lens.
 
     Attributes
@@ -353,7 +353,7 @@ class RectifiedPair:
     left_maps, right_maps : for `cv2.remap`, from recorded images to rectified ones.
     """
 
-    camera: PinholeCamera
+    camera: Camera
     baseline: float
     rectified_from_left: Array
     left_maps: tuple[NDArray, NDArray]
@@ -369,8 +369,8 @@ class RectifiedPair:
 class StereoCamera:
     """Two cameras and the pose of the left one in the right one's frame, metres."""
 
-    left: PinholeCamera
-    right: PinholeCamera
+    left: Camera
+    right: Camera
     right_from_left: RigidTransform
 
     @property
@@ -395,7 +395,7 @@ class StereoCamera:
         rotation = self._rectified_from_left()
         focal = float(np.mean([*left.intrinsics[:2], *right.intrinsics[:2]]))
         centre = 0.5 * (left.intrinsics[2:] + right.intrinsics[2:])
-        camera = PinholeCamera(left.width, left.height, focal, focal, float(centre[0]), float(centre[1]))
+        camera = Camera(left.width, left.height, focal, focal, float(centre[0]), float(centre[1]))
         rays = camera.rays(_pixel_grid(camera))
         left_rays = rays @ rotation
         right_rays = left_rays @ self.right_from_left.rotation.T
@@ -418,12 +418,12 @@ class StereoCamera:
         return np.stack([x, y, np.cross(x, y)])
 
 
-def _pixel_grid(camera: PinholeCamera) -> Array:
+def _pixel_grid(camera: Camera) -> Array:
     rows, columns = np.mgrid[: camera.height, : camera.width]
     return np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
 
 
-def _maps(camera: PinholeCamera, rays: Array) -> tuple[NDArray, NDArray]:
+def _maps(camera: Camera, rays: Array) -> tuple[NDArray, NDArray]:
     """Maps for `cv2.remap` that take each pixel from where the camera recorded its ray."""
     pixels = camera.project_recorded(rays).astype(np.float32).reshape(camera.height, camera.width, 2)
     return cv2.convertMaps(pixels, None, cv2.CV_16SC2)  # type: ignore[call-overload]

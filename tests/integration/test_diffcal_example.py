@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import EvaluationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.meshing.generators import block
@@ -18,7 +18,7 @@ from tests.support.real_data import ROOT
 
 NAMES = ("recording", "silhouette", "silicone", "pictures", "fitting")
 CLAMPED_FROM = 0.07
-CAMERA = PinholeCamera(640, 480, 700.0, 700.0, 319.5, 239.5)
+CAMERA = Camera(640, 480, 700.0, 700.0, 319.5, 239.5)
 #: The bar hangs in front of the camera, seen a little from the side: y up, as the recordings have it.
 POSE = RigidTransform(
     rotation_exp(np.array([0.0, 0.35, 0.0])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.0, -0.02, 0.45])

@@ -10,7 +10,7 @@ from morph_dslam.timing import StageClock
 from morph_dslam.tracking.estimator import Estimator
 from morph_dslam.tracking.observability import position_std
 from morph_dslam.tracking.options import TrackerOptions
-from morph_dslam.tracking.patches import flatten
+from morph_dslam.tracking.patches import normalize_contrast
 from morph_dslam.tracking.reference import PosedImage, ReferenceView
 from morph_dslam.tracking.result import Image
 from morph_dslam.tracking.state import moved
@@ -35,7 +35,9 @@ def known_views(film, step=None, deviations=None):
             error_factors = np.vstack([np.zeros((2, 6)), np.diag(deviations)])
         if step is not None:
             state = moved(state, np.concatenate([np.zeros(2), step]))
-        views.append(PosedImage(Image(grey, flatten(grey, OPTIONS.flow.flatten_window)), state, error_factors))
+        views.append(
+            PosedImage(Image(grey, normalize_contrast(grey, OPTIONS.flow.contrast_window)), state, error_factors)
+        )
     return views
 
 
@@ -72,7 +74,7 @@ def test_a_view_from_between_looks_as_it_is_rendered_from_both_sides(film, views
     first = ReferenceView(estimator, views[:1], OPTIONS)
     both = ReferenceView(estimator, [views[0], views[4]], OPTIONS)
     between = block_state(np.radians(50), 0.3)
-    actual = flatten(np.ascontiguousarray(film.frame(between, noise=0.0)[..., 0]), 31)
+    actual = normalize_contrast(np.ascontiguousarray(film.frame(between, noise=0.0)[..., 0]), 31)
     seen = cv2.erode(np.isfinite(both.depth(between)).astype(np.uint8), np.ones((21, 21))) > 0
     likeness = [np.corrcoef(r.rendered(between).image[seen], actual[seen])[0, 1] for r in (first, both)]
     assert likeness[0] < 0.8
@@ -108,7 +110,7 @@ def test_what_covers_a_picture_is_not_taken_for_the_object(film, views, estimato
     hand = np.zeros(grey.shape, dtype=bool)
     hand[200:280, 280:360] = True
     grey[hand] = np.clip(grey.astype(int) + noise, 0, 255)[hand].astype(np.uint8)
-    covered = replace(views[4], picture=Image(grey, flatten(grey, 31)))
+    covered = replace(views[4], picture=Image(grey, normalize_contrast(grey, 31)))
     further = choose_keyframe_views(estimator, views[0], [views[2], covered, views[5]], OPTIONS)
     (number,) = (k for k, view in enumerate(further.views) if view.picture is covered.picture)
     bound = ReferenceView(estimator, [views[0], *further.views], OPTIONS)

@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import fit_similarity
 from morph_dslam.slam.loop_closing import LoopCloser, Similarities, optimise
 from morph_dslam.slam.output import trajectory_of
@@ -17,7 +17,7 @@ from morph_dslam.slam.slam import Slam
 from tests.support.rendered_room import RoomFilm, closed_room, pose, round_trip
 
 NONE = np.empty(0, dtype=np.int64)
-CAMERA = PinholeCamera(480, 360, 380.0, 380.0, 239.5, 179.5)
+CAMERA = Camera(480, 360, 380.0, 380.0, 239.5, 179.5)
 
 
 def keyframe_errors(slam, truth):

@@ -23,7 +23,7 @@ from morph_dslam.render.texture import render_textured
 from morph_dslam.slam.map_files import save_map
 from morph_dslam.slam.rigid_map import GOOD, Keyframe, RigidMap
 from morph_dslam.tracking.estimator import Estimator
-from morph_dslam.tracking.patches import flatten
+from morph_dslam.tracking.patches import normalize_contrast
 from morph_dslam.tracking.relocalization import RelocalizationOptions, state_from_matches
 from morph_dslam.tracking.run_live import LiveOptions, run_live
 from morph_dslam.tracking.setup import ObjectOptions
@@ -165,8 +165,8 @@ def test_a_board_in_a_map_tells_the_unit_and_the_place(tmp_path, scene):
         rotation = pose.rotation @ world.rotation.T
         view = np.eye(4)
         view[:3, :3], view[:3, 3] = rotation, 3.7 * pose.translation - rotation @ world.translation
-        flat = flatten(picture_of(board, pose), 31)
-        rigid_map.add_keyframe(Keyframe(k, 0.1 * k, flat, view, np.arange(1), np.zeros((1, 2))))
+        normalized = normalize_contrast(picture_of(board, pose), 31)
+        rigid_map.add_keyframe(Keyframe(k, 0.1 * k, normalized, view, np.arange(1), np.zeros((1, 2))))
     save_map(tmp_path / "map.h5", rigid_map, CAMERA)
     save_camera(tmp_path / "camera.yaml", CAMERA)
     save_model(tmp_path / "sheet.morph", scene.model)

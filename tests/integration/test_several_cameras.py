@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.cli.app import main
 from morph_dslam.errors import RegistrationError
 from morph_dslam.evaluation.run_folder import load_run
@@ -18,10 +18,10 @@ from tests.support.camchain import write_camchain
 from tests.support.rendered_sequence import SheetFilm, mean_error, sheet_state
 
 #: Two cameras of wide lenses, so that one by itself tells little along its sight line; 0.4 m apart.
-FRONT = RigCamera(PinholeCamera(480, 360, 330.0, 330.0, 240.0, 180.0), RigidTransform.identity())
+FRONT = RigCamera(Camera(480, 360, 330.0, 330.0, 240.0, 180.0), RigidTransform.identity())
 TURN = rotation_exp(np.array([0.0, 0.5, 0.0]))
 ASIDE = RigCamera(
-    PinholeCamera(480, 360, 350.0, 350.0, 235.0, 182.0),
+    Camera(480, 360, 350.0, 350.0, 235.0, 182.0),
     RigidTransform(TURN, np.array([0.0, 0.0, 0.62]) - TURN @ np.array([0.0, 0.0, 0.62])),
 )
 RIG = (FRONT, ASIDE)

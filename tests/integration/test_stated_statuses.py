@@ -115,7 +115,7 @@ def map_with(objects, metric=True):
     rigid_map.add_points(points.positions, np.zeros((len(points), 2)), 0, GOOD)
     for view in views:
         pose = view.camera_from_world.matrix
-        keyframe = Keyframe(view.frame, view.frame / 30.0, view.flat, pose, view.point_ids, view.pixels)
+        keyframe = Keyframe(view.frame, view.frame / 30.0, view.normalized, pose, view.point_ids, view.pixels)
         rigid_map.add_keyframe(keyframe)
     return rigid_map
 

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import CameraError, RegistrationError, SourceError, TrackingError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.io.camera_files import save_camera
@@ -167,7 +167,7 @@ def test_reference_may_lie_inside_the_range(inputs, tmp_path):
 
 
 def test_camera_of_another_size_is_refused(inputs, tmp_path):
-    save_camera(tmp_path / "camera.yaml", PinholeCamera(1280, 720, 900.0, 900.0, 640.0, 360.0))
+    save_camera(tmp_path / "camera.yaml", Camera(1280, 720, 900.0, 900.0, 640.0, 360.0))
     chosen = {**vars(options(inputs, tmp_path / "run")), "camera": tmp_path / "camera.yaml"}
     with pytest.raises(CameraError, match="is 640x480 pixels but the camera file is for 1280x720"):
         track(TrackOptions(**chosen))

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.tracking.binding import draw_view, view_of
@@ -84,7 +84,7 @@ def test_lost_object_says_why_and_is_recovered_elsewhere(model, film):
 
 def test_lens_distortion_is_undone(model):
     """Frames warped by a lens give the same states as ideal ones."""
-    lens = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0, (-0.15, 0.05, 0.001, -0.001))
+    lens = Camera(640, 480, 528.0, 528.0, 320.0, 240.0, (-0.15, 0.05, 0.001, -0.001))
     columns, rows = np.meshgrid(np.arange(640.0), np.arange(480.0))
     ideal = lens.undistort_pixels(np.column_stack([columns.ravel(), rows.ravel()]))
     maps = ideal.reshape(480, 640, 2).astype(np.float32)

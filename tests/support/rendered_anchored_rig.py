@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, cross_matrix, rotation_exp
 from morph_dslam.io.camera_files import save_camera
 from morph_dslam.model import ReducedModel, load_model, save_model
@@ -39,13 +39,13 @@ KEYFRAME_DEVIATIONS = np.array([5e-4, 5e-4, 5e-4, 2e-4, 2e-4, 2e-4])
 #: The wedge is so much larger than the one on the stage.
 WEDGE_SIZE = 2.0
 
-_CAMERA = PinholeCamera(480, 360, 420.0, 420.0, 239.5, 179.5)
+_CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
 
 
 def _rig(turn: float) -> tuple[RigCamera, RigCamera]:
     """The second camera 0.22 m beside the first, turned so that both look at the same place 0.55 m away."""
     around, place = rotation_exp(np.array([0.0, turn, 0.0])), np.array([0.0, 0.0, 0.55])
-    beside = PinholeCamera(480, 360, 400.0, 400.0, 236.0, 182.0)
+    beside = Camera(480, 360, 400.0, 400.0, 236.0, 182.0)
     pose = RigidTransform(around, place - around @ place)
     return RigCamera(_CAMERA, RigidTransform.identity()), RigCamera(beside, pose)
 

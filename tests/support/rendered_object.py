@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.registration.scene import MapPoints, View
 from morph_dslam.render.model_view import looking_at
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
-from morph_dslam.tracking.patches import flatten
+from morph_dslam.tracking.patches import normalize_contrast
 from tests.support.rendered_sequence import printed_texture
 
-CAMERA = PinholeCamera(480, 360, 420.0, 420.0, 239.5, 179.5)
+CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
 #: Corners of the wedge, metres: no two of its views from around are alike.
 _CORNERS = np.array(
     [
@@ -87,24 +87,30 @@ def scanned(world_from_object, objects=ONE, noise=3e-4, seed=0, with_images=Fals
         on_surface = np.einsum("pc,pcx->px", rng.dirichlet(np.ones(3), 320), corners[chosen])
         parts.append(on_surface[on_surface[:, 2] > 2e-3] + place)
     points = np.concatenate(parts)
-    texture = flatten(printed_texture(400, 520, seed), 31)
+    texture = normalize_contrast(printed_texture(400, 520, seed), 31)
     views, count, places = [], np.zeros(len(points)), np.zeros((len(points), 3))
     for pose in cameras():
         pixels, seen = visible_in(pose, points, scene, scene_triangles)
-        flat = np.full((CAMERA.height, CAMERA.width), 128, dtype=np.uint8)
+        normalized = np.full((CAMERA.height, CAMERA.width), 128, dtype=np.uint8)
         if with_images:
             local = pose.apply(scene)
             drawn = rasterise(CAMERA.project(local), local[:, 2], scene_triangles, CAMERA.height, CAMERA.width)
             image = render_textured(drawn, scene_triangles, np.tile(coordinates, (len(objects), 1)), texture)
-            flat = np.where(drawn.covered, image, np.uint8(128)).astype(np.uint8)
+            normalized = np.where(drawn.covered, image, np.uint8(128)).astype(np.uint8)
         camera_from_world = _camera_from_world(pose, world_from_object)
-        views.append(View(len(views), flat, camera_from_world, np.flatnonzero(seen), pixels[seen]))
+        views.append(View(len(views), normalized, camera_from_world, np.flatnonzero(seen), pixels[seen]))
         count[seen] += 1
         places[seen] += camera_from_world.inverse.translation
     kept = count >= 2
     rows = np.cumsum(kept) - 1
     views = [
-        View(v.frame, v.flat, v.camera_from_world, rows[v.point_ids[kept[v.point_ids]]], v.pixels[kept[v.point_ids]])
+        View(
+            v.frame,
+            v.normalized,
+            v.camera_from_world,
+            rows[v.point_ids[kept[v.point_ids]]],
+            v.pixels[kept[v.point_ids]],
+        )
         for v in views
     ]
     noisy = points + noise * rng.standard_normal(points.shape)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
 from tests.support.rendered_sequence import printed_texture
 
-CAMERA = PinholeCamera(640, 480, 525.0, 525.0, 319.5, 239.5)
+CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 #: Texture pixels a metre: about one for each pixel of the image at the usual distance of 2.5 m.
 DENSITY = 210.0
 

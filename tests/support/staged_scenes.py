@@ -13,7 +13,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
@@ -105,7 +105,7 @@ class Stage:
     coordinates: np.ndarray
     texture: np.ndarray
     backdrop: np.ndarray
-    camera: PinholeCamera
+    camera: Camera
     rng: np.random.Generator
 
     def frame(

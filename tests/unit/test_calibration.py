@@ -2,7 +2,7 @@
 
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import CameraError
 from morph_dslam.io.camera_files import load_camera, save_camera
 
@@ -11,14 +11,14 @@ GOOD = "width: 640\nheight: 480\nfx: 528.0\nfy: 527.5\ncx: 320\ncy: 239.5\n"
 
 @pytest.mark.parametrize("distortion", [(), (-0.2, 0.1, 1e-3, 2e-3), (-0.2, 0.1, 1e-3, 2e-3, 0.05)])
 def test_a_saved_camera_is_read_back(tmp_path, distortion):
-    camera = PinholeCamera(640, 480, 528.0144, 527.5, 320.25, 239.5, distortion)
+    camera = Camera(640, 480, 528.0144, 527.5, 320.25, 239.5, distortion)
     save_camera(tmp_path / "camera.yaml", camera)
     assert load_camera(tmp_path / "camera.yaml") == camera
 
 
 def test_a_handwritten_file_is_read(tmp_path):
     (tmp_path / "camera.yaml").write_text(GOOD)
-    assert load_camera(tmp_path / "camera.yaml") == PinholeCamera(640, 480, 528.0, 527.5, 320.0, 239.5)
+    assert load_camera(tmp_path / "camera.yaml") == Camera(640, 480, 528.0, 527.5, 320.0, 239.5)
 
 
 @pytest.mark.parametrize(

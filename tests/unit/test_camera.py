@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import CameraError
 
-PLAIN = PinholeCamera(640, 480, 528.0, 531.0, 318.5, 241.2)
-BARREL = PinholeCamera(640, 480, 528.0, 531.0, 318.5, 241.2, (-0.28, 0.09, 1e-3, -5e-4, 0.02))
+PLAIN = Camera(640, 480, 528.0, 531.0, 318.5, 241.2)
+BARREL = Camera(640, 480, 528.0, 531.0, 318.5, 241.2, (-0.28, 0.09, 1e-3, -5e-4, 0.02))
 RATIONAL = replace(BARREL, distortion=(0.4, -0.1, 1e-3, -5e-4, 0.02, 0.6, -0.05, 0.01))
 FISHEYE = replace(BARREL, distortion=(0.03, -0.02, 0.008, -0.001), lens_model="fisheye")
 
@@ -86,7 +86,7 @@ def test_recorded_jacobian_by_central_differences(camera):
 
 def test_a_fisheye_sees_more_than_a_pinhole_does():
     # Equidistant with k = 0: the image radius is the angle itself, here 120 degrees to the right.
-    lens = PinholeCamera(640, 480, 100.0, 100.0, 320.0, 240.0, (0.0, 0.0, 0.0, 0.0), "fisheye")
+    lens = Camera(640, 480, 100.0, 100.0, 320.0, 240.0, (0.0, 0.0, 0.0, 0.0), "fisheye")
     aside = np.array([[np.sin(2.0 * np.pi / 3.0), 0.0, np.cos(2.0 * np.pi / 3.0)], [0.0, 0.0, 1.0]])
     expected = [[320.0 + 100.0 * 2.0 * np.pi / 3.0, 240.0], [320.0, 240.0]]
     np.testing.assert_allclose(lens.project_recorded(aside), expected, atol=1e-9)
@@ -97,7 +97,7 @@ def test_a_fisheye_sees_more_than_a_pinhole_does():
 
 def test_pixels_beyond_the_fold_of_the_distortion_are_not_undistorted():
     # r (1 - r^2 / 3) is largest, 2/3, at r = 1: nothing is imaged farther out.
-    folding = PinholeCamera(640, 480, 300.0, 300.0, 320.0, 240.0, (-1.0 / 3.0, 0.0, 0.0, 0.0))
+    folding = Camera(640, 480, 300.0, 300.0, 320.0, 240.0, (-1.0 / 3.0, 0.0, 0.0, 0.0))
     inside, outside = [320.0 + 300.0 * 0.5 * (1 - 0.25 / 3.0), 240.0], [320.0 + 300.0 * 0.7, 240.0]
     found = folding.undistort_pixels(np.array([inside, outside]))
     np.testing.assert_allclose(found[0], [470.0, 240.0], atol=1e-6)
@@ -117,9 +117,9 @@ def test_undistortion_maps_are_opencvs(camera):
 
 def test_wrong_lenses_are_refused():
     with pytest.raises(CameraError, match="unknown lens model 'mirror'"):
-        PinholeCamera(640, 480, 500.0, 500.0, 320.0, 240.0, (), "mirror")
+        Camera(640, 480, 500.0, 500.0, 320.0, 240.0, (), "mirror")
     with pytest.raises(CameraError, match="fisheye distortion has 0 values; give 4"):
-        PinholeCamera(640, 480, 500.0, 500.0, 320.0, 240.0, (), "fisheye")
+        Camera(640, 480, 500.0, 500.0, 320.0, 240.0, (), "fisheye")
 
 
 def test_undistortion_maps_bring_a_distorted_dot_to_its_ideal_pixel():

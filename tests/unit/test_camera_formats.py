@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import CameraError
 from morph_dslam.io.camera_files import load_camera, save_camera
 from tests.support.real_data import real_data
@@ -104,14 +104,11 @@ BROWN = (-0.28, 0.07, 0.0002, 1.76e-05)
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (ROS, PinholeCamera(640, 480, 458.654, 457.296, 367.215, 248.375, BROWN)),
-        (ROS_TOPIC, PinholeCamera(640, 480, 300, 301, 320, 240, (0.01, -0.02, 0.003, 1e-5), "fisheye")),
+        (ROS, Camera(640, 480, 458.654, 457.296, 367.215, 248.375, BROWN)),
+        (ROS_TOPIC, Camera(640, 480, 300, 301, 320, 240, (0.01, -0.02, 0.003, 1e-5), "fisheye")),
         (ROS.replace("-0.28, 0.07, 0.0002, 1.76e-05, 0", "0, 0, 0, 0, 0"), (458.654, ())),
-        (ORB_SLAM2, PinholeCamera(752, 480, 458.654, 457.296, 367.215, 248.375, BROWN)),
-        (
-            ORB_SLAM3,
-            PinholeCamera(512, 512, 190.97, 190.97, 254.93, 256.89, (0.0034, 0.0007, -0.002, 0.0002), "fisheye"),
-        ),
+        (ORB_SLAM2, Camera(752, 480, 458.654, 457.296, 367.215, 248.375, BROWN)),
+        (ORB_SLAM3, Camera(512, 512, 190.97, 190.97, 254.93, 256.89, (0.0034, 0.0007, -0.002, 0.0002), "fisheye")),
         (EUROC, (458.654, (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05))),
     ],
 )
@@ -133,7 +130,7 @@ def test_a_camera_chosen_from_a_chain(tmp_path):
     path.write_text(KALIBR)
     assert load_camera(tmp_path / "camchain.yaml#cam0").distortion == (-0.28, 0.07, 0.0002, 1e-5)
     second = load_camera(tmp_path / "camchain.yaml#cam1")
-    assert second == PinholeCamera(752, 480, 380, 381, 370, 250, (0.01, -0.02, 0.003, 0.0), "fisheye")
+    assert second == Camera(752, 480, 380, 381, 370, 250, (0.01, -0.02, 0.003, 0.0), "fisheye")
     with pytest.raises(CameraError, match=r"holds the cameras cam0, cam1: choose one, .*camchain\.yaml#cam0"):
         load_camera(path)
     with pytest.raises(CameraError, match="holds the cameras cam0, cam1"):
@@ -176,7 +173,7 @@ def test_colmap_cameras(tmp_path, line, distortion, lens):
     path = tmp_path / "cameras.txt"
     path.write_text(f"# Camera list\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 {line}\n")
     # COLMAP's centre of a 640x480 image is (320, 240); with pixel centres at whole numbers (319.5, 239.5).
-    assert load_camera(path) == PinholeCamera(640, 480, 500, 500, 319.5, 239.5, distortion, lens)
+    assert load_camera(path) == Camera(640, 480, 500, 500, 319.5, 239.5, distortion, lens)
 
 
 def test_a_camera_chosen_from_a_colmap_model(tmp_path):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
 from morph_dslam.model.reduced_model import with_revolution_angle
@@ -14,7 +14,7 @@ from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.sequence_filter import SequenceFilter, without_clear_effect
 from tests.support.bent_tube import AXIS, bent_tube
 
-CAMERA = PinholeCamera(640, 480, 560.0, 560.0, 320.0, 240.0)
+CAMERA = Camera(640, 480, 560.0, 560.0, 320.0, 240.0)
 MODEL = with_revolution_angle(bent_tube(), AXIS)
 ESTIMATOR = Estimator(MODEL, CAMERA)
 POSE = RigidTransform(rotation_exp(np.array([2.2, 0.1, 0.0])), np.array([0.0, 0.04, 0.4]))

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.io.camera_files import load_camera
 from morph_dslam.io.colmap import ColmapImage, write_colmap_model
 from morph_dslam.io.trajectory import load_trajectory
 
-CAMERA = PinholeCamera(640, 480, 500.0, 510.0, 320.5, 238.0)
+CAMERA = Camera(640, 480, 500.0, 510.0, 320.5, 238.0)
 
 
 @pytest.fixture

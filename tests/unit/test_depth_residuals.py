@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
 from morph_dslam.tracking.depth import DepthOptions, PointDepths, linearise_depths, linearise_depths_numpy
@@ -12,7 +12,7 @@ from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model
 
-CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
+CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 MODEL = bent_sheet_model(22, 16)
 POSE = RigidTransform(
     rotation_exp(np.array([0.2, -0.3, 0.05])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.02, -0.01, 0.6])
@@ -138,7 +138,7 @@ def test_jumps_holes_and_the_image_border_have_no_depth():
 
 def test_lens_is_taken_into_account():
     """The depth image is as recorded, pixels are of the undistorted image."""
-    camera = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0, (-0.3, 0.1, 0.0, 0.0))
+    camera = Camera(640, 480, 528.0, 528.0, 320.0, 240.0, (-0.3, 0.1, 0.0, 0.0))
     normal = np.array([0.5, -0.3, 0.8])
     rows, columns = np.mgrid[:480, :640]
     recorded = np.column_stack([columns.ravel(), rows.ravel()]).astype(float)

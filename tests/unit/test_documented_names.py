@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from pydantic import BaseModel
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.cli import app as cli
 from morph_dslam.io.camera_files import _CameraFile
 from morph_dslam.mechanics.materials.library import LAWS, constant_quantities
@@ -85,7 +85,7 @@ def test_every_result_of_a_run_is_documented(tmp_path):
 
 
 def test_every_result_of_camera_tracking_is_documented(tmp_path):
-    slam = Slam(PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0))
+    slam = Slam(Camera(640, 480, 528.0, 528.0, 320.0, 240.0))
     frame = slam.process_frame(np.zeros((480, 640, 3), np.uint8), 0, 0.0)
     found = set(write_slam_run(tmp_path, slam, [frame.record(is_final=False)], {}))
     columns = (tmp_path / "frames.csv").read_text().splitlines()[0].split(",")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
 from morph_dslam.tracking.covariance import huber_covariance, huber_covariance_numpy
@@ -23,7 +23,7 @@ from morph_dslam.tracking.estimator import (
 from morph_dslam.tracking.levenberg_marquardt import bounded_step, bounded_step_numpy
 from tests.support.bent_sheet import bent_sheet_model
 
-CAMERA = PinholeCamera(640, 480, 528.0, 520.0, 320.0, 240.0)
+CAMERA = Camera(640, 480, 528.0, 520.0, 320.0, 240.0)
 POSE = RigidTransform(
     rotation_exp(np.array([0.2, -0.3, 0.05])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.02, -0.01, 0.6])
 )

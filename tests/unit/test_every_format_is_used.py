@@ -9,7 +9,7 @@ import numpy as np
 import pygltflib
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.explore.server import ModelSurface
 from morph_dslam.export import StateChoice, export
 from morph_dslam.geometry import RigidTransform, rotation_exp
@@ -96,7 +96,7 @@ def test_the_page_in_the_browser_shows_the_closed_form(path):
 
 
 def test_parameters_are_estimated_from_pixels(path):
-    model, camera = load_model(path), PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
+    model, camera = load_model(path), Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
     rng = np.random.default_rng(0)
     surface = SurfacePoints(rng.integers(len(model.triangles), size=80), rng.dirichlet(np.ones(3), 80))
     points = BoundPoints.from_surface(model, surface)

@@ -12,10 +12,10 @@ from morph_dslam.tracking.patches import (
     NEUTRAL,
     FlowOptions,
     detect_orb,
-    flatten,
     follow,
     interior,
     match_descriptors,
+    normalize_contrast,
     spread_corners,
 )
 from tests.support.bent_sheet import bent_sheet_model
@@ -37,15 +37,15 @@ def image():
 def test_flattening_removes_slow_shading(image):
     rows = np.linspace(0.0, 40.0, 480)[:, None]
     shaded = np.clip(image.astype(float) * 0.8 + rows, 0, 255).astype(np.uint8)
-    plain = flatten((image * 0.8).astype(np.uint8), OPTIONS.flatten_window).astype(int)
-    difference = flatten(shaded, OPTIONS.flatten_window).astype(int) - plain
+    plain = normalize_contrast((image * 0.8).astype(np.uint8), OPTIONS.contrast_window).astype(int)
+    difference = normalize_contrast(shaded, OPTIONS.contrast_window).astype(int) - plain
     assert np.abs(difference[20:-20, 20:-20]).max() <= 2
 
 
 def test_followed_points_move_by_the_shift(image):
-    flat = flatten(image, 31)
-    points = spread_corners(flat, np.pad(np.full((400, 560), 255, np.uint8), 40), 150)
-    found, ok = follow(flat, flatten(shifted(image, 7.25, -4.5), 31), points, points, OPTIONS)
+    normalized = normalize_contrast(image, 31)
+    points = spread_corners(normalized, np.pad(np.full((400, 560), 255, np.uint8), 40), 150)
+    found, ok = follow(normalized, normalize_contrast(shifted(image, 7.25, -4.5), 31), points, points, OPTIONS)
     assert ok.mean() > 0.95
     np.testing.assert_allclose(np.median(found - points, axis=0), [7.25, -4.5], atol=0.06)
     assert np.percentile(np.abs(found[ok] - points[ok] - [7.25, -4.5]), 95) < 0.15
@@ -60,7 +60,7 @@ def test_following_no_points_is_allowed(image):
 def test_corners_are_spread_over_the_mask_and_stay_in_it(image):
     mask = np.zeros((480, 640), np.uint8)
     mask[100:400, 100:500] = 255
-    corners = spread_corners(flatten(image, 31), mask, 200)
+    corners = spread_corners(normalize_contrast(image, 31), mask, 200)
     assert 120 <= len(corners) <= 200
     assert (corners >= [99.5, 99.5]).all()
     assert (corners <= [499.5, 399.5]).all()
@@ -100,10 +100,10 @@ def test_rendering_looks_like_the_frame_it_predicts():
     model = bent_sheet_model()
     film = SheetFilm(model)
     first, second = sheet_state(0.0), sheet_state(0.15)
-    flat = flatten(film.frame(first, noise=0.0)[..., 0], 31)
-    appearance = ReferenceAppearance(model, CAMERA, [flat], [view_of(model, CAMERA, first)])
+    normalized = normalize_contrast(film.frame(first, noise=0.0)[..., 0], 31)
+    appearance = ReferenceAppearance(model, CAMERA, [normalized], [view_of(model, CAMERA, first)])
     rendering = appearance.render(view_of(model, CAMERA, second))
-    actual = flatten(film.frame(second, noise=0.0)[..., 0], 31)
+    actual = normalize_contrast(film.frame(second, noise=0.0)[..., 0], 31)
     inside = interior(np.isfinite(rendering.depth), 20) > 0
     assert inside.sum() > 50_000
     assert np.corrcoef(rendering.image[inside], actual[inside])[0, 1] > 0.97
@@ -135,8 +135,8 @@ def test_drawing_in_one_pass_equals_drawing_in_two(closed):
 def test_rendering_an_object_outside_the_image_is_empty():
     model = bent_sheet_model(22, 16)
     state = sheet_state(0.0)
-    flat = np.full((480, 640), 90, np.uint8)
-    appearance = ReferenceAppearance(model, CAMERA, [flat], [view_of(model, CAMERA, state)])
+    normalized = np.full((480, 640), 90, np.uint8)
+    appearance = ReferenceAppearance(model, CAMERA, [normalized], [view_of(model, CAMERA, state)])
     for position in ([9.0, 0.0, 0.6], [0.0, 0.0, -0.6]):
         away = State(state.parameters, RigidTransform(state.camera_from_object.rotation, np.array(position)))
         rendering = appearance.render(view_of(model, CAMERA, away))

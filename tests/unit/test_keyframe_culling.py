@@ -3,21 +3,21 @@
 import numpy as np
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.slam.map_files import load_map, save_map
 from morph_dslam.slam.mapping import ENOUGH_KEYFRAMES, MOST_AT_ONCE, RECENT, cull_keyframes
 from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, REMOVED, Keyframe, RigidMap
 from tests.support.rendered_room import pose
 
-CAMERA = PinholeCamera(4, 4, 5.0, 5.0, 1.5, 1.5)
+CAMERA = Camera(4, 4, 5.0, 5.0, 1.5, 1.5)
 
 
 def add_keyframe(rigid_map, ids, place=(0.0, 0.0, 0.0)):
     number = len(rigid_map.keyframes)
     pixels = np.column_stack([ids, np.full(len(ids), number)]).astype(float)
-    flat = np.full((4, 4), number, np.uint8)
+    normalized = np.full((4, 4), number, np.uint8)
     rigid_map.add_keyframe(
-        Keyframe(10 * number, 0.1 * number, flat, pose(place), np.array(ids, dtype=np.int64), pixels)
+        Keyframe(10 * number, 0.1 * number, normalized, pose(place), np.array(ids, dtype=np.int64), pixels)
     )
 
 
@@ -91,5 +91,5 @@ def test_a_saved_map_has_only_the_keyframes_that_are_left(tmp_path):
     loaded = load_map(tmp_path / "map.h5", CAMERA)
     assert [keyframe.index for keyframe in loaded.keyframes] == [0, 20, 30]
     assert loaded.template_keyframe.tolist() == [2, 2]
-    assert loaded.keyframes[loaded.template_keyframe[0]].flat[0, 0] == 3
+    assert loaded.keyframes[loaded.template_keyframe[0]].normalized[0, 0] == 3
     assert loaded.kept_keyframes.tolist() == [0, 1, 2]

@@ -40,9 +40,9 @@ def test_a_place_that_no_image_confirms_is_doubted():
     """The same map, with images that show something beside the object, and nothing on it."""
     nodes, triangles, _ = wedge()
     points, views = scanned(WORLD)
-    rim = np.full_like(views[0].flat, 128)
+    rim = np.full_like(views[0].normalized, 128)
     rim[:4] = np.arange(rim.shape[1]) % 251
-    found = register_mesh(nodes, triangles, points, [replace(view, flat=rim) for view in views], CAMERA)
+    found = register_mesh(nodes, triangles, points, [replace(view, normalized=rim) for view in views], CAMERA)
     assert found.rms_px is None
     assert found.runner_up < 0.8 * found.score
     assert found.ambiguous

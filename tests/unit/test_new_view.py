@@ -10,7 +10,7 @@ from morph_dslam.timing import StageClock
 from morph_dslam.tracking.estimator import Estimator
 from morph_dslam.tracking.frame_estimation import FrameEstimation
 from morph_dslam.tracking.options import TrackerOptions
-from morph_dslam.tracking.patches import flatten
+from morph_dslam.tracking.patches import normalize_contrast
 from morph_dslam.tracking.reference import PosedImage, ReferenceView, SurfaceSamples
 from morph_dslam.tracking.result import STAGES, Image
 from morph_dslam.tracking.views import is_known_well, is_sharp, seen_part, sharpness, surface_spread
@@ -22,7 +22,7 @@ OPTIONS, NOW = TrackerOptions(), sheet_state(0.1)
 
 def picture(image, **others):
     grey = np.ascontiguousarray(image[:, :, 0])
-    return Image(grey, flatten(grey, OPTIONS.flow.flatten_window), **others)
+    return Image(grey, normalize_contrast(grey, OPTIONS.flow.contrast_window), **others)
 
 
 @pytest.fixture(scope="module")
@@ -82,15 +82,15 @@ def test_a_blurred_frame_is_not(scene):
     streak[4] = 1.0 / 9.0
     blurred = picture(cv2.filter2D(film.frame(NOW), -1, streak))
     assert not fit(view, blurred, tried)
-    everywhere = np.ones(made.flat.shape, dtype=bool)
-    assert sharpness(blurred.flat, everywhere) < 0.8 * sharpness(made.flat, everywhere)
+    everywhere = np.ones(made.normalized.shape, dtype=bool)
+    assert sharpness(blurred.normalized, everywhere) < 0.8 * sharpness(made.normalized, everywhere)
 
 
 def test_nothing_is_bound_around_points_that_disagree_or_behind_another_object(scene):
     film, view, attempt = scene
     hand = (250, 150, 90, 90)
     made, tried = attempt(film.frame(NOW, occluder=hand))
-    inside = np.zeros(made.flat.shape, dtype=bool)
+    inside = np.zeros(made.normalized.shape, dtype=bool)
     inside[155:235, 255:335] = True
     should_be = view.rendered(tried.estimate.state)
     covered = np.isfinite(should_be.depth)

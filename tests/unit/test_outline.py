@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.tracking.estimator import State, moved
 from morph_dslam.tracking.outline import Outline, OutlineOptions, rim, search_outline, search_outline_numpy
 from tests.support.bent_sheet import bent_sheet_model
 
-CAMERA = PinholeCamera(640, 480, 520.0, 520.0, 320.0, 240.0)
+CAMERA = Camera(640, 480, 520.0, 520.0, 320.0, 240.0)
 POSE = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.55]))
 
 

@@ -19,11 +19,11 @@ def before(contrast, brightness):
     rng = np.random.default_rng(1)
     found = []
     for view in scanned(WORLD, with_images=True)[1]:
-        image = view.flat.astype(float)
+        image = view.normalized.astype(float)
         wall = printed_texture(CAMERA.height, CAMERA.width, 9 + view.frame).astype(float)
-        image = np.where(view.flat == 128, contrast * wall + brightness, image)
+        image = np.where(view.normalized == 128, contrast * wall + brightness, image)
         noisy = np.clip(image + 2.0 * rng.standard_normal(image.shape), 0, 255).astype(np.uint8)
-        found.append(replace(view, flat=noisy))
+        found.append(replace(view, normalized=noisy))
     return found
 
 
@@ -65,7 +65,7 @@ def test_another_place_is_contradicted():
 
 def test_images_without_anything_tell_nothing(views):
     rng = np.random.default_rng(2)
-    blank = [replace(v, flat=(128 + rng.integers(-1, 2, v.flat.shape)).astype(np.uint8)) for v in views]
+    blank = [replace(v, normalized=(128 + rng.integers(-1, 2, v.normalized.shape)).astype(np.uint8)) for v in views]
     found = outline_fit(WORLD, NODES, TRIANGLES, blank, CAMERA)
     assert found.count < 60
     assert not found.contradicts

@@ -60,13 +60,13 @@ def two_views():
         local = pose.apply(nodes)
         pixels = CAMERA.project(local)
         drawn.append((pixels, local[:, 2], rasterise(pixels, local[:, 2], triangles, CAMERA.height, CAMERA.width)))
-    return triangles, drawn, views[1].flat, views[4].flat
+    return triangles, drawn, views[1].normalized, views[4].normalized
 
 
 def carried_by(function, two_views):
-    triangles, ((pixels, depths, first), (_, _, second)), flat, _ = two_views
-    carried, shown = np.zeros(flat.shape, np.float32), np.zeros(flat.shape, dtype=bool)
-    function(second.triangle_ids, second.weights, triangles, pixels, depths, first.depth, flat, carried, shown)
+    triangles, ((pixels, depths, first), (_, _, second)), normalized, _ = two_views
+    carried, shown = np.zeros(normalized.shape, np.float32), np.zeros(normalized.shape, dtype=bool)
+    function(second.triangle_ids, second.weights, triangles, pixels, depths, first.depth, normalized, carried, shown)
     return carried, shown
 
 

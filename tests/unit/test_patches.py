@@ -9,8 +9,8 @@ from morph_dslam.tracking.patches import (
     FlowOptions,
     compare_patches,
     compare_patches_numpy,
-    flatten,
     follow,
+    normalize_contrast,
     patch_correlation,
     patch_correlation_numpy,
     spread_corners,
@@ -32,8 +32,8 @@ def shifted(image, x, y):
     return np.clip(np.rint(moved), 0, 255).astype(np.uint8)
 
 
-def spread_points(flat, count=300):
-    return spread_corners(flat, np.pad(np.full((400, 560), 255, np.uint8), 40), count)
+def spread_points(normalized, count=300):
+    return spread_corners(normalized, np.pad(np.full((400, 560), 255, np.uint8), 40), count)
 
 
 def test_compiled_and_plain_comparison_agree(image):
@@ -82,16 +82,16 @@ def test_without_a_change_of_light_the_places_stay_as_they_are_found(image):
 
 def test_the_spread_of_a_patch_is_how_far_off_points_are_found(image):
     """Points are followed into images with more and more noise; in each the errors are as told."""
-    flat = flatten(image, 31)
-    points, half = spread_points(flat), OPTIONS.window // 2
+    normalized = normalize_contrast(image, 31)
+    points, half = spread_points(normalized), OPTIONS.window // 2
     errors, told = [], []
     for noise in (2.0, 8.0, 16.0):
         rng = np.random.default_rng(int(noise))
         noisy = np.clip(image + noise * rng.standard_normal(image.shape), 0, 255).astype(np.uint8)
-        target = flatten(noisy, 31)
-        found, ok = follow(flat, target, points, points, OPTIONS)
+        target = normalize_contrast(noisy, 31)
+        found, ok = follow(normalized, target, points, points, OPTIONS)
         close = ok & (np.linalg.norm(found - points, axis=1) < 2.0)
-        places, _, spread = compare_patches(flat, target, points[close], found[close], half)
+        places, _, spread = compare_patches(normalized, target, points[close], found[close], half)
         known = np.isfinite(spread)
         errors.append(np.sqrt(np.mean((places - points[close])[known] ** 2)))
         told.append(np.sqrt(np.mean(spread[known] ** 2)))
@@ -101,13 +101,13 @@ def test_the_spread_of_a_patch_is_how_far_off_points_are_found(image):
 
 def test_a_window_that_is_covered_in_part_is_told_by_its_spread(image):
     """A disc moves over the image: its rim shifts what is found in the windows that straddle it."""
-    flat = flatten(image, 31)
-    points = spread_points(flat, 800)
+    normalized = normalize_contrast(image, 31)
+    points = spread_points(normalized, 800)
     covered = image.copy()
     cv2.circle(covered, (320, 240), 90, 150, -1, cv2.LINE_AA)
-    target = flatten(covered, 31)
-    found, ok = follow(flat, target, points, points, OPTIONS)
-    places, correlation, spread = compare_patches(flat, target, points, found, 7)
+    target = normalize_contrast(covered, 31)
+    found, ok = follow(normalized, target, points, points, OPTIONS)
+    places, correlation, spread = compare_patches(normalized, target, points, found, 7)
     far = np.linalg.norm(points - [320.0, 240.0], axis=1)
     off = np.linalg.norm(places - points, axis=1)
     passed = ok & (correlation > 0.6) & np.isfinite(spread)

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
 from morph_dslam.render.picking import nearest_on_outline, pick_surface, pick_surface_numpy
 from tests.support.bent_sheet import bent_sheet_model
 
-CAMERA = PinholeCamera(640, 480, 528.0, 527.0, 320.3, 239.1)
+CAMERA = Camera(640, 480, 528.0, 527.0, 320.3, 239.1)
 POSE = RigidTransform(rotation_exp(np.array([np.pi + 0.2, 0.1, -0.3])), np.array([0.02, -0.01, 0.6]))
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_exp
 from morph_dslam.model import SeparatedField
@@ -112,11 +112,11 @@ def test_only_what_can_move_is_taken_out_of_the_scene():
 
 def test_an_anchor_keeps_the_scene_and_needs_to_know_how_well_the_place_is_known():
     model, place, positions, _ = sheet_map()
-    camera = PinholeCamera(320, 240, 300.0, 300.0, 160.0, 120.0)
+    camera = Camera(320, 240, 300.0, 300.0, 160.0, 120.0)
     rigid_map = RigidMap()
     ids = rigid_map.add_points(positions, np.zeros((51, 2)), 0, GOOD)
-    flat = np.full((240, 320), 128, dtype=np.uint8)
-    rigid_map.add_keyframe(Keyframe(0, 0.0, flat, np.eye(4), ids, np.zeros((51, 2))))
+    normalized = np.full((240, 320), 128, dtype=np.uint8)
+    rigid_map.add_keyframe(Keyframe(0, 0.0, normalized, np.eye(4), ids, np.zeros((51, 2))))
     expected = points_on_object(positions, place, model)[1]
     blind = MapRegistration(place.world_from_object, place.centre, None)
     with pytest.raises(RegistrationError, match="does not say how well the object's place is known"):

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import rotation_exp
 from morph_dslam.render.rasteriser import rasterise, rasterise_numpy, visible_points
 from morph_dslam.render.texture import render_textured, render_textured_numpy
 from tests.support.bent_sheet import bent_sheet_model
 
-CAMERA = PinholeCamera(96, 72, 80.0, 82.0, 47.0, 36.5)
+CAMERA = Camera(96, 72, 80.0, 82.0, 47.0, 36.5)
 SIZE = (CAMERA.height, CAMERA.width)
 
 

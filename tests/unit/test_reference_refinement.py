@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
 from morph_dslam.registration.landmarks import register
@@ -12,7 +12,7 @@ from morph_dslam.tracking.refinement import Keyframe, RefinementOptions, choose_
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import mean_error, sheet_state
 
-CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
+CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 
 
 def keyframe(points, state, rng, noise=0.1):

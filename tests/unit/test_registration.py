@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
@@ -11,7 +11,7 @@ from morph_dslam.registration.landmarks import register, shape_starts, solve_pnp
 from morph_dslam.tracking.estimator import BoundPoints, State
 from tests.support.bent_sheet import bent_sheet_model
 
-CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
+CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 POSE = RigidTransform(
     rotation_exp(np.array([0.25, -0.3, 0.1])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.02, -0.01, 0.6])
 )
@@ -49,7 +49,7 @@ def test_bend_the_other_way_is_told_apart(model):
 
 
 def test_distorted_pixels_are_undistorted(model):
-    lens = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0, (-0.2, 0.05, 0.0, 0.0))
+    lens = Camera(640, 480, 528.0, 528.0, 320.0, 240.0, (-0.2, 0.05, 0.0, 0.0))
     points, pixels = landmarks(model, BENT, spread_nodes(model))
     x, y = ((pixels - [320.0, 240.0]) / 528.0).T
     r2 = x**2 + y**2
@@ -97,7 +97,7 @@ def test_shape_beyond_the_range_is_flagged(model):
 
 def test_bend_that_landmarks_cannot_tell_is_flagged_as_ambiguous(model):
     """A long way off the image of a shallow arch is nearly the same for both signs of a mirrored pose."""
-    far = PinholeCamera(640, 480, 9000.0, 9000.0, 320.0, 240.0)
+    far = Camera(640, 480, 9000.0, 9000.0, 320.0, 240.0)
     pose = RigidTransform(POSE.rotation, np.array([0.0, 0.0, 12.0]))
     positions = pose.apply(model.positions(np.array([0.02, 0.0, 0.0])))
     nodes = spread_nodes(model, 9)

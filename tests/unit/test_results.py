@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel, SeparatedField, SurfacePoints
 from morph_dslam.model.functions import ParameterFunctions
@@ -17,7 +17,7 @@ from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.run_folder import RunResults, flags, summarise
 from tests.support.bent_sheet import PARAMETERS, bent_sheet_model
 
-CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
+CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 FRONT = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
 BACK = RigidTransform(np.diag([-1.0, -1.0, 1.0]), np.array([0.0, 0.0, 0.6]))
 
@@ -115,8 +115,8 @@ def test_points_hidden_by_the_object_or_turned_away_are_not_visible():
         model, SurfacePoints(np.arange(4), np.array([[0.4, 0.3, 0.3]] * 3 + [[0.3, 0.4, 0.3]]))
     )
     front = State(np.zeros(3), FRONT)
-    flat = np.full((480, 640), 90, np.uint8)
-    appearance = ReferenceAppearance(model, CAMERA, [flat], [view_of(model, CAMERA, front)])
+    normalized = np.full((480, 640), 90, np.uint8)
+    appearance = ReferenceAppearance(model, CAMERA, [normalized], [view_of(model, CAMERA, front)])
 
     def visible(state):
         view = view_of(model, CAMERA, state)

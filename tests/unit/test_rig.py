@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import CameraError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.camera_files import load_rig
@@ -17,10 +17,10 @@ from morph_dslam.tracking.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model
 
 MODEL = bent_sheet_model(22, 16)
-LEFT = RigCamera(PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0), RigidTransform.identity())
+LEFT = RigCamera(Camera(640, 480, 528.0, 528.0, 320.0, 240.0), RigidTransform.identity())
 #: Half a metre to the right, turned towards the object, of another make.
 ASIDE = RigCamera(
-    PinholeCamera(800, 600, 700.0, 690.0, 400.0, 290.0),
+    Camera(800, 600, 700.0, 690.0, 400.0, 290.0),
     RigidTransform(rotation_exp(np.array([0.05, 0.7, -0.1])), np.array([-0.45, 0.02, 0.15])),
 )
 TRUTH = State(

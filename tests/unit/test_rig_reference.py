@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.covariance import BoundPart
@@ -24,7 +24,7 @@ TURN = rotation_exp(np.array([0.02, 0.4, -0.05]))
 RIG = (
     RigCamera(CAMERA, RigidTransform.identity()),
     RigCamera(
-        PinholeCamera(640, 480, 500.0, 505.0, 330.0, 236.0),
+        Camera(640, 480, 500.0, 505.0, 330.0, 236.0),
         RigidTransform(TURN, np.array([0.0, 0.0, 0.6]) - TURN @ np.array([0.0, 0.0, 0.6])),
     ),
 )

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import TrackingError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import SeparatedField
@@ -16,7 +16,7 @@ from tests.support.bent_sheet import bent_sheet_model
 from tests.support.small_models import block_model
 
 SIDE = 0.1
-CAMERA = PinholeCamera(320, 240, 300.0, 300.0, 160.0, 120.0)
+CAMERA = Camera(320, 240, 300.0, 300.0, 160.0, 120.0)
 #: The camera looks along +x of the object, z up in the image.
 ALONG_X = RigidTransform(np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.array([-0.05, 0.05, 0.3]))
 

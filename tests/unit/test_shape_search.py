@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
 from morph_dslam.model.reduced_model import with_revolution_angle
@@ -13,7 +13,7 @@ from morph_dslam.tracking.shape_search import BoundSearch, ShapeSearch, with_und
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.bent_tube import bent_tube
 
-CAMERA = PinholeCamera(640, 480, 528.0, 528.0, 320.0, 240.0)
+CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 POSE = RigidTransform(rotation_exp(np.array([0.3, -0.2, 0.0])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
 
 

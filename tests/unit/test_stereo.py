@@ -6,13 +6,13 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.camera import PinholeCamera, StereoCamera
+from morph_dslam.camera import Camera, StereoCamera
 from morph_dslam.errors import CameraError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.camera_files import load_stereo
 
-LEFT = PinholeCamera(320, 240, 210.0, 212.0, 161.0, 118.0, (-0.28, 0.07, 2e-4, 2e-5))
-FISHEYE = PinholeCamera(320, 240, 205.0, 204.0, 157.0, 121.0, (0.01, -0.02, 0.003, 0.0), "fisheye")
+LEFT = Camera(320, 240, 210.0, 212.0, 161.0, 118.0, (-0.28, 0.07, 2e-4, 2e-5))
+FISHEYE = Camera(320, 240, 205.0, 204.0, 157.0, 121.0, (0.01, -0.02, 0.003, 0.0), "fisheye")
 # The right camera is 11 cm to the right, a little higher, and turned.
 RIGHT_IN_LEFT = RigidTransform(
     Rotation.from_euler("xyz", [1.0, -2.0, 0.5], degrees=True).as_matrix(), np.array([0.11, -0.002, 0.001])
@@ -62,7 +62,7 @@ def test_pairs_that_cannot_be_rectified():
         StereoCamera(LEFT, FISHEYE, RIGHT_IN_LEFT).rectify()
     with pytest.raises(CameraError, match="in one place"):
         StereoCamera(LEFT, FISHEYE, RigidTransform.identity()).rectify()
-    small = PinholeCamera(160, 120, 100.0, 100.0, 80.0, 60.0)
+    small = Camera(160, 120, 100.0, 100.0, 80.0, 60.0)
     with pytest.raises(CameraError, match="320x240 pixels, the right one 160x120"):
         StereoCamera(LEFT, small, PAIR.right_from_left).rectify()
 

@@ -7,7 +7,7 @@ import pytest
 from morph_dslam.calibration.board import Board, find_corners, parse_board
 from morph_dslam.calibration.calibrate import calibrate
 from morph_dslam.calibration.solve import View, select_by_coverage, solve_intrinsics
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.cli import app as cli
 from morph_dslam.errors import CameraError
 from morph_dslam.io.camera_files import load_camera
@@ -15,8 +15,8 @@ from tests.support.real_data import real_data
 from tests.support.rendered_board import board_image, board_poses
 
 BOARD = Board(9, 6, 0.025)
-CAMERA = PinholeCamera(640, 480, 541.0, 538.5, 327.3, 236.1, (-0.27, 0.09, 8e-4, -5e-4))
-FISHEYE = PinholeCamera(640, 480, 260.0, 259.0, 322.0, 237.0, (0.02, -0.008, 0.003, -0.0006), "fisheye")
+CAMERA = Camera(640, 480, 541.0, 538.5, 327.3, 236.1, (-0.27, 0.09, 8e-4, -5e-4))
+FISHEYE = Camera(640, 480, 260.0, 259.0, 322.0, 237.0, (0.02, -0.008, 0.003, -0.0006), "fisheye")
 
 
 @pytest.fixture(scope="module")

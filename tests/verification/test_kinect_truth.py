@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.evaluation.points import bind_truth, load_truth, material_error
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.geometry import RigidTransform
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.real_data import real_data
 
-CAMERA = PinholeCamera(640, 480, 528.0144, 528.0144, 320.0, 240.0)
+CAMERA = Camera(640, 480, 528.0144, 528.0144, 320.0, 240.0)
 
 
 def rigid_run(folder, frames, poses):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from morph_dslam.calibration.board import Board, find_corners
-from morph_dslam.camera import LensModel, PinholeCamera
+from morph_dslam.camera import Camera, LensModel
 from morph_dslam.errors import CameraError
 from morph_dslam.geometry import RigidTransform, cross_matrix, rotation_exp
 from morph_dslam.sources import open_source
@@ -152,7 +152,7 @@ LEAST_DECREASE = 1e-9
 class Estimate:
     """What is solved for: the camera, the poses (v) camera_from_board, the corners (n, 3), metres."""
 
-    camera: PinholeCamera
+    camera: Camera
     poses: tuple[RigidTransform, ...]
     points: Array
 
@@ -209,7 +209,7 @@ def jacobian(estimate: Estimate, free: NDArray[np.bool_]) -> Array:
     return result.reshape(-1, result.shape[2])
 
 
-def _intrinsic_jacobian(camera: PinholeCamera, points: Array) -> Array:
+def _intrinsic_jacobian(camera: Camera, points: Array) -> Array:
     """Derivative (2 n, 4 + d) of the recorded pixels by fx, fy, cx, cy and the distortion."""
     pixels = camera.project_recorded(points)
     image = (pixels - camera.intrinsics[2:]) / camera.intrinsics[:2]
@@ -296,7 +296,7 @@ class Solution:
     focal_deviation : standard deviation of fx and fy, pixels.
     """
 
-    camera: PinholeCamera
+    camera: Camera
     views: tuple[View, ...]
     left_out: tuple[str, ...]
     board_points: Array
@@ -387,7 +387,7 @@ def _solve_radial_tangential(views: Sequence[View], board: Board, size: tuple[in
     found = cv2.calibrateCamera(objects, images, size, np.eye(3), np.zeros(5))
     _, matrix, coefficients, rotations, translations = found[:5]
     fx, fy, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    camera = PinholeCamera(*size, fx, fy, cx, cy, tuple(float(value) for value in np.ravel(coefficients)))
+    camera = Camera(*size, fx, fy, cx, cy, tuple(float(value) for value in np.ravel(coefficients)))
     poses = tuple(
         RigidTransform(rotation_exp(np.ravel(r).astype(float)), np.ravel(t).astype(float))
         for r, t in zip(rotations, translations, strict=True)
@@ -413,7 +413,7 @@ def _solve_fisheye(views: Sequence[View], board: Board, size: tuple[int, int]) -
     fits = []
     for angle in FISHEYE_ANGLES:
         focal = size[0] / angle
-        start = PinholeCamera(*size, focal, focal, *centre, (0.0, 0.0, 0.0, 0.0), "fisheye")
+        start = Camera(*size, focal, focal, *centre, (0.0, 0.0, 0.0, 0.0), "fisheye")
         poses = [_planar_pose(start, board, view) for view in corners]
         if all(pose is not None for pose in poses):
             known = tuple(pose for pose in poses if pose is not None)
@@ -425,7 +425,7 @@ def _solve_fisheye(views: Sequence[View], board: Board, size: tuple[int, int]) -
     return min(fits, key=lambda fit: fit.rms)
 
 
-def _planar_pose(camera: PinholeCamera, board: Board, corners: Array) -> RigidTransform | None:
+def _planar_pose(camera: Camera, board: Board, corners: Array) -> RigidTransform | None:
     """The pose of the flat board in one view, None where the camera cannot see it so."""
     rays = camera.rays(camera.undistort_pixels(corners))[:, :2]
     if not np.isfinite(rays).all():

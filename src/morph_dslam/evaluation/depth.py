@@ -19,7 +19,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import EvaluationError, SourceError
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.render.rasteriser import rasterise
@@ -329,7 +329,7 @@ class DepthError:
         return np.divide(total, count, out=np.full(n_nodes, np.nan), where=count > 0)
 
 
-def sensor_points(depth: DepthImage, mask: NDArray[np.bool_], camera: PinholeCamera) -> Array:
+def sensor_points(depth: DepthImage, mask: NDArray[np.bool_], camera: Camera) -> Array:
     """Points (p, 3) in the camera frame, metres, of pixels that have depth (h, w), evenly spread.
 
     ``mask`` (h, w) is of the undistorted image, ``depth`` of the image as recorded.
@@ -345,7 +345,7 @@ def sensor_points(depth: DepthImage, mask: NDArray[np.bool_], camera: PinholeCam
     return camera.rays(pixels[kept]) * depth[rows[kept], columns[kept], None].astype(np.float64)
 
 
-def surface_mask(nodes: Array, triangles: NDArray[np.int64], camera: PinholeCamera) -> NDArray[np.bool_]:
+def surface_mask(nodes: Array, triangles: NDArray[np.int64], camera: Camera) -> NDArray[np.bool_]:
     """Pixels (h, w) that the surface covers, its rim left out."""
     buffers = rasterise(camera.project(nodes), nodes[:, 2], triangles, camera.height, camera.width)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * RIM_PX + 1,) * 2)

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import EvaluationError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.camera_files import load_camera
@@ -39,7 +39,7 @@ class Run:
 
     folder: Path
     model: ReducedModel
-    camera: PinholeCamera
+    camera: Camera
     frames: NDArray[np.int64]
     status: tuple[str, ...]
     reasons: tuple[str, ...]

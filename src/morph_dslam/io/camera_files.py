@@ -11,7 +11,7 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
-from morph_dslam.camera import LensModel, PinholeCamera, StereoCamera
+from morph_dslam.camera import Camera, LensModel, StereoCamera
 from morph_dslam.errors import CameraError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.colmap import read_cameras
@@ -83,7 +83,7 @@ class _CameraFile(BaseModel):
     lens: str = "radial-tangential"
 
 
-def load_camera(path: Path) -> PinholeCamera:
+def load_camera(path: Path) -> Camera:
     """Read a camera file, or a calibration by OpenCV, ROS, ORB-SLAM, Kalibr, EuRoC or COLMAP (cameras.txt).
 
     Parameters
@@ -133,7 +133,7 @@ def _choose(cameras: dict[str, dict], name: str | None, path: Path) -> dict:
     return cameras[name]
 
 
-def parse_camera(content: object, where: str) -> PinholeCamera:
+def parse_camera(content: object, where: str) -> Camera:
     """The camera that a mapping with the keys of a camera file describes; errors as of `load_camera`.
 
     ``where`` is where the mapping was written, and begins the message.
@@ -151,12 +151,12 @@ def parse_camera(content: object, where: str) -> PinholeCamera:
         ) from error
     intrinsics = (values.width, values.height, values.fx, values.fy, values.cx, values.cy)
     try:
-        return PinholeCamera(*intrinsics, tuple(values.distortion), cast(LensModel, values.lens))
+        return Camera(*intrinsics, tuple(values.distortion), cast(LensModel, values.lens))
     except CameraError as error:
         raise CameraError(f"{where}: {error}") from error
 
 
-def save_camera(path: Path, camera: PinholeCamera) -> None:
+def save_camera(path: Path, camera: Camera) -> None:
     """Write a camera file that `load_camera` reads."""
     content = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     content["distortion"] = list(camera.distortion)
@@ -345,7 +345,7 @@ def load_stereo(path: Path) -> StereoCamera:
     return _from_euroc(path) if path.is_dir() else _from_kalibr(path)
 
 
-def load_camera_or_pair(path: Path) -> PinholeCamera | StereoCamera:
+def load_camera_or_pair(path: Path) -> Camera | StereoCamera:
     """Read what `load_stereo` reads as a pair, anything else as `load_camera` does.
 
     A camchain of which one camera is chosen, `camchain.yaml#cam0`, is that camera alone.
@@ -365,7 +365,7 @@ def load_camera_or_pair(path: Path) -> PinholeCamera | StereoCamera:
     return load_camera(path)
 
 
-def load_rig(path: Path) -> list[tuple[PinholeCamera, RigidTransform]]:
+def load_rig(path: Path) -> list[tuple[Camera, RigidTransform]]:
     """Read all cameras of a Kalibr camchain, cam0 first, each with camera_from_cam0, metres.
 
     Raises

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import CameraError, MapError
 
 #: Where each of COLMAP's models keeps its values; fx and fy are one value in those that begin with f.
@@ -125,7 +125,7 @@ class ColmapImage:
         return int(digits[-1])
 
 
-def write_colmap_model(folder: Path, camera: PinholeCamera, images: Sequence[ColmapImage], points: Array) -> None:
+def write_colmap_model(folder: Path, camera: Camera, images: Sequence[ColmapImage], points: Array) -> None:
     """Write images of one camera, undistorted, and the points (n, 3) that they see, into a new folder."""
     folder.mkdir(parents=True, exist_ok=True)
     fx, fy, cx, cy = camera.intrinsics

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, cross_matrix
 from morph_dslam.model import ReducedModel
@@ -297,7 +297,7 @@ class BoardPose:
         return self.camera_from_board @ board_from_object, slopes @ self.covariance @ slopes.T
 
 
-def locate_board(board: FiducialBoard, camera: PinholeCamera, grey: NDArray[np.uint8]) -> BoardPose | None:
+def locate_board(board: FiducialBoard, camera: Camera, grey: NDArray[np.uint8]) -> BoardPose | None:
     """The board in an undistorted image (h, w); None where too little of it is seen.
 
     Raises
@@ -329,7 +329,7 @@ def locate_board(board: FiducialBoard, camera: PinholeCamera, grey: NDArray[np.u
 
 
 def _refined(
-    start: RigidTransform, points: Array, pixels: Array, camera: PinholeCamera
+    start: RigidTransform, points: Array, pixels: Array, camera: Camera
 ) -> tuple[RigidTransform, float, Array]:
     """The pose of least squared residuals near ``start``, their sum, and the information (6, 6)."""
     state = State(NO_PARAMETERS, start)
@@ -341,7 +341,7 @@ def _refined(
     return state.camera_from_object, float(residuals @ residuals), jacobian.T @ jacobian
 
 
-def _linear(pose: RigidTransform, points: Array, pixels: Array, camera: PinholeCamera) -> tuple[Array, Array]:
+def _linear(pose: RigidTransform, points: Array, pixels: Array, camera: Camera) -> tuple[Array, Array]:
     local = pose.apply(points)
     of_pose = np.zeros((len(points), 3, 6))
     of_pose[:, :, :3] = -cross_matrix(local - pose.translation)
@@ -361,7 +361,7 @@ class BoardStart:
 
     board: FiducialBoard
 
-    def place(self, model: ReducedModel, camera: PinholeCamera, grey: NDArray[np.uint8]) -> Registration:
+    def place(self, model: ReducedModel, camera: Camera, grey: NDArray[np.uint8]) -> Registration:
         """The object in an undistorted image (h, w).
 
         Raises

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, cross_matrix, rotation_exp
 from morph_dslam.io.camera_files import load_camera
@@ -49,7 +49,7 @@ class BoardInMap:
     rms_px: float
 
 
-def find_board_in_map(board: FiducialBoard, views: Sequence[View], camera: PinholeCamera) -> BoardInMap:
+def find_board_in_map(board: FiducialBoard, views: Sequence[View], camera: Camera) -> BoardInMap:
     """The similarity with which all keyframes see the board's corners where they are.
 
     Raises
@@ -59,8 +59,8 @@ def find_board_in_map(board: FiducialBoard, views: Sequence[View], camera: Pinho
     """
     seen, poses = [], []
     for view in views:
-        points, pixels = board.find(view.flat)
-        pose = locate_board(board, camera, view.flat) if len(points) >= FEWEST_CORNERS else None
+        points, pixels = board.find(view.normalized)
+        pose = locate_board(board, camera, view.normalized) if len(points) >= FEWEST_CORNERS else None
         if pose is not None:
             seen.append((view, points, pixels))
             poses.append(pose.camera_from_board)

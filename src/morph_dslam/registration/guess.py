@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.tables import Landmarks, read_toml
@@ -117,7 +117,7 @@ class PictureStart:
     rectangle: Array | None
     coordinates: Array | None
 
-    def place(self, model: ReducedModel, camera: PinholeCamera, grey: Image) -> Registration:
+    def place(self, model: ReducedModel, camera: Camera, grey: Image) -> Registration:
         """The object in an undistorted image (h, w).
 
         Raises
@@ -204,7 +204,7 @@ def _matches(picture: Image, grey: Image) -> tuple[Array, Array]:
     return mine, np.array([theirs[b].pt for _, b in pairs], dtype=np.float64).reshape(-1, 2)
 
 
-def _agreeing(model: ReducedModel, camera: PinholeCamera, points: Array, pixels: Array) -> NDArray[np.bool_]:
+def _agreeing(model: ReducedModel, camera: Camera, points: Array, pixels: Array) -> NDArray[np.bool_]:
     """Which matches (k,) agree on one state of the object; none if they are too few."""
     none = np.zeros(len(points), dtype=bool)
     if len(points) < MATCHING.least_matches:
@@ -277,7 +277,7 @@ class GuessStart:
         turn = Rotation.from_euler("xyz", self.guess.pose.rotation_deg, degrees=True).as_matrix()
         return State(values, RigidTransform(turn, 1e-3 * np.array(self.guess.pose.position_mm)))
 
-    def place(self, model: ReducedModel, camera: PinholeCamera, grey: Image) -> Registration:
+    def place(self, model: ReducedModel, camera: Camera, grey: Image) -> Registration:
         """The object in an undistorted image (h, w).
 
         Raises
@@ -309,7 +309,7 @@ def load_guess(path: Path) -> GuessStart:
 class _OutlineSearch:
     """Lays the outline of an object on the edges of an image."""
 
-    def __init__(self, model: ReducedModel, camera: PinholeCamera, grey: Image) -> None:
+    def __init__(self, model: ReducedModel, camera: Camera, grey: Image) -> None:
         self._model, self._camera = model, camera
         self._drawn = DrawnSurface.of(model).model
         self._grey = grey

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, cross_matrix, rotation_log
 from morph_dslam.registration.icp import Axis
 from morph_dslam.registration.scene import (
@@ -121,7 +121,7 @@ class KeyframeAdjustment:
         self,
         nodes: Array,
         triangles: NDArray[np.int64],
-        camera: PinholeCamera,
+        camera: Camera,
         points: MapPoints,
         views: Sequence[View],
         axis: Axis | None,
@@ -137,7 +137,7 @@ class KeyframeAdjustment:
             return None
         poses = [camera_from_object(view, placed) for view in views]
         static = StaticPoints(placed.inverse.apply(self._points.positions), views, self._camera)
-        images, units = [view.flat for view in views], self._units(len(views))
+        images, units = [view.normalized for view in views], self._units(len(views))
         mixing = _Mixing()
         for _ in range(ITERATIONS):
             measured = self._comparison.measure(images, poses)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import ReducedModel
@@ -136,7 +136,7 @@ class LandmarkFit:
 
 
 def register(
-    model: ReducedModel, camera: PinholeCamera, points: Array, pixels: Array, options: RegistrationOptions | None = None
+    model: ReducedModel, camera: Camera, points: Array, pixels: Array, options: RegistrationOptions | None = None
 ) -> LandmarkFit:
     """Place the object in the reference frame.
 
@@ -200,7 +200,7 @@ def bind_landmarks(model: ReducedModel, points: Array, options: RegistrationOpti
     return BoundPoints.from_surface(model, surface)
 
 
-def _check_pixels(camera: PinholeCamera, pixels: Array) -> None:
+def _check_pixels(camera: Camera, pixels: Array) -> None:
     outside = ~((pixels > -0.5) & (pixels < [camera.width - 0.5, camera.height - 0.5])).all(axis=1)
     if outside.any():
         row = int(np.flatnonzero(outside)[0])
@@ -230,7 +230,7 @@ def shape_starts(model: ReducedModel, largest: int = 243) -> list[Array]:
     return [default, *grid]
 
 
-def _starts(model: ReducedModel, camera: PinholeCamera, bound: BoundPoints, pixels: Array) -> Iterator[State]:
+def _starts(model: ReducedModel, camera: Camera, bound: BoundPoints, pixels: Array) -> Iterator[State]:
     """PnP poses of every start shape.
 
     Too few landmarks to determine all unknowns leave the shape at its default, from which the damped
@@ -242,7 +242,7 @@ def _starts(model: ReducedModel, camera: PinholeCamera, bound: BoundPoints, pixe
             yield State(parameters, pose)
 
 
-def solve_pnp(points: Array, pixels: Array, camera: PinholeCamera) -> list[RigidTransform]:
+def solve_pnp(points: Array, pixels: Array, camera: Camera) -> list[RigidTransform]:
     """Poses (camera from object) that put points (k, 3) in front of the camera near their pixels (k, 2).
 
     SQPNP (Terzakis & Lourakis 2020) for any shape, and both poses of IPPE (Collins & Bartoli 2014) where the

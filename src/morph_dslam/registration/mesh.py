@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import SimilarityTransform
 from morph_dslam.registration.icp import Axis, Fit, Surface, candidate_regions, find_planes, fit_surface, plane_points
@@ -57,7 +57,7 @@ def gather_evidence(
     triangles: NDArray[np.int64],
     positions: Array,
     views: Sequence[View],
-    camera: PinholeCamera,
+    camera: Camera,
     tolerance: float,
 ) -> Evidence:
     """Draw the object into every view and compare its depth with that of the points seen there.
@@ -89,8 +89,8 @@ def gather_evidence(
     return Evidence(explained, hidden, solid)
 
 
-def _shrunk(camera: PinholeCamera) -> PinholeCamera:
-    return PinholeCamera(
+def _shrunk(camera: Camera) -> Camera:
+    return Camera(
         camera.width // SHRINK,
         camera.height // SHRINK,
         camera.fx / SHRINK,
@@ -241,7 +241,7 @@ def register_mesh(
     triangles: NDArray[np.int64],
     points: MapPoints,
     views: Sequence[View],
-    camera: PinholeCamera,
+    camera: Camera,
     metric: bool = False,
     progress: bool = False,
 ) -> MeshRegistration:
@@ -281,7 +281,7 @@ def register_mesh(
         adjustment = KeyframeAdjustment(nodes, triangles, camera, points, views, surface.axis_of_revolution)
         found = _adjusted(found, adjustment, nodes.mean(axis=0), metric)
     outline = outline_fit(found.world_from_object, nodes, triangles, more, camera)
-    unconfirmed = found.rms_px is None and any(np.ptp(view.flat) > 0 for view in views)
+    unconfirmed = found.rms_px is None and any(np.ptp(view.normalized) > 0 for view in views)
     return replace(found, outline=outline, unconfirmed=unconfirmed)
 
 
@@ -403,7 +403,7 @@ def register_in_unit(
     triangles: NDArray[np.int64],
     points: MapPoints,
     views: Sequence[View],
-    camera: PinholeCamera,
+    camera: Camera,
     metric: bool,
     progress: bool = False,
 ) -> MeshRegistration:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion, gaussian_filter, map_coordinates
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import SimilarityTransform
 from morph_dslam.registration.scene import View
 from morph_dslam.render.rasteriser import rasterise
@@ -68,7 +68,7 @@ class OutlineFit:
 
 
 def outline_fit(
-    place: SimilarityTransform, nodes: Array, triangles: NDArray[np.int64], views: Sequence[View], camera: PinholeCamera
+    place: SimilarityTransform, nodes: Array, triangles: NDArray[np.int64], views: Sequence[View], camera: Camera
 ) -> OutlineFit:
     """Compare the outline of a mesh with images.
 
@@ -84,7 +84,7 @@ def outline_fit(
             continue
         drawn = rasterise(camera.project(local), local[:, 2], triangles, camera.height, camera.width)
         pixels, normals, stretches = _outline(np.asarray(drawn.covered, dtype=bool))
-        offsets = _offsets(_across(view.flat, pixels, normals), stretches)
+        offsets = _offsets(_across(view.normalized, pixels, normals), stretches)
         there = (offsets >= FOUND[0]) & (offsets <= FOUND[1])
         elsewhere = np.isfinite(offsets) & ~there
         pairs = elsewhere & np.roll(elsewhere, 1)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, cross_matrix, rotation_log
 from morph_dslam.io.tables import Landmarks
@@ -294,7 +294,7 @@ def _of_state(of_pose: Array, n_parameters: int) -> Array:
 
 def register_by_landmarks(
     model: ReducedModel,
-    camera: PinholeCamera,
+    camera: Camera,
     landmarks: Landmarks,
     options: RegistrationOptions,
     depth: NDArray[np.float32] | None = None,

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.io.camera_files import load_camera
 from morph_dslam.model import ReducedModel, load_model
@@ -194,7 +194,7 @@ def registration_line(content: dict[str, Any]) -> str:
 
 
 def draw_registration(
-    found: MeshRegistration, model: ReducedModel, views: Sequence[View], camera: PinholeCamera
+    found: MeshRegistration, model: ReducedModel, views: Sequence[View], camera: Camera
 ) -> NDArray[np.uint8]:
     """Keyframes side by side, the object drawn over the lower row, coloured by its height."""
     nodes = model.positions(model.default)
@@ -203,7 +203,7 @@ def draw_registration(
     columns = []
     for view in spread_views(views, N_PICTURES):
         local = view.camera_from_world.apply(world)
-        image = cv2.cvtColor(view.flat, cv2.COLOR_GRAY2BGR)
+        image = cv2.cvtColor(view.normalized, cv2.COLOR_GRAY2BGR)
         normals = vertex_normals(local, model.triangles)
         drawn = draw_overlay(
             np.asarray(image, dtype=np.uint8),

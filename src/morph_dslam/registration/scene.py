@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, SimilarityTransform
 from morph_dslam.registration.texture import pose_jacobian
 from morph_dslam.slam.rigid_map import GOOD, RigidMap
@@ -53,7 +53,7 @@ class StaticPoints:
     positions : (n, 3) of all points, object frame, metres. views : with ``point_ids`` among these.
     """
 
-    def __init__(self, positions: Array, views: Sequence[View], camera: PinholeCamera) -> None:
+    def __init__(self, positions: Array, views: Sequence[View], camera: Camera) -> None:
         self._camera = camera
         counts = np.bincount(np.concatenate([view.point_ids for view in views]), minlength=len(positions))
         chosen = np.argsort(-counts, kind="stable")[:MOST_POINTS]
@@ -166,12 +166,12 @@ class View:
     Attributes
     ----------
     frame : its number in the recording.
-    flat : (h, w) uint8 its flattened image, undistorted. camera_from_world : its pose.
+    normalized : (h, w) uint8 its contrast-normalized image, undistorted. camera_from_world : its pose.
     point_ids : (k,) rows of the map points seen. pixels : (k, 2) where.
     """
 
     frame: int
-    flat: NDArray[np.uint8]
+    normalized: NDArray[np.uint8]
     camera_from_world: RigidTransform
     point_ids: NDArray[np.int64]
     pixels: Array
@@ -187,7 +187,7 @@ def scene_of_map(rigid_map: RigidMap) -> tuple[MapPoints, Sequence[View]]:
         pose = RigidTransform.from_matrix(keyframe.camera_from_world)
         seen = row[keyframe.point_ids]
         kept = seen >= 0
-        views.append(View(keyframe.index, keyframe.flat, pose, seen[kept], keyframe.pixels[kept]))
+        views.append(View(keyframe.index, keyframe.normalized, pose, seen[kept], keyframe.pixels[kept]))
         total[seen[kept]] += pose.inverse.translation
         count[seen[kept]] += 1.0
     used = count > 0
@@ -208,9 +208,7 @@ def camera_from_object(view: View, world_from_object: SimilarityTransform) -> Ri
     return RigidTransform(camera.rotation @ placed.rotation, camera.apply(placed.translation) / placed.scale)
 
 
-def views_of(
-    nodes: Array, placed: SimilarityTransform, views: Sequence[View], camera: PinholeCamera, most: int
-) -> list[View]:
+def views_of(nodes: Array, placed: SimilarityTransform, views: Sequence[View], camera: Camera, most: int) -> list[View]:
     """At most so many of the views that have the object in their image, spread over all.
 
     ``nodes`` are its (n, 3), metres.

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import TrackingError
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.board import BoardStart, load_board
@@ -23,7 +23,7 @@ Image = NDArray[np.uint8]
 class Initializer(Protocol):
     """Places an object in one image."""
 
-    def place(self, model: ReducedModel, camera: PinholeCamera, grey: Image) -> Registration:
+    def place(self, model: ReducedModel, camera: Camera, grey: Image) -> Registration:
         """The object in an undistorted image (h, w); raises RegistrationError if it cannot be placed."""
         ...
 
@@ -47,7 +47,7 @@ class InitializerFiles:
         return None if self.guess is None else load_guess(self.guess)
 
 
-def register_by_initializer(aid: Initializer, model: ReducedModel, camera: PinholeCamera, image: Image) -> Registration:
+def register_by_initializer(aid: Initializer, model: ReducedModel, camera: Camera, image: Image) -> Registration:
     """The object in a frame (h, w, 3) as recorded; raises RegistrationError as `Initializer.place` does."""
     grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
     maps = camera.undistortion_maps()

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.render.rasteriser import Buffers, rasterise
 
@@ -58,7 +58,7 @@ class PairDisplacements:
 class _Drawn:
     """The mesh in one view: projected nodes (n, 2), depths (n,), all pixels, and corners (c, 2) on it."""
 
-    flat: Image
+    normalized: Image
     pose: RigidTransform
     pixels: Array
     depths: Array
@@ -97,7 +97,7 @@ class TextureComparison:
     nodes : (n, 3) of the undeformed mesh, metres. triangles : (m, 3). camera : without distortion.
     """
 
-    def __init__(self, nodes: Array, triangles: NDArray[np.int64], camera: PinholeCamera) -> None:
+    def __init__(self, nodes: Array, triangles: NDArray[np.int64], camera: Camera) -> None:
         self._nodes, self._triangles, self._camera = nodes, triangles, camera
         self._centre = nodes.mean(axis=0)
 
@@ -106,7 +106,7 @@ class TextureComparison:
 
         Parameters
         ----------
-        images : (h, w) flattened. poses : camera_from_object of each, metres.
+        images : (h, w) contrast-normalized. poses : camera_from_object of each, metres.
         """
         drawn = [self._draw(image, pose) for image, pose in zip(images, poses, strict=True)]
         sights = [self._centre - pose.inverse.translation for pose in poses]
@@ -118,12 +118,12 @@ class TextureComparison:
         ]
         return [pair for pair in pairs if pair is not None]
 
-    def _draw(self, flat: Image, pose: RigidTransform) -> _Drawn:
+    def _draw(self, normalized: Image, pose: RigidTransform) -> _Drawn:
         local = pose.apply(self._nodes)
         pixels = self._camera.project(local)
         size = (self._camera.height, self._camera.width)
         buffers = rasterise(pixels, local[:, 2], self._triangles, *size)
-        return _Drawn(flat, pose, pixels, local[:, 2], buffers, _corners(flat, buffers))
+        return _Drawn(normalized, pose, pixels, local[:, 2], buffers, _corners(normalized, buffers))
 
     def _compare(self, drawn: Sequence[_Drawn], a: int, b: int) -> PairDisplacements | None:
         """What the second view shows of the corners that the first one sees."""
@@ -176,7 +176,7 @@ class TextureComparison:
 
     def _displaced(self, first: _Drawn, second: _Drawn, expected: Array) -> tuple[Array, NDArray[np.bool_]]:
         """How far (p, 2) from the expected pixels the second view shows what the first does; which are so."""
-        carried, shown = np.zeros(first.flat.shape, np.float32), np.zeros(first.flat.shape, dtype=np.bool_)
+        carried, shown = np.zeros(first.normalized.shape, np.float32), np.zeros(first.normalized.shape, dtype=np.bool_)
         buffers, seen = second.buffers, first.buffers.depth
         carry(
             buffers.triangle_ids,
@@ -185,18 +185,18 @@ class TextureComparison:
             first.pixels,
             first.depths,
             seen,
-            first.flat,
+            first.normalized,
             carried,
             shown,
         )
-        moves, alike = align_patches(carried, shown, second.flat, expected, WINDOW // 2)
+        moves, alike = align_patches(carried, shown, second.normalized, expected, WINDOW // 2)
         return moves, alike >= LEAST_CORRELATION
 
 
-def _corners(flat: Image, buffers: Buffers) -> Array:
+def _corners(normalized: Image, buffers: Buffers) -> Array:
     """Corners (c, 2) of a view's image on the object, away from its rim."""
     mask = cv2.erode(buffers.covered.astype(np.uint8), np.ones((9, 9), np.uint8))
-    corners = cv2.goodFeaturesToTrack(flat, N_CORNERS, 0.01, 5.0, mask=mask)
+    corners = cv2.goodFeaturesToTrack(normalized, N_CORNERS, 0.01, 5.0, mask=mask)
     return np.empty((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_exp
 from morph_dslam.registration.scene import View, camera_from_object, views_of
 from morph_dslam.registration.texture import PairDisplacements, TextureComparison
@@ -56,12 +56,7 @@ class TextureAlignment:
     """
 
     def __init__(
-        self,
-        nodes: Array,
-        triangles: NDArray[np.int64],
-        camera: PinholeCamera,
-        views: Sequence[View],
-        metric: bool = False,
+        self, nodes: Array, triangles: NDArray[np.int64], camera: Camera, views: Sequence[View], metric: bool = False
     ) -> None:
         self._comparison = TextureComparison(nodes, triangles, camera)
         self._nodes, self._camera, self._views = nodes, camera, views
@@ -70,7 +65,7 @@ class TextureAlignment:
     def refine(self, start: SimilarityTransform) -> Alignment | None:
         """The similarity near ``start`` with which all views agree; None where too little can be compared."""
         views = views_of(self._nodes, start, self._views, self._camera, MOST_VIEWS)
-        images, transform, result = [view.flat for view in views], start, None
+        images, transform, result = [view.normalized for view in views], start, None
         for _ in range(TEXTURE_ITERATIONS):
             poses = [camera_from_object(view, transform) for view in views]
             measured = self._comparison.measure(images, poses)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import SceneError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import Parameter, ReducedModel
@@ -135,13 +135,7 @@ class StaticScene:
     """
 
     def __init__(
-        self,
-        environment: Environment,
-        folder: Path,
-        camera: PinholeCamera,
-        positions: Array,
-        light: Array,
-        ambient: float,
+        self, environment: Environment, folder: Path, camera: Camera, positions: Array, light: Array, ambient: float
     ) -> None:
         self._camera = camera
         faces = environment_faces(environment)
@@ -161,7 +155,7 @@ class StaticScene:
         self._nodes, self._triangles = np.concatenate(nodes), np.concatenate(triangles)
         self._coordinates, self._owners = np.concatenate(coordinates), np.concatenate(owners)
 
-    def buffers(self, camera_from_world: RigidTransform, camera: PinholeCamera | None = None) -> Buffers:
+    def buffers(self, camera_from_world: RigidTransform, camera: Camera | None = None) -> Buffers:
         """What every pixel of the surroundings sees, in this camera or in another one."""
         camera = camera or self._camera
         local = camera_from_world.apply(self._nodes)

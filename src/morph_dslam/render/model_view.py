@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
 from morph_dslam.render.overlay import draw_overlay, paint_surface
@@ -40,7 +40,7 @@ def looking_at(centre: Array, direction: Array, distance: float) -> RigidTransfo
 
 def fitting_view(
     shapes: Sequence[Array], direction: Array, size: tuple[int, int], middle: float = 0.5
-) -> tuple[RigidTransform, PinholeCamera]:
+) -> tuple[RigidTransform, Camera]:
     """camera_from_object and the camera that sees all ``shapes`` [(n, 3)] when it looks along ``direction``.
 
     Parameters
@@ -50,11 +50,11 @@ def fitting_view(
     corners = np.concatenate(shapes)
     centre, extent = (corners.min(axis=0) + corners.max(axis=0)) / 2.0, np.ptp(corners, axis=0).max()
     focal = FILLING * DISTANCE * min(size)
-    camera = PinholeCamera(*size, focal, focal, middle * size[0], 0.5 * size[1])
+    camera = Camera(*size, focal, focal, middle * size[0], 0.5 * size[1])
     return looking_at(centre, direction, DISTANCE * extent), camera
 
 
-def _filled(camera: PinholeCamera, pixels: Array) -> PinholeCamera:
+def _filled(camera: Camera, pixels: Array) -> Camera:
     """The camera zoomed and shifted so that what it sees at ``pixels`` (n, 2) fills its picture."""
     size = np.array([camera.width, camera.height])
     low, high = pixels.min(axis=0), pixels.max(axis=0)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
 from morph_dslam.render.environment import StaticScene
@@ -38,7 +38,7 @@ Image = NDArray[np.uint8]
 LARGEST_PRINT = 8000
 
 
-def supersampled(camera: PinholeCamera, factor: int) -> PinholeCamera:
+def supersampled(camera: Camera, factor: int) -> Camera:
     """The camera whose image, averaged over ``factor`` x ``factor`` pixels, is this camera's image."""
     return replace(
         camera,
@@ -69,7 +69,7 @@ def print_texture(surface: Surface, folder: Path, size: Array, pixels_per_metre:
     return texture
 
 
-def prepare_background(background: Background, folder: Path, camera: PinholeCamera) -> Image:
+def prepare_background(background: Background, folder: Path, camera: Camera) -> Image:
     """The background (h, w, 3) filling the camera's image."""
     if background.image is None:
         return np.full((camera.height, camera.width, 3), background.colour[::-1], dtype=np.uint8)
@@ -146,7 +146,7 @@ class SceneRenderer:
         self,
         scene: Scene,
         model: ReducedModel,
-        camera: PinholeCamera,
+        camera: Camera,
         folder: Path,
         nearest_depth: float,
         surroundings: StaticScene | None = None,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import SceneError
 from morph_dslam.io.camera_files import load_camera, parse_camera, save_camera
 from morph_dslam.io.tables import Landmarks, save_landmarks
@@ -47,7 +47,7 @@ class _World:
     scene: Scene
     folder: Path
     model: ReducedModel
-    camera: PinholeCamera
+    camera: Camera
     motion: Motion
     surroundings: StaticScene | None
 
@@ -115,7 +115,7 @@ def _load_world(scene_path: Path) -> _World:
     return world
 
 
-def _surroundings(scene: Scene, folder: Path, camera: PinholeCamera, motion: Motion) -> StaticScene | None:
+def _surroundings(scene: Scene, folder: Path, camera: Camera, motion: Motion) -> StaticScene | None:
     if scene.environment is None or motion.camera_from_world is None:
         return None
     positions = np.array([pose.inverse.translation for pose in motion.camera_from_world])

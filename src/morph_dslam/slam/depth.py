@@ -74,7 +74,7 @@ class DepthImage:
 
 @dataclass(frozen=True)
 class StereoImages:
-    """Both flattened images (h, w) of a rectified pair."""
+    """Both contrast-normalized images (h, w) of a rectified pair."""
 
     left: Image
     right: Image

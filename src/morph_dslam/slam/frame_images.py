@@ -1,8 +1,8 @@
 """ORB descriptors at given points, and matching points that have several of them.
 
 Descriptors are turned upright by each patch's intensity centroid (Rublee et al. 2011) and computed at several
-scales, since the points did not come from ORB's detector. The image is the grey one: flattening, by a window
-of fixed size, makes the same surface look different from nearer or farther.
+scales, since the points did not come from ORB's detector. The image is the grey one: contrast normalization, by a
+window of fixed size, makes the same surface look different from nearer or farther.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from numba import njit, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera, StereoCamera
+from morph_dslam.camera import Camera, StereoCamera
 from morph_dslam.errors import CameraError
 from morph_dslam.slam.depth import DepthImage, FrameDepth, StereoImages
 from morph_dslam.slam.options import SlamOptions
 from morph_dslam.slam.pose import PoseEstimate, inside
 from morph_dslam.slam.rigid_map import NOWHERE, Followed
 from morph_dslam.slam.tracking import Tracked
-from morph_dslam.tracking.patches import flatten
+from morph_dslam.tracking.patches import normalize_contrast
 
 Array = NDArray[np.float64]
 
@@ -204,7 +204,7 @@ def points_of(tracked: Tracked, is_candidate: NDArray[np.bool_]) -> dict[str, An
     return points | counts | corners_of(tracked.points.pixels[is_candidate])
 
 
-# From a frame as recorded to what tracking and mapping work on: undistorted, flattened, and depth.
+# From a frame as recorded to what tracking and mapping work on: undistorted, contrast-normalized, and depth.
 
 
 #: Baseline, metres, that depth images are taken to have: structured light's noise is then half a pixel.
@@ -217,13 +217,13 @@ class FrameView:
 
     Attributes
     ----------
-    grey : (h, w) undistorted. flat : (h, w) the same flattened. depth : None where nothing measured it.
+    grey : (h, w) undistorted. normalized : (h, w) the same contrast-normalized. depth : None where nothing measured it.
     """
 
     index: int
     timestamp: float
     grey: Image
-    flat: Image
+    normalized: Image
     depth: FrameDepth | None = None
 
 
@@ -240,7 +240,7 @@ class FrameImages:
         If a stereo pair is to have depth images too, or cannot be rectified.
     """
 
-    def __init__(self, camera: PinholeCamera | StereoCamera, options: SlamOptions, with_depth: bool = False) -> None:
+    def __init__(self, camera: Camera | StereoCamera, options: SlamOptions, with_depth: bool = False) -> None:
         self._options = options
         if isinstance(camera, StereoCamera):
             if with_depth:
@@ -272,11 +272,11 @@ class FrameImages:
             If an image has not the camera's size.
         """
         grey = self._grey(image, f"frame {index}", self._maps)
-        flat = self._flat(grey)
-        return FrameView(index, timestamp, grey, flat, self._depth(index, flat, depth, right))
+        normalized = self._normalized(grey)
+        return FrameView(index, timestamp, grey, normalized, self._depth(index, normalized, depth, right))
 
     def _depth(
-        self, index: int, flat: Image, depth: NDArray[np.float32] | None, right: Image | None
+        self, index: int, normalized: Image, depth: NDArray[np.float32] | None, right: Image | None
     ) -> FrameDepth | None:
         if not self.baseline_px:
             return None
@@ -284,7 +284,7 @@ class FrameImages:
             if right is None:
                 return None
             right = self._grey(right, f"the right image of frame {index}", self._right_maps)
-            return StereoImages(flat, self._flat(right), self._options)
+            return StereoImages(normalized, self._normalized(right), self._options)
         if depth is None:
             return None
         self.camera.check_image(depth, f"the depth image of frame {index}")
@@ -298,8 +298,8 @@ class FrameImages:
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         return self._remapped(np.asarray(grey, dtype=np.uint8), maps)
 
-    def _flat(self, grey: Image) -> Image:
-        return flatten(grey, self._options.flow.flatten_window)
+    def _normalized(self, grey: Image) -> Image:
+        return normalize_contrast(grey, self._options.flow.contrast_window)
 
     @staticmethod
     def _remapped(image: Image, maps: tuple[NDArray, NDArray] | None) -> Image:

@@ -105,7 +105,7 @@ class MapInitializer:
         """Take in a frame; a start, or the reason why there is none yet."""
         if self._first is None:
             return self._take_reference(frame)
-        self._follow(frame.flat)
+        self._follow(frame.normalized)
         if self._alive.sum() < max(self._options.least_start_points, 0.4 * len(self._alive)):
             reason = self._take_reference(frame)
             return f"the first view was lost from sight; {reason}"
@@ -113,10 +113,10 @@ class MapInitializer:
         return self._verify(view) if self._second is not None else self._propose(view)
 
     def _take_reference(self, frame: FrameView) -> str:
-        mask = np.zeros(frame.flat.shape, dtype=np.uint8)
+        mask = np.zeros(frame.normalized.shape, dtype=np.uint8)
         border = self._options.flow.window
         mask[border:-border, border:-border] = 255
-        corners = spread_corners(frame.flat, mask, self._options.start_corners)
+        corners = spread_corners(frame.normalized, mask, self._options.start_corners)
         self.reset()
         if len(corners) < self._options.least_start_points:
             return f"too little texture: {len(corners)} corners"
@@ -124,15 +124,15 @@ class MapInitializer:
         self._pixels, self._alive = corners.copy(), np.ones(len(corners), dtype=bool)
         return "waiting for the camera to move"
 
-    def _follow(self, flat: NDArray[np.uint8]) -> None:
+    def _follow(self, normalized: NDArray[np.uint8]) -> None:
         assert self._first is not None
         rows = np.flatnonzero(self._alive)
         start, flow = self._first.pixels[rows], self._options.flow
-        first = self._first.frame.flat
-        found, ok = follow(first, flat, start, self._pixels[rows], flow)
-        back, ok_back = follow(flat, first, found, start, flow)
+        first = self._first.frame.normalized
+        found, ok = follow(first, normalized, start, self._pixels[rows], flow)
+        back, ok_back = follow(normalized, first, found, start, flow)
         ok &= ok_back & (np.linalg.norm(back - start, axis=1) < 1.0)
-        likeness = patch_correlation(first, flat, start, found, self._options.patch_half)
+        likeness = patch_correlation(first, normalized, start, found, self._options.patch_half)
         ok &= likeness > self._options.least_correlation
         self._alive[rows[~ok]] = False
         self._pixels[rows] = found

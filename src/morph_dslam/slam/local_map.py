@@ -27,19 +27,19 @@ SAME_PIXEL, SAME_DEPTH = 2.0, 0.1
 LEAST_MISSING = 10
 
 
-def free_corners(flat: NDArray[np.uint8], taken: Array, options: SlamOptions) -> Array:
-    """Corners (c, 2) of a flattened image, as many as are missing, away from the pixels (n, 2) taken."""
+def free_corners(normalized: NDArray[np.uint8], taken: Array, options: SlamOptions) -> Array:
+    """Corners (c, 2) of a contrast-normalized image, as many as are missing, away from the pixels (n, 2) taken."""
     missing = options.map_corners - len(taken)
     if missing < LEAST_MISSING:
         return np.empty((0, 2))
-    mask = np.full(flat.shape, 255, dtype=np.uint8)
+    mask = np.full(normalized.shape, 255, dtype=np.uint8)
     columns, rows = np.rint(taken).astype(int).clip(0, np.array(mask.shape[::-1]) - 1).T
     mask[rows, columns] = 0
     reach = 2 * options.corner_distance_px + 1
     mask = np.asarray(cv2.erode(mask, np.ones((reach, reach), np.uint8)), dtype=np.uint8)
     border = options.flow.window
     mask[:border], mask[-border:], mask[:, :border], mask[:, -border:] = 0, 0, 0, 0
-    return spread_corners(flat, mask, missing)
+    return spread_corners(normalized, mask, missing)
 
 
 class PointMaker:

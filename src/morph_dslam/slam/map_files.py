@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import MapError
 from morph_dslam.io.colmap import ColmapImage, ColmapModel
 from morph_dslam.io.trajectory import Trajectory
@@ -62,7 +62,7 @@ def map_from_trajectory(
             mapper.begin_at(view, pose)
             tracker.place(pose, rigid_map.keyframes[-1].seen)
             continue
-        tracked = tracker.track_at(view.flat, pose)
+        tracked = tracker.track_at(view.normalized, pose)
         if mapper.wants_keyframe(tracked, view.index):
             do_all(mapper.insert(tracked, view))
             tracker.points = rigid_map.keyframes[-1].seen
@@ -99,18 +99,18 @@ def _check(
 class _PosedTracker(Tracker):
     """Follows points through frames of known pose."""
 
-    def track_at(self, flat: NDArray[np.uint8], camera_from_world: Array) -> Tracked:
+    def track_at(self, normalized: NDArray[np.uint8], camera_from_world: Array) -> Tracked:
         """The points of the next frame, at its pose (4, 4)."""
         options = self._options
         flow = FlowOptions(options.flow.window, options.flow.levels + 1)
-        found = self._follow(flat, camera_from_world, flow)
-        found = found.joined(self._search(flat, camera_from_world, found.ids))
+        found = self._follow(normalized, camera_from_world, flow)
+        found = found.joined(self._search(normalized, camera_from_world, found.ids))
         known = self._map.state[found.ids] == GOOD
         positions, pixels = self._map.positions[found.ids[known]], found.pixels[known]
         errors = reprojection_errors(camera_from_world, positions, pixels, self._intrinsics)
         rms = float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0
         pose = PoseEstimate(camera_from_world, np.zeros((6, 6)), errors < options.inlier_px, rms)
-        result = self._tracked(flat, pose, found, NOWHERE)
+        result = self._tracked(normalized, pose, found, NOWHERE)
         self.camera_from_world, self.points = camera_from_world, result.points
         return result
 
@@ -118,13 +118,13 @@ class _PosedTracker(Tracker):
 # Saving a map of the rigid scene, and loading it for another run with the same camera.
 
 
-FORMAT, VERSION = "morph-dslam map", 2
+FORMAT, VERSION = "morph-dslam map", 3
 
-KEYFRAME_ARRAYS = ("flat", "camera_from_world", "point_ids", "pixels", "right", "described_ids", "descriptors")
+KEYFRAME_ARRAYS = ("normalized", "camera_from_world", "point_ids", "pixels", "right", "described_ids", "descriptors")
 
 
-def save_map(path: Path, rigid_map: RigidMap, camera: PinholeCamera) -> None:
-    """Write points, keyframes with their flattened images, and the camera that they are of, as HDF5."""
+def save_map(path: Path, rigid_map: RigidMap, camera: Camera) -> None:
+    """Write points, keyframes with their contrast-normalized images, and the camera that they are of, as HDF5."""
     with h5py.File(path, "w") as file:
         file.attrs.update({"format": FORMAT, "version": VERSION, "usual_rms_px": rigid_map.usual_rms_px})
         file.attrs["baseline_px"] = rigid_map.baseline_px
@@ -140,11 +140,11 @@ def save_map(path: Path, rigid_map: RigidMap, camera: PinholeCamera) -> None:
             group = file.create_group(f"keyframes/{number:06d}")
             group.attrs.update({"index": keyframe.index, "timestamp": keyframe.timestamp})
             for name in KEYFRAME_ARRAYS:
-                packed = {"compression": "gzip", "compression_opts": 1} if name == "flat" else {}
+                packed = {"compression": "gzip", "compression_opts": 1} if name == "normalized" else {}
                 group.create_dataset(name, data=getattr(keyframe, name), **packed)
 
 
-def load_map(path: Path, camera: PinholeCamera) -> RigidMap:
+def load_map(path: Path, camera: Camera) -> RigidMap:
     """Read a map.
 
     Raises
@@ -161,7 +161,7 @@ def load_map(path: Path, camera: PinholeCamera) -> RigidMap:
         raise MapError(f"{path} is no map of `morph slam`, or damaged: {error}") from error
 
 
-def _read(path: Path, file: h5py.File, camera: PinholeCamera) -> RigidMap:
+def _read(path: Path, file: h5py.File, camera: Camera) -> RigidMap:
     if file.attrs.get("format") != FORMAT:
         raise MapError(f"{path} is no map of `morph slam`; give the map.h5 of a run folder")
     if file.attrs["version"] != VERSION:
@@ -243,10 +243,10 @@ def _add_keyframe(
     pixels = images.camera.undistort_pixels(image.pixels[rows])
     intrinsics = np.asarray(images.camera.intrinsics)
     errors = reprojection_errors(image.camera_from_world, model.points[ids], pixels, intrinsics)
-    good = (errors < MOST_ERROR_PX) & inside(pixels, view.flat.shape, options.patch_half + 2)
+    good = (errors < MOST_ERROR_PX) & inside(pixels, view.normalized.shape, options.patch_half + 2)
     seen = Followed(ids, pixels)[good]
     keyframe = Keyframe(
-        view.index, view.timestamp, view.flat, image.camera_from_world, seen.ids, seen.pixels, seen.right
+        view.index, view.timestamp, view.normalized, image.camera_from_world, seen.ids, seen.pixels, seen.right
     )
     rigid_map.add_keyframe(keyframe)
     described, keyframe.descriptors = describe(view.grey, keyframe.pixels, OCTAVES)

@@ -204,7 +204,7 @@ class Mapper:
     def _finish(self, number: int, view: FrameView) -> Work:
         """New corners to follow, and a description of what the view sees, so that it can be recognised."""
         keyframe = self._map.keyframes[number]
-        corners = free_corners(keyframe.flat, keyframe.pixels, self._options)
+        corners = free_corners(keyframe.normalized, keyframe.pixels, self._options)
         if len(corners):
             depth = median_depth(
                 self._map, keyframe.camera_from_world, keyframe.point_ids, self._intrinsics, self._choice.unknown_depth
@@ -237,7 +237,7 @@ class Mapper:
 
 
 def _keyframe(view: FrameView, pose: Array, seen: Followed) -> Keyframe:
-    return Keyframe(view.index, view.timestamp, view.flat, pose, seen.ids, seen.pixels, seen.right)
+    return Keyframe(view.index, view.timestamp, view.normalized, pose, seen.ids, seen.pixels, seen.right)
 
 
 def pose_in_keyframe(camera_from_world: Array, keyframe: Keyframe) -> Array:

@@ -157,7 +157,7 @@ class _Corners:
 
 
 def _described_corners(view: FrameView) -> _Corners:
-    pixels = spread_corners(view.flat, np.full(view.flat.shape, 255, dtype=np.uint8), N_CORNERS)
+    pixels = spread_corners(view.normalized, np.full(view.normalized.shape, 255, dtype=np.uint8), N_CORNERS)
     return _Corners(pixels, *describe(view.grey, pixels, OCTAVES))
 
 
@@ -191,7 +191,7 @@ class Relocalizer:
         if not len(tracker.points.ids):
             return None
         number = int(np.bincount(self._map.template_keyframe[tracker.points.ids]).argmax())
-        return self._confirmed(self.group(number), view.flat, tracker.camera_from_world, tracker)
+        return self._confirmed(self.group(number), view.normalized, tracker.camera_from_world, tracker)
 
     def locate(self, view: FrameView, group: Indices, tracker: Tracker) -> tuple[PoseEstimate, Followed] | None:
         """The pose by the points of some keyframes, and the points that support it; None if they do not."""
@@ -201,7 +201,7 @@ class Relocalizer:
         self, view: FrameView, corners: _Corners, group: Indices, tracker: Tracker
     ) -> tuple[PoseEstimate, Followed] | None:
         rough = self._rough_pose(group, corners)
-        return None if rough is None else self._confirmed(group, view.flat, rough.camera_from_world, tracker)
+        return None if rough is None else self._confirmed(group, view.normalized, rough.camera_from_world, tracker)
 
     def _candidates(self, descriptors: Descriptors) -> list[int]:
         order = np.argsort(-self.places.similarities(descriptors), kind="stable").tolist()
@@ -230,16 +230,16 @@ class Relocalizer:
         return find_pose(positions, corners.pixels[first], self._intrinsics, ROUGH_PX, least=ROUGH_INLIERS)
 
     def _confirmed(
-        self, group: Indices, flat: Image, pose: Array, tracker: Tracker
+        self, group: Indices, normalized: Image, pose: Array, tracker: Tracker
     ) -> tuple[PoseEstimate, Followed] | None:
         """The pose from all points of the group, found near a rough pose (4, 4); None if too few are."""
         ids = np.unique(np.concatenate([self._map.keyframes[k].point_ids for k in group]))
         ids = ids[self._map.state[ids] == GOOD]
         guesses, depths = project(pose, self._map.positions[ids], self._intrinsics)
-        seen = inside(guesses, flat.shape, self._options.patch_half + 2)
+        seen = inside(guesses, normalized.shape, self._options.patch_half + 2)
         seen &= tracker.looks_alike(ids, pose, depths)
         flow = FlowOptions(self._options.flow.window, 2)
-        found = tracker.find(flat, Followed(ids[seen], guesses[seen]), pose, flow)
+        found = tracker.find(normalized, Followed(ids[seen], guesses[seen]), pose, flow)
         refined = refine_pose(
             pose, self._map.positions[found.ids], found.pixels, self._intrinsics, inlier_px=self._options.inlier_px
         )

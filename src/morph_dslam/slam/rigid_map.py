@@ -46,7 +46,7 @@ class Keyframe:
 
     Attributes
     ----------
-    index, timestamp : of its frame. flat : (h, w) its flattened image.
+    index, timestamp : of its frame. normalized : (h, w) its contrast-normalized image.
     camera_from_world : (4, 4). point_ids : (k,) points seen, ascending. pixels : (k, 2) where.
     right : (k,) their columns in a right image (`Followed`); all unmeasured by default.
     described_ids, descriptors : (d,), (d, 32) what points looked like, by `descriptors.describe`.
@@ -56,7 +56,7 @@ class Keyframe:
 
     index: int
     timestamp: float
-    flat: NDArray[np.uint8]
+    normalized: NDArray[np.uint8]
     camera_from_world: Array
     point_ids: Indices
     pixels: Array

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from morph_dslam.camera import PinholeCamera, StereoCamera
+from morph_dslam.camera import Camera, StereoCamera
 from morph_dslam.errors import MapError
 from morph_dslam.io.camera_files import load_camera_or_pair
 from morph_dslam.io.colmap import read_colmap_model
@@ -102,10 +102,10 @@ def run_slam(options: SlamRunOptions) -> dict[str, Any]:
         return _run(options, camera, source)
 
 
-def _run(options: SlamRunOptions, camera: PinholeCamera | StereoCamera, source: FrameStream) -> dict[str, Any]:
+def _run(options: SlamRunOptions, camera: Camera | StereoCamera, source: FrameStream) -> dict[str, Any]:
     with_depth = (
         options.use_depth
-        and isinstance(camera, PinholeCamera)
+        and isinstance(camera, Camera)
         and isinstance(source, RecordedFrames)
         and source.has_registered_depth
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera, StereoCamera
+from morph_dslam.camera import Camera, StereoCamera
 from morph_dslam.errors import MapError
 from morph_dslam.slam.frame_images import STAGES, FrameImages, FrameView, SlamFrame, corners_of, points_of
 from morph_dslam.slam.initialization import MapInitializer, MapStart
@@ -50,7 +50,7 @@ class Slam:
 
     def __init__(
         self,
-        camera: PinholeCamera | StereoCamera,
+        camera: Camera | StereoCamera,
         options: SlamOptions | None = None,
         with_depth: bool = False,
         freeze_when_deforming: bool = False,
@@ -213,7 +213,7 @@ class Slam:
             if not isinstance(points, Followed):
                 return {"status": "waiting", "reason": points} | corners_of(self._initialiser.followed)
             self._tracker.place(self.map.keyframes[-1].camera_from_world, points)
-            tracked = self._tracker.track(view.flat, view.depth)
+            tracked = self._tracker.track(view.normalized, view.depth)
         if not isinstance(tracked, Tracked):
             self._restart()
             return {"status": "waiting", "reason": f"the first map did not hold: {tracked}"}
@@ -237,7 +237,7 @@ class Slam:
 
     def _track(self, view: FrameView, clock: StageClock) -> dict:
         with clock.stage("track"):
-            tracked = self._tracker.track(view.flat, view.depth)
+            tracked = self._tracker.track(view.normalized, view.depth)
         if not isinstance(tracked, Tracked):
             found = self._relocalise(view, clock)
             return found if found["status"] != "lost" else {"status": "lost", "reason": tracked}

@@ -147,12 +147,12 @@ class WarpedViews:
         centre = self._intrinsics[2:]
         change = local_change(now, centre)
         if is_small(change) or not np.isfinite(change).all() or np.linalg.det(change) <= 0.0:
-            return keyframe.flat, None
+            return keyframe.normalized, None
         if number in self._views:
             before, image = self._views[number]
             if is_small(change @ np.linalg.inv(local_change(before, centre)), REUSE):
                 return image, before
-        image = cv2.warpPerspective(keyframe.flat, now, keyframe.flat.shape[::-1], borderValue=NEUTRAL)
+        image = cv2.warpPerspective(keyframe.normalized, now, keyframe.normalized.shape[::-1], borderValue=NEUTRAL)
         self._views[number] = now, np.asarray(image, dtype=np.uint8)
         return self._views[number][1], now
 
@@ -245,7 +245,7 @@ class Tracker:
         """The map is complete: look for points from the few keyframes that show most of them."""
         self._templates = FewTemplates(self._map)
 
-    def track(self, flat: Image, depth: FrameDepth | None = None) -> Tracked | str:
+    def track(self, normalized: Image, depth: FrameDepth | None = None) -> Tracked | str:
         """Pose and points of the next frame, or why it is lost; then the newest pose stays what it was."""
         reason = ""
         deeper = FlowOptions(self._options.flow.window, self._options.flow.levels + 1)
@@ -254,8 +254,8 @@ class Tracker:
             (self._motion @ self.camera_from_world, self._options.flow),
             (self.camera_from_world, deeper),
         ):
-            found = self._follow(flat, predicted, flow)
-            result = self._estimate(flat, depth, predicted, found)
+            found = self._follow(normalized, predicted, flow)
+            result = self._estimate(normalized, depth, predicted, found)
             if isinstance(result, Tracked):
                 self._motion = result.pose.camera_from_world @ inverse(self.camera_from_world)
                 self.camera_from_world = result.pose.camera_from_world
@@ -276,7 +276,7 @@ class Tracker:
         at = self._map.keyframes[newest].camera_from_world
         self._map.passing.note(newest, at, self.camera_from_world, waiting.ids, waiting.pixels)
 
-    def _follow(self, flat: Image, predicted: Array, flow: FlowOptions) -> Followed:
+    def _follow(self, normalized: Image, predicted: Array, flow: FlowOptions) -> Followed:
         """Followed points, astray ones too, found again, begun where the predicted motion takes them."""
         # A further keyframe costs as much as all points of one: those astray come along with others only.
         views = self._map.template_keyframe
@@ -288,7 +288,7 @@ class Tracker:
         before, _ = project(self.camera_from_world, positions, self._intrinsics)
         after, _ = project(predicted, positions, self._intrinsics)
         guesses = points.pixels + np.nan_to_num(after - before)
-        return self.find(flat, Followed(points.ids, guesses), predicted, flow)
+        return self.find(normalized, Followed(points.ids, guesses), predicted, flow)
 
     def _still_astray(self, pose: Array, followed: Followed) -> Followed:
         """Those of the points that had left the rigid scene that are still away from their places."""
@@ -297,7 +297,7 @@ class Tracker:
         errors = reprojection_errors(pose, positions, followed.pixels, self._intrinsics)
         return followed[errors > self._options.inlier_px]
 
-    def find(self, flat: Image, guesses: Followed, pose: Array, flow: FlowOptions) -> Followed:
+    def find(self, normalized: Image, guesses: Followed, pose: Array, flow: FlowOptions) -> Followed:
         """Points found near their guessed pixels, by the patches of their keyframes as seen from a pose."""
         ids = guesses.ids
         if self._templates is not None:
@@ -306,10 +306,10 @@ class Tracker:
             views, templates = self._map.template_keyframe[ids], self._map.template_pixels[ids]
         found, good = guesses.pixels.copy(), np.zeros(len(ids), dtype=bool)
         for view in np.unique(views):
-            rows = np.flatnonzero((views == view) & inside(guesses.pixels, flat.shape, 0.0))
+            rows = np.flatnonzero((views == view) & inside(guesses.pixels, normalized.shape, 0.0))
             source, starts = self._seen_from(pose, int(view), ids[rows], templates[rows])
-            pixels, ok = follow(source, flat, starts, guesses.pixels[rows], flow)
-            likeness = patch_correlation(source, flat, starts, pixels, self._options.patch_half)
+            pixels, ok = follow(source, normalized, starts, guesses.pixels[rows], flow)
+            likeness = patch_correlation(source, normalized, starts, pixels, self._options.patch_half)
             found[rows], good[rows] = pixels, ok & (likeness > self._options.least_correlation)
         return Followed(ids, found)[good]
 
@@ -317,7 +317,7 @@ class Tracker:
         """A keyframe's image, warped where it looks much different from the pose, and its pixels there."""
         keyframe = self._map.keyframes[number]
         if not len(ids):
-            return keyframe.flat, pixels
+            return keyframe.normalized, pixels
         _, depths = project(keyframe.camera_from_world, self._map.positions[ids], self._intrinsics)
         depth = max(float(np.median(depths)), LEAST_DEPTH)
         image, homography = self._warped.view(number, keyframe, pose, depth)
@@ -334,7 +334,9 @@ class Tracker:
         right[known] = depth.right_columns(found.pixels[known], columns)
         return Followed(found.ids, found.pixels, right)
 
-    def _estimate(self, flat: Image, depth: FrameDepth | None, predicted: Array, found: Followed) -> Tracked | str:
+    def _estimate(
+        self, normalized: Image, depth: FrameDepth | None, predicted: Array, found: Followed
+    ) -> Tracked | str:
         """Pose from what was followed, then with the lost points that are found again."""
         was_astray = np.isin(found.ids, self._astray.ids)
         followed_astray, found = found[was_astray], self.measured(found[~was_astray], predicted, depth)
@@ -342,15 +344,15 @@ class Tracker:
         if isinstance(pose, str):
             return pose
         astray = self._still_astray(pose.camera_from_world, followed_astray)
-        searched = self._search(flat, pose.camera_from_world, np.concatenate([found.ids, astray.ids]))
+        searched = self._search(normalized, pose.camera_from_world, np.concatenate([found.ids, astray.ids]))
         if len(searched.ids):
             found = found.joined(self.measured(searched, pose.camera_from_world, depth))
             pose = self._pose(pose.camera_from_world, found)
             if isinstance(pose, str):
                 return pose
-        return self._tracked(flat, pose, found, astray)
+        return self._tracked(normalized, pose, found, astray)
 
-    def _tracked(self, flat: Image, pose: PoseEstimate, found: Followed, astray: Followed) -> Tracked:
+    def _tracked(self, normalized: Image, pose: PoseEstimate, found: Followed, astray: Followed) -> Tracked:
         """Which points obey a pose; counted in the map."""
         known = self._map.state[found.ids] == GOOD
         fits = np.zeros(len(found.ids), dtype=bool)
@@ -359,7 +361,7 @@ class Tracker:
         self._map.n_expected[np.union1d(np.union1d(wanted, found.ids[known]), astray.ids)] += 1
         self._map.n_found[found.ids[fits]] += 1
         keep = fits | (self._map.state[found.ids] == CANDIDATE)
-        keep &= inside(found.pixels, flat.shape, self._options.patch_half + 2)
+        keep &= inside(found.pixels, normalized.shape, self._options.patch_half + 2)
         before, _ = project(self.camera_from_world, self._map.positions[found.ids[fits]], self._intrinsics)
         moved = np.linalg.norm(found.pixels[fits] - np.nan_to_num(before), axis=1)
         leaving = found[known & ~fits]
@@ -375,7 +377,7 @@ class Tracker:
         known = found[self._map.state[found.ids] == GOOD]
         return Sight(self._map, known, self._intrinsics, self._options).pose(start)
 
-    def _search(self, flat: Image, pose: Array, followed: Indices) -> Followed:
+    def _search(self, normalized: Image, pose: Array, followed: Indices) -> Followed:
         """Map points that are not followed but in view, found where the pose says."""
         options = self._options
         # In a complete map points have no need to be seen again for their own sake.
@@ -388,12 +390,12 @@ class Tracker:
         lost[followed] = False
         ids = np.flatnonzero(lost)
         pixels, depths = project(pose, self._map.positions[ids], self._intrinsics)
-        seen = inside(pixels, flat.shape, options.flow.window) & self.looks_alike(ids, pose, depths)
+        seen = inside(pixels, normalized.shape, options.flow.window) & self.looks_alike(ids, pose, depths)
         wanted = Followed(ids, pixels)[seen]
         wanted = wanted[self._chosen(wanted.ids, most)]
         if not len(wanted.ids):
             return wanted
-        found = self.find(flat, wanted, pose, FlowOptions(options.flow.window, 1))
+        found = self.find(normalized, wanted, pose, FlowOptions(options.flow.window, 1))
         errors = reprojection_errors(pose, self._map.positions[found.ids], found.pixels, self._intrinsics)
         self._map.n_expected[np.setdiff1d(wanted.ids, found.ids)] += 1
         return found[errors < options.search_radius_px]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
@@ -81,7 +81,7 @@ class Anchor:
     """
 
     def __init__(
-        self, rigid_map: RigidMap, camera: PinholeCamera, objects: Mapping[str, tuple[MapRegistration, ReducedModel]]
+        self, rigid_map: RigidMap, camera: Camera, objects: Mapping[str, tuple[MapRegistration, ReducedModel]]
     ) -> None:
         if any(place.covariance is None for place, _ in objects.values()):
             raise RegistrationError(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.render.picking import pick_surface
@@ -75,7 +75,7 @@ def _closes_a_volume(nodes: Array, triangles: NDArray[np.int64]) -> bool:
     return float(np.einsum("mx,mx->", a, np.cross(b, c))) > 0.0
 
 
-def view_of(model: ReducedModel, camera: PinholeCamera, state: State, discrepancy: Discrepancy | None = None) -> View:
+def view_of(model: ReducedModel, camera: Camera, state: State, discrepancy: Discrepancy | None = None) -> View:
     """Deform, place and project the mesh; with what its shape has beyond the model's, if that is known."""
     positions = model.positions(state.parameters)
     if discrepancy is not None:
@@ -84,13 +84,13 @@ def view_of(model: ReducedModel, camera: PinholeCamera, state: State, discrepanc
     return View(nodes, camera.project(nodes))
 
 
-def draw_view(view: View, triangles: NDArray[np.int64], camera: PinholeCamera) -> Buffers:
+def draw_view(view: View, triangles: NDArray[np.int64], camera: Camera) -> Buffers:
     """The z-buffer of the whole image, depths in metres; triangles (m, 3)."""
     return rasterise(view.pixels, view.nodes[:, 2], triangles, camera.height, camera.width)
 
 
 def bind_pixels(
-    model: ReducedModel, camera: PinholeCamera, view: View, pixels: Array
+    model: ReducedModel, camera: Camera, view: View, pixels: Array
 ) -> tuple[SurfacePoints, NDArray[np.bool_]]:
     """Material points that pixels (p, 2) of the undistorted image see, and which pixels see any.
 

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.model.separated import combine_modes
 from morph_dslam.tracking.state import BoundPoints, State
 
@@ -67,7 +67,7 @@ class PointDepths:
         image: NDArray[np.float32],
         pixels: Array,
         used: NDArray[np.bool_],
-        camera: PinholeCamera,
+        camera: Camera,
         squared_px: float,
         options: DepthOptions,
     ) -> PointDepths:

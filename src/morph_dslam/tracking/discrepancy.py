@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial import KDTree
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.model.discrepancy import Discrepancy, DiscrepancyBasis, farthest_points
 from morph_dslam.tracking.binding import bind_pixels, view_of
@@ -121,7 +121,7 @@ class DiscrepancyFit:
     basis : the centres on the model's surface.
     """
 
-    def __init__(self, model: ReducedModel, camera: PinholeCamera, options: DiscrepancyOptions) -> None:
+    def __init__(self, model: ReducedModel, camera: Camera, options: DiscrepancyOptions) -> None:
         self.camera, self.options = camera, options
         used, first = np.unique(model.triangles, return_index=True)
         nodes = model.nodes[used]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 from tqdm import tqdm
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import TrackingError
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.model import ReducedModel, SeparatedField
@@ -210,7 +210,7 @@ class AugmentedView:
     def __init__(
         self,
         model: ReducedModel,
-        camera: PinholeCamera,
+        camera: Camera,
         options: DrawOptions | None = None,
         inner: Sequence[CarriedStructure] = (),
     ) -> None:
@@ -381,7 +381,7 @@ def _drawn_mesh(model: ReducedModel, section: SectionPlane | None) -> tuple[Mate
 MOST_STATES = 60
 
 
-def write_video(path: Path, source: FrameSource, camera: PinholeCamera, run: RunResults, view: AugmentedView) -> None:
+def write_video(path: Path, source: FrameSource, camera: Camera, run: RunResults, view: AugmentedView) -> None:
     """Draw every frame of the run; hidden and lost frames are shown as they are, with the reason."""
     states = run.states()
     known = [state for state in states if state is not None]

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import cross_matrix
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.separated import combine_modes
@@ -211,13 +211,7 @@ class LinearCost:
 
     @classmethod
     def about(
-        cls,
-        measured: Observations,
-        state: State,
-        residuals: Array,
-        camera: PinholeCamera,
-        huber_px: float,
-        scale: Array,
+        cls, measured: Observations, state: State, residuals: Array, camera: Camera, huber_px: float, scale: Array
     ) -> LinearCost:
         """That of the measurements of a frame, about a state that leaves these residuals (p, 2)."""
         points, pose = measured.points, state.camera_from_object
@@ -357,7 +351,7 @@ class Estimator:
     def __init__(
         self,
         model: ReducedModel,
-        camera: PinholeCamera,
+        camera: Camera,
         options: EstimationOptions | None = None,
         linearise: Callable = linearise,
     ) -> None:

@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import TrackingError
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.sources import Frame
@@ -105,7 +105,7 @@ class LivePicture:
     views : by object, whose run folder it is called by; all of the same field, with one range of colours.
     """
 
-    def __init__(self, camera: PinholeCamera, views: Mapping[str, AugmentedView]) -> None:
+    def __init__(self, camera: Camera, views: Mapping[str, AugmentedView]) -> None:
         ranges = np.array([view.range_of_box() for view in views.values()])
         self._views, self._limits = dict(views), (float(ranges[:, 0].min()), float(ranges[:, 1].max()))
         self._maps = camera.undistortion_maps()

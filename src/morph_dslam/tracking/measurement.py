@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.render.rasteriser import (
     is_inside,
@@ -37,7 +37,7 @@ class Rendering:
 
     Attributes
     ----------
-    image : (h, w) uint8, the flattened texture as it should appear; `NEUTRAL` off the object.
+    image : (h, w) uint8, the contrast-normalized texture as it should appear; `NEUTRAL` off the object.
     depth : (h, w) float32 metres, infinity off the object.
     """
 
@@ -50,7 +50,7 @@ class ReferenceAppearance:
 
     Parameters
     ----------
-    flats : (h, w) each, the flattened pictures. views : the mesh in each of them.
+    normalized_images : (h, w) each, the contrast-normalized pictures. views : the mesh in each of them.
     sources : (m,) the picture that gives each triangle its texture; the first by default.
     closed : see `rasterise`.
 
@@ -62,8 +62,8 @@ class ReferenceAppearance:
     def __init__(
         self,
         model: ReducedModel,
-        camera: PinholeCamera,
-        flats: Sequence[NDArray[np.uint8]],
+        camera: Camera,
+        normalized_images: Sequence[NDArray[np.uint8]],
         views: Sequence[View],
         sources: NDArray[np.int64] | None = None,
         closed: bool = False,
@@ -72,7 +72,7 @@ class ReferenceAppearance:
         self._camera = camera
         sources = np.zeros(len(self._triangles), dtype=np.int64) if sources is None else sources
         # One picture below the other, so that a triangle's place says which one it is from.
-        self._texture = np.ascontiguousarray(np.concatenate(flats))
+        self._texture = np.ascontiguousarray(np.concatenate(normalized_images))
         self._coordinates = np.empty((len(self._triangles), 3, 2))
         self.facing = np.empty(len(self._triangles), dtype=bool)
         for number, view in enumerate(views):
@@ -246,7 +246,7 @@ def compare_with_rendering(
 
     Parameters
     ----------
-    frame : (h, w) the flattened frame. predicted : (p, 2) where the rendering shows the points.
+    frame : (h, w) the contrast-normalized frame. predicted : (p, 2) where the rendering shows the points.
     guesses : (p, 2) where to start looking for them in the frame.
     """
     rows = np.flatnonzero(visible)

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
@@ -45,7 +45,7 @@ Array = NDArray[np.float64]
 class RigCamera:
     """A camera and where it is: ``camera_from_rig``, metres; the first camera's is the identity."""
 
-    camera: PinholeCamera
+    camera: Camera
     camera_from_rig: RigidTransform
 
     def seen(self, state: State) -> State:
@@ -211,7 +211,7 @@ def keyframe_views_of_rig(
     return found
 
 
-def pictures_from(path: Path, camera: PinholeCamera, numbers: Collection[int]) -> dict[int, Image]:
+def pictures_from(path: Path, camera: Camera, numbers: Collection[int]) -> dict[int, Image]:
     """Frames of a recording by number, made ready; those that it does not hold are left out.
 
     Raises
@@ -223,7 +223,7 @@ def pictures_from(path: Path, camera: PinholeCamera, numbers: Collection[int]) -
     for frame in open_source(path):
         if frame.index in numbers:
             view = images.prepare(frame.image, frame.index, frame.timestamp)
-            pictures[frame.index] = Image(view.grey, view.flat)
+            pictures[frame.index] = Image(view.grey, view.normalized)
         if frame.index >= max(numbers):
             break
     return pictures

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import TrackingError
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.registration.start import InitializerFiles
@@ -105,7 +105,7 @@ class MultiObjectTracker:
     anchor : of the objects that are anchored, by name; None if all are free.
     """
 
-    def __init__(self, camera: PinholeCamera, trackers: Mapping[str, Tracker], anchor: Anchor | None = None) -> None:
+    def __init__(self, camera: Camera, trackers: Mapping[str, Tracker], anchor: Anchor | None = None) -> None:
         self._camera, self._objects, self._anchor = camera, ObjectTracker(trackers), anchor
 
     def process(self, frame: Frame) -> dict[str, FrameResult]:

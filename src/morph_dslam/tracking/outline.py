@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.tracking.estimator import BoundPoints, State
 
@@ -74,7 +74,7 @@ class Outline:
     """
 
     def __init__(
-        self, model: ReducedModel, camera: PinholeCamera, grey: NDArray[np.uint8], state: State, options: OutlineOptions
+        self, model: ReducedModel, camera: Camera, grey: NDArray[np.uint8], state: State, options: OutlineOptions
     ) -> None:
         self._camera, self.options = camera, options
         edges = _spread(model.nodes, rim(model.triangles), options.n_points)

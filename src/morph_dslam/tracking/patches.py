@@ -263,8 +263,8 @@ def compare_patches_numpy(
     return places, correlation, spread
 
 
-# Image motion: contrast-flattened images and pyramidal Lucas-Kanade.
-# Tracking works on flattened images (each pixel minus its neighbourhood's mean), so that shading, which
+# Image motion: contrast-normalized images and pyramidal Lucas-Kanade.
+# Tracking works on contrast-normalized images (each pixel minus its neighbourhood's mean), so that shading, which
 # changes as the surface bends, does not count as motion.
 
 
@@ -278,10 +278,10 @@ class FlowOptions:
 
     window: int = 17
     levels: int = 3
-    flatten_window: int = 31
+    contrast_window: int = 31
 
 
-def flatten(grey: NDArray[np.uint8], window: int) -> NDArray[np.uint8]:
+def normalize_contrast(grey: NDArray[np.uint8], window: int) -> NDArray[np.uint8]:
     """Grey image (h, w) minus its mean over a square window, plus `NEUTRAL`; clipped to 0..255."""
     mean = cv2.boxFilter(grey, -1, (window, window), borderType=cv2.BORDER_REFLECT)
     return cv2.addWeighted(grey, 1.0, mean, -1.0, NEUTRAL)  # type: ignore[return-value]
@@ -290,7 +290,7 @@ def flatten(grey: NDArray[np.uint8], window: int) -> NDArray[np.uint8]:
 def follow(
     source: NDArray[np.uint8], target: NDArray[np.uint8], points: Array, guesses: Array, options: FlowOptions
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Follow points from one flattened image to another (Bouguet's pyramidal Lucas-Kanade).
+    """Follow points from one contrast-normalized image to another (Bouguet's pyramidal Lucas-Kanade).
 
     Parameters
     ----------
@@ -325,7 +325,7 @@ def interior(covered: NDArray[np.bool_], margin: int) -> NDArray[np.uint8]:
     return cv2.erode(padded, kernel)[1:-1, 1:-1]  # type: ignore[return-value]
 
 
-def spread_corners(flat: NDArray[np.uint8], mask: NDArray[np.uint8], count: int) -> Array:
+def spread_corners(normalized: NDArray[np.uint8], mask: NDArray[np.uint8], count: int) -> Array:
     """About ``count`` corners (p, 2) inside the mask, spread over it and the strongest of their surroundings.
 
     Shi and Tomasi's corners are taken in order of strength, at most as many from each cell of a grid as an
@@ -336,7 +336,7 @@ def spread_corners(flat: NDArray[np.uint8], mask: NDArray[np.uint8], count: int)
         return np.empty((0, 2))
     spacing = np.sqrt(area / count)
     corners = cv2.goodFeaturesToTrack(
-        flat, maxCorners=8 * count, qualityLevel=0.005, minDistance=max(3.0, 0.4 * spacing), mask=mask
+        normalized, maxCorners=8 * count, qualityLevel=0.005, minDistance=max(3.0, 0.4 * spacing), mask=mask
     )
     if corners is None:
         return np.empty((0, 2))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.landmarks import shape_starts, solve_pnp
 from morph_dslam.timing import StageClock
@@ -41,7 +41,7 @@ class Recovery:
     def __init__(
         self,
         model: ReducedModel,
-        camera: PinholeCamera,
+        camera: Camera,
         reference: ReferenceView,
         estimation: FrameEstimation,
         options: TrackerOptions,

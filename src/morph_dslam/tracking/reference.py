@@ -284,7 +284,7 @@ class ReferenceView:
         return self._estimator.camera.project(self.points.in_camera(state))
 
     def rendered(self, state: State) -> Rendering:
-        """This view as it should appear in a state, flattened."""
+        """This view as it should appear in a state, contrast-normalized."""
         return self.appearance.render(view_of(self.surface.model, self._estimator.camera, state))
 
     def measure(self, picture: Image, state: State, followed: Measurement | None, clock: StageClock) -> Measurement:
@@ -312,7 +312,13 @@ class ReferenceView:
             if followed is not None:
                 guesses = np.where(followed.valid[:, None], followed.pixels, predicted)
             return compare_with_rendering(
-                picture.flat, rendering, predicted, guesses, visible, self._options.flow, self._options.measurement
+                picture.normalized,
+                rendering,
+                predicted,
+                guesses,
+                visible,
+                self._options.flow,
+                self._options.measurement,
             )
 
     def _draw(self, meshes: Sequence[View]) -> tuple[list[NDArray[np.uint8]], float]:
@@ -333,8 +339,8 @@ class ReferenceView:
                     for mesh, (_, depth) in zip(meshes, shown, strict=True)
                 ]
             )
-        flats = [view.picture.flat for view in self._views]
-        self.appearance = ReferenceAppearance(drawn, camera, flats, meshes, sources, closed)
+        normalized_images = [view.picture.normalized for view in self._views]
+        self.appearance = ReferenceAppearance(drawn, camera, normalized_images, meshes, sources, closed)
         masks = [interior(seen, self._options.measurement.patch_half + 2) for seen, _ in shown]
         per_pixel = self._options.n_points / max(np.count_nonzero(masks[0]), 1)
         for number, (mask, buffer) in enumerate(zip(masks, buffers, strict=True)):
@@ -348,7 +354,7 @@ class ReferenceView:
         counts *= min(1.0, MOST_TIMES * self._options.n_points / max(counts.sum(), 1.0))
         bound = []
         for view, mesh, mask, count in zip(self._views, meshes, masks, counts, strict=True):
-            corners = spread_corners(view.picture.flat, mask, max(round(count), 1))
+            corners = spread_corners(view.picture.normalized, mask, max(round(count), 1))
             surface, _ = bind_pixels(self.surface.model, camera, mesh, corners)
             bound.append(BoundPoints.from_surface(model, surface))
         found = sum(len(points) for points in bound)

@@ -144,14 +144,14 @@ class Image:
 
     Attributes
     ----------
-    grey : the undistorted image (h, w). flat : flattened.
+    grey : the undistorted image (h, w). normalized : contrast-normalized.
     depth : (h, w) of a depth camera, as recorded, metres, NaN where unknown; None without one.
     occluder_depth : (h, w) depth of other objects, metres, infinite where there are none; None if none is
         known.
     """
 
     grey: NDArray[np.uint8]
-    flat: NDArray[np.uint8]
+    normalized: NDArray[np.uint8]
     depth: NDArray[np.float32] | None = None
     occluder_depth: NDArray[np.float32] | None = None
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import MapError, RegistrationError, TrackingError
 from morph_dslam.geometry import RigidTransform, rotation_log
 from morph_dslam.io.camera_files import load_camera
@@ -60,8 +60,8 @@ def map_of(registration: Path, given: Path | None) -> Path | None:
     return next((path for path in beside if path.is_file()), None)
 
 
-def pictures_of(path: Path, camera: PinholeCamera, placement: Registration) -> dict[int, KeyframeImage]:
-    """The keyframes that the placement is for; their images are flattened, which is all that is needed.
+def pictures_of(path: Path, camera: Camera, placement: Registration) -> dict[int, KeyframeImage]:
+    """The keyframes that the placement is for; their images are contrast-normalized, which is all that is needed.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def pictures_of(path: Path, camera: PinholeCamera, placement: Registration) -> d
     for keyframe in load_map(path, camera).keyframes:
         if keyframe.index not in wanted:
             continue
-        picture = Image(keyframe.flat, keyframe.flat)
+        picture = Image(keyframe.normalized, keyframe.normalized)
         pictures[keyframe.index] = KeyframeImage(picture, keyframe.camera_from_world)
         if keyframe.index == placement.frame and placement.place is not None:
             _check_pose(path, placement, placement.place.pose_in(keyframe.camera_from_world))
@@ -176,7 +176,7 @@ class Setup:
 
     options: ObjectOptions
     model: ReducedModel
-    camera: PinholeCamera
+    camera: Camera
     landmarks: Landmarks | None
     inner: tuple[InnerStructure, ...]
     placement: Registration | None

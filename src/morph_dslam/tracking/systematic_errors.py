@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.diagnostics.dimensions import DimensionCheck, StretchEvidence
 from morph_dslam.diagnostics.reference_misfit import ReferenceMisfit
 from morph_dslam.model import SurfacePoints
@@ -245,7 +245,7 @@ def _corners(estimator: Estimator, points: BoundPoints) -> BoundPoints:
     return BoundPoints(surface, model.nodes[nodes], model.displacement.with_modes(model.displacement.modes[:, nodes]))
 
 
-def _edges(camera: PinholeCamera, corners: BoundPoints, state: State) -> Array:
+def _edges(camera: Camera, corners: BoundPoints, state: State) -> Array:
     """Two edges of each triangle in the image, as the columns of (p, 2, 2)."""
     pixels = camera.project(corners.in_camera(state)).reshape(-1, 3, 2)
     return np.stack([pixels[:, 1] - pixels[:, 0], pixels[:, 2] - pixels[:, 0]], axis=2)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.errors import CameraError, RegistrationError, SourceError, TrackingError
 from morph_dslam.io.camera_files import load_rig
 from morph_dslam.slam.frame_images import FrameImages
@@ -28,7 +28,7 @@ from morph_dslam.tracking.setup import Setup, load_setup
 from morph_dslam.tracking.track import TrackOptions, find_begin, open_frames, with_reference, write_results
 from morph_dslam.tracking.tracker import AnchoredTracker
 
-#: Correlation of two flattened images that are the same but for the compression.
+#: Correlation of two contrast-normalized images that are the same but for the compression.
 SAME_IMAGE = 0.8
 
 
@@ -134,14 +134,14 @@ def _with_reference(setup: Setup, options: TrackOptions) -> tuple[Setup, TrackOp
     return setup, with_reference(options, setup)
 
 
-def _check_scan(camera: PinholeCamera, keyframe: Image, frames: Path, number: int) -> None:
+def _check_scan(camera: Camera, keyframe: Image, frames: Path, number: int) -> None:
     """Raise TrackingError unless a frame is the map's keyframe of the same number.
 
     The other cameras' reference frames are those of that number, in which the object is undeformed.
     """
     try:
         view = FrameImages(camera, SlamOptions()).prepare(_frame(frames, number).image, number, 0.0)
-        is_keyframe = np.corrcoef(view.flat.ravel(), keyframe.flat.ravel())[0, 1] > SAME_IMAGE
+        is_keyframe = np.corrcoef(view.normalized.ravel(), keyframe.normalized.ravel())[0, 1] > SAME_IMAGE
     except SourceError:
         is_keyframe = False
     if not is_keyframe:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import PinholeCamera
+from morph_dslam.camera import Camera
 from morph_dslam.diagnostics.duplicate_objects import DuplicateObjects
 from morph_dslam.diagnostics.statements import FrameStatements, missed
 from morph_dslam.model import ReducedModel
@@ -30,7 +30,7 @@ from morph_dslam.tracking.estimator import Estimator, Prior, State
 from morph_dslam.tracking.frame_estimation import at_constant_velocity, new_filter
 from morph_dslam.tracking.measurement import Measurement
 from morph_dslam.tracking.options import TrackerOptions
-from morph_dslam.tracking.patches import flatten, follow
+from morph_dslam.tracking.patches import follow, normalize_contrast
 from morph_dslam.tracking.reference import PosedImage, ReferenceView
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.result import (
@@ -82,7 +82,7 @@ class Tracker:
     def __init__(
         self,
         model: ReducedModel,
-        camera: PinholeCamera,
+        camera: Camera,
         reference: NDArray[np.uint8] | Image,
         state: State,
         options: TrackerOptions | None = None,
@@ -204,7 +204,9 @@ class Tracker:
         """Follow the points that supported the previous frame's estimate from that frame to this one."""
         rows = np.flatnonzero(self._supported)
         guesses = self._pixels + self._expected_motion(prior)
-        found, ok = follow(self._picture.flat, picture.flat, self._pixels[rows], guesses[rows], self.options.flow)
+        found, ok = follow(
+            self._picture.normalized, picture.normalized, self._pixels[rows], guesses[rows], self.options.flow
+        )
         pixels, valid = guesses, np.zeros(len(guesses), dtype=bool)
         pixels[rows], valid[rows] = found, ok
         return Measurement(pixels, valid, self._supported, np.ones(len(pixels)))
@@ -310,8 +312,8 @@ class Tracker:
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         if self._undistortion is not None:
             grey = cv2.remap(grey, *self._undistortion, interpolation=cv2.INTER_LINEAR)
-        flat = flatten(grey, self.options.flow.flatten_window)  # type: ignore[arg-type]
-        return Image(grey, flat)  # type: ignore[arg-type]
+        normalized = normalize_contrast(grey, self.options.flow.contrast_window)  # type: ignore[arg-type]
+        return Image(grey, normalized)  # type: ignore[arg-type]
 
 
 # From a frame to the object in it: the camera in the map of the scene, then the object.
@@ -351,7 +353,7 @@ class AnchoredTracker:
     ``anchor`` is of this object alone.
     """
 
-    def __init__(self, camera: PinholeCamera, tracker: Tracker, anchor: Anchor | None = None) -> None:
+    def __init__(self, camera: Camera, tracker: Tracker, anchor: Anchor | None = None) -> None:
         self._camera, self.tracker, self.anchor = camera, tracker, anchor
 
     def with_tracker(self, tracker: Tracker) -> AnchoredTracker:

@@ -76,7 +76,7 @@ def is_sharp(picture: Image, attempt: PoseHypothesis, should_be: Rendering, half
         sharpness is compared, pixels.
     """
     near = around(picture, attempt.measurement.pixels[attempt.inliers], half)
-    return sharpness(picture.flat, near) > LEAST_SHARPNESS * sharpness(should_be.image, near)
+    return sharpness(picture.normalized, near) > LEAST_SHARPNESS * sharpness(should_be.image, near)
 
 
 def seen_part(picture: Image, attempt: PoseHypothesis, should_be: Rendering, view: ReferenceView) -> NDArray[np.bool_]:
@@ -94,27 +94,27 @@ def seen_part(picture: Image, attempt: PoseHypothesis, should_be: Rendering, vie
     return seen
 
 
-def sharpness(flat: NDArray[np.uint8], where: NDArray[np.bool_]) -> float:
+def sharpness(normalized: NDArray[np.uint8], where: NDArray[np.bool_]) -> float:
     """Squared slope of an image (h, w) over its variance ``where`` (h, w): blur lowers it, light does not."""
     if not where.any():
         return 0.0
-    flat, where = _cut_out(flat, where)
-    smooth = cv2.GaussianBlur(flat, (0, 0), 1.0).astype(np.float32)
+    normalized, where = _cut_out(normalized, where)
+    smooth = cv2.GaussianBlur(normalized, (0, 0), 1.0).astype(np.float32)
     x, y = (cv2.Sobel(smooth, cv2.CV_32F, *order) / 8.0 for order in ((1, 0), (0, 1)))
     return float(np.mean((x**2 + y**2)[where]) / max(float(np.var(smooth[where])), 1e-6))
 
 
-def _cut_out(flat: NDArray[np.uint8], where: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+def _cut_out(normalized: NDArray[np.uint8], where: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """The part of both (h, w) that holds all of ``where``, with as much around it as filters reach."""
     left, top, width, height = cv2.boundingRect(where.astype(np.uint8))
     rows = slice(max(top - REACH_PX, 0), top + height + REACH_PX)
     columns = slice(max(left - REACH_PX, 0), left + width + REACH_PX)
-    return np.ascontiguousarray(flat[rows, columns]), where[rows, columns]
+    return np.ascontiguousarray(normalized[rows, columns]), where[rows, columns]
 
 
 def around(picture: Image, pixels: Array, half: int) -> NDArray[np.bool_]:
     """Pixels (h, w) in squares about points (p, 2)."""
-    height, width = picture.flat.shape[:2]
+    height, width = picture.normalized.shape[:2]
     marks = np.zeros((height, width), np.uint8)
     places = np.rint(pixels).astype(np.int64).reshape(-1, 2)
     columns, rows = places[:, 0], places[:, 1]
