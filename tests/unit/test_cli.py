@@ -69,7 +69,7 @@ def test_a_broken_pipe_elsewhere_is_not_hidden(monkeypatch):
     def fail(arguments):
         raise BrokenPipeError
 
-    monkeypatch.setattr(cli, "_info", fail)
+    monkeypatch.setattr("morph_dslam.cli.info.run", fail)
     with pytest.raises(BrokenPipeError):
         cli.main(["info", "model.morph"])
 
@@ -90,7 +90,7 @@ def test_errors_and_interrupts_become_statuses(monkeypatch, capsys, error, statu
     def fail(arguments):
         raise error
 
-    monkeypatch.setattr(cli, "_info", fail)
+    monkeypatch.setattr("morph_dslam.cli.info.run", fail)
     assert cli.main(["info", "model.morph"]) == status
     assert message in capsys.readouterr().err
 
@@ -99,7 +99,7 @@ def test_defects_are_not_hidden(monkeypatch):
     def fail(arguments):
         raise ZeroDivisionError
 
-    monkeypatch.setattr(cli, "_info", fail)
+    monkeypatch.setattr("morph_dslam.cli.info.run", fail)
     with pytest.raises(ZeroDivisionError):
         cli.main(["info", "model.morph"])
 

@@ -121,7 +121,7 @@ def test_links_between_documents_lead_somewhere():
 
 def test_commands_in_documents_have_these_options():
     """What the pages tell to type after `morph` is known to the command line; a # begins a remark."""
-    (commands,) = (a for a in cli._parser()._actions if isinstance(a, argparse._SubParsersAction))
+    (commands,) = (a for a in cli.new_parser()._actions if isinstance(a, argparse._SubParsersAction))
     n_options = 0
     for page in PAGES:
         text = re.sub(r"\\\n\s*", " ", page.read_text())

@@ -111,7 +111,7 @@ def test_every_key_in_a_table_exists(page, roots):
 
 
 def commands() -> dict[str, argparse.ArgumentParser]:
-    (action,) = (a for a in cli._parser()._actions if isinstance(a, argparse._SubParsersAction))
+    (action,) = (a for a in cli.new_parser()._actions if isinstance(a, argparse._SubParsersAction))
     return dict(action.choices)
 
 

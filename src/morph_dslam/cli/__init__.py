@@ -1,4 +1,4 @@
-"""The command line."""
+"""The command line: `morph build | info | track | live | ...`; one file a command."""
 
 from morph_dslam.cli.app import main, run_and_report_errors
 

@@ -35,6 +35,11 @@ def frame_range(text: str) -> tuple[int | None, int | None]:
     return numbers
 
 
+def add_range(command: argparse.ArgumentParser, text: str) -> None:
+    """Add ``--range FIRST-LAST``, a `frame_range`."""
+    command.add_argument("--range", type=frame_range, default=(None, None), metavar="FIRST-LAST", help=text)
+
+
 def positive_number(text: str) -> float:
     """A number above zero, not infinite."""
     try:

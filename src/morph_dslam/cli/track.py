@@ -1,21 +1,55 @@
-"""The command that follows an object in a recording, `morph track`, and what `morph live` shares with it."""
+"""`morph track`, and what `morph live` shares with it: an object's pose and parameters in every frame."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from morph_dslam.cli.arguments import frame_and_file, frame_range, named_value
+from morph_dslam.cli.arguments import add_range, frame_and_file, named_value
 from morph_dslam.errors import TrackingError
 
 if TYPE_CHECKING:
     from morph_dslam.tracking.drawing import DrawOptions
     from morph_dslam.tracking.multi_object import OtherObject
 
+HELP = "find an object's pose and parameters in every frame, and draw the stress over the video"
+KEPT = "the frames tracked so far are kept in the run folder"
 
-def _track(arguments: argparse.Namespace) -> None:
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    command.add_argument(
+        "frames",
+        type=Path,
+        metavar="FRAMES",
+        help="video file, folder of numbered images, or another recording (docs/sources.md)",
+    )
+    add_tracking_arguments(command)
+    command.add_argument(
+        "--reference-frame",
+        type=int,
+        metavar="N",
+        help="frame that the landmarks, or another aid, belong to (default: the first one tracked); with "
+        "--place and --with: one in which the object is undeformed",
+    )
+    command.add_argument(
+        "--refine", action="store_true", help="refine the reference state over the whole sequence and track once more"
+    )
+    command.add_argument(
+        "--with",
+        type=Path,
+        action="append",
+        default=[],
+        dest="other_cameras",
+        metavar="FRAMES",
+        help="what the next camera of the rig saw; with --camera camchain.yaml#cam0, which a map is of too; "
+        "may be repeated",
+    )
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Track and print the figures of each run folder."""
     from morph_dslam.tracking.multi_object import track_objects
     from morph_dslam.tracking.track import TrackOptions, track
     from morph_dslam.tracking.track_rig import track_rig
@@ -37,32 +71,39 @@ def _track(arguments: argparse.Namespace) -> None:
     if arguments.other_cameras and arguments.also:
         raise TrackingError("several objects and several cameras cannot go together: leave out --also or --with")
     if arguments.other_cameras:
-        _say(options.output, track_rig(options, arguments.other_cameras))
+        print_summary(options.output, track_rig(options, arguments.other_cameras))
         return
     if not arguments.also:
-        _say(options.output, track(options))
+        print_summary(options.output, track(options))
         return
     for folder, summary in track_objects(options, other_objects(arguments)).items():
-        _say(folder, summary)
+        print_summary(folder, summary)
 
 
-def _say(folder: Path, summary: dict[str, Any]) -> None:
-    """What the command line says of a run."""
+def print_summary(folder: Path, summary: dict[str, Any]) -> None:
+    """Print what came of a run, recorded or live; without a summary no frame was tracked."""
     from morph_dslam.tracking.observability import value_line
 
+    if not summary:
+        print("no frame was tracked: nothing was written")
+        return
     for flag in summary["flags"]:
         print(f"note: {flag}")
     for figures in summary["one_over_the_sequence"]:
         print(value_line(figures))
     print(f"wrote {folder}")
-    print(
-        f"tracked={summary['n_tracked']}/{summary['n_frames']} "
-        f"median_ms={summary['median_ms']:.2f} p95_ms={summary['p95_ms']:.2f}"
-    )
+    line = f"tracked={summary['n_tracked']}/{summary['n_frames']}"
+    if "live" in summary:
+        figures = summary["live"]
+        line += f" fps={figures['fps']:.1f} dropped={figures['n_dropped']}"
+        line += f" latency_median_ms={figures['latency_median_ms']:.1f} latency_p95_ms={figures['latency_p95_ms']:.1f}"
+    else:
+        line += f" median_ms={summary['median_ms']:.2f} p95_ms={summary['p95_ms']:.2f}"
+    print(line)
 
 
 def object_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What `add_object_arguments` asked for, by the names of `ObjectOptions`."""
+    """What `add_tracking_arguments` asked for, by the names of `ObjectOptions`."""
     from morph_dslam.registration.start import InitializerFiles
     from morph_dslam.tracking.options import TrackerOptions
 
@@ -103,7 +144,7 @@ def drawing(arguments: argparse.Namespace) -> DrawOptions:
     return DrawOptions(arguments.show, section)
 
 
-def add_object_arguments(command: argparse.ArgumentParser) -> None:
+def add_tracking_arguments(command: argparse.ArgumentParser) -> None:
     """The arguments that say what is tracked, with what, and where it is at first."""
     command.add_argument("--model", type=Path, required=True, help="model file of `morph build`")
     command.add_argument("--camera", type=Path, required=True, help="camera file: size, intrinsics, distortion")
@@ -208,42 +249,5 @@ def add_object_arguments(command: argparse.ArgumentParser) -> None:
         metavar="PLANE",
         help="draw a solid cut open: x=12 takes away all beyond x = 12 mm, -x=12 all before it; also y and z",
     )
-
-
-def add_tracking_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
-    """Add the command; ``add(name, action, kept, text)`` makes its parser."""
-    track = add(
-        "track",
-        _track,
-        "the frames tracked so far are kept in the run folder",
-        "find an object's pose and parameters in every frame, and draw the stress over the video",
-    )
-    track.add_argument(
-        "frames",
-        type=Path,
-        metavar="FRAMES",
-        help="video file, folder of numbered images, or another recording (docs/sources.md)",
-    )
-    add_object_arguments(track)
-    track.add_argument("--range", type=frame_range, default=(None, None), metavar="FIRST-LAST", help="frames to track")
-    track.add_argument(
-        "--reference-frame",
-        type=int,
-        metavar="N",
-        help="frame that the landmarks, or another aid, belong to (default: the first one tracked); with "
-        "--place and --with: one in which the object is undeformed",
-    )
-    track.add_argument(
-        "--refine", action="store_true", help="refine the reference state over the whole sequence and track once more"
-    )
-    track.add_argument(
-        "--with",
-        type=Path,
-        action="append",
-        default=[],
-        dest="other_cameras",
-        metavar="FRAMES",
-        help="what the next camera of the rig saw; with --camera camchain.yaml#cam0, which a map is of too; "
-        "may be repeated",
-    )
-    track.add_argument("--no-video", action="store_true", help="do not draw the augmented video")
+    add_range(command, "frames to track, of a recording")
+    command.add_argument("--no-video", action="store_true", help="do not draw the augmented video")

@@ -1,0 +1,43 @@
+"""`morph calibrate`: a camera's intrinsics and distortion."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+HELP = "find a camera's intrinsics and distortion from pictures of a checkerboard"
+KEPT = "nothing was written"
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    command.add_argument(
+        "source", type=Path, nargs="+", help="images, a folder of images, or a video (docs/cameras.md)"
+    )
+    command.add_argument(
+        "--board", required=True, metavar="9x6", help="inner corners, where four squares meet, each way"
+    )
+    command.add_argument("--square", required=True, metavar="'25 mm'", help="side of one square, with its unit")
+    command.add_argument(
+        "--lens",
+        choices=("radial-tangential", "fisheye"),
+        default="radial-tangential",
+        help="lens model: fisheye for views of more than about 120 degrees",
+    )
+    command.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="CAMERA", help="camera file to write (.yaml)"
+    )
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Calibrate and print how well the corners fit."""
+    from morph_dslam.calibration.board import parse_board
+    from morph_dslam.calibration.calibrate import calibrate, picture_path
+
+    board = parse_board(arguments.board, arguments.square)
+    calibration = calibrate(arguments.source, board, arguments.output, arguments.lens)
+    print(calibration.table())
+    for remark in calibration.remarks():
+        print(f"note: {remark}")
+    print(f"wrote {arguments.output} and {picture_path(arguments.output)}")
+    print(calibration.line())

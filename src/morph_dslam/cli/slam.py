@@ -1,0 +1,90 @@
+"""`morph slam`: the path of a camera, and a map of the scene."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from morph_dslam.cli.arguments import add_range, frame_number
+
+HELP = "find the path of a camera through a rigid scene, and a map of the scene"
+KEPT = "the frames tracked so far and their map are kept in the run folder"
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    command.add_argument("source", type=Path, help="recording (docs/sources.md), or webcam:0")
+    command.add_argument(
+        "--camera",
+        type=Path,
+        required=True,
+        help="camera file: size, intrinsics, distortion; a Kalibr camchain or EuRoC folder for a stereo pair",
+    )
+    command.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="run folder to write")
+    add_range(command, "frames to track")
+    command.add_argument(
+        "--map",
+        type=Path,
+        metavar="MAP",
+        help="map.h5 of an earlier run, or the folder of a COLMAP text model, to find the camera in",
+    )
+    command.add_argument(
+        "--trajectory",
+        type=Path,
+        metavar="FILE",
+        help="make the map with these poses, of whatever program (TUM's format), and find the camera in it",
+    )
+    command.add_argument(
+        "--images",
+        type=Path,
+        metavar="RECORDING",
+        help="recording that the COLMAP model or the poses are of, where it is not the one to track",
+    )
+    command.add_argument(
+        "--extend",
+        action="store_true",
+        help="with --map or --trajectory: let the map grow, instead of keeping it as it is",
+    )
+    command.add_argument(
+        "--freeze-at", type=frame_number, metavar="N", help="from this frame on keep the map and only find the camera"
+    )
+    command.add_argument(
+        "--freeze-when-deforming",
+        action="store_true",
+        help="keep the map from when a part of the scene begins to move or to deform",
+    )
+    command.add_argument("--no-depth", action="store_true", help="leave the depth images of the recording aside")
+    command.add_argument("--overwrite", action="store_true", help="replace a run that is in the run folder")
+    command.add_argument("--no-video", action="store_true", help="do not draw the video with tracked points")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Map the scene and print the figures."""
+    from morph_dslam.slam.run import SlamRunOptions, run_slam
+
+    first, last = arguments.range
+    summary = run_slam(
+        SlamRunOptions(
+            source=arguments.source,
+            camera=arguments.camera,
+            output=arguments.output,
+            first=first,
+            last=last,
+            map_path=arguments.map,
+            trajectory=arguments.trajectory,
+            images=arguments.images,
+            extend=arguments.extend,
+            freeze_at=arguments.freeze_at,
+            freeze_when_deforming=arguments.freeze_when_deforming,
+            use_depth=not arguments.no_depth,
+            video=not arguments.no_video,
+            overwrite=arguments.overwrite,
+        )
+    )
+    for flag in summary["flags"]:
+        print(f"note: {flag}")
+    print(f"wrote {arguments.output}")
+    print(
+        f"start={summary['start_frame']} tracked={summary['n_tracked']}/{summary['n_after_start']} "
+        f"median_ms={summary['median_ms']:.2f} p95_ms={summary['p95_ms']:.2f}"
+    )
