@@ -20,12 +20,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from reduction import Grid, write_reduction
-from tqdm import tqdm
-
-from morph_dslam.cli.app import run_and_report_errors
-from morph_dslam.errors import SolverError
-from morph_dslam.mechanics.sheet_buckling import (
+from positions import (
     BuckledSheet,
     BucklingFolder,
     PathRecord,
@@ -34,6 +29,11 @@ from morph_dslam.mechanics.sheet_buckling import (
     solve_positions,
     southwell_load,
 )
+from reduction import Grid, write_reduction
+from tqdm import tqdm
+
+from morph_dslam.cli.app import run_and_report_errors
+from morph_dslam.errors import SolverError
 from morph_dslam.mechanics.shell import OrthotropicSheet
 from morph_dslam.mechanics.solvers.arc_length import PathPoint, missed_bifurcations
 from morph_dslam.studies.snapshots import load_snapshot

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from positions import BuckledSheet, BucklingFolder
 from reduction import Grid
 from run import HEIGHT, OUTPUT, PAPER, POSITIONS, SIZE
 from sides import filmed_model, tracked_model
@@ -28,7 +29,6 @@ from morph_dslam.evaluation.evaluate import evaluate_depth
 from morph_dslam.evaluation.report import KeyFigures, Link, Picture, Section, Table, Text, write_report
 from morph_dslam.evaluation.run_folder import depth_line
 from morph_dslam.experiment import Recording, keep, keep_sequence, report, track_and_evaluate
-from morph_dslam.mechanics.sheet_buckling import BuckledSheet, BucklingFolder
 from morph_dslam.model import load_model, save_model
 from morph_dslam.studies.problem import Snapshot
 from morph_dslam.studies.snapshots import load_snapshot

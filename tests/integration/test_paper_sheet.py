@@ -14,11 +14,14 @@ import numpy as np
 import pytest
 
 from morph_dslam import load_model
+from morph_dslam.errors import SolverError
 from morph_dslam.evaluation.evaluate import evaluate
 from morph_dslam.evaluation.run_folder import load_run
+from morph_dslam.mechanics.shell import OrthotropicSheet
 from morph_dslam.model import save_model
 from morph_dslam.render.simulation import simulate
 from morph_dslam.studies.problem import Snapshot
+from morph_dslam.studies.snapshots import load_snapshot
 from morph_dslam.tracking.track import TrackOptions, track
 from tests.support.real_data import ROOT
 
@@ -52,12 +55,83 @@ def test_the_papers_sheet_is_followed_to_its_full_height_and_not_solved_twice(tm
         assert (tmp_path / name).is_file()
 
 
-@pytest.fixture
-def reduction(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def example_module(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """The example's module of this name."""
     monkeypatch.syspath_prepend(str(ROOT / "examples" / "paper_sheet"))
-    monkeypatch.delitem(sys.modules, "reduction", raising=False)
-    return importlib.import_module("reduction")
+    monkeypatch.delitem(sys.modules, name, raising=False)
+    return importlib.import_module(name)
+
+
+@pytest.fixture
+def positions(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    return example_module("positions", monkeypatch)
+
+
+@pytest.fixture
+def reduction(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    return example_module("reduction", monkeypatch)
+
+
+@pytest.fixture
+def sides(reduction: ModuleType, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    return example_module("sides", monkeypatch)
+
+
+#: E = 5 GPa, nu = 0.
+COLUMN = OrthotropicSheet(young_fibre=5e9, young_cross=5e9, poisson=0.0, shear=2.5e9, thickness=1e-4)
+#: Euler's load of a column of 297 x 210 x 0.1 mm that is clamped at both ends, N.
+EULER = 4.0 * np.pi**2 * 5e9 * 0.210 * 1e-12 / 12.0 / 0.297**2
+
+
+def test_a_clamped_strip_buckles_at_eulers_load_into_eulers_mode(positions: ModuleType) -> None:
+    sheet = positions.BuckledSheet(0.297, 0.210, COLUMN, (10, 2), 3)
+    force, mode = sheet.first_buckling()
+    assert force == pytest.approx(EULER, rel=1e-3)
+    x = np.linspace(-0.14, 0.14, 15)
+    height, _ = sheet.shell.sample(mode, np.column_stack([x, np.zeros_like(x)]))
+    np.testing.assert_allclose(height[:, 2], np.cos(np.pi * x / 0.297) ** 2, atol=2e-3)
+
+
+def test_an_imperfect_strip_deflects_as_columns_do_and_goes_on_where_it_was(
+    positions: ModuleType, tmp_path: Path
+) -> None:
+    """w = w0 / (1 - P / P_cr) for an imperfection in the shape of the mode; Southwell's load is Euler's."""
+    sheet = positions.BuckledSheet(0.297, 0.210, COLUMN, (10, 2), 3, 2e-6)
+    folder = positions.BucklingFolder.of(tmp_path, sheet, 2e-3, count=4)
+    path = list(positions.follow_path(sheet, folder, 2e-3))
+    heights, forces = (np.array([getattr(r, name) for r in path]) for name in ("height", "end_force"))
+    early = (heights > 1.5 * sheet.imperfection) & (heights < 5e-5)
+    expected = sheet.imperfection / (1.0 - forces[early] / EULER)
+    np.testing.assert_allclose(heights[early], expected, rtol=0.03)
+    assert positions.southwell_load(heights, forces, sheet.imperfection, 5e-5) == pytest.approx(EULER, rel=2e-3)
+    assert heights[-1] == pytest.approx(2e-3, rel=1e-6)
+
+    folder.path_file(len(path) - 1).unlink()
+    again = list(positions.follow_path(sheet, folder, 2e-3))
+    assert len(again) == len(path)
+    assert again[-1].end_force == pytest.approx(path[-1].end_force, rel=1e-6)
+
+    points = [record.point for record in path]
+    for number, lengths in positions.positions_by_point(points, folder.count):
+        positions.solve_positions(sheet, folder, number, lengths, points[-1].length)
+    last = load_snapshot(folder.position_file(3))
+    assert last.coordinates == pytest.approx([1.0])
+    assert last.outputs["height"] == pytest.approx(2e-3, rel=1e-6)
+    # Bending energy of the mode at height w: E I w^2 pi^4 / L^3.
+    energy = 5e9 * 0.210 * 1e-12 / 12.0 * np.pi**4 * 4e-6 / 0.297**3
+    assert last.outputs["bending_energy"] == pytest.approx(energy, rel=5e-3)
+    # Stress on the upper face at the crest: E t / 2 times the curvature 2 pi^2 w / L^2.
+    crest = np.argmax(last.fields["displacement"][:, 2])
+    stress = 5e9 * 5e-5 * 2.0 * np.pi**2 * 2e-3 / 0.297**2
+    assert last.fields["stress_top"][crest, 0] == pytest.approx(stress, rel=0.02)
+
+
+def test_a_sheet_that_cannot_arch_so_high_says_how_high_it_can(positions: ModuleType, tmp_path: Path) -> None:
+    """The elastica of length L arches to 0.40315 L at most."""
+    sheet = positions.BuckledSheet(0.297, 0.02, COLUMN, (10, 1), 3, 1e-5)
+    folder = positions.BucklingFolder.of(tmp_path, sheet, 0.15, count=4)
+    with pytest.raises(SolverError, match=r"rises to 119\.[5-9]\d mm and falls again"):
+        list(positions.follow_path(sheet, folder, 0.15))
 
 
 LENGTH, WIDTH, CELLS = 0.4, 0.2, (10, 4)
@@ -101,13 +175,6 @@ def test_a_rolled_sheet_is_given_by_few_modes_and_by_products_of_x_y_and_the_pat
     assert max(figures["normalised_error"], figures["separated_error"]) <= 2e-4
     assert max(figures["von_mises_error"], figures["separated_von_mises_error"]) <= 1e-3
     assert (tmp_path / "reduction.png").is_file()
-
-
-@pytest.fixture
-def sides(reduction: ModuleType, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The example's module of this name."""
-    monkeypatch.delitem(sys.modules, "sides", raising=False)
-    return importlib.import_module("sides")
 
 
 def test_a_sheet_below_its_plane_is_the_one_above_it_in_a_mirror(reduction: ModuleType, sides: ModuleType) -> None:

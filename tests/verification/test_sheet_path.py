@@ -1,4 +1,4 @@
-"""The sheet's buckling and post-buckling against Euler's column and the elastica, and its derivatives."""
+"""Koiter sheets against the elastica and closed forms, and their derivatives against differences."""
 
 from __future__ import annotations
 
@@ -6,20 +6,10 @@ import ngsolve as ngs
 import numpy as np
 import pytest
 
-from morph_dslam.errors import SolverError
-from morph_dslam.mechanics.sheet_buckling import (
-    BuckledSheet,
-    BucklingFolder,
-    SheetEquations,
-    follow_path,
-    positions_by_point,
-    solve_positions,
-    southwell_load,
-)
+from morph_dslam.mechanics.sheet_equations import SheetEquations
 from morph_dslam.mechanics.shell import KoiterSheet, OrthotropicSheet, rectangle_mesh
 from morph_dslam.mechanics.solvers.arc_length import ArcLength, ArcOptions, missed_bifurcations
 from morph_dslam.mechanics.solvers.newton import NewtonOptions, State, advance, sensitivities
-from morph_dslam.studies.snapshots import load_snapshot
 
 #: For differences of solutions.
 PRECISE = NewtonOptions(tolerance=1e-12)
@@ -108,60 +98,6 @@ def test_post_buckled_cantilever_follows_the_elastica() -> None:
         assert not missed_bifurcations(points)
         assert {point.state.negative_pivots for point in points} == {0}
         start = points[-1]  # type: ignore[assignment]
-
-
-def strip(imperfection: float = 2e-6) -> BuckledSheet:
-    """297 x 210 x 0.1 mm, E = 5 GPa, nu = 0: a column whose Euler load is 0.0391611 N."""
-    return BuckledSheet(0.297, 0.210, isotropic(5e9, 0.0, 1e-4), (10, 2), 3, imperfection)
-
-
-def test_clamped_strip_buckles_at_eulers_load_into_eulers_mode() -> None:
-    sheet = strip()
-    force, mode = sheet.first_buckling()
-    assert force == pytest.approx(0.0391611, rel=1e-3)
-    x = np.linspace(-0.14, 0.14, 15)
-    height, _ = sheet.shell.sample(mode, np.column_stack([x, np.zeros_like(x)]))
-    np.testing.assert_allclose(height[:, 2], np.cos(np.pi * x / 0.297) ** 2, atol=2e-3)
-
-
-def test_imperfect_strip_deflects_as_columns_do_and_goes_on_where_it_was(tmp_path) -> None:
-    """w = w0 / (1 - P / P_cr) for an imperfection in the shape of the mode; Southwell's load is Euler's."""
-    sheet = strip()
-    folder = BucklingFolder.of(tmp_path, sheet, 2e-3, count=4)
-    path = list(follow_path(sheet, folder, 2e-3))
-    heights, forces = (np.array([getattr(r, name) for r in path]) for name in ("height", "end_force"))
-    early = (heights > 1.5 * sheet.imperfection) & (heights < 5e-5)
-    expected = sheet.imperfection / (1.0 - forces[early] / 0.0391611)
-    np.testing.assert_allclose(heights[early], expected, rtol=0.03)
-    assert southwell_load(heights, forces, sheet.imperfection, 5e-5) == pytest.approx(0.0391611, rel=2e-3)
-    assert heights[-1] == pytest.approx(2e-3, rel=1e-6)
-
-    folder.path_file(len(path) - 1).unlink()
-    again = list(follow_path(sheet, folder, 2e-3))
-    assert len(again) == len(path)
-    assert again[-1].end_force == pytest.approx(path[-1].end_force, rel=1e-6)
-
-    points = [record.point for record in path]
-    for number, positions in positions_by_point(points, folder.count):
-        solve_positions(sheet, folder, number, positions, points[-1].length)
-    last = load_snapshot(folder.position_file(3))
-    assert last.coordinates == pytest.approx([1.0])
-    assert last.outputs["height"] == pytest.approx(2e-3, rel=1e-6)
-    # Bending energy of the mode at height w: E I w^2 pi^4 / L^3.
-    energy = 5e9 * 0.210 * 1e-12 / 12.0 * np.pi**4 * 4e-6 / 0.297**3
-    assert last.outputs["bending_energy"] == pytest.approx(energy, rel=5e-3)
-    # Stress on the upper face at the crest: E t / 2 times the curvature 2 pi^2 w / L^2.
-    crest = np.argmax(last.fields["displacement"][:, 2])
-    stress = 5e9 * 5e-5 * 2.0 * np.pi**2 * 2e-3 / 0.297**2
-    assert last.fields["stress_top"][crest, 0] == pytest.approx(stress, rel=0.02)
-
-
-def test_a_sheet_that_cannot_arch_so_high_says_how_high_it_can(tmp_path) -> None:
-    """The elastica of length L arches to 0.40315 L at most."""
-    sheet = BuckledSheet(0.297, 0.02, isotropic(5e9, 0.0, 1e-4), (10, 1), 3, 1e-5)
-    folder = BucklingFolder.of(tmp_path, sheet, 0.15, count=4)
-    with pytest.raises(SolverError, match=r"rises to 119\.[5-9]\d mm and falls again"):
-        list(follow_path(sheet, folder, 0.15))
 
 
 def test_fibres_askew_give_the_off_axis_modulus() -> None:

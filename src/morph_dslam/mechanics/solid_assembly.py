@@ -1,9 +1,6 @@
 """Residual, tangent and their derivatives by parameters, assembled by NGSolve from a solid's integrands.
 
-Unknowns inside of cells (bubbles, discontinuous pressures) are condensed: with i the inner and c the coupled
-dofs, only S = K_cc - K_ci K_ii^-1 K_ic is factorised. NGSolve keeps the factors of
-
-    K = (1 - H') (S + K_ii) (1 - H),   H = -K_ii^-1 K_ic.
+Unknowns inside cells (bubbles, discontinuous pressures) are condensed, see `condensation`.
 """
 
 from __future__ import annotations
@@ -19,6 +16,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from morph_dslam.mechanics.parameters import ParameterSymbols
+from morph_dslam.mechanics.solvers.condensation import Condensation, CondensedLinearisation
 from morph_dslam.mechanics.solvers.linear_solver import AssembledLinearisation, LinearSolver
 from morph_dslam.mechanics.solvers.newton import Linearisation
 
@@ -83,7 +81,7 @@ class Assembly:
         self._state = ngs.GridFunction(space)
         self._result = self._state.vec.CreateVector()
         self._pattern: tuple[NDArray[np.int32], NDArray[np.int32]] | None = None
-        self.latest: Linearisation | None = None
+        self._condensation = Condensation(self._form, self._threads)
 
     def _threads(self) -> AbstractContextManager:
         """NGSolve's threads; none for small problems, where starting them takes longer than the work."""
@@ -130,9 +128,13 @@ class Assembly:
         linearisation = _MixedLinearisation(residual, self.tangent(x), solver, multipliers)
         if not self.condensed:
             return linearisation
-        condensed = _CondensedLinearisation(self, linearisation, x.copy(), mu.copy(), solver)
-        self.latest = condensed
-        return condensed
+        x, mu = x.copy(), mu.copy()
+
+        def reassemble() -> None:
+            self._symbols.set(mu)
+            self.tangent(x)
+
+        return CondensedLinearisation(self._condensation, linearisation, reassemble)
 
     def tangent(self, x: Array) -> sp.csr_matrix:
         """K, or S where inner dofs are condensed, (n, n) with all entries stored."""
@@ -143,18 +145,6 @@ class Assembly:
         if self._pattern is None:
             self._pattern = np.array(indices, dtype=np.int32), np.array(indptr, dtype=np.int32)
         return sp.csr_matrix((np.array(data), *self._pattern), shape=(len(x), len(x)))
-
-    def reassemble(self, x: Array, mu: Array) -> None:
-        """Restore the condensation's factors of an earlier linearisation."""
-        self._symbols.set(mu)
-        self.tangent(x)
-
-    def multiply(self, operators: str, vector: Array) -> Array:
-        """Sum of NGSolve's condensation operators, named, applied to ``vector`` (n,)."""
-        self._state.vec.FV().NumPy()[:] = vector
-        with self._threads():
-            self._result.data = getattr(self._form, operators) * self._state.vec
-        return self._result.FV().NumPy().copy()
 
 
 class _MixedLinearisation(AssembledLinearisation):
@@ -172,46 +162,3 @@ class _MixedLinearisation(AssembledLinearisation):
     def negative_pivots(self) -> int | None:
         found = super().negative_pivots
         return None if found is None else found - self._multipliers
-
-
-class _CondensedLinearisation:
-    """A linearisation of all dofs on top of that of the coupled ones."""
-
-    def __init__(
-        self, assembly: Assembly, coupled: AssembledLinearisation, x: Array, mu: Array, solver: LinearSolver
-    ) -> None:
-        self.residual = coupled.residual
-        self._assembly, self._coupled, self._at = assembly, coupled, (x, mu)
-        self._solver = solver
-
-    def _make_current(self) -> None:
-        if self._assembly.latest is not self:
-            self._assembly.reassemble(*self._at)
-            self._assembly.latest = self
-
-    @property
-    def negative_pivots(self) -> int | None:
-        """Of S; K_ii holds the pressures and bubbles, whose inertia does not change."""
-        return self._coupled.negative_pivots
-
-    def solve(self, right: Array) -> Array:
-        self._make_current()
-        multiply = self._assembly.multiply
-        rows = np.atleast_2d(right)
-        condensed = np.array([row + multiply("harmonic_extension_trans", row) for row in rows])
-        solution = self._coupled.solve(condensed)
-        inner = [
-            outer + multiply("harmonic_extension", outer) + multiply("inner_solve", row)
-            for outer, row in zip(solution, rows, strict=True)
-        ]
-        return np.array(inner).reshape(right.shape)
-
-    def apply(self, vectors: Array) -> Array:
-        self._make_current()
-        multiply = self._assembly.multiply
-        result = []
-        for vector in np.atleast_2d(vectors):
-            reduced = vector - multiply("harmonic_extension", vector)
-            product = self._coupled.apply(reduced) + multiply("inner_matrix", reduced)
-            result.append(product - multiply("harmonic_extension_trans", product))
-        return np.array(result).reshape(vectors.shape)

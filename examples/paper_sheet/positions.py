@@ -1,9 +1,8 @@
-"""A Koiter sheet with moved edges and dead loads as `newton.Equations`: for arc length and buckling.
+"""The paper's sheet with its clamped ends brought together: buckling load, path beyond it, positions along it.
 
-Two parameters: mu[0] scales the motion of the moved edges, mu[1] the shell's dead loads. Displacements are
-counted from the plane. An initial imperfection w0 (a stress-free shape) enters exactly, without another form:
-strains and curvatures appear in the mixed energy as N:E(u) + m:kappa(u), so that taking E(w0) and kappa(w0)
-off them subtracts a constant from the equations of the forces and moments.
+The path is followed by arc length from the first buckling mode as a small imperfection. Positions equally spaced along
+it are then solved between the path's points, many from one factorisation, in parallel if asked for. What was solved is
+kept in a folder and not solved again.
 """
 
 from __future__ import annotations
@@ -18,194 +17,18 @@ from typing import Any
 
 import ngsolve as ngs
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError
+from morph_dslam.mechanics.sheet_equations import SheetEquations
 from morph_dslam.mechanics.shell import KoiterSheet, OrthotropicSheet, rectangle_mesh
 from morph_dslam.mechanics.solvers.arc_length import ArcLength, ArcOptions, PathPoint, buckling_modes
-from morph_dslam.mechanics.solvers.linear_solver import AssembledLinearisation, LinearSolver
-from morph_dslam.mechanics.solvers.newton import Linearisation, State, sensitivities
+from morph_dslam.mechanics.solvers.newton import State, sensitivities
 from morph_dslam.studies.problem import Snapshot
 from morph_dslam.studies.sheet_study import output_points
 from morph_dslam.studies.snapshots import SOLVER_VERSION, save_snapshot
 
 Array = NDArray[np.float64]
-
-
-class SheetEquations:
-    """Equilibrium of a `KoiterSheet`; forces are in units of its ``energy_scale``.
-
-    Parameters
-    ----------
-    shell : with the edges that are moved among its ``clamped`` ones.
-    motion : boundary name -> displacement (3,) of that edge at mu[0] = 1, m.
-    length : of the sheet, m: the unit in which changes of its displacement are measured.
-    condensed : eliminate the dofs inside elements before the factorisation: far cheaper, but each
-        linearisation is then assembled again if used after another one is made, so not for `buckling_modes`.
-    threads : of the linear solver.
-    """
-
-    def __init__(
-        self,
-        shell: KoiterSheet,
-        motion: dict[str, Array],
-        length: float,
-        condensed: bool = True,
-        threads: int | None = None,
-    ) -> None:
-        self.shell, self.condensed, self.n_dofs = shell, condensed, shell.space.ndof
-        form = ngs.BilinearForm(shell.space, symmetric=True, condense=condensed, store_inner=condensed)
-        for part in shell.form.integrators:
-            form += part
-        self.form = form
-        self.free = np.array(shell.space.FreeDofs())
-        coupling = np.array(shell.space.FreeDofs(condensed))
-        self.inside = self.free & ~coupling
-        self.solver = LinearSolver(coupling, symmetric=True, threads=threads)
-        self.scale = np.full(self.n_dofs, np.inf)
-        for component in range(3):
-            self.scale[shell.displacement_dofs(component)] = length
-        self._motion = self._edge_motion(motion)
-        self._initial = np.zeros(self.n_dofs)
-        self.unloaded = np.zeros(self.n_dofs)
-        self.assembled: CondensedLinearisation | None = None
-        still, loaded = np.zeros(self.n_dofs), np.array([0.0, 1.0])
-        self._load_slope = self.residual(still, loaded) - self.residual(still, np.zeros(2))
-
-    def _edge_motion(self, motion: dict[str, Array]) -> Array:
-        result = np.zeros(self.n_dofs)
-        for name, displacement in motion.items():
-            for component, value in enumerate(displacement):
-                field = ngs.GridFunction(self.shell.scalar_space)
-                field.Set(ngs.CF(float(value)), definedon=self.shell.mesh.Boundaries(name))
-                result[self.shell.displacement_dofs(component)] += field.vec.FV().NumPy()
-        return result
-
-    def set_imperfection(self, dofs: Array) -> None:
-        """Make the displacement in ``dofs`` (n,) the stress-free shape; its other entries do not matter.
-
-        It must be level along clamped edges. A solution then starts from `unloaded`.
-        """
-        shape = np.zeros(self.n_dofs)
-        for component in range(3):
-            part = self.shell.displacement_dofs(component)
-            shape[part] = dofs[part]
-        self._initial[:] = 0.0
-        self._use(shape, np.zeros(2))
-        self.shell.refresh_normals()
-        initial = self.residual(shape, np.zeros(2))
-        initial[np.isfinite(self.scale)] = 0.0
-        # The rotations of edges between elements are unknowns too, but nothing is taken off their equations.
-        rotations = self.shell.space.Range(4)
-        initial[rotations.start : rotations.stop] = 0.0
-        self._initial, self.unloaded = initial, shape
-
-    # -- Equations --------------------------------------------------------------------------------------
-
-    def prescribed(self, mu: Array) -> Array:
-        return mu[0] * self._motion
-
-    def prescribed_slopes(self, mu: Array) -> Array:
-        return np.array([self._motion, np.zeros(self.n_dofs)])[: len(mu)]
-
-    def residual(self, x: Array, mu: Array) -> Array:
-        self._use(x, mu)
-        result = self.shell.state.vec.CreateVector()
-        self.form.Apply(self.shell.state.vec, result)
-        return result.FV().NumPy() - self._initial
-
-    def residual_slopes(self, x: Array, mu: Array) -> Array:
-        return np.array([np.zeros_like(x), self._load_slope])[: len(mu)]
-
-    def linearise(self, x: Array, mu: Array) -> Linearisation:
-        """Tangent at ``x``; the frozen edge normals are averaged there first.
-
-        That renewal shifts the meaning of the edges' rotations, which the next correction makes up for.
-        """
-        self._use(x, mu)
-        self.shell.refresh_normals()
-        self.form.AssembleLinearization(self.shell.state.vec)
-        data, indices, indptr = self.form.mat.CSR()
-        matrix = sp.csr_matrix(
-            (np.array(data), np.array(indices), np.array(indptr, dtype=np.int64)), shape=(self.n_dofs, self.n_dofs)
-        )
-        residual = self.residual(x, mu)
-        if not self.condensed:
-            return AssembledLinearisation(residual, matrix, self.solver)
-        self.assembled = CondensedLinearisation(self, x.copy(), mu.copy(), residual, matrix)
-        return self.assembled
-
-    def _use(self, x: Array, mu: Array) -> None:
-        self.shell.state_vector()[:] = x
-        self.shell.load_factor.Set(float(mu[1]))
-
-    # -- results ----------------------------------------------------------------------------------------
-
-    def end_force(self, x: Array, mu: Array) -> float:
-        """Force along the motion of the edges, conjugate to mu[0]: d energy / d mu[0], N."""
-        return float(self._motion @ self.residual(x, mu)) * self.shell.energy_scale
-
-    def bending_energy(self, x: Array, mu: Array) -> float:
-        """Elastic energy of bending, joule."""
-        self._use(x, mu)
-        return self.shell.bending_energy()
-
-
-class CondensedLinearisation:
-    """Tangent with the dofs inside elements eliminated by NGSolve.
-
-    With K = [A B; B^T D], D inside elements, NGSolve offers S = A - B D^-1 B^T, H = -D^-1 B^T, its transpose,
-    D and D^-1. They live in the form and change when it is assembled anew.
-    """
-
-    def __init__(self, equations: SheetEquations, x: Array, mu: Array, residual: Array, matrix: Any) -> None:
-        self._equations, self._x, self._mu, self.residual = equations, x, mu, residual
-        self._schur = AssembledLinearisation(residual, matrix, equations.solver)
-
-    def _restore(self) -> Any:
-        """The form, assembled at this linearisation's own point."""
-        if self._equations.assembled is not self:
-            self._equations.linearise(self._x, self._mu)
-            self._equations.assembled = self
-        return self._equations.form
-
-    @property
-    def negative_pivots(self) -> int | None:
-        """Of the condensed tangent: those inside elements are the same in every state."""
-        return self._schur.negative_pivots
-
-    def solve(self, right: Array) -> Array:
-        if right.ndim == 2:
-            return np.array([self.solve(row) for row in right])
-        form = self._restore()
-        load = right + _product(form.harmonic_extension_trans, right)
-        solution = self._schur.solve(load)
-        solution += _product(form.harmonic_extension, solution)
-        return np.where(self._equations.free, solution + _product(form.inner_solve, right), 0.0)
-
-    def apply(self, vectors: Array) -> Array:
-        if vectors.ndim == 2:
-            return np.array([self.apply(row) for row in vectors])
-        form = self._restore()
-        inside = np.where(self._equations.inside, vectors, 0.0)
-        outside = vectors - inside
-        local = _product(form.inner_matrix, inside - _product(form.harmonic_extension, outside))
-        return self._schur.apply(outside) + local - _product(form.harmonic_extension_trans, local)
-
-
-def _product(operator: Any, vector: Array) -> Array:
-    given, result = operator.CreateRowVector(), operator.CreateColVector()
-    given.FV().NumPy()[:] = vector
-    result.data = operator * given
-    return result.FV().NumPy().copy()
-
-
-# A sheet whose two clamped ends are brought together: its buckling load and its path beyond.
-# The path is followed by arc length from the first buckling mode as a small imperfection. Positions equally
-# spaced along it are then solved between the path's points, many from one factorisation, in parallel if asked
-# for; whatever was solved is kept and not solved again.
-
 
 #: The end force needs the ends' distance far more precisely than the shape: the sheet is stiff along itself.
 PATH_OPTIONS = ArcOptions(first=2e-7, smallest=1e-10, largest=0.005, corrections=10, contraction=0.5, tolerance=1e-11)
