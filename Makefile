@@ -2,7 +2,7 @@
 SHELL := bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DELETE_ON_ERROR:
-.PHONY: demo test test-all test-lowest bench lint clean
+.PHONY: demo test test-all test-lowest bench lint docs clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -53,6 +53,11 @@ lint: $(INSTALLED)
 	@$(BIN)/pyright --warnings
 	@$(BIN)/lint-imports
 
+# The site, in build/site: open build/site/index.html.
+docs: $(INSTALLED)
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "the documentation is in build/site/index.html"
+
 clean:
 	rm -rf demo examples/*/output build dist .pytest_cache .ruff_cache .import_linter_cache
 	find src tests examples -name __pycache__ -type d -prune -exec rm -rf {} +
@@ -61,5 +66,5 @@ $(INSTALLED): pyproject.toml
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer, with its venv module, is needed: no such python3 was found"; exit 1; }
 	@echo "Installing into $(VENV) with $(PYTHON) (a few minutes, once)"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off --editable '.[dev]' | $(PIP_PROGRESS)
+	@$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off --editable '.[dev,docs]' | $(PIP_PROGRESS)
 	@touch $@
