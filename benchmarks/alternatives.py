@@ -36,7 +36,7 @@ from morph_dslam.io.camera_files import load_camera
 from morph_dslam.io.tables import Landmarks
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.registration.landmarks import RegistrationOptions
-from morph_dslam.registration.registration import register_by_landmarks
+from morph_dslam.registration.registration import Registration, register_by_landmarks
 from morph_dslam.sources import open_source
 from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State, moved
@@ -175,11 +175,11 @@ def follow(model: ReducedModel, kind: type[Counted], recording: Recording, exact
                     placed = register_by_landmarks(model, camera, landmarks, RegistrationOptions())
                 except MorphError as error:
                     return Row([], [], [], last + 1 - recording.first, str(error))
-                tracker = Tracker(model, camera, frame.image, placed.state)
-                tracker.process_frame(frame.image)  # compiles
-                tracker = Tracker(model, camera, frame.image, placed.state)
+                tracker = Tracker(model, camera, Registration.at(model, placed.state), reference=frame.image)
+                tracker.track(frame.image)  # compiles
+                tracker = Tracker(model, camera, Registration.at(model, placed.state), reference=frame.image)
             Counted.iterations, Counted.seconds = 0, 0.0
-            estimate = tracker.process_frame(frame.image).estimate
+            estimate = tracker.track(frame.image).estimate
             if estimate is None:
                 row = replace(row, lost=row.lost + 1)
                 continue

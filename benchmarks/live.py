@@ -145,7 +145,7 @@ def run(arguments: argparse.Namespace) -> None:
     assert reference is not None
     images = [frame.image for frame in open_source(folder / "recording" / "frames", placement.frame)]
     setup.warm_up(placement, reference)
-    chain = setup.new_chain(placement, reference, in_sequence=False)
+    chain = setup.new_tracker(placement, reference, in_sequence=False)
     picture = LivePicture(setup.camera, {"seal": AugmentedView(placement.model, setup.camera)})
     picture_time, locate, track = Timed(picture, "draw"), Timed(chain, "locate"), Timed(chain, "track")
     results = RunResults(placement.model, placement.frame or 0)

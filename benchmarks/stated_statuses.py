@@ -48,7 +48,6 @@ from morph_dslam.registration.landmarks import register
 from morph_dslam.registration.mesh import register_mesh
 from morph_dslam.registration.registration import Registration
 from morph_dslam.threads import one_thread_for_algebra
-from morph_dslam.tracking.result import DIMENSIONS_OFF
 
 Case = tuple[str, Callable[[], Outcome]]
 #: The scene whose object stays in its place while the camera goes round it, as one in a map does.
@@ -198,13 +197,12 @@ def _line(scene: str, case: str, outcomes: list[Outcome]) -> str:
     wrong, refused = sum(o.n_wrong for o in outcomes), sum(o.n_frames == 0 for o in outcomes)
     largest = [o.largest_error for o in outcomes if np.isfinite(o.largest_error)]
     error = f"{1e3 * max(largest):6.1f}" if largest else "     -"
-    named = sum(any(DIMENSIONS_OFF in line for line in o.said) for o in outcomes)
     backs = [o.back_after for o in outcomes if o.back_after is not None]
     back = f" back after {max(backs)}" if backs else ""
     return (
         f"{scene:19} | {case:58} | refused {refused} of {len(outcomes)} | tracked {seen:4} not {lost:4} | "
         f"mm {error} | beyond {beyond:3} confident wrong {wrong:3} of {frames}{back} | "
-        f"dimensions named {named} | {said[:100]}"
+        f"{said[:100]}"
     )
 
 

@@ -27,6 +27,7 @@ from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField, SurfacePoints, load_model
 from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
 from morph_dslam.model.reduced_model import with_revolution_angle
+from morph_dslam.registration.registration import Registration
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
 from morph_dslam.threads import one_thread_for_algebra
@@ -131,9 +132,9 @@ def new_tracker(model: ReducedModel, film: Film, plain: bool) -> Tracker:
 
     def begin() -> Tracker:
         with patch.object(DrawnSurface, "of", whole if plain else DrawnSurface.of):
-            return Tracker(model, CAMERA, film.images[0], film.states[0])
+            return Tracker(model, CAMERA, Registration.at(model, film.states[0]), reference=film.images[0])
 
-    begin().process_frame(film.images[0])
+    begin().track(film.images[0])
     return begin()
 
 
@@ -154,7 +155,7 @@ def compare(model: ReducedModel, distance: float, frames: int) -> None:
     for image in film.images[1:]:
         for name, tracker in trackers.items():
             start = time.process_time()
-            results[name].append(tracker.process_frame(image))
+            results[name].append(tracker.track(image))
             times[name].append(1e3 * (time.process_time() - start))
     drawn = DrawnSurface.of(model)
     print(

@@ -14,8 +14,10 @@ from morph_dslam.io.tables import Landmarks, save_landmarks
 from morph_dslam.model import load_model
 from morph_dslam.sources import open_source
 from morph_dslam.tracking.multi_camera import RigTracker
-from morph_dslam.tracking.result import HAS_MOVED, STAGES
+from morph_dslam.tracking.outcomes import ObjectMoved
+from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.setup import ObjectOptions, load_setup
+from morph_dslam.tracking.tracker import CameraLocalization
 from tests.support.rendered_anchored_rig import FRAMES, RIG, SCAN
 from tests.support.tracked_rig import column, errors, exact_nodes
 
@@ -215,23 +217,23 @@ def test_an_object_moved_before_two_cameras_is_followed_by_its_points(recording)
     )
     setup = load_setup(options)
     placement = setup.placement
-    chain = setup.new_chain(placement, setup.reference, in_sequence=False)
+    chain = setup.new_tracker(placement, setup.reference, in_sequence=False)
     sources = [open_source(folder / name, SCAN - 1, SCAN + 5) for name in ("front", "aside")]
     beside = next(iter(open_source(folder / "aside", placement.frame, placement.frame))).image
     rig = RigTracker(placement.model, RIG, [setup.reference, beside], placement.state, in_sequence=False)
     results = []
     for front, aside in zip(*sources, strict=True):
-        known = chain.locate(front).known
+        known = chain.locate(front).pose_prior
         if front.index >= SCAN + 1:
             pose = known.pose
             there = RigidTransform(pose.rotation, pose.translation + pose.rotation @ [0.02, 0.0, 0.0])
             known = replace(known, pose=there)
-        results.append(rig.process_frame([front.image, aside.image], known))
+        results.append(rig.track([front.image, aside.image], CameraLocalization(known)))
         exact = truth["wedge"]["camera_from_object"][front.index][:3, 3]
         assert np.linalg.norm(results[-1].pose.translation - exact) < MAP_ERROR
     assert [result.pose_from for result in results] == ["points and map"] * 2 + ["points"] * 5
     # Three frames on end make it sure.
-    assert [HAS_MOVED in result.reason for result in results] == [False] * 4 + [True] * 3
+    assert [result.warning(ObjectMoved) is not None for result in results] == [False] * 4 + [True] * 3
 
 
 def renumbered(source, target, shift, last=FRAMES):

@@ -214,7 +214,7 @@ def test_a_truncated_video_keeps_the_frames_before_the_break(sequence, tmp_path,
 def test_an_interrupt_keeps_the_frames_so_far_and_says_so(sequence, tmp_path, capsys, monkeypatch):
     from morph_dslam.tracking.tracker import Tracker
 
-    whole, frames_seen = Tracker.process_frame, []
+    whole, frames_seen = Tracker.track, []
 
     def interrupted(tracker, image, *known):
         frames_seen.append(image)
@@ -222,7 +222,7 @@ def test_an_interrupt_keeps_the_frames_so_far_and_says_so(sequence, tmp_path, ca
             raise KeyboardInterrupt
         return whole(tracker, image, *known)
 
-    monkeypatch.setattr(Tracker, "process_frame", interrupted)
+    monkeypatch.setattr(Tracker, "track", interrupted)
     assert cli.main(track_command(sequence, output=tmp_path / "run")) == 130
     assert "interrupted; the frames tracked so far are kept" in capsys.readouterr().err
     with h5py.File(tmp_path / "run" / "result.h5") as file:

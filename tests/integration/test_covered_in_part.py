@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, mean_error, sheet_state
@@ -27,11 +28,11 @@ def covered_run():
     """Mean errors by frame, mm, errors of the parameters over their deviations, and points that agreed."""
     model = bent_sheet_model(43, 31)
     film = SheetFilm(model)
-    tracker = Tracker(model, CAMERA, film.frame(sheet_state(0.0)), sheet_state(0.0))
+    tracker = Tracker(model, CAMERA, Registration.at(model, sheet_state(0.0)), reference=film.frame(sheet_state(0.0)))
     errors, normalised, counts = [], [], []
     for step, time in enumerate(TIMES):
         truth = sheet_state(time)
-        result = tracker.process_frame(covered(film.frame(truth), step))
+        result = tracker.track(covered(film.frame(truth), step))
         assert result.status == "tracked", (step, result.reason)
         errors.append(1e3 * mean_error(model, result.estimate.state, truth))
         off = result.estimate.state.parameters - truth.parameters

@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.timing import StageClock
+from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.estimator import Estimator
+from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.observability import position_std
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.patches import normalize_contrast
 from morph_dslam.tracking.reference import PosedImage, ReferenceView
-from morph_dslam.tracking.result import Image
 from morph_dslam.tracking.state import moved
 from morph_dslam.tracking.tracker import Tracker
 from morph_dslam.tracking.views import KeyframeViews, choose_keyframe_views
@@ -80,7 +80,7 @@ def test_a_view_from_between_looks_as_it_is_rendered_from_both_sides(film, views
     assert likeness[0] < 0.8
     assert likeness[1] > 0.95
     assert len(both.points) > 1.4 * len(first.points)
-    measurement = both.measure(Image(actual, actual), between, None, StageClock(("render", "correct")))
+    measurement = both.measure(Image(actual, actual), between, None)
     for part in both.parts:
         good = measurement.valid[part.rows]
         off = measurement.pixels - both.projected(between)
@@ -93,8 +93,10 @@ def test_the_block_is_followed_all_around_without_a_view_that_is_made(film, view
     start = block_state(0.0, 0.0)
     turns = np.radians(np.linspace(4, 160, 40))
     truths = [block_state(turn, (k + 1) / 40) for k, turn in enumerate(turns)]
-    tracker = Tracker(film.model, CAMERA, views[0].picture, start, OPTIONS, further=further)
-    results = [tracker.process_frame(film.frame(truth)) for truth in truths]
+    tracker = Tracker(
+        film.model, CAMERA, Registration.at(film.model, start), OPTIONS, reference=views[0].picture, keyframes=further
+    )
+    results = [tracker.track(film.frame(truth)) for truth in truths]
     assert not any(result.made_view for result in results)
     assert [result.status for result in results] == ["tracked"] * 40
     errors = np.array([mean_error(film.model, r.estimate.state, t) for r, t in zip(results, truths, strict=True)])
@@ -128,10 +130,11 @@ def test_the_error_that_all_views_have_in_common_is_stated(film, estimator):
     for _ in range(6):
         views = known_views(film, deviations * rng.standard_normal(6), deviations)
         further = KeyframeViews(views[0].error_factors, (views[3], views[5]))
-        tracker = Tracker(film.model, CAMERA, views[0].picture, views[0].state, OPTIONS, further=further)
+        start = Registration.at(film.model, views[0].state)
+        tracker = Tracker(film.model, CAMERA, start, OPTIONS, reference=views[0].picture, keyframes=further)
         for turn in np.radians([10, 25, 40]):
             truth = block_state(turn, 0.25)
-            result = tracker.process_frame(film.frame(truth))
+            result = tracker.track(film.frame(truth))
             assert result.status == "tracked", result.reason
             apart = truth.camera_from_object.apply(film.model.positions(truth.parameters))
             apart -= result.estimate.state.camera_from_object.apply(

@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.observability import position_std
 from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.outcomes import OtherReferenceView
 from morph_dslam.tracking.state import moved
 from morph_dslam.tracking.tracker import Tracker
 from tests.support.rendered_sequence import CAMERA, mean_error
@@ -25,8 +27,14 @@ def tracked(truths=TRUTHS, step=None, covariance=None, **options):
     """The film, and what was found in its frames; the first view is off by ``step`` (8,)."""
     film, start = BlockFilm(), block_state(0.0, 0.0)
     state = start if step is None else moved(start, step)
-    tracker = Tracker(film.model, CAMERA, film.frame(start), state, TrackerOptions(**options), True, covariance)
-    return film, [tracker.process_frame(film.frame(truth)) for truth in truths]
+    tracker = Tracker(
+        film.model,
+        CAMERA,
+        Registration.at(film.model, state, covariance),
+        TrackerOptions(**options),
+        reference=film.frame(start),
+    )
+    return film, [tracker.track(film.frame(truth)) for truth in truths]
 
 
 def errors_and_deviations(film, results, truths=TRUTHS):
@@ -65,7 +73,7 @@ def test_with_new_views_it_is_followed_all_around_and_the_first_view_takes_the_d
     assert (views[:5] == 0).all()
     assert (views[-5:] == 0).all()
     assert 2 <= sum(result.made_view for result in results) <= 4
-    assert "by reference view 1" in results[int(np.argmax(views == 1))].reason
+    assert results[int(np.argmax(views == 1))].warning(OtherReferenceView).number == 1
 
 
 @pytest.mark.parametrize(("truths", "kept"), [(TRUTHS, ()), (UNTWISTED, ("twist",))])

@@ -10,6 +10,7 @@ from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.camera_files import save_camera
 from morph_dslam.io.tables import Landmarks, save_landmarks
 from morph_dslam.model import save_model
+from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.multi_object import ObjectTracker
 from morph_dslam.tracking.tracker import Tracker
@@ -50,7 +51,7 @@ def frame(model, films, time):
 
 def new_trackers(model, films):
     first = frame(model, films, 0.0)
-    return {name: Tracker(model, CAMERA, first, states(0.0)[name]) for name in films}
+    return {name: Tracker(model, CAMERA, Registration.at(model, states(0.0)[name]), reference=first) for name in films}
 
 
 def test_object_that_passes_before_another_one_costs_it_no_accuracy(model, films):
@@ -58,7 +59,7 @@ def test_object_that_passes_before_another_one_costs_it_no_accuracy(model, films
     errors = {name: [] for name in films}
     visible = []
     for time in TIMES[1:]:
-        results = objects.process_frame(frame(model, films, time))
+        results = objects.track(frame(model, films, time))
         for name, result in results.items():
             assert result.status == "tracked", (name, time, result.reason)
             errors[name].append(mean_error(model, result.estimate.state, states(time)[name]))
@@ -75,7 +76,7 @@ def test_hidden_points_are_known_to_be_hidden(model, films):
     aware, unaware = ObjectTracker(new_trackers(model, films)), new_trackers(model, films)["behind"]
     for time in TIMES[1:]:
         image = frame(model, films, time)
-        counts = aware.process_frame(image)["behind"].n_points, unaware.process_frame(image).n_points
+        counts = aware.track(image)["behind"].n_points, unaware.track(image).n_points
     tracker = aware.trackers["behind"]
     positions = tracker.reference.points.in_camera(states(1.0)["behind"])
     pixels = np.rint(CAMERA.project(positions)).astype(int)
@@ -88,8 +89,8 @@ def test_hidden_points_are_known_to_be_hidden(model, films):
 def test_lost_object_hides_nothing(model, films):
     objects = ObjectTracker(new_trackers(model, films))
     for time in TIMES[1:14]:
-        before = objects.process_frame(frame(model, films, time))
-    results = objects.process_frame(films["behind"].frame(states(TIMES[14])["behind"]))
+        before = objects.track(frame(model, films, time))
+    results = objects.track(films["behind"].frame(states(TIMES[14])["behind"]))
     assert results["before"].status == "lost"
     assert results["behind"].n_points > before["behind"].n_points + 80
 

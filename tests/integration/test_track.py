@@ -137,7 +137,7 @@ def test_a_run_is_not_overwritten_unasked(inputs, finished):
 
 
 def test_interrupt_keeps_the_frames_so_far(inputs, tmp_path, monkeypatch):
-    process = Tracker.process_frame
+    process = Tracker.track
     calls = []
 
     def interrupted(self, image, *rest):
@@ -146,7 +146,7 @@ def test_interrupt_keeps_the_frames_so_far(inputs, tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return process(self, image, *rest)
 
-    monkeypatch.setattr(Tracker, "process_frame", interrupted)
+    monkeypatch.setattr(Tracker, "track", interrupted)
     with pytest.raises(KeyboardInterrupt):
         track(options(inputs, tmp_path / "run", overlay=False))
     assert load_run(tmp_path / "run").frames.tolist() == [20, 21, 22]

@@ -7,8 +7,10 @@ import pytest
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.binding import draw_view, view_of
 from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.outcomes import RejectionReason
 from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
@@ -26,7 +28,7 @@ def film(model):
 
 
 def start(model, film):
-    return Tracker(model, CAMERA, film.frame(sheet_state(0.0)), sheet_state(0.0))
+    return Tracker(model, CAMERA, Registration.at(model, sheet_state(0.0)), reference=film.frame(sheet_state(0.0)))
 
 
 def test_moving_bending_sheet_is_followed_within_a_fraction_of_a_millimetre(model, film):
@@ -34,7 +36,7 @@ def test_moving_bending_sheet_is_followed_within_a_fraction_of_a_millimetre(mode
     errors, deviations = [], []
     for time in np.linspace(0.0, 1.0, 31)[1:]:
         truth = sheet_state(time)
-        result = tracker.process_frame(film.frame(truth, light=1.0 - 0.25 * time))
+        result = tracker.track(film.frame(truth, light=1.0 - 0.25 * time))
         assert result.status == "tracked", result.reason
         errors.append(mean_error(model, result.estimate.state, truth))
         deviations.append(np.abs(result.estimate.state.parameters - truth.parameters) / result.estimate.parameter_std)
@@ -51,7 +53,7 @@ def test_points_behind_an_occluder_are_rejected_and_come_back(model, film):
     for step, time in enumerate(np.linspace(0.0, 0.5, 16)[1:]):
         truth = sheet_state(time)
         hand = (60 + 25 * step, 140, 150, 240) if 3 <= step <= 9 else None
-        result = tracker.process_frame(film.frame(truth, occluder=hand))
+        result = tracker.track(film.frame(truth, occluder=hand))
         assert result.status == "tracked", result.reason
         assert mean_error(model, result.estimate.state, truth) < 1.5e-3
         counts[step] = result.n_inliers
@@ -61,24 +63,24 @@ def test_points_behind_an_occluder_are_rejected_and_come_back(model, film):
 
 def test_lost_object_says_why_and_is_recovered_elsewhere(model, film):
     tracker = start(model, film)
-    assert tracker.process_frame(film.frame(sheet_state(0.03))).status == "tracked"
+    assert tracker.track(film.frame(sheet_state(0.03))).status == "tracked"
     for _ in range(2):
-        result = tracker.process_frame(film.blank())
+        result = tracker.track(film.blank())
         assert result.status == "lost"
         assert result.estimate is None
-        assert "points agree, at least 30 needed" in result.reason
+        assert (result.rejection.reason, result.rejection.needed) == (RejectionReason.FEW_POINTS, 30)
     away = sheet_state(0.2)
     moved = RigidTransform(
         rotation_exp(np.array([0.0, 0.0, 0.4])) @ away.camera_from_object.rotation,
         away.camera_from_object.translation + np.array([-0.05, 0.04, 0.1]),
     )
     truth = State(away.parameters, moved)
-    result = tracker.process_frame(film.frame(truth))
+    result = tracker.track(film.frame(truth))
     assert result.status == "tracked", result.reason
     assert result.recovered
     assert mean_error(model, result.estimate.state, truth) < 1.5e-3
     following = State(away.parameters, RigidTransform(moved.rotation, moved.translation + np.array([0.004, 0.0, 0.0])))
-    result = tracker.process_frame(film.frame(following))
+    result = tracker.track(film.frame(following))
     assert (result.status, result.recovered) == ("tracked", False)
 
 
@@ -93,25 +95,25 @@ def test_lens_distortion_is_undone(model):
     def recorded(state):
         return cv2.remap(film.frame(state, noise=0.0), maps[..., 0], maps[..., 1], cv2.INTER_CUBIC)
 
-    tracker = Tracker(model, lens, recorded(sheet_state(0.0)), sheet_state(0.0))
+    tracker = Tracker(model, lens, Registration.at(model, sheet_state(0.0)), reference=recorded(sheet_state(0.0)))
     for time in (0.03, 0.06, 0.09):
-        result = tracker.process_frame(recorded(sheet_state(time)))
+        result = tracker.track(recorded(sheet_state(time)))
         assert result.status == "tracked"
     assert mean_error(model, result.estimate.state, sheet_state(0.09)) < 0.6e-3
 
 
 def test_sequence_that_does_not_begin_at_the_reference_is_entered(model, film):
     reference = film.frame(sheet_state(0.0))
-    tracker = Tracker(model, CAMERA, reference, sheet_state(0.0), in_sequence=False)
+    tracker = Tracker(model, CAMERA, Registration.at(model, sheet_state(0.0)), reference=reference, in_sequence=False)
     truth = sheet_state(0.5)
-    result = tracker.process_frame(film.frame(truth))
+    result = tracker.track(film.frame(truth))
     assert result.status == "tracked", result.reason
     assert mean_error(model, result.estimate.state, truth) < 1.5e-3
 
 
 def test_object_without_texture_is_refused_with_advice(model, film):
     with pytest.raises(RegistrationError, match="printed texture"):
-        Tracker(model, CAMERA, film.blank(noise=0.0), sheet_state(0.0))
+        Tracker(model, CAMERA, Registration.at(model, sheet_state(0.0)), reference=film.blank(noise=0.0))
 
 
 def test_same_frames_give_the_same_states(model):
@@ -119,7 +121,7 @@ def test_same_frames_give_the_same_states(model):
     for _ in range(2):
         film = SheetFilm(model, seed=3)
         tracker = start(model, film)
-        states = [tracker.process_frame(film.frame(sheet_state(t))).estimate.state for t in (0.03, 0.06)]
+        states = [tracker.track(film.frame(sheet_state(t))).estimate.state for t in (0.03, 0.06)]
         runs.append(np.array([state.parameters for state in states]))
     np.testing.assert_array_equal(*runs)
 
@@ -138,10 +140,10 @@ def test_covered_object_is_lost_and_never_put_elsewhere(model, film):
     for step, share in enumerate(shares):
         truth = sheet_state(0.01 * step)
         board = (0, 0, int(640 * share), 480) if share else None
-        result = tracker.process_frame(film.frame(truth, occluder=board))
+        result = tracker.track(film.frame(truth, occluder=board))
         seen.append(result.status == "tracked")
         if result.estimate is None:
-            assert "points agree, at least" in result.reason
+            assert result.rejection.reason is RejectionReason.FEW_POINTS
         else:
             # Of a third of the object the shape of the rest is not known well, and that is said.
             found, pose = result.estimate.state, result.estimate.state.camera_from_object
@@ -158,12 +160,13 @@ def test_covered_object_is_lost_and_never_put_elsewhere(model, film):
 def test_object_absent_from_the_beginning_is_waited_for(model, film):
     """Another print on a sheet of the same shape is not the object either."""
     truth = sheet_state(0.1)
-    tracker = Tracker(model, CAMERA, film.frame(sheet_state(0.0)), sheet_state(0.0), in_sequence=False)
+    start = Registration.at(model, sheet_state(0.0))
+    tracker = Tracker(model, CAMERA, start, reference=film.frame(sheet_state(0.0)), in_sequence=False)
     for frame in (film.blank(), SheetFilm(model, seed=9).frame(truth), film.blank()):
-        result = tracker.process_frame(frame)
+        result = tracker.track(frame)
         assert (result.status, result.estimate) == ("lost", None)
-        assert "features of the reference view were found again" in result.reason
-    result = tracker.process_frame(film.frame(truth))
+        assert result.rejection.then.reason is RejectionReason.FEW_FEATURES
+    result = tracker.track(film.frame(truth))
     assert result.status == "tracked", result.reason
     assert mean_error(model, result.estimate.state, truth) < 1.5e-3
 
@@ -172,7 +175,7 @@ def test_second_identical_object_is_not_taken_for_the_first(model, film):
     """Followed, the object stays what it is; after a loss two that look the same cannot be told apart."""
     here = aside(sheet_state(0.0), -0.16, 0.0, 0.55)
     there = aside(here, 0.42, 0.08)
-    tracker = Tracker(model, CAMERA, film.frame(here), here)
+    tracker = Tracker(model, CAMERA, Registration.at(model, here), reference=film.frame(here))
 
     def both(first, second):
         image, other = film.frame(first), film.frame(second)
@@ -182,15 +185,15 @@ def test_second_identical_object_is_not_taken_for_the_first(model, film):
 
     for step in range(3):
         moved = aside(here, 0.002 * step)
-        result = tracker.process_frame(both(moved, there))
+        result = tracker.track(both(moved, there))
         assert result.status == "tracked"
         assert mean_error(model, result.estimate.state, moved) < 1e-3
-    assert tracker.process_frame(film.blank()).status == "lost"
+    assert tracker.track(film.blank()).status == "lost"
     changed = aside(here, 0.0, -0.05), aside(there, 0.0, 0.04)
-    result = tracker.process_frame(both(*changed))
+    result = tracker.track(both(*changed))
     assert (result.status, result.estimate) == ("lost", None)
-    assert "it could be in two places" in result.reason
+    assert result.rejection.then.reason is RejectionReason.TWO_PLACES
     # With one of them gone there is no doubt.
-    result = tracker.process_frame(film.frame(changed[1]))
+    result = tracker.track(film.frame(changed[1]))
     assert result.status == "tracked", result.reason
     assert mean_error(model, result.estimate.state, changed[1]) < 1.5e-3

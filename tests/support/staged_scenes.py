@@ -22,15 +22,6 @@ from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.observability import position_std
-from morph_dslam.tracking.result import (
-    DIMENSIONS_OFF,
-    FEW_AGREE,
-    HAS_MOVED,
-    MAY_BE_ANOTHER,
-    REFERENCE_WORSE,
-    UNCHECKED,
-    UNEXPLAINED,
-)
 from tests.support.bent_sheet import LENGTH, WIDTH, _separated, bent_sheet_model, deflection_terms
 from tests.support.rendered_object import wedge
 from tests.support.rendered_sequence import CAMERA, UPRIGHT, printed_texture
@@ -38,8 +29,6 @@ from tests.support.rendered_sequence import CAMERA, UPRIGHT, printed_texture
 #: An estimate is off beyond what it states if by so many of its standard deviations and by this share of the
 #: object's size: 5.1 mm of the sheets, 1.3 mm of the wedge.
 CONFIDENT_SIGMAS, CONFIDENT_SHARE = 3.0, 0.01
-#: What a reason says of a frame that is not to be relied on; the last one only of a model that is wrong.
-DOUBTS = (UNEXPLAINED, FEW_AGREE, REFERENCE_WORSE, HAS_MOVED, MAY_BE_ANOTHER, DIMENSIONS_OFF, UNCHECKED)
 #: Height of the wedge, metres, and how far its top is moved.
 HEIGHT, REACH = 0.07, 0.02
 
@@ -263,6 +252,6 @@ def is_beyond(model, result, truth_model, truth) -> bool:
     return bool(error > CONFIDENT_SHARE * size and error > CONFIDENT_SIGMAS * stated)
 
 
-def is_doubted(result, wrong_model: bool) -> bool:
-    """Whether a frame's reason says that it is not to be relied on, for what is wrong with it."""
-    return any(doubt in result.reason for doubt in (DOUBTS if wrong_model else DOUBTS[:-1]))
+def is_doubted(result) -> bool:
+    """Whether a frame's warnings say that it is not to be relied on."""
+    return any(warning.doubts_result for warning in result.warnings)

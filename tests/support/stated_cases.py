@@ -15,7 +15,7 @@ from morph_dslam.registration.landmarks import register
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.run_folder import RunResults, flags
-from morph_dslam.tracking.tracker import Tracker
+from morph_dslam.tracking.tracker import CameraLocalization, Tracker
 from tests.support.staged_scenes import Scene, is_beyond, is_doubted, mean_error
 
 #: Frames of a recording at 30 a second that show one unit of a scene's time.
@@ -134,14 +134,7 @@ def run_case(
 ) -> Outcome:
     """Track what is shown from the scene's first frame, in which the object is where ``placement`` says."""
     reference = scene.stage.frame([scene.state(0.0)])
-    tracker = Tracker(
-        placement.model,
-        scene.stage.camera,
-        reference,
-        placement.state,
-        reference_covariance=placement.covariance,
-        **options,
-    )
+    tracker = Tracker(placement.model, scene.stage.camera, placement, reference=reference, **options)
     run, errors, back = RunResults(placement.model, 0), [np.nan], None
     wrong_model = placement.model is not scene.model
     doubtful = wrong_model and any(word in flag for flag in placement.flags for word in DOUBTFUL)
@@ -150,13 +143,13 @@ def run_case(
         states = [*view.others, *([] if view.state is None else [view.state])]
         image = scene.stage.frame(states, view.cover, strangers=view.strangers, thing=view.thing)
         known = None if in_map is None or view.place is None else in_map.known(view.place)
-        result = tracker.process_frame(image, known)
+        result = tracker.track(image, CameraLocalization(known))
         run.add(number, number / 30.0, result)
         if result.status != "tracked":
             continue
         off = view.state is None or is_beyond(placement.model, result, scene.model, view.state)
         beyond += off
-        wrong += off and not doubtful and not is_doubted(result, wrong_model)
+        wrong += off and not doubtful and not is_doubted(result)
         if view.state is None:
             continue
         errors.append(mean_error(placement.model, result.estimate, scene.model, view.state))

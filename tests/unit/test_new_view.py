@@ -6,13 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.timing import StageClock
 from morph_dslam.tracking.estimator import Estimator
 from morph_dslam.tracking.frame_estimation import FrameEstimation
+from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.patches import normalize_contrast
 from morph_dslam.tracking.reference import PosedImage, ReferenceView, SurfaceSamples
-from morph_dslam.tracking.result import STAGES, Image
 from morph_dslam.tracking.views import is_known_well, is_sharp, seen_part, sharpness, surface_spread
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state
@@ -36,7 +35,7 @@ def scene():
 
     def attempt(image):
         made = picture(image)
-        return made, estimation.correct(made, NOW, None, None, StageClock(STAGES))
+        return made, estimation.correct(made, NOW, None, None)
 
     return film, view, attempt
 

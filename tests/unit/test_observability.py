@@ -10,6 +10,7 @@ from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
 from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.observability import one_value, statement, unobservable, value_line
+from morph_dslam.tracking.outcomes import FoundBy, Status
 from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.run_folder import RunResults, summarise
 from morph_dslam.tracking.sequence_filter import SequenceFilter
@@ -55,7 +56,20 @@ def run_of(per_sequence, frames=3):
         alone = estimator.estimate(points, pixels, weights, truth)
         estimate = filtered.fuse(Observations(points, pixels, weights, normals, np.eye(80)), alone)
         times = dict.fromkeys(STAGES, 1.0)
-        run.add(number, 0.1 * number, FrameResult("tracked", "", estimate, 0.4, 80, 80, times, 9.0))
+        run.add(
+            number,
+            0.1 * number,
+            FrameResult(
+                MODEL,
+                Status.TRACKED,
+                estimate,
+                FoundBy.FLOW,
+                n_points=80,
+                n_inliers=80,
+                residual_rms_px=0.4,
+                timings_ms=times,
+            ),
+        )
     return run
 
 

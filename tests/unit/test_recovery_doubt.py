@@ -6,16 +6,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from morph_dslam.tracking.hypothesis import reject
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.recovery import Recovery
-from morph_dslam.tracking.result import refusal
 
 
 def attempt(share, sigma_px, prior=None, visible=1.0) -> Any:
     inliers, seen = np.arange(200) < 200 * share, np.arange(200) < 200 * visible
     measurement = SimpleNamespace(visible=seen, valid=inliers)
     estimate = SimpleNamespace(sigma_px=sigma_px)
-    return SimpleNamespace(inliers=inliers, estimate=estimate, prior=prior, measurement=measurement)
+    counts = int(seen.sum()), int(inliers.sum())
+    return SimpleNamespace(inliers=inliers, estimate=estimate, prior=prior, measurement=measurement, counts=counts)
 
 
 def new() -> Recovery:
@@ -62,4 +63,4 @@ def test_with_a_pose_from_the_map_fewer_points_will_do(recovery):
 
 @pytest.mark.parametrize(("share", "sigma_px", "believed"), [(0.4, 0.9, True), (0.4, 2.5, False), (0.6, 2.5, True)])
 def test_few_points_that_do_not_agree_closely_agree_by_chance(share, sigma_px, believed):
-    assert (refusal(attempt(share, sigma_px), TrackerOptions()) == "") == believed
+    assert (reject(attempt(share, sigma_px), TrackerOptions()) is None) == believed

@@ -222,6 +222,11 @@ class Registration:
     discrepancy: Discrepancy | None = None
     views: tuple[KeyframePose, ...] = ()
 
+    @classmethod
+    def at(cls, model: ReducedModel, state: State, covariance: Array | None = None) -> Registration:
+        """An object whose state in the reference frame is known from elsewhere, with this covariance."""
+        return cls(model, None, state, {}, (), covariance=covariance)
+
 
 def load_registration(path: Path, model: ReducedModel) -> Registration:
     """The object as `morph register` placed it, undeformed, in the last keyframe of the map.

@@ -26,10 +26,10 @@ from morph_dslam.slam.rigid_map import RigidMap
 from morph_dslam.slam.slam import Slam
 from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, moved
+from morph_dslam.tracking.hypothesis import PoseHypothesis
 from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.reference import ReferenceView
-from morph_dslam.tracking.result import PoseHypothesis
 
 Array = NDArray[np.float64]
 

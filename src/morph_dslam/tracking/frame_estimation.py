@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from morph_dslam.errors import TrackingError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import Parameter
-from morph_dslam.timing import StageClock
+from morph_dslam.timing import stage
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
+from morph_dslam.tracking.hypothesis import Image, PoseHypothesis
 from morph_dslam.tracking.measurement import Measurement
 from morph_dslam.tracking.noise import Observations, PointNoise, RigObservations, window_correlation
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.reference import ReferenceView
-from morph_dslam.tracking.result import Image, PoseHypothesis
 from morph_dslam.tracking.sequence_filter import Fitter, SequenceFilter
 from morph_dslam.tracking.shape_search import BoundSearch, ShapeSearch
 
@@ -47,11 +47,11 @@ class FrameEstimation:
         return self._scout.estimate(self._reference.points, followed.pixels, weights, start, prior=prior).state
 
     def correct(
-        self, picture: Image, state: State, followed: Measurement | None, prior: Prior | None, clock: StageClock
+        self, picture: Image, state: State, followed: Measurement | None, prior: Prior | None
     ) -> PoseHypothesis:
         """Measure against the reference view rendered in ``state`` and estimate from these measurements."""
-        measurement = self._reference.measure(picture, state, followed, clock)
-        with clock.stage("estimate"):
+        measurement = self._reference.measure(picture, state, followed)
+        with stage("estimate"):
             return self._trimmed(measurement, state, prior)
 
     def _trimmed(self, measurement: Measurement, start: State, prior: Prior | None) -> PoseHypothesis:

@@ -33,7 +33,7 @@ from morph_dslam.tracking.drawing import AugmentedView, with_caption
 from morph_dslam.tracking.result import FrameResult
 from morph_dslam.tracking.run_folder import RunResults
 from morph_dslam.tracking.setup import Reregistration
-from morph_dslam.tracking.tracker import AnchoredTracker, CameraLocalization
+from morph_dslam.tracking.tracker import CameraLocalization, Tracker
 
 
 class Sink(Protocol):
@@ -70,7 +70,7 @@ class LiveTimes:
 
 
 class LiveChain(Protocol):
-    """What finds objects in a frame, in two steps that take turns in two threads; see `AnchoredTracker`."""
+    """What finds objects in a frame, in two steps that take turns in two threads; see `Tracker`."""
 
     def locate(self, frame: Frame) -> Any: ...
 
@@ -80,15 +80,15 @@ class LiveChain(Protocol):
 class OneObject:
     """The chain of one object by its name; ``again`` decides when it is placed anew, never by default."""
 
-    def __init__(self, name: str, chain: AnchoredTracker, again: Reregistration | None = None) -> None:
+    def __init__(self, name: str, chain: Tracker, again: Reregistration | None = None) -> None:
         self._name, self._chain, self._again = name, chain, again
 
     def locate(self, frame: Frame) -> CameraLocalization:
-        """See `AnchoredTracker.locate`."""
+        """See `Tracker.locate`."""
         return self._chain.locate(frame)
 
     def track(self, frame: Frame, located: CameraLocalization) -> dict[str, FrameResult]:
-        """See `AnchoredTracker.track`."""
+        """See `Tracker.track`."""
         if self._again is not None:
             self._chain = self._again.chain(frame, self._chain)
         result = self._chain.track(frame, located)

@@ -19,23 +19,35 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
-from morph_dslam.registration.registration import PosePrior
+from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.slam.frame_images import FrameImages
 from morph_dslam.slam.options import SlamOptions
 from morph_dslam.sources import open_source
-from morph_dslam.timing import StageClock
+from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import FIRST_SIGMA_PX, HELD, LEAST_SIGMA_PX
 from morph_dslam.tracking.covariance import error_factors_of
 from morph_dslam.tracking.estimator import Estimate, EstimationOptions, Estimator, LinearCost, Prior, State
 from morph_dslam.tracking.frame_estimation import new_filter
+from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.levenberg_marquardt import minimise
 from morph_dslam.tracking.noise import RigObservations
 from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.outcomes import (
+    CameraIgnored,
+    CameraLost,
+    FoundBy,
+    ObjectMoved,
+    PoseSource,
+    Rejection,
+    RejectionReason,
+    Status,
+    TrackingWarning,
+)
 from morph_dslam.tracking.reference import PosedImage
-from morph_dslam.tracking.result import FOLLOWED, HAS_MOVED, STAGES, FrameResult, Image
+from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.setup import Setup, views_of
 from morph_dslam.tracking.systematic_errors import SystematicErrors, inverse_of_seen
-from morph_dslam.tracking.tracker import Tracker
+from morph_dslam.tracking.tracker import CameraLocalization, Tracker
 from morph_dslam.tracking.views import KeyframeViews, choose_keyframe_views
 
 Array = NDArray[np.float64]
@@ -284,43 +296,67 @@ class RigTracker:
         self._reference = RigReference(self.trackers, self.cameras)
         self._sigma_px = FIRST_SIGMA_PX
 
-    def process_frame(self, images: Sequence[NDArray[np.uint8]], known: PosePrior | None = None) -> FrameResult:
+    def track(self, images: Sequence[NDArray[np.uint8]], localization: CameraLocalization | None = None) -> FrameResult:
         """Find the object in the next frames (h, w, 3) uint8 of all cameras, in their order.
 
-        ``known`` is an anchored object's pose in the rig's frame by the map; see `Tracker.process_frame`.
+        Parameters
+        ----------
+        images : one of each camera.
+        localization : an anchored object's pose in the rig's frame by the map; None for a free object.
         """
+        where = localization or CameraLocalization()
+        known = where.pose_prior
         results = [
-            tracker.process_frame(image, None if known is None else part.seen_pose(known))
+            tracker.track(image, CameraLocalization(None if known is None else part.seen_pose(known)))
             for tracker, part, image in zip(self.trackers, self.cameras, images, strict=True)
         ]
-        clock, has_moved = StageClock(STAGES), any(HAS_MOVED in result.reason for result in results)
+        has_moved = any(result.warning(ObjectMoved) is not None for result in results)
         prior = None if known is None or has_moved else self._prior(known, results)
-        with clock.stage("fuse"):
-            estimate, measured, why_not = self._together(results, prior)
-        n_points = sum(result.n_points for result in results)
-        times = {stage: sum(r.timings_ms[stage] for r in results) for stage in STAGES}
+        with frame_clock(STAGES) as clock, stage("fuse"):
+            estimate, measured, rejection = self._together(results, prior)
+        times = {name: sum(result.timings_ms[name] for result in results) for name in STAGES}
         times["fuse"] += clock.milliseconds["fuse"]
-        total = sum(result.total_ms for result in results) + clock.total
-        if estimate is None and known is not None and not has_moved:
-            why = why_not.removeprefix("lost: ")
-            return FrameResult.hidden(why, known, n_points, 0, times, total)
+        times["locate"] = where.milliseconds
+        common = FrameResult(
+            self.model,
+            Status.LOST,
+            n_points=sum(result.n_points for result in results),
+            timings_ms=times,
+            total_ms=sum(result.total_ms for result in results) + clock.total + where.milliseconds,
+        )
+        warnings: list[TrackingWarning] = [*_ignored(results, measured), *([ObjectMoved()] if has_moved else [])]
+        if where.why_lost:
+            warnings.append(CameraLost(where.why_lost))
         if estimate is None:
-            return FrameResult("lost", why_not, None, np.nan, n_points, 0, times, total)
+            is_hidden = known is not None and not has_moved
+            status, pose_from = (Status.HIDDEN, PoseSource.MAP) if is_hidden else (Status.LOST, PoseSource.NONE)
+            pose_prior = known if is_hidden else None
+            return replace(
+                common,
+                status=status,
+                rejection=rejection,
+                warnings=tuple(warnings),
+                pose_from=pose_from,
+                pose_prior=pose_prior,
+            )
         for tracker, part in zip(self.trackers, self.cameras, strict=True):
             tracker.continue_from(part.seen(estimate.state))
         used = measured.weights > 0.0
-        rms = float(np.sqrt(np.mean(np.sum(estimate.residuals[used] ** 2, axis=1))))
-        aside = [HAS_MOVED] if has_moved else []
-        reason = "; ".join([*_reasons(results, measured), *aside]) or FOLLOWED
         recovered = all(result.recovered or result.estimate is None for result in results)
-        return FrameResult(
-            "tracked", reason, estimate, rms, n_points, int(used.sum()), times, total, recovered,
-            pose_from="points" if prior is None else "points and map",
-        )  # fmt: skip
+        return replace(
+            common,
+            status=Status.TRACKED,
+            estimate=estimate,
+            found_by=FoundBy.LAST_STATE if recovered else FoundBy.FLOW,
+            warnings=tuple(warnings),
+            pose_from=PoseSource.POINTS if prior is None else PoseSource.POINTS_AND_MAP,
+            n_inliers=int(used.sum()),
+            residual_rms_px=float(np.sqrt(np.mean(np.sum(estimate.residuals[used] ** 2, axis=1)))),
+        )
 
     def _prior(self, known: PosePrior, results: list[FrameResult]) -> Prior | None:
         """What the map tells of the pose; None if the points of a camera show the object elsewhere."""
-        if any(result.pose_from == "points" for result in results):
+        if any(result.pose_from is PoseSource.POINTS for result in results):
             return None
         redundancy = np.mean([tracker.reference.redundancy for tracker in self.trackers])
         squared_px = float(redundancy) * self._sigma_px**2
@@ -328,24 +364,24 @@ class RigTracker:
 
     def _together(
         self, results: list[FrameResult], prior: Prior | None
-    ) -> tuple[Estimate | None, RigObservations, str]:
+    ) -> tuple[Estimate | None, RigObservations, Rejection | None]:
         """The estimate from all cameras, what it was made from, and why there is none."""
         measured = RigObservations(tuple(tracker.last_measured for tracker in self.trackers))
         counts = [0 if result.estimate is None else result.n_inliers for result in results]
         best = int(np.argmax(counts))
         seen = results[best].estimate
         if seen is None:
-            return None, measured, "; ".join(_reasons(results, measured))
+            return None, measured, Rejection(RejectionReason.NO_CAMERA)
         estimate = self.estimator.fit(measured, self.cameras[best].in_rig(seen.state), prior)
         measured = self._agreeing(measured, estimate)
         needed = self.options.least_inliers if prior is None else self.options.least_anchored
         if (measured.weights > 0.0).sum() < needed:
-            return None, measured, "lost: the cameras contradict each other: is their calibration right?"
+            return None, measured, Rejection(RejectionReason.CAMERAS_CONTRADICT)
         estimate = self.estimator.fit(measured, estimate.state, prior)
         if np.isfinite(estimate.sigma_px):
             self._sigma_px = max(estimate.sigma_px, LEAST_SIGMA_PX)
         estimate = self._filter.fuse(measured, estimate, prior)
-        return self._reference.added(estimate, measured, prior), measured, ""
+        return self._reference.added(estimate, measured, prior), measured, None
 
     def _agreeing(self, measured: RigObservations, estimate: Estimate) -> RigObservations:
         """Without points that are far from the estimate, and without cameras of which most are."""
@@ -377,19 +413,26 @@ class RigTracker:
         # The joint estimate ties lasting errors to the points of one view a camera, so that none is made.
         single = replace(self.options, per_sequence=(), random_walk=(), new_views=False)
         try:
-            return Tracker(self.model, part.camera, image, state, single, in_sequence, further=further)
+            registration = Registration.at(self.model, state)
+            return Tracker(
+                self.model,
+                part.camera,
+                registration,
+                single,
+                reference=image,
+                in_sequence=in_sequence,
+                keyframes=further,
+            )
         except RegistrationError as error:
             raise RegistrationError(f"camera {number}: {error}") from error
 
 
-def _reasons(results: list[FrameResult], measured: RigObservations) -> list[str]:
-    """What is to be said of the cameras that do not count."""
-    said = []
+def _ignored(results: list[FrameResult], measured: RigObservations) -> list[CameraIgnored]:
+    """The cameras that do not count."""
+    found = []
     for number, (result, view) in enumerate(zip(results, measured.views, strict=True)):
-        if result.status == "hidden":  # what the map knows then is said once, of all cameras
-            said.append(f"camera {number}: {result.reason.split(';')[0]}")
-        elif result.estimate is None:
-            said.append(f"camera {number}: {result.reason}")
+        if result.estimate is None:
+            found.append(CameraIgnored(number, result.status, result.rejection))
         elif not view.weights.any():
-            said.append(f"camera {number} contradicts the others and does not count")
-    return said
+            found.append(CameraIgnored(number, result.status))
+    return found

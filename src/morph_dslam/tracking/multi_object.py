@@ -27,7 +27,9 @@ from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.tracking.anchoring import Anchor
 from morph_dslam.tracking.binding import DrawnSurface, draw_view, view_of
 from morph_dslam.tracking.estimator import State
-from morph_dslam.tracking.result import FrameResult, Image
+from morph_dslam.tracking.hypothesis import Image
+from morph_dslam.tracking.outcomes import PoseSource
+from morph_dslam.tracking.result import FrameResult
 from morph_dslam.tracking.run_folder import RunResults, check_run_folder
 from morph_dslam.tracking.setup import KeyframeImage, ObjectOptions, Setup, load_setup, warm_up
 from morph_dslam.tracking.track import TrackOptions, find_begin, open_frames, with_reference, write_results
@@ -55,33 +57,30 @@ class ObjectTracker:
         self.trackers = dict(trackers)
         self._last: dict[str, FrameResult] = {}
 
-    def process_frame(
-        self,
-        image: NDArray[np.uint8],
-        depth: NDArray[np.float32] | None = None,
-        known: Mapping[str, PosePrior] | None = None,
+    def track(
+        self, frame: Frame | NDArray[np.uint8], located: Mapping[str, CameraLocalization] | None = None
     ) -> dict[str, FrameResult]:
-        """Find the objects in the next frame; see `Tracker.process_frame`. By name.
+        """Find the objects in the next frame; see `Tracker.track`. By name.
 
-        ``known`` has the poses of anchored objects by the map; none where the camera is lost.
+        Parameters
+        ----------
+        located : of the anchored objects, what the map says of this frame.
         """
-        known = known or {}
-        expected = {name: self._expected(name, known.get(name)) for name in self.trackers}
+        located = {name: CameraLocalization() for name in self.trackers} | dict(located or {})
+        expected = {name: self._expected(name, located[name].pose_prior) for name in self.trackers}
         nearest_first = sorted(expected, key=lambda name: self._distance(name, expected[name]))
         drawn = {name: self._drawn(name, expected[name]) for name in nearest_first}
         for name in nearest_first:
             others = [depths for other, depths in drawn.items() if other != name and depths is not None]
             occluder_depth = np.minimum.reduce(others) if others else None
-            tracker = self.trackers[name]
-            seen = depth if tracker.options.use_depth else None
-            self._last[name] = tracker.process_frame(image, known.get(name), seen, occluder_depth)
-            drawn[name] = self._drawn(name, tracker.state)
+            self._last[name] = self.trackers[name].track(frame, located[name], occluder_depth)
+            drawn[name] = self._drawn(name, self.trackers[name].state)
         return {name: self._last[name] for name in self.trackers}
 
     def _expected(self, name: str, known: PosePrior | None) -> State:
         """Where an object may be in the next frame: where it was last, or where the map has it."""
         state, last = self.trackers[name].state, self._last.get(name)
-        if known is None or (last is not None and last.pose_from == "points"):
+        if known is None or (last is not None and last.pose_from is PoseSource.POINTS):
             return state
         return replace(state, camera_from_object=known.pose)
 
@@ -97,7 +96,7 @@ class ObjectTracker:
 
 
 class MultiObjectTracker:
-    """From a frame to the objects in it, as `AnchoredTracker` for one: the camera in the map once, then each
+    """From a frame to the objects in it, as `Tracker` for one: the camera in the map once, then each
     object.
 
     Parameters
@@ -124,11 +123,7 @@ class MultiObjectTracker:
 
     def track(self, frame: Frame, located: Mapping[str, CameraLocalization]) -> dict[str, FrameResult]:
         """Find the objects in a frame that `locate` has seen."""
-        known = {name: one.known for name, one in located.items() if one.known is not None}
-        results = self._objects.process_frame(frame.image, frame.depth, known)
-        for name, one in located.items():
-            results[name] = one.told_of(results[name])
-        return results
+        return self._objects.track(frame, located)
 
 
 # Where several objects hide each other in the pictures that they are known by.
@@ -287,7 +282,9 @@ def objects_chain(objects: Mapping[str, ObjectStart]) -> MultiObjectTracker:
     first = next(iter(anchored.values()), None)
     anchor = None if first is None else first.setup.new_anchor(placements)
     trackers = {
-        name: part.setup.new_tracker(part.placement, part.picture, part.in_sequence, part.setup.seen.get(part.frame))
+        name: part.setup.new_tracker(
+            part.placement, part.picture, part.in_sequence, part.setup.seen.get(part.frame), anchored=False
+        )
         for name, part in objects.items()
     }
     return MultiObjectTracker(next(iter(objects.values())).setup.camera, trackers, anchor)

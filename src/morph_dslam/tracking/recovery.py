@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.landmarks import shape_starts, solve_pnp
-from morph_dslam.timing import StageClock
+from morph_dslam.timing import stage
 from morph_dslam.tracking.frame_estimation import FrameEstimation
+from morph_dslam.tracking.hypothesis import MOST_AGREE, Image, PoseHypothesis, reject
 from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.outcomes import Rejection, RejectionReason
 from morph_dslam.tracking.reference import ReferenceView
-from morph_dslam.tracking.result import MOST_AGREE, Image, PoseHypothesis, refusal
 from morph_dslam.tracking.state import State
 
 Array = NDArray[np.float64]
@@ -24,9 +27,6 @@ CLOSE_PX, CLOSE_TO_USUAL = 0.25, 1.5
 
 #: Something is before the object where less than this share of the points that it does not hide itself agree.
 UNHIDDEN = 0.75
-
-#: Is said where another one like it is seen too.
-TWO_PLACES = "it could be in two places"
 
 #: At most about so many shapes are tried, lest a mirrored one that fits nearly as well is taken.
 MOST_SHAPES = 27
@@ -80,16 +80,15 @@ class Recovery:
             return 0.0
         return float(np.sqrt(spread**2 - self._usual_px**2))
 
-    def refusal(self, attempt: PoseHypothesis) -> str:
-        """Why an object that was not seen in the frame before is not to be believed; empty when it is."""
-        why_not = refusal(attempt, self._options)
-        if why_not or attempt.prior is not None:
-            return why_not
-        count = int(attempt.inliers.sum())
+    def reject(self, attempt: PoseHypothesis) -> Rejection | None:
+        """Why an object that was not seen in the frame before is not accepted; None when it is."""
+        rejection = reject(attempt, self._options)
+        if rejection is not None or attempt.prior is not None:
+            return rejection
         if self.most_agree(attempt) or self._agrees_closely(attempt):
-            return ""
-        visible = int(attempt.measurement.visible.sum())
-        return f"{count} of {visible} points agree, but only by {attempt.estimate.sigma_px:.1f} px"
+            return None
+        visible, count = attempt.counts
+        return Rejection(RejectionReason.LOOSE_AGREEMENT, count, visible, spread_px=attempt.estimate.sigma_px)
 
     def most_agree(self, attempt: PoseHypothesis) -> bool:
         """Whether half of all points agree."""
@@ -104,50 +103,50 @@ class Recovery:
         return attempt.estimate.sigma_px < max(CLOSE_PX, CLOSE_TO_USUAL * usual)
 
     def recover(
-        self, picture: Image, last_shape: Array, why_lost: str, clock: StageClock
-    ) -> tuple[PoseHypothesis | None, str]:
+        self, picture: Image, last_shape: Array, rejection: Rejection
+    ) -> tuple[PoseHypothesis | None, Rejection | None]:
         """The object somewhere in the frame, or None and why it is lost.
 
         Parameters
         ----------
-        last_shape : (d,) the parameters known last. why_lost : what is to be said before anything else.
+        last_shape : (d,), the parameters known last.
+        rejection : why it was not found by its last state.
         """
-        shapes = self._shapes(last_shape)
-        found, matches = self._find(picture, shapes, None, clock)
+        found, matches = self._find(picture, self._shapes(last_shape), None)
         if matches is not None:
-            return None, f"{why_lost}; only {matches} features of the reference view were found again"
+            return None, replace(rejection, then=Rejection(RejectionReason.FEW_FEATURES, matches))
         if found is None:
-            return None, why_lost
-        other = self.another(picture, found, clock)
+            return None, rejection
+        other = self.another(picture, found)
         if other is not None:
-            counts = f"{int(found.inliers.sum())} and {int(other.inliers.sum())} points agree"
-            return None, f"{why_lost}; {TWO_PLACES}, where {counts}"
-        return found, ""
+            counts = int(found.inliers.sum()), int(other.inliers.sum())
+            return None, replace(rejection, then=Rejection(RejectionReason.TWO_PLACES, *counts))
+        return found, None
 
-    def another(self, picture: Image, found: PoseHypothesis, clock: StageClock) -> PoseHypothesis | None:
+    def another(self, picture: Image, found: PoseHypothesis) -> PoseHypothesis | None:
         """Another one like the object that was found, elsewhere in the frame; None if there is none."""
-        with clock.stage("recover"):
+        with stage("recover"):
             covered = self._reference.covered(found.estimate.state)
             elsewhere = np.where(covered, 0, 255).astype(np.uint8)
-        other, _ = self._find(picture, self._shapes(found.estimate.state.parameters), elsewhere, clock)
+        other, _ = self._find(picture, self._shapes(found.estimate.state.parameters), elsewhere)
         return other if other is not None and self._apart(found, other) else None
 
     def _find(
-        self, picture: Image, shapes: list[Array], mask: NDArray[np.uint8] | None, clock: StageClock
+        self, picture: Image, shapes: list[Array], mask: NDArray[np.uint8] | None
     ) -> tuple[PoseHypothesis | None, int | None]:
         """A place where the object is to be believed, or None; and how many features agreed, if too few."""
-        with clock.stage("recover"):
+        with stage("recover"):
             state, matches = self._reference.relocaliser.find(picture.grey, shapes, mask)
         if state is None:
             return None, matches
-        candidate = self._estimation.correct(picture, state, None, None, clock)
-        candidate = self._estimation.correct(picture, candidate.estimate.state, None, None, clock)
-        if refusal(candidate, self._options):
+        candidate = self._estimation.correct(picture, state, None, None)
+        candidate = self._estimation.correct(picture, candidate.estimate.state, None, None)
+        if reject(candidate, self._options) is not None:
             return None, None
-        with clock.stage("search"):
+        with stage("search"):
             better = self._estimation.best_of(candidate, self._starts(candidate))
-        candidate = self._estimation.correct(picture, better.estimate.state, None, None, clock)
-        return (None if self.refusal(candidate) else candidate), None
+        candidate = self._estimation.correct(picture, better.estimate.state, None, None)
+        return (candidate if self.reject(candidate) is None else None), None
 
     def _starts(self, candidate: PoseHypothesis) -> list[State]:
         """Shapes spread over the box, each in the poses in which it fits the supporting points best."""

@@ -20,7 +20,7 @@ from morph_dslam.model import SurfacePoints
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.reduced_model import spread_over, triangle_normals
 from morph_dslam.render.rasteriser import Buffers, visible_points
-from morph_dslam.timing import StageClock
+from morph_dslam.timing import stage
 from morph_dslam.tracking.binding import (
     DrawnSurface,
     View,
@@ -32,6 +32,7 @@ from morph_dslam.tracking.binding import (
 )
 from morph_dslam.tracking.covariance import BoundPart
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
+from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.measurement import (
     DEPTH_TOLERANCE,
     Measurement,
@@ -48,7 +49,6 @@ from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outline import Outline
 from morph_dslam.tracking.patches import interior, spread_corners
 from morph_dslam.tracking.relocalization import Relocalizer
-from morph_dslam.tracking.result import Image
 
 Array = NDArray[np.float64]
 
@@ -287,16 +287,16 @@ class ReferenceView:
         """This view as it should appear in a state, contrast-normalized."""
         return self.appearance.render(view_of(self.surface.model, self._estimator.camera, state))
 
-    def measure(self, picture: Image, state: State, followed: Measurement | None, clock: StageClock) -> Measurement:
+    def measure(self, picture: Image, state: State, followed: Measurement | None) -> Measurement:
         """Where a frame shows the points, compared with this view rendered in ``state``.
 
         ``followed`` says where to look first; None where nothing is known but the state.
         """
         drawn, camera = self.surface.model, self._estimator.camera
-        with clock.stage("render"):
+        with stage("render"):
             view = view_of(drawn, camera, state)
             rendering = self.appearance.render(view)
-        with clock.stage("correct"):
+        with stage("correct"):
             positions = self.points.in_camera(state)
             predicted = camera.project(positions)
             visible = visible_surface(

@@ -1,22 +1,23 @@
-"""What one frame told."""
+"""The result of one frame."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.geometry import RigidTransform
+from morph_dslam.model import ReducedModel
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.registration.registration import PosePrior
-from morph_dslam.tracking.depth import PointDepths
-from morph_dslam.tracking.estimator import Estimate, Prior
-from morph_dslam.tracking.measurement import Measurement
-from morph_dslam.tracking.options import TrackerOptions
-from morph_dslam.tracking.outline import OutlineMeasurement
+from morph_dslam.tracking.estimator import Estimate
+from morph_dslam.tracking.observability import displacement_std, von_mises_std
+from morph_dslam.tracking.outcomes import FoundBy, PoseSource, Rejection, Status, TrackingWarning, reason_text
 
 Array = NDArray[np.float64]
+_Kind = TypeVar("_Kind", bound=TrackingWarning)
 
 #: The stages of a frame that are timed, in order; "locate" finds the camera in the map.
 STAGES = (
@@ -35,167 +36,164 @@ STAGES = (
     "views",
 )
 
-FOLLOWED = "followed from the previous frame"
-
-FOUND_AGAIN = "found again where it was last seen"
-
-RECOVERED = "recovered from the reference view's features"
-
-#: Follows the reason of a frame in which the model, not noise, is what is left of the residuals.
-UNEXPLAINED = "the model does not explain the images"
-
-#: Follows the reason of a frame in which few points agree, and less closely than usual.
-FEW_AGREE = "few points agree, and less closely than usual"
-
-#: Follows the reason of frames by which the object is longer or shorter than the model along an axis.
-DIMENSIONS_OFF = "it looks as if the object had not got the model's dimensions"
-
-#: Follows the reason of a frame as long as the frames do not exclude that.
-UNCHECKED = "no view so far could show whether the object has the model's dimensions"
-
-#: Follows the reason of frames by which the reference state is worse known than it was stated.
-REFERENCE_WORSE = "the frames contradict the reference state"
-
-#: Follows the reason of frames in which the object cannot be told from another one with its print.
-MAY_BE_ANOTHER = "it may be another one like it"
-
-#: Follows the reason of frames in which an anchored object is away from its place.
-HAS_MOVED = "the object has moved from its place in the map"
-
 
 @dataclass(frozen=True)
 class FrameResult:
-    """What one frame told.
+    """What one frame tells of an object.
 
     Attributes
     ----------
-    status : "tracked"; "hidden", where the map tells the pose but too few points the parameters; or "lost".
-    reason : how it was found, or why it was not.
-    estimate : None unless tracked.
-    residual_rms_px : root mean square of the inliers' residuals, NaN when lost.
-    n_points, n_inliers : points that the object itself does not hide, and those that support the estimate.
-    timings_ms : by stage, milliseconds. total_ms : the whole frame. recovered : found again after a loss.
-    unexplained_px : what the model leaves of the residuals, see `systematic_errors`; NaN when lost.
-    reference_worse : by how much larger than stated the deviation of the reference state is, by all frames so
-        far; see `reference_misfit`.
-    dimensions_off : along which axis of the object, and by how much, it is longer or shorter than the model,
-        against the others, as all frames so far show it; "" where they do not.
-    pose_from : "points", "points and map", "map" where it is hidden, or "" where there is no pose.
-    known : the pose by the map, where that alone tells it.
+    model : the reduced model that it was tracked with.
+    status : tracked; hidden, where the map gives the pose but too few points the parameters; or lost.
+    estimate : pose, parameters and their covariance; None unless tracked.
+    found_by : how the object was found; None unless tracked.
+    rejection : why it was not; None when tracked.
+    warnings : what a reader must know of this result.
+    pose_from : what the pose comes from.
+    pose_prior : the pose by the map, where that alone gives it.
+    n_points : number of points that the object itself does not occlude.
+    n_inliers : number of those that support the estimate.
+    residual_rms_px : root mean square of the inliers' residuals, pixels, NaN unless tracked.
+    unexplained_px : what the model leaves of the residuals, pixels, see `systematic_errors`; NaN unless tracked.
+    reference_factor : by how much worse than stated the reference state is known, by all frames so far.
     view : number of the reference view that the frame was compared with, 0 for the first.
-    made_view : whether the frame has become a reference view itself.
-    discrepancy : what the object's shape has beyond the model's; None where it was not looked for.
+    made_view : whether the frame became a reference view itself.
+    discrepancy : what the object's shape has beyond the model's; None where it was not estimated.
+    timings_ms : by stage, milliseconds.
+    total_ms : of the whole frame, milliseconds.
     """
 
-    status: str
-    reason: str
-    estimate: Estimate | None
-    residual_rms_px: float
-    n_points: int
-    n_inliers: int
-    timings_ms: dict[str, float]
-    total_ms: float
-    recovered: bool = False
+    model: ReducedModel
+    status: Status
+    estimate: Estimate | None = None
+    found_by: FoundBy | None = None
+    rejection: Rejection | None = None
+    warnings: tuple[TrackingWarning, ...] = ()
+    pose_from: PoseSource = PoseSource.NONE
+    pose_prior: PosePrior | None = None
+    n_points: int = 0
+    n_inliers: int = 0
+    residual_rms_px: float = float("nan")
     unexplained_px: float = float("nan")
-    reference_worse: float = 1.0
-    dimensions_off: str = ""
-    pose_from: str = ""
-    known: PosePrior | None = None
+    reference_factor: float = 1.0
     view: int = 0
     made_view: bool = False
     discrepancy: Discrepancy | None = None
+    timings_ms: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
+    total_ms: float = 0.0
 
-    @classmethod
-    def hidden(
-        cls, why: str, known: PosePrior, n_points: int, n_inliers: int, timings_ms: dict[str, float], total_ms: float
-    ) -> FrameResult:
-        """The map tells where the object is, but it is covered there, or gone."""
-        reason = f"hidden: {why}; its place is known from the map, its parameters are not"
-        return cls(
-            "hidden", reason, None, float("nan"), n_points, n_inliers, timings_ms, total_ms,
-            pose_from="map", known=known,
-        )  # fmt: skip
+    @property
+    def tracked(self) -> bool:
+        """Whether pose and parameters are estimated."""
+        return self.estimate is not None
+
+    @property
+    def recovered(self) -> bool:
+        """Whether the object was found again after a loss."""
+        return self.found_by in (FoundBy.LAST_STATE, FoundBy.FEATURES)
+
+    @property
+    def reason(self) -> str:
+        """For people: how the object was found, or why it was not, and the warnings."""
+        return reason_text(self.status, self.found_by, self.rejection, self.warnings)
+
+    def warning(self, kind: type[_Kind]) -> _Kind | None:
+        """The first warning of a kind; None if there is none."""
+        return next((warning for warning in self.warnings if isinstance(warning, kind)), None)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Values by name, SI; NaN unless tracked."""
+        names = [parameter.name for parameter in self.model.parameters]
+        values = np.full(len(names), np.nan) if self.estimate is None else self.estimate.state.parameters
+        return dict(zip(names, values.tolist(), strict=True))
+
+    @property
+    def parameter_std(self) -> dict[str, float]:
+        """Standard deviations by name, SI; NaN unless tracked."""
+        values = np.full(len(self.model.parameters), np.nan) if self.estimate is None else self.estimate.parameter_std
+        return {p.name: float(value) for p, value in zip(self.model.parameters, values, strict=True)}
+
+    @property
+    def covariance(self) -> Array:
+        """(d + 6, d + 6) of [parameters, rotation vector, translation], SI; NaN unless tracked."""
+        if self.estimate is not None:
+            return self.estimate.covariance
+        return np.full((len(self.model.parameters) + 6,) * 2, np.nan)
 
     @property
     def pose(self) -> RigidTransform | None:
-        """camera_from_object; None when lost."""
+        """camera_from_object, metres; None when lost."""
         if self.estimate is not None:
             return self.estimate.state.camera_from_object
-        return None if self.known is None else self.known.pose
+        return None if self.pose_prior is None else self.pose_prior.pose
 
     @property
     def pose_std(self) -> Array:
         """Standard deviations (6,) of the pose's rotation vector (rad) and translation (m); NaN when lost."""
         if self.estimate is not None:
             return self.estimate.pose_std
-        return np.full(6, np.nan) if self.known is None else np.sqrt(np.diag(self.known.covariance))
+        return np.full(6, np.nan) if self.pose_prior is None else np.sqrt(np.diag(self.pose_prior.covariance))
 
+    def displacement(self) -> Array:
+        """Of every node (n, 3) in the object frame, metres, with the discrepancy where it was estimated.
 
-# What a frame is made into, what an attempt to find the object in it gave, and whether to believe it.
+        Raises
+        ------
+        ValueError
+            If the frame was not tracked; the same of the methods below.
+        """
+        value = self.model.displacement.value(self._mu)
+        return value if self.discrepancy is None else value + self.discrepancy.displacement(self.model.nodes)
 
+    def displacement_std(self) -> Array:
+        """Standard deviation (n,) of the displacement of every node, metres."""
+        return displacement_std(self.model, self._tracked)
 
-#: Where less than this share of all points agree, they must agree closely.
-MOST_AGREE = 0.5
+    def positions(self) -> Array:
+        """Of every node (n, 3) in the camera frame, metres."""
+        pose = self._tracked.state.camera_from_object
+        return pose.apply(self.model.nodes + self.displacement())
 
+    def von_mises(self, place: str | None = None) -> Array:
+        """Von Mises stress (n,) of every node, pascals.
 
-@dataclass(frozen=True)
-class Image:
-    """A frame made ready.
+        Parameters
+        ----------
+        place : "solid", or "top" or "bottom" of a sheet; by default the larger one of a sheet's faces.
 
-    Attributes
-    ----------
-    grey : the undistorted image (h, w). normalized : contrast-normalized.
-    depth : (h, w) of a depth camera, as recorded, metres, NaN where unknown; None without one.
-    occluder_depth : (h, w) depth of other objects, metres, infinite where there are none; None if none is
-        known.
-    """
+        Raises
+        ------
+        KeyError
+            If the model has no stress there.
+        """
+        places = [place] if place is not None else list(self.model.stresses)
+        if not places:
+            raise KeyError(f"the model '{self.model.name}' holds no stress")
+        return np.maximum.reduce([self.model.von_mises(self._mu, at) for at in places])
 
-    grey: NDArray[np.uint8]
-    normalized: NDArray[np.uint8]
-    depth: NDArray[np.float32] | None = None
-    occluder_depth: NDArray[np.float32] | None = None
+    def von_mises_std(self, place: str) -> Array:
+        """Standard deviation (n,) of the von Mises stress of every node, pascals."""
+        return von_mises_std(self.model, self._tracked, place)
 
+    def strain(self) -> Array:
+        """Green-Lagrange strain (n, 6) of every node, [xx, yy, zz, yz, xz, xy], tensor shears.
 
-@dataclass(frozen=True)
-class PoseHypothesis:
-    """An estimate, which measurements support it (p,), and all the measurements.
+        Raises
+        ------
+        KeyError
+            If the model has no strain, as those of sheets.
+        """
+        if self.model.strain is None:
+            raise KeyError(f"the model '{self.model.name}' holds no strain")
+        return self.model.strain.value(self._mu)
 
-    Attributes
-    ----------
-    weights : (p,) that the measurements counted with, zero for those that do not support it.
-    prior : what was known of the pose from the map when it was made; None if nothing was.
-    depths : of the points that support it, where a depth camera saw them.
-    discrepancy : what the shape has beyond the model's, once it was looked for.
-    """
+    @property
+    def _tracked(self) -> Estimate:
+        if self.estimate is None:
+            raise ValueError(f"the object was not tracked in this frame ({self.reason})")
+        return self.estimate
 
-    estimate: Estimate
-    inliers: NDArray[np.bool_]
-    measurement: Measurement
-    weights: Array
-    prior: Prior | None = None
-    outline: OutlineMeasurement | None = None
-    depths: PointDepths | None = None
-    discrepancy: Discrepancy | None = None
-
-
-def refusal(attempt: PoseHypothesis, options: TrackerOptions) -> str:
-    """Why an attempt is not to be believed; empty when it is.
-
-    What covers an object may look like it by chance in places, but these do not agree closely. With a pose
-    from the map the parameters alone are left to be found, which few points can tell. They must agree closely
-    then, and be most of those that were found: what looks alike by chance does neither.
-    """
-    measurement, count = attempt.measurement, int(attempt.inliers.sum())
-    needed = min(options.least_inliers, int(np.ceil(options.least_share * len(attempt.inliers))))
-    visible, spread = int(measurement.visible.sum()), attempt.estimate.sigma_px
-    if count >= needed:
-        by_chance = count < MOST_AGREE * len(attempt.inliers) and spread > options.few_sigma_px
-        return f"{count} of {visible} points agree, but only by {spread:.1f} px" if by_chance else ""
-    if attempt.prior is None:
-        return f"{count} of {visible} points agree, at least {needed} needed"
-    if count < options.least_anchored:
-        return f"{count} of {visible} points agree, at least {options.least_anchored} needed"
-    found = int(measurement.valid.sum())
-    if spread < options.few_sigma_px and count >= options.anchored_share * found:
-        return ""
-    return f"of {found} points found only {count} agree on a shape, by {spread:.1f} px"
+    @property
+    def _mu(self) -> Array:
+        return self._tracked.state.parameters

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import os
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -30,16 +29,8 @@ from morph_dslam.tracking.observability import (
     statement,
     untold_in_run,
 )
-from morph_dslam.tracking.result import (
-    DIMENSIONS_OFF,
-    HAS_MOVED,
-    MAY_BE_ANOTHER,
-    REFERENCE_WORSE,
-    STAGES,
-    UNCHECKED,
-    UNEXPLAINED,
-    FrameResult,
-)
+from morph_dslam.tracking.outcomes import DiagnosticFinding, ModelDoesNotExplain, ObjectMoved, Status
+from morph_dslam.tracking.result import STAGES, FrameResult
 
 
 def make_folder(folder: Path, what: str, error_class: type[MorphError]) -> None:
@@ -186,7 +177,7 @@ class RunResults:
     @property
     def hidden(self) -> NDArray[np.bool_]:
         """Frames (f,) in which only the pose is known, from the map."""
-        return np.array([result.status == "hidden" for result in self.results], dtype=bool)
+        return np.array([result.status is Status.HIDDEN for result in self.results], dtype=bool)
 
     def states(self) -> list[State | None]:
         """The state of every frame, None where it was hidden or lost."""
@@ -381,41 +372,39 @@ def write_summary(path: Path, run: RunResults, extra: dict[str, Any]) -> dict[st
 def flags(run: RunResults) -> list[str]:
     """What a reader of the results must know."""
     found = []
-    lost = Counter(result.status for result in run.results)["lost"]
+    lost = sum(result.status is Status.LOST for result in run.results)
     if lost:
         found.append(f"{lost} of {len(run)} frames were lost; their reasons are in frames.csv")
     found += _flags_of_place(run)
-    failed = sum(UNEXPLAINED in result.reason for result in run.results)
+    failed = sum(result.warning(ModelDoesNotExplain) is not None for result in run.results)
     if failed:
         largest = float(np.nanmax(run.unexplained_px()))
         found.append(
-            f"{UNEXPLAINED} in {failed} of {len(run)} frames: up to {largest:.1f} px are left that "
-            "neighbouring points have in common; it may be a model of something else, or too stiff, or "
+            f"the model does not explain the images in {failed} of {len(run)} frames: up to {largest:.1f} px are left "
+            "that neighbouring points have in common; it may be a model of something else, or too stiff, or "
             "a wrong camera file"
         )
-    confused = [f for f, r in zip(run.frames, run.results, strict=True) if MAY_BE_ANOTHER in r.reason]
-    if confused:
-        found.append(f"{MAY_BE_ANOTHER} in {len(confused)} frames, first in frame {confused[0]}")
-    worse = max((result.reference_worse for result in run.results), default=1.0)
+    worse = max((result.reference_factor for result in run.results), default=1.0)
     if worse > CLEARLY_WORSE:
         found.append(
-            f"{REFERENCE_WORSE}: {worse:.1f} times what it was taken to be known to, and the deviations are "
-            "that much wider; check the landmarks and whether the object has the model's dimensions"
+            f"the frames contradict the reference state: {worse:.1f} times its stated deviation, and all deviations "
+            "are that much wider; check the landmarks and whether the object has the model's dimensions"
         )
-    off = [result for result in run.results if result.dimensions_off]
-    if off:
-        found.append(
-            f"{DIMENSIONS_OFF} in {len(off)} of {len(run)} frames: {off[-1].dimensions_off}, "
-            "longer or shorter than the model; measure it, or see whether it is a model of something else"
-        )
-    last = next((result for result in reversed(run.results) if result.estimate), None)
-    if last is not None and UNCHECKED in last.reason:
-        found.append(
-            f"{UNCHECKED}: if it is 2 % longer along one axis, it may be as much farther off; let it turn or "
-            "bend more, or measure it"
-        )
+    for name, (count, first, message) in _found_by_diagnostics(run).items():
+        found.append(f"{message} in {count} of {len(run)} frames, first in frame {first} (diagnostic '{name}')")
     found += _at_bound(run)
     return found + _untold(run)
+
+
+def _found_by_diagnostics(run: RunResults) -> dict[str, tuple[int, int, str]]:
+    """Of each diagnostic in how many frames it found something, the first of them, and its last message."""
+    found: dict[str, tuple[int, int, str]] = {}
+    for frame, result in zip(run.frames, run.results, strict=True):
+        finding = result.warning(DiagnosticFinding)
+        if finding is not None:
+            count, first, _ = found.get(finding.diagnostic, (0, frame, ""))
+            found[finding.diagnostic] = count + 1, first, finding.message
+    return found
 
 
 def _at_bound(run: RunResults) -> list[str]:
@@ -466,10 +455,11 @@ def _flags_of_place(run: RunResults) -> list[str]:
             f"the object was hidden in {hidden} of {len(run)} frames: its pose there is the map's, its "
             "parameters are not known"
         )
-    moved = [frame for frame, r in zip(run.frames, run.results, strict=True) if HAS_MOVED in r.reason]
+    moved = [frame for frame, r in zip(run.frames, run.results, strict=True) if r.warning(ObjectMoved)]
     if moved:
         found.append(
-            f"{HAS_MOVED} in {len(moved)} frames, first in frame {moved[0]}: there its points alone tell "
+            f"the object has moved from its place in the map in {len(moved)} frames, first in frame {moved[0]}: "
+            "there its points alone give "
             "its pose; register it again to use the map"
         )
     return found

@@ -163,7 +163,7 @@ def _new_chain(objects: Sequence[_Object], again: Reregistration | None = None) 
     if len(objects) > 1:
         return objects_chain({part.name: part.start for part in objects})
     start = objects[0].start
-    chain = start.setup.new_chain(start.placement, start.picture, start.in_sequence)
+    chain = start.setup.new_tracker(start.placement, start.picture, start.in_sequence)
     return OneObject(objects[0].name, chain, again)
 
 

@@ -29,11 +29,12 @@ from morph_dslam.sources import Frame
 from morph_dslam.tracking.anchoring import Anchor
 from morph_dslam.tracking.discrepancy import DiscrepancyOptions
 from morph_dslam.tracking.estimator import Estimator, State
+from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.options import StartFrom, TrackerOptions
 from morph_dslam.tracking.outline import rim
 from morph_dslam.tracking.reference import PosedImage
-from morph_dslam.tracking.result import FrameResult, Image
-from morph_dslam.tracking.tracker import AnchoredTracker, Tracker
+from morph_dslam.tracking.result import FrameResult
+from morph_dslam.tracking.tracker import Tracker
 from morph_dslam.tracking.views import KeyframeViews, choose_keyframe_views
 from morph_dslam.units import to_si
 
@@ -253,6 +254,7 @@ class Setup:
         reference: NDArray[np.uint8] | Image,
         in_sequence: bool,
         seen: NDArray[np.bool_] | None = None,
+        anchored: bool = True,
     ) -> Tracker:
         """A tracker at its beginning; see `Tracker` for the arguments.
 
@@ -262,22 +264,14 @@ class Setup:
         return Tracker(
             placement.model,
             self.camera,
-            reference,
-            placement.state,
+            placement,
             self.tracker_options(placement),
-            in_sequence,
-            placement.covariance,
-            seen,
-            placement.discrepancy,
-            self.further if by_map else None,
+            reference=reference,
+            in_sequence=in_sequence,
+            anchor=self.new_anchor({self.model.name: placement}) if anchored else None,
+            seen=seen,
+            keyframes=self.further if by_map else None,
         )
-
-    def new_chain(
-        self, placement: Registration, reference: NDArray[np.uint8] | Image, in_sequence: bool
-    ) -> AnchoredTracker:
-        """As `new_tracker`, with the camera in the map before it where the object is anchored."""
-        tracker = self.new_tracker(placement, reference, in_sequence)
-        return AnchoredTracker(self.camera, tracker, self.new_anchor({self.model.name: placement}))
 
     def new_anchor(self, placements: Mapping[str, Registration]) -> Anchor | None:
         """The map with this object, and others by name, in it; None for a free object."""
@@ -288,7 +282,7 @@ class Setup:
 
     def warm_up(self, placement: Registration, reference: NDArray[np.uint8] | Image) -> None:
         """Compile the inner loops, so that the first frame takes no longer than the others."""
-        warm_up(self.new_chain(placement, reference, True).process, reference)
+        warm_up(self.new_tracker(placement, reference, True).track, reference)
 
 
 def warm_up(process: Callable[[Frame], object], reference: NDArray[np.uint8] | Image) -> None:
@@ -387,7 +381,7 @@ class Reregistration:
         """What was done, and where it was to be done and was not, for the reader of the run."""
         return [*self._notes, *(f"not placed anew in frame {n}: it was not tracked" for n in self._at)]
 
-    def chain(self, frame: Frame, chain: AnchoredTracker) -> AnchoredTracker:
+    def chain(self, frame: Frame, chain: Tracker) -> Tracker:
         """The chain that processes the frame: the one so far, or a new one whose reference is this frame."""
         due = self._due(frame.index)
         after_loss = self._setup.aid is not None and self._n_lost > 0 and self._n_lost % LONG_LOSS == 0
@@ -396,14 +390,15 @@ class Reregistration:
         given = [self._at.pop(n) for n in due]
         try:
             placed = self._placed(frame, next((found for found in given if found is not None), None))
-            tracker = self._setup.new_tracker(placed, frame.image, True)
+            tracker = self._setup.new_tracker(placed, frame.image, True, anchored=False)
         except RegistrationError as error:
             if due:
                 self._notes.append(f"not placed anew in frame {frame.index}: {error}")
             return chain
         self._notes += [f"placed anew in frame {frame.index}", *placed.flags]
         self._n_lost = 0
-        return chain.with_tracker(tracker)
+        tracker.anchor = chain.anchor
+        return tracker
 
     def _due(self, frame: int) -> list[int]:
         """The numbers for which this frame is the one; the aid may be late where live frames were dropped."""

@@ -18,8 +18,8 @@ from morph_dslam.sources.recorded import RecordedFrames
 from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.tracking.discrepancy import DiscrepancyFit, Reference, refine_discrepancy
 from morph_dslam.tracking.drawing import AugmentedView, DrawOptions, write_video
+from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.refinement import Keyframe, RefinementOptions, choose_keyframes, refine_reference
-from morph_dslam.tracking.result import Image
 from morph_dslam.tracking.run_folder import RunResults, check_run_folder
 from morph_dslam.tracking.run_writing import RunInputs, write_run
 from morph_dslam.tracking.setup import ObjectOptions, Reregistration, Setup, load_setup
@@ -156,16 +156,16 @@ def _follow(
     again: Reregistration | None = None,
 ) -> list[Keyframe]:
     """Track all frames into ``run``; returns where the points were seen if the reference is to be refined."""
-    chain = setup.new_chain(placement, begin.picture, begin.in_sequence)
+    chain = setup.new_tracker(placement, begin.picture, begin.in_sequence)
     keyframes = []
     for frame in tqdm(source, total=len(source), desc="tracking", unit="frame"):
         chain = chain if again is None else again.chain(frame, chain)
-        result = chain.process(frame)
+        result = chain.track(frame)
         if again is not None:
             again.take_in(result)
         run.add(frame.index, frame.timestamp, result)
-        if refines and result.estimate is not None and chain.tracker.last_seen is not None:
-            keyframes.append(chain.tracker.last_seen)
+        if refines and result.estimate is not None and chain.last_seen is not None:
+            keyframes.append(chain.last_seen)
     return keyframes
 
 
@@ -174,7 +174,7 @@ def _refined(
 ) -> Registration:
     """The placement refined over the sequence; how sure it is then is not known."""
     print("refining the reference state over the sequence ...", file=sys.stderr)
-    tracker, landmarks = setup.new_chain(placement, begin.picture, True).tracker, setup.landmarks
+    tracker, landmarks = setup.new_tracker(placement, begin.picture, True), setup.landmarks
     assert landmarks is not None
     # How well the landmarks fit tells how carefully they were set, where they are enough to tell.
     sigma = placement.facts["sigma_px"]

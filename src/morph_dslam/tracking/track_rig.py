@@ -21,12 +21,12 @@ from morph_dslam.slam.options import SlamOptions
 from morph_dslam.sources import Frame, FrameSource, open_source
 from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.multi_camera import RigCamera, RigTracker, keyframe_views_of_rig
-from morph_dslam.tracking.result import Image
 from morph_dslam.tracking.run_folder import RunResults, check_run_folder
 from morph_dslam.tracking.setup import Setup, load_setup
 from morph_dslam.tracking.track import TrackOptions, find_begin, open_frames, with_reference, write_results
-from morph_dslam.tracking.tracker import AnchoredTracker
+from morph_dslam.tracking.tracker import Tracker
 
 #: Correlation of two contrast-normalized images that are the same but for the compression.
 SAME_IMAGE = 0.8
@@ -80,7 +80,7 @@ def track_rig(options: TrackOptions, others: Sequence[Path]) -> dict[str, Any]:
         placement.covariance,
         further,
     )
-    first = setup.new_chain(placement, begin.picture, begin.in_sequence)
+    first = setup.new_tracker(placement, begin.picture, begin.in_sequence)
     run = RunResults(placement.model, begin.frame, per_sequence=tracked_with.per_sequence)
     try:
         _follow(sources, first, tracker, run)
@@ -90,14 +90,13 @@ def track_rig(options: TrackOptions, others: Sequence[Path]) -> dict[str, Any]:
     return summary
 
 
-def _follow(sources: Sequence[FrameSource], first: AnchoredTracker, tracker: RigTracker, run: RunResults) -> None:
+def _follow(sources: Sequence[FrameSource], first: Tracker, tracker: RigTracker, run: RunResults) -> None:
     """Track all frames into ``run``; ``first`` finds the first camera in the map, where there is one."""
     for frames in tqdm(_together(sources), total=len(sources[0]), desc="tracking", unit="frame"):
         for number, (frame, part) in enumerate(zip(frames, tracker.cameras, strict=True)):
             part.camera.check_image(frame.image, f"frame {frame.index} of camera {number}")
         located = first.locate(frames[0])
-        result = tracker.process_frame([frame.image for frame in frames], located.known)
-        result = result if first.anchor is None else located.told_of(result)
+        result = tracker.track([frame.image for frame in frames], located)
         run.add(frames[0].index, frames[0].timestamp, result)
 
 
@@ -119,16 +118,16 @@ def _with_reference(setup: Setup, options: TrackOptions) -> tuple[Setup, TrackOp
             "without its map a registration brings its own reference frame: leave out --reference-frame"
         )
     frame = _frame(options.frames, number)
-    located = setup.new_chain(placement, setup.reference, False).locate(frame)
-    if located.known is None:
+    located = setup.new_tracker(placement, setup.reference, False).locate(frame)
+    if located.pose_prior is None:
         raise RegistrationError(
             f"the camera is not found in the map in frame {number} of {options.frames} ({located.why_lost}): "
             "take another --reference-frame"
         )
     d = len(placement.model.parameters)
     covariance = np.zeros((d + 6, d + 6))
-    covariance[d:, d:] = located.known.covariance
-    state = State(placement.model.default, located.known.pose)
+    covariance[d:, d:] = located.pose_prior.covariance
+    state = State(placement.model.default, located.pose_prior.pose)
     placed = replace(placement, frame=number, state=state, covariance=covariance)
     setup = replace(setup, placement=placed, keyframes={})
     return setup, with_reference(options, setup)

@@ -1,10 +1,8 @@
 """Tracking one object: its pose and parameters in every frame.
 
-`Tracker.process_frame` is the method: follow the bound points from the previous frame, estimate, correct
-against the rendered reference view so that nothing drifts, and accept the result on evidence; a lost object
-is found again from the reference view's features. A free object's pose is estimated with its parameters; an
-anchored one's comes from the camera in the map of the scene, as long as its points agree. There is no
-temporal prior on what changes: the previous frames only say where to start.
+`Tracker.track` is the method. A free object's pose is estimated with its parameters; that of an anchored one
+comes from the camera in the map of the scene, as long as its points agree. There is no temporal prior on what
+changes: the previous frames only say where to start.
 """
 
 from __future__ import annotations
@@ -16,58 +14,80 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.diagnostics.duplicate_objects import DuplicateObjects
-from morph_dslam.diagnostics.statements import FrameStatements, missed
+from morph_dslam.diagnostics.reference_misfit import CLEARLY_WORSE
 from morph_dslam.model import ReducedModel
-from morph_dslam.model.discrepancy import Discrepancy
-from morph_dslam.registration.registration import PosePrior
+from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.sources import Frame
-from morph_dslam.timing import StageClock
+from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import Anchor, Anchoring
 from morph_dslam.tracking.covariance import error_factors_of
 from morph_dslam.tracking.discrepancy import DiscrepancyFit
-from morph_dslam.tracking.estimator import Estimator, Prior, State
+from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
 from morph_dslam.tracking.frame_estimation import at_constant_velocity, new_filter
+from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.measurement import Measurement
 from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.outcomes import (
+    CameraLost,
+    FewPointsAgree,
+    FoundBy,
+    ModelDoesNotExplain,
+    ObjectMoved,
+    OtherReferenceView,
+    PoseSource,
+    ReferenceContradicted,
+    Rejection,
+    Status,
+    TrackingWarning,
+)
 from morph_dslam.tracking.patches import follow, normalize_contrast
 from morph_dslam.tracking.reference import PosedImage, ReferenceView
 from morph_dslam.tracking.refinement import Keyframe
-from morph_dslam.tracking.result import (
-    FOLLOWED,
-    FOUND_AGAIN,
-    HAS_MOVED,
-    RECOVERED,
-    STAGES,
-    FrameResult,
-    Image,
-    PoseHypothesis,
-    refusal,
-)
+from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.shape_search import with_undetermined_at_default
 from morph_dslam.tracking.views import ActiveView, Change, KeyframeViews, ViewSet
 
 Array = NDArray[np.float64]
 
 
-class Tracker:
-    """Follows one object from its registered reference view.
-
-    Parameters
-    ----------
-    reference : the reference frame (h, w, 3) uint8, as recorded, or made ready already.
-    state : the object in it.
-    in_sequence : whether the first frame to process is the reference frame or follows it; if not, the object
-        is looked for as after a loss.
-    reference_covariance : (d + 6, d + 6) of ``state``; it enters that of every frame. None where nothing is
-        known of the error of ``state``.
-    seen : (h, w) where the object is seen in the reference frame; all that it covers by default.
-    discrepancy : what the object's shape has beyond the model's in the reference frame, if it is known.
-    further : other pictures of the object as it is there; they bring the error of ``state`` with them.
+@dataclass(frozen=True)
+class CameraLocalization:
+    """Where the map has the object in a frame.
 
     Attributes
     ----------
-    reference : the reference view that frames are compared with. state : last known of the object.
+    pose_prior : of the object; None for a free one, or where the camera is lost.
+    why_lost : why the camera is; empty if it is not.
+    milliseconds : that it took.
+    """
+
+    pose_prior: PosePrior | None = None
+    why_lost: str = ""
+    milliseconds: float = 0.0
+
+
+class Tracker:
+    """Follows one object through the frames of one camera.
+
+    Parameters
+    ----------
+    model : the object; where the registration leaves the angle about an axis open, ``registration.model``.
+    camera : its intrinsics and lens.
+    registration : pose and parameters in the reference frame, and how well they are known.
+    options : what is measured and what is demanded; defaults if None.
+    reference : (h, w, 3) uint8, the reference frame as recorded, or made ready; None if it is the first frame
+        that is tracked.
+    in_sequence : whether the first frame to track is the reference frame or follows it; if not, the object is
+        looked for as after a loss.
+    anchor : the map that the object is anchored in; None for a free object.
+    seen : (h, w), where the reference frame shows the object; all that it covers by default.
+    keyframes : other images of the object as it is in the reference frame; they bring the error of the
+        registration with them.
+
+    Attributes
+    ----------
+    reference : the reference view that frames are compared with.
+    state : last known of the object.
     last_seen : where the first view's points were in the last frame that was compared with it.
     last_measured : what the last frame's estimate was made from; without weights if the object was lost.
 
@@ -76,99 +96,271 @@ class Tracker:
     RegistrationError
         If the object shows too few corners in the reference frame.
     TrackingError
-        If a parameter is to be one over the sequence, or to walk, that the model does not have.
+        If a per-sequence parameter, or one that walks, is not in the model.
     """
 
     def __init__(
         self,
         model: ReducedModel,
         camera: Camera,
-        reference: NDArray[np.uint8] | Image,
-        state: State,
+        registration: Registration,
         options: TrackerOptions | None = None,
+        *,
+        reference: NDArray[np.uint8] | Image | None = None,
         in_sequence: bool = True,
-        reference_covariance: Array | None = None,
+        anchor: Anchor | None = None,
         seen: NDArray[np.bool_] | None = None,
-        discrepancy: Discrepancy | None = None,
-        further: KeyframeViews | None = None,
+        keyframes: KeyframeViews | None = None,
     ) -> None:
-        self.model, self.camera, self.options = model, camera, options or TrackerOptions()
-        self.estimator = Estimator(model, camera, self.options.estimation)
+        self.model = registration.model if registration.per_sequence else model
+        self.camera, self.options, self.anchor = camera, options or TrackerOptions(), anchor
+        self.estimator = Estimator(self.model, camera, self.options.estimation)
         self._undistortion = camera.undistortion_maps()
-        picture = reference if isinstance(reference, Image) else self._prepare(reference)
-        further = further or KeyframeViews(error_factors_of(reference_covariance, self.estimator.scale))
-        first = PosedImage(picture, state, further.error_factors, seen, discrepancy)
-        reference_view = ReferenceView(self.estimator, [first, *further.views], self.options)
+        self._registration, self._seen, self._keyframes = registration, seen, keyframes
         sought = self.options.discrepancy
-        self._discrepancy = None if sought is None else DiscrepancyFit(model, camera, sought)
-        self._views = ViewSet(self.estimator, reference_view, self.options)
-        self._anchoring = Anchoring(self.estimator, reference_view, self.options)
+        self._discrepancy = None if sought is None else DiscrepancyFit(self.model, camera, sought)
         self._filter = new_filter(self.estimator, self.options)
-        self._unfiltered = np.zeros((len(model.parameters) + 6,) * 2)
-        self.last_seen: Keyframe | None = None
-        self.last_measured = self.reference.nothing_measured
-        self._picture, self._pixels = picture, self.reference.pixels
-        self._supported = np.ones(len(reference_view.points), dtype=bool)
-        self._last, self._velocity_base, self._start = state, state, state
-        self._beyond = discrepancy
+        self._unfiltered = np.zeros((len(self.model.parameters) + 6,) * 2)
         self._lost, self._n_lost = not in_sequence, 0
-        self._statements = FrameStatements(self._filter.constant)
-        self._look_alikes = DuplicateObjects(model.nodes)
+        self.last_seen: Keyframe | None = None
+        self._views: ViewSet | None = None
+        if reference is not None:
+            self._begin(reference if isinstance(reference, Image) else self._prepared(reference))
 
-    def process_frame(
+    def track(
         self,
-        image: NDArray[np.uint8],
-        known: PosePrior | None = None,
-        depth: NDArray[np.float32] | None = None,
+        frame: Frame | NDArray[np.uint8],
+        localization: CameraLocalization | None = None,
         occluder_depth: NDArray[np.float32] | None = None,
     ) -> FrameResult:
-        """Find the object in the next frame (h, w, 3) uint8, as recorded.
+        """Find the object in the next frame.
 
         Parameters
         ----------
-        known : an anchored object's pose by the map; None for a free one, or where the camera is lost.
-        depth : (h, w) metres, NaN where unknown, of a depth camera that sees what the image shows.
-        occluder_depth : (h, w) depth of other objects, metres, infinite where there are none: points that
-            they hide do not count.
+        frame : as recorded, with depth where a depth camera saw it too; or its image (h, w, 3) alone.
+        localization : what `locate` found in the frame; None to find it here.
+        occluder_depth : (h, w) of other objects, metres, infinite where there are none: points that they
+            occlude do not count.
+
+        Raises
+        ------
+        CameraError
+            If the frame has not the camera's size.
         """
-        clock = StageClock(STAGES)
-        with clock.stage("prepare"):
-            picture = replace(self._prepare(image), depth=depth, occluder_depth=occluder_depth)
-        attempt = self._attempt_from_last(picture, self._anchoring.prior(known), clock)
-        with clock.stage("search"):
-            attempt = self._view.estimation.search_other_shapes(attempt)
-        if known is not None and attempt.prior is not None:
-            attempt = self._without_map_if_moved(picture, attempt, known, clock)
-        why_not, how = refusal(attempt, self.options), FOLLOWED
+        camera = localization or self.locate(frame)
+        with frame_clock(STAGES) as clock:
+            image = self._prepare(frame, occluder_depth)
+            prior = self._predict(camera)
+            followed = self._follow(image, prior)
+            hypothesis = self._match(image, followed, prior)
+            hypothesis = self._search(hypothesis)
+            hypothesis = self._check_map(image, hypothesis, camera)
+            found_by, rejection = self._gate(hypothesis)
+            if rejection is not None:
+                hypothesis, found_by, rejection = self._relocalize(image, hypothesis, rejection, camera)
+            if rejection is None:
+                hypothesis = self._refine(image, hypothesis, camera)
+            self._update(image, hypothesis, rejection, camera)
+            result = self._result(hypothesis, found_by, rejection, camera)
+            change = self._choose_view(image, hypothesis, result)
+        times = clock.milliseconds | {"locate": camera.milliseconds}
+        made_view = change is not None and change.is_new
+        return replace(result, made_view=made_view, timings_ms=times, total_ms=clock.total + camera.milliseconds)
+
+    def locate(self, frame: Frame | NDArray[np.uint8]) -> CameraLocalization:
+        """Find the camera of the next frame in the map, and with it the object's pose there.
+
+        It may run in another thread than `track`, one frame ahead.
+        """
+        if not isinstance(frame, Frame):
+            return CameraLocalization()
+        self.camera.check_image(frame.image, f"frame {frame.index}")
+        if self.anchor is None:
+            return CameraLocalization()
+        poses, camera = self.anchor.locate(frame.image, frame.index, frame.timestamp)
+        return CameraLocalization(next(iter(poses.values()), None), camera.reason, camera.total_ms)
+
+    # -- the steps of a frame -----------------------------------------------------------------------------
+
+    def _prepare(self, frame: Frame | NDArray[np.uint8], occluder_depth: NDArray[np.float32] | None) -> Image:
+        """Undistort and normalize contrast; the first frame is the reference if none was given."""
+        with stage("prepare"):
+            if isinstance(frame, Frame):
+                depth = frame.depth if self.options.use_depth else None
+                image = replace(self._prepared(frame.image), depth=depth, occluder_depth=occluder_depth)
+            else:
+                image = replace(self._prepared(frame), occluder_depth=occluder_depth)
+            if self._views is None:
+                self._begin(image)
+            return image
+
+    def _predict(self, camera: CameraLocalization) -> Prior | None:
+        """What the map says of the object's pose, as a term of the estimator's cost."""
+        return self._anchoring.prior(camera.pose_prior)
+
+    def _follow(self, image: Image, prior: Prior | None) -> Measurement | None:
+        """Follow the points that supported the previous frame's estimate from there; None after a loss."""
         if self._lost:
-            why_not, how = self._view.recovery.refusal(attempt), FOUND_AGAIN
-        if why_not and self._is_to_be_looked_for(known):
-            found, why_not = self._view.recovery.recover(picture, self._last.parameters, why_not, clock)
-            attempt, how = (attempt, how) if found is None else (found, RECOVERED)
-        if why_not:
-            self._look_alikes.note_lost(why_not)
+            return None
+        with stage("flow"):
+            rows = np.flatnonzero(self._supported)
+            guesses = self._pixels + self._expected_motion(prior)
+            options = self.options.flow
+            found, ok = follow(self._image.normalized, image.normalized, self._pixels[rows], guesses[rows], options)
+            pixels, valid = guesses, np.zeros(len(guesses), dtype=bool)
+            pixels[rows], valid[rows] = found, ok
+            return Measurement(pixels, valid, self._supported, np.ones(len(pixels)))
+
+    def _match(self, image: Image, followed: Measurement | None, prior: Prior | None) -> PoseHypothesis:
+        """Compare with the rendered reference view and solve for pose and parameters."""
+        estimation = self._view.estimation
+        if followed is None:
+            start = self._last if prior is None else prior.placed(self._last)
+            hypothesis = estimation.correct(image, start, None, prior)
+            if reject(hypothesis, self.options) is None:
+                # It may have another shape by now: what that occludes or shows is only known once it is found.
+                hypothesis = estimation.correct(image, hypothesis.estimate.state, None, prior)
         else:
-            recovery = self._view.recovery
-            why_not = self._look_alikes.refusal(picture, attempt, how == RECOVERED, recovery, clock)
-        if not why_not:
-            with clock.stage("outline"):
-                attempt = self._view.estimation.fit_outline(picture, attempt)
-            with clock.stage("depth"):
-                attempt = self._view.estimation.fit_depths(picture, attempt)
-            with clock.stage("fuse"):
-                attempt = self._fuse(attempt)
-            if self._discrepancy is not None:
-                with clock.stage("discrepancy"):
-                    attempt = self._with_discrepancy(attempt, self._discrepancy)
-            if known is not None:
-                self._anchoring.note(self._anchoring.contradicts(known, attempt))
-        self._remember(picture, attempt, bool(why_not), known)
-        result = self._result(attempt, why_not, how, known, clock)
-        change = self._change_of_view(picture, attempt, result, clock)
-        return replace(result, made_view=change is not None and change.is_new, total_ms=clock.total)
+            with stage("estimate"):
+                start = estimation.rough(followed, self._start, prior)
+            hypothesis = estimation.correct(image, start, followed, prior)
+        return hypothesis
+
+    def _search(self, hypothesis: PoseHypothesis) -> PoseHypothesis:
+        """Try other shapes where the residuals are large, lest the estimate stay in a local minimum."""
+        with stage("search"):
+            return self._view.estimation.search_other_shapes(hypothesis)
+
+    def _check_map(self, image: Image, hypothesis: PoseHypothesis, camera: CameraLocalization) -> PoseHypothesis:
+        """Go by the points alone where they are not where the map has the object."""
+        if camera.pose_prior is None or hypothesis.prior is None:
+            return hypothesis
+        rejected = reject(hypothesis, self.options) is not None
+        if rejected and self._lost:
+            return hypothesis
+        if not rejected and not self._anchoring.contradicts(camera.pose_prior, hypothesis):
+            return hypothesis
+        free = self._match(image, self._follow(image, None), None)
+        return hypothesis if reject(free, self.options) is not None else free
+
+    def _gate(self, hypothesis: PoseHypothesis) -> tuple[FoundBy, Rejection | None]:
+        """Whether to accept the hypothesis; after a loss more is demanded."""
+        if self._lost:
+            return FoundBy.LAST_STATE, self._view.recovery.reject(hypothesis)
+        return FoundBy.FLOW, reject(hypothesis, self.options)
+
+    def _relocalize(
+        self, image: Image, hypothesis: PoseHypothesis, rejection: Rejection, camera: CameraLocalization
+    ) -> tuple[PoseHypothesis, FoundBy, Rejection | None]:
+        """Look for the object by its features; a hidden one, whose place is known, only now and then."""
+        is_placed = camera.pose_prior is not None and not self._anchoring.has_moved
+        if is_placed and self._n_lost % self.options.look_every:
+            return hypothesis, FoundBy.FEATURES, rejection
+        found, why = self._view.recovery.recover(image, self._last.parameters, rejection)
+        return hypothesis if found is None else found, FoundBy.FEATURES, why
+
+    def _refine(self, image: Image, hypothesis: PoseHypothesis, camera: CameraLocalization) -> PoseHypothesis:
+        """Add outline, depth, what earlier frames tell of per-sequence parameters, and the discrepancy."""
+        estimation = self._view.estimation
+        with stage("outline"):
+            hypothesis = estimation.fit_outline(image, hypothesis)
+        with stage("depth"):
+            hypothesis = estimation.fit_depths(image, hypothesis)
+        with stage("fuse"):
+            self.last_measured = measured = estimation.measured(hypothesis)
+            estimate = self._filter.fuse(measured, hypothesis.estimate, hypothesis.prior)
+            estimate = replace(estimate, residuals=estimate.residuals[: len(hypothesis.inliers)])
+            hypothesis = replace(hypothesis, estimate=estimate)
+        if self._discrepancy is not None:
+            with stage("discrepancy"):
+                last = None if self._lost else self._beyond
+                self._beyond = self._discrepancy.fit(self.last_measured, hypothesis.estimate.state, last)
+                hypothesis = replace(hypothesis, discrepancy=self._beyond)
+        if camera.pose_prior is not None:
+            self._anchoring.note(self._anchoring.contradicts(camera.pose_prior, hypothesis))
+        return hypothesis
+
+    def _update(
+        self, image: Image, hypothesis: PoseHypothesis, rejection: Rejection | None, camera: CameraLocalization
+    ) -> None:
+        """Keep what the next frame starts from; a lost frame keeps the last known shape."""
+        if rejection is None:
+            self._learn(hypothesis)
+        else:
+            self.last_measured = self.reference.nothing_measured
+            if camera.pose_prior is not None and not self._anchoring.has_moved:
+                self._last = replace(self._last, camera_from_object=camera.pose_prior.pose)
+        self._image, self._lost = image, rejection is not None
+        self._n_lost = self._n_lost + 1 if self._lost else 0
+
+    # -- results ------------------------------------------------------------------------------------------
+
+    def _result(
+        self, hypothesis: PoseHypothesis, found_by: FoundBy, rejection: Rejection | None, camera: CameraLocalization
+    ) -> FrameResult:
+        """Status, estimate with all known errors in its covariance, and warnings."""
+        warnings = self._warnings_of_place(camera)
+        n_points, n_inliers = hypothesis.counts
+        if rejection is not None:
+            is_hidden = camera.pose_prior is not None and not self._anchoring.has_moved
+            return FrameResult(
+                self.model,
+                Status.HIDDEN if is_hidden else Status.LOST,
+                rejection=rejection,
+                warnings=() if is_hidden else tuple(warnings),
+                pose_from=PoseSource.MAP if is_hidden else PoseSource.NONE,
+                pose_prior=camera.pose_prior if is_hidden else None,
+                n_points=n_points,
+                n_inliers=n_inliers,
+                view=self._view.number,
+            )
+        estimate, unexplained_px, more = self._with_systematic_errors(hypothesis)
+        residuals = hypothesis.estimate.residuals[hypothesis.inliers]
+        return FrameResult(
+            self.model,
+            Status.TRACKED,
+            estimate,
+            found_by,
+            warnings=(*warnings, *more),
+            pose_from=PoseSource.POINTS if hypothesis.prior is None else PoseSource.POINTS_AND_MAP,
+            n_points=n_points,
+            n_inliers=n_inliers,
+            residual_rms_px=float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))),
+            unexplained_px=unexplained_px,
+            reference_factor=self._view.systematic.worse,
+            view=self._view.number,
+            discrepancy=hypothesis.discrepancy,
+        )
+
+    def _warnings_of_place(self, camera: CameraLocalization) -> list[TrackingWarning]:
+        warnings: list[TrackingWarning] = [ObjectMoved()] if self._anchoring.has_moved else []
+        if self._view.number:
+            warnings.append(OtherReferenceView(self._view.number))
+        if camera.why_lost:
+            warnings.append(CameraLost(camera.why_lost))
+        return warnings
+
+    def _with_systematic_errors(self, hypothesis: PoseHypothesis) -> tuple[Estimate, float, list[TrackingWarning]]:
+        """The estimate with errors that do not average out in its covariance, and what that says of it."""
+        systematic, recovery = self._view.systematic, self._view.recovery
+        left = systematic.unexplained(hypothesis.estimate, hypothesis.inliers)
+        doubt_px, whole = recovery.doubt(hypothesis), not recovery.partly_hidden(hypothesis)
+        common_px = max(left.px, doubt_px)
+        estimate = systematic.added(hypothesis.estimate, hypothesis.weights, common_px, hypothesis.prior, whole)
+        warnings: list[TrackingWarning] = []
+        if doubt_px:
+            warnings.append(FewPointsAgree(hypothesis.estimate.sigma_px))
+        if left.is_failure:
+            warnings.append(ModelDoesNotExplain(left.px))
+        if systematic.worse > CLEARLY_WORSE:
+            warnings.append(ReferenceContradicted(systematic.worse))
+        return estimate, left.px, warnings
+
+    # -- reference views and state ------------------------------------------------------------------------
 
     @property
     def _view(self) -> ActiveView:
+        assert self._views is not None
         return self._views.active
 
     @property
@@ -182,112 +374,65 @@ class Tracker:
     def continue_from(self, state: State) -> None:
         """Go on from a state of the last frame that is known better from elsewhere, also when it is lost."""
         self._last = self._start = state
-        projected = self.camera.project(self.reference.points.in_camera(state))
-        self._pixels = np.where(self._supported[:, None], self._pixels, projected)
+        self._pixels = np.where(self._supported[:, None], self._pixels, self.reference.projected(state))
 
-    def _attempt_from_last(self, picture: Image, prior: Prior | None, clock: StageClock) -> PoseHypothesis:
-        """Estimate from the last known state; by way of the previous frame if the object was seen there."""
-        if self._lost:
-            start = self._last if prior is None else prior.placed(self._last)
-            attempt = self._view.estimation.correct(picture, start, None, prior, clock)
-            if refusal(attempt, self.options):
-                return attempt
-            # It may have another shape by now: what that hides or shows is only known once it is found.
-            return self._view.estimation.correct(picture, attempt.estimate.state, None, prior, clock)
-        with clock.stage("flow"):
-            followed = self._follow(picture, prior)
-        with clock.stage("estimate"):
-            start = self._view.estimation.rough(followed, self._start, prior)
-        return self._view.estimation.correct(picture, start, followed, prior, clock)
+    def _begin(self, image: Image) -> None:
+        """Make the reference view."""
+        known, options = self._registration, self.options
+        keyframes = self._keyframes or KeyframeViews(error_factors_of(known.covariance, self.estimator.scale))
+        first = PosedImage(image, known.state, keyframes.error_factors, self._seen, known.discrepancy)
+        view = ReferenceView(self.estimator, [first, *keyframes.views], options)
+        self._views = ViewSet(self.estimator, view, options)
+        self._anchoring = Anchoring(self.estimator, view, options)
+        self.last_measured = view.nothing_measured
+        self._image, self._pixels = image, view.pixels
+        self._supported = np.ones(len(view.points), dtype=bool)
+        self._last = self._velocity_base = self._start = known.state
+        self._beyond = known.discrepancy
 
-    def _follow(self, picture: Image, prior: Prior | None) -> Measurement:
-        """Follow the points that supported the previous frame's estimate from that frame to this one."""
-        rows = np.flatnonzero(self._supported)
-        guesses = self._pixels + self._expected_motion(prior)
-        found, ok = follow(
-            self._picture.normalized, picture.normalized, self._pixels[rows], guesses[rows], self.options.flow
-        )
-        pixels, valid = guesses, np.zeros(len(guesses), dtype=bool)
-        pixels[rows], valid[rows] = found, ok
-        return Measurement(pixels, valid, self._supported, np.ones(len(pixels)))
+    def _prepared(self, image: NDArray[np.uint8]) -> Image:
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        if self._undistortion is not None:
+            grey = cv2.remap(grey, *self._undistortion, interpolation=cv2.INTER_LINEAR)
+        normalized = normalize_contrast(grey, self.options.flow.contrast_window)  # type: ignore[arg-type]
+        return Image(grey, normalized)  # type: ignore[arg-type]
 
     def _expected_motion(self, prior: Prior | None) -> Array:
-        """Image motion (p, 2) as the map has it, or at the velocity of two frames; only a first guess."""
-        points = self.reference.points
-        last = self.camera.project(points.in_camera(self._last))
+        """Image motion (p, 2) by the map, or at the velocity of two frames; only a first guess."""
+        last = self.reference.projected(self._last)
         if prior is not None:
-            there = prior.placed(self._last)
-            return np.nan_to_num(self.camera.project(points.in_camera(there)) - last)
-        return np.nan_to_num(last - self.camera.project(points.in_camera(self._velocity_base)))
+            return np.nan_to_num(self.reference.projected(prior.placed(self._last)) - last)
+        return np.nan_to_num(last - self.reference.projected(self._velocity_base))
 
-    def _without_map_if_moved(
-        self, picture: Image, attempt: PoseHypothesis, known: PosePrior, clock: StageClock
-    ) -> PoseHypothesis:
-        """The attempt, or one by the points alone where they are not where the map has the object."""
-        refused = bool(refusal(attempt, self.options))
-        if refused and self._lost:
-            return attempt
-        if not refused and not self._anchoring.contradicts(known, attempt):
-            return attempt
-        free = self._attempt_from_last(picture, None, clock)
-        return attempt if refusal(free, self.options) else free
+    def _learn(self, hypothesis: PoseHypothesis) -> None:
+        """Take in an accepted frame."""
+        estimate, inliers, pixels = hypothesis.estimate, hypothesis.inliers, hypothesis.measurement.pixels
+        self.last_seen = None
+        if not self._view.number:
+            weights = inliers.astype(float)
+            self.last_seen = Keyframe(pixels, weights, estimate.state, estimate.sigma_px, hypothesis.outline)
+        self._velocity_base = estimate.state if self._lost else self._last
+        self._last = estimate.state
+        self._start = with_undetermined_at_default(self.model, estimate)
+        if self.options.start == "constant-velocity":
+            self._start = at_constant_velocity(self._velocity_base, self._start)
+        self._supported = inliers
+        self._pixels = np.where(inliers[:, None], pixels, self.reference.projected(self._last))
+        self._anchoring.learn(estimate, self.last_measured)
+        self._view.estimation.learn(hypothesis)
+        if not self._lost:
+            self._view.recovery.learn(hypothesis)
 
-    def _is_to_be_looked_for(self, known: PosePrior | None) -> bool:
-        """A hidden object, whose place is known from the map, is looked for elsewhere now and then."""
-        return known is None or self._anchoring.has_moved or self._n_lost % self.options.look_every == 0
-
-    def _fuse(self, attempt: PoseHypothesis) -> PoseHypothesis:
-        """The attempt with what earlier frames tell of the parameters that are one per sequence."""
-        self.last_measured = measured = self._view.estimation.measured(attempt)
-        estimate = self._filter.fuse(measured, attempt.estimate, attempt.prior)
-        return replace(attempt, estimate=replace(estimate, residuals=estimate.residuals[: len(attempt.inliers)]))
-
-    def _with_discrepancy(self, attempt: PoseHypothesis, fit: DiscrepancyFit) -> PoseHypothesis:
-        """The attempt with what the object's shape has beyond the model's."""
-        last = None if self._lost else self._beyond
-        self._beyond = fit.fit(self.last_measured, attempt.estimate.state, last)
-        return replace(attempt, discrepancy=self._beyond)
-
-    def _remember(self, picture: Image, attempt: PoseHypothesis, lost: bool, known: PosePrior | None) -> None:
-        """Keep what the next frame starts from; a lost frame keeps the last known shape."""
-        if not lost:
-            estimate, weights = attempt.estimate, attempt.inliers.astype(float)
-            self.last_seen = None
-            if not self._view.number:
-                self.last_seen = Keyframe(
-                    attempt.measurement.pixels, weights, estimate.state, estimate.sigma_px, attempt.outline
-                )
-            self._velocity_base = estimate.state if self._lost else self._last
-            self._last = estimate.state
-            self._start = with_undetermined_at_default(self.model, estimate)
-            if self.options.start == "constant-velocity":
-                self._start = at_constant_velocity(self._velocity_base, self._start)
-            self._supported = attempt.inliers
-            projected = self.camera.project(self.reference.points.in_camera(self._last))
-            self._pixels = np.where(attempt.inliers[:, None], attempt.measurement.pixels, projected)
-            self._anchoring.learn(estimate, self.last_measured)
-            self._view.estimation.learn(attempt)
-            if not self._lost:
-                self._view.recovery.learn(attempt)
-        elif known is not None and not self._anchoring.has_moved:
-            self._last = replace(self._last, camera_from_object=known.pose)
-        if lost:
-            self.last_measured = self.reference.nothing_measured
-        self._picture, self._lost = picture, lost
-        self._n_lost = self._n_lost + 1 if lost else 0
-
-    def _change_of_view(
-        self, picture: Image, attempt: PoseHypothesis, result: FrameResult, clock: StageClock
-    ) -> Change | None:
+    def _choose_view(self, image: Image, hypothesis: PoseHypothesis, result: FrameResult) -> Change | None:
         """Go on with another reference view if it shows more of what is seen, or may show a lost object."""
+        assert self._views is not None
         if result.estimate is None:
             change = self._views.after_lost(self._n_lost)
         else:
-            self._unfiltered = result.estimate.covariance - attempt.estimate.covariance
+            self._unfiltered = result.estimate.covariance - hypothesis.estimate.covariance
             if result.recovered:  # what was only just found again is followed for a frame first
                 return None
-            left = result.unexplained_px
-            change = self._views.after_tracked(picture, attempt, result.estimate, left, clock)
+            change = self._views.after_tracked(image, hypothesis, result.estimate, result.unexplained_px)
         if change is None:
             return None
         self._filter.change_points(self._views.point_change(change.view, self._unfiltered))
@@ -295,85 +440,3 @@ class Tracker:
         self._views.active, self._anchoring.reference = change.view, change.view.reference
         self._supported, self._pixels = change.supported, change.pixels
         return change
-
-    def _result(
-        self, attempt: PoseHypothesis, why_not: str, how: str, known: PosePrior | None, clock: StageClock
-    ) -> FrameResult:
-        has_moved = self._anchoring.has_moved
-        aside = f"; {HAS_MOVED}" if has_moved else ""
-        if self._view.number:
-            aside += f"; by reference view {self._view.number}"
-        if why_not:
-            return missed(attempt, why_not, aside, None if has_moved else known, clock)
-        doubt, unobservable = self._look_alikes.doubt, self._filter.unobservable
-        return self._statements.tracked(attempt, unobservable, how, aside, doubt, self._view, clock)
-
-    def _prepare(self, image: NDArray[np.uint8]) -> Image:
-        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        if self._undistortion is not None:
-            grey = cv2.remap(grey, *self._undistortion, interpolation=cv2.INTER_LINEAR)
-        normalized = normalize_contrast(grey, self.options.flow.contrast_window)  # type: ignore[arg-type]
-        return Image(grey, normalized)  # type: ignore[arg-type]
-
-
-# From a frame to the object in it: the camera in the map of the scene, then the object.
-# The two steps can run one after the other or, for different frames, in two threads.
-
-
-@dataclass(frozen=True)
-class CameraLocalization:
-    """What the map told of a frame.
-
-    Attributes
-    ----------
-    known : the object's pose by the map, None where the camera is lost. why_lost : the camera; empty if not.
-    milliseconds : that it took.
-    """
-
-    known: PosePrior | None = None
-    why_lost: str = ""
-    milliseconds: float = 0.0
-
-    def told_of(self, result: FrameResult) -> FrameResult:
-        """The result of an anchored object, with the time that finding the camera took, or why it failed."""
-        reason = result.reason
-        if self.known is None:
-            reason = f"{reason}; the camera is lost in the map: {self.why_lost}"
-        return replace(
-            result,
-            reason=reason,
-            timings_ms=result.timings_ms | {"locate": self.milliseconds},
-            total_ms=result.total_ms + self.milliseconds,
-        )
-
-
-class AnchoredTracker:
-    """Both steps; without an anchor the object is free and the first one does nothing.
-
-    ``anchor`` is of this object alone.
-    """
-
-    def __init__(self, camera: Camera, tracker: Tracker, anchor: Anchor | None = None) -> None:
-        self._camera, self.tracker, self.anchor = camera, tracker, anchor
-
-    def with_tracker(self, tracker: Tracker) -> AnchoredTracker:
-        """The same with another tracker; the camera stays where it was found."""
-        return AnchoredTracker(self._camera, tracker, self.anchor)
-
-    def process(self, frame: Frame) -> FrameResult:
-        """Both steps for the next frame; raises CameraError if it has not the camera's size."""
-        return self.track(frame, self.locate(frame))
-
-    def locate(self, frame: Frame) -> CameraLocalization:
-        """Find the camera of the next frame in the map."""
-        self._camera.check_image(frame.image, f"frame {frame.index}")
-        if self.anchor is None:
-            return CameraLocalization()
-        known, camera = self.anchor.locate(frame.image, frame.index, frame.timestamp)
-        return CameraLocalization(next(iter(known.values()), None), camera.reason, camera.total_ms)
-
-    def track(self, frame: Frame, located: CameraLocalization) -> FrameResult:
-        """Find the object in a frame that `locate` has seen."""
-        depth = frame.depth if self.tracker.options.use_depth else None
-        result = self.tracker.process_frame(frame.image, located.known, depth)
-        return result if self.anchor is None else located.told_of(result)

@@ -14,17 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import RegistrationError
-from morph_dslam.timing import StageClock
+from morph_dslam.timing import stage
 from morph_dslam.tracking.binding import DrawnSurface, draw_view, view_of
 from morph_dslam.tracking.covariance import error_factors_of
 from morph_dslam.tracking.estimator import Estimate, Estimator, State
 from morph_dslam.tracking.frame_estimation import FrameEstimation
+from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.measurement import Rendering
 from morph_dslam.tracking.observability import position_std
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.recovery import Recovery
 from morph_dslam.tracking.reference import PosedImage, ReferenceView, SurfaceSamples, choose_view, covered_share
-from morph_dslam.tracking.result import Image, PoseHypothesis, refusal
 from morph_dslam.tracking.sequence_filter import PointChange
 from morph_dslam.tracking.systematic_errors import UNEXPLAINED_PX, SystematicErrors
 
@@ -185,10 +185,10 @@ def _agreed(
     estimator: Estimator, views: Sequence[PosedImage], pictures: Sequence[PosedImage], options: TrackerOptions
 ) -> list[PosedImage]:
     """The views, each with what other ``pictures`` agree with in ``seen``."""
-    reference, clock = ReferenceView(estimator, views, options), StageClock(("render", "correct"))
+    reference = ReferenceView(estimator, views, options)
     agreed = np.zeros((len(pictures), len(reference.points)), dtype=bool)
     for row, picture in enumerate(pictures):
-        agreed[row] = reference.measure(_as_frame(picture), picture.state, None, clock).valid
+        agreed[row] = reference.measure(_as_frame(picture), picture.state, None).valid
     result = [views[0]]
     for view, part in zip(views[1:], reference.parts[1:], strict=True):
         rows = [row for row, picture in enumerate(pictures) if picture is not view]
@@ -323,7 +323,7 @@ class ViewSet:
         return PointChange(self.active.number, taken.number, left.correlation, count, kept, besides)
 
     def after_tracked(
-        self, picture: Image, attempt: PoseHypothesis, stated: Estimate, unexplained_px: float, clock: StageClock
+        self, picture: Image, attempt: PoseHypothesis, stated: Estimate, unexplained_px: float
     ) -> Change | None:
         """What to go on with after a frame in which the object was followed; None if nothing changes.
 
@@ -336,9 +336,9 @@ class ViewSet:
         if not self._options.new_views:
             return None
         if self._begun is not None or self._n_frames % CHECK_EVERY:
-            with clock.stage("views"):
+            with stage("views"):
                 return self._gone_on(stated.state)
-        with clock.stage("views"):
+        with stage("views"):
             assert attempt.measurement.depth is not None
             now = self._samples.seen(stated.state, attempt.measurement.depth)
             shares = [covered_share(now, seen) for seen in self._seen]
@@ -346,11 +346,11 @@ class ViewSet:
         while (chosen := choose_view(shares, errors, active)) is not None:
             if chosen == active:
                 return None
-            change = self._tried(self._kept[chosen], picture, attempt, clock)
+            change = self._tried(self._kept[chosen], picture, attempt)
             if change is not None:
                 return change
             shares[chosen] = 0.0
-        with clock.stage("views"):
+        with stage("views"):
             self._begun = self._begin(picture, attempt, stated, unexplained_px, now)
         return None
 
@@ -369,10 +369,10 @@ class ViewSet:
         count = len(view.reference.points)
         return Change(view, np.ones(count, dtype=bool), view.reference.pixels)
 
-    def _tried(self, view: ActiveView, picture: Image, attempt: PoseHypothesis, clock: StageClock) -> Change | None:
+    def _tried(self, view: ActiveView, picture: Image, attempt: PoseHypothesis) -> Change | None:
         """A change to a view that is kept, if the frame agrees with it."""
-        found = view.estimation.correct(picture, attempt.estimate.state, None, attempt.prior, clock)
-        if refusal(found, self._options):
+        found = view.estimation.correct(picture, attempt.estimate.state, None, attempt.prior)
+        if reject(found, self._options) is not None:
             return None
         places = view.reference.projected(found.estimate.state)
         return Change(view, found.inliers, np.where(found.inliers[:, None], found.measurement.pixels, places))

@@ -1,0 +1,94 @@
+"""A frame made ready, an estimate of the object in it, and whether to accept that estimate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.model.discrepancy import Discrepancy
+from morph_dslam.tracking.depth import PointDepths
+from morph_dslam.tracking.estimator import Estimate, Prior
+from morph_dslam.tracking.measurement import Measurement
+from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.outcomes import Rejection, RejectionReason
+from morph_dslam.tracking.outline import OutlineMeasurement
+
+#: Where less than this share of all points agree, they must agree closely.
+MOST_AGREE = 0.5
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Image:
+    """A frame made ready.
+
+    Attributes
+    ----------
+    grey : (h, w), the undistorted image.
+    normalized : (h, w), the same with contrast normalized.
+    depth : (h, w) of a depth camera, as recorded, metres, NaN where unknown; None without one.
+    occluder_depth : (h, w) of other objects, metres, infinite where there are none; None if none is known.
+    """
+
+    grey: NDArray[np.uint8]
+    normalized: NDArray[np.uint8]
+    depth: NDArray[np.float32] | None = None
+    occluder_depth: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True)
+class PoseHypothesis:
+    """An estimate of the object in a frame, and all the measurements that it was made from.
+
+    Attributes
+    ----------
+    estimate : pose and parameters.
+    inliers : (p,) which measurements support it.
+    measurement : of all points.
+    weights : (p,) that the measurements counted with, zero for those that do not support the estimate.
+    prior : what was known of the pose from the map; None if nothing was.
+    outline : of the object's rim, where it counts.
+    depths : of the points that support it, where a depth camera saw them.
+    discrepancy : what the shape has beyond the model's, once it was estimated.
+    """
+
+    estimate: Estimate
+    inliers: NDArray[np.bool_]
+    measurement: Measurement
+    weights: Array
+    prior: Prior | None = None
+    outline: OutlineMeasurement | None = None
+    depths: PointDepths | None = None
+    discrepancy: Discrepancy | None = None
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Points that the object itself does not occlude, and those that support the estimate."""
+        return int(self.measurement.visible.sum()), int(self.inliers.sum())
+
+
+def reject(hypothesis: PoseHypothesis, options: TrackerOptions) -> Rejection | None:
+    """Why a hypothesis is not accepted; None when it is.
+
+    What occludes an object may look like it by chance in places, but such points do not agree closely. With a
+    pose prior from the map only the parameters are left to be found, which few points can tell. These must
+    agree closely then, and be most of those that were found.
+    """
+    visible, count = hypothesis.counts
+    needed = min(options.least_inliers, int(np.ceil(options.least_share * len(hypothesis.inliers))))
+    spread = hypothesis.estimate.sigma_px
+    if count >= needed:
+        if count < MOST_AGREE * len(hypothesis.inliers) and spread > options.few_sigma_px:
+            return Rejection(RejectionReason.LOOSE_AGREEMENT, count, visible, spread_px=spread)
+        return None
+    if hypothesis.prior is None:
+        return Rejection(RejectionReason.FEW_POINTS, count, visible, needed)
+    if count < options.least_anchored:
+        return Rejection(RejectionReason.FEW_POINTS, count, visible, options.least_anchored)
+    found = int(hypothesis.measurement.valid.sum())
+    if spread < options.few_sigma_px and count >= options.anchored_share * found:
+        return None
+    return Rejection(RejectionReason.NO_COMMON_SHAPE, count, found, spread_px=spread)

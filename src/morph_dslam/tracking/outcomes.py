@@ -1,0 +1,226 @@
+"""What a frame can come to: its status, why an estimate is rejected, and what a reader must know of one.
+
+Decisions rest on these types; the texts are for people and are made here only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import ClassVar
+
+
+class Status(StrEnum):
+    """Whether the object was found in a frame."""
+
+    #: Pose and parameters are estimated.
+    TRACKED = "tracked"
+    #: The map gives the pose of an anchored object, but too few points give the parameters.
+    HIDDEN = "hidden"
+    #: Neither pose nor parameters are known.
+    LOST = "lost"
+
+
+class FoundBy(StrEnum):
+    """How the object was found in a frame."""
+
+    FLOW = "followed from the previous frame"
+    LAST_STATE = "found again where it was last seen"
+    FEATURES = "recovered from the reference view's features"
+
+
+class PoseSource(StrEnum):
+    """Where a frame's pose comes from."""
+
+    POINTS = "points"
+    POINTS_AND_MAP = "points and map"
+    MAP = "map"
+    NONE = ""
+
+
+class RejectionReason(StrEnum):
+    """Why an estimate is not accepted; the texts are filled in by `Rejection`."""
+
+    FEW_POINTS = "{agreeing} of {points} points agree, at least {needed} needed"
+    LOOSE_AGREEMENT = "{agreeing} of {points} points agree, but only by {spread_px:.1f} px"
+    NO_COMMON_SHAPE = "of {points} points found only {agreeing} agree on a shape, by {spread_px:.1f} px"
+    FEW_FEATURES = "only {agreeing} features of the reference view were found again"
+    TWO_PLACES = "it could be in two places, where {agreeing} and {points} points agree"
+    CAMERAS_CONTRADICT = "the cameras contradict each other: is their calibration right?"
+    NO_CAMERA = "no camera sees the object"
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """Why the object was not found in a frame.
+
+    Attributes
+    ----------
+    reason : what was missing.
+    agreeing : number of points (or features) that agree.
+    points : number of points that could be seen (`NO_COMMON_SHAPE`: that were found).
+    needed : number of points that must agree.
+    spread_px : robust spread of the residuals of those that agree, pixels.
+    then : why looking for it by its features failed too; None if that was not tried.
+    """
+
+    reason: RejectionReason
+    agreeing: int = 0
+    points: int = 0
+    needed: int = 0
+    spread_px: float = 0.0
+    then: Rejection | None = None
+
+    @property
+    def text(self) -> str:
+        """For people."""
+        own = self.reason.value.format(**vars(self))
+        return own if self.then is None else f"{own}; {self.then.text}"
+
+
+@dataclass(frozen=True)
+class TrackingWarning:
+    """Something that a reader of a frame's result must know; each kind is a class of its own.
+
+    Attributes
+    ----------
+    doubts_result : whether the estimate may be wrong by more than its deviations state.
+    """
+
+    doubts_result: ClassVar[bool] = True
+    template: ClassVar[str] = ""
+
+    @property
+    def text(self) -> str:
+        """For people."""
+        return self.template.format(**vars(self))
+
+
+@dataclass(frozen=True)
+class ObjectMoved(TrackingWarning):
+    """An anchored object is away from its place in the map; its points alone give the pose."""
+
+    template: ClassVar[str] = "the object has moved from its place in the map"
+
+
+@dataclass(frozen=True)
+class FewPointsAgree(TrackingWarning):
+    """Few points agree, and less closely than usual: something may cover the object in part.
+
+    Attributes
+    ----------
+    spread_px : robust spread of their residuals, pixels.
+    """
+
+    template: ClassVar[str] = "few points agree, and less closely than usual: by {spread_px:.1f} px"
+    spread_px: float
+
+
+@dataclass(frozen=True)
+class ModelDoesNotExplain(TrackingWarning):
+    """Neighbouring points are off together, which noise does not do: the model is wrong there.
+
+    Attributes
+    ----------
+    residual_px : root mean square of what they have in common, pixels.
+    """
+
+    template: ClassVar[str] = "the model does not explain the images: {residual_px:.1f} px are left"
+    residual_px: float
+
+
+@dataclass(frozen=True)
+class ReferenceContradicted(TrackingWarning):
+    """The frames show that the reference state is worse known than the registration states.
+
+    Attributes
+    ----------
+    factor : by which its deviations are widened.
+    """
+
+    template: ClassVar[str] = "the frames contradict the reference state: {factor:.1f} times its stated deviation"
+    factor: float
+
+
+@dataclass(frozen=True)
+class OtherReferenceView(TrackingWarning):
+    """The frame was compared with another reference view than the first.
+
+    Attributes
+    ----------
+    number : of the view, in the order in which they were made.
+    """
+
+    doubts_result: ClassVar[bool] = False
+    template: ClassVar[str] = "by reference view {number}"
+    number: int
+
+
+@dataclass(frozen=True)
+class CameraLost(TrackingWarning):
+    """The camera of an anchored object was not found in the map; the object's points alone give the pose.
+
+    Attributes
+    ----------
+    why : what camera tracking says.
+    """
+
+    doubts_result: ClassVar[bool] = False
+    template: ClassVar[str] = "the camera is lost in the map: {why}"
+    why: str
+
+
+@dataclass(frozen=True)
+class CameraIgnored(TrackingWarning):
+    """One of several cameras does not count in this frame.
+
+    Attributes
+    ----------
+    camera : its number.
+    status : of the object in its image.
+    rejection : why the object was not found there; None if it contradicts the other cameras.
+    """
+
+    doubts_result: ClassVar[bool] = False
+    camera: int
+    status: Status
+    rejection: Rejection | None = None
+
+    @property
+    def text(self) -> str:
+        """For people."""
+        if self.rejection is None:
+            return f"camera {self.camera} contradicts the others and does not count"
+        return f"camera {self.camera}: {self.status}: {self.rejection.text}"
+
+
+@dataclass(frozen=True)
+class DiagnosticFinding(TrackingWarning):
+    """What an opt-in diagnostic found.
+
+    Attributes
+    ----------
+    diagnostic : its name.
+    message : what it found.
+    data : the figures behind it.
+    """
+
+    template: ClassVar[str] = "{message}"
+    diagnostic: str
+    message: str
+    data: dict[str, float] = field(default_factory=dict, compare=False)
+
+
+def reason_text(
+    status: Status, found_by: FoundBy | None, rejection: Rejection | None, warnings: Iterable[TrackingWarning]
+) -> str:
+    """One line for people: how the object was found or why it was not, then the warnings."""
+    why = "" if rejection is None else rejection.text
+    if status is Status.HIDDEN:
+        first = f"hidden: {why}; its place is known from the map, its parameters are not"
+    elif status is Status.LOST:
+        first = f"lost: {why}"
+    else:
+        first = str(found_by)
+    return "; ".join([first, *(warning.text for warning in warnings)])
