@@ -1,11 +1,15 @@
-"""Frame sources: order, numbering, ranges, and what is said of bad input."""
+"""Frame sources: order, numbering, ranges, layouts of benchmarks, written videos, and registered kinds."""
 
 import cv2
 import numpy as np
 import pytest
 
 from morph_dslam.errors import SourceError
-from morph_dslam.sources import open_source
+from morph_dslam.extend import register_source
+from morph_dslam.io.video import VideoWriter
+from morph_dslam.sources import Frame, open_live, open_source, open_stream
+from morph_dslam.sources.frames import check_range
+from tests.support.real_data import real_data
 
 
 def grey(value, size=(32, 48)):
@@ -159,3 +163,186 @@ def test_names_that_give_no_order(tmp_path):
     (tmp_path / "b1.png").rename(tmp_path / "b.png")
     with pytest.raises(SourceError, match="no number in its name"):
         open_source(tmp_path)
+
+
+def save_image(path, value, size=(12, 16)):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.full((*size, 3), value, dtype=np.uint8))
+
+
+def save_depth(path, values):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.asarray(values, dtype=np.uint16))
+
+
+@pytest.fixture
+def tum(tmp_path):
+    times = ("1305031102.1753", "1305031102.2113", "1305031102.2433")
+    for number, time in enumerate(times):
+        save_image(tmp_path / "rgb" / f"{time}.png", 10 * number)
+    (tmp_path / "rgb.txt").write_text(
+        "# color images\n# timestamp filename\n" + "".join(f"{t} rgb/{t}.png\n" for t in times)
+    )
+    depth = np.full((12, 16), 7500)
+    depth[0, 0] = 0
+    save_depth(tmp_path / "depth" / "a.png", depth)
+    save_depth(tmp_path / "depth" / "b.png", depth + 1)
+    # 4 ms after the first image, 30 ms after the last; nothing close to the second.
+    (tmp_path / "depth.txt").write_text("1305031102.1793 depth/a.png\n1305031102.2733 depth/b.png\n")
+    return tmp_path
+
+
+def test_tum_keeps_time_and_depth(tum):
+    source = open_source(tum)
+    frames = list(source)
+    assert len(source) == 3
+    assert [frame.index for frame in frames] == [0, 1, 2]
+    assert [frame.timestamp for frame in frames] == [1305031102.1753, 1305031102.2113, 1305031102.2433]
+    assert [int(frame.image[0, 0, 0]) for frame in frames] == [0, 10, 20]
+    depth = frames[0].depth
+    assert depth.dtype == np.float32
+    assert np.isnan(depth[0, 0])
+    assert depth[1, 1] == pytest.approx(1.5)
+    assert [frame.depth is None for frame in frames] == [False, True, True]
+    assert source.fps == pytest.approx(1.0 / 0.034, rel=1e-3)
+    assert [frame.index for frame in open_source(tum, 1, 1)] == [1]
+
+
+def test_tum_without_depth_and_with_a_broken_list(tum):
+    (tum / "depth.txt").unlink()
+    assert next(iter(open_source(tum))).depth is None
+    (tum / "rgb.txt").write_text("1305031102.1 rgb/a.png more\n")
+    with pytest.raises(SourceError, match=r"rgb\.txt, line 1: .* is not a timestamp and a file"):
+        open_source(tum)
+    (tum / "rgb.txt").write_text("# nothing\n")
+    with pytest.raises(SourceError, match="holds no frames"):
+        open_source(tum)
+
+
+def test_depth_of_another_kind_or_size(tum):
+    save_image(tum / "depth" / "a.png", 3)
+    with pytest.raises(SourceError, match=r"frame 0: .*a\.png is not a depth image"):
+        list(open_source(tum))
+    save_depth(tum / "depth" / "a.png", np.ones((6, 8)))
+    with pytest.raises(SourceError, match=r"frame 0: .*a\.png is 8x6 pixels, the frames before it are 16x12"):
+        list(open_source(tum))
+
+
+@pytest.fixture
+def euroc(tmp_path):
+    stamps = {"cam0": (1403636579763555584, 1403636579813555456), "cam1": (1403636579813555456,)}
+    for camera, times in stamps.items():
+        folder = tmp_path / "mav0" / camera
+        for number, time in enumerate(times):
+            save_image(folder / "data" / f"{time}.png", 50 * number + 100 * (camera == "cam1"))
+        rows = "".join(f"{time},{time}.png\r\n" for time in times)
+        (folder / "data.csv").write_text(f"#timestamp [ns],filename\r\n{rows}")
+    return tmp_path
+
+
+def test_euroc_pairs_left_and_right(euroc):
+    for folder in (euroc, euroc / "mav0"):
+        first, second = open_source(folder)
+        assert first.timestamp == pytest.approx(1403636579.763555584, abs=3e-7, rel=0)
+        assert second.timestamp - first.timestamp == pytest.approx(0.05, abs=1e-6)
+        assert first.right is None
+        assert (int(second.image[0, 0, 0]), int(second.right[0, 0, 0])) == (50, 100)
+    (euroc / "mav0" / "cam0" / "data.csv").write_text("yesterday,a.png\n")
+    with pytest.raises(SourceError, match=r"data\.csv, line 1: .* is not a timestamp in nanoseconds"):
+        open_source(euroc)
+
+
+def test_seven_scenes_by_number(tmp_path):
+    for number in (3, 4):
+        save_image(tmp_path / f"frame-{number:06}.color.png", number)
+        (tmp_path / f"frame-{number:06}.pose.txt").write_text("1")
+    save_depth(tmp_path / "frame-000004.depth.png", [[1500, 0, 65535, 2000] * 4] * 12)
+    first, second = open_source(tmp_path)
+    assert (first.index, first.timestamp, first.depth) == (3, 0.1, None)
+    np.testing.assert_allclose(second.depth[0, :4], [1.5, np.nan, np.nan, 2.0])
+    with pytest.raises(SourceError, match="frame 5 is not in"):
+        open_source(tmp_path, 3, 5)
+
+
+def test_the_real_seven_scenes_recording():
+    source = open_source(real_data("7scenes_redkitchen"), 10, 11)
+    with_depth, without = source
+    assert with_depth.image.shape == (480, 640, 3)
+    # A kitchen: depths between half a metre and five.
+    assert 0.5 < np.nanmedian(with_depth.depth) < 5.0
+    assert without.depth is None
+
+
+def picture(position):
+    image = np.full((96, 128, 3), 40, dtype=np.uint8)
+    cv2.circle(image, (20 + 8 * position, 48), 10, (30, 200, 230), -1)
+    return image
+
+
+def write_video(path, n_frames, error=None):
+    with VideoWriter(path, 25.0, (128, 96)) as writer:
+        for position in range(n_frames):
+            writer.write(picture(position))
+        if error:
+            raise error
+
+
+def test_frames_read_back(tmp_path):
+    write_video(tmp_path / "out.mp4", 10)
+    source = open_source(tmp_path / "out.mp4")
+    frames = list(source)
+    assert len(frames) == len(source) == 10
+    assert source.fps == pytest.approx(25.0)
+    for position, read in enumerate(frames):
+        assert np.abs(read.image.astype(float) - picture(position)).mean() < 4.0
+    assert [path.name for path in tmp_path.iterdir()] == ["out.mp4"]
+
+
+def test_interrupted_video_plays_what_was_written(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        write_video(tmp_path / "out.mp4", 4, KeyboardInterrupt())
+    assert len(list(open_source(tmp_path / "out.mp4"))) == 4
+
+
+def test_no_frames_no_file_and_the_older_video_stays(tmp_path):
+    write_video(tmp_path / "out.mp4", 3)
+    write_video(tmp_path / "out.mp4", 0)
+    assert len(list(open_source(tmp_path / "out.mp4"))) == 3
+
+
+def test_missing_folder(tmp_path):
+    with pytest.raises(SourceError, match="there is no folder"):
+        write_video(tmp_path / "missing" / "out.mp4", 1)
+
+
+def test_frame_of_another_size_is_refused(tmp_path):
+    with VideoWriter(tmp_path / "out.mp4", 25.0, (128, 96)) as writer, pytest.raises(ValueError, match="128x96"):
+        writer.write(np.zeros((48, 64, 3), dtype=np.uint8))
+
+
+class FilmOfArrays:
+    """Images in one .npy file (n, h, w, 3) as a source: all that a new kind of source needs."""
+
+    fps = 25.0
+
+    def __init__(self, path, first=None, last=None):
+        self.name, self.images = str(path), np.load(path)
+        first, last = check_range(path, range(len(self.images)), first, last)
+        self.numbers = range(first, last + 1)
+
+    def __len__(self):
+        return len(self.numbers)
+
+    def __iter__(self):
+        return (Frame(k, k / self.fps, self.images[k]) for k in self.numbers)
+
+
+def test_a_registered_kind_of_source_opens_as_any_other(tmp_path):
+    register_source(lambda path: path.suffix == ".npy", FilmOfArrays)
+    np.save(tmp_path / "film.npy", np.arange(4, dtype=np.uint8)[:, None, None, None] * np.ones((8, 6, 3), np.uint8))
+    for opened in (open_source, open_stream):
+        assert [(f.index, int(f.image[0, 0, 0])) for f in opened(tmp_path / "film.npy", 1, 2)] == [(1, 1), (2, 2)]
+    with open_live(tmp_path / "film.npy", 3) as stream:
+        assert [frame.index for frame in stream] == [3]
+    with pytest.raises(SourceError, match=r"frame 9 is not in .*film\.npy"):
+        open_source(tmp_path / "film.npy", 9)

@@ -28,8 +28,8 @@ from morph_dslam.slam.relocalization import bit_counts
 from morph_dslam.slam.rigid_map import RigidMap
 from morph_dslam.slam.slam import Slam
 from morph_dslam.sources import FrameStream, open_source, open_stream
+from morph_dslam.sources.frames import has_registered_depth
 from morph_dslam.sources.live import LiveCamera
-from morph_dslam.sources.recorded import RecordedFrames
 from morph_dslam.threads import threads_side_by_side
 from morph_dslam.tracking.patches import patch_correlation
 from morph_dslam.tracking.run_folder import check_run_folder
@@ -103,12 +103,7 @@ def run_slam(options: SlamRunOptions) -> dict[str, Any]:
 
 
 def _run(options: SlamRunOptions, camera: Camera | StereoCamera, source: FrameStream) -> dict[str, Any]:
-    with_depth = (
-        options.use_depth
-        and isinstance(camera, Camera)
-        and isinstance(source, RecordedFrames)
-        and source.has_registered_depth
-    )
+    with_depth = options.use_depth and isinstance(camera, Camera) and has_registered_depth(source)
     is_live = isinstance(source, LiveCamera)
     slam, frames = Slam(camera, options.slam, with_depth, options.freeze_when_deforming, is_live), []
     known = _known_map(options, slam)

@@ -1,13 +1,13 @@
-"""Where frames come from: videos, folders of images, recordings of benchmarks, ROS bags, and webcams."""
+"""Where frames come from: videos, folders of images, benchmark recordings, ROS bags, webcams, and registered kinds."""
 
 from __future__ import annotations
 
-import re
+from collections.abc import Callable
 from pathlib import Path
 
 from morph_dslam.errors import SourceError
 from morph_dslam.sources.frames import Frame, FrameSource, FrameStream
-from morph_dslam.sources.live import LiveStream, PacedRecording, open_webcam
+from morph_dslam.sources.live import LiveStream, PacedRecording, is_webcam, open_webcam
 from morph_dslam.sources.recorded import (
     euroc_recording,
     image_folder,
@@ -20,23 +20,55 @@ from morph_dslam.sources.recorded import (
 from morph_dslam.sources.ros_bag import RosBag, is_bag
 from morph_dslam.sources.video import VideoFile
 
-__all__ = ["Frame", "FrameSource", "FrameStream", "open_live", "open_source", "open_stream"]
+__all__ = ["Frame", "FrameSource", "FrameStream", "open_live", "open_source", "open_stream", "register_source"]
 
-_WEBCAM = re.compile(r"webcam:(\d+)")
+Matches = Callable[[Path], bool]
 
-#: Layouts of folders, each with the test for it and what opens it.
-_LAYOUTS = ((is_tum, tum_recording), (is_euroc, euroc_recording), (is_seven_scenes, seven_scenes_recording))
+Open = Callable[[Path, int | None, int | None], FrameStream]
+
+_KINDS: list[tuple[Matches, Open]] = []
 
 
-def open_source(path: Path, first: int | None = None, last: int | None = None) -> FrameSource:
+def register_source(matches: Matches, open: Open) -> None:
+    """Add a kind of source, which every command and `open_source` then accept.
+
+    Parameters
+    ----------
+    matches : function of a path that tells whether it is of this kind; the newest kind is asked first
+    open : function of the path and of the first and last frame number wanted (None: open end) that returns the
+        frames: an object with ``name``, ``fps`` and ``__iter__``, and, if it is a recording, ``__len__``
+    """
+    _KINDS.insert(0, (matches, open))
+
+
+def open_stream(source: str | Path, first: int | None = None, last: int | None = None) -> FrameStream:
+    """Open a recording as `open_source` does, or a webcam: `webcam:0` is the first one.
+
+    A recording gives every frame, however long each takes; a webcam gives the newest and drops the others.
+
+    Raises
+    ------
+    SourceError
+        If the source is missing or cannot be opened, or the range is not in it.
+    """
+    path = Path(source)
+    if first is not None and last is not None and last < first:
+        raise SourceError(f"frames {first}-{last} of {path}: the last frame is before the first")
+    for matches, open_kind in _KINDS:
+        if matches(path):
+            return open_kind(path, first, last)
+    raise SourceError(f"there is no folder of images and no video at {path} (webcams are webcam:0, webcam:1, ...)")
+
+
+def open_source(path: str | Path, first: int | None = None, last: int | None = None) -> FrameSource:
     """Open a recording.
 
     Parameters
     ----------
     path : a folder of images, whose frames are numbered by the last number in each file name (`001.jpg` is
         frame 1); a folder in the layout of TUM RGB-D, EuRoC or 7-Scenes; a video file, or a ROS 1 or ROS 2
-        bag, with `#topic` after its name where it holds several, whose frames are numbered from 0.
-    first, last : the range of frame numbers wanted, both included; open ends by default.
+        bag, with `#topic` after its name where it holds several, whose frames are numbered from 0
+    first, last : range of frame numbers, both included; open ends by default
 
     Raises
     ------
@@ -44,56 +76,25 @@ def open_source(path: Path, first: int | None = None, last: int | None = None) -
         If the path is missing, holds no frames, or does not reach ``first`` or ``last``. While iterating:
         if a frame cannot be decoded, changes size, or the video ends early; all frames before it come first.
     """
-    path, topic = _split_topic(Path(path))
-    if not path.exists():
-        raise SourceError(f"there is no folder of images and no video at {path}")
-    if first is not None and last is not None and last < first:
-        raise SourceError(f"frames {first}-{last} of {path}: the last frame is before the first")
-    if is_bag(path):
-        return RosBag(path, topic, first, last)
-    if not path.is_dir():
-        return VideoFile(path, first, last)
-    for has_layout, open_layout in _LAYOUTS:
-        if has_layout(path):
-            return open_layout(path, first, last)
-    return image_folder(path, first, last)
-
-
-def open_stream(source: str | Path, first: int | None = None, last: int | None = None) -> FrameStream:
-    """Open a webcam, `webcam:0` for the first one, or a recording as `open_source` does.
-
-    A recording gives every frame, however long each takes; a webcam gives the newest and drops the others.
-
-    Raises
-    ------
-    SourceError
-        As `open_source` does; if the webcam cannot be opened, or a range of its frames is asked for.
-    """
-    webcam = _WEBCAM.fullmatch(str(source))
-    if webcam is None:
-        if str(source).startswith("webcam") and not Path(source).exists():
-            raise SourceError(f"'{source}' is no webcam: write webcam:0 for the first one, webcam:1 for the next")
-        return open_source(Path(source), first, last)
-    if first is not None or last is not None:
-        raise SourceError(f"{source} is live and has no range of frames to choose from")
-    return open_webcam(int(webcam[1]))
+    stream = open_stream(path, first, last)
+    if isinstance(stream, LiveStream):
+        stream.close()
+        raise SourceError(f"{path} is live; a recording is needed here")
+    assert isinstance(stream, FrameSource)
+    return stream
 
 
 def open_live(source: str | Path, first: int | None = None, last: int | None = None) -> LiveStream:
-    """Open a webcam, or a recording that plays as if it were live: frames that come too fast are dropped.
-
-    Raises
-    ------
-    SourceError
-        As `open_stream` does.
-    """
+    """Open a webcam, or a recording that plays as if it were live: frames that come too fast are dropped."""
     stream = open_stream(source, first, last)
     return stream if isinstance(stream, LiveStream) else PacedRecording(stream)
 
 
-def _split_topic(path: Path) -> tuple[Path, str | None]:
-    """The bag and the topic after its name, None where none is given."""
-    if path.exists() or "#" not in str(path):
-        return path, None
-    bag, _, topic = str(path).partition("#")
-    return (Path(bag), topic) if is_bag(Path(bag)) else (path, None)
+# From the general to the special: the last one is asked first.
+register_source(Path.is_file, VideoFile)
+register_source(Path.is_dir, image_folder)
+register_source(is_seven_scenes, seven_scenes_recording)
+register_source(is_euroc, euroc_recording)
+register_source(is_tum, tum_recording)
+register_source(is_bag, RosBag)
+register_source(is_webcam, open_webcam)

@@ -1,4 +1,4 @@
-"""Frames, and what a source of frames offers."""
+"""Frames, what a source of frames offers, and reading image files."""
 
 from __future__ import annotations
 
@@ -6,13 +6,21 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SourceError
+
+#: Frames per second where a recording does not tell it.
+ASSUMED_FPS = 30.0
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
+
+#: The bytes with which a complete file of this kind ends; the decoder itself fills what is missing with grey.
+END_MARKERS = {".png": b"IEND", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 
 
 @dataclass(frozen=True)
@@ -21,12 +29,12 @@ class Frame:
 
     Attributes
     ----------
-    index : its number in the sequence.
-    timestamp : seconds, by the recording's clock where it has one, else since frame 0.
-    image : (h, w, 3) uint8, blue, green, red.
-    depth : (h, w) metres along the optical axis, NaN where not measured; None without a depth camera.
-    right : (h, w, 3) uint8, what the right camera of a stereo pair saw; None without one.
-    captured : when a live frame came, seconds of `time.monotonic`; None in a recording.
+    index : its number in the sequence
+    timestamp : seconds, by the recording's clock where it has one, else since frame 0
+    image : (h, w, 3) uint8, blue, green, red
+    depth : (h, w) metres along the optical axis, NaN where not measured; None without a depth camera
+    right : (h, w, 3) uint8, image of the right camera of a stereo pair; None without one
+    captured : when a live frame came, seconds of `time.monotonic`; None in a recording
     """
 
     index: int
@@ -38,7 +46,10 @@ class Frame:
 
 
 class FrameStream(Protocol):
-    """Frames one after the other, recorded or live."""
+    """Frames one after the other, recorded or live.
+
+    One whose frames have depth that belongs to their pixels says so by ``has_registered_depth = True``.
+    """
 
     name: str
     fps: float
@@ -46,12 +57,18 @@ class FrameStream(Protocol):
     def __iter__(self) -> Iterator[Frame]: ...
 
 
+@runtime_checkable
 class FrameSource(FrameStream, Protocol):
     """A recorded sequence of frames, which can be iterated more than once and drops none."""
 
     def __len__(self) -> int:
         """Number of frames expected; fewer may come when a video is cut short, and then SourceError."""
         ...
+
+
+def has_registered_depth(source: FrameStream) -> bool:
+    """Whether frames come with depth that belongs to their pixels."""
+    return bool(getattr(source, "has_registered_depth", False))
 
 
 def check_range(where: Path, available: range, first: int | None, last: int | None) -> tuple[int, int]:
@@ -69,13 +86,12 @@ def check_range(where: Path, available: range, first: int | None, last: int | No
     return (low if first is None else first), (high if last is None else last)
 
 
-# Reading image files, colour and depth.
-
-
-SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
-
-#: The bytes with which a complete file of this kind ends; the decoder itself fills what is missing with grey.
-END_MARKERS = {".png": b"IEND", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
+def check_size(image: NDArray, size: tuple[int, int] | None, what: str) -> tuple[int, int]:
+    """The size (height, width) of an image; SourceError if it is not that of the frames before."""
+    height, width = image.shape[:2]
+    if size is not None and (height, width) != size:
+        raise SourceError(f"{what} is {width}x{height} pixels, the frames before it are {size[1]}x{size[0]}")
+    return height, width
 
 
 @dataclass(frozen=True)
@@ -84,8 +100,9 @@ class DepthScale:
 
     Attributes
     ----------
-    values_per_metre : of the stored whole numbers. unknown : values that mean it was not measured.
-    registered : whether depth pixels belong to the colour pixels of the same row and column.
+    values_per_metre : of the stored whole numbers
+    unknown : values that mean it was not measured
+    registered : whether depth pixels belong to the colour pixels of the same row and column
     """
 
     values_per_metre: float
@@ -105,13 +122,7 @@ def read_image(path: Path, what: str) -> NDArray[np.uint8]:
 
 
 def read_depth(path: Path, what: str, scale: DepthScale) -> NDArray[np.float32]:
-    """Read a depth image (h, w) in metres, NaN where no depth was measured.
-
-    Raises
-    ------
-    SourceError
-        As `read_image` does, and if the image has not one channel of 16 bits.
-    """
+    """Read a depth image (h, w) of one channel of 16 bits in metres, NaN where no depth was measured."""
     stored = _decode(path, what, cv2.IMREAD_UNCHANGED)
     if stored.ndim != 2 or stored.dtype != np.uint16:
         raise SourceError(f"{what}: {path} is not a depth image, which has one channel of 16 bits")
@@ -134,25 +145,21 @@ def _decode(path: Path, what: str, flags: int) -> NDArray:
     return np.asarray(image)
 
 
-# Opening videos and webcams by OpenCV, without what it and FFmpeg print: what is wrong our messages say.
-
-
-#: What OpenCV hands on to FFmpeg as its log level: AV_LOG_QUIET.
-_QUIET = "-8"
-
-#: OpenCV's own level at which it prints nothing.
-_SILENT = 0
-
-
 def open_capture(source: str | int) -> cv2.VideoCapture:
-    """A video file, or a webcam by its number; whether it could be opened, its ``isOpened()`` says."""
-    # It is read once, when the first video is opened.
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", _QUIET)
+    """A video file, or a webcam by its number, without what OpenCV and FFmpeg print; see its ``isOpened()``."""
+    # FFmpeg's log level AV_LOG_QUIET; it is read once, when the first video is opened.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     # Until 4.12 these functions were OpenCV's own, since then they are in a module.
     log: Any = getattr(cv2.utils, "logging", cv2)
     before = log.getLogLevel()
-    log.setLogLevel(_SILENT)
+    log.setLogLevel(0)
     try:
         return cv2.VideoCapture(source)
     finally:
         log.setLogLevel(before)
+
+
+def frame_rate(capture: Any) -> float:
+    """Frames per second of a video or a webcam."""
+    fps = capture.get(cv2.CAP_PROP_FPS)
+    return fps if np.isfinite(fps) and fps > 0 else ASSUMED_FPS

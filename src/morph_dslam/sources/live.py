@@ -1,21 +1,24 @@
-"""Handing the newest item from one thread to another."""
+"""Live sources, which wait for nobody: of the frames that come during work on one the newest is kept."""
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import TracebackType
 from typing import Generic, Protocol, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SourceError
-from morph_dslam.sources.frames import Frame, FrameStream, open_capture
+from morph_dslam.sources.frames import Frame, FrameStream, frame_rate, open_capture
 
 Item = TypeVar("Item")
+
+_WEBCAM = re.compile(r"webcam:(\d+)")
 
 
 class Newest(Generic[Item]):
@@ -23,7 +26,7 @@ class Newest(Generic[Item]):
 
     Attributes
     ----------
-    dropped : number of items so far that were replaced before anybody took them.
+    dropped : number of items so far that were replaced before anybody took them
     """
 
     def __init__(self) -> None:
@@ -47,22 +50,13 @@ class Newest(Generic[Item]):
             self._changed.notify_all()
 
     def take(self) -> Item | None:
-        """Wait for an item and take it; None when no more will come.
-
-        Raises
-        ------
-        BaseException
-            The error with which the items ended.
-        """
+        """Wait for an item and take it; None when no more will come, or the error with which they ended."""
         with self._changed:
             self._changed.wait_for(lambda: self._item is not None or self._ended)
             item, self._item = self._item, None
             if item is None and self._error is not None:
                 raise self._error
             return item
-
-
-# Live sources, which wait for nobody: of the frames that come during work on one the newest is kept.
 
 
 class Capture(Protocol):
@@ -73,23 +67,6 @@ class Capture(Protocol):
     def get(self, propId: int) -> float: ...
 
     def release(self) -> None: ...
-
-
-def open_webcam(device: int) -> LiveCamera:
-    """Open webcam number ``device``.
-
-    Raises
-    ------
-    SourceError
-        If there is none, or another program holds it.
-    """
-    capture = open_capture(device)
-    if not capture.isOpened():
-        raise SourceError(
-            f"webcam {device} cannot be opened: check that it is plugged in, that no other program uses it, "
-            "and that you may read /dev/video*"
-        )
-    return LiveCamera(capture, f"webcam {device}")
 
 
 class LiveStream:
@@ -160,8 +137,7 @@ class LiveCamera(LiveStream):
     """
 
     def __init__(self, capture: Capture, name: str = "camera", clock: Callable[[], float] = time.monotonic) -> None:
-        fps = capture.get(cv2.CAP_PROP_FPS)
-        super().__init__(name, fps if np.isfinite(fps) and fps > 0 else 30.0)
+        super().__init__(name, frame_rate(capture))
         self._capture, self._clock = capture, clock
         self.start()
 
@@ -182,6 +158,25 @@ class LiveCamera(LiveStream):
 
     def release(self) -> None:
         self._capture.release()
+
+
+def is_webcam(path: Path) -> bool:
+    """Whether it is written like `webcam:0`."""
+    return _WEBCAM.fullmatch(str(path)) is not None
+
+
+def open_webcam(path: Path, first: int | None = None, last: int | None = None) -> LiveCamera:
+    """Open the webcam of this number; SourceError if it is not there, is in use, or a range is asked for."""
+    if first is not None or last is not None:
+        raise SourceError(f"{path} is live and has no range of frames to choose from")
+    device = int(str(path).partition(":")[2])
+    capture = open_capture(device)
+    if not capture.isOpened():
+        raise SourceError(
+            f"webcam {device} cannot be opened: check that it is plugged in, that no other program uses it, "
+            "and that you may read /dev/video*"
+        )
+    return LiveCamera(capture, f"webcam {device}")
 
 
 class PacedRecording(LiveStream):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SourceError
-from morph_dslam.sources.frames import Frame, check_range
+from morph_dslam.sources.frames import Frame, check_range, check_size
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -38,8 +38,17 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a ROS 1 bag, or a file or folder of a ROS 2 bag."""
-    return path.suffix in (".bag", ".db3", ".mcap") or (path / "metadata.yaml").is_file()
+    """Whether a path, `#topic` after it or not, is a ROS 1 bag, or a file or folder of a ROS 2 bag."""
+    bag, _ = _split_topic(path)
+    return bag.suffix in (".bag", ".db3", ".mcap") or (bag / "metadata.yaml").is_file()
+
+
+def _split_topic(path: Path) -> tuple[Path, str | None]:
+    """The bag and the topic after its name, None where none is given."""
+    if path.exists() or "#" not in str(path):
+        return path, None
+    bag, _, topic = str(path).partition("#")
+    return Path(bag), topic
 
 
 @contextmanager
@@ -80,17 +89,12 @@ class RosBag:
 
     Parameters
     ----------
-    path : a `.bag` file, or a folder or file of a ROS 2 bag. topic : needed where there are several.
-    first, last : the range of frame numbers wanted, both included; open ends by default.
-
-    Raises
-    ------
-    SourceError
-        If rosbags is not installed, the bag is damaged, holds no images or none of that topic or in that
-        range. While iterating: if an image has an encoding that is not known, or changes size.
+    path : a `.bag` file, or a folder or file of a ROS 2 bag; `#topic` after it where there are several
+    first, last : range of frame numbers, both included; open ends by default
     """
 
-    def __init__(self, path: Path, topic: str | None = None, first: int | None = None, last: int | None = None) -> None:
+    def __init__(self, path: Path, first: int | None = None, last: int | None = None) -> None:
+        path, topic = _split_topic(path)
         self._path = path
         with _reader(path) as reader:
             connection = _choose_topic(path, reader, topic)
@@ -114,12 +118,7 @@ class RosBag:
                     return
                 message: Any = reader.deserialize(data, connection.msgtype)
                 image = _decode(message, f"frame {index} of {self.name}")
-                size = size or image.shape[:2]
-                if image.shape[:2] != size:
-                    raise SourceError(
-                        f"frame {index} of {self.name} is {image.shape[1]}x{image.shape[0]} pixels, "
-                        f"the frames before it are {size[1]}x{size[0]}"
-                    )
+                size = check_size(image, size, f"frame {index} of {self.name}")
                 yield Frame(index, _timestamp(message, received), image)
 
 

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 
 from morph_dslam.errors import SourceError
-from morph_dslam.sources.frames import Frame, check_range, open_capture
-from morph_dslam.sources.recorded import ASSUMED_FPS
+from morph_dslam.sources.frames import Frame, check_range, frame_rate, open_capture
 
 #: Containers that only estimate their length from its duration are off by so many frames without damage.
 LENGTH_TOLERANCE = 1
@@ -28,12 +27,10 @@ def _open(path: Path) -> cv2.VideoCapture:
 
 def _count_frames(path: Path, capture: cv2.VideoCapture) -> int:
     """The declared number of frames, counted where the container does not declare it."""
-    declared = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-    if declared > 0:
-        return declared
-    count = 0
-    while capture.grab():
-        count += 1
+    count = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
+    if count == 0:
+        while capture.grab():
+            count += 1
     if count == 0:
         raise SourceError(f"{path} holds no frames")
     return count
@@ -46,14 +43,11 @@ class VideoFile:
         capture = _open(path)
         try:
             self._declared = _count_frames(path, capture)
-            fps = capture.get(cv2.CAP_PROP_FPS)
+            self.fps = frame_rate(capture)
         finally:
             capture.release()
-        self._path = path
+        self._path, self._open_ended, self.name = path, last is None, str(path)
         self._first, self._last = check_range(path, range(self._declared), first, last)
-        self._open_ended = last is None
-        self.name = str(path)
-        self.fps = fps if np.isfinite(fps) and fps > 0 else ASSUMED_FPS
 
     def __len__(self) -> int:
         return self._last - self._first + 1
@@ -73,9 +67,8 @@ class VideoFile:
             capture.release()
 
     def _timestamp(self, capture: cv2.VideoCapture, index: int) -> float:
-        """Seconds since frame 0, by the container, for telephones film at a varying rate."""
+        """Seconds since frame 0, by the container if it has times: telephones film at a varying rate."""
         milliseconds = capture.get(cv2.CAP_PROP_POS_MSEC)
-        # Some containers tell no times.
         return 1e-3 * milliseconds if milliseconds > 0.0 else index / self.fps
 
     def _check_end(self, index: int) -> None:

@@ -14,7 +14,7 @@ from morph_dslam.errors import SourceError, TrackingError
 from morph_dslam.registration.landmarks import bind_landmarks
 from morph_dslam.registration.registration import Registration
 from morph_dslam.sources import Frame, FrameSource, open_source
-from morph_dslam.sources.recorded import RecordedFrames
+from morph_dslam.sources.frames import has_registered_depth
 from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.tracking.discrepancy import DiscrepancyFit, Reference, refine_discrepancy
 from morph_dslam.tracking.drawing import AugmentedView, DrawOptions, write_video
@@ -107,7 +107,7 @@ def with_reference(options: TrackOptions, setup: Setup) -> TrackOptions:
 def open_frames(options: TrackOptions) -> FrameSource:
     """The frames to track; raises SourceError, or TrackingError if there is no depth that is to be used."""
     source = open_source(options.frames, options.first, options.last)
-    if options.use_depth and not (isinstance(source, RecordedFrames) and source.has_registered_depth):
+    if options.use_depth and not has_registered_depth(source):
         raise TrackingError(
             f"{options.frames} has no depth images that belong to its pixels, as TUM RGB-D recordings have: "
             "track it without --depth"
