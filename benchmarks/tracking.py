@@ -26,7 +26,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField, SurfacePoints, load_model
 from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
-from morph_dslam.model.reduced_model import with_revolution_angle
+from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.registration.registration import Registration
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured

@@ -26,6 +26,10 @@ class ModelFileError(MorphError):
     """A model file is missing, damaged, or of a version that this release cannot read."""
 
 
+class ParameterError(MorphError):
+    """A model is asked for parameters or fields that it does not have."""
+
+
 class CameraError(MorphError):
     """The calibration is missing, malformed, or belongs to other images."""
 

@@ -1,11 +1,19 @@
-"""The methods of reduction from study files to certified model files, on tiny solids."""
+"""The methods of reduction from study files to certified model files, on tiny solids; choices that do not suit."""
 
 from __future__ import annotations
 
+import json
+import tomllib
+
 import numpy as np
+import pytest
 
 from morph_dslam import build, make_study
+from morph_dslam.cli import app as cli
+from morph_dslam.errors import StudyError
 from morph_dslam.model import load_model
+from morph_dslam.studies.study import resolve_defaults
+from tests.support.block_study import STUDY, write_study
 
 BEAM = {
     "name": "cantilever",
@@ -71,3 +79,63 @@ def test_a_reduced_basis_is_sampled_one_solve_at_a_time(tmp_path) -> None:
     assert estimates[-1] <= 5e-6 < estimates[-2]
     assert certificate["reduction"]["method"] == "reduced_basis"
     assert certificate["displacement"]["relative_l2"] < 2e-5
+
+
+def test_methods_reduce_the_same_solutions(tmp_path) -> None:
+    errors = {}
+    for method in ("galerkin", "pod", "sparse_pgd"):
+        sampling = {"scheme": "sobol", "training": 16, "held_out": 6}
+        study = BLOCK | {"sampling": sampling, "reduction": {"method": method, "max_degree": 4}}
+        model = build(make_study(study), tmp_path / "block.morph")
+        assert model.certificate["reduction"]["method"] == method
+        errors[method] = model.certificate["displacement"]["relative_l2"]
+    assert len(list((tmp_path / "block.morph.snapshots").glob("*.npz"))) == 22
+    assert max(errors["galerkin"], errors["pod"]) < 1e-3
+    assert errors["sparse_pgd"] < 0.05
+
+
+def test_reactions_of_a_model_balance_its_loads(tmp_path) -> None:
+    study = tomllib.loads(STUDY) | {"reduction": {"method": "galerkin"}}
+    model, area = build(make_study(study), tmp_path / "block.morph"), 0.02**2
+    force = model.at({"pull": 4e5, "push": 2e4, "young": 3e6}).reactions()["force_z_min"]
+    assert force == pytest.approx([-2e4 * area, 0.0, -4e5 * area], abs=2e-3 * 4e5 * area)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ('method = "krylov"', ["reduction.method"]),
+        ('basis = "kriging"', ["reduction.basis", '"chebyshev", "cubic_spline"']),
+        ('method = "sparse_pgd"\nformat = "tucker"', ["reduction.format", '"cp"']),
+        ('method = "sparse_pgd"\ncomponents = "separate"', ["reduction.components", '"galerkin"']),
+        ('method = "galerkin"\nformat = "polynomial"\nbasis = "hat"', ["reduction.basis"]),
+        ('method = "pod"\n[sampling]\nscheme = "adaptive"', ["sampling.scheme", '"galerkin"']),
+    ],
+)
+def test_a_wrong_choice_is_one_message(tmp_path, capsys, line, words):
+    path = write_study(tmp_path, ("[sampling]\ntraining = 24\nheld_out = 6\n", ""), ('method = "pod"', line))
+    path.write_text(path.read_text().replace("max_degree = 2\n", ""))
+    assert cli.main(["build", str(path), "-o", str(tmp_path / "x.morph")]) == 2
+    (printed,) = capsys.readouterr().err.splitlines()
+    for word in words:
+        assert word in printed
+
+
+def test_methods_that_do_not_suit_a_study_are_refused_with_those_that_do():
+    external = {
+        "name": "runs",
+        "external": {"table": "t.csv", "length_unit": "mm"},
+        "reduction": {"method": "galerkin"},
+    }
+    with pytest.raises(StudyError, match=r'"galerkin" .*"pod" or "sparse_pgd"'):
+        resolve_defaults(make_study(external))
+
+
+def test_defaults_follow_the_study():
+    content = tomllib.loads(STUDY) | {"reduction": {}, "sampling": {}}
+    several = resolve_defaults(make_study(content))
+    assert (several.reduction.method, several.sampling.scheme) == ("galerkin", "adaptive")
+    one = json.loads(json.dumps(BLOCK)) | {"parameters": {"bend": BLOCK["parameters"]["bend"]}, "reduction": {}}
+    del one["supports"][1]["translation"]
+    single = resolve_defaults(make_study(one))
+    assert (single.reduction.method, single.sampling.scheme) == ("pod", "sobol")

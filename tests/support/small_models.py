@@ -1,4 +1,4 @@
-"""Small models in every format of the model file, and a writer of version 2 files as earlier releases had."""
+"""A small model in every format of the model file."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import numpy as np
 
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.model.basis_functions import Basis
-from morph_dslam.model.separated import GridModes
-from morph_dslam.model.tensor_functions import stack_components
+from morph_dslam.model.separated import ComponentModes
 from tests.support.function_formats import SMOOTH, make_functions
 
 PARAMETERS = (
@@ -21,7 +20,7 @@ N = 3  # nodes along each edge
 def block_model(form: str, bases: tuple[Basis, ...] = SMOOTH) -> ReducedModel:
     """A cube of 8 hex8 cells with random fields of every kind, its displacement in the format ``form``.
 
-    "by_component" and "grid" name the modes' form; their functions are Tucker's.
+    "by_component" names the form of the modes; their functions are Tucker's.
     """
     rng = np.random.default_rng(2)
     index = np.arange(N**3).reshape(N, N, N)
@@ -33,13 +32,8 @@ def block_model(form: str, bases: tuple[Basis, ...] = SMOOTH) -> ReducedModel:
     a, b, c, d = (part.ravel() for part in (top[:-1, :-1], top[1:, :-1], top[1:, 1:], top[:-1, 1:]))
     tucker = make_functions("tucker", 6, bases)
     if form == "by_component":
-        parts = [("cp", 1), ("tucker", 2), ("tensor_train", 3)]
-        displacement = stack_components(
-            [SeparatedField(rng.normal(size=(n, N**3, 1)), make_functions(part, n, bases)) for part, n in parts]
-        )
-    elif form == "grid":
-        axes = tuple(rng.normal(size=(6, N)) for _ in range(3))
-        displacement = SeparatedField.from_compact(GridModes(axes, rng.normal(size=(6, 3))), tucker)
+        compact = ComponentModes(rng.normal(size=(6, N**3)), np.array([0, 1, 1, 2, 2, 2]), 3)
+        displacement = SeparatedField.from_compact(compact, tucker)
     else:
         displacement = SeparatedField(rng.normal(size=(6, N**3, 3)), make_functions(form, 6, bases))
     return ReducedModel(

@@ -10,12 +10,12 @@ from morph_dslam.model.basis_functions import (
     Basis,
     chebyshev_basis,
     cubic_spline_basis,
-    evaluate_numpy,
     fourier_basis,
     hat_basis,
     kriging_basis,
     p_spline_basis,
 )
+from tests.support.numpy_twins.fields import basis_values
 
 BASES = {
     "chebyshev": chebyshev_basis(-1.0, 3.0, 7),
@@ -33,7 +33,7 @@ every_basis = pytest.mark.parametrize("basis", BASES.values(), ids=BASES.keys())
 @pytest.mark.parametrize("order", [0, 1, 2])
 def test_compiled_and_plain_values_agree_inside_and_outside(basis: Basis, order: int) -> None:
     x = np.linspace(-2.5, 4.5, 301)
-    np.testing.assert_allclose(basis.evaluate(x, order), evaluate_numpy(basis, x, order), atol=1e-11)
+    np.testing.assert_allclose(basis.evaluate(x, order), basis_values(basis, x, order), atol=1e-11)
 
 
 @every_basis
@@ -105,7 +105,7 @@ def test_gram_matrices_are_the_integrals(basis: Basis, order: int) -> None:
     for i, j in [(0, 0), (0, basis.size - 1), (basis.size // 2, basis.size // 2)]:
 
         def product(x: float, i: int = i, j: int = j) -> float:
-            values = evaluate_numpy(basis, x, order)[0]
+            values = basis_values(basis, x, order)[0]
             return float(values[i] * values[j])
 
         expected = quad(product, -1.0, 3.0, points=breaks, limit=400, epsabs=1e-10)[0]

@@ -8,7 +8,7 @@ import pytest
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.model.reduced_model import with_revolution_angle
+from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
 from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.sequence_filter import SequenceFilter, without_clear_effect

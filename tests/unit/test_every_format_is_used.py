@@ -15,7 +15,8 @@ from morph_dslam.export import StateChoice, export
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SeparatedField, SurfacePoints, load_model, save_model
 from morph_dslam.model.basis_functions import cubic_spline_basis
-from morph_dslam.model.tensor_functions import CPFunctions, TensorTrainFunctions, TuckerFunctions, stack_components
+from morph_dslam.model.separated import ComponentModes
+from morph_dslam.model.tensor_functions import CPFunctions, TensorTrainFunctions, TuckerFunctions
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State, moved
 from tests.support.stretched_block import PARAMETERS, SIZE, YOUNG_MODULUS, stretched_block_model
 
@@ -43,10 +44,11 @@ def path(request, tmp_path_factory):
     """The stretched block, in a file, with all its fields in the format."""
     model = stretched_block_model()
     functions = linear_functions("tucker" if request.param == "by_component" else request.param)
-    displacement = SeparatedField(model.displacement.modes, functions)
-    if request.param == "by_component":
-        modes = model.displacement.modes
-        displacement = stack_components([SeparatedField(modes[:, :, c : c + 1], functions) for c in range(3)])
+    modes = model.displacement.modes
+    displacement = SeparatedField(modes, functions)
+    if request.param == "by_component":  # both modes are along x
+        compact = ComponentModes(modes[:, :, 0], np.array([0, 0]), 3)
+        displacement = SeparatedField.from_compact(compact, functions)
     found = replace(
         model,
         displacement=displacement,

@@ -5,7 +5,7 @@ import numpy as np
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.model.reduced_model import with_revolution_angle
+from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.registration.landmarks import shape_starts
 from morph_dslam.registration.registration import PosePrior
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, State

@@ -26,11 +26,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--scheduler", metavar="ADDRESS", help="solve on a Dask cluster, tcp://host:8786 say (docs/clusters.md)"
     )
     command.add_argument(
-        "--compare",
-        action="store_true",
-        help="reduce the same solutions by every other method too, and print how they compare",
-    )
-    command.add_argument(
         "--reference-curve",
         type=Path,
         metavar="CSV",
@@ -56,12 +51,8 @@ def run(arguments: argparse.Namespace) -> None:
         cluster = cluster_executor(arguments.scheduler)
     with cluster as executor, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".* nearly incompressible")  # printed once, at the end
-        model = build(arguments.study, output, arguments.workers, executor, compare=arguments.compare)
+        model = build(arguments.study, output, arguments.workers, executor)
     write_build_report(report_path(output), model, reference)
     print(f"wrote {output} and {report_path(output)}")
-    if arguments.compare:
-        from morph_dslam.reduction.comparison import comparison_lines
-
-        print("\n".join(comparison_lines(output)))
     for line in build_warnings(model.certificate):
         print(f"warning: {line}")

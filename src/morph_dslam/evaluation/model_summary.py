@@ -12,13 +12,7 @@ from morph_dslam.evaluation.points import error_table, field_title, sensitivity_
 from morph_dslam.evaluation.report import Table
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.model.tensor_functions import (
-    CPFunctions,
-    ProductFunctions,
-    StackedFunctions,
-    TensorTrainFunctions,
-    TuckerFunctions,
-)
+from morph_dslam.model.tensor_functions import CPFunctions, ProductFunctions, TensorTrainFunctions, TuckerFunctions
 
 #: Endings of certificate keys and the unit they stand for.
 _UNITS = {"_mm": "mm", "_percent": "%", "_MPa": "MPa", "_seconds": "s", "_ms": "ms", "_deg": "°"}
@@ -31,7 +25,6 @@ _FORMATS = {
     CPFunctions: "CP",
     TuckerFunctions: "Tucker",
     TensorTrainFunctions: "tensor train",
-    StackedFunctions: "by component",
     ProductFunctions: "products",
 }
 
@@ -70,7 +63,7 @@ def flatten(content: Mapping[str, Any], prefix: str = "") -> Facts:
 def summarise_model(model: ReducedModel) -> dict[str, Table]:
     """Tables of a model by heading, in the order in which they are read; empty ones are left out.
 
-    Certificates of older files, which say less, are shown as far as they go.
+    A model made without `morph build` has an empty certificate.
     """
     certificate = model.certificate
     summary = {

@@ -1,4 +1,16 @@
-"""Compiled values and derivatives of the one-dimensional bases of `basis_functions`, one point at a time."""
+"""One-dimensional function bases of a parameter: values, first and second derivatives, compiled.
+
+========== =========================================================== ===================================
+kind       functions                                                   use
+========== =========================================================== ===================================
+chebyshev  T_0 ... T_p on the scaled range                             smooth dependence, few samples
+spline     B-splines of degree 3 (C2) or 1 (hats) on any knots         values on grids; P-splines
+fourier    1, cos j x, sin j x with the range as the period            angles
+kriging    Matern-5/2 kernels at centres                               scattered samples of one parameter
+========== =========================================================== ===================================
+
+Outside the range every basis but the periodic one goes on as its tangent (C1): nothing is extrapolated.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +19,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
-from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import BSpline
 
 CHEBYSHEV, SPLINE, FOURIER, KRIGING = range(4)
 
@@ -119,20 +129,6 @@ def fill_many(kind, degree, n, lower, upper, knots, points, out):
         fill_basis(kind, degree, n, lower, upper, knots, points[i], out[i][:, :n])
 
 
-# One-dimensional function bases of a parameter: values, first and second derivatives.
-# All bases have one interface, `Basis`, and are evaluated by one compiled function,
-# `basis_kernels.fill_basis`:
-# ========== ============================================================== =================================
-# kind functions use ========== ==============================================================
-# ================================= chebyshev T_0 ... T_p on the scaled range smooth dependence, few samples
-# spline B-splines of degree 3 (C2) or 1 (hats) on any knots the default on grids; P-splines fourier 1, cos j
-# x, sin j x with the range as the period angles kriging Matern-5/2 kernels at centres scattered samples of
-# one parameter ========== ==============================================================
-# =================================
-# Outside the range every basis but the periodic one goes on as its tangent (C1): polynomials are never
-# extrapolated. `Basis.inside` is the flag that says so.
-
-
 Array = NDArray[np.float64]
 
 
@@ -143,7 +139,8 @@ class Basis:
     Attributes
     ----------
     kind : "chebyshev", "spline", "fourier" or "kriging".
-    lower, upper : the range, in the parameter's SI unit.
+    lower : lower end of the range, in the parameter's SI unit.
+    upper : its upper end.
     size : number of functions.
     degree : of a spline, 0 for the other kinds.
     knots : of a spline (size + degree + 1,); of kriging the correlation length and then the centres.
@@ -263,45 +260,6 @@ class Basis:
         flat = np.asarray(values, dtype=float).reshape(len(points), -1)
         coefficients = np.asarray(np.linalg.lstsq(matrix, flat, rcond=None)[0], dtype=np.float64)
         return coefficients.reshape(self.size, *np.shape(values)[1:])
-
-
-def evaluate_numpy(basis: Basis, x: ArrayLike, order: int = 0) -> Array:
-    """The plain twin of `Basis.evaluate`, by scipy's B-splines and numpy's Chebyshev series."""
-    x = np.atleast_1d(np.asarray(x, dtype=float))
-    if basis.kind == "fourier":
-        return _fourier_numpy(basis, x, order)
-    at = np.clip(x, basis.lower, basis.upper)
-    inside = (at == x)[:, None]
-    if order == 0:
-        slope = 0.0 if inside.all() else _at_numpy(basis, at, 1)
-        return _at_numpy(basis, at, 0) + (x - at)[:, None] * slope
-    return _at_numpy(basis, at, order) * (inside if order == 2 else 1.0)
-
-
-def _fourier_numpy(basis: Basis, x: Array, order: int) -> Array:
-    omega = 2.0 * np.pi / (basis.upper - basis.lower)
-    harmonic = np.arange(1, (basis.size - 1) // 2 + 1) * omega
-    phase = np.outer(x - basis.lower, harmonic) + order * np.pi / 2.0
-    out = np.full((len(x), basis.size), 1.0 if order == 0 else 0.0)
-    out[:, 1::2] = harmonic**order * np.cos(phase)
-    out[:, 2::2] = harmonic**order * np.sin(phase)
-    return out
-
-
-def _at_numpy(basis: Basis, x: Array, order: int) -> Array:
-    if basis.kind == "chebyshev":
-        scale = 2.0 / (basis.upper - basis.lower)
-        series = chebyshev.chebder(np.eye(basis.size), order) if order < basis.size else np.zeros((1, basis.size))
-        values = chebyshev.chebval((x - basis.lower) * scale - 1.0, series).T
-        return np.asarray(scale**order * values, dtype=np.float64)
-    if basis.kind == "spline":
-        spline = BSpline(basis.knots, np.eye(basis.size), basis.degree)
-        return np.asarray(spline(x, nu=order)) if order <= basis.degree else np.zeros((len(x), basis.size))
-    a = np.sqrt(5.0) / basis.knots[0]
-    difference = x[:, None] - basis.knots[None, 1:]
-    ar = a * np.abs(difference)
-    factor = [1.0 + ar + ar**2 / 3.0, -(a**2) / 3.0 * difference * (1.0 + ar), -(a**2) / 3.0 * (1 + ar - ar**2)]
-    return factor[order] * np.exp(-ar)
 
 
 def chebyshev_basis(lower: float, upper: float, degree: int) -> Basis:

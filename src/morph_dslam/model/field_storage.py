@@ -1,9 +1,12 @@
-"""Arrays and texts of an HDF5 file, checked before they are believed: kind, shape, size, finite values."""
+"""Separated fields in the groups of a model file (docs/model-file.md), and arrays checked before they are believed.
+
+Modes are kept in single precision, whose rounding is far below any model's error; the numbers that make the
+functions are few and stay in double precision.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -11,14 +14,36 @@ from numpy.typing import NDArray
 
 from morph_dslam.model.basis_functions import Basis
 from morph_dslam.model.functions import Functions, ParameterFunctions
-from morph_dslam.model.separated import CompactModes, ComponentModes, GridModes, SeparatedField
-from morph_dslam.model.tensor_functions import (
-    CPFunctions,
-    ProductFunctions,
-    StackedFunctions,
-    TensorTrainFunctions,
-    TuckerFunctions,
-)
+from morph_dslam.model.separated import ComponentModes, SeparatedField
+from morph_dslam.model.tensor_functions import CPFunctions, ProductFunctions, TensorTrainFunctions, TuckerFunctions
+
+Array = NDArray[np.float64]
+
+
+class _Format(NamedTuple):
+    """How functions with a basis for each parameter are kept: an array for each parameter, and one of all.
+
+    Attributes
+    ----------
+    kind : class of the functions.
+    parts : its attribute that has an array for each parameter.
+    stem : name of these in the file, before "_1", "_2" and so on.
+    n_dimensions : of these arrays.
+    whole : attribute, and name in the file, of the array of all parameters.
+    """
+
+    kind: type
+    parts: str
+    stem: str
+    n_dimensions: int
+    whole: str | None
+
+
+_FORMATS = {
+    "cp": _Format(CPFunctions, "factors", "factor", 2, "mixing"),
+    "tucker": _Format(TuckerFunctions, "factors", "factor", 2, "core"),
+    "tensor_train": _Format(TensorTrainFunctions, "cores", "core", 3, None),
+}
 
 
 def read_array(group: h5py.Group, name: str, n_dimensions: int, kind: type = np.float64) -> NDArray[Any]:
@@ -72,33 +97,14 @@ def read_number(group: h5py.Group, name: str) -> float:
     return float(number)
 
 
-# Separated fields in the groups of a model file: modes as they are or compact, functions in any format.
-# The layout is documented in docs/model-file.md. Modes are in single precision, whose rounding is far below
-# any model's error; the numbers that make the functions are few and stay in double precision.
-
-
-Array = NDArray[np.float64]
-
-#: Products of more parts than this are not met; a file that announces them is not believed.
-_MOST_PARTS = 64
-
-
 def write_field(group: h5py.Group, field: SeparatedField) -> None:
     """Write a field into an empty group."""
     compact = field.compact
-    if isinstance(compact, ComponentModes):
-        group.attrs["modes"] = "by_component"
+    group.attrs["modes"] = "full" if compact is None else "by_component"
+    _write_single(group, "modes", field.modes if compact is None else compact.values)
+    if compact is not None:
         group.attrs["n_components"] = compact.n_components
-        _write_single(group, "modes", compact.values)
         group.create_dataset("components", data=compact.components.astype(np.uint8))
-    elif isinstance(compact, GridModes):
-        group.attrs["modes"] = "grid"
-        for k, axis in enumerate(compact.axes):
-            _write_single(group, f"axis_{k + 1}", axis)
-        _write_single(group, "components", compact.components)
-    else:
-        group.attrs["modes"] = "full"
-        _write_single(group, "modes", field.modes)
     _write_functions(group.create_group("functions"), field.functions)
 
 
@@ -110,18 +116,11 @@ def _write_single(group: h5py.Group, name: str, values: Array) -> None:
     group.create_dataset(name, data=single)
 
 
-def _write_arrays(group: h5py.Group, stem: str, arrays: Sequence[Array]) -> None:
-    for k, array in enumerate(arrays):
-        group.create_dataset(f"{stem}_{k + 1}", data=array)
-
-
-def _write_bases(group: h5py.Group, bases: tuple[Basis, ...]) -> None:
-    for k, basis in enumerate(bases):
-        made = group.create_group(f"basis_{k + 1}")
-        made.attrs["kind"] = basis.kind
-        made.attrs["lower"], made.attrs["upper"] = basis.lower, basis.upper
-        made.attrs["size"], made.attrs["degree"] = basis.size, basis.degree
-        made.create_dataset("knots", data=basis.knots)
+def _write_basis(group: h5py.Group, basis: Basis) -> None:
+    group.attrs["kind"] = basis.kind
+    group.attrs["lower"], group.attrs["upper"] = basis.lower, basis.upper
+    group.attrs["size"], group.attrs["degree"] = basis.size, basis.degree
+    group.create_dataset("knots", data=basis.knots)
 
 
 def _write_functions(group: h5py.Group, functions: Functions) -> None:
@@ -130,36 +129,23 @@ def _write_functions(group: h5py.Group, functions: Functions) -> None:
         degrees = functions.multi_indices
         group.create_dataset("multi_indices", data=degrees.astype(np.min_scalar_type(int(degrees.max()))))
         group.create_dataset("coefficients", data=functions.coefficients)
-    elif isinstance(functions, CPFunctions):
-        group.attrs["format"] = "cp"
-        _write_bases(group, functions.bases)
-        _write_arrays(group, "factor", functions.factors)
-        if not functions.is_unmixed:
-            group.create_dataset("mixing", data=functions.mixing)
-    elif isinstance(functions, TuckerFunctions):
-        group.attrs["format"] = "tucker"
-        _write_bases(group, functions.bases)
-        _write_arrays(group, "factor", functions.factors)
-        group.create_dataset("core", data=functions.core)
-    elif isinstance(functions, TensorTrainFunctions):
-        group.attrs["format"] = "tensor_train"
-        _write_bases(group, functions.bases)
-        _write_arrays(group, "core", functions.cores)
-    elif isinstance(functions, StackedFunctions):
-        group.attrs["format"] = "stacked"
-        for k, part in enumerate(functions.parts):
-            _write_functions(group.create_group(f"part_{k + 1}"), part)
-        if functions.mixing is not None:
-            group.create_dataset("mixing", data=functions.mixing)
-    elif isinstance(functions, ProductFunctions):
+        return
+    if isinstance(functions, ProductFunctions):
         group.attrs["format"] = "product"
         group.attrs["n_first"] = functions.first.dimension
         _write_functions(group.create_group("part_1"), functions.first)
         _write_functions(group.create_group("part_2"), functions.second)
         if functions.mixing is not None:
             group.create_dataset("mixing", data=functions.mixing)
-    else:
-        raise TypeError(f"there is no place in the model file for {type(functions).__name__}")
+        return
+    name, form = next(item for item in _FORMATS.items() if isinstance(functions, item[1].kind))
+    found: Any = functions
+    group.attrs["format"] = name
+    for k, (basis, part) in enumerate(zip(found.bases, getattr(found, form.parts), strict=True), start=1):
+        _write_basis(group.create_group(f"basis_{k}"), basis)
+        group.create_dataset(f"{form.stem}_{k}", data=part)
+    if form.whole is not None and not (name == "cp" and found.is_unmixed):
+        group.create_dataset(form.whole, data=getattr(found, form.whole))
 
 
 def read_field(group: h5py.Group, lower: Array, upper: Array) -> SeparatedField:
@@ -172,27 +158,12 @@ def read_field(group: h5py.Group, lower: Array, upper: Array) -> SeparatedField:
     """
     functions = read_functions(read_group(group, "functions"), lower, upper)
     form = read_text(group, "modes")
-    compact: CompactModes
     if form == "full":
         return SeparatedField(read_array(group, "modes", 3), functions)
-    if form == "by_component":
-        components = read_array(group, "components", 1, np.int64)
-        count = int(read_number(group, "n_components"))
-        compact = ComponentModes(read_array(group, "modes", 2), components, count)
-    elif form == "grid":
-        axes = [read_array(group, f"axis_{k}", 2) for k in _numbers(group, "axis")]
-        compact = GridModes(tuple(axes), read_array(group, "components", 2))
-    else:
+    if form != "by_component":
         raise ValueError(f"modes are kept in the unknown form '{form}'")
-    return SeparatedField.from_compact(compact, functions)
-
-
-def _numbers(group: h5py.Group, stem: str) -> range:
-    """1, 2 ... n for the n members of the group that are called ``stem``_1, ``stem``_2 and so on."""
-    count = sum(name.startswith(f"{stem}_") for name in names(group))
-    if not 1 <= count <= _MOST_PARTS:
-        raise ValueError(f"{group.name} holds {count} of '{stem}_1', '{stem}_2' and so on")
-    return range(1, count + 1)
+    components, count = read_array(group, "components", 1, np.int64), int(read_number(group, "n_components"))
+    return SeparatedField.from_compact(ComponentModes(read_array(group, "modes", 2), components, count), functions)
 
 
 def _read_basis(group: h5py.Group) -> Basis:
@@ -208,27 +179,24 @@ def _read_basis(group: h5py.Group) -> Basis:
 
 def read_functions(group: h5py.Group, lower: Array, upper: Array) -> Functions:
     """The functions of a field; see `read_field`."""
-    form, d = read_text(group, "format"), len(lower)
-    if form == "polynomial":
+    name, d = read_text(group, "format"), len(lower)
+    if name == "polynomial":
         degrees = read_array(group, "multi_indices", 2, np.int64)
         return ParameterFunctions(lower, upper, degrees, read_array(group, "coefficients", 2))
-    if form == "stacked":
-        parts = [read_functions(read_group(group, f"part_{k}"), lower, upper) for k in _numbers(group, "part")]
-        return StackedFunctions(tuple(parts), read_array(group, "mixing", 2) if "mixing" in group else None)
-    if form == "product":
+    if name == "product":
         split = int(read_number(group, "n_first"))
         if not 1 <= split < d:
             raise ValueError(f"products of functions of {split} parameters in a model of {d}")
         first = read_functions(read_group(group, "part_1"), lower[:split], upper[:split])
         second = read_functions(read_group(group, "part_2"), lower[split:], upper[split:])
         return ProductFunctions(first, second, read_array(group, "mixing", 2) if "mixing" in group else None)
-    if form not in ("cp", "tucker", "tensor_train"):
-        raise ValueError(f"functions are kept in the unknown format '{form}'")
+    if name not in _FORMATS:
+        raise ValueError(f"functions are kept in the unknown format '{name}'")
+    form = _FORMATS[name]
     bases = tuple(_read_basis(read_group(group, f"basis_{k + 1}")) for k in range(d))
-    if form == "tensor_train":
-        return TensorTrainFunctions(bases, tuple(read_array(group, f"core_{k + 1}", 3) for k in range(d)))
-    factors = tuple(read_array(group, f"factor_{k + 1}", 2) for k in range(d))
-    if form == "cp":
-        unmixed = np.eye(factors[0].shape[1])
-        return CPFunctions(bases, factors, read_array(group, "mixing", 2) if "mixing" in group else unmixed)
-    return TuckerFunctions(bases, factors, read_array(group, "core", d + 1))
+    parts = tuple(read_array(group, f"{form.stem}_{k + 1}", form.n_dimensions) for k in range(d))
+    if form.whole is None:
+        return form.kind(bases, parts)
+    if name == "cp" and form.whole not in group:
+        return CPFunctions(bases, parts, np.eye(parts[0].shape[1]))
+    return form.kind(bases, parts, read_array(group, form.whole, d + 1 if name == "tucker" else 2))

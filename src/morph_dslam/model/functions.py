@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from morph_dslam.model.basis_functions import CHEBYSHEV, chebyshev_basis, evaluate_numpy, fill_basis
+from morph_dslam.model.basis_functions import CHEBYSHEV, fill_basis
 
 Array = NDArray[np.float64]
 
@@ -45,10 +45,6 @@ class Functions(ABC):
     @abstractmethod
     def _compiled(self, mu: Array) -> Array:
         """`rows` without the check."""
-
-    @abstractmethod
-    def partial(self, mu: ArrayLike, orders: tuple[int, ...]) -> Array:
-        """The mixed derivative (n_functions,) of ``orders`` (0, 1 or 2 for each parameter) at ``mu`` (d,)."""
 
     @abstractmethod
     def mixed(self, matrix: Array) -> Self:
@@ -90,12 +86,6 @@ class Functions(ABC):
         rows = self.rows(mu)
         return rows[0], rows[1:]
 
-    def evaluate_numpy(self, mu: ArrayLike) -> tuple[Array, Array]:
-        """The plain twin of `evaluate`."""
-        unit = np.eye(self.dimension, dtype=int)
-        slopes = [self.partial(mu, tuple(row)) for row in unit]
-        return self.partial(mu, (0,) * self.dimension), np.stack(slopes)
-
     def inside(self, mu: ArrayLike) -> NDArray[np.bool_]:
         """Which parameters (d,) lie in their range: where one does not, the answer is extrapolated."""
         mu = np.asarray(mu, dtype=np.float64)
@@ -114,7 +104,9 @@ def evaluate_polynomials(mu, lower, upper, multi_indices, coefficients):
 
     Parameters
     ----------
-    mu, lower, upper : (d,) parameters and their range.
+    mu : (d,) parameters.
+    lower : (d,) lower ends of their ranges.
+    upper : (d,) upper ends.
     multi_indices : (n_terms, d) int, polynomial degree of each factor.
     coefficients : (n_terms, n).
     """
@@ -149,7 +141,8 @@ class ParameterFunctions(Functions):
 
     Attributes
     ----------
-    lower, upper : (d,) the box, SI units.
+    lower : (d,) lower ends of the ranges, SI.
+    upper : (d,) upper ends.
     multi_indices : (n_terms, d) polynomial degrees.
     coefficients : (n_terms, n_functions).
     """
@@ -184,19 +177,6 @@ class ParameterFunctions(Functions):
 
     def _compiled(self, mu: Array) -> Array:
         return evaluate_polynomials(mu, self.lower, self.upper, self.multi_indices, self.coefficients)
-
-    def partial(self, mu: ArrayLike, orders: tuple[int, ...]) -> Array:
-        terms = np.ones(len(self.coefficients))
-        for x, basis, degrees, order in zip(np.asarray(mu), self._bases, self.multi_indices.T, orders, strict=True):
-            terms = terms * evaluate_numpy(basis, x, order)[0, degrees]
-        return terms @ self.coefficients
-
-    @cached_property
-    def _bases(self):
-        return tuple(
-            chebyshev_basis(low, high, int(degree))
-            for low, high, degree in zip(self.lower, self.upper, self.multi_indices.max(axis=0), strict=True)
-        )
 
     def mixed(self, matrix: Array) -> Self:
         return replace(self, coefficients=self.coefficients @ matrix)

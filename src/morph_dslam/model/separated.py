@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numba import njit
@@ -46,16 +46,16 @@ class SeparatedField:
     ----------
     modes : (n_modes, n_points, n_components), the functions F_i at the points, in the field's SI unit.
     functions : the n_modes functions H_i, in any format.
-    compact : the same modes in the form that the file keeps, or None where it keeps them as they are.
+    compact : the same modes without their zeros, where each moves one component only; None otherwise.
     """
 
     modes: Array
     functions: Functions
-    compact: CompactModes | None = None
+    compact: ComponentModes | None = None
 
     @classmethod
-    def from_compact(cls, compact: CompactModes, functions: Functions) -> SeparatedField:
-        """A field whose modes are kept in a compact form."""
+    def from_compact(cls, compact: ComponentModes, functions: Functions) -> SeparatedField:
+        """A field whose modes move one component each; the model file keeps them without zeros."""
         return cls(compact.expand(), functions, compact)
 
     @property
@@ -94,11 +94,6 @@ class SeparatedField:
         result = result.reshape(len(rows), *self.modes.shape[1:])
         return result[0], result[1:]
 
-    def value_and_sensitivities_numpy(self, mu: ArrayLike, outside: Outside = "bounded") -> tuple[Array, Array]:
-        """The plain twin of `value_and_sensitivities`."""
-        values, gradient = self.functions.evaluate_numpy(self._state(mu, outside))
-        return np.tensordot(values, self.modes, axes=1), np.tensordot(gradient, self.modes, axes=1)
-
     def with_modes(self, modes: Array) -> SeparatedField:
         """The same functions with other modes (n_modes, any points, any components)."""
         return SeparatedField(np.ascontiguousarray(modes), self.functions)
@@ -108,27 +103,10 @@ class SeparatedField:
 
         Parameters
         ----------
-        corners : (p, c) node indices. weights : (p, c) interpolation weights.
+        corners : (p, c) node indices.
+        weights : (p, c) interpolation weights.
         """
         return self.with_modes(np.einsum("pc,mpcx->mpx", weights, self.modes[:, corners]))
-
-
-# Modes kept in less space than their values at every point: by component, and on structured meshes.
-# A field works with the values of its modes, (n_modes, n_points, n_components). Where those have a structure
-# the field also knows the compact form, which the model file keeps and the compression factor counts.
-
-
-class CompactModes(Protocol):
-    """Modes in a compact form."""
-
-    @property
-    def n_floats(self) -> int:
-        """Numbers stored."""
-        ...
-
-    def expand(self) -> Array:
-        """The modes (n_modes, n_points, n_components) at every point."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -161,33 +139,3 @@ class ComponentModes:
         modes = np.zeros((*self.values.shape, self.n_components))
         modes[np.arange(len(modes)), :, self.components] = self.values
         return modes
-
-
-@dataclass(frozen=True)
-class GridModes:
-    """Modes on a structured mesh, separated in its directions: F_i = X_i(x) Y_i(y) a_i, and so on for Z.
-
-    Attributes
-    ----------
-    axes : for each direction (n_modes, n_k), the function at its n_k positions. The node at positions
-        (j, l) has the number j n_2 + l: the last direction runs fastest.
-    components : (n_modes, n_components), the vector a_i.
-    """
-
-    axes: tuple[Array, ...]
-    components: Array
-
-    def __post_init__(self) -> None:
-        shapes = [axis.shape for axis in (*self.axes, self.components)]
-        if not self.axes or any(len(shape) != 2 or shape[0] != shapes[0][0] for shape in shapes):
-            raise ValueError(f"arrays {shapes} are not the factors of the same modes")
-
-    @property
-    def n_floats(self) -> int:
-        return sum(axis.size for axis in self.axes) + self.components.size
-
-    def expand(self) -> Array:
-        modes = np.ones((len(self.components), 1))
-        for axis in (*self.axes, self.components):
-            modes = (modes[:, :, None] * axis[:, None, :]).reshape(len(modes), -1)
-        return modes.reshape(len(modes), -1, self.components.shape[1])

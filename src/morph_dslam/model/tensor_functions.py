@@ -1,20 +1,26 @@
-"""Compiled evaluation of CP, Tucker and tensor-train functions: values and first derivatives in one pass."""
+"""Functions of several parameters in separated form: CP, Tucker and tensor train, and products of functions.
+
+Each class holds ``n_functions`` functions H_i(mu), one for each spatial mode, made of one-dimensional bases:
+
+- `CPFunctions`: H_i = sum_t C[t, i] prod_k (phi_k(mu_k) . A_k[:, t]), the paper's sum of products;
+- `TuckerFunctions`: H_i = sum_abc core[i, a, b, c] u_a(mu_1) v_b(mu_2) w_c(mu_3);
+- `TensorTrainFunctions`: H_i = [G_1(mu_1) G_2(mu_2) ... G_d(mu_d)]_i, a product of small matrices.
+
+Values and all first derivatives come from one compiled pass.
+"""
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from morph_dslam.model.basis_functions import KINDS, Basis, evaluate_numpy, fill_basis
+from morph_dslam.model.basis_functions import KINDS, Basis, fill_basis
 from morph_dslam.model.functions import Functions
-from morph_dslam.model.separated import ComponentModes, SeparatedField
 
 Array = NDArray[np.float64]
 
@@ -149,24 +155,11 @@ def evaluate_tensor_train(packed, mu, ranks, cores):
     return after
 
 
-# Functions of several parameters in separated form: CP, Tucker and tensor-train coefficients.
-# Each class holds ``n_functions`` functions H_i(mu), one per spatial mode, built from one-dimensional bases:
-# - `CPFunctions`: H_i = sum_t C[t, i] prod_k (phi_k(mu_k) . A_k[:, t]), the paper's sum of products; -
-# `TuckerFunctions`: H_i = sum_abc core[i, a, b, c] u_a(mu_1) v_b(mu_2) w_c(mu_3); - `TensorTrainFunctions`:
-# H_i = [G_1(mu_1) G_2(mu_2) ... G_d(mu_d)]_i, a product of small matrices.
-# Values and all first derivatives come from one compiled pass. `partial` gives any mixed derivative (up to
-# the second in each parameter) by plain numpy, and is the twin that the compiled pass is tested against.
-
-
 @dataclass(frozen=True)
 class TensorFunctions(Functions):
     """``n_functions`` functions of ``d`` parameters; the common part of the three formats."""
 
     bases: tuple[Basis, ...]
-
-    @abstractmethod
-    def _contract(self, vectors: list[Array]) -> Array:
-        """The functions (n_functions,) from the basis values of each parameter [(size_k,)]."""
 
     @cached_property
     def _packed(self) -> PackedBases:
@@ -181,10 +174,6 @@ class TensorFunctions(Functions):
         sizes, found = [b.size for b in self.bases], [a.shape[axis] for a in arrays]
         if sizes != found:
             raise ValueError(f"the bases have {sizes} functions, the coefficients {found}")
-
-    def partial(self, mu: ArrayLike, orders: tuple[int, ...]) -> Array:
-        mu = np.asarray(mu, dtype=float)
-        return self._contract([evaluate_numpy(b, mu[k], orders[k])[0] for k, b in enumerate(self.bases)])
 
 
 @dataclass(frozen=True)
@@ -225,10 +214,6 @@ class CPFunctions(TensorFunctions):
 
     def _compiled(self, mu: Array) -> Array:
         return evaluate_cp(self._packed, mu, self._stacked, self.mixing)
-
-    def _contract(self, vectors: list[Array]) -> Array:
-        terms = np.prod([v @ f for v, f in zip(vectors, self.factors, strict=True)], axis=0)
-        return terms @ self.mixing
 
     def mixed(self, matrix: Array) -> Self:
         mixing = self.mixing @ matrix
@@ -273,12 +258,6 @@ class TuckerFunctions(TensorFunctions):
     def _compiled(self, mu: Array) -> Array:
         return evaluate_tucker(self._packed, mu, *self._flat, self.n_functions)
 
-    def _contract(self, vectors: list[Array]) -> Array:
-        result = self.core
-        for v, factor in zip(vectors[::-1], self.factors[::-1], strict=True):
-            result = result @ (v @ factor)
-        return result
-
     def mixed(self, matrix: Array) -> Self:
         return replace(self, core=np.ascontiguousarray(np.tensordot(matrix.T, self.core, axes=1)))
 
@@ -316,18 +295,9 @@ class TensorTrainFunctions(TensorFunctions):
     def _compiled(self, mu: Array) -> Array:
         return evaluate_tensor_train(self._packed, mu, *self._flat)
 
-    def _contract(self, vectors: list[Array]) -> Array:
-        result = np.ones(1)
-        for v, core in zip(vectors[::-1], self.cores[::-1], strict=True):
-            result = np.einsum("j,ijq,q->i", v, core, result)
-        return result
-
     def mixed(self, matrix: Array) -> Self:
         first = np.ascontiguousarray(np.tensordot(matrix.T, self.cores[0], axes=1))
         return replace(self, cores=(first, *self.cores[1:]))
-
-
-# Products of functions of some parameters with functions of others.
 
 
 @dataclass(frozen=True)
@@ -336,7 +306,8 @@ class ProductFunctions(Functions):
 
     Attributes
     ----------
-    first, second : functions of the first parameters and of those that follow.
+    first : functions of the first parameters.
+    second : functions of those that follow.
     mixing : (products, n_functions), or None where they stand as they are.
     """
 
@@ -374,81 +345,5 @@ class ProductFunctions(Functions):
         rows = np.concatenate([by_first, by_second]).reshape(1 + len(mu), -1)
         return rows if self.mixing is None else rows @ self.mixing
 
-    def partial(self, mu: ArrayLike, orders: tuple[int, ...]) -> Array:
-        mu, split = np.asarray(mu, dtype=np.float64), self.first.dimension
-        first = self.first.partial(mu[:split], orders[:split])
-        values = np.outer(first, self.second.partial(mu[split:], orders[split:])).ravel()
-        return values if self.mixing is None else values @ self.mixing
-
     def mixed(self, matrix: Array) -> Self:
         return replace(self, mixing=matrix if self.mixing is None else self.mixing @ matrix)
-
-
-# Functions of several formats one after another, for fields whose components have modes of their own.
-
-
-@dataclass(frozen=True)
-class StackedFunctions(Functions):
-    """The functions of all ``parts`` in order, or linear combinations of them.
-
-    Attributes
-    ----------
-    parts : functions of the same parameters, each in a format of its own.
-    mixing : (functions of all parts, n_functions), or None where they stand as they are.
-    """
-
-    parts: tuple[Functions, ...]
-    mixing: Array | None = None
-
-    def __post_init__(self) -> None:
-        boxes = np.array([part.bounds for part in self.parts])
-        if not self.parts or (boxes != boxes[0]).any():
-            raise ValueError("stacked functions need the same ranges of the parameters")
-        if self.mixing is not None and len(self.mixing) != self._n_stacked:
-            raise ValueError(f"{self._n_stacked} functions are mixed by a matrix {self.mixing.shape}")
-
-    @property
-    def _n_stacked(self) -> int:
-        return sum(part.n_functions for part in self.parts)
-
-    @property
-    def n_functions(self) -> int:
-        return self._n_stacked if self.mixing is None else self.mixing.shape[1]
-
-    @property
-    def n_floats(self) -> int:
-        return sum(part.n_floats for part in self.parts) + (0 if self.mixing is None else self.mixing.size)
-
-    @cached_property
-    def bounds(self) -> tuple[Array, Array]:
-        return self.parts[0].bounds
-
-    def _compiled(self, mu: Array) -> Array:
-        rows = np.concatenate([part.rows(mu) for part in self.parts], axis=1)
-        return rows if self.mixing is None else rows @ self.mixing
-
-    def partial(self, mu: ArrayLike, orders: tuple[int, ...]) -> Array:
-        values = np.concatenate([part.partial(mu, orders) for part in self.parts])
-        return values if self.mixing is None else values @ self.mixing
-
-    def mixed(self, matrix: Array) -> Self:
-        return replace(self, mixing=matrix if self.mixing is None else self.mixing @ matrix)
-
-
-def stack_components(fields: Sequence[SeparatedField]) -> SeparatedField:
-    """One field whose components are ``fields`` of one component each, with modes and functions of their own.
-
-    Each may have another number of modes and another format. The file keeps no zeros for it.
-
-    Raises
-    ------
-    ValueError
-        If a field has more than one component, or other points or ranges than the first.
-    """
-    shapes = [field.modes.shape[1:] for field in fields]
-    if any(shape != (shapes[0][0], 1) for shape in shapes):
-        raise ValueError(f"fields of shapes {shapes} are not components at the same points")
-    components = np.repeat(np.arange(len(fields)), [field.n_modes for field in fields])
-    values = np.concatenate([field.modes[:, :, 0] for field in fields])
-    compact = ComponentModes(values, components, len(fields))
-    return SeparatedField.from_compact(compact, StackedFunctions(tuple(f.functions for f in fields)))

@@ -16,7 +16,7 @@ from morph_dslam.geometry import RigidTransform, SimilarityTransform, cross_matr
 from morph_dslam.io.tables import Landmarks
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.discrepancy import Discrepancy
-from morph_dslam.model.reduced_model import with_revolution_angle
+from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.registration.landmarks import RegistrationOptions, bind_landmarks, register
 from morph_dslam.slam.pose import PoseEstimate
 from morph_dslam.tracking.depth import DepthOptions

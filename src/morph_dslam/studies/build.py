@@ -16,7 +16,6 @@ from morph_dslam.meshing.netgen_meshing import read_surface
 from morph_dslam.model import ReducedModel, save_model
 from morph_dslam.model.inner_structure import InnerStructure
 from morph_dslam.reduction.certificate import certify, compression_percent, stability_warnings
-from morph_dslam.reduction.comparison import compare_methods, write_comparison
 from morph_dslam.reduction.galerkin import FullSolutions, ReducedSolver, solid_equations
 from morph_dslam.reduction.method import METHODS, ReductionTask
 from morph_dslam.studies import external as solutions
@@ -90,7 +89,6 @@ def build(
     output: Path,
     workers: int | None = None,
     executor: Executor | None = None,
-    compare: bool = False,
 ) -> ReducedModel:
     """Solve a study and write its model file.
 
@@ -101,8 +99,6 @@ def build(
     study : a study, its file, or the folder of a file study.toml. output : the model file.
     workers : processes, the study's own number if absent.
     executor : what to solve on in their place, a Dask cluster's say.
-    compare : whether to try every other method on the same solutions too, and write how they compare beside
-        the model (`comparison.comparison_paths`).
 
     Raises
     ------
@@ -114,11 +110,7 @@ def build(
         raise StudyError(f"the folder {output.parent} for the model file does not exist: make it first")
     chosen = resolve_defaults(described)
     known = solve_or_read(chosen, output.with_name(output.name + ".snapshots"), workers, executor)
-    if compare:
-        model, rows = compare_methods(chosen, lambda options: certified_model(known, options, chosen.name))
-        write_comparison(output, rows)
-    else:
-        model = certified_model(known, chosen.reduction, chosen.name)
+    model = certified_model(known, chosen.reduction, chosen.name)
     model.provenance.update(provenance(text, chosen, model))
     if found := locking_warnings(chosen):
         model.certificate["warnings"] = found

@@ -1,0 +1,1 @@
+"""Plain numpy and scipy versions of compiled functions, to compare with."""

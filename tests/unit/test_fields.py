@@ -1,0 +1,274 @@
+"""Functions of the parameters in every format, fields and reduced models, against numpy and closed forms."""
+
+from math import radians
+
+import numpy as np
+import pytest
+from scipy.special import eval_chebyt
+
+from morph_dslam.errors import ParameterError, StudyError
+from morph_dslam.mechanics.recovery import material_points
+from morph_dslam.model import SeparatedField, SurfacePoints
+from morph_dslam.model.basis_functions import chebyshev_basis, cubic_spline_basis, fourier_basis
+from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
+from morph_dslam.model.separated import ComponentModes
+from morph_dslam.model.tensor_functions import CPFunctions, TensorTrainFunctions, TuckerFunctions
+from tests.support.bent_sheet import LENGTH, bending_stress_terms, bent_sheet_model, deflection_terms
+from tests.support.function_formats import FORMATS, LOWER, OTHERS, SMOOTH, UPPER, make_functions
+from tests.support.numpy_twins import fields as plain
+from tests.support.small_models import block_model
+
+MU = np.array([0.3, 0.6, 0.4])
+OUTSIDE = np.array([1.3, -0.2, 0.5])
+every_format = pytest.mark.parametrize("form", FORMATS)
+
+
+@every_format
+@pytest.mark.parametrize("bases", [SMOOTH, OTHERS], ids=["smooth bases", "other bases"])
+@pytest.mark.parametrize("mu", [MU, OUTSIDE], ids=["inside", "outside"])
+def test_compiled_functions_equal_plain_ones(form, bases, mu):
+    functions = make_functions(form, bases=bases)
+    for compiled, expected in zip(functions.evaluate(mu), plain.evaluate(functions, mu), strict=True):
+        np.testing.assert_allclose(compiled, expected, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize(("dimension", "degree"), [(1, 0), (1, 9), (2, 5), (4, 4)])
+def test_polynomials_of_any_number_of_parameters_equal_plain_ones(dimension, degree):
+    rng = np.random.default_rng(0)
+    indices = total_degree_indices(dimension, degree)
+    lower = rng.uniform(-3.0, -1.0, dimension)
+    functions = ParameterFunctions(lower, lower + 2.5, indices, rng.normal(size=(len(indices), 7)))
+    for mu in rng.uniform(lower - 0.1, lower + 2.6, (10, dimension)):
+        for compiled, expected in zip(functions.evaluate(mu), plain.evaluate(functions, mu), strict=True):
+            np.testing.assert_allclose(compiled, expected, rtol=1e-10, atol=1e-10)
+
+
+@every_format
+def test_values_are_the_sums_that_define_the_format(form):
+    functions = make_functions(form)
+    if isinstance(functions, ParameterFunctions):
+        scaled = 2.0 * (MU - LOWER) / (UPPER - LOWER) - 1.0
+        expected = np.prod(eval_chebyt(functions.multi_indices, scaled), axis=1) @ functions.coefficients
+    else:
+        if isinstance(functions, CPFunctions):
+            full = np.einsum("at,bt,ct,ti->iabc", *functions.factors, functions.mixing)
+        elif isinstance(functions, TuckerFunctions):
+            full = np.einsum("ixyz,ax,by,cz->iabc", functions.core, *functions.factors)
+        else:
+            assert isinstance(functions, TensorTrainFunctions)
+            full = np.einsum("iax,xby,ycz->iabc", *functions.cores)
+        vectors = [plain.basis_values(b, x)[0] for b, x in zip(functions.bases, MU, strict=True)]
+        expected = np.einsum("iabc,a,b,c->i", full, *vectors)
+        assert functions.n_floats < full.size or form == "cp"
+    np.testing.assert_allclose(functions.evaluate(MU)[0], expected, rtol=1e-10)
+    assert functions.n_functions == 7
+
+
+@every_format
+@pytest.mark.parametrize("mu", [MU, OUTSIDE], ids=["inside", "outside"])
+def test_gradients_follow_finite_differences(form, mu):
+    functions, h = make_functions(form), 1e-6
+    for k, step in enumerate(h * np.eye(3)):
+        slope = (functions.evaluate(mu + step)[0] - functions.evaluate(mu - step)[0]) / (2.0 * h)
+        np.testing.assert_allclose(functions.evaluate(mu)[1][k], slope, rtol=1e-6, atol=1e-5)
+
+
+@every_format
+def test_mixed_functions_are_the_linear_combinations_of_the_old(form):
+    functions, mixing = make_functions(form), np.random.default_rng(3).normal(size=(7, 4))
+    for new, old in zip(functions.mixed(mixing).evaluate(MU), functions.evaluate(MU), strict=True):
+        np.testing.assert_allclose(new, old @ mixing, rtol=1e-10, atol=1e-12)
+
+
+@every_format
+def test_a_wrong_number_of_parameters_is_refused(form):
+    with pytest.raises(ValueError, match="3 parameters"):
+        make_functions(form).evaluate([0.1, 0.2])
+
+
+def test_arrays_that_do_not_fit_are_refused():
+    rng = np.random.default_rng(0)
+    factors = tuple(rng.normal(size=(b.size, 2)) for b in SMOOTH)
+    for make in (
+        lambda: CPFunctions(SMOOTH, factors[::-1], np.eye(2)),
+        lambda: CPFunctions(SMOOTH, factors, np.eye(3)),
+        lambda: TuckerFunctions(SMOOTH, factors, rng.normal(size=(4, 2, 2, 3))),
+        lambda: TensorTrainFunctions(SMOOTH, tuple(rng.normal(size=(2, b.size, 2)) for b in SMOOTH)),
+        lambda: ComponentModes(np.zeros((1, 5)), np.array([2]), 2),
+    ):
+        with pytest.raises(ValueError):  # noqa: PT011
+            make()
+
+
+def test_total_degree_indices_are_all_and_ordered():
+    indices = total_degree_indices(3, 4)
+    assert len(np.unique(indices, axis=0)) == len(indices) == 35  # (3 + 4)! / (3! 4!)
+    totals = indices.sum(axis=1)
+    assert totals.max() == 4
+    assert (np.diff(totals) >= 0).all()
+
+
+def test_an_angle_has_no_outside():
+    bases = (chebyshev_basis(0.0, 1.0, 3), fourier_basis(-np.pi, np.pi, 2))
+    functions = CPFunctions(bases, (np.ones((4, 2)), np.ones((5, 2))), np.eye(2))
+    assert functions.inside([0.5, 9.0]).tolist() == [True, True]
+    assert functions.inside([1.5, 9.0]).tolist() == [False, True]
+
+
+@pytest.fixture(params=FORMATS)
+def field(request):
+    modes = np.random.default_rng(4).normal(size=(6, 11, 3))
+    return SeparatedField(modes, make_functions(request.param, n_functions=6))
+
+
+def test_fields_combine_the_modes_and_restrict_to_points(field):
+    for mu in (MU, OUTSIDE):
+        expected = plain.value_and_sensitivities(field, mu)
+        for one, other in zip(field.value_and_sensitivities(mu, "linear"), expected, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(field.value(mu, "linear"), expected[0], rtol=1e-9, atol=1e-9)
+    corners, weights = np.array([[0, 3, 5], [10, 2, 2]]), np.array([[0.2, 0.3, 0.5], [1.0, 0.0, 0.0]])
+    whole = field.value(MU)
+    at_points = [0.2 * whole[0] + 0.3 * whole[3] + 0.5 * whole[5], whole[10]]
+    np.testing.assert_allclose(field.restrict(corners, weights).value(MU), at_points, rtol=1e-9, atol=1e-9)
+
+
+def test_a_bounded_field_is_that_of_the_nearest_state(field):
+    found = field.value_and_sensitivities([1.4, 0.3, -0.2])
+    nearest = field.value_and_sensitivities([1.0, 0.3, 0.0], outside="linear")
+    for one, other in zip(found, nearest, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert field.inside([1.4, 0.3, -0.2]).tolist() == [False, True, False]
+    assert field.inside([1.0, 0.0, 2.0]).all()
+    with pytest.raises(ValueError, match="wild"):
+        field.value([0.0, 0.0, 0.0], outside="wild")
+
+
+def test_outside_fields_go_on_along_straight_lines(field):
+    """C1 across a face: the slope at the face is that of the line beyond."""
+    mu, step = np.array([1.0, 0.4, 0.7]), np.array([0.8, 0.0, 0.0])
+    near, middle, far = (field.value(mu + i * step, outside="linear") for i in (0.0, 0.5, 1.0))
+    np.testing.assert_allclose(middle, (near + far) / 2.0, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(far - near, 0.8 * field.value_and_sensitivities(mu)[1][0], rtol=1e-9, atol=1e-9)
+
+
+def test_outside_two_ranges_the_tangent_is_bilinear():
+    functions = make_functions("polynomial")
+    width, mu = np.array([0.3, 0.2, 0.0]), np.array([1.0, 1.0, 0.4])
+    value, gradient = functions.evaluate(mu)
+    expected = value + width @ gradient + 0.06 * plain.partial(functions, mu, (1, 1, 0))
+    np.testing.assert_allclose(functions.evaluate(mu + width)[0], expected, rtol=1e-10, atol=1e-10)
+
+
+STATE = np.array([0.03, -0.25, radians(12)])
+
+
+@pytest.fixture(scope="module")
+def model():
+    return bent_sheet_model(15, 11)
+
+
+def monomial_sum(terms, mu):
+    return sum(np.prod(mu ** np.array(powers)) * values for powers, values in terms.items())
+
+
+def test_positions_and_stress_are_the_sums_they_were_made_from(model):
+    x, y = model.nodes[:, 0], model.nodes[:, 1]
+    displacement = monomial_sum(deflection_terms(x, y), STATE)
+    np.testing.assert_allclose(model.positions(STATE), model.nodes + displacement, atol=1e-15)
+    s11, s22, s12 = monomial_sum(bending_stress_terms(x, y), STATE).T
+    # Von Mises' definition in three dimensions, with the stresses out of the plane zero.
+    expected = np.sqrt(((s11 - s22) ** 2 + s22**2 + s11**2) / 2 + 3 * s12**2)
+    for place in ("top", "bottom", None):
+        np.testing.assert_allclose(model.von_mises(STATE, place), expected, rtol=1e-10)
+
+
+def test_a_state_by_name_is_that_of_the_array():
+    model = block_model("tucker")
+    names = [parameter.name for parameter in model.parameters]
+    state, mu = model.at({names[2]: 0.001, names[0]: -0.4}), np.array([-0.4, model.default[1], 0.001])
+    np.testing.assert_array_equal(state.parameters, mu)
+    np.testing.assert_array_equal(state.displacement(), model.displacement.value(mu))
+    np.testing.assert_array_equal(state.positions(), model.positions(mu))
+    np.testing.assert_array_equal(state.strain(), model.strain.value(mu))
+    np.testing.assert_array_equal(state.stress(), model.stresses["solid"].value(mu))
+    np.testing.assert_array_equal(state.von_mises(), model.von_mises(mu, "solid"))
+    (name, force), (key, reaction) = *state.reactions().items(), *model.reactions.items()
+    assert name == key
+    np.testing.assert_array_equal(force, reaction.value(mu)[0])
+
+
+def test_parameters_and_fields_that_a_model_lacks_are_named(model):
+    for values, word in (({"bulge": 0.1}, "bulge"), ([0.1, 0.2], r"\(2,\)")):
+        with pytest.raises(ParameterError, match=word):
+            model.at(values)
+    with pytest.raises(ParameterError, match="strain"):
+        model.at({}).strain()
+    with pytest.raises(ParameterError, match="side"):
+        model.von_mises(STATE, "side")
+
+
+def test_restriction_interpolates_the_full_field(model):
+    rng = np.random.default_rng(0)
+    points = SurfacePoints(rng.integers(len(model.triangles), size=30), rng.dirichlet(np.ones(3), 30))
+    corners = model.triangles[points.triangles]
+    full_value, full_sensitivities = model.displacement.value_and_sensitivities(STATE)
+    value, sensitivities = model.restrict(points).value_and_sensitivities(STATE)
+    np.testing.assert_allclose(value, np.einsum("pc,pcx->px", points.weights, full_value[corners]), atol=1e-14)
+    expected = np.einsum("pc,dpcx->dpx", points.weights, full_sensitivities[:, corners])
+    np.testing.assert_allclose(sensitivities, expected, atol=1e-12)
+    rest = model.rest_positions(points)
+    assert np.abs(rest[:, 0]).max() <= LENGTH / 2
+    np.testing.assert_allclose(rest, np.einsum("pc,pcx->px", points.weights, model.nodes[corners]), atol=1e-16)
+
+
+def test_points_can_be_chosen_by_index_and_by_mask():
+    points = SurfacePoints(np.array([5, 6, 7]), np.eye(3))
+    assert points.take(np.array([2, 0])).triangles.tolist() == [7, 5]
+    np.testing.assert_array_equal(points.take(np.array([False, True, False])).weights, [[0, 1, 0]])
+
+
+def test_parameters_are_shown_in_their_unit(model):
+    assert model.parameters[2].display(model.parameters[2].upper) == pytest.approx(20.0)
+    assert model.parameters[0].display(model.lower[0]) == pytest.approx(-60.0)
+
+
+def test_a_model_passes_the_choice_of_the_outside_on(model):
+    """Bending stress is proportional to the arch, so that its tangent is exact."""
+    beyond, end = np.array([0.075, 0.0, 0.0]), np.array([0.060, 0.0, 0.0])
+    np.testing.assert_array_equal(model.positions(beyond), model.positions(end))
+    np.testing.assert_array_equal(model.von_mises(beyond, "top"), model.von_mises(end, "top"))
+    expected = 0.075 / 0.060 * model.von_mises(end, "top")
+    np.testing.assert_allclose(model.von_mises(beyond, "top", "linear"), expected, rtol=1e-9)
+    assert not np.allclose(model.at(beyond, "linear").positions(), model.positions(beyond))
+    assert model.inside(beyond).tolist() == [False, True, True]
+
+
+def test_points_inside_of_cells_follow_the_interpolated_field():
+    """Trilinear functions of the position, x y z and 1 + x, are exact between the nodes of hexahedra."""
+    model = block_model("tucker")
+    rng = np.random.default_rng(7)
+    positions = rng.uniform(0.0, 0.1, (30, 3))
+    points = material_points(model, positions)
+    np.testing.assert_allclose(model.rest_positions(points), positions, atol=1e-12)
+    known = lambda p: np.stack([p.prod(axis=1), 1.0 + p[:, 0], p[:, 1]], axis=-1)  # noqa: E731
+    values = rng.normal(size=(6, 1, 1))
+    field = SeparatedField(values * known(model.nodes), model.displacement.functions)
+    factor = values.ravel() @ model.displacement.functions.evaluate(MU)[0]
+    found = field.restrict(points.corners, points.weights).value(MU)
+    np.testing.assert_allclose(found, factor * known(positions), rtol=1e-9, atol=1e-12)
+    whole = model.stresses["solid"].value(MU)
+    stress = model.restrict(points, "stress_solid").value(MU)
+    np.testing.assert_allclose(stress, np.einsum("pc,pcx->px", points.weights, whole[points.corners]))
+    with pytest.raises(StudyError, match=r"1 of 2 points lie outside of the solid, the first at \(120, 0, 0\)"):
+        material_points(model, np.array([[0.05, 0.05, 0.05], [0.12, 0.0, 0.0]]))
+
+
+def test_interpolated_functions_are_those_of_one_parameter():
+    """A mixture of functions of one parameter needs no mixing matrix."""
+    nodes = np.linspace(0.0, 1.0, 6)
+    basis = cubic_spline_basis(nodes)
+    functions = CPFunctions((basis,), (basis.interpolate(nodes, np.column_stack([nodes, nodes**2])),), np.eye(2))
+    mixed = functions.mixed(np.array([[1.0], [2.0]]))
+    assert mixed.is_unmixed
+    np.testing.assert_allclose(mixed.evaluate([0.3])[0], [0.3 + 2.0 * 0.09])
