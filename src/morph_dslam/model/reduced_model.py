@@ -187,9 +187,7 @@ class ReducedModel:
         result |= {} if self.strain is None else {"strain": self.strain}
         return result | {f"reaction_{name}": field for name, field in self.reactions.items()}
 
-    def von_mises(
-        self, parameters: ParameterValues, place: str | None = None, outside: Outside = "bounded"
-    ) -> Array:
+    def von_mises(self, parameters: ParameterValues, place: str | None = None, outside: Outside = "bounded") -> Array:
         """Von Mises stress (n,) in pascals.
 
         On the faces of sheets, plane stress: sqrt(s11² - s11 s22 + s22² + 3 s12²); there the second

@@ -85,10 +85,7 @@ def read_inner_structure(model: ReducedModel, name: str, path: Path, unit: str) 
 
 
 def build(
-    study: Path | Study,
-    output: Path,
-    workers: int | None = None,
-    executor: Executor | None = None,
+    study: Path | Study, output: Path, workers: int | None = None, executor: Executor | None = None
 ) -> ReducedModel:
     """Solve a study and write its model file.
 
