@@ -22,16 +22,15 @@ from morph_dslam.tracking.run_live import LiveOptions, run_live
 from morph_dslam.tracking.setup import ObjectOptions, load_setup
 from morph_dslam.tracking.track import TrackOptions, track
 from morph_dslam.tracking.tracker import CameraLocalization
-from tests.support.rendered_anchored import SCAN, make_anchored_recording
+from tests.support.rendered_anchored import SCAN
 
 #: What the map made from the scan is off by, and the registration with it, metres.
 MAP_ERROR = 2.5e-3
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("anchored")
-    return folder, make_anchored_recording(folder)
+def recording(anchored_recording):
+    return anchored_recording
 
 
 def of_object(folder, **others):
