@@ -23,12 +23,13 @@ from pathlib import Path
 # As `morph live` does it; only before numpy is loaded has it an effect.
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"))
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
+
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.cli.app import run_and_report_errors
 from morph_dslam.errors import SourceError
-from morph_dslam.experiment import keep, keep_sequence
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.registration.run import run_registration
 from morph_dslam.slam.run import SlamRunOptions, run_slam
@@ -39,6 +40,7 @@ from morph_dslam.tracking.live import LivePicture, LiveSession, OneObject, Video
 from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.run_folder import RunResults
 from morph_dslam.tracking.setup import ObjectOptions, load_setup
+from support import keep, keep_sequence
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLE = ROOT / "examples" / "boot_seal"

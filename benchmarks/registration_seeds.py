@@ -23,19 +23,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import RegistrationError
-from morph_dslam.experiment import keep
 from morph_dslam.geometry import RigidTransform, cross_matrix, fit_similarity
 from morph_dslam.io.camera_files import load_camera
 from morph_dslam.registration.run import run_registration
-from morph_dslam.render.simulation import simulate
 from morph_dslam.slam.map_files import load_map
 from morph_dslam.slam.rigid_map import RigidMap
 from morph_dslam.slam.run import SlamRunOptions, run_slam
+from support import keep_sequence
 
 Array = NDArray[np.float64]
 HERE = Path(__file__).resolve().parent
@@ -110,7 +111,7 @@ def recorded(seed: int) -> Path:
     scene = folder / "scene.toml"
     if not scene.is_file() or scene.read_text() != scene_text(seed):
         scene.write_text(scene_text(seed))
-    keep(folder / "recording", [scene, MODEL], lambda: simulate(scene, folder / "recording", progress=False))
+    keep_sequence(scene, MODEL, folder / "recording", progress=False)
     (folder / "recording" / "depth.h5").unlink(missing_ok=True)
     return folder
 

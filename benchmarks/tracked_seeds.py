@@ -18,14 +18,15 @@ import csv
 import sys
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
+
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.experiment import keep
 from morph_dslam.registration.run import run_registration
-from morph_dslam.render.simulation import simulate
 from morph_dslam.tracking.track import TrackOptions, track
 from registration_seeds import MODEL, PATH, mapped, scene_text
+from support import keep_sequence
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(MODEL.parents[1]))
@@ -45,7 +46,7 @@ def recorded(seed: int) -> Path:
     scene, text = folder / "scene.toml", "\n".join([scene_text(seed, LONGER), *turned])
     if not scene.is_file() or scene.read_text() != text:
         scene.write_text(text)
-    keep(folder / "recording", [scene, MODEL], lambda: simulate(scene, folder / "recording", progress=False))
+    keep_sequence(scene, MODEL, folder / "recording", progress=False)
     (folder / "recording" / "depth.h5").unlink(missing_ok=True)
     return folder
 

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from morph_dslam.evaluation.report import KeyFigures, Link, Picture, Section, Table, Text, write_report
+from morph_dslam.extend.reports import KeyFigures, Link, Picture, Section, Table, Text, write_report
 
 Array = NDArray[np.float64]
 

@@ -11,23 +11,17 @@ import argparse
 import resource
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from morph_dslam.cli.app import run_and_report_errors
-from morph_dslam.errors import StudyError
-from morph_dslam.io.tables import read_toml
-from morph_dslam.model import ReducedModel
-from morph_dslam.reduction.report import report_path, write_build_report
-from morph_dslam.reduction.report_pictures import read_reference_curve
-from morph_dslam.render.model_view import draw_states
-from morph_dslam.studies.build import build
-from morph_dslam.studies.problem import Snapshot
-from morph_dslam.studies.snapshots import load_snapshot, snapshot_key
-from morph_dslam.studies.solid_study import SolidStudy
-from morph_dslam.studies.study import make_study
+import morph_dslam as md
+from morph_dslam.extend import run_and_report_errors
+from morph_dslam.extend.reduction import read_reference_curve, report_path
+from morph_dslam.extend.rendering import draw_states
+from morph_dslam.extend.studies import Snapshot, SolidStudy, load_snapshot, snapshot_key
 
 HERE = Path(__file__).resolve().parent
 OUTPUT = HERE / "output"
@@ -43,13 +37,13 @@ def read_study(
     divisions: list[int] | None = None, cells: str | None = None, positions: int | None = None
 ) -> SolidStudy:
     """The study, if wished with a coarser mesh, other cells, or so many positions in all."""
-    content = read_toml(HERE / "study.toml", "study file", StudyError)
+    content = tomllib.loads((HERE / "study.toml").read_text())
     content["mesh"]["divisions"] = divisions or content["mesh"]["divisions"]
     content["mesh"]["cells"] = cells or content["mesh"]["cells"]
     if positions is not None:
         held_out = HELD_OUT if positions >= 4 * HELD_OUT else content["sampling"]["held_out"]
         content["sampling"] |= {"training": positions - held_out, "held_out": held_out}
-    study = make_study(content, HERE, "study.toml")
+    study = md.make_study(content, HERE, "study.toml")
     assert isinstance(study, SolidStudy)
     return study
 
@@ -66,7 +60,7 @@ def moment_about_pivot(snapshot: Snapshot) -> float:
     return 1e3 * float((about_origin - np.cross(PIVOT, force))[1])
 
 
-def draw(model: ReducedModel, path: Path) -> None:
+def draw(model: md.ReducedModel, path: Path) -> None:
     """The seal at rest, half way and at the end."""
     angles = np.linspace(model.lower[0], model.upper[0], 3)
     captions = [f"lever at {np.degrees(angle):.0f} deg" for angle in angles]
@@ -79,10 +73,10 @@ def run(arguments: argparse.Namespace) -> None:
     arguments.output.mkdir(parents=True, exist_ok=True)
     target = arguments.output / "boot_seal.morph"
     start = time.perf_counter()
-    model = build(study, target)
+    model = md.build(study, target)
     seconds = time.perf_counter() - start
     draw(model, arguments.output / "boot_seal.png")
-    write_build_report(report_path(target), model, read_reference_curve(PAPER_ERRORS))
+    md.write_build_report(report_path(target), model, read_reference_curve(PAPER_ERRORS))
     end = last_snapshot(study, target.with_name(target.name + ".snapshots"))
     largest = 1e3 * float(np.linalg.norm(end.fields["displacement"], axis=1).max())
     errors, samples = model.certificate["displacement"], model.certificate["samples"]

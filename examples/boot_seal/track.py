@@ -17,21 +17,20 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import h5py
 import numpy as np
 from comparison import write_comparison
 from numpy.typing import NDArray
 
-from morph_dslam.cli.app import run_and_report_errors
-from morph_dslam.errors import TrackingError
-from morph_dslam.evaluation.evaluate import evaluate_depth
-from morph_dslam.evaluation.run_folder import depth_line
-from morph_dslam.experiment import keep_sequence
-from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.model import load_model
-from morph_dslam.registration.run import registration_line, run_registration
-from morph_dslam.slam.run import SlamRunOptions, run_slam
-from morph_dslam.tracking.track import TrackOptions, track
+import morph_dslam as md
+from morph_dslam.extend import run_and_report_errors
+from morph_dslam.extend.geometry import RigidTransform, rotation_exp
+from morph_dslam.extend.registration import registration_line, run_registration
+from morph_dslam.extend.reports import depth_line
+from morph_dslam.extend.slam import SlamRunOptions, run_slam
+from support import keep_sequence
 
 Array = NDArray[np.float64]
 HERE = Path(__file__).resolve().parent
@@ -57,14 +56,14 @@ def errors(run: Path, sequence: Path, model_file: Path) -> Errors:
 
     The registration's turn about the axis is arbitrary: a true node X is at R(d) X of the estimated object.
     """
-    model, turned = load_model(model_file), load_model(run / "model.morph")
+    model, turned = md.load_model(model_file), md.load_model(run / "model.morph")
     truth = np.load(sequence / "truth.npz")
     with h5py.File(run / "result.h5") as file:
         frames, poses = np.asarray(file["frame"]), np.asarray(file["camera_from_object"])
         parameters = np.asarray(file["parameters"])
     tracked = np.flatnonzero(np.isfinite(parameters).all(axis=1))
     if not len(tracked):
-        raise TrackingError("no frame was tracked, so there is nothing to compare")
+        raise md.MorphError("no frame was tracked, so there is nothing to compare")
     lever, side, nodes = [], [], []
     first = truth["camera_from_object"][frames[tracked[0]]]
     between = poses[tracked[0]][:3, :3].T @ first[:3, :3]
@@ -83,10 +82,10 @@ def errors(run: Path, sequence: Path, model_file: Path) -> Errors:
 
 
 def deformed_frames(found: Errors, sequence: Path) -> NDArray[np.bool_]:
-    """Which of the tracked frames (f,) show the seal deformed; raises TrackingError if none does."""
+    """Which of the tracked frames (f,) show the seal deformed; raises MorphError if none does."""
     deformed = np.load(sequence / "truth.npz")["parameters"][found.frames, 0] > BEGUN
     if not deformed.any():
-        raise TrackingError("no tracked frame shows the seal deformed: let the scene turn the lever")
+        raise md.MorphError("no tracked frame shows the seal deformed: let the scene turn the lever")
     return deformed
 
 
@@ -110,7 +109,7 @@ def run(arguments: argparse.Namespace) -> None:
     output = arguments.output if scene.stem == "scene" else arguments.output / scene.stem
     sequence = output / "recording"
     if not model.is_file():
-        raise TrackingError(f"there is no model {model}: build it with `python {HERE.name}/run.py` first")
+        raise md.MorphError(f"there is no model {model}: build it with `python {HERE.name}/run.py` first")
     keep_sequence(scene, model, sequence)
     camera, frames = sequence / "camera.yaml", sequence / "frames"
     run_slam(
@@ -120,8 +119,8 @@ def run(arguments: argparse.Namespace) -> None:
     )
     registration = run_registration(output / "scan" / "map.h5", model, camera, output / "registration")
     print(registration_line(registration))
-    summary = track(
-        TrackOptions(
+    summary = md.track(
+        md.TrackOptions(
             frames=frames,
             model=model,
             camera=camera,
@@ -142,7 +141,7 @@ def run(arguments: argparse.Namespace) -> None:
     (output / "run" / "errors.json").write_text(json.dumps(per_frame, indent=1) + "\n")
     # Of a scene without a depth sensor the exact depths are there.
     depths = sequence if (sequence / "depth.txt").is_file() else sequence / "depth.h5"
-    depth = evaluate_depth(output / "run", depths, base_frame=int(found.frames[0]))
+    depth = md.evaluate_depth(output / "run", depths, base_frame=int(found.frames[0]))
     deformed = deformed_frames(found, sequence)
     angles = (np.degrees(angle[deformed]) for angle in (found.lever, found.side))
     page = write_comparison(output / "run", found.frames[deformed], 1e3 * found.nodes[deformed], *angles, depth)

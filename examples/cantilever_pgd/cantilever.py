@@ -10,8 +10,8 @@ import scipy.sparse as sp
 from ngsolve.meshes import MakeStructured2DMesh
 from numpy.typing import NDArray
 
-from morph_dslam.model.basis_functions import cubic_spline_basis
-from morph_dslam.reduction.separable_problem import SeparableProblem, collocation_axis, galerkin_axis
+from morph_dslam.extend.models import cubic_spline_basis
+from morph_dslam.extend.reduction import SeparableProblem, collocation_axis, galerkin_axis
 
 Array = NDArray[np.float64]
 

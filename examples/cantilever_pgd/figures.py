@@ -8,7 +8,7 @@ import numpy as np
 from cantilever import HEIGHT, LENGTH, Cantilever
 from matplotlib.figure import Figure
 
-from morph_dslam.reduction.pgd import PgdSolution
+from morph_dslam.extend.reduction import PgdSolution
 
 N_SHOWN = 5
 SLICE = 0.6  # position of the load that is cut out of the response surface, in lengths

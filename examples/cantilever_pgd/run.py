@@ -20,10 +20,8 @@ from cantilever import STIFFNESS_RATIO, Cantilever, build_cantilever, moving_loa
 from figures import draw_errors, draw_modes
 from numpy.typing import NDArray
 
-from morph_dslam.cli.app import run_and_report_errors
-from morph_dslam.reduction.pgd import PgdOptions, PgdSolution, solve_pgd
-from morph_dslam.reduction.separable_problem import factorise
-from morph_dslam.reduction.tensor_formats import khatri_rao
+from morph_dslam.extend import run_and_report_errors
+from morph_dslam.extend.reduction import PgdOptions, PgdSolution, factorise, khatri_rao, solve_pgd
 
 Array = NDArray[np.float64]
 

@@ -6,16 +6,17 @@ that is.
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 
 import cv2
 
-from morph_dslam.cli.app import main as morph
-from morph_dslam.model import load_model
-from morph_dslam.render.scene_file import load_scene_file
-from morph_dslam.render.scene_renderer import print_texture
-from morph_dslam.render.texture import sheet_bounds
+import morph_dslam as md
+from morph_dslam.extend import run_and_report_errors
+from morph_dslam.extend.registration import InitializerFiles
+from morph_dslam.extend.rendering import load_scene_file, print_texture, sheet_bounds
+from morph_dslam.extend.reports import result_line
 
 HERE = Path(__file__).resolve().parent
 DEMO = HERE.parents[1] / "demo"
@@ -26,7 +27,7 @@ PIXELS_PER_METRE = 4000.0
 def write_picture() -> None:
     """The print as it lies on the sheet, and where."""
     scene = load_scene_file(HERE / "scene.toml")
-    low, high = sheet_bounds(load_model(DEMO / "sheet.morph"))
+    low, high = sheet_bounds(md.load_model(DEMO / "sheet.morph"))
     texture = print_texture(scene.surface, HERE, high - low, PIXELS_PER_METRE)
     cv2.imwrite(str(FOLDER / "print.png"), texture)
     left, right, bottom, top = 1e3 * low[0], 1e3 * high[0], 1e3 * low[1], 1e3 * high[1]
@@ -44,20 +45,31 @@ def write_guess() -> None:
     )
 
 
-def main() -> int:
+def run(_: argparse.Namespace) -> None:
     FOLDER.mkdir(parents=True, exist_ok=True)
     write_picture()
     write_guess()
     sequence = DEMO / "sequence"
     for aid in ("picture", "guess"):
-        run = FOLDER / aid
-        files = ["--model", str(DEMO / "sheet.morph"), "--camera", str(sequence / "camera.yaml")]
-        place = [f"--{aid}", str(FOLDER / f"{aid}.toml"), "--range", "0-29", "--no-video", "--overwrite"]
-        status = morph(["track", str(sequence / "frames"), *files, *place, "-o", str(run)])
-        if status:
-            return status
-        morph(["evaluate", str(run), "--points", str(sequence / "truth.npz"), "--bind-frame", "0"])
-    return 0
+        folder = FOLDER / aid
+        md.track(
+            md.TrackOptions(
+                frames=sequence / "frames",
+                model=DEMO / "sheet.morph",
+                camera=sequence / "camera.yaml",
+                aids=InitializerFiles(**{aid: FOLDER / f"{aid}.toml"}),
+                output=folder,
+                last=29,
+                overlay=False,
+                overwrite=True,
+            )
+        )
+        print(result_line(md.evaluate(folder, sequence / "truth.npz", bind_frame=0)))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    return run_and_report_errors(run, parser.parse_args(), "the runs so far are kept")
 
 
 if __name__ == "__main__":

@@ -9,8 +9,10 @@ import argparse
 import sys
 from pathlib import Path
 
-from morph_dslam.cli.app import run_and_report_errors
-from morph_dslam.experiment import Recording, keep_model, keep_sequence, report, track_and_evaluate
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from morph_dslam.extend import run_and_report_errors
+from support import Recording, keep_model, keep_sequence, report, track_and_evaluate
 
 HERE = Path(__file__).resolve().parent
 OUTPUT = HERE.parents[1] / "demo"

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 from recording import CLAMP_X, HangingBar
 
-from morph_dslam.experiment import keep
-from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning
-from morph_dslam.model import ReducedModel, load_model
-from morph_dslam.studies.build import build
-from morph_dslam.studies.study import Study, make_study
+import morph_dslam as md
+from morph_dslam.extend.mechanics import NearlyIncompressibleWarning
+from morph_dslam.extend.studies import Study
+from support import keep
 
 HERE = Path(__file__).resolve().parent
 #: Of the shear modulus over the published one: from 160 kPa to 20 kPa.
@@ -48,7 +50,7 @@ def write_mesh(path: Path, bar: HangingBar) -> None:
 
 def bar_study(mesh: Path, discretisation: Discretisation) -> Study:
     """The bar under its weight."""
-    return make_study(
+    return md.make_study(
         {
             "name": f"silicone bar, {discretisation.name}",
             "mesh": {"file": mesh.name, "unit": "mm"},
@@ -74,7 +76,7 @@ def bar_study(mesh: Path, discretisation: Discretisation) -> Study:
     )
 
 
-def bar_model(output: Path, bar: HangingBar, discretisation: Discretisation) -> ReducedModel:
+def bar_model(output: Path, bar: HangingBar, discretisation: Discretisation) -> md.ReducedModel:
     """Build the model, unless that was done from the same mesh and code."""
     stem = discretisation.name.replace(", ", "_").replace(" ", "_")
     mesh, model = output / f"{stem}.inp", output / f"{stem}.morph"
@@ -84,7 +86,7 @@ def bar_model(output: Path, bar: HangingBar, discretisation: Discretisation) -> 
         with warnings.catch_warnings():
             # That linear tetrahedra lock is what this example is about.
             warnings.simplefilter("ignore", NearlyIncompressibleWarning)
-            build(bar_study(mesh, discretisation), model)
+            md.build(bar_study(mesh, discretisation), model)
 
     keep(model, [mesh, HERE / "silicone.py", HERE / "bar_models.py"], make)
-    return load_model(model)
+    return md.load_model(model)

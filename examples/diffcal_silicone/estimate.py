@@ -28,12 +28,10 @@ from recording import load_bar
 from run import OUTPUT, default_data
 from silicone import PUBLISHED_SHEAR
 
-from morph_dslam.cli.app import run_and_report_errors
-from morph_dslam.evaluation.depth import distances_to_surface
-from morph_dslam.evaluation.report import Picture as Image
-from morph_dslam.evaluation.report import Section, Table, Text, write_report
-from morph_dslam.model import ReducedModel
-from morph_dslam.render.overlay import draw_overlay
+import morph_dslam as md
+from morph_dslam.extend import reports, run_and_report_errors
+from morph_dslam.extend.rendering import draw_overlay
+from morph_dslam.extend.reports import Section, Table, Text, distances_to_surface, write_report
 
 Array = NDArray[np.float64]
 
@@ -50,7 +48,7 @@ class Case:
 
     discretisation: Discretisation
     picture: Picture
-    model: ReducedModel
+    model: md.ReducedModel
     fit: Fit
     free: bool
     distance: Array | None
@@ -126,7 +124,11 @@ def write_page(cases: list[Case], picture: Path) -> list[tuple[str, ...]]:
         "The interval holds the errors of the outline, alike over stretches of it, and of the marker's pose. "
         "It does not hold those of the discretisation or of the clamp, which the rows show.",
     ]
-    blocks = [Table(rows, HEADER), *map(Text, notes), Image.read(picture, "Estimated bars over their pictures.")]
+    blocks = [
+        Table(rows, HEADER),
+        *map(Text, notes),
+        reports.Picture.read(picture, "Estimated bars over their pictures."),
+    ]
     page = OUTPUT / "estimate.html"
     write_report(page, "Stiffness of a hanging silicone bar from pictures", [Section("Shear modulus", blocks)])
     print(f"page {page}")

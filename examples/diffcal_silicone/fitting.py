@@ -11,10 +11,19 @@ from recording import CLAMP_X
 from silhouette import FINER, Matches, match
 from silicone import PUBLISHED_SHEAR
 
-from morph_dslam.model import ReducedModel
-from morph_dslam.tracking.binding import bind_pixels, draw_view, view_of
-from morph_dslam.tracking.depth import DepthOptions, PointDepths
-from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, Prior, State
+import morph_dslam as md
+from morph_dslam.extend.tracking import (
+    BoundPoints,
+    DepthOptions,
+    EstimationOptions,
+    Estimator,
+    PointDepths,
+    Prior,
+    State,
+    bind_pixels,
+    draw_view,
+    view_of,
+)
 
 Array = NDArray[np.float64]
 
@@ -65,7 +74,7 @@ class Fit:
         return PUBLISHED_SHEAR / (softness + off), PUBLISHED_SHEAR / max(softness - off, 1e-9)
 
 
-def fit(model: ReducedModel, picture: Picture, turn_std: float = MARKER_STD) -> Fit:
+def fit(model: md.ReducedModel, picture: Picture, turn_std: float = MARKER_STD) -> Fit:
     """Estimate softness and pose, from several starts; the one that leaves the least of the outline.
 
     Parameters
@@ -76,7 +85,7 @@ def fit(model: ReducedModel, picture: Picture, turn_std: float = MARKER_STD) -> 
     return min(fits, key=lambda fit: fit.outline_rms)
 
 
-def _fit_from(model: ReducedModel, picture: Picture, turn_std: float, softness: float) -> Fit:
+def _fit_from(model: md.ReducedModel, picture: Picture, turn_std: float, softness: float) -> Fit:
     estimator = Estimator(model, picture.camera, EstimationOptions(max_iterations=60))
     state = State(np.array([softness]), picture.camera_from_object)
     free = model.nodes[:, 0] < CLAMP_X - RIM
@@ -120,7 +129,7 @@ def _pose_prior(picture: Picture, turn_std: float, variance: float) -> Prior:
 
 
 def _with_depths(
-    model: ReducedModel, picture: Picture, state: State, matches: Matches, variance: float
+    model: md.ReducedModel, picture: Picture, state: State, matches: Matches, variance: float
 ) -> tuple[BoundPoints, Array, PointDepths | None]:
     """The outline's points and, where there is a depth image, points inside of it with their depths."""
     if picture.depth is None:

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from recording import MESH_UNIT, HangingBar
 from silhouette import outline_of
 
-from morph_dslam.camera import Camera
-from morph_dslam.errors import EvaluationError
-from morph_dslam.geometry import RigidTransform
+import morph_dslam as md
+from morph_dslam.extend.geometry import RigidTransform
 
 Array = NDArray[np.float64]
 
@@ -39,7 +38,7 @@ class Picture:
 
     name: str
     image: NDArray[np.uint8]
-    camera: Camera
+    camera: md.Camera
     camera_from_object: RigidTransform
     place_std: float
     outline: Array
@@ -50,7 +49,7 @@ def depth_picture(bar: HangingBar) -> Picture:
     """The depth image: the bar's outline, where depths jump, and its depths."""
     height, width = bar.depth.shape
     matrix = bar.intrinsics
-    camera = Camera(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+    camera = md.Camera(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
     pose = _rigid(bar.camera_from_object)
     seen = pose.apply(bar.points)
     low, high = np.percentile(seen[:, 2], (1, 99))
@@ -67,17 +66,17 @@ def colour_picture(data: Path, bar: HangingBar, recording: str = "h_m_c") -> Pic
 
     Raises
     ------
-    EvaluationError
+    MorphError
         If there are no views.
     """
     folder = data / recording
     read = [cv2.imread(str(path)) for path in sorted((folder / "rgb").glob("*.jpg"))]
     images = [image for image in read if image is not None]
     if not images:
-        raise EvaluationError(f"{folder / 'rgb'} does not hold the recording's colour views NN.jpg")
+        raise md.MorphError(f"{folder / 'rgb'} does not hold the recording's colour views NN.jpg")
     mean = np.mean(np.array(images, dtype=np.float32), axis=0)
     height, width = mean.shape[:2]
-    camera = Camera(width, height, COLOUR_FOCAL, COLOUR_FOCAL, *COLOUR_CENTRE)
+    camera = md.Camera(width, height, COLOUR_FOCAL, COLOUR_FOCAL, *COLOUR_CENTRE)
     with np.load(folder / "views.npz") as views:
         world_from_object = views["object_transform"].copy()
         world_from_object[:3, 3] *= MESH_UNIT

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.errors import EvaluationError
+import morph_dslam as md
 
 Array = NDArray[np.float64]
 
@@ -50,14 +50,14 @@ def load_bar(data: Path, recording: str = "h_m_c", mesh: str = "cantilever/canti
 
     Raises
     ------
-    EvaluationError
+    MorphError
         If a file is missing or not what it should be.
     """
     folder = data / recording
     mesh_path = data / "CAD_models" / f"{mesh}.tet"
     depth_paths = sorted(folder.glob("depth_view*.png"))
     if not (folder / "views.npz").is_file() or not mesh_path.is_file() or not depth_paths:
-        raise EvaluationError(
+        raise md.MorphError(
             f"{data} does not hold the recording {recording}: {folder / 'views.npz'}, "
             f"{folder / 'depth_viewNN.png'} and {mesh_path} are needed"
         )
@@ -70,7 +70,7 @@ def load_bar(data: Path, recording: str = "h_m_c", mesh: str = "cantilever/canti
         intrinsics = views["K_depth"]
     image = cv2.imread(str(depth_paths[0]), cv2.IMREAD_UNCHANGED)
     if image is None:
-        raise EvaluationError(f"{depth_paths[0]} is not an image")
+        raise md.MorphError(f"{depth_paths[0]} is not an image")
     depth = image.astype(float) * DEPTH_UNIT
     points = _points_on_bar(depth, intrinsics, camera_from_object, nodes)
     return HangingBar(nodes, tetrahedra, camera_from_object, intrinsics, depth, points)
@@ -84,7 +84,7 @@ def _read_tet(path: Path) -> tuple[Array, NDArray[np.int64]]:
         tetrahedra = np.array([row[1:5] for row in rows if row[0] == "t"], dtype=np.int64)
         edges = nodes[tetrahedra[:, 1:]] - nodes[tetrahedra[:, :1]]
     except (ValueError, IndexError) as error:
-        raise EvaluationError(f"{path} is not a list of vertices and tetrahedra: {error}") from error
+        raise md.MorphError(f"{path} is not a list of vertices and tetrahedra: {error}") from error
     inverted = np.linalg.det(edges) < 0.0
     tetrahedra[inverted] = tetrahedra[inverted][:, [0, 2, 1, 3]]
     return nodes, tetrahedra

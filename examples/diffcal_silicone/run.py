@@ -25,17 +25,21 @@ from numpy.typing import NDArray
 from recording import CLAMP_X, HangingBar, load_bar
 from scipy.optimize import minimize_scalar
 
-from morph_dslam.cli.app import run_and_report_errors
-from morph_dslam.evaluation.depth import distances_to_surface
-from morph_dslam.mechanics.loads import Gravity
-from morph_dslam.mechanics.materials.isotropic import NeoHookean
-from morph_dslam.mechanics.parameters import ParameterSymbols
-from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
-from morph_dslam.mechanics.solvers.newton import State, advance
-from morph_dslam.mechanics.supports import fixed
-from morph_dslam.meshing.meshes import CellBlock, Mesh
-from morph_dslam.model import Parameter
-from morph_dslam.render.overlay import draw_overlay
+import morph_dslam as md
+from morph_dslam.extend import run_and_report_errors
+from morph_dslam.extend.mechanics import (
+    CellBlock,
+    Gravity,
+    Mesh,
+    NeoHookean,
+    ParameterSymbols,
+    SolidOptions,
+    State,
+    advance,
+    fixed,
+)
+from morph_dslam.extend.rendering import draw_overlay
+from morph_dslam.extend.reports import distances_to_surface
 
 Array = NDArray[np.float64]
 HERE = Path(__file__).resolve().parent
@@ -51,10 +55,10 @@ SHOWN = (slice(60, 640), slice(220, 820))
 FACE_BAND = 0.012
 
 
-def hanging_problem(bar: HangingBar, options: SolidOptions) -> SolidProblem:
+def hanging_problem(bar: HangingBar, options: SolidOptions) -> md.SolidProblem:
     """The bar with gravity (0 to 1) and shear modulus (Pa) as parameters."""
     symbols = ParameterSymbols(
-        (Parameter("gravity", "ratio", "1", 0.0, 1.0, 0.0), Parameter("shear", "stress", "kPa", *SEARCHED, 100e3))
+        (md.Parameter("gravity", "ratio", "1", 0.0, 1.0, 0.0), md.Parameter("shear", "stress", "kPa", *SEARCHED, 100e3))
     )
     shear = symbols["shear"]
     poisson = LAME / (2.0 * (LAME + shear))
@@ -62,7 +66,7 @@ def hanging_problem(bar: HangingBar, options: SolidOptions) -> SolidProblem:
     clamp = np.flatnonzero(bar.nodes[:, 0] > CLAMP_X - 1e-6)
     mesh = Mesh(bar.nodes, (CellBlock("tet4", bar.tetrahedra),), node_sets={"clamp": clamp})
     weight = Gravity((0.0, -GRAVITY * symbols["gravity"], 0.0))
-    return SolidProblem(mesh, {"all": silicone}, [fixed("clamp")], [weight], symbols, options)
+    return md.SolidProblem(mesh, {"all": silicone}, [fixed("clamp")], [weight], symbols, options)
 
 
 @dataclass(frozen=True)

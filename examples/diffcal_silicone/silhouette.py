@@ -14,11 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from morph_dslam.camera import Camera
-from morph_dslam.errors import EvaluationError
-from morph_dslam.model import ReducedModel, SurfacePoints
-from morph_dslam.tracking.binding import draw_view, facing, view_of
-from morph_dslam.tracking.state import BoundPoints, State
+import morph_dslam as md
+from morph_dslam.extend.models import SurfacePoints
+from morph_dslam.extend.tracking import BoundPoints, State, draw_view, facing, view_of
 
 Array = NDArray[np.float64]
 
@@ -37,13 +35,13 @@ def outline_of(level: NDArray[np.float32], inside: Array) -> Array:
 
     Raises
     ------
-    EvaluationError
+    MorphError
         If those pixels are not brighter than the image as a whole.
     """
     columns, rows = np.rint(inside).astype(int).T
     bright, dark = float(np.median(level[rows, columns])), float(np.median(level))
     if bright < dark + 0.1 * float(level.max() - dark):
-        raise EvaluationError("the bar cannot be told from its surroundings in this image")
+        raise md.MorphError("the bar cannot be told from its surroundings in this image")
     fine = cv2.resize(level, None, fx=FINER, fy=FINER, interpolation=cv2.INTER_LINEAR)
     mask = (fine > 0.5 * (bright + dark)).astype(np.uint8)
     _, labels = cv2.connectedComponents(mask)
@@ -75,7 +73,7 @@ class Matches:
 
 
 def silhouette_points(
-    model: ReducedModel, camera: Camera, state: State, free: NDArray[np.bool_]
+    model: md.ReducedModel, camera: md.Camera, state: State, free: NDArray[np.bool_]
 ) -> tuple[BoundPoints, Array]:
     """Points of the model on its silhouette, and the image normals (p, 2) of their edges, outwards.
 
@@ -119,7 +117,7 @@ def _edges(triangles: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.
 
 
 def match(
-    model: ReducedModel, camera: Camera, state: State, free: NDArray[np.bool_], outline: Array, reach_px: float
+    model: md.ReducedModel, camera: md.Camera, state: State, free: NDArray[np.bool_], outline: Array, reach_px: float
 ) -> Matches:
     """Silhouette points of a state and the nearest of the outline's points (k, 2), within a reach."""
     points, normals = silhouette_points(model, camera, state, free)

@@ -13,9 +13,10 @@ import os
 import sys
 from pathlib import Path
 
-from morph_dslam.cli.app import run_and_report_errors
-from morph_dslam.cli.arguments import frame_range
-from morph_dslam.experiment import Recording, check_recording, keep_model, report, track_and_evaluate
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from morph_dslam.extend import frame_range, run_and_report_errors
+from support import Recording, check_recording, keep_model, report, track_and_evaluate
 
 HERE = Path(__file__).resolve().parent
 OUTPUT = HERE / "output"

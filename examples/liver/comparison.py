@@ -10,10 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from morph_dslam.errors import TrackingError
-from morph_dslam.geometry import RigidTransform
-from morph_dslam.model import Parameter, ReducedModel
-from morph_dslam.model.inner_structure import CarriedStructure
+import morph_dslam as md
+from morph_dslam.extend.geometry import RigidTransform
+from morph_dslam.extend.models import CarriedStructure
 
 Array = NDArray[np.float64]
 #: Colours of the plots: estimated, true, compared with.
@@ -54,12 +53,12 @@ def _distance(first: Array, second: Array) -> float:
     return float(np.linalg.norm(first - second, axis=1).mean())
 
 
-def compare(run: Path, sequence: Path, model: ReducedModel, tumour: CarriedStructure) -> Comparison:
+def compare(run: Path, sequence: Path, model: md.ReducedModel, tumour: CarriedStructure) -> Comparison:
     """Compare all tracked frames of a run.
 
     Raises
     ------
-    TrackingError
+    MorphError
         If no frame that shows the organ deformed was tracked.
     """
     truth = np.load(sequence / "truth.npz")
@@ -72,7 +71,7 @@ def compare(run: Path, sequence: Path, model: ReducedModel, tumour: CarriedStruc
     mus, errors = truth["parameters"][frames[tracked]], []
     deformed = (np.abs(mus - model.default) > 0.1 * (model.upper - model.lower)).any(axis=1)
     if not deformed.any():
-        raise TrackingError("no tracked frame shows the organ deformed, so there is nothing to compare")
+        raise md.MorphError("no tracked frame shows the organ deformed, so there is nothing to compare")
     for row, mu in zip(tracked, mus, strict=True):
         pose = RigidTransform.from_matrix(poses[row])
         true_pose = RigidTransform.from_matrix(truth["camera_from_object"][frames[row]])
@@ -109,7 +108,7 @@ def result_line(found: Comparison, summary: dict) -> str:
     )
 
 
-def plot(path: Path, found: Comparison, parameters: tuple[Parameter, ...]) -> None:
+def plot(path: Path, found: Comparison, parameters: tuple[md.Parameter, ...]) -> None:
     """The tumour's error, then each parameter as estimated and in truth, with two standard deviations."""
     figure = Figure(figsize=(9.0, 3.0 + 1.7 * len(parameters)), layout="constrained")
     top, *others = figure.subplots(1 + len(parameters), 1, sharex=True, height_ratios=[1.6, *(1.0 for _ in parameters)])

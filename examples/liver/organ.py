@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from organ_mesh import Patch
 from scipy.spatial import ConvexHull
 
-from morph_dslam.errors import StudyError
-from morph_dslam.meshing.mesh_files import load_mesh
-from morph_dslam.meshing.meshes import Mesh
+import morph_dslam as md
+from morph_dslam.extend.mechanics import Mesh, load_mesh
 
 Array = NDArray[np.float64]
 
@@ -35,11 +34,11 @@ def fine_liver(path: Path) -> Mesh:
 
     Raises
     ------
-    StudyError
+    MorphError
         If the file is not there or cannot be read.
     """
     if not path.is_file():
-        raise StudyError(
+        raise md.MorphError(
             f"there is no mesh {path}: it is not part of the project; name the folder that holds "
             "sofa_mor/liverFine.vtu with --data, or the folder above it with MORPH_DATA"
         )

@@ -17,9 +17,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.sparse import coo_matrix
 from skimage.measure import marching_cubes
 
-from morph_dslam.meshing.mesh_checks import check_mesh
-from morph_dslam.meshing.mesh_files import load_mesh, to_second_order
-from morph_dslam.meshing.meshes import Mesh
+from morph_dslam.extend.mechanics import Mesh, check_mesh, load_mesh, to_second_order
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -111,7 +109,7 @@ def organ_mesh(fine: Mesh, size: float, patches: Mapping[str, Patch]) -> Mesh:
 
     Raises
     ------
-    StudyError
+    MorphError
         If the organ cannot be meshed at this size, or a patch has no face.
     """
     with tempfile.TemporaryDirectory() as folder:

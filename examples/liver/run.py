@@ -16,22 +16,21 @@ import os
 import sys
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import numpy as np
 from comparison import Comparison, compare, plot, result_line
 from organ import PATCHES, SIZE, TUMOUR_AXES, TUMOUR_CENTRE, ellipsoid, fine_liver
 from organ_mesh import organ_mesh, write_inp
 
-from morph_dslam.cli.app import run_and_report_errors
-from morph_dslam.evaluation.depth import distances_to_surface
-from morph_dslam.experiment import keep, keep_sequence
-from morph_dslam.model import MaterialPoints, ReducedModel, load_model
-from morph_dslam.model.inner_structure import CarriedStructure, save_inner_structure
-from morph_dslam.registration.run import registration_line, run_registration
-from morph_dslam.slam.run import SlamRunOptions, run_slam
-from morph_dslam.studies.build import build, place_inner_structure
-from morph_dslam.studies.snapshots import load_snapshot, snapshot_key
-from morph_dslam.studies.study import load_study
-from morph_dslam.tracking.track import TrackOptions, track
+import morph_dslam as md
+from morph_dslam.extend import run_and_report_errors
+from morph_dslam.extend.models import CarriedStructure, MaterialPoints, save_inner_structure
+from morph_dslam.extend.registration import registration_line, run_registration
+from morph_dslam.extend.reports import distances_to_surface
+from morph_dslam.extend.slam import SlamRunOptions, run_slam
+from morph_dslam.extend.studies import load_snapshot, place_inner_structure, snapshot_key
+from support import keep, keep_sequence
 
 HERE = Path(__file__).resolve().parent
 OUTPUT = HERE / "output"
@@ -41,17 +40,17 @@ SEQUENCE = OUTPUT / "recording"
 FROZEN_AT = 130
 
 
-def make_model(data: Path) -> ReducedModel:
+def make_model(data: Path) -> md.ReducedModel:
     """Mesh the liver and build its model, unless that was done."""
     file = data / "sofa_mor" / "liverFine.vtu"
     fine, study = fine_liver(file), HERE / "study.toml"
     code = [HERE / "organ.py", HERE / "organ_mesh.py"]
     keep(MESH, [file, *code], lambda: write_inp(MESH, organ_mesh(fine, SIZE, PATCHES)))
-    keep(MODEL, [study, MESH], lambda: build(load_study(study), MODEL))
-    return load_model(MODEL)
+    keep(MODEL, [study, MESH], lambda: md.build(study, MODEL))
+    return md.load_model(MODEL)
 
 
-def make_tumour(model: ReducedModel) -> CarriedStructure:
+def make_tumour(model: md.ReducedModel) -> CarriedStructure:
     """Place the tumour in the model and write its file; says how deep it lies."""
     nodes, triangles = ellipsoid(np.array(TUMOUR_CENTRE), np.array(TUMOUR_AXES))
     tumour = place_inner_structure(model, "tumour", nodes, triangles)
@@ -65,9 +64,9 @@ def make_tumour(model: ReducedModel) -> CarriedStructure:
     return carried
 
 
-def largest_model_error(model: ReducedModel, tumour: CarriedStructure, points: MaterialPoints) -> float:
+def largest_model_error(model: md.ReducedModel, tumour: CarriedStructure, points: MaterialPoints) -> float:
     """How far the model's tumour is from the solver's, metres: any node, any unseen solution."""
-    study, folder = load_study(HERE / "study.toml"), MODEL.with_name(MODEL.name + ".snapshots")
+    study, folder = md.load_study(HERE / "study.toml"), MODEL.with_name(MODEL.name + ".snapshots")
     largest = 0.0
     for mu in np.array(model.certificate["held_out"]["coordinates"]):
         nodes = load_snapshot(folder / f"{snapshot_key(study, mu)}.npz").fields["displacement"]
@@ -78,8 +77,8 @@ def largest_model_error(model: ReducedModel, tumour: CarriedStructure, points: M
 
 def track_from_landmarks(folder: Path) -> dict:
     """Track the whole recording from points of frame 0 that are known exactly."""
-    return track(
-        TrackOptions(
+    return md.track(
+        md.TrackOptions(
             frames=SEQUENCE / "frames",
             model=MODEL,
             camera=SEQUENCE / "camera.yaml",
@@ -98,8 +97,8 @@ def track_from_map(folder: Path) -> dict:
     scan, place = OUTPUT / "scan", OUTPUT / "registration"
     run_slam(SlamRunOptions(source=frames, camera=camera, output=scan, first=0, last=FROZEN_AT, overwrite=True))
     print(registration_line(run_registration(scan / "map.h5", MODEL, camera, place)))
-    return track(
-        TrackOptions(
+    return md.track(
+        md.TrackOptions(
             frames=frames,
             model=MODEL,
             camera=camera,

@@ -19,14 +19,20 @@ import ngsolve as ngs
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.errors import SolverError
-from morph_dslam.mechanics.sheet_equations import SheetEquations
-from morph_dslam.mechanics.shell import KoiterSheet, OrthotropicSheet, rectangle_mesh
-from morph_dslam.mechanics.solvers.arc_length import ArcLength, ArcOptions, PathPoint, buckling_modes
-from morph_dslam.mechanics.solvers.newton import State, sensitivities
-from morph_dslam.studies.problem import Snapshot
-from morph_dslam.studies.sheet_study import output_points
-from morph_dslam.studies.snapshots import SOLVER_VERSION, save_snapshot
+import morph_dslam as md
+from morph_dslam.extend.mechanics import State, sensitivities
+from morph_dslam.extend.sheets import (
+    ArcLength,
+    ArcOptions,
+    KoiterSheet,
+    OrthotropicSheet,
+    PathPoint,
+    SheetEquations,
+    buckling_modes,
+    output_points,
+    rectangle_mesh,
+)
+from morph_dslam.extend.studies import SOLVER_VERSION, Snapshot, save_snapshot
 
 Array = NDArray[np.float64]
 
@@ -197,7 +203,7 @@ def follow_path(sheet: BuckledSheet, folder: BucklingFolder, height: float) -> I
             force = arc.equations.end_force(state.dofs, state.mu)  # type: ignore[attr-defined]
             record = PathRecord(point, sheet.height(state.dofs), force)
             if record.height < highest:
-                raise SolverError(
+                raise md.MorphError(
                     f"the sheet's middle rises to {1e3 * highest:.2f} mm and falls again where its ends have "
                     f"approached by {1e3 * state.mu[0]:.0f} mm: ask for less than {1e3 * height:.2f} mm"
                 )

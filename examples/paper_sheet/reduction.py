@@ -20,21 +20,23 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from morph_dslam.meshing.generators import sheet as sheet_mesh
-from morph_dslam.meshing.meshes import model_mesh_of
-from morph_dslam.model import Parameter, ReducedModel, save_model
-from morph_dslam.model.basis_functions import cubic_spline_basis
-from morph_dslam.model.reduced_model import von_mises
-from morph_dslam.model.tensor_functions import CPFunctions
-from morph_dslam.reduction.certificate import certify, compression_percent
-from morph_dslam.reduction.method import METHODS, ReductionTask
-from morph_dslam.reduction.tensor_formats import cp, cp_functions
-from morph_dslam.studies.problem import ModelMesh, Snapshot
-from morph_dslam.studies.sections import ReductionSection
+import morph_dslam as md
+from morph_dslam.extend import mechanics
+from morph_dslam.extend.models import CPFunctions, cubic_spline_basis, von_mises
+from morph_dslam.extend.reduction import (
+    METHODS,
+    ReductionSection,
+    ReductionTask,
+    certify,
+    compression_percent,
+    cp,
+    cp_functions,
+)
+from morph_dslam.extend.studies import ModelMesh, Snapshot
 
 Array = NDArray[np.float64]
 
-PATH = Parameter("path", "ratio", "1", 0.0, 1.0, 0.0, "part of the path from the flat sheet to its full height")
+PATH = md.Parameter("path", "ratio", "1", 0.0, 1.0, 0.0, "part of the path from the flat sheet to its full height")
 OPTIONS = ReductionSection(method="pod", basis="cubic_spline", tolerance=5e-5)
 #: The model file is made from about so many positions: as many splines interpolate between them.
 NODES = 41
@@ -60,10 +62,10 @@ class Grid:
     def mesh(self) -> ModelMesh:
         """Nodes, triangles and weights as the model file holds them."""
         nx, ny = self.cells
-        made = sheet_mesh(self.size, self.cells)  # its nodes are counted with y fastest
+        made = mechanics.sheet(self.size, self.cells)  # its nodes are counted with y fastest
         order = np.arange(made.n_nodes).reshape(nx + 1, ny + 1).T.ravel()
         middle = np.array([*self.size, 0.0]) / 2.0
-        return model_mesh_of(made.renumbered(np.argsort(order), made.nodes[order] - middle))
+        return mechanics.model_mesh_of(made.renumbered(np.argsort(order), made.nodes[order] - middle))
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ class Reduced:
     compression : of the separated displacement, %.
     """
 
-    model: ReducedModel
+    model: md.ReducedModel
     separated: dict[str, CPFunctions]
     errors: dict[str, float]
     compression: float
@@ -148,7 +150,7 @@ def write_reduction(snapshots: Sequence[Snapshot], grid: Grid, output: Path) -> 
     every = max(2, round((len(snapshots) - 1) / (NODES - 1)))
     reduced = reduce_positions(snapshots, every, grid)
     print(_table_row(reduced))
-    save_model(output / "paper_sheet.morph", reduced.model)
+    md.save_model(output / "paper_sheet.morph", reduced.model)
     unseen = [snapshot for i, snapshot in enumerate(snapshots) if i % every]
     draw_reduction(output / "reduction.png", reduced, unseen, grid)
     certificate, figures = reduced.model.certificate, reduced.errors

@@ -32,12 +32,10 @@ from positions import (
 from reduction import Grid, write_reduction
 from tqdm import tqdm
 
-from morph_dslam.cli.app import run_and_report_errors
-from morph_dslam.errors import SolverError
-from morph_dslam.mechanics.shell import OrthotropicSheet
-from morph_dslam.mechanics.solvers.arc_length import PathPoint, missed_bifurcations
-from morph_dslam.studies.snapshots import load_snapshot
-from morph_dslam.studies.sweep import default_executor
+import morph_dslam as md
+from morph_dslam.extend import run_and_report_errors
+from morph_dslam.extend.sheets import OrthotropicSheet, PathPoint, missed_bifurcations
+from morph_dslam.extend.studies import default_executor, load_snapshot
 
 HERE = Path(__file__).resolve().parent
 OUTPUT = HERE / "output"
@@ -126,23 +124,23 @@ def check(table: np.ndarray, eigenvalue: float, from_path: float, points: list[P
 
     Raises
     ------
-    SolverError
+    MorphError
         Saying what is wrong.
     """
     if missed := missed_bifurcations(points):
-        raise SolverError(f"the path has passed a bifurcation: {missed[0]}")
+        raise md.MorphError(f"the path has passed a bifurcation: {missed[0]}")
     approach, _, energy, force = table.T
     buckled = slice(1, None)  # the first position is the unloaded sheet
     for name, values in (("bending energy", energy[buckled]), ("end force", force[buckled])):
         jump = np.abs(np.diff(values)).max() / values.max()
         if jump > LARGEST_JUMP / len(table):
-            raise SolverError(f"the {name} jumps by {100.0 * jump:.1f} % between neighbouring positions")
+            raise md.MorphError(f"the {name} jumps by {100.0 * jump:.1f} % between neighbouring positions")
     work = np.sum(np.diff(approach[buckled]) * (force[1:-1] + force[2:]) / 2.0)
     gained = energy[-1] - energy[1]
     if abs(work / gained - 1.0) > WORK_TOLERANCE:
-        raise SolverError(f"the end force works {1e3 * work:.4f} mJ but bending takes {1e3 * gained:.4f} mJ")
+        raise md.MorphError(f"the end force works {1e3 * work:.4f} mJ but bending takes {1e3 * gained:.4f} mJ")
     if abs(from_path / eigenvalue - 1.0) > BUCKLING_TOLERANCE:
-        raise SolverError(f"the path buckles at {from_path:.5f} N, the eigenvalue is {eigenvalue:.5f} N")
+        raise md.MorphError(f"the path buckles at {from_path:.5f} N, the eigenvalue is {eigenvalue:.5f} N")
 
 
 def draw_path(file: Path, table: np.ndarray, eigenvalue: float) -> None:

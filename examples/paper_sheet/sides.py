@@ -13,12 +13,11 @@ from collections.abc import Sequence
 import numpy as np
 from reduction import NODES, OPTIONS, Grid
 
-from morph_dslam.model import Parameter, ReducedModel
-from morph_dslam.reduction.certificate import certify
-from morph_dslam.reduction.method import METHODS, ReductionTask
-from morph_dslam.studies.problem import Snapshot
+import morph_dslam as md
+from morph_dslam.extend.reduction import METHODS, ReductionTask, certify
+from morph_dslam.extend.studies import Snapshot
 
-PATH = Parameter("path", "ratio", "1", -1.0, 1.0, 0.0, "part of the path to full height; negative below the plane")
+PATH = md.Parameter("path", "ratio", "1", -1.0, 1.0, 0.0, "part of the path to full height; negative below the plane")
 #: The model that is filmed is made of every position, to this tolerance.
 FILMED = OPTIONS.model_copy(update={"tolerance": 1e-6})
 
@@ -39,7 +38,7 @@ def both_sides(snapshots: Sequence[Snapshot]) -> list[Snapshot]:
     return [*(below(snapshot) for snapshot in snapshots[:0:-1]), *snapshots]
 
 
-def tracked_model(snapshots: Sequence[Snapshot], grid: Grid) -> ReducedModel:
+def tracked_model(snapshots: Sequence[Snapshot], grid: Grid) -> md.ReducedModel:
     """The model that the tracker has: of few positions, certified on all others."""
     every = max(1, round((len(snapshots) - 1) / (NODES - 1)))
     seen, unseen = snapshots[::every], [s for i, s in enumerate(snapshots) if i % every]
@@ -49,7 +48,7 @@ def tracked_model(snapshots: Sequence[Snapshot], grid: Grid) -> ReducedModel:
     return model
 
 
-def filmed_model(snapshots: Sequence[Snapshot], grid: Grid) -> ReducedModel:
+def filmed_model(snapshots: Sequence[Snapshot], grid: Grid) -> md.ReducedModel:
     """The model that is filmed: through all positions."""
     task = ReductionTask(
         grid.mesh(), (PATH,), [[s] for s in both_sides(snapshots)], FILMED, "paper sheet, every position"

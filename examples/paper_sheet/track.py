@@ -15,6 +15,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -23,15 +25,11 @@ from reduction import Grid
 from run import HEIGHT, OUTPUT, PAPER, POSITIONS, SIZE
 from sides import filmed_model, tracked_model
 
-from morph_dslam.cli.app import run_and_report_errors
-from morph_dslam.errors import TrackingError
-from morph_dslam.evaluation.evaluate import evaluate_depth
-from morph_dslam.evaluation.report import KeyFigures, Link, Picture, Section, Table, Text, write_report
-from morph_dslam.evaluation.run_folder import depth_line
-from morph_dslam.experiment import Recording, keep, keep_sequence, report, track_and_evaluate
-from morph_dslam.model import load_model, save_model
-from morph_dslam.studies.problem import Snapshot
-from morph_dslam.studies.snapshots import load_snapshot
+import morph_dslam as md
+from morph_dslam.extend import run_and_report_errors
+from morph_dslam.extend.reports import KeyFigures, Link, Picture, Section, Table, Text, depth_line, write_report
+from morph_dslam.extend.studies import Snapshot, load_snapshot
+from support import Recording, keep, keep_sequence, report, track_and_evaluate
 
 Array = NDArray[np.float64]
 HERE = Path(__file__).resolve().parent
@@ -49,7 +47,7 @@ def make_models() -> None:
 
     Raises
     ------
-    TrackingError
+    MorphError
         If the positions are not there.
     """
     sheet = BuckledSheet(*GRID.size, PAPER, cells=GRID.cells)
@@ -57,13 +55,13 @@ def make_models() -> None:
     files = [folder.position_file(number) for number in range(POSITIONS)]
     missing = sum(not file.is_file() for file in files)
     if missing:
-        raise TrackingError(
+        raise md.MorphError(
             f"{missing} of the {POSITIONS} positions are not in {folder.root}: solve them with "
             f"`python examples/{HERE.name}/run.py` first"
         )
     ingredients = [HERE / "sides.py", HERE / "reduction.py", *files]
     for model, make in ((MODEL, tracked_model), (FILMED, filmed_model)):
-        keep(model, ingredients, lambda model=model, make=make: save_model(model, make(read(files), GRID)))
+        keep(model, ingredients, lambda model=model, make=make: md.save_model(model, make(read(files), GRID)))
 
 
 def read(files: list[Path]) -> list[Snapshot]:
@@ -74,7 +72,7 @@ def read(files: list[Path]) -> list[Snapshot]:
 
 def heights() -> Array:
     """How high above its plane, or below it, the sheet is in each frame, m."""
-    model = load_model(FILMED)
+    model = md.load_model(FILMED)
     found = []
     for mu in np.load(RECORDING / "truth.npz")["parameters"]:
         z = model.positions(mu)[:, 2]
@@ -111,7 +109,7 @@ def rows(figures: dict[str, Any], surface: dict[str, Any], height: Array) -> lis
     highest = np.flatnonzero(np.abs(height) > HIGHEST * HEIGHT)
     near = [figures["per_frame"].get(str(frame), {}).get("mean_mm", np.nan) for frame in highest]
     base = surface["base"]["mean_mm"]
-    model = load_model(MODEL).certificate["displacement"]
+    model = md.load_model(MODEL).certificate["displacement"]
     return [
         ("largest displacement", f"{PAPER_HEIGHT:.0f} mm", f"{1e3 * np.abs(height).max():.1f} mm"),
         ("mean error, material points", "", f"{figures['mean_mm']:.2f} mm"),
@@ -151,7 +149,7 @@ def run(_: argparse.Namespace) -> None:
         RECORDING / "frames", RECORDING / "camera.yaml", RECORDING / "landmarks.csv", RECORDING / "truth.npz"
     )
     figures = track_and_evaluate(recording, MODEL, RUN)
-    surface = evaluate_depth(RUN, RECORDING, base_frame=0)
+    surface = md.evaluate_depth(RUN, RECORDING, base_frame=0)
     for line in Table(write_comparison(figures, surface), ("", "paper", "here")).text():
         print(line)
     print(depth_line(surface))

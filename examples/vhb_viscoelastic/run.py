@@ -21,10 +21,9 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from morph_dslam.cli.app import run_and_report_errors
-from morph_dslam.errors import StudyError
-from morph_dslam.mechanics.materials.fit import Fit, TensionTest, evaluate_tests, fit_law, relative_error
-from morph_dslam.mechanics.materials.isotropic import Ogden
+import morph_dslam as md
+from morph_dslam.extend import run_and_report_errors
+from morph_dslam.extend.mechanics import Fit, Ogden, TensionTest, evaluate_tests, fit_law, relative_error
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -53,7 +52,7 @@ def read_sheet(path: Path) -> np.ndarray:
         rows = [re.findall(r"<v>([^<]*)</v>", row) for row in re.findall(r"<row.*?</row>", text, re.S)]
         return np.array(rows[1:], dtype=float).reshape(-1, 3)
     except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise StudyError(f"{path} is no sheet of time, stretch and stress: {error}") from error
+        raise md.MorphError(f"{path} is no sheet of time, stretch and stress: {error}") from error
 
 
 def read_test(path: Path, kind: str) -> TensionTest:
@@ -81,7 +80,7 @@ def read_tests(folder: Path) -> tuple[list[TensionTest], list[TensionTest]]:
     for kind, stretches in FITTED.items():
         paths = sorted((folder / kind / "time_strain_stress").glob("*.xlsx"))
         if not paths:
-            raise StudyError(
+            raise md.MorphError(
                 f"there are no measurements in {folder / kind / 'time_strain_stress'}; "
                 "--data names the folder of VHB 4910"
             )

@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Any
 from morph_dslam._version import __version__ as __version__
 
 __all__ = [
+    "Camera",
     "Frame",
     "MorphError",
     "Parameter",
     "ReducedModel",
     "SolidProblem",
+    "TrackOptions",
     "build",
     "calibrate",
     "evaluate",
@@ -30,16 +32,19 @@ __all__ = [
     "open_source",
     "save_model",
     "simulate",
+    "track",
     "write_build_report",
 ]
 
 #: The module of each public name, as in the imports below.
 _MODULES = {
+    "Camera": "camera",
     "Frame": "sources.frames",
     "MorphError": "errors",
     "Parameter": "model",
     "ReducedModel": "model",
     "SolidProblem": "mechanics.solid",
+    "TrackOptions": "tracking.track",
     "build": "studies.build",
     "calibrate": "calibration.calibrate",
     "evaluate": "evaluation.evaluate",
@@ -53,11 +58,13 @@ _MODULES = {
     "open_source": "sources",
     "save_model": "model",
     "simulate": "render.simulation",
+    "track": "tracking.track",
     "write_build_report": "reduction.report",
 }
 
 if TYPE_CHECKING:  # the same for editors and type checkers
     from morph_dslam.calibration.calibrate import calibrate
+    from morph_dslam.camera import Camera
     from morph_dslam.errors import MorphError
     from morph_dslam.evaluation.evaluate import evaluate, evaluate_depth
     from morph_dslam.evaluation.trajectory import evaluate_trajectory
@@ -70,6 +77,7 @@ if TYPE_CHECKING:  # the same for editors and type checkers
     from morph_dslam.sources.frames import Frame
     from morph_dslam.studies.build import build
     from morph_dslam.studies.study import load_study, make_study
+    from morph_dslam.tracking.track import TrackOptions, track
 
 
 def __getattr__(name: str) -> Any:

@@ -1,7 +1,8 @@
-"""The names that scripts may rely on: they exist, say what they are, and cost nothing until they are used."""
+"""The names that scripts may rely on: they exist, cost nothing until they are used, and examples need no others."""
 
 import ast
 import inspect
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,9 +11,21 @@ import pytest
 
 import morph_dslam as md
 from morph_dslam import extend
+from tests.support.documents import PROJECT
 
 #: Packages that take long to load.
 HEAVY = ("ngsolve", "cv2", "numba", "numpy", "matplotlib")
+
+
+#: An import of what is not public.
+INNER = re.compile(r"^\s*(?:from|import) morph_dslam\.(?!extend\b)[a-z_.]+.*", re.MULTILINE)
+
+
+def test_examples_import_public_names_only():
+    inner = [
+        (path.name, line) for path in (PROJECT / "examples").rglob("*.py") for line in INNER.findall(path.read_text())
+    ]
+    assert inner == []
 
 
 def test_there_are_few_public_names():

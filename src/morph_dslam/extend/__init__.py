@@ -3,15 +3,19 @@
 Here are what a command-line program needs, and the registries: a new law, source or method of reduction is one
 file that registers it. Building blocks stand in a module for each subject:
 
-=====================  ==========================================================================
+=====================  ==============================================================================
 `extend.geometry`      rigid and similarity transforms, rotations
 `extend.mechanics`     meshes, hyperelastic laws, supports, loads, and what solves a `SolidProblem`
-`extend.reduction`     snapshots, methods of reduction, and separated functions
+`extend.models`        separated fields, functions of the parameters, points that a model carries
+`extend.reduction`     methods that reduce solutions, and their certificate
+`extend.registration`  landmarks, and registration in a map with its run folder
 `extend.rendering`     drawing of models: rasteriser, overlays, pictures of states
 `extend.reports`       the blocks of a report page, and the lines that sum up a run
+`extend.sheets`        thin sheets, and paths past buckling by arc length
 `extend.slam`          tracking and mapping of a rigid scene, frame by frame
+`extend.studies`       studies as objects, and their solved samples
 `extend.tracking`      points bound to a model, and the estimator of parameters and pose
-=====================  ==========================================================================
+=====================  ==============================================================================
 """
 
 from importlib import import_module

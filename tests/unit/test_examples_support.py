@@ -1,10 +1,10 @@
-"""Products that are kept, and made again when what they were made from changes."""
+"""What the examples have in common: products that are kept, and the frame in which truth is bound."""
 
 import numpy as np
 import pytest
+from examples.support import Recording, keep, keep_sequence
 
-from morph_dslam.errors import EvaluationError, SceneError
-from morph_dslam.experiment import Recording, first_truth_frame, keep, keep_sequence
+from morph_dslam import MorphError
 
 
 def test_a_product_is_made_once_for_the_same_ingredients(tmp_path, capsys):
@@ -50,20 +50,19 @@ def test_truth_is_bound_in_the_first_frame_of_the_range(tmp_path, wanted, expect
     path = tmp_path / "truth.npz"
     frames = np.array([9, 17, 25, 33])
     np.savez(path, frame=frames, points_mm=np.ones((4, 5, 3)), pixels=np.ones((4, 5, 2)))
-    recording = Recording(tmp_path, tmp_path, tmp_path, path, wanted)
-    assert first_truth_frame(recording) == expected
+    assert Recording(tmp_path, tmp_path, tmp_path, path, wanted).first_truth_frame == expected
 
 
 def test_a_range_without_truth_is_refused(tmp_path):
     path = tmp_path / "truth.npz"
     np.savez(path, frame=np.array([9]), points_mm=np.ones((1, 5, 3)), pixels=np.ones((1, 5, 2)))
-    with pytest.raises(EvaluationError, match=r"has no frame in the range tracked; it has \[9\]"):
-        first_truth_frame(Recording(tmp_path, tmp_path, tmp_path, path, (10, 20)))
+    with pytest.raises(MorphError, match=r"has no frame in the range tracked; it has \[9\]"):
+        Recording(tmp_path, tmp_path, tmp_path, path, (10, 20)).first_truth_frame  # noqa: B018
 
 
 def test_a_scene_that_is_not_there_is_named(tmp_path):
     model, film = tmp_path / "seal.morph", tmp_path / "recording"
     model.write_text("a model")
-    with pytest.raises(SceneError, match=r"there is no scene file .*other\.toml"):
+    with pytest.raises(MorphError, match=r"there is no scene file .*other\.toml"):
         keep_sequence(tmp_path / "other.toml", model, film)
     assert not film.exists()

@@ -1,0 +1,84 @@
+"""Meshes, hyperelastic laws, supports and loads of a `morph_dslam.SolidProblem`, and what solves and fits it."""
+
+from morph_dslam.mechanics.loads import (
+    BodyForce,
+    DeadTraction,
+    FollowerPressure,
+    Gravity,
+    MovingLine,
+    MovingPatch,
+    NodalForces,
+    PointLoad,
+)
+from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden
+from morph_dslam.mechanics.materials.base import Material
+from morph_dslam.mechanics.materials.fit import Fit, TensionTest, evaluate_tests, fit_law, relative_error
+from morph_dslam.mechanics.materials.isotropic import (
+    Gent,
+    LinearElastic,
+    MooneyRivlin,
+    NeoHookean,
+    Ogden,
+    Rubber,
+    StVenantKirchhoff,
+    Yeoh,
+)
+from morph_dslam.mechanics.materials.viscoelastic import Prony
+from morph_dslam.mechanics.parameters import ParameterSymbols
+from morph_dslam.mechanics.solid import SolidOptions
+from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning
+from morph_dslam.mechanics.solvers.newton import State, advance, sensitivities, solve
+from morph_dslam.mechanics.supports import ElasticFoundation, PrescribedDisplacement, RigidRotation, fixed
+from morph_dslam.meshing.generators import Profile, block, revolution, sheet, tube
+from morph_dslam.meshing.mesh_checks import check_mesh
+from morph_dslam.meshing.mesh_files import load_mesh, to_second_order
+from morph_dslam.meshing.meshes import CellBlock, Mesh, model_mesh_of
+
+__all__ = [
+    "BodyForce",
+    "CellBlock",
+    "DeadTraction",
+    "ElasticFoundation",
+    "Fit",
+    "FollowerPressure",
+    "Gent",
+    "Gravity",
+    "HolzapfelGasserOgden",
+    "LinearElastic",
+    "Material",
+    "Mesh",
+    "MooneyRivlin",
+    "MovingLine",
+    "MovingPatch",
+    "NearlyIncompressibleWarning",
+    "NeoHookean",
+    "NodalForces",
+    "Ogden",
+    "ParameterSymbols",
+    "PointLoad",
+    "PrescribedDisplacement",
+    "Profile",
+    "Prony",
+    "RigidRotation",
+    "Rubber",
+    "SolidOptions",
+    "StVenantKirchhoff",
+    "State",
+    "TensionTest",
+    "Yeoh",
+    "advance",
+    "block",
+    "check_mesh",
+    "evaluate_tests",
+    "fit_law",
+    "fixed",
+    "load_mesh",
+    "model_mesh_of",
+    "relative_error",
+    "revolution",
+    "sensitivities",
+    "sheet",
+    "solve",
+    "to_second_order",
+    "tube",
+]
