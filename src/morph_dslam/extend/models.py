@@ -4,7 +4,7 @@ from morph_dslam.model import MaterialPoints, SeparatedField, SurfacePoints
 from morph_dslam.model.basis_functions import Basis, chebyshev_basis, cubic_spline_basis, hat_basis
 from morph_dslam.model.functions import Functions, ParameterFunctions, total_degree_indices
 from morph_dslam.model.inner_structure import CarriedStructure, save_inner_structure
-from morph_dslam.model.reduced_model import von_mises, with_revolution_angle
+from morph_dslam.model.reduced_model import von_mises
 from morph_dslam.model.tensor_functions import CPFunctions
 
 __all__ = [
@@ -22,5 +22,4 @@ __all__ = [
     "save_inner_structure",
     "total_degree_indices",
     "von_mises",
-    "with_revolution_angle",
 ]
