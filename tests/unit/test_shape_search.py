@@ -8,8 +8,8 @@ from morph_dslam.model import SurfacePoints
 from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.registration.landmarks import shape_starts
 from morph_dslam.registration.registration import PosePrior
-from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, State
-from morph_dslam.tracking.shape_search import BoundSearch, ShapeSearch, with_undetermined_at_default
+from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOptions, Estimator, State
+from morph_dslam.tracking.shape_search import ShapeSearch, with_unobservable_at_default
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.bent_tube import bent_tube
 
@@ -17,11 +17,17 @@ CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 POSE = RigidTransform(rotation_exp(np.array([0.3, -0.2, 0.0])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
 
 
+def determined(model):
+    """An estimate of all parameters, at no bound."""
+    state, none = State(model.default, POSE), np.zeros(len(model.parameters), dtype=bool)
+    return Estimate(state, 0.0, np.empty((0, 2)), 0.1, np.zeros((9, 9)), none, 1, True)
+
+
 def test_every_shape_is_handed_out_once_before_any_is_repeated():
     model = bent_sheet_model(22, 16)
-    search = ShapeSearch(model, 3)
+    search, estimate = ShapeSearch(model, 3), determined(model)
     count = len(shape_starts(model))
-    given = [state.parameters for _ in range(count) for state in search.next_starts(POSE)]
+    given = [state.parameters for _ in range(count) for state in search.starts(estimate, anywhere=True)]
     np.testing.assert_array_equal(given[0], model.default)
     assert len(np.unique(np.round(given[:count], 9), axis=0)) == len(np.unique(shape_starts(model), axis=0))
     np.testing.assert_array_equal(given[:count], given[count : 2 * count])
@@ -36,7 +42,7 @@ def test_a_mirrored_bend_is_left_by_way_of_another_start():
     truth = State(np.array([0.03, 0.2, 0.05]), POSE)
     pixels, weights = CAMERA.project(points.in_camera(truth)), np.ones(150)
     estimator = Estimator(model, CAMERA, EstimationOptions(max_iterations=10, tolerance=1e-3))
-    starts = ShapeSearch(model, 4).next_starts(POSE)
+    starts = ShapeSearch(model, 4).starts(determined(model), anywhere=True)
     best = estimator.estimate_from(points, pixels, weights, starts)[0]
     np.testing.assert_allclose(best.state.parameters, truth.parameters, atol=5e-3)
 
@@ -51,7 +57,7 @@ def test_only_undetermined_parameters_return_to_their_default():
     pixels = CAMERA.project(points.in_camera(truth)) + 0.1 * rng.standard_normal((150, 2))
     start = State(np.array([0.001, 0.5, 0.2]), POSE)
     found = Estimator(model, CAMERA).estimate(points, pixels, np.ones(150), start)
-    kept = with_undetermined_at_default(model, found)
+    kept = with_unobservable_at_default(model, found)
     assert kept.parameters[1] == 0.0
     np.testing.assert_array_equal(kept.parameters[[0, 2]], found.state.parameters[[0, 2]])
 
@@ -65,13 +71,13 @@ def test_an_estimate_leaves_a_bound_that_it_reached_on_the_wrong_side():
     truth = State(np.array([0.5, np.pi - 0.1]), RigidTransform(POSE.rotation, np.array([0.0, 0.0, 0.4])))
     pixels = CAMERA.project(points.in_camera(truth)) + 0.1 * rng.standard_normal((80, 2))
     known = PosePrior(truth.camera_from_object, 1e-8 * np.eye(6), np.zeros((6, 0))).prior(2, 0.01)
-    estimator, search = Estimator(model, CAMERA), BoundSearch(model, 2)
+    estimator, search = Estimator(model, CAMERA), ShapeSearch(model, 2)
     start = State(np.array([0.1, 0.0]), truth.camera_from_object)
     stuck = estimator.estimate(points, pixels, weights, start, prior=known)
     assert stuck.at_bound[0]
     assert stuck.state.parameters[0] < 1e-3
     for _ in range(3):
-        starts = search.next_starts(stuck)
+        starts = search.starts(stuck, anywhere=False)
         assert len(starts) == 2
         found = [estimator.estimate(points, pixels, weights, s, prior=known) for s in starts]
         best = min(found, key=lambda estimate: estimate.cost)
@@ -80,4 +86,4 @@ def test_an_estimate_leaves_a_bound_that_it_reached_on_the_wrong_side():
     load, side = best.state.parameters
     assert abs(load - truth.parameters[0]) < 0.01
     assert np.cos(side - truth.parameters[1]) > np.cos(0.02)
-    assert search.next_starts(best) == []
+    assert search.starts(best, anywhere=False) == []

@@ -21,7 +21,7 @@ from morph_dslam.tracking.noise import Observations, PointNoise, RigObservations
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.reference import ReferenceView
 from morph_dslam.tracking.sequence_filter import Fitter, SequenceFilter
-from morph_dslam.tracking.shape_search import BoundSearch, ShapeSearch
+from morph_dslam.tracking.shape_search import ShapeSearch
 
 #: Share of the cost below which another shape is a better explanation and not the same one.
 CLEARLY_BETTER = 0.95
@@ -37,7 +37,6 @@ class FrameEstimation:
         self._estimator, self._reference, self._options = estimator, reference, options
         self._noise = PointNoise()
         self._search = ShapeSearch(estimator.model, options.searches)
-        self._off_bound = BoundSearch(estimator.model, options.searches)
         brief = replace(options.estimation, max_iterations=10, tolerance=1e-3)
         self._scout = Estimator(estimator.model, estimator.camera, brief)
 
@@ -84,12 +83,8 @@ class FrameEstimation:
         """The attempt, or a clearly better explanation of its measurements reached from another shape."""
         if not attempt.estimate.sigma_px < np.inf:
             return attempt
-        starts = self._off_bound.next_starts(attempt.estimate)
-        if starts:
-            attempt = self.best_of(attempt, starts)
-        if not self._options.search_above_px < attempt.estimate.sigma_px:
-            return attempt
-        return self.best_of(attempt, self._search.next_starts(attempt.estimate.state.camera_from_object))
+        starts = self._search.starts(attempt.estimate, attempt.estimate.sigma_px > self._options.search_above_px)
+        return self.best_of(attempt, starts) if starts else attempt
 
     def best_of(self, attempt: PoseHypothesis, starts: list[State]) -> PoseHypothesis:
         """The attempt, or a clearly better explanation of its measurements reached from one of the starts."""

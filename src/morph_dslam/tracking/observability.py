@@ -21,7 +21,7 @@ from morph_dslam.tracking.estimator import Estimate
 Array = NDArray[np.float64]
 
 #: A standard deviation of this share of a parameter's range makes the 95 % interval as wide as the range.
-UNTOLD_SHARE = 0.25
+UNOBSERVABLE_SHARE = 0.25
 
 #: A parameter takes part in a combination when its share of the direction is larger.
 PART = 0.2
@@ -56,7 +56,7 @@ def unobservable(covariance: Array, ranges: Array) -> list[Unobservable]:
         return [Unobservable((k,), unit[k : k + 1]) for k in range(d)]
     values, vectors = np.linalg.eigh(covariance / np.outer(ranges, ranges))
     information = (vectors / np.maximum(values, 1e-300)) @ vectors.T
-    no_effect = np.diag(information) <= UNTOLD_SHARE**-2
+    no_effect = np.diag(information) <= UNOBSERVABLE_SHARE**-2
     found = [Unobservable((int(k),), unit[k : k + 1]) for k in np.flatnonzero(no_effect)]
     rest = np.flatnonzero(~no_effect)
     if len(rest):
@@ -67,7 +67,7 @@ def unobservable(covariance: Array, ranges: Array) -> list[Unobservable]:
 def _combinations(information: Array, axes: Array) -> list[Unobservable]:
     """Directions of little information (r, r), in the unknowns with these ``axes`` (r, d)."""
     values, vectors = np.linalg.eigh(information)
-    directions = (vectors[:, values <= UNTOLD_SHARE**-2].T) @ axes
+    directions = (vectors[:, values <= UNOBSERVABLE_SHARE**-2].T) @ axes
     groups: list[tuple[set[int], list[Array]]] = []
     for direction in directions:
         members = set(np.flatnonzero(np.abs(direction) > PART).tolist())
@@ -124,7 +124,7 @@ def one_value(parameter: Parameter, value: float, deviation: float) -> dict[str,
         "value": parameter.display(value),
         "standard_deviation": parameter.display(deviation),
         "interval_95": [parameter.display(low), parameter.display(high)],
-        "told_by_the_images": bool(deviation < UNTOLD_SHARE * (parameter.upper - parameter.lower)),
+        "told_by_the_images": bool(deviation < UNOBSERVABLE_SHARE * (parameter.upper - parameter.lower)),
     }
 
 

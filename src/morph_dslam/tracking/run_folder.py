@@ -14,7 +14,6 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.diagnostics.reference_misfit import CLEARLY_WORSE
 from morph_dslam.errors import MorphError, RegistrationError, TrackingError
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.model.discrepancy import Discrepancy, largest_deformation, save_discrepancies
@@ -22,7 +21,7 @@ from morph_dslam.model.inner_structure import CarriedStructure
 from morph_dslam.tracking.binding import DrawnSurface
 from morph_dslam.tracking.estimator import Estimate, State
 from morph_dslam.tracking.observability import (
-    UNTOLD_SHARE,
+    UNOBSERVABLE_SHARE,
     largest_displacement,
     largest_von_mises,
     one_value,
@@ -31,6 +30,7 @@ from morph_dslam.tracking.observability import (
 )
 from morph_dslam.tracking.outcomes import DiagnosticFinding, ModelDoesNotExplain, ObjectMoved, Status
 from morph_dslam.tracking.result import STAGES, FrameResult
+from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE
 
 
 def make_folder(folder: Path, what: str, error_class: type[MorphError]) -> None:
@@ -411,7 +411,7 @@ def _at_bound(run: RunResults) -> list[str]:
     """Parameters that the images put to an end of their range."""
     found = []
     with np.errstate(invalid="ignore"):
-        determined = run.parameter_std() < UNTOLD_SHARE * (run.model.upper - run.model.lower)
+        determined = run.parameter_std() < UNOBSERVABLE_SHARE * (run.model.upper - run.model.lower)
     at_bound, values = run.at_bound() & determined, run.parameters()
     for k, parameter in enumerate(run.model.parameters):
         upper = values[:, k] > 0.5 * (parameter.lower + parameter.upper)

@@ -24,8 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.diagnostics.dimensions import DimensionCheck, StretchEvidence
-from morph_dslam.diagnostics.reference_misfit import ReferenceMisfit
 from morph_dslam.model import SurfacePoints
 from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR, BoundPart, SharedErrors
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, Prior, State, project_with_jacobian
@@ -34,6 +32,15 @@ Array = NDArray[np.float64]
 
 #: More than this, pixels, and more than half of the residuals' variance, is stated as the model's failure.
 UNEXPLAINED_PX = 0.5
+
+#: What comparing windows leaves in neighbours alike, pixels: an expectation well below tells nothing.
+FLOOR_PX = 0.05
+
+#: Frames over which what was learnt of the reference fades, by a factor e.
+MEMORY = 600.0
+
+#: More than so many times the stated deviation is said of a frame and of the run.
+CLEARLY_WORSE = 2.0
 
 #: A triangle seen so much flatter in the reference view than in another says nothing of the motion there.
 LARGEST_STRETCH = 5.0
@@ -83,6 +90,33 @@ class _Linear:
         return np.where(self.usable[:, None, None], moved - taken.reshape(moved.shape), 0.0)
 
 
+class ReferenceMisfit:
+    """By how much the reference state is worse known than was stated, as the frames of a sequence show it.
+
+    The stated covariance of the reference state lets expect e px² a coordinate of what neighbours have in
+    common in the residuals; the frame shows o px². One factor f of the variance holds for the whole sequence,
+    o = f e: the least squares slope over the frames, in which those that expect much count most (a variance
+    component by the method of moments; Rao 1971, J. Multivariate Analysis 1, 257). A frame in which the
+    object is as in the reference view expects nothing. So the factor starts as one, as if a frame with
+    `FLOOR_PX` of both had said so.
+    """
+
+    def __init__(self) -> None:
+        self._fade = np.exp(-1.0 / MEMORY)
+        self._product = self._square = 0.0
+
+    def learn(self, shown: float, expected: float) -> None:
+        """Take in what a frame shows and what was expected of it, px²; noise makes the first negative too."""
+        self._product = self._fade * self._product + shown * expected
+        self._square = self._fade * self._square + expected**2
+
+    @property
+    def factor(self) -> float:
+        """Of the variance; one where the frames show no more than was stated."""
+        one = FLOOR_PX**4
+        return max((self._product + one) / (self._square + one), 1.0)
+
+
 class SystematicErrors:
     """Adds to covariances what the reference and the model are off by.
 
@@ -99,7 +133,6 @@ class SystematicErrors:
         self._jacobian = self._by_parts(parts, lambda state: self._project(points, state)[1])
         self._edges = self._by_parts(parts, lambda state: _edges(estimator.camera, self._corners, state))
         self._moved = self._by_causes(parts)
-        self._dimensions = DimensionCheck(points, parts, self._jacobian, estimator.scale)
         self._common = SharedErrors(self._places(parts[0].state), window)
 
     def _by_parts(self, parts: Sequence[BoundPart], of_state: Callable[[State], Array]) -> Array:
@@ -132,11 +165,6 @@ class SystematicErrors:
         """By how much larger than stated the reference's deviation is, as the frames so far show it."""
         return float(np.sqrt(self._misfit.factor))
 
-    @property
-    def stretch(self) -> StretchEvidence | None:
-        """What the frames so far tell of the object's dimensions; None where the reference is not known."""
-        return None if self._moved is None else self._dimensions.evidence
-
     def added(
         self,
         estimate: Estimate,
@@ -144,9 +172,8 @@ class SystematicErrors:
         alike_px: float,
         prior: Prior | None = None,
         learns: bool = True,
-        elsewhere: Sequence[StretchEvidence] = (),
     ) -> Estimate:
-        """The estimate with a covariance that holds both errors, and wrong dimensions that the frames show.
+        """The estimate with a covariance that holds both errors.
 
         Parameters
         ----------
@@ -154,28 +181,19 @@ class SystematicErrors:
         alike_px : standard deviation of a pixel coordinate that neighbours have in common in the residuals,
             as of `unexplained`.
         learns : whether the residuals are the object's, so that they tell how well the reference is known.
-        elsewhere : what frames that were compared with other views tell of the object's dimensions.
         """
         frame = self._linear(estimate, weights)
         hessian = frame.products(frame.jacobian)
-        free = gain = inverse_of_seen(hessian, self._estimator.scale)
         if prior is not None:
-            gain = inverse_of_seen(hessian + prior.terms(estimate.state)[1], self._estimator.scale)
+            hessian = hessian + prior.terms(estimate.state)[1]
+        gain = inverse_of_seen(hessian, self._estimator.scale)
         covariance = estimate.covariance.copy()
         if self._moved is not None:
-            warps = self._warps(estimate.state)
-            moved = warps @ self._moved
-            stretched = self._dimensions.moved(estimate.state, frame.jacobian, warps)
+            moved = self._warps(estimate.state) @ self._moved
             if learns:
                 self._learn_reference(frame, frame.left(moved, gain))
-                error_factors = np.concatenate([stretched @ self._dimensions.stretches, moved], axis=2)
-                self._dimensions.learn(frame.residuals, frame.left(error_factors, free), frame.weights)
             transfer = gain @ frame.products(moved)
             covariance += self._misfit.factor * transfer @ transfer.T
-            excess = self._dimensions.evidence.joined(elsewhere).excess
-            if excess.any():
-                taken = gain @ frame.products(stretched)
-                covariance += taken @ excess @ taken.T
         gradients = self._common.gradients(frame.scores)
         share = self._common.share_left(frame.usable, frame.jacobian, gradients, gain)
         covariance += alike_px**2 / share * (gain @ (gradients.T @ gradients) @ gain)

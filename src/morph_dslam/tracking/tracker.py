@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.diagnostics.reference_misfit import CLEARLY_WORSE
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.sources import Frame
@@ -44,7 +43,8 @@ from morph_dslam.tracking.patches import follow, normalize_contrast
 from morph_dslam.tracking.reference import PosedImage, ReferenceView
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.result import STAGES, FrameResult
-from morph_dslam.tracking.shape_search import with_undetermined_at_default
+from morph_dslam.tracking.shape_search import with_unobservable_at_default
+from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE
 from morph_dslam.tracking.views import ActiveView, Change, KeyframeViews, ViewSet
 
 Array = NDArray[np.float64]
@@ -413,7 +413,7 @@ class Tracker:
             self.last_seen = Keyframe(pixels, weights, estimate.state, estimate.sigma_px, hypothesis.outline)
         self._velocity_base = estimate.state if self._lost else self._last
         self._last = estimate.state
-        self._start = with_undetermined_at_default(self.model, estimate)
+        self._start = with_unobservable_at_default(self.model, estimate)
         if self.options.start == "constant-velocity":
             self._start = at_constant_velocity(self._velocity_base, self._start)
         self._supported = inliers
