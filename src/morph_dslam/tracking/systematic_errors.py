@@ -166,12 +166,7 @@ class SystematicErrors:
         return float(np.sqrt(self._misfit.factor))
 
     def added(
-        self,
-        estimate: Estimate,
-        weights: Array,
-        alike_px: float,
-        prior: Prior | None = None,
-        learns: bool = True,
+        self, estimate: Estimate, weights: Array, alike_px: float, prior: Prior | None = None, learns: bool = True
     ) -> Estimate:
         """The estimate with a covariance that holds both errors.
 
