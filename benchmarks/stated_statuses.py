@@ -6,10 +6,10 @@ Of each case: how often the registration was refused; frames tracked, and not; t
 frame; frames that are off by more than 1 % of the object's size (mean over all nodes) and by more than three
 times what they state ("beyond"); those of them of which nothing says that they are not to be relied on,
 neither the frame's reason nor, of a wrong model, a flag of the placement ("confident wrong"). Objects start
-from 16 landmarks with 0.3 px of noise, or, "in a map", from a place with errors of a usual size. `map` says what comes of the
-registration in a map of a scan. `right` is the right model of an object in full view, for comparison; `one
-size` are mesh and landmarks that are both too large or too small, which one camera cannot tell: it is listed,
-but not counted in the last line.
+from 16 landmarks with 0.3 px of noise, or, "in a map", from a place with errors of a usual size. `map` says
+what comes of the registration in a map of a scan. `right` is the right model of an object in full view, for
+comparison; `one size` are mesh and landmarks that are both too large or too small, which one camera cannot
+tell: it is listed, but not counted in the last line.
 """
 
 from __future__ import annotations
