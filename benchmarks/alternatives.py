@@ -35,7 +35,6 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.camera_files import load_camera
 from morph_dslam.io.tables import Landmarks
 from morph_dslam.model import ReducedModel, load_model
-from morph_dslam.registration.landmarks import RegistrationOptions
 from morph_dslam.registration.registration import Registration, register_by_landmarks
 from morph_dslam.sources import open_source
 from morph_dslam.threads import one_thread_for_algebra
@@ -172,7 +171,7 @@ def follow(model: ReducedModel, kind: type[Counted], recording: Recording, exact
         for frame in open_source(recording.folder / "frames", recording.first, last):
             if tracker is None:
                 try:
-                    placed = register_by_landmarks(model, camera, landmarks, RegistrationOptions())
+                    placed = register_by_landmarks(model, camera, landmarks)
                 except MorphError as error:
                     return Row([], [], [], last + 1 - recording.first, str(error))
                 tracker = Tracker(model, camera, Registration.at(model, placed.state), reference=frame.image)

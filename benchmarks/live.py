@@ -138,19 +138,19 @@ def run(arguments: argparse.Namespace) -> None:
         ObjectOptions(
             model=model,
             camera=folder / "recording" / "camera.yaml",
-            placement=place,
+            registration=place,
             map_path=folder / "scan" / "map.h5",
         )
     )
-    placement, reference = setup.placement, setup.reference
-    assert placement is not None
+    registration, reference = setup.registration, setup.reference
+    assert registration is not None
     assert reference is not None
-    images = [frame.image for frame in open_source(folder / "recording" / "frames", placement.frame)]
-    setup.warm_up(placement, reference)
-    chain = setup.new_tracker(placement, reference, in_sequence=False)
-    picture = LivePicture(setup.camera, {"seal": AugmentedView(placement.model, setup.camera)})
+    images = [frame.image for frame in open_source(folder / "recording" / "frames", registration.frame)]
+    setup.warm_up(registration, reference)
+    chain = setup.new_tracker(registration, reference, in_sequence=False)
+    picture = LivePicture(setup.camera, {"seal": AugmentedView(registration.model, setup.camera)})
     picture_time, locate, track = Timed(picture, "draw"), Timed(chain, "locate"), Timed(chain, "track")
-    results = RunResults(placement.model, placement.frame or 0)
+    results = RunResults(registration.model, registration.frame or 0)
     stream = PacedRecording(BackAndForth(images, arguments.minutes))
     with tempfile.TemporaryDirectory() as temporary:
         size = (setup.camera.width, setup.camera.height)

@@ -5,7 +5,7 @@
 Of each case: how often the registration was refused; frames tracked, and not; the largest error of a tracked
 frame; frames that are off by more than 1 % of the object's size (mean over all nodes) and by more than three
 times what they state ("beyond"); those of them of which nothing says that they are not to be relied on,
-neither the frame's reason nor, of a wrong model, a flag of the placement ("confident wrong"). Objects start
+neither the frame's reason nor, of a wrong model, a flag of the registration ("confident wrong"). Objects start
 from 16 landmarks with 0.3 px of noise, or, "in a map", from a place with errors of a usual size. `map` says
 what comes of the registration in a map of a scan. `right` is the right model of an object in full view, for
 comparison; `one size` are mesh and landmarks that are both too large or too small, which one camera cannot
@@ -126,7 +126,7 @@ def anchored_cases(scene: Scene, seed: int) -> Iterator[Case]:
 
     def run(shown: list[Shown], model=None, back_at: int | None = None) -> Outcome:
         in_map = InMap(scene, model or scene.model, seed)
-        return run_case(scene, in_map.placement(), in_place(shown, scene), back_at, in_map)
+        return run_case(scene, in_map.registration(), in_place(shown, scene), back_at, in_map)
 
     yield "in a map: right", lambda: run(moving(scene, 80))
     for name, other in scene.others.items():

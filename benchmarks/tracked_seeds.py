@@ -71,7 +71,7 @@ def tracked(seed: int, pose: str) -> NDArray[np.float64]:
             frames=folder / "recording" / "frames",
             model=MODEL,
             camera=camera,
-            placement=registration / "registration.json",
+            registration=registration / "registration.json",
             pose=pose,  # type: ignore[arg-type]
             output=folder / "run",
             overlay=False,

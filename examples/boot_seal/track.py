@@ -124,7 +124,7 @@ def run(arguments: argparse.Namespace) -> None:
             frames=frames,
             model=model,
             camera=camera,
-            placement=output / "registration" / "registration.json",
+            registration=output / "registration" / "registration.json",
             map_path=output / "scan" / "map.h5",
             output=output / "run",
             overwrite=True,

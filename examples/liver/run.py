@@ -102,7 +102,7 @@ def track_from_map(folder: Path) -> dict:
             frames=frames,
             model=MODEL,
             camera=camera,
-            placement=place / "registration.json",
+            registration=place / "registration.json",
             inner=(TUMOUR,),
             output=folder,
             overwrite=True,

@@ -5,6 +5,8 @@ The command line prints the message alone and exits with status 2. Everything el
 
 from __future__ import annotations
 
+from enum import StrEnum
+
 
 class MorphError(Exception):
     """A mistake in the input that the user can mend; the base of all errors raised on purpose."""
@@ -38,8 +40,30 @@ class SourceError(MorphError):
     """Frames are missing, unreadable or cut short."""
 
 
+class RegistrationFailure(StrEnum):
+    """Why the images say no to a registration whose input is well formed."""
+
+    NOT_FOUND = "not_found"
+    WRONG_SIZE = "wrong_size"
+    BOARD_NOT_SEEN = "board_not_seen"
+    BOARD_DOES_NOT_FIT = "board_does_not_fit"
+    PICTURE_NOT_SEEN = "picture_not_seen"
+    GUESS_CONTRADICTED = "guess_contradicted"
+    LANDMARKS_DO_NOT_FIT = "landmarks_do_not_fit"
+
+
 class RegistrationError(MorphError):
-    """The object could not be placed in the reference frame."""
+    """The object could not be registered.
+
+    Attributes
+    ----------
+    reason : RegistrationFailure or None
+        What the images contradict; None where the input itself is wrong.
+    """
+
+    def __init__(self, message: str, reason: RegistrationFailure | None = None) -> None:
+        super().__init__(message)
+        self.reason = reason
 
 
 class SceneError(MorphError):

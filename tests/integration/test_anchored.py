@@ -34,13 +34,13 @@ def recording(anchored_recording):
 
 
 def of_object(folder, **others):
-    known = {"placement": folder / "registration.json", "map_path": folder / "map.h5"} | others
+    known = {"registration": folder / "registration.json", "map_path": folder / "map.h5"} | others
     return ObjectOptions(folder / "sheet.morph", folder / "sequence" / "camera.yaml", **known)
 
 
 def new_chain(folder, **others):
     setup = load_setup(of_object(folder, **others))
-    return setup, setup.new_tracker(setup.placement, setup.reference, in_sequence=False)
+    return setup, setup.new_tracker(setup.registration, setup.reference, in_sequence=False)
 
 
 def frames_of(folder, first, last):
@@ -63,7 +63,7 @@ def test_a_recording_is_tracked_with_the_camera_in_the_map(recording):
             frames=folder / "sequence" / "frames",
             model=folder / "sheet.morph",
             camera=folder / "sequence" / "camera.yaml",
-            placement=folder / "registration.json",
+            registration=folder / "registration.json",
             output=folder / "run",
             first=SCAN,
             overlay=False,
@@ -169,7 +169,7 @@ def test_a_free_object_is_known_by_the_maps_pictures_wherever_it_is(recording):
     folder, truth = recording
     setup, chain = new_chain(folder, pose="free")
     assert (setup.map_path, chain.anchor) == (None, None)
-    placement = setup.placement
+    registration = setup.registration
     half_turn = RigidTransform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
     width, height = setup.camera.width, setup.camera.height
     middle = np.array([2.0 * setup.camera.cx, 2.0 * setup.camera.cy])
@@ -180,7 +180,7 @@ def test_a_free_object_is_known_by_the_maps_pictures_wherever_it_is(recording):
     assert (result.status, result.pose_from) == ("tracked", "points"), result.reason
     assert result.estimate.state.parameters[0] == pytest.approx(truth["parameters"][52, 0], abs=1e-3)
     found, true = result.estimate.state.camera_from_object, half_turn @ true_pose(truth, 52)
-    apart = (found.apply(placement.model.nodes) - true.apply(placement.model.nodes)).mean(axis=0)
+    apart = (found.apply(registration.model.nodes) - true.apply(registration.model.nodes)).mean(axis=0)
     assert np.linalg.norm(apart) < 2.0 * MAP_ERROR
 
 
@@ -212,7 +212,7 @@ def test_a_free_object_starts_live_from_landmarks_in_the_first_frame(recording):
         LiveOptions(
             str(folder / "sequence" / "frames"),
             folder / "free",
-            of_object(folder, landmarks=landmarks, placement=None, map_path=None),
+            of_object(folder, landmarks=landmarks, registration=None, map_path=None),
             record=False,
             last=20,
         )
@@ -239,7 +239,7 @@ def test_an_interrupt_keeps_a_live_run(recording, monkeypatch, capsys):
     monkeypatch.setattr(VideoSink, "show", interrupted)
     command = ["live", str(folder / "sequence" / "frames"), "--model", str(folder / "sheet.morph")]
     command += ["--camera", str(folder / "sequence" / "camera.yaml"), "--show", "displacement"]
-    command += ["--place", str(folder / "registration.json"), "-o", str(folder / "stopped")]
+    command += ["--registration", str(folder / "registration.json"), "-o", str(folder / "stopped")]
     assert main(command) == 130
     said = capsys.readouterr()
     assert "everything until then is kept" in said.err
@@ -257,13 +257,13 @@ def test_inputs_that_do_not_fit_are_refused(recording, tmp_path):
         json.dumps(content | {"keyframes": [content["keyframes"][0] | {"frame": 1234}]})
     )
     with pytest.raises(MapError, match="is not the map of the registration: it has no keyframe 1234"):
-        load_setup(of_object(folder, placement=tmp_path / "registration.json"))
-    alone = load_setup(of_object(folder, placement=tmp_path / "registration.json", map_path=None))
+        load_setup(of_object(folder, registration=tmp_path / "registration.json"))
+    alone = load_setup(of_object(folder, registration=tmp_path / "registration.json", map_path=None))
     assert alone.map_path is None
-    assert "no map was given or found" in alone.placement.flags[-1]
+    assert "no map was given or found" in alone.registration.flags[-1]
     with pytest.raises(TrackingError, match="a registration needs the map that it was made in"):
         run_live(
             LiveOptions(str(folder / "sequence" / "frames"), tmp_path / "run", replace(alone.options, pose="free"))
         )
     with pytest.raises(TrackingError, match="a map needs the object's place in it"):
-        load_setup(of_object(folder, placement=None, landmarks=tmp_path / "landmarks.csv"))
+        load_setup(of_object(folder, registration=None, landmarks=tmp_path / "landmarks.csv"))

@@ -24,7 +24,7 @@ CAMERA = RIG[0].camera
 
 def command(folder, output, *more):
     arguments = [folder / "left", "--camera", folder / "camera.yaml", "--range", f"0-{LEFT_FRAMES - 1}"]
-    arguments += ["--model", folder / "sheet.morph", "--place", folder / "sheet" / "adjusted.json"]
+    arguments += ["--model", folder / "sheet.morph", "--registration", folder / "sheet" / "adjusted.json"]
     arguments += ["--also", "wedge", folder / "wedge.morph", folder / "wedge" / "adjusted.json"]
     return ["track", *map(str, [*arguments, "-o", output, "--no-video", *more])]
 
@@ -46,7 +46,9 @@ def test_objects_are_known_by_what_other_keyframes_show_of_them(left_recording, 
 def setups_of(folder):
     return {
         name: load_setup(
-            ObjectOptions(folder / f"{name}.morph", folder / "camera.yaml", placement=folder / name / "adjusted.json")
+            ObjectOptions(
+                folder / f"{name}.morph", folder / "camera.yaml", registration=folder / name / "adjusted.json"
+            )
         )
         for name in NAMES
     }
@@ -63,9 +65,9 @@ def wedge_before_sheet(folder, truth, frame):
 
 def bound_points(setup):
     """The points bound in all keyframes, and in each their pixels (p, 2)."""
-    placement = setup.placement
-    seen = setup.seen.get(placement.frame)
-    reference = setup.new_tracker(placement, setup.reference, False, seen).reference
+    registration = setup.registration
+    seen = setup.seen.get(registration.frame)
+    reference = setup.new_tracker(registration, setup.reference, False, seen).reference
     places = [CAMERA.project(reference.points.in_camera(part.state)[part.rows]) for part in reference.parts]
     pixels = [np.rint(own).astype(int) for own in places]
     return reference, dict(zip(setup.reference_keyframes, pixels, strict=True))
@@ -75,7 +77,7 @@ def bound_points(setup):
 def sheets(rig_recording):
     """The sheet, with and without what the wedge hides of it in each keyframe."""
     setups = setups_of(rig_recording[0])
-    known = [Known(setups[name], setups[name].placement, setups[name].placement.frame) for name in NAMES]
+    known = [Known(setups[name], setups[name].registration, setups[name].registration.frame) for name in NAMES]
     of_sheet, of_wedge = seen_parts(known)
     # The sheet lies behind the wedge everywhere.
     assert not of_wedge
@@ -109,18 +111,18 @@ def test_what_is_hidden_in_the_last_keyframe_is_bound_in_another(rig_recording, 
     sheet = sheets["aware"]
     reference, bound = bound_points(sheet)
     assert len(bound) > 1
-    pixels = np.rint(reference.projected(sheet.placement.state)).astype(int)
+    pixels = np.rint(reference.projected(sheet.registration.state)).astype(int)
     inside = ((pixels >= 0) & (pixels < [CAMERA.width, CAMERA.height])).all(axis=1)
-    hidden, before = (np.zeros(len(pixels), dtype=bool), wedge_before_sheet(*rig_recording, sheet.placement.frame))
+    hidden, before = (np.zeros(len(pixels), dtype=bool), wedge_before_sheet(*rig_recording, sheet.registration.frame))
     hidden[inside] = before[pixels[inside, 1], pixels[inside, 0]]
     assert hidden.sum() > 50
 
 
 def test_what_is_hidden_does_not_count_as_shown_by_the_reference_view(rig_recording, sheets):
-    sheet, last = sheets["aware"], sheets["aware"].placement.frame
+    sheet, last = sheets["aware"], sheets["aware"].registration.frame
     reference, bound = bound_points(replace(sheet, keyframes={last: sheet.keyframes[last]}))
     assert list(bound) == [last]
-    samples, state = SurfaceSamples(Estimator(sheet.model, CAMERA), reference.surface), sheet.placement.state
+    samples, state = SurfaceSamples(Estimator(sheet.model, CAMERA), reference.surface), sheet.registration.state
     share = np.abs(reference.shown(samples)).sum() / np.abs(samples.seen(state, reference.depth(state))).sum()
     covered = np.isfinite(exact_depth(*rig_recording, "sheet", last))
     hidden = wedge_before_sheet(*rig_recording, last) & covered
@@ -142,7 +144,7 @@ def test_each_camera_of_a_rig_knows_the_object_by_its_own_pictures_of_the_scan(m
             nodes = view.state.camera_from_object.apply(setup.model.positions(view.state.parameters))
             assert np.linalg.norm(nodes - exact, axis=1).max() < 0.4e-3
     arguments = [folder / "both", "--with", folder / "mirrored", "--camera", f"{folder}/camchain_mirrored.yaml#cam0"]
-    arguments += ["--model", folder / "wedge.morph", "--place", folder / "wedge" / "adjusted.json"]
+    arguments += ["--model", folder / "wedge.morph", "--registration", folder / "wedge" / "adjusted.json"]
     arguments += ["--range", f"{SCAN}-{SCAN + LEFT_FRAMES - 1}", "--no-video", "-o"]
     for name, more in (("one", ["--one-view"]), ("several", [])):
         assert main(["track", *map(str, [*arguments, tmp_path / name, *more])]) == 0

@@ -31,7 +31,7 @@ def recording(rig_recording):
 
 
 def command(folder, output, *more, first="sheet", camera="camera.yaml"):
-    start = [] if first is None else ["--place", str(folder / first / "registration.json")]
+    start = [] if first is None else ["--registration", str(folder / first / "registration.json")]
     arguments = [str(folder / "front"), "--camera", str(folder / camera), *start]
     arguments += ["--model", str(folder / f"{first or 'wedge'}.morph"), "--range", f"{SCAN - 1}-{FRAMES - 1}"]
     return ["track", *arguments, "-o", str(output), "--no-video", *map(str, more)]
@@ -213,14 +213,14 @@ def test_an_object_moved_before_two_cameras_is_followed_by_its_points(recording)
     """The map's pose is shifted, as if the object had been pushed by 20 mm."""
     folder, truth = recording
     options = ObjectOptions(
-        folder / "wedge.morph", folder / "camera.yaml", placement=folder / "wedge" / "registration.json"
+        folder / "wedge.morph", folder / "camera.yaml", registration=folder / "wedge" / "registration.json"
     )
     setup = load_setup(options)
-    placement = setup.placement
-    chain = setup.new_tracker(placement, setup.reference, in_sequence=False)
+    registration = setup.registration
+    chain = setup.new_tracker(registration, setup.reference, in_sequence=False)
     sources = [open_source(folder / name, SCAN - 1, SCAN + 5) for name in ("front", "aside")]
-    beside = next(iter(open_source(folder / "aside", placement.frame, placement.frame))).image
-    rig = RigTracker(placement.model, RIG, [setup.reference, beside], placement.state, in_sequence=False)
+    beside = next(iter(open_source(folder / "aside", registration.frame, registration.frame))).image
+    rig = RigTracker(registration.model, RIG, [setup.reference, beside], registration.state, in_sequence=False)
     results = []
     for front, aside in zip(*sources, strict=True):
         known = chain.locate(front).pose_prior

@@ -24,7 +24,7 @@ CAMERA = RIG[0].camera
 
 def command(folder, output, *more):
     arguments = [folder / "front", "--camera", folder / "camera.yaml", "--range", f"{SCAN - 1}-{FRAMES - 1}"]
-    arguments += ["--model", folder / "sheet.morph", "--place", folder / "sheet" / "adjusted.json"]
+    arguments += ["--model", folder / "sheet.morph", "--registration", folder / "sheet" / "adjusted.json"]
     arguments += ["--also", "wedge", folder / "wedge.morph", folder / "wedge" / "adjusted.json", "-o", output]
     return ["live", *map(str, [*arguments, *more])]
 

@@ -104,7 +104,7 @@ def test_a_board_tells_its_pose_within_half_a_millimetre(tmp_path, text):
 
 def test_an_object_on_a_board_is_where_the_file_says(tmp_path, scene):
     board = load_board(written(tmp_path, GRID))
-    placed = BoardStart(board).place(scene.model, CAMERA, picture_of(board, BOARD_POSE))
+    placed = BoardStart(board).register(scene.model, CAMERA, picture_of(board, BOARD_POSE))
     turn = Rotation.from_euler("xyz", [10, 5, 30], degrees=True).as_matrix()
     truth = BOARD_POSE @ RigidTransform(turn, np.array([0.020, -0.040, -0.015]))
     assert mean_distance(scene.model, placed.state, State(scene.model.default, truth)) < 1.0
@@ -118,7 +118,7 @@ def test_a_board_that_is_not_seen_or_of_other_sizes_is_refused(tmp_path, scene):
     board = load_board(written(tmp_path, GRID))
     blank = np.full((CAMERA.height, CAMERA.width), 120, dtype=np.uint8)
     with pytest.raises(RegistrationError, match="the board is not seen in the reference frame"):
-        BoardStart(board).place(scene.model, CAMERA, blank)
+        BoardStart(board).register(scene.model, CAMERA, blank)
     narrow = load_board(written(tmp_path, GRID.replace("gap_mm = 9", "gap_mm = 20")))
     with pytest.raises(RegistrationError, match="corners of the board do not lie as they should"):
         locate_board(narrow, CAMERA, picture_of(board, BOARD_POSE))
@@ -195,10 +195,10 @@ def grey(scene, states):
 
 def test_a_picture_of_the_print_places_a_bent_sheet(scene):
     truth = scene.state(0.3)
-    by_rectangle = print_on_sheet(scene).place(scene.model, CAMERA, grey(scene, [truth]))
+    by_rectangle = print_on_sheet(scene).register(scene.model, CAMERA, grey(scene, [truth]))
     assert mean_distance(scene.model, by_rectangle.state, truth) < 3.0
     by_nodes = PictureStart(scene.stage.texture, None, scene.stage.coordinates)
-    placed = by_nodes.place(scene.model, CAMERA, grey(scene, [truth]))
+    placed = by_nodes.register(scene.model, CAMERA, grey(scene, [truth]))
     assert mean_distance(scene.model, placed.state, truth) < 1.5
     assert placed.facts["n_agreeing"] > 200
     assert not any("ambiguous" in flag for flag in placed.flags)
@@ -207,11 +207,11 @@ def test_a_picture_of_the_print_places_a_bent_sheet(scene):
 def test_a_second_sheet_with_the_print_is_told_and_another_print_is_refused(scene):
     truth = scene.state(0.3)
     two = grey(scene, [truth, aside(truth, [scene.beside, 0.02, 0.0])])
-    placed = print_on_sheet(scene).place(scene.model, CAMERA, two)
+    placed = print_on_sheet(scene).register(scene.model, CAMERA, two)
     assert any("the print is in two places" in flag for flag in placed.flags)
     other = SCENES["sheet"](7)
     with pytest.raises(RegistrationError, match="print is not found in the reference frame"):
-        print_on_sheet(scene).place(scene.model, CAMERA, grey(other, [other.state(0.3)]))
+        print_on_sheet(scene).register(scene.model, CAMERA, grey(other, [other.state(0.3)]))
 
 
 def test_a_picture_file_is_read_and_its_mistakes_named(tmp_path, scene):
@@ -246,7 +246,7 @@ def test_a_guess_is_refined_to_a_hundredth_of_the_distance(name):
     scene = SCENES[name](0)
     truth = scene.state(0.0)
     guess = guess_near(scene, truth, np.array([6e-3, -5e-3, 8e-3]), [0.02, -0.03, 0.03])
-    placed = guess.place(scene.model, scene.stage.camera, grey(scene, [truth]))
+    placed = guess.register(scene.model, scene.stage.camera, grey(scene, [truth]))
     off = mean_distance(scene.model, placed.state, truth)
     assert off < mean_distance(scene.model, guess.state(scene.model), truth)
     assert off < 25.0 * truth.camera_from_object.translation[2]
@@ -260,10 +260,10 @@ def test_a_guess_that_the_image_contradicts_is_refused(name):
     truth = scene.state(0.0)
     far = guess_near(scene, truth, np.array([0.08, 0.05, 0.0]), [0.1, 0.1, 0.3])
     with pytest.raises(RegistrationError, match=r"the image contradicts the guess|out of the image"):
-        far.place(scene.model, scene.stage.camera, grey(scene, [truth]))
+        far.register(scene.model, scene.stage.camera, grey(scene, [truth]))
     near = guess_near(scene, truth, np.zeros(3), [0.0, 0.0, 0.0])
     with pytest.raises(RegistrationError, match="the image contradicts the guess"):
-        near.place(scene.model, scene.stage.camera, grey(scene, []))
+        near.register(scene.model, scene.stage.camera, grey(scene, []))
 
 
 @pytest.fixture(scope="module")
@@ -314,7 +314,9 @@ def test_a_run_starts_from_a_picture_and_is_placed_anew(recording, scene, tmp_pa
 
 def test_a_live_run_is_placed_anew_in_the_frame_or_the_next_that_is_not_dropped(recording, scene, tmp_path):
     of_object = ObjectOptions(
-        recording / "sheet.morph", recording / "camera.yaml", aids=InitializerFiles(picture=recording / "picture.toml")
+        recording / "sheet.morph",
+        recording / "camera.yaml",
+        initializer=InitializerFiles(picture=recording / "picture.toml"),
     )
     live = LiveOptions(str(recording / "frames"), tmp_path / "run", of_object, reregister_at=((7, None),), record=False)
     flags = run_live(live)["flags"]

@@ -14,7 +14,6 @@ from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.io.camera_files import save_camera
 from morph_dslam.io.tables import Landmarks, save_landmarks
 from morph_dslam.model import save_model
-from morph_dslam.registration.landmarks import RegistrationOptions
 from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.track import TrackOptions, track
 from morph_dslam.tracking.tracker import Tracker
@@ -47,7 +46,7 @@ def inputs(tmp_path_factory):
 def options(inputs, output, **changes):
     files = {"frames": "frames", "model": "sheet.morph", "camera": "camera.yaml", "landmarks": "landmarks.csv"}
     # The landmarks are exact but for rounding.
-    changes = {"registration": RegistrationOptions(click_px=0.01), **changes}
+    changes = {"click_px": 0.01, **changes}
     return TrackOptions(**{name: inputs / path for name, path in files.items()}, output=output, **changes)
 
 

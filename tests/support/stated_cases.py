@@ -20,7 +20,7 @@ from tests.support.staged_scenes import Scene, is_beyond, is_doubted, mean_error
 
 #: Frames of a recording at 30 a second that show one unit of a scene's time.
 FRAMES = 120
-#: Flags of a placement that say it may be wrong.
+#: Flags of a registration that say it may be wrong.
 DOUBTFUL = ("ambiguous", "poor", "doubtful", "underdetermined", "at a bound")
 #: Errors of a pose in a map: of the registration, which last, and of the camera; rad and metres.
 LASTING, FROM_CAMERA = np.repeat([8e-4, 3e-4], 3), np.repeat([3e-4, 1e-4], 3)
@@ -34,7 +34,7 @@ class Outcome:
     ----------
     said : the error, or the flags of the run and the reasons of lost frames. n_frames : of the recording.
     n_tracked, n_lost : of them. n_beyond : off beyond what they state. n_wrong : those of them of which
-        neither the frame's reason nor, where the model is wrong, a flag of the placement says that they are
+        neither the frame's reason nor, where the model is wrong, a flag of the registration says that they are
         not to be relied on.
     back_after : frames after the object could be seen whole again until it was tracked; None if it never was.
     largest_error : of a tracked frame, metres; NaN without one. statuses : of the frames.
@@ -106,7 +106,7 @@ class InMap:
         self._scene, self._model, self._rng = scene, model, np.random.default_rng(seed)
         self._off = LASTING * self._rng.standard_normal(6)
 
-    def placement(self) -> Registration:
+    def registration(self) -> Registration:
         """In the scene's first frame, as a keyframe of the map has it."""
         model, truth = self._model, self._scene.state(0.0).camera_from_object
         covariance = np.zeros((len(model.parameters) + 6,) * 2)
@@ -126,18 +126,18 @@ def _off_by(pose: RigidTransform, error) -> RigidTransform:
 
 def run_case(
     scene: Scene,
-    placement: Registration,
+    registration: Registration,
     shown: Iterable[Shown],
     back_at: int | None = None,
     in_map: InMap | None = None,
     **options,
 ) -> Outcome:
-    """Track what is shown from the scene's first frame, in which the object is where ``placement`` says."""
+    """Track what is shown from the scene's first frame, in which the object is where ``registration`` says."""
     reference = scene.stage.frame([scene.state(0.0)])
-    tracker = Tracker(placement.model, scene.stage.camera, placement, reference=reference, **options)
-    run, errors, back = RunResults(placement.model, 0), [np.nan], None
-    wrong_model = placement.model is not scene.model
-    doubtful = wrong_model and any(word in flag for flag in placement.flags for word in DOUBTFUL)
+    tracker = Tracker(registration.model, scene.stage.camera, registration, reference=reference, **options)
+    run, errors, back = RunResults(registration.model, 0), [np.nan], None
+    wrong_model = registration.model is not scene.model
+    doubtful = wrong_model and any(word in flag for flag in registration.flags for word in DOUBTFUL)
     beyond = wrong = 0
     for number, view in enumerate(shown):
         states = [*view.others, *([] if view.state is None else [view.state])]
@@ -147,17 +147,17 @@ def run_case(
         run.add(number, number / 30.0, result)
         if result.status != "tracked":
             continue
-        off = view.state is None or is_beyond(placement.model, result, scene.model, view.state)
+        off = view.state is None or is_beyond(registration.model, result, scene.model, view.state)
         beyond += off
         wrong += off and not doubtful and not is_doubted(result)
         if view.state is None:
             continue
-        errors.append(mean_error(placement.model, result.estimate, scene.model, view.state))
+        errors.append(mean_error(registration.model, result.estimate, scene.model, view.state))
         if back is None and back_at is not None and number >= back_at:
             back = number - back_at
     reasons = Counter(_gist(r.reason) for r in run.results if r.status != "tracked")
     return Outcome(
-        (*placement.flags, *flags(run), *reasons),
+        (*registration.flags, *flags(run), *reasons),
         len(run),
         int(run.tracked.sum()),
         int((~run.tracked).sum()),

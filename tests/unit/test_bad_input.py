@@ -167,10 +167,10 @@ def test_numbers_that_cannot_be_meant(tmp_path, load, name, text):
 
 
 def test_frames_to_place_the_object_anew_in_that_cannot_be(tmp_path):
-    setup, placement = SimpleNamespace(aid=object()), SimpleNamespace()
+    setup, registration = SimpleNamespace(initializer=object()), SimpleNamespace()
     with pytest.raises(RegistrationError, match=r"absent\.csv"):
-        Reregistration(setup, placement, [(7, tmp_path / "absent.csv")])
-    assert Reregistration(setup, placement, [(7, None)]).notes == ["not placed anew in frame 7: it was not tracked"]
+        Reregistration(setup, registration, [(7, tmp_path / "absent.csv")])
+    assert Reregistration(setup, registration, [(7, None)]).notes == ["not placed anew in frame 7: it was not tracked"]
 
 
 def test_a_damaged_summary_is_named(tmp_path):

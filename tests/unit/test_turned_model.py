@@ -119,11 +119,11 @@ def test_a_registration_places_the_object_in_its_last_keyframe(tmp_path):
     }
     path = tmp_path / "registration.json"
     path.write_text(json.dumps(content))
-    placement = load_registration(path, bent_tube())
-    assert placement.frame == 7
-    np.testing.assert_allclose(placement.state.camera_from_object.matrix, pose)
-    assert placement.model.parameters[-1].name == "turn"
-    assert any("ambiguous" in flag for flag in placement.flags)
+    registration = load_registration(path, bent_tube())
+    assert registration.frame == 7
+    np.testing.assert_allclose(registration.state.camera_from_object.matrix, pose)
+    assert registration.model.parameters[-1].name == "turn"
+    assert any("ambiguous" in flag for flag in registration.flags)
     path.write_text("{}")
     with pytest.raises(RegistrationError, match=r"not a registration\.json"):
         load_registration(path, bent_tube())

@@ -30,8 +30,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--reference-frame",
         type=int,
         metavar="N",
-        help="frame that the landmarks, or another aid, belong to (default: the first one tracked); with "
-        "--place and --with: one in which the object is undeformed",
+        help="frame that the landmarks, or another start, belong to (default: the first one tracked); with "
+        "--registration and --with: one in which the object is undeformed",
     )
     command.add_argument(
         "--refine", action="store_true", help="refine the reference state over the whole sequence and track once more"
@@ -111,8 +111,8 @@ def object_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
         "model": arguments.model,
         "camera": arguments.camera,
         "landmarks": arguments.landmarks,
-        "placement": arguments.place,
-        "aids": InitializerFiles(arguments.board, arguments.picture, arguments.guess),
+        "registration": arguments.registration,
+        "initializer": InitializerFiles(arguments.board, arguments.picture, arguments.guess),
         "map_path": arguments.map,
         "pose": arguments.pose,
         "use_outline": arguments.outline,
@@ -150,7 +150,9 @@ def add_tracking_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--camera", type=Path, required=True, help="camera file: size, intrinsics, distortion")
     start = command.add_mutually_exclusive_group(required=True)
     start.add_argument("--landmarks", type=Path, help="object points and their pixels in the reference frame")
-    start.add_argument("--place", type=Path, metavar="JSON", help="registration.json of `morph register` in a map")
+    start.add_argument(
+        "--registration", type=Path, metavar="JSON", help="registration.json of `morph register` in a map"
+    )
     start.add_argument(
         "--board", type=Path, metavar="TOML", help="a printed board of markers, and where the object is on it"
     )
@@ -162,13 +164,13 @@ def add_tracking_arguments(command: argparse.ArgumentParser) -> None:
         "--map",
         type=Path,
         metavar="H5",
-        help="with --place: the map that the camera is found in (default: the one that was registered in)",
+        help="with --registration: the map that the camera is found in (default: the one that was registered in)",
     )
     command.add_argument(
         "--pose",
         choices=("map", "fixed", "free"),
         default="map",
-        help="the object's pose with --place: by map and points together, by the map alone, or by its points "
+        help="the object's pose with --registration: by map and points together, by the map alone, or by its points "
         "alone (default: %(default)s)",
     )
     command.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="run folder to write")

@@ -361,7 +361,7 @@ class BoardStart:
 
     board: FiducialBoard
 
-    def place(self, model: ReducedModel, camera: Camera, grey: NDArray[np.uint8]) -> Registration:
+    def register(self, model: ReducedModel, camera: Camera, grey: NDArray[np.uint8]) -> Registration:
         """The object in an undistorted image (h, w).
 
         Raises

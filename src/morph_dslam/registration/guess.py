@@ -17,7 +17,7 @@ from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.tables import Landmarks, read_toml
 from morph_dslam.model import ReducedModel, SurfacePoints
-from morph_dslam.registration.landmarks import RegistrationOptions, shape_starts
+from morph_dslam.registration.landmarks import shape_starts
 from morph_dslam.registration.registration import Registration, register_by_landmarks
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.sources.frames import read_image
@@ -117,7 +117,7 @@ class PictureStart:
     rectangle: Array | None
     coordinates: Array | None
 
-    def place(self, model: ReducedModel, camera: Camera, grey: Image) -> Registration:
+    def register(self, model: ReducedModel, camera: Camera, grey: Image) -> Registration:
         """The object in an undistorted image (h, w).
 
         Raises
@@ -140,7 +140,7 @@ class PictureStart:
         rows = np.flatnonzero(agreeing)
         chosen = rows[np.unique(np.linspace(0, len(rows) - 1, N_LANDMARKS).round().astype(int))]
         landmarks = Landmarks(points[chosen], camera.distort_pixels(pixels[chosen]))
-        placed = register_by_landmarks(model, camera, landmarks, RegistrationOptions(click_px=LANDMARK_PX))
+        placed = register_by_landmarks(model, camera, landmarks, LANDMARK_PX)
         flags = placed.flags
         if second.sum() >= AMBIGUOUS * agreeing.sum():
             counts = f"{int(agreeing.sum())} and {int(second.sum())} features agree"
@@ -277,7 +277,7 @@ class GuessStart:
         turn = Rotation.from_euler("xyz", self.guess.pose.rotation_deg, degrees=True).as_matrix()
         return State(values, RigidTransform(turn, 1e-3 * np.array(self.guess.pose.position_mm)))
 
-    def place(self, model: ReducedModel, camera: Camera, grey: Image) -> Registration:
+    def register(self, model: ReducedModel, camera: Camera, grey: Image) -> Registration:
         """The object in an undistorted image (h, w).
 
         Raises

@@ -80,26 +80,15 @@ POOR_FIT = 2.0
 SIZES = (0.005, 10.0)
 
 
-@dataclass(frozen=True)
-class RegistrationOptions:
-    """Limits of the registration.
+#: Standard deviation of a carefully set landmark, pixels.
+CLICK_PX = 0.5
 
-    Attributes
-    ----------
-    spread_share : least extent of the landmarks, as a share of the object's size.
-    surface_share : how far a landmark may lie off the undeformed surface, as a share of the object's size.
-    residual_share : largest residual (root mean square) as a share of the image's diagonal.
-    click_px : standard deviation of a carefully set landmark, pixels; minima that fit equally well within it
-        are ambiguous.
-    distinct_share : minima farther apart than this share of the object's size (mean over the mesh, in the
-        camera frame) are different.
-    """
+#: Shares of the object's size: least extent of the landmarks, how far one may lie off the undeformed surface,
+#: and how far apart different minima are (mean over the mesh, in the camera frame).
+SPREAD_SHARE, SURFACE_SHARE, DISTINCT_SHARE = 0.12, 0.01, 0.02
 
-    spread_share: float = 0.12
-    surface_share: float = 0.01
-    residual_share: float = 0.005
-    click_px: float = 0.5
-    distinct_share: float = 0.02
+#: Largest residual (root mean square) as a share of the image's diagonal.
+RESIDUAL_SHARE = 0.005
 
 
 @dataclass(frozen=True)
@@ -136,7 +125,7 @@ class LandmarkFit:
 
 
 def register(
-    model: ReducedModel, camera: Camera, points: Array, pixels: Array, options: RegistrationOptions | None = None
+    model: ReducedModel, camera: Camera, points: Array, pixels: Array, click_px: float = CLICK_PX
 ) -> LandmarkFit:
     """Place the object in the reference frame.
 
@@ -144,6 +133,8 @@ def register(
     ----------
     points : (k, 3) landmarks on the undeformed object, object frame, metres.
     pixels : (k, 2) where they are seen in the image as recorded, with its distortion.
+    click_px : standard deviation of a carefully set landmark; minima that fit equally well within it are
+        ambiguous.
 
     Raises
     ------
@@ -151,8 +142,7 @@ def register(
         If there are fewer than 4 landmarks, one lies off the object or outside the image, or no pose and
         parameters explain them.
     """
-    options = options or RegistrationOptions()
-    bound = bind_landmarks(model, points, options)
+    bound = bind_landmarks(model, points)
     _check_pixels(camera, pixels)
     undistorted = np.ascontiguousarray(camera.undistort_pixels(pixels))
     estimator = Estimator(model, camera, EstimationOptions(huber_px=3.0, max_iterations=60))
@@ -163,16 +153,16 @@ def register(
         raise RegistrationError(
             "no pose of the object explains the landmarks: check that points and pixels belong together"
         )
-    best, alternatives = _distinct_minima(model, found, options)
+    best, alternatives = _distinct_minima(model, found, click_px)
     rms = float(np.sqrt(np.mean(np.sum(best.residuals**2, axis=1))))
-    _check_residual(best, rms, options.residual_share * float(np.hypot(camera.width, camera.height)))
+    _check_residual(best, rms, RESIDUAL_SHARE * float(np.hypot(camera.width, camera.height)))
     states = tuple(estimate.state for estimate in alternatives)
-    flags = _flags(model, best, alternatives, len(bound), options.click_px)
-    flags += flag_of_unit(model, points, options.surface_share)
-    return LandmarkFit(best, states, rms, flags, options.click_px)
+    flags = _flags(model, best, alternatives, len(bound), click_px)
+    flags += flag_of_unit(model, points, SURFACE_SHARE)
+    return LandmarkFit(best, states, rms, flags, click_px)
 
 
-def bind_landmarks(model: ReducedModel, points: Array, options: RegistrationOptions) -> BoundPoints:
+def bind_landmarks(model: ReducedModel, points: Array) -> BoundPoints:
     """Bind landmarks to the nearest points of the undeformed surface; see `register`."""
     if len(points) < 4:
         raise RegistrationError(
@@ -181,7 +171,7 @@ def bind_landmarks(model: ReducedModel, points: Array, options: RegistrationOpti
         )
     size, spread = extent(model.nodes), extent(points)
     surface, distances = nearest_surface_points(model.nodes, model.triangles, points)
-    limit = options.surface_share * size
+    limit = SURFACE_SHARE * size
     worst = int(distances.argmax())
     if distances[worst] > limit:
         x, y, z = 1e3 * points[worst]
@@ -190,12 +180,12 @@ def bind_landmarks(model: ReducedModel, points: Array, options: RegistrationOpti
         raise RegistrationError(
             f"landmark {worst + 1} at ({x:g}, {y:g}, {z:g}) mm is {1e3 * distances[worst]:.1f} mm off the "
             f"object, at most {1e3 * limit:.1f} mm are allowed: landmarks are points of the "
-            f"undeformed object ({ranges} mm){unit_hint(model, points, options.surface_share)}"
+            f"undeformed object ({ranges} mm){unit_hint(model, points, SURFACE_SHARE)}"
         )
-    if spread < options.spread_share * size:
+    if spread < SPREAD_SHARE * size:
         raise RegistrationError(
             f"the landmarks are {1e3 * spread:.3g} mm apart on an object of {1e3 * size:.3g} mm: spread them "
-            f"over all that is seen of it{unit_hint(model, points, options.surface_share)}"
+            f"over all that is seen of it{unit_hint(model, points, SURFACE_SHARE)}"
         )
     return BoundPoints.from_surface(model, surface)
 
@@ -267,13 +257,13 @@ def solve_pnp(points: Array, pixels: Array, camera: Camera) -> list[RigidTransfo
 
 
 def _distinct_minima(
-    model: ReducedModel, found: list[Estimate], options: RegistrationOptions
+    model: ReducedModel, found: list[Estimate], click_px: float
 ) -> tuple[Estimate, tuple[Estimate, ...]]:
     """The best minimum and the different ones that landmarks of the stated accuracy cannot exclude."""
-    limit = options.distinct_share * extent(model.nodes)
+    limit = DISTINCT_SHARE * extent(model.nodes)
     best = found[0]
     freedom = max(2 * len(best.residuals) - len(best.covariance), 1)
-    variance = max(options.click_px**2, 2.0 * best.cost / freedom)
+    variance = max(click_px**2, 2.0 * best.cost / freedom)
     # Twice the log-likelihood ratio of two minima; 9 is the three-sigma level.
     plausible = [e for e in found if 2.0 * (e.cost - best.cost) < 9.0 * variance]
     shapes = [_mesh_in_camera(model, best.state)]

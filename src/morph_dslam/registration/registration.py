@@ -17,7 +17,7 @@ from morph_dslam.io.tables import Landmarks
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.revolution import with_revolution_angle
-from morph_dslam.registration.landmarks import RegistrationOptions, bind_landmarks, register
+from morph_dslam.registration.landmarks import CLICK_PX, bind_landmarks, register
 from morph_dslam.slam.pose import PoseEstimate
 from morph_dslam.tracking.depth import DepthOptions
 from morph_dslam.tracking.estimator import Estimator, State
@@ -203,10 +203,10 @@ class Registration:
     model : the model to track with; with the angle about its axis as a parameter where that is not known.
     frame : number of the reference frame; None for the first one tracked.
     state : of the object there. facts : for the summary. flags : what a reader must know.
-    per_sequence : names of the parameters that the placement leaves open and that do not change: the angle
+    per_sequence : names of the parameters that the registration leaves open and that do not change: the angle
         about an axis.
     covariance : (d + 6, d + 6) of ``state``; None where it is not known.
-    place : in the map of the scene; None where there is none.
+    map_registration : where the object is in the map of the scene; None where there is none.
     discrepancy : what the object's shape has beyond the model's in the frame; None where it is not known.
     views : keyframes that show the object, that of ``frame`` first; none where their errors are not known.
     """
@@ -218,7 +218,7 @@ class Registration:
     flags: tuple[str, ...]
     per_sequence: tuple[str, ...] = ()
     covariance: Array | None = None
-    place: MapRegistration | None = None
+    map_registration: MapRegistration | None = None
     discrepancy: Discrepancy | None = None
     views: tuple[KeyframePose, ...] = ()
 
@@ -301,7 +301,7 @@ def register_by_landmarks(
     model: ReducedModel,
     camera: Camera,
     landmarks: Landmarks,
-    options: RegistrationOptions,
+    click_px: float = CLICK_PX,
     depth: NDArray[np.float32] | None = None,
     sensor: DepthOptions | None = None,
 ) -> Registration:
@@ -311,7 +311,7 @@ def register_by_landmarks(
     ----------
     depth : (h, w) of that frame, metres, NaN where unknown; None without a depth camera, ``sensor``.
     """
-    registration = register(model, camera, landmarks.points, landmarks.pixels, options)
+    registration = register(model, camera, landmarks.points, landmarks.pixels, click_px)
     facts = {
         "from": "landmarks",
         "residual_rms_px": registration.residual_rms_px,
@@ -321,7 +321,7 @@ def register_by_landmarks(
     }
     placed, covariance = registration.estimate, registration.covariance
     if depth is not None:
-        bound = bind_landmarks(model, landmarks.points, options)
+        bound = bind_landmarks(model, landmarks.points)
         # How well the landmarks fit tells how carefully they were set, where they are enough to tell.
         sigma = max(placed.sigma_px, LEAST_LANDMARK_PX) if np.isfinite(placed.sigma_px) else LANDMARK_PX
         placed = refine_by_depth(

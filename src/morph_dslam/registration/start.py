@@ -23,7 +23,7 @@ Image = NDArray[np.uint8]
 class Initializer(Protocol):
     """Places an object in one image."""
 
-    def place(self, model: ReducedModel, camera: Camera, grey: Image) -> Registration:
+    def register(self, model: ReducedModel, camera: Camera, grey: Image) -> Registration:
         """The object in an undistorted image (h, w); raises RegistrationError if it cannot be placed."""
         ...
 
@@ -47,10 +47,12 @@ class InitializerFiles:
         return None if self.guess is None else load_guess(self.guess)
 
 
-def register_by_initializer(aid: Initializer, model: ReducedModel, camera: Camera, image: Image) -> Registration:
-    """The object in a frame (h, w, 3) as recorded; raises RegistrationError as `Initializer.place` does."""
+def register_by_initializer(
+    initializer: Initializer, model: ReducedModel, camera: Camera, image: Image
+) -> Registration:
+    """The object in a frame (h, w, 3) as recorded; raises RegistrationError as `Initializer.register` does."""
     grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
     maps = camera.undistortion_maps()
     if maps is not None:
         grey = np.asarray(cv2.remap(grey, *maps, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
-    return aid.place(model, camera, grey)
+    return initializer.register(model, camera, grey)

@@ -208,10 +208,10 @@ def keyframe_views_of_rig(
     ----------
     setup : of the first camera, whose recording shows the map's keyframes. others : the other recordings.
     """
-    if setup.further is None or setup.placement is None:
+    if setup.further is None or setup.registration is None:
         return None
-    model, views = setup.placement.model, views_of(setup.placement, setup.keyframes, setup.seen)
-    options, found = setup.tracker_options(setup.placement), [setup.further]
+    model, views = setup.registration.model, views_of(setup.registration, setup.keyframes, setup.seen)
+    options, found = setup.tracker_options(setup.registration), [setup.further]
     for part, path in zip(cameras[1:], others, strict=True):
         pictures = pictures_from(path, part.camera, [view.frame for view in views if view.frame is not None])
         own = [

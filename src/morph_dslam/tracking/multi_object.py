@@ -136,24 +136,24 @@ class Known:
     """An object, where it is, and the ``frame`` that it starts from."""
 
     setup: Setup
-    placement: Registration
+    registration: Registration
     frame: int
 
     @cached_property
     def _surface(self) -> DrawnSurface:
-        return DrawnSurface.of(self.placement.model)
+        return DrawnSurface.of(self.registration.model)
 
     def state_in(self, frame: int, keyframe: KeyframeImage | None) -> State | None:
         """The object in a frame, a keyframe of the map or not; None where nobody knows where it is."""
-        placement = self.placement
+        registration = self.registration
         if frame == self.frame:
-            return placement.state
-        pose = next((view.pose for view in placement.views if view.frame == frame), None)
-        is_in_map = self.setup.map_path is not None and placement.place is not None
+            return registration.state
+        pose = next((view.pose for view in registration.views if view.frame == frame), None)
+        is_in_map = self.setup.map_path is not None and registration.map_registration is not None
         if pose is None and is_in_map and keyframe is not None:
-            assert placement.place is not None
-            pose = placement.place.pose_in(keyframe.camera_from_world)
-        return None if pose is None else State(placement.model.default, pose)
+            assert registration.map_registration is not None
+            pose = registration.map_registration.pose_in(keyframe.camera_from_world)
+        return None if pose is None else State(registration.model.default, pose)
 
     def depth(self, state: State) -> NDArray[np.float32]:
         """Depth (h, w) of the object in a state, metres, infinite where it is not."""
@@ -215,9 +215,9 @@ class OtherObject:
             options,
             model=self.model,
             landmarks=None if self.is_registered else self.start,
-            placement=self.start if self.is_registered else None,
+            registration=self.start if self.is_registered else None,
             map_path=options.map_path if self.is_registered else None,
-            aids=InitializerFiles(),
+            initializer=InitializerFiles(),
             inner=(),
             per_sequence=(),
             random_walk=(),
@@ -252,20 +252,20 @@ class ObjectStart:
     """
 
     setup: Setup
-    placement: Registration
+    registration: Registration
     picture: NDArray[np.uint8] | Image
     frame: int
     in_sequence: bool
 
     def new_run(self) -> RunResults:
         """Results of no frame so far."""
-        constant = self.setup.tracker_options(self.placement).per_sequence
-        return RunResults(self.placement.model, self.frame, per_sequence=constant)
+        constant = self.setup.tracker_options(self.registration).per_sequence
+        return RunResults(self.registration.model, self.frame, per_sequence=constant)
 
 
 def without_hidden(objects: Sequence[ObjectStart]) -> list[ObjectStart]:
     """The objects, known by nothing that another one hides in the pictures that they are known by."""
-    seen = seen_parts([Known(part.setup, part.placement, part.frame) for part in objects])
+    seen = seen_parts([Known(part.setup, part.registration, part.frame) for part in objects])
     return [replace(part, setup=replace(part.setup, seen=own)) for part, own in zip(objects, seen, strict=True)]
 
 
@@ -278,12 +278,12 @@ def objects_chain(objects: Mapping[str, ObjectStart]) -> MultiObjectTracker:
         If two are registered in the same place, or one shows too few corners.
     """
     anchored = {name: part for name, part in objects.items() if part.setup.map_path is not None}
-    placements = {name: part.placement for name, part in anchored.items()}
+    registrations = {name: part.registration for name, part in anchored.items()}
     first = next(iter(anchored.values()), None)
-    anchor = None if first is None else first.setup.new_anchor(placements)
+    anchor = None if first is None else first.setup.new_anchor(registrations)
     trackers = {
         name: part.setup.new_tracker(
-            part.placement, part.picture, part.in_sequence, part.setup.seen.get(part.frame), anchored=False
+            part.registration, part.picture, part.in_sequence, part.setup.seen.get(part.frame), anchored=False
         )
         for name, part in objects.items()
     }
@@ -335,7 +335,7 @@ def track_objects(options: TrackOptions, others: Sequence[OtherObject]) -> dict[
         for part in objects:
             if len(part.run):
                 folder, start = part.options.output, part.start
-                summaries[folder] = write_results(start.setup, start.placement, source, part.options, part.run)
+                summaries[folder] = write_results(start.setup, start.registration, source, part.options, part.run)
     return summaries
 
 
@@ -347,10 +347,10 @@ def _follow(chain: MultiObjectTracker, objects: Sequence[_Object], source: Frame
 
 
 def _check(options: TrackOptions, others: Sequence[OtherObject]) -> None:
-    if options.landmarks is None and options.placement is None:
+    if options.landmarks is None and options.registration is None:
         raise TrackingError(
             "several objects start from landmarks or from registrations in a map: give the first one "
-            "--landmarks or --place"
+            "--landmarks or --registration"
         )
     if options.refine_reference or options.reregister_at:
         raise TrackingError("several objects are tracked from where they start: leave out --refine and --reregister-at")
@@ -360,12 +360,12 @@ def _check(options: TrackOptions, others: Sequence[OtherObject]) -> None:
 
 
 def _all_registered(options: TrackOptions, others: Sequence[OtherObject]) -> bool:
-    return options.placement is not None and all(other.is_registered for other in others)
+    return options.registration is not None and all(other.is_registered for other in others)
 
 
 def _for_first(options: TrackOptions, others: Sequence[OtherObject]) -> TrackOptions:
     """The first object's options: a map may have been given for the others only."""
-    needs_map = options.placement is not None or not any(other.is_registered for other in others)
+    needs_map = options.registration is not None or not any(other.is_registered for other in others)
     return options if needs_map else replace(options, map_path=None)
 
 
@@ -377,12 +377,12 @@ def _prepare(everything: Sequence[TrackOptions], setups: Sequence[Setup]) -> lis
     """The objects in their reference frames; the sequence begins with that of the map, if there is one."""
     check_one_map(setups)
     own = [with_reference(part, setup) for part, setup in zip(everything, setups, strict=True)]
-    first = next((part.first for part in own if part.placement is not None), own[0].first)
+    first = next((part.first for part in own if part.registration is not None), own[0].first)
     starts, options = [], [replace(part, first=first) for part in own]
     for part, setup in zip(options, setups, strict=True):
         begin = find_begin(setup, part)
-        placement = setup.placed(begin.picture, begin.depth)
-        starts.append(ObjectStart(setup, placement, begin.picture, begin.frame, begin.in_sequence))
+        registration = setup.placed(begin.picture, begin.depth)
+        starts.append(ObjectStart(setup, registration, begin.picture, begin.frame, begin.in_sequence))
     return [_Object(part, start, start.new_run()) for part, start in zip(options, without_hidden(starts), strict=True)]
 
 

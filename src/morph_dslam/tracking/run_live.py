@@ -49,7 +49,7 @@ class LiveOptions:
     of_object : what is tracked and with what. drawing : what is drawn.
     others : more objects, registered in the same map, each with its run folder in ``output``.
     first, last : frame numbers of a recording to play, both included; all by default.
-    reregister_at : see `TrackOptions`; by the aid it may be a later frame, where that one was dropped.
+    reregister_at : see `TrackOptions`; by the initializer it may be a later frame, where that one was dropped.
     serve : port on this computer at which browsers see the pictures; None for none, 0 for any.
     record : write the pictures into a video. seconds : how long; until the stream ends by default.
     overwrite : replace a run that is there already.
@@ -118,7 +118,7 @@ def run_live(
         starts = without_hidden([_start(setup, stream, options) for setup in setups])
         objects = [_Object(folder, start, start.new_run()) for folder, start in zip(folders, starts, strict=True)]
         first = starts[0]
-        again = Reregistration(first.setup, first.placement, options.reregister_at, first.frame)
+        again = Reregistration(first.setup, first.registration, options.reregister_at, first.frame)
         _warm_up(objects)
         sinks = _sinks(stack, first.setup, stream, options)
         runs = {part.name: part.run for part in objects}
@@ -163,7 +163,7 @@ def _new_chain(objects: Sequence[_Object], again: Reregistration | None = None) 
     if len(objects) > 1:
         return objects_chain({part.name: part.start for part in objects})
     start = objects[0].start
-    chain = start.setup.new_tracker(start.placement, start.picture, start.in_sequence)
+    chain = start.setup.new_tracker(start.registration, start.picture, start.in_sequence)
     return OneObject(objects[0].name, chain, again)
 
 
@@ -182,12 +182,12 @@ def _picture(objects: Sequence[_Object], drawing: DrawOptions) -> LivePicture:
 
 def _start(setup: Setup, stream: LiveStream, options: LiveOptions) -> ObjectStart:
     """The keyframe of the map, or the first frame that comes, with the landmarks in it."""
-    placement = setup.placement
+    registration = setup.registration
     if setup.reference is not None:
-        assert placement is not None
-        assert placement.frame is not None
-        return ObjectStart(setup, placement, setup.reference, placement.frame, False)
-    if placement is not None:
+        assert registration is not None
+        assert registration.frame is not None
+        return ObjectStart(setup, registration, setup.reference, registration.frame, False)
+    if registration is not None:
         raise TrackingError(
             "a registration needs the map that it was made in, to know what the object looks like: give "
             "--map, and leave out --outline"
@@ -216,14 +216,14 @@ def _sinks(stack: ExitStack, setup: Setup, stream: LiveStream, options: LiveOpti
 def _write(part: _Object, notes: Sequence[str], times: LiveTimes, options: LiveOptions) -> dict[str, Any]:
     """Write all files of an object's run folder but the video, which was written on the way."""
     setup, run, of_object = part.start.setup, part.run, part.start.setup.options
-    placement = part.start.placement
-    placement = replace(placement, flags=(*placement.flags, *notes))
+    registration = part.start.registration
+    registration = replace(registration, flags=(*registration.flags, *notes))
     named = {"source": options.source}
-    named |= {name: str(path) for name, path in vars(of_object.aids).items() if path is not None}
-    for name, path in (("landmarks", of_object.landmarks), ("placement", of_object.placement)):
+    named |= {name: str(path) for name, path in vars(of_object.initializer).items() if path is not None}
+    for name, path in (("landmarks", of_object.landmarks), ("registration", of_object.registration)):
         named |= {} if path is None else {name: str(path)}
     named |= {} if setup.map_path is None else {"map": str(setup.map_path)}
-    tracker = setup.tracker_options(placement)
+    tracker = setup.tracker_options(registration)
     extra = {
         "live": live_figures(times),
         "pose": of_object.pose if setup.map_path is not None else "free",
@@ -232,7 +232,7 @@ def _write(part: _Object, notes: Sequence[str], times: LiveTimes, options: LiveO
         "settings": {"tracker": asdict(tracker)},
     }
     inputs = RunInputs(of_object.model, of_object.camera, named)
-    summary = write_run(part.folder, run, inputs, placement, setup.carried(run.model), tracker, extra)
+    summary = write_run(part.folder, run, inputs, registration, setup.carried(run.model), tracker, extra)
     write_latencies(part.folder / "latency.csv", times)
     return summary
 

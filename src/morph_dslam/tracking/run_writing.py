@@ -44,7 +44,7 @@ def write_run(
     folder: Path,
     run: RunResults,
     inputs: RunInputs,
-    placement: Registration,
+    registration: Registration,
     inner: Sequence[CarriedStructure],
     tracker: TrackerOptions,
     extra: dict[str, Any],
@@ -58,8 +58,8 @@ def write_run(
     write_hdf5(folder / "result.h5", run)
     write_inner_positions(folder / "result.h5", run, inner)
     write_csv(folder / "frames.csv", run)
-    if placement.per_sequence:  # the model has the angle that the placement leaves open
-        save_model(folder / "model.morph", placement.model)
+    if registration.per_sequence:  # the model has the angle that the registration leaves open
+        save_model(folder / "model.morph", registration.model)
     else:
         _copy(inputs.model, folder / "model.morph")
     if inputs.camera.is_file():
@@ -73,8 +73,8 @@ def write_run(
             "made": sum(result.made_view for result in run.results),
             "frames_compared_with_them": sum(result.view > 0 for result in run.results),
         },
-        "registration": placement.facts,
-        "flags": list(placement.flags),
+        "registration": registration.facts,
+        "flags": list(registration.flags),
         "inputs": given,
         "versions": _versions(),
     }

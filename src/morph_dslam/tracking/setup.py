@@ -21,7 +21,7 @@ from morph_dslam.io.camera_files import load_camera
 from morph_dslam.io.tables import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.inner_structure import CarriedStructure, InnerStructure, load_inner_structure
-from morph_dslam.registration.landmarks import RegistrationOptions
+from morph_dslam.registration.landmarks import CLICK_PX
 from morph_dslam.registration.registration import Registration, load_registration, register_by_landmarks
 from morph_dslam.registration.start import Initializer, InitializerFiles, register_by_initializer
 from morph_dslam.slam.map_files import load_map
@@ -61,57 +61,57 @@ def map_of(registration: Path, given: Path | None) -> Path | None:
     return next((path for path in beside if path.is_file()), None)
 
 
-def pictures_of(path: Path, camera: Camera, placement: Registration) -> dict[int, KeyframeImage]:
-    """The keyframes that the placement is for; their images are contrast-normalized, which is all that is needed.
+def pictures_of(path: Path, camera: Camera, registration: Registration) -> dict[int, KeyframeImage]:
+    """The keyframes that the registration is for; their images are contrast-normalized, which is all that is needed.
 
     Raises
     ------
     MapError
         If the map cannot be read, or is not that of the registration.
     """
-    wanted, pictures = {placement.frame, *(view.frame for view in placement.views)}, {}
+    wanted, pictures = {registration.frame, *(view.frame for view in registration.views)}, {}
     for keyframe in load_map(path, camera).keyframes:
         if keyframe.index not in wanted:
             continue
         picture = Image(keyframe.normalized, keyframe.normalized)
         pictures[keyframe.index] = KeyframeImage(picture, keyframe.camera_from_world)
-        if keyframe.index == placement.frame and placement.place is not None:
-            _check_pose(path, placement, placement.place.pose_in(keyframe.camera_from_world))
-    if placement.frame not in pictures:
-        raise MapError(f"{path} is not the map of the registration: it has no keyframe {placement.frame}")
+        if keyframe.index == registration.frame and registration.map_registration is not None:
+            _check_pose(path, registration, registration.map_registration.pose_in(keyframe.camera_from_world))
+    if registration.frame not in pictures:
+        raise MapError(f"{path} is not the map of the registration: it has no keyframe {registration.frame}")
     return pictures
 
 
 def views_of(
-    placement: Registration, pictures: Mapping[int, KeyframeImage], seen: Mapping[int, NDArray[np.bool_]]
+    registration: Registration, pictures: Mapping[int, KeyframeImage], seen: Mapping[int, NDArray[np.bool_]]
 ) -> list[PosedImage]:
-    """The undeformed object in those keyframes whose errors are known, that of the placement first.
+    """The undeformed object in those keyframes whose errors are known, that of the registration first.
 
     ``seen`` (h, w) says of some keyframes where they show the object.
     """
-    d = len(placement.model.parameters)
+    d = len(registration.model.parameters)
     return [
         PosedImage(
             pictures[view.frame].picture,
-            State(placement.model.default, view.pose),
+            State(registration.model.default, view.pose),
             np.vstack([np.zeros((d, view.error_factors.shape[1])), view.error_factors]),
             seen=seen.get(view.frame),
             frame=view.frame,
         )
-        for view in placement.views
+        for view in registration.views
         if view.frame in pictures
     ]
 
 
-def _check_pose(path: Path, placement: Registration, by_map: RigidTransform) -> None:
-    """Raise MapError if the map has the keyframe of the placement elsewhere than the registration."""
-    pose = placement.state.camera_from_object
+def _check_pose(path: Path, registration: Registration, by_map: RigidTransform) -> None:
+    """Raise MapError if the map has the keyframe of the registration elsewhere than the registration."""
+    pose = registration.state.camera_from_object
     turn = np.linalg.norm(rotation_log(by_map.rotation @ pose.rotation.T))
     shift = np.linalg.norm(by_map.translation - pose.translation)
     if turn > OTHER_MAP_TURN or shift > OTHER_MAP_SHIFT * np.linalg.norm(pose.translation):
         raise MapError(
             f"{path} is not the map of the registration: by the map the object is {1e3 * shift:.0f} mm and "
-            f"{np.degrees(turn):.0f} deg from where the registration has it in keyframe {placement.frame}"
+            f"{np.degrees(turn):.0f} deg from where the registration has it in keyframe {registration.frame}"
         )
 
 
@@ -129,8 +129,8 @@ class ObjectOptions:
     Attributes
     ----------
     model, camera : files.
-    landmarks : file of landmarks in the reference frame; or placement : registration.json of
-        `morph register`; or aids : another thing to place the object by there.
+    landmarks : file of landmarks in the reference frame; or registration : registration.json of
+        `morph register`; or initializer : another way to find it there.
     map_path : map.h5 that the object was registered in; by default the one that the registration names, or
         the one beside it, if there is one.
     pose : "map": the object is anchored and the camera is found in the map, "fixed": and the map's pose is
@@ -139,7 +139,7 @@ class ObjectOptions:
     use_discrepancy : look in every frame for what the object's shape has beyond the model's.
     inner : files of inner structures (`morph inner`), whose positions are written and drawn.
     per_sequence : names of the parameters that are one over the whole sequence, beside those that the
-        placement leaves open.
+        registration leaves open.
     random_walk : names of parameters and the standard deviation of their change from frame to frame, in the
         parameter's own unit. start : see `TrackerOptions`.
     """
@@ -147,8 +147,8 @@ class ObjectOptions:
     model: Path
     camera: Path
     landmarks: Path | None = None
-    placement: Path | None = None
-    aids: InitializerFiles = field(default_factory=InitializerFiles)
+    registration: Path | None = None
+    initializer: InitializerFiles = field(default_factory=InitializerFiles)
     map_path: Path | None = None
     pose: PoseFrom = "map"
     use_outline: bool = False
@@ -158,7 +158,7 @@ class ObjectOptions:
     per_sequence: tuple[str, ...] = ()
     random_walk: tuple[tuple[str, float], ...] = ()
     start: StartFrom = "previous"
-    registration: RegistrationOptions = field(default_factory=RegistrationOptions)
+    click_px: float = CLICK_PX
     tracker: TrackerOptions = field(default_factory=TrackerOptions)
 
 
@@ -168,10 +168,10 @@ class Setup:
 
     Attributes
     ----------
-    model : as it is in its file. placement : None as long as the frame that landmarks belong to is not there.
+    model : as it is in its file. registration : None as long as the frame that landmarks belong to is not there.
     map_path : of the map that the object is anchored in; None if it is free.
     keyframes : of that map, by frame, in which the object is; none where a frame has to be the reference.
-    aid : that places the object in the reference frame; None if something else does.
+    initializer : that places the object in the reference frame; None if something else does.
     seen : (h, w) by frame, where it shows the object, if other objects hide some of it there.
     """
 
@@ -180,77 +180,79 @@ class Setup:
     camera: Camera
     landmarks: Landmarks | None
     inner: tuple[InnerStructure, ...]
-    placement: Registration | None
+    registration: Registration | None
     map_path: Path | None
     keyframes: Mapping[int, KeyframeImage]
-    aid: Initializer | None = None
+    initializer: Initializer | None = None
     seen: Mapping[int, NDArray[np.bool_]] = field(default_factory=dict)
 
     @property
     def reference(self) -> Image | None:
         """The keyframe that the object is placed in; None where a frame has to be it."""
-        if self.placement is None or self.placement.frame is None:
+        if self.registration is None or self.registration.frame is None:
             return None
-        keyframe = self.keyframes.get(self.placement.frame)
+        keyframe = self.keyframes.get(self.registration.frame)
         return None if keyframe is None else keyframe.picture
 
     @cached_property
     def further(self) -> KeyframeViews | None:
         """Other keyframes that show more of the object, where it is known how they are off with the first."""
-        placement = self.placement
-        if placement is None or not placement.views or not self.options.tracker.further_views:
+        registration = self.registration
+        if registration is None or not registration.views or not self.options.tracker.further_views:
             return None
-        views = views_of(placement, self.keyframes, self.seen)
+        views = views_of(registration, self.keyframes, self.seen)
         if len(views) < 2:
             return None
-        estimator = Estimator(placement.model, self.camera)
-        return choose_keyframe_views(estimator, views[0], views[1:], self.tracker_options(placement))
+        estimator = Estimator(registration.model, self.camera)
+        return choose_keyframe_views(estimator, views[0], views[1:], self.tracker_options(registration))
 
     @property
     def reference_keyframes(self) -> list[int]:
         """Numbers of the map's keyframes that the object is compared with, the one it is placed in first."""
-        if self.placement is None or self.placement.frame is None or self.reference is None:
+        if self.registration is None or self.registration.frame is None or self.reference is None:
             return []
         others = [] if self.further is None else [view.frame for view in self.further.views]
-        return [self.placement.frame, *(frame for frame in others if frame is not None)]
+        return [self.registration.frame, *(frame for frame in others if frame is not None)]
 
     def placed(self, image: NDArray[np.uint8] | Image, depth: NDArray[np.float32] | None = None) -> Registration:
-        """The placement; raises RegistrationError as `register_by_landmarks` and `Initializer.place` do.
+        """The registration; raises RegistrationError as `register_by_landmarks` and `Initializer.register` do.
 
         Parameters
         ----------
         image : (h, w, 3) the reference frame. depth : (h, w) there, metres, where there is any.
         """
-        if self.placement is not None:
-            return self.placement
-        if self.aid is not None:
+        if self.registration is not None:
+            return self.registration
+        if self.initializer is not None:
             assert not isinstance(image, Image)
-            return register_by_initializer(self.aid, self.model, self.camera, image)
+            return register_by_initializer(self.initializer, self.model, self.camera, image)
         assert self.landmarks is not None
-        registration, sensor = self.options.registration, self.options.tracker.depth
-        return register_by_landmarks(self.model, self.camera, self.landmarks, registration, depth, sensor)
+        options = self.options
+        return register_by_landmarks(
+            self.model, self.camera, self.landmarks, options.click_px, depth, options.tracker.depth
+        )
 
     def carried(self, model: ReducedModel) -> list[CarriedStructure]:
         """The inner structures in the model that is tracked with."""
         return [structure.carried_by(model) for structure in self.inner]
 
-    def tracker_options(self, placement: Registration) -> TrackerOptions:
-        """The options with what the placement leaves open."""
+    def tracker_options(self, registration: Registration) -> TrackerOptions:
+        """The options with what the registration leaves open."""
         options = self.options
         return replace(
             options.tracker,
-            per_sequence=tuple(dict.fromkeys((*placement.per_sequence, *options.per_sequence))),
+            per_sequence=tuple(dict.fromkeys((*registration.per_sequence, *options.per_sequence))),
             use_outline=options.use_outline,
             use_depth=options.use_depth,
             discrepancy=(options.tracker.discrepancy or DiscrepancyOptions()) if options.use_discrepancy else None,
-            random_walk=tuple((name, _in_si(placement, name, step)) for name, step in options.random_walk),
+            random_walk=tuple((name, _in_si(registration, name, step)) for name, step in options.random_walk),
             start=options.start,
             hold_pose=options.pose == "fixed",
         )
 
     def new_tracker(
         self,
-        placement: Registration,
+        registration: Registration,
         reference: NDArray[np.uint8] | Image,
         in_sequence: bool,
         seen: NDArray[np.bool_] | None = None,
@@ -262,27 +264,29 @@ class Setup:
         """
         by_map = self.reference is not None and reference is self.reference
         return Tracker(
-            placement.model,
+            registration.model,
             self.camera,
-            placement,
-            self.tracker_options(placement),
+            registration,
+            self.tracker_options(registration),
             reference=reference,
             in_sequence=in_sequence,
-            anchor=self.new_anchor({self.model.name: placement}) if anchored else None,
+            anchor=self.new_anchor({self.model.name: registration}) if anchored else None,
             seen=seen,
             keyframes=self.further if by_map else None,
         )
 
-    def new_anchor(self, placements: Mapping[str, Registration]) -> Anchor | None:
+    def new_anchor(self, registrations: Mapping[str, Registration]) -> Anchor | None:
         """The map with this object, and others by name, in it; None for a free object."""
         if self.map_path is None:
             return None
-        objects = {name: (p.place, p.model) for name, p in placements.items() if p.place is not None}
+        objects = {
+            name: (p.map_registration, p.model) for name, p in registrations.items() if p.map_registration is not None
+        }
         return Anchor(load_map(self.map_path, self.camera), self.camera, objects)
 
-    def warm_up(self, placement: Registration, reference: NDArray[np.uint8] | Image) -> None:
+    def warm_up(self, registration: Registration, reference: NDArray[np.uint8] | Image) -> None:
         """Compile the inner loops, so that the first frame takes no longer than the others."""
-        warm_up(self.new_tracker(placement, reference, True).track, reference)
+        warm_up(self.new_tracker(registration, reference, True).track, reference)
 
 
 def warm_up(process: Callable[[Frame], object], reference: NDArray[np.uint8] | Image) -> None:
@@ -295,9 +299,9 @@ def warm_up(process: Callable[[Frame], object], reference: NDArray[np.uint8] | I
         process(Frame(number, float(number), image))
 
 
-def _in_si(placement: Registration, name: str, value: float) -> float:
+def _in_si(registration: Registration, name: str, value: float) -> float:
     """A value in a parameter's own unit; of a name that is none it stays as it is, to be refused later."""
-    known = {parameter.name: parameter for parameter in placement.model.parameters}
+    known = {parameter.name: parameter for parameter in registration.model.parameters}
     return to_si(value, known[name].unit, known[name].quantity) if name in known else value
 
 
@@ -310,40 +314,40 @@ def load_setup(options: ObjectOptions) -> Setup:
         If one cannot be used (ModelFileError, CameraError, MapError, RegistrationError), or they do not fit
         together (TrackingError).
     """
-    aid = options.aids.load()
-    if sum(start is not None for start in (options.landmarks, options.placement, aid)) != 1:
+    initializer = options.initializer.load()
+    if sum(start is not None for start in (options.landmarks, options.registration, initializer)) != 1:
         raise TrackingError(
             "say where the object is, in one way: by landmarks, a registration in a map, a board, a picture or a guess"
         )
-    if options.placement is None and options.map_path is not None:
-        raise TrackingError("a map needs the object's place in it: --place registration.json")
-    if options.placement is None and options.pose == "fixed":
-        raise TrackingError("a pose is held fixed by a map: give the object's place in it, --place")
+    if options.registration is None and options.map_path is not None:
+        raise TrackingError("a map needs the object's place in it: --registration registration.json")
+    if options.registration is None and options.pose == "fixed":
+        raise TrackingError("a pose is held fixed by a map: give the object's place in it, --registration")
     model, camera = load_model(options.model), load_camera(options.camera)
     if options.use_outline and not len(rim(model.triangles)):
         raise TrackingError(f"the surface of '{model.name}' is closed and has no rim: track it without the outline")
     inner = tuple(load_inner_structure(path) for path in options.inner)
     for structure in inner:
         structure.carried_by(model)  # says so before the tracking if it is not for this model
-    if options.placement is None:
+    if options.registration is None:
         landmarks = None if options.landmarks is None else load_landmarks(options.landmarks)
-        return Setup(options, model, camera, landmarks, inner, None, None, {}, aid)
-    placement, path = load_registration(options.placement, model), map_of(options.placement, options.map_path)
+        return Setup(options, model, camera, landmarks, inner, None, None, {}, initializer)
+    registration, path = load_registration(options.registration, model), map_of(options.registration, options.map_path)
     free = options.pose == "free"
     if path is None and not free:
         note = "no map was given or found beside the registration: the object is tracked as a free one"
-        placement = replace(placement, flags=(*placement.flags, note))
+        registration = replace(registration, flags=(*registration.flags, note))
     keyframes: dict[int, KeyframeImage] = {}
     if path is not None and not options.use_outline:
-        keyframes = pictures_of(path, camera, placement)
+        keyframes = pictures_of(path, camera, registration)
     # A free object is not where the map has it, but looks as in the map's pictures.
-    return Setup(options, model, camera, None, inner, placement, None if free else path, keyframes)
+    return Setup(options, model, camera, None, inner, registration, None if free else path, keyframes)
 
 
-# Placing an object anew in mid-sequence: where the user says so, or by its aid after a long loss.
+# Placing an object anew in mid-sequence: where the user says so, or by its initializer after a long loss.
 
 
-#: After so many lost frames on end the aid is tried, and again after as many more.
+#: After so many lost frames on end the initializer is tried, and again after as many more.
 LONG_LOSS = 30
 
 
@@ -352,26 +356,26 @@ class Reregistration:
 
     Parameters
     ----------
-    at : frames in which to place the object anew, and the landmarks there; None for the run's own aid.
+    at : frames in which to place the object anew, and the landmarks there; None for the run's own initializer.
     begin : the reference frame; frames before it are not waited for.
 
     Raises
     ------
     TrackingError
-        If a frame has no landmarks and the run no aid.
+        If a frame has no landmarks and the run no initializer.
     RegistrationError
         If a file of landmarks cannot be read.
     """
 
     def __init__(
-        self, setup: Setup, placement: Registration, at: Sequence[tuple[int, Path | None]], begin: int = 0
+        self, setup: Setup, registration: Registration, at: Sequence[tuple[int, Path | None]], begin: int = 0
     ) -> None:
-        if setup.aid is None and any(landmarks is None for _, landmarks in at):
+        if setup.initializer is None and any(landmarks is None for _, landmarks in at):
             raise TrackingError(
                 "to place the object anew give landmarks of that frame (--reregister-at N=FILE), or start "
                 "from a board, a picture or a guess, which are looked for there again"
             )
-        self._setup, self._placement, self._n_lost = setup, placement, 0
+        self._setup, self._registration, self._n_lost = setup, registration, 0
         self._before = begin
         self._at = {frame: None if path is None else load_landmarks(path) for frame, path in at}
         self._notes: list[str] = []
@@ -384,7 +388,7 @@ class Reregistration:
     def chain(self, frame: Frame, chain: Tracker) -> Tracker:
         """The chain that processes the frame: the one so far, or a new one whose reference is this frame."""
         due = self._due(frame.index)
-        after_loss = self._setup.aid is not None and self._n_lost > 0 and self._n_lost % LONG_LOSS == 0
+        after_loss = self._setup.initializer is not None and self._n_lost > 0 and self._n_lost % LONG_LOSS == 0
         if not due and not after_loss:
             return chain
         given = [self._at.pop(n) for n in due]
@@ -401,7 +405,7 @@ class Reregistration:
         return tracker
 
     def _due(self, frame: int) -> list[int]:
-        """The numbers for which this frame is the one; the aid may be late where live frames were dropped."""
+        """The numbers for which this frame is the one; the initializer may be late where live frames were dropped."""
         before, self._before = self._before, frame
         return [n for n, landmarks in self._at.items() if n == frame or (landmarks is None and before < n < frame)]
 
@@ -411,11 +415,13 @@ class Reregistration:
 
     def _placed(self, frame: Frame, landmarks: Landmarks | None) -> Registration:
         """The object in the frame, with the model and what else the run began with."""
-        model, camera, options = self._placement.model, self._setup.camera, self._setup.options
+        model, camera, options = self._registration.model, self._setup.camera, self._setup.options
         if landmarks is not None:
-            found = register_by_landmarks(model, camera, landmarks, options.registration)
+            found = register_by_landmarks(model, camera, landmarks, options.click_px)
         else:
-            assert self._setup.aid is not None
+            assert self._setup.initializer is not None
             image = np.asarray(frame.image, dtype=np.uint8)
-            found = register_by_initializer(self._setup.aid, model, camera, image)
-        return replace(found, per_sequence=self._placement.per_sequence, place=self._placement.place)
+            found = register_by_initializer(self._setup.initializer, model, camera, image)
+        return replace(
+            found, per_sequence=self._registration.per_sequence, map_registration=self._registration.map_registration
+        )

@@ -25,7 +25,7 @@ from morph_dslam.tracking.run_writing import RunInputs, write_run
 from morph_dslam.tracking.setup import ObjectOptions, Reregistration, Setup, load_setup
 
 #: Options that name input files.
-_INPUTS = ("frames", "landmarks", "placement")
+_INPUTS = ("frames", "landmarks", "registration")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,10 +35,10 @@ class TrackOptions(ObjectOptions):
     Attributes
     ----------
     frames : video file or folder of images. output : the run folder.
-    reregister_at : frames in which to place the object anew, with landmarks there, or None for the aid.
+    reregister_at : frames in which to place the object anew, with landmarks there, or None for the initializer.
     first, last : frame numbers to track, both included; all by default.
     reference_frame : the frame that the landmarks belong to; the first one tracked by default. With
-        ``placement`` it is the map's last keyframe.
+        ``registration`` it is the map's last keyframe.
     refine_reference : after tracking, refine the reference state over the whole sequence and track once more.
     overlay : draw the augmented video, drawing : with what. overwrite : replace a run that is there already.
     """
@@ -80,27 +80,27 @@ def track(options: TrackOptions) -> dict[str, Any]:
         AugmentedView(setup.model, setup.camera, options.drawing)  # says so now if it cannot be drawn
     source = open_frames(options)
     begin = find_begin(setup, options)
-    placement = setup.placed(begin.picture, begin.depth)
-    again = Reregistration(setup, placement, options.reregister_at, begin.frame)
-    setup.warm_up(placement, begin.picture)
-    run = RunResults(placement.model, begin.frame, per_sequence=setup.tracker_options(placement).per_sequence)
+    registration = setup.placed(begin.picture, begin.depth)
+    again = Reregistration(setup, registration, options.reregister_at, begin.frame)
+    setup.warm_up(registration, begin.picture)
+    run = RunResults(registration.model, begin.frame, per_sequence=setup.tracker_options(registration).per_sequence)
     try:
-        keyframes = _follow(source, setup, placement, begin, options.refine_reference, run, again)
+        keyframes = _follow(source, setup, registration, begin, options.refine_reference, run, again)
         if options.refine_reference and setup.landmarks is not None:
-            placement = _refined(setup, placement, begin, keyframes, options)
+            registration = _refined(setup, registration, begin, keyframes, options)
             run = replace(run, refined=True, frames=[], timestamps=[], results=[])
-            _follow(source, setup, placement, begin, False, run)
+            _follow(source, setup, registration, begin, False, run)
     finally:
-        placement = replace(placement, flags=(*placement.flags, *again.notes))
-        summary = write_results(setup, placement, source, options, run) if len(run) else {}
+        registration = replace(registration, flags=(*registration.flags, *again.notes))
+        summary = write_results(setup, registration, source, options, run) if len(run) else {}
     return summary
 
 
 def with_reference(options: TrackOptions, setup: Setup) -> TrackOptions:
     """The options with the reference frame that a registration brings; tracking begins there by default."""
-    if setup.placement is None:
+    if setup.registration is None:
         return options
-    frame = setup.placement.frame
+    frame = setup.registration.frame
     return replace(options, reference_frame=frame, first=frame if options.first is None else options.first)
 
 
@@ -128,10 +128,10 @@ class Begin:
 def find_begin(setup: Setup, options: TrackOptions) -> Begin:
     """The reference view; raises SourceError or CameraError if it is not there, or of another size."""
     if setup.reference is not None:
-        assert setup.placement is not None
-        assert setup.placement.frame is not None
+        assert setup.registration is not None
+        assert setup.registration.frame is not None
         # The frames may be those of another recording: the object is looked for as after a loss.
-        return Begin(setup.reference, setup.placement.frame, False)
+        return Begin(setup.reference, setup.registration.frame, False)
     reference = _reference_frame(options)
     setup.camera.check_image(reference.image, f"frame {reference.index} of {options.frames}")
     # A sequence that does not begin with the reference frame is entered as if the object had been lost.
@@ -149,14 +149,14 @@ def _reference_frame(options: TrackOptions) -> Frame:
 def _follow(
     source: FrameSource,
     setup: Setup,
-    placement: Registration,
+    registration: Registration,
     begin: Begin,
     refines: bool,
     run: RunResults,
     again: Reregistration | None = None,
 ) -> list[Keyframe]:
     """Track all frames into ``run``; returns where the points were seen if the reference is to be refined."""
-    chain = setup.new_tracker(placement, begin.picture, begin.in_sequence)
+    chain = setup.new_tracker(registration, begin.picture, begin.in_sequence)
     keyframes = []
     for frame in tqdm(source, total=len(source), desc="tracking", unit="frame"):
         chain = chain if again is None else again.chain(frame, chain)
@@ -170,28 +170,28 @@ def _follow(
 
 
 def _refined(
-    setup: Setup, placement: Registration, begin: Begin, keyframes: list[Keyframe], options: TrackOptions
+    setup: Setup, registration: Registration, begin: Begin, keyframes: list[Keyframe], options: TrackOptions
 ) -> Registration:
-    """The placement refined over the sequence; how sure it is then is not known."""
+    """The registration refined over the sequence; how sure it is then is not known."""
     print("refining the reference state over the sequence ...", file=sys.stderr)
-    tracker, landmarks = setup.new_tracker(placement, begin.picture, True), setup.landmarks
+    tracker, landmarks = setup.new_tracker(registration, begin.picture, True), setup.landmarks
     assert landmarks is not None
     # How well the landmarks fit tells how carefully they were set, where they are enough to tell.
-    sigma = placement.facts["sigma_px"]
+    sigma = registration.facts["sigma_px"]
     stated = options.refinement.landmark_px
     trust = replace(options.refinement, landmark_px=max(sigma, 0.1) if np.isfinite(sigma) else stated)
-    bound = bind_landmarks(placement.model, landmarks.points, options.registration)
+    bound = bind_landmarks(registration.model, landmarks.points)
     seen = setup.camera.undistort_pixels(landmarks.pixels)
     chosen = choose_keyframes(keyframes, options.refinement.n_keyframes)
     pixels, outline, sought = tracker.reference.pixels, tracker.reference.outline, tracker.options.discrepancy
     if sought is None:
-        state = refine_reference(tracker.estimator, bound, seen, pixels, placement.state, chosen, trust, outline)
-        return replace(placement, state=state, covariance=None)
+        state = refine_reference(tracker.estimator, bound, seen, pixels, registration.state, chosen, trust, outline)
+        return replace(registration, state=state, covariance=None)
     # What the state is wrong by counts with the discrepancy: both at once would be the same twice.
-    known = Reference(placement.state, pixels, bound, seen, trust.landmark_px)
-    fit = DiscrepancyFit(placement.model, setup.camera, sought)
+    known = Reference(registration.state, pixels, bound, seen, trust.landmark_px)
+    fit = DiscrepancyFit(registration.model, setup.camera, sought)
     found = refine_discrepancy(fit, tracker.estimator, known, chosen, outline)
-    return replace(placement, discrepancy=found, covariance=None)
+    return replace(registration, discrepancy=found, covariance=None)
 
 
 def _check(options: TrackOptions) -> None:
@@ -200,12 +200,12 @@ def _check(options: TrackOptions) -> None:
             "a reference refined over the whole sequence cannot be changed in mid-sequence: leave out "
             "--refine or --reregister-at"
         )
-    if options.placement is not None and (options.refine_reference or options.reference_frame is not None):
+    if options.registration is not None and (options.refine_reference or options.reference_frame is not None):
         raise TrackingError(
             "a registration in a map brings its own reference frame, refined already: leave out --refine and "
             "--reference-frame"
         )
-    if options.refine_reference and any(path is not None for path in vars(options.aids).values()):
+    if options.refine_reference and any(path is not None for path in vars(options.initializer).values()):
         raise TrackingError(
             "the reference is refined with the landmarks in it: start from landmarks, or leave out --refine"
         )
@@ -213,14 +213,14 @@ def _check(options: TrackOptions) -> None:
 
 
 def write_results(
-    setup: Setup, placement: Registration, source: FrameSource, options: TrackOptions, run: RunResults
+    setup: Setup, registration: Registration, source: FrameSource, options: TrackOptions, run: RunResults
 ) -> dict[str, Any]:
     """Write all files of the run folder; the video last, because it takes longest."""
     carried = setup.carried(run.model)
     named = {name: str(getattr(options, name)) for name in _INPUTS if getattr(options, name)}
-    aids = {name: str(path) for name, path in vars(options.aids).items() if path is not None}
-    named |= aids | ({} if setup.map_path is None else {"map": str(setup.map_path)})
-    tracker = setup.tracker_options(placement)
+    given = {name: str(path) for name, path in vars(options.initializer).items() if path is not None}
+    named |= given | ({} if setup.map_path is None else {"map": str(setup.map_path)})
+    tracker = setup.tracker_options(registration)
     extra = {
         "reference_keyframes": setup.reference_keyframes,
         "reference_refined_over_the_sequence": run.refined,
@@ -229,13 +229,13 @@ def write_results(
         "discrepancy_used": options.use_discrepancy,
         "pose": options.pose if setup.map_path is not None else "free",
         "settings": {
-            "registration": asdict(options.registration),
+            "click_px": options.click_px,
             "refinement": asdict(options.refinement),
             "tracker": asdict(tracker),
         },
     }
     inputs = RunInputs(options.model, options.camera, named)
-    summary = write_run(options.output, run, inputs, placement, carried, tracker, extra)
+    summary = write_run(options.output, run, inputs, registration, carried, tracker, extra)
     if options.overlay:
         view = AugmentedView(run.model, setup.camera, options.drawing, carried)
         write_video(options.output / "augmented.mp4", source, setup.camera, run, view)

@@ -67,26 +67,26 @@ def track_rig(options: TrackOptions, others: Sequence[Path]) -> dict[str, Any]:
         _check_scan(setup.camera, setup.reference, options.frames, begin.frame)
         further = keyframe_views_of_rig(setup, cameras, others)
     references = [begin.picture, *(_frame(path, begin.frame).image for path in others)]
-    placement = setup.placed(begin.picture)
-    setup.warm_up(placement, begin.picture)
-    tracked_with = setup.tracker_options(placement)
+    registration = setup.placed(begin.picture)
+    setup.warm_up(registration, begin.picture)
+    tracked_with = setup.tracker_options(registration)
     tracker = RigTracker(
-        placement.model,
+        registration.model,
         cameras,
         references,
-        placement.state,
+        registration.state,
         tracked_with,
         begin.in_sequence,
-        placement.covariance,
+        registration.covariance,
         further,
     )
-    first = setup.new_tracker(placement, begin.picture, begin.in_sequence)
-    run = RunResults(placement.model, begin.frame, per_sequence=tracked_with.per_sequence)
+    first = setup.new_tracker(registration, begin.picture, begin.in_sequence)
+    run = RunResults(registration.model, begin.frame, per_sequence=tracked_with.per_sequence)
     try:
         _follow(sources, first, tracker, run)
     finally:
-        placement = replace(placement, flags=(*placement.flags, *_unequal(sources, len(run))))
-        summary = write_results(setup, placement, sources[0], options, run) if len(run) else {}
+        registration = replace(registration, flags=(*registration.flags, *_unequal(sources, len(run))))
+        summary = write_results(setup, registration, sources[0], options, run) if len(run) else {}
     return summary
 
 
@@ -110,26 +110,26 @@ def _check(options: TrackOptions) -> None:
 
 def _with_reference(setup: Setup, options: TrackOptions) -> tuple[Setup, TrackOptions]:
     """As `with_reference`; a frame that is wished instead of the map's keyframe is where the map has it."""
-    number, placement = options.reference_frame, setup.placement
-    if number is None or placement is None:
+    number, registration = options.reference_frame, setup.registration
+    if number is None or registration is None:
         return setup, with_reference(options, setup)
-    if setup.map_path is None or setup.reference is None or placement.place is None:
+    if setup.map_path is None or setup.reference is None or registration.map_registration is None:
         raise TrackingError(
             "without its map a registration brings its own reference frame: leave out --reference-frame"
         )
     frame = _frame(options.frames, number)
-    located = setup.new_tracker(placement, setup.reference, False).locate(frame)
+    located = setup.new_tracker(registration, setup.reference, False).locate(frame)
     if located.pose_prior is None:
         raise RegistrationError(
             f"the camera is not found in the map in frame {number} of {options.frames} ({located.why_lost}): "
             "take another --reference-frame"
         )
-    d = len(placement.model.parameters)
+    d = len(registration.model.parameters)
     covariance = np.zeros((d + 6, d + 6))
     covariance[d:, d:] = located.pose_prior.covariance
-    state = State(placement.model.default, located.pose_prior.pose)
-    placed = replace(placement, frame=number, state=state, covariance=covariance)
-    setup = replace(setup, placement=placed, keyframes={})
+    state = State(registration.model.default, located.pose_prior.pose)
+    placed = replace(registration, frame=number, state=state, covariance=covariance)
+    setup = replace(setup, registration=placed, keyframes={})
     return setup, with_reference(options, setup)
 
 
