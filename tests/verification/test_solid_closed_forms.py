@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from morph_dslam.mechanics.loads import DeadTraction
-from morph_dslam.mechanics.materials.isotropic import NeoHookean
+from morph_dslam.mechanics.materials.base import Material
+from morph_dslam.mechanics.materials.isotropic import NeoHookean, StVenantKirchhoff
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.supports import PrescribedDisplacement
 from morph_dslam.meshing.generators import block
@@ -19,13 +20,16 @@ ROLLERS = (
 )
 #: Lame's constants 4 and 1 (MPa): Poisson's ratio lambda / 2(lambda + mu), E = 2 mu (1 + nu).
 STIFF = NeoHookean(young=2.8e6, poisson=0.4)
+#: Hooke's law in the Green-Lagrange strain: l_2^2 = 1 - nu (l^2 - 1) and P = l E (l^2 - 1) / 2.
+HOOKE = StVenantKirchhoff(young=3e6, poisson=0.3)
 
 
 @pytest.mark.parametrize(
-    ("material", "lateral", "stress"), [(RUBBER, 0.830679, 1.075843e6), (STIFF, 0.846028, 1.022825e6)]
+    ("material", "lateral", "stress"),
+    [(RUBBER, 0.830679, 1.075843e6), (STIFF, 0.846028, 1.022825e6), (HOOKE, 0.625**0.5, 2.8125e6)],
 )
 @pytest.mark.parametrize(("cell_type", "mixed"), [("hex8", False), ("hex20", True), ("tet10", False)])
-def test_uniaxial_stretch(material: NeoHookean, lateral: float, stress: float, cell_type: str, mixed: bool) -> None:
+def test_uniaxial_stretch(material: Material, lateral: float, stress: float, cell_type: str, mixed: bool) -> None:
     symbols = load_parameter(pull=0.0)
     mesh = distorted(block((1.0, 1.0, 1.0), (2, 2, 2), cell_type), 0.05)
     supports = [*ROLLERS, PrescribedDisplacement("x_max", x=symbols["pull"])]

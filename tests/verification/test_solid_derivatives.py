@@ -17,8 +17,7 @@ from morph_dslam.mechanics.loads import (
     MovingPatch,
     PointLoad,
 )
-from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden
-from morph_dslam.mechanics.materials.base import turned_direction
+from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden, turned_direction
 from morph_dslam.mechanics.materials.isotropic import NeoHookean
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem

@@ -21,14 +21,20 @@ file that registers it. Building blocks stand in a module for each subject:
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__all__ = ["frame_range", "register_source", "run_and_report_errors"]
+__all__ = ["frame_range", "register_law", "register_source", "run_and_report_errors"]
 
 #: The module of each name, as in the imports below; imported when it is first used.
-_MODULES = {"frame_range": "cli.arguments", "register_source": "sources", "run_and_report_errors": "cli.app"}
+_MODULES = {
+    "frame_range": "cli.arguments",
+    "register_law": "mechanics.materials.base",
+    "register_source": "sources",
+    "run_and_report_errors": "cli.app",
+}
 
 if TYPE_CHECKING:
     from morph_dslam.cli.app import run_and_report_errors
     from morph_dslam.cli.arguments import frame_range
+    from morph_dslam.mechanics.materials.base import register_law
     from morph_dslam.sources import register_source
 
 

@@ -1,4 +1,4 @@
-"""Meshes, hyperelastic laws, supports and loads of a `morph_dslam.SolidProblem`, and what solves and fits it."""
+"""Meshes, hyperelastic laws, supports and loads of a `morph_dslam.SolidProblem`, and what solves it."""
 
 from morph_dslam.mechanics.loads import (
     BodyForce,
@@ -11,8 +11,7 @@ from morph_dslam.mechanics.loads import (
     PointLoad,
 )
 from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden
-from morph_dslam.mechanics.materials.base import Material
-from morph_dslam.mechanics.materials.fit import Fit, TensionTest, evaluate_tests, fit_law, relative_error
+from morph_dslam.mechanics.materials.base import Constant, Material, green_lagrange, log_volume, right_cauchy_green
 from morph_dslam.mechanics.materials.isotropic import (
     Gent,
     LinearElastic,
@@ -22,6 +21,8 @@ from morph_dslam.mechanics.materials.isotropic import (
     Rubber,
     StVenantKirchhoff,
     Yeoh,
+    first_invariant,
+    second_invariant,
 )
 from morph_dslam.mechanics.materials.viscoelastic import Prony
 from morph_dslam.mechanics.parameters import ParameterSymbols
@@ -37,9 +38,9 @@ from morph_dslam.meshing.meshes import CellBlock, Mesh, model_mesh_of
 __all__ = [
     "BodyForce",
     "CellBlock",
+    "Constant",
     "DeadTraction",
     "ElasticFoundation",
-    "Fit",
     "FollowerPressure",
     "Gent",
     "Gravity",
@@ -64,18 +65,19 @@ __all__ = [
     "SolidOptions",
     "StVenantKirchhoff",
     "State",
-    "TensionTest",
     "Yeoh",
     "advance",
     "block",
     "check_mesh",
-    "evaluate_tests",
-    "fit_law",
+    "first_invariant",
     "fixed",
+    "green_lagrange",
     "load_mesh",
+    "log_volume",
     "model_mesh_of",
-    "relative_error",
     "revolution",
+    "right_cauchy_green",
+    "second_invariant",
     "sensitivities",
     "sheet",
     "solve",

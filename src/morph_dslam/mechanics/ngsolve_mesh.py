@@ -125,6 +125,10 @@ class NgsolveMesh:
     def cell_field(self, values: Array) -> Any:
         """Coefficient function constant in each cell: a number (n_cells,) or a vector (n_cells, c)."""
         values = np.asarray(values, dtype=np.float64)
+        if len(values) != self.mesh.n_cells:
+            raise StudyError(
+                f"there are {len(values)} values for the mesh's {self.mesh.n_cells} cells; give each cell one"
+            )
         columns = values.reshape(self.mesh.n_cells, -1)
         parts = []
         for column in columns.T:

@@ -27,11 +27,12 @@ from morph_dslam.mechanics.ngsolve_mesh import NgsolveMesh
 from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
 from morph_dslam.mechanics.recovery import Recovery
 from morph_dslam.mechanics.solid_assembly import Assembly, Term
-from morph_dslam.mechanics.solid_materials import SolidHistory, owners_of_cells, place_materials
+from morph_dslam.mechanics.solid_materials import owners_of_cells, place_materials
 from morph_dslam.mechanics.solvers.linear_solver import LinearSolver
 from morph_dslam.mechanics.solvers.newton import Linearisation, State
 from morph_dslam.mechanics.spaces import DisplacementSpace
 from morph_dslam.mechanics.supports import Constraints, ElasticFoundation, PrescribedMotion
+from morph_dslam.mechanics.viscous_history import ViscousHistory
 from morph_dslam.meshing.meshes import Mesh
 
 Array = NDArray[np.float64]
@@ -69,7 +70,6 @@ class SolidProblem:
     parameters : the symbols that materials, supports, loads and shapes were written with.
     options : see `SolidOptions`.
     shape : how the undeformed shape depends on parameters.
-    directions : fibre fields that materials name, a direction for each cell (n_cells, 3).
     time : expression of the parameters that is the time, s; viscous materials need it.
 
     Attributes
@@ -93,7 +93,6 @@ class SolidProblem:
         parameters: ParameterSymbols | None = None,
         options: SolidOptions | None = None,
         shape: Sequence[ShapeField] = (),
-        directions: Mapping[str, Array] | None = None,
         time: Scalar | None = None,
     ) -> None:
         options = options or SolidOptions()
@@ -104,9 +103,7 @@ class SolidProblem:
         self.shape = Shape(self.displacements, shape)
         self.length = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
         self.cell_materials = owners_of_cells(mesh, materials)
-        self.regions = place_materials(
-            self.displacements, self.cell_materials, materials, directions or {}, options.mixed
-        )
+        self.regions = place_materials(self.displacements, self.cell_materials, materials, options.mixed)
         self.history = self._make_history(time)
         self.flags = tuple(region.flag for region in self.regions if region.flag)
         self.space = self._product_space()
@@ -125,10 +122,10 @@ class SolidProblem:
 
     # -- set-up ---------------------------------------------------------------------------------------
 
-    def _make_history(self, time: Scalar | None) -> SolidHistory | None:
+    def _make_history(self, time: Scalar | None) -> ViscousHistory | None:
         if all(region.material.prony is None for region in self.regions):
             return None
-        history = SolidHistory(self.displacements, self.regions, time, self.symbols)
+        history = ViscousHistory(self.displacements, self.regions, time, self.symbols)
         self.regions = history.regions
         return history
 

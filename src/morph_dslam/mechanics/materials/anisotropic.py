@@ -1,24 +1,59 @@
-"""Laws with preferred directions."""
+"""Laws with preferred directions.
+
+A direction is constant, turned by an angle, or one for each cell of the mesh.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, ClassVar, Self
 
 import ngsolve as ngs
+import numpy as np
 
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.materials.base import (
+    Array,
     Constant,
-    Direction,
     Material,
     evaluate,
     green_lagrange,
     log_volume,
+    register_law,
     right_cauchy_green,
-    unit_direction,
 )
 from morph_dslam.mechanics.materials.isotropic import Rubber, first_invariant
+
+#: (x, y, z) of any length, a vector coefficient function, or an array (n_cells, 3) with a direction for each cell.
+Direction = Any
+
+
+def unit_direction(direction: Direction, law: str) -> Any:
+    """The direction as a unit vector coefficient function; StudyError if it is zero or no vector."""
+    if isinstance(direction, ngs.CoefficientFunction):
+        return direction / ngs.Norm(direction)
+    vector = np.asarray(direction, dtype=float)
+    if vector.shape != (3,) or not np.linalg.norm(vector) > 0.0 or not np.all(np.isfinite(vector)):
+        raise StudyError(f"{law}: the direction {direction} must be three numbers, not all of them zero")
+    return ngs.CF(tuple(vector / np.linalg.norm(vector)))
+
+
+def turned_direction(angle: Constant, start: tuple[float, ...], towards: tuple[float, ...]) -> Any:
+    """cos(angle) start + sin(angle) towards, both made orthonormal first; the angle (rad) may be a parameter.
+
+    Raises
+    ------
+    StudyError
+        If the two directions are zero or parallel.
+    """
+    a, b = np.asarray(start, dtype=float), np.asarray(towards, dtype=float)
+    if a.shape != (3,) or b.shape != (3,) or not np.linalg.norm(np.cross(a, b)) > 1e-9 * (a @ a + b @ b):
+        raise StudyError(f"a fibre angle turns from {start} towards {towards}: two directions that differ")
+    a = a / np.linalg.norm(a)
+    b = b - (a @ b) * a
+    b = b / np.linalg.norm(b)
+    return ngs.cos(ngs.CF(angle)) * ngs.CF(tuple(a)) + ngs.sin(ngs.CF(angle)) * ngs.CF(tuple(b))
 
 
 class Directed(Material):
@@ -27,28 +62,26 @@ class Directed(Material):
     #: Attribute of each direction, and what stands for a field where the law is examined without a mesh.
     directions: ClassVar[dict[str, tuple[float, float, float]]]
 
-    @property
-    def fibres(self) -> tuple[str, ...]:
-        return tuple(value for value in self._given().values() if isinstance(value, str))
-
     def _given(self) -> dict[str, Direction]:
         return {name: getattr(self, name) for name in self.directions if getattr(self, name) is not None}
 
-    def with_fibres(self, fields: dict[str, Any]) -> Material:
-        found = {name: fields[d] for name, d in self._given().items() if isinstance(d, str) and d in fields}
-        return replace(self, **found)
+    def on_mesh(self, cell_field: Callable[[Array], Any]) -> Self:
+        by_cell = {name: np.asarray(d, dtype=float) for name, d in self._given().items() if np.ndim(d) == 2}
+        for name, values in by_cell.items():
+            if not np.all(np.linalg.norm(values, axis=1) > 0.0):
+                raise StudyError(f"{self.name}: the {name} of a cell is zero")
+        return replace(self, **{name: cell_field(values) for name, values in by_cell.items()})
 
     def at_a_point(self) -> Self:
-        fields = [n for n, d in self._given().items() if isinstance(d, (str, ngs.CoefficientFunction))]
+        fields = [n for n, d in self._given().items() if isinstance(d, ngs.CoefficientFunction) or np.ndim(d) == 2]
         return replace(self, **{name: self.directions[name] for name in fields})
 
     def check_constants(self) -> None:
-        for direction in self._given().values():
-            if not isinstance(direction, str):
-                unit_direction(direction, self.name)
+        for direction in self.at_a_point()._given().values():
+            unit_direction(direction, self.name)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@register_law("orthotropic")
 class Orthotropic(Directed):
     """Orthotropic elasticity in the Green-Lagrange strain: large rotations, small strains.
 
@@ -59,10 +92,11 @@ class Orthotropic(Directed):
 
     Attributes
     ----------
-    young_1, young_2, young_3 : Young's moduli along the axes, Pa.
-    poisson_12, poisson_13, poisson_23 : poisson_ij is the contraction along j under tension along i.
-    shear_12, shear_13, shear_23 : shear moduli, Pa.
-    axis_1, axis_2 : the first two axes; axis_2 is made orthogonal to axis_1.
+    young_1 : Young's modulus along the first axis, Pa; young_2 and young_3 likewise.
+    poisson_12 : contraction along the second axis under tension along the first; poisson_13 and poisson_23 likewise.
+    shear_12 : shear modulus between the first two axes, Pa; shear_13 and shear_23 likewise.
+    axis_1 : the first axis.
+    axis_2 : the second axis, made orthogonal to the first.
     """
 
     young_1: Constant
@@ -78,6 +112,7 @@ class Orthotropic(Directed):
     axis_2: Direction = (0.0, 1.0, 0.0)
 
     directions: ClassVar = {"axis_1": (1.0, 0.0, 0.0), "axis_2": (0.0, 1.0, 0.0)}
+    quantities: ClassVar = {"poisson_12": "ratio", "poisson_13": "ratio", "poisson_23": "ratio"}
 
     def parts(self, F: Any) -> tuple[Any, Any]:
         strain = green_lagrange(F)
@@ -118,7 +153,7 @@ class Orthotropic(Directed):
 
     def check_constants(self) -> None:
         super().check_constants()
-        self.require_positive(*(f"{kind}_{i}" for kind, i in _MODULI))
+        self.require_positive("young_1", "young_2", "young_3", "shear_12", "shear_13", "shear_23")
         point = self.at_a_point()
         first, second = (unit_direction(axis, self.name) for axis in (point.axis_1, point.axis_2))
         if not evaluate(ngs.Norm(ngs.Cross(first, second))) > 1e-9:
@@ -132,10 +167,7 @@ class Orthotropic(Directed):
             )
 
 
-_MODULI = [("young", "1"), ("young", "2"), ("young", "3"), ("shear", "12"), ("shear", "13"), ("shear", "23")]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
+@register_law("transversely_isotropic")
 class TransverselyIsotropic(Directed):
     """Neo-Hookean solid with one family of fibres, for finite strains.
 
@@ -151,7 +183,8 @@ class TransverselyIsotropic(Directed):
 
     Attributes
     ----------
-    young_fibre, young_cross : Young's moduli along and across the fibres, Pa.
+    young_fibre : Young's modulus along the fibres, Pa.
+    young_cross : Young's modulus across them, Pa.
     poisson_fibre : contraction across under tension along the fibres.
     poisson_cross : contraction across under tension across, in the plane of isotropy.
     shear_fibre : shear modulus between the fibres and a direction across, Pa.
@@ -166,6 +199,7 @@ class TransverselyIsotropic(Directed):
     fibre: Direction = (1.0, 0.0, 0.0)
 
     directions: ClassVar = {"fibre": (1.0, 0.0, 0.0)}
+    quantities: ClassVar = {"poisson_fibre": "ratio", "poisson_cross": "ratio"}
 
     def parts(self, F: Any) -> tuple[Any, Any]:
         mu, alpha, beta, gamma = self._moduli()
@@ -204,7 +238,7 @@ class TransverselyIsotropic(Directed):
             )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@register_law("holzapfel_gasser_ogden")
 class HolzapfelGasserOgden(Rubber, Directed):
     """Soft tissue: a neo-Hookean matrix with one or two families of dispersed fibres that stiffen in tension.
 
@@ -234,6 +268,7 @@ class HolzapfelGasserOgden(Rubber, Directed):
     fibre_2: Direction | None = None
 
     directions: ClassVar = {"fibre": (1.0, 0.0, 0.0), "fibre_2": (0.0, 1.0, 0.0)}
+    quantities: ClassVar = {"k2": "ratio", "dispersion": "ratio"}
 
     def distortional(self, F: Any, J: Any) -> Any:
         C = right_cauchy_green(F)

@@ -1,12 +1,22 @@
-"""Directions of fibres and material axes: constant, turned by an angle, or one for each cell of a mesh."""
+"""What every material law offers to the solvers, and the registry of laws.
+
+A law is its strain-energy density W(F), in joule per cubic metre of the undeformed solid; stresses and tangents are
+derivatives of W and are never written by hand. So that nearly incompressible solids can be solved without locking, W
+is split:
+
+    W(F) = remainder(F) + K/2 g(F)^2
+
+with g the volumetric strain and K its modulus. The displacement form uses W; the mixed form uses
+remainder(F) + p g(F) - p^2 / (2 K), whose stationary value in the pressure p is W.
+"""
 
 from __future__ import annotations
 
-import re
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, dataclass_transform
 
 import ngsolve as ngs
 import numpy as np
@@ -17,74 +27,6 @@ from morph_dslam.errors import StudyError
 
 if TYPE_CHECKING:
     from morph_dslam.mechanics.materials.viscoelastic import Prony
-
-
-#: (x, y, z) of any length, a vector coefficient function, or the name of a field that a mesh will give.
-Direction = Any
-
-
-def unit_direction(direction: Direction, law: str) -> Any:
-    """The direction as a unit vector coefficient function.
-
-    Raises
-    ------
-    StudyError : the direction is zero, is not a vector, or is a name that nobody has given a field for.
-    """
-    if isinstance(direction, str):
-        raise StudyError(f"{law} needs the field of directions '{direction}', but the mesh gives none of that name")
-    if not isinstance(direction, ngs.CoefficientFunction):
-        vector = np.asarray(direction, dtype=float)
-        if vector.shape != (3,) or not np.linalg.norm(vector) > 0.0 or not np.all(np.isfinite(vector)):
-            raise StudyError(f"{law}: the direction {direction} must be three numbers, not all of them zero")
-        return ngs.CF(tuple(vector / np.linalg.norm(vector)))
-    return direction / ngs.Norm(direction)
-
-
-def turned_direction(angle: Constant, start: tuple[float, ...], towards: tuple[float, ...]) -> Any:
-    """cos(angle) start + sin(angle) towards, both made orthonormal first; the angle (rad) may be a parameter.
-
-    Raises
-    ------
-    StudyError : the two directions are zero or parallel.
-    """
-    a, b = np.asarray(start, dtype=float), np.asarray(towards, dtype=float)
-    if a.shape != (3,) or b.shape != (3,) or not np.linalg.norm(np.cross(a, b)) > 1e-9 * (a @ a + b @ b):
-        raise StudyError(f"a fibre angle turns from {start} towards {towards}: two directions that differ")
-    a = a / np.linalg.norm(a)
-    b = b - (a @ b) * a
-    b = b / np.linalg.norm(b)
-    return ngs.cos(ngs.CF(angle)) * ngs.CF(tuple(a)) + ngs.sin(ngs.CF(angle)) * ngs.CF(tuple(b))
-
-
-def cell_directions(mesh: ngs.Mesh, directions: NDArray[np.float64]) -> ngs.GridFunction:
-    """A field that is constant in each cell, from directions (n_cells, 3) in the mesh's own order of cells.
-
-    Raises
-    ------
-    StudyError : there is not one direction, other than zero, for each cell.
-    """
-    directions = np.asarray(directions, dtype=float)
-    if directions.shape != (mesh.ne, 3):
-        raise StudyError(
-            f"fibre directions must be an array ({mesh.ne}, 3), one for each cell, but it is {directions.shape}"
-        )
-    lengths = np.linalg.norm(directions, axis=1)
-    if not np.all(lengths > 0.0):
-        raise StudyError(f"the fibre direction of cell {int(np.argmin(lengths))} is zero")
-    field = ngs.GridFunction(ngs.L2(mesh, order=0) ** 3)
-    for component, values in zip(field.components, (directions / lengths[:, None]).T, strict=True):
-        component.vec.FV().NumPy()[:] = values
-    return field
-
-
-# What every material offers to the solvers.
-# A material is its strain-energy density W(F), in joule per cubic metre of the undeformed solid; stresses
-# and tangents are derivatives of W and are never written by hand. So that nearly incompressible solids can be
-# solved without locking, W is split:
-#     W(F) = remainder(F) + K/2 g(F)^2
-# with g the volumetric strain and K its modulus. The displacement form uses W; the mixed form uses
-# remainder(F) + p g(F) - p^2 / (2 K), whose stationary value in the pressure p is W.
-
 
 Array = NDArray[np.float64]
 
@@ -108,21 +50,18 @@ class Material(ABC):
     density: Constant = 0.0
     prony: Prony | None = None
 
+    #: Name in study files and messages; `register_law` sets it.
+    law: ClassVar[str] = ""
+    #: What constants measure that are neither stresses nor the density, as in `units.FACTORS`.
+    quantities: ClassVar[dict[str, str]] = {}
+
     @abstractmethod
     def parts(self, F: Any) -> tuple[Any, Any]:
-        """Remainder of the energy, Pa, and volumetric strain g (None without a split); the law itself.
+        """Remainder of the energy, Pa, and volumetric strain g (None without a split): the law itself.
 
         F is a 3x3 coefficient function. Both come from one call so that they share what they have in common:
         NGSolve evaluates a shared expression once.
         """
-
-    def remainder(self, F: Any) -> Any:
-        """Strain energy without the volumetric part, Pa; F is a 3x3 coefficient function."""
-        return self.parts(F)[0]
-
-    def volumetric(self, F: Any) -> Any:
-        """Volumetric strain g(F): zero where the volume is unchanged. Most laws use ln J or J - 1."""
-        return self.parts(F)[1]
 
     @property
     def volumetric_modulus(self) -> Constant | None:
@@ -143,16 +82,11 @@ class Material(ABC):
 
     @property
     def name(self) -> str:
-        """The law's name in study files and messages: its class in snake case."""
-        return law_name(type(self))
+        """Name in messages."""
+        return self.law or type(self).__name__
 
-    @property
-    def fibres(self) -> tuple[str, ...]:
-        """Names of the fibre fields that the law still waits for; `with_fibres` gives them."""
-        return ()
-
-    def with_fibres(self, fields: dict[str, Any]) -> Material:
-        """The law with the named fields of directions filled in, each a vector coefficient function (3)."""
+    def on_mesh(self, cell_field: Callable[[Array], Any]) -> Self:
+        """The law with directions given cell by cell as fields of a mesh, which ``cell_field`` makes."""
         return self
 
     def at_a_point(self) -> Self:
@@ -164,13 +98,9 @@ class Material(ABC):
         F = ngs.Id(3).MakeVariable()
         # Derivatives by the whole of F share their sub-expressions; directional ones grow exponentially.
         slope = evaluate(self.at_a_point().energy(F).Diff(F).Diff(F)).reshape(3, 3, 3, 3)
-        stiffness = np.empty((6, 6))
-        for row, (i, j) in enumerate(VOIGT):
-            for column, (k, m) in enumerate(VOIGT):
-                stiffness[row, column] = 0.25 * (
-                    slope[i, j, k, m] + slope[j, i, k, m] + slope[i, j, m, k] + slope[j, i, m, k]
-                )
-        return stiffness
+        symmetric = 0.25 * (slope + slope.swapaxes(0, 1) + slope.swapaxes(2, 3) + slope.swapaxes(0, 1).swapaxes(2, 3))
+        rows, columns = np.transpose(VOIGT)
+        return symmetric[rows, columns][:, rows, columns]
 
     @property
     def equivalent_poisson(self) -> float:
@@ -183,7 +113,8 @@ class Material(ABC):
 
         Raises
         ------
-        StudyError : a constant is not finite, or some small strain would lower the energy.
+        StudyError
+            If a constant is not finite, or some small strain would lower the energy.
         """
         for name, constant in self.constants().items():
             if not np.all(np.isfinite(evaluate(constant))):
@@ -218,19 +149,42 @@ class Material(ABC):
             if not value > 0.0:
                 raise StudyError(f"{self.name}: {name} = {value:g} must be positive")
 
-    def require_poisson(self, name: str = "poisson") -> None:
-        """Refuse an isotropic Poisson's ratio outside of (-1, 0.5), StudyError."""
-        value = evaluate(getattr(self, name))
-        if not -1.0 < value < 0.5:
-            raise StudyError(
-                f"{self.name}: {name} = {value:g} must lie between -1 and 0.5 "
-                "(0.4999 for a nearly incompressible solid, in mixed elements)"
-            )
+
+_Law = TypeVar("_Law", bound=type[Material])
+
+_LAWS: dict[str, type[Material]] = {}
 
 
-def law_name(law: type[Material]) -> str:
-    """`NeoHookean` is `neo_hookean` in a study file."""
-    return re.sub(r"(?<!^)(?=[A-Z])", "_", law.__name__).lower()
+@dataclass_transform(kw_only_default=True, frozen_default=True)
+def register_law(name: str) -> Callable[[_Law], _Law]:
+    """Decorator that makes a class a law which studies can name: ``law = "name"``.
+
+    The class derives from `Material`, or from `Rubber` if its bulk modulus is a constant of its own, and becomes a
+    frozen dataclass. Its fields are the constants, keyword-only; those that are no stresses are named in `quantities`.
+
+        @register_law("demiray")
+        class Demiray(Rubber):
+            mu: Constant
+            exponent: Constant
+            quantities: ClassVar = {"exponent": "ratio"}
+
+            def distortional(self, F, J):
+                growth = ngs.exp(self.exponent * (first_invariant(F, J) - 3.0)) - 1.0
+                return 0.5 * self.mu / self.exponent * growth
+    """
+
+    def register(law: _Law) -> _Law:
+        made = dataclass(frozen=True, kw_only=True, eq=False)(law)
+        made.law = name
+        _LAWS[name] = made
+        return made
+
+    return register
+
+
+def registered_laws() -> dict[str, type[Material]]:
+    """The laws registered so far, by name; `library.law_named` knows those of this package too."""
+    return dict(_LAWS)
 
 
 def _is_constant(value: Any) -> bool:
@@ -244,12 +198,6 @@ def isotropic_average(stiffness: Array) -> tuple[float, float]:
     bulk = stiffness[:3, :3].sum() / 9.0
     normal, shear = np.trace(stiffness[:3, :3]), np.trace(stiffness[3:, 3:])
     return float(bulk), float((normal - 3.0 * bulk + 2.0 * shear) / 10.0)
-
-
-def lame(young: Constant, poisson: Constant) -> tuple[Constant, Constant]:
-    """Lame's constants lambda and mu (the shear modulus), Pa, from Young's modulus and Poisson's ratio."""
-    shear = young / (2.0 * (1.0 + poisson))
-    return young * poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson)), shear
 
 
 @cache

@@ -1,11 +1,11 @@
-"""Isotropic laws with Young's modulus and Poisson's ratio."""
+"""Isotropic laws: with Young's modulus and Poisson's ratio, and rubbers with a bulk modulus of their own."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
 from math import sqrt
-from typing import Any
+from typing import Any, ClassVar
 
 import ngsolve as ngs
 
@@ -15,9 +15,9 @@ from morph_dslam.mechanics.materials.base import (
     Material,
     evaluate,
     green_lagrange,
-    lame,
     log_volume,
     positive_or_nan,
+    register_law,
     right_cauchy_green,
 )
 
@@ -34,23 +34,29 @@ class _Lame(Material):
 
     young: Constant
     poisson: Constant
+    quantities: ClassVar = {"poisson": "ratio"}
 
     @property
     def shear(self) -> Constant:
         """Shear modulus mu at small strain, Pa."""
-        return lame(self.young, self.poisson)[1]
+        return self.young / (2.0 * (1.0 + self.poisson))
 
     @property
     def volumetric_modulus(self) -> Constant:
         """Lame's lambda, Pa."""
-        return lame(self.young, self.poisson)[0]
+        return self.young * self.poisson / ((1.0 + self.poisson) * (1.0 - 2.0 * self.poisson))
 
     def check_constants(self) -> None:
         self.require_positive("young")
-        self.require_poisson()
+        poisson = evaluate(self.poisson)
+        if not -1.0 < poisson < 0.5:
+            raise StudyError(
+                f"{self.name}: poisson = {poisson:g} must lie between -1 and 0.5 "
+                "(0.4999 for a nearly incompressible solid, in mixed elements)"
+            )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@register_law("neo_hookean")
 class NeoHookean(_Lame):
     """Compressible neo-Hookean solid, the paper's law for the boot seal.
 
@@ -65,7 +71,7 @@ class NeoHookean(_Lame):
         return self.shear * (0.5 * (ngs.InnerProduct(F, F) - 3.0) - log_J), log_J
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@register_law("st_venant_kirchhoff")
 class StVenantKirchhoff(_Lame):
     """St Venant-Kirchhoff solid: Hooke's law in the Green-Lagrange strain E = (F'F - 1)/2.
 
@@ -81,7 +87,7 @@ class StVenantKirchhoff(_Lame):
         return self.shear * ngs.InnerProduct(strain, strain), ngs.Trace(strain)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@register_law("linear_elastic")
 class LinearElastic(_Lame):
     """Hooke's law in the small strain e = sym(F - 1), for small strains and small rotations only.
 
@@ -97,15 +103,12 @@ class LinearElastic(_Lame):
         return self.shear * ngs.InnerProduct(strain, strain), ngs.Trace(strain)
 
 
-# Rubber laws in the invariants of the volume-preserving deformation.
-# Each is a distortional energy in I1~ = J^(-2/3) I1 and I2~ = J^(-4/3) I2 plus kappa/2 (J - 1)^2, kappa being
-# the bulk modulus. The distortional part is the `remainder`, so all of them serve mixed elements. Rubber's
-# bulk modulus is some thousand times its shear modulus.
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rubber(Material):
-    """A law with a separate volumetric energy kappa/2 (J - 1)^2.
+    """A law with a volumetric energy kappa/2 (J - 1)^2 beside a distortional one, for mixed elements too.
+
+    Distortional energies are functions of I1~ = J^(-2/3) I1 and I2~ = J^(-4/3) I2. Rubber's bulk modulus is some
+    thousand times its shear modulus.
 
     Attributes
     ----------
@@ -141,7 +144,7 @@ def second_invariant(F: Any, J: Any) -> Any:
     return J ** (-4.0 / 3.0) * 0.5 * (ngs.Trace(C) ** 2 - ngs.InnerProduct(C, C))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@register_law("mooney_rivlin")
 class MooneyRivlin(Rubber):
     """Mooney-Rivlin rubber; c01 = 0 makes it the volume-split neo-Hookean law.
 
@@ -153,7 +156,8 @@ class MooneyRivlin(Rubber):
 
     Attributes
     ----------
-    c10, c01 : Pa.
+    c10 : Pa.
+    c01 : Pa.
     """
 
     c10: Constant
@@ -163,7 +167,7 @@ class MooneyRivlin(Rubber):
         return self.c10 * (first_invariant(F, J) - 3.0) + self.c01 * (second_invariant(F, J) - 3.0)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@register_law("yeoh")
 class Yeoh(Rubber):
     """Yeoh rubber: a cubic in the first invariant, for filled rubbers and large strains.
 
@@ -175,7 +179,9 @@ class Yeoh(Rubber):
 
     Attributes
     ----------
-    c10, c20, c30 : Pa.
+    c10 : Pa.
+    c20 : Pa.
+    c30 : Pa.
     """
 
     c10: Constant
@@ -187,7 +193,7 @@ class Yeoh(Rubber):
         return x * (self.c10 + x * (self.c20 + x * self.c30))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@register_law("gent")
 class Gent(Rubber):
     """Gent rubber: neo-Hookean whose chains lock where I1~ - 3 reaches the limit Jm.
 
@@ -205,6 +211,7 @@ class Gent(Rubber):
 
     shear: Constant
     limit: Constant
+    quantities: ClassVar = {"limit": "ratio"}
 
     def distortional(self, F: Any, J: Any) -> Any:
         left = positive_or_nan(1.0 - (first_invariant(F, J) - 3.0) / self.limit)
@@ -212,18 +219,6 @@ class Gent(Rubber):
 
     def check_constants(self) -> None:
         self.require_positive("shear", "limit", "bulk")
-
-
-# Ogden's law, and traces of powers of a tensor that can be differentiated where eigenvalues meet.
-# The formula for the eigenvalues of a 3x3 tensor has no derivative where two of them are equal: in every
-# solid at rest and all along a uniaxial or biaxial test. A symmetric function of all three, like tr C^s, has
-# every derivative there. It is computed here as an analytic function of mean, J2 and J3 (the invariants of
-# the deviator), exact to rounding, without perturbing the tensor:
-# * one eigenvalue is always apart from the other two: the largest if J3 >= 0, else the smallest. It is a
-# simple root of its cubic, found by Newton's method, through which NGSolve differentiates; * the power sum of
-# the other two is even in their half difference q: a series in q^2 if q is small; * where all three are
-# close, so that the direction of the deviator is lost in rounding, tr C^s is a series in the powers of the
-# deviator, whose traces follow from Cayley and Hamilton's theorem.
 
 
 #: Where the series take over: relative size of the deviator, and (q / mean of the pair)^2.
@@ -240,8 +235,18 @@ _PAIR_TERMS = 5
 _ROOT_STEPS = 5
 
 
-class Spectrum:
-    """The eigenvalues of a symmetric positive 3x3 coefficient function, ready for power sums.
+class _Spectrum:
+    """The eigenvalues of a symmetric positive 3x3 coefficient function, for sums of their powers, tr C^s.
+
+    The formula for the eigenvalues has no derivative where two of them are equal: in every solid at rest and all along
+    a uniaxial test. Their power sums do. They are computed from the mean and the deviator's invariants J2 and J3, exact
+    to rounding:
+
+    * One eigenvalue is apart from the other two: the largest if J3 >= 0, else the smallest. It is a simple root of its
+      cubic, found by Newton's method, through which NGSolve differentiates.
+    * The power sum of the other two is even in their half difference q: a series in q^2 if q is small.
+    * Where all three are close, the direction of the deviator is lost in rounding: a series in powers of the deviator,
+      whose traces follow from Cayley and Hamilton's theorem.
 
     Parameters
     ----------
@@ -312,7 +317,7 @@ def _binomials(exponent: Constant, highest: int) -> list[Constant]:
     return values
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@register_law("ogden")
 class Ogden(Rubber):
     """Ogden rubber: a sum of powers of the volume-preserving principal stretches.
 
@@ -331,10 +336,11 @@ class Ogden(Rubber):
 
     moduli: tuple[Constant, ...]
     exponents: tuple[Constant, ...]
+    quantities: ClassVar = {"exponents": "ratio"}
 
     def distortional(self, F: Any, J: Any) -> Any:
         # The volume is taken out of the sums rather than of the tensor, whose entries are then polynomials.
-        spectrum = Spectrum(right_cauchy_green(F))
+        spectrum = _Spectrum(right_cauchy_green(F))
         energy: Any = ngs.CF(0.0)
         for modulus, exponent in zip(self.moduli, self.exponents, strict=True):
             stretches = _power(J, -exponent / 3.0) * spectrum.power_sum(0.5 * exponent)

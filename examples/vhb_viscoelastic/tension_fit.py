@@ -2,7 +2,7 @@
 
 At stretch l the sides contract by l^-1/2 whatever the law, and the pressure that frees them is eliminated:
 with S1 and S2 the axial and lateral second Piola-Kirchhoff stress of the law's remainder, the nominal stress
-is P = l S1 - S2 / l^2. With a Prony series S1 and S2 advance in time by the recurrence of `viscoelastic`.
+is P = l S1 - S2 / l^2. With a Prony series S1 and S2 advance in time by the recurrence of `viscous_history`.
 """
 
 from __future__ import annotations
@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from tqdm import tqdm
 
-from morph_dslam.errors import StudyError
-from morph_dslam.mechanics.materials.base import Material, evaluate
-from morph_dslam.mechanics.materials.viscoelastic import Prony
+import morph_dslam as md
+from morph_dslam.extend.mechanics import Material, Prony
 
 Array = NDArray[np.float64]
 
@@ -64,7 +63,7 @@ class TensionStress:
         field.vec.FV().NumPy()[:] = self.stretch
         side = 1.0 / ngs.sqrt(field)
         F = ngs.CF((field, 0, 0, 0, side, 0, 0, 0, side), dims=(3, 3)).MakeVariable()
-        stress = ngs.Inv(F) * material.remainder(F).Diff(F)
+        stress = ngs.Inv(F) * material.parts(F)[0].Diff(F)
         self._components = ngs.CF((stress[0, 0], stress[1, 1])).Compile()
         self._points = mesh((np.arange(n) + 0.5) / n)
 
@@ -77,8 +76,10 @@ class TensionStress:
         stress = self.instantaneous()
         prony = self.material.prony
         if prony is not None and self.time is not None:
-            moduli = np.array([evaluate(g) for g in prony.relative_moduli])
-            times = np.array([evaluate(tau) for tau in prony.times])
+            moduli, times = (
+                np.array([ngs.CF(value)(self._points)[0, 0] for value in values])
+                for values in (prony.relative_moduli, prony.times)
+            )
             stress = relaxed_stress(stress, np.asarray(self.time, dtype=float), moduli, times)
         return self.stretch * stress[:, 0] - stress[:, 1] / self.stretch**2
 
@@ -87,7 +88,7 @@ class TensionStress:
 def relaxed_stress(instantaneous: Array, time: Array, moduli: Array, times: Array) -> Array:
     """Stress (n, k) with a Prony series, from the instantaneous one (n, k) at ``time`` (n,).
 
-    The exponential midpoint rule of `viscoelastic`; the state before the first time is free of stress, and
+    The exponential midpoint rule of `viscous_history`; the state before the first time is free of stress, and
     the first step is instantaneous.
     """
     n, k = instantaneous.shape
@@ -150,7 +151,7 @@ class _Unknowns:
     def __init__(self, bounds: Mapping[str, Bounds]) -> None:
         for name, (low, high) in bounds.items():
             if not low < high:
-                raise StudyError(f"the bounds of {name} must be increasing, not {low:g}, {high:g}")
+                raise md.MorphError(f"the bounds of {name} must be increasing, not {low:g}, {high:g}")
         self.low, self.high = np.array(list(bounds.values()), dtype=float).T
         # Moduli and times span decades: equal steps of their logarithms.
         self.logarithmic = (self.low > 0.0) & (self.high >= 100.0 * self.low)
@@ -192,7 +193,7 @@ def fit_law(
 
     Raises
     ------
-    StudyError : no search found constants with finite stresses.
+    md.MorphError : no search found constants with finite stresses.
     """
     all_bounds = dict(bounds)
     n_terms = 0
@@ -231,7 +232,7 @@ def _best_of(differences: Callable[[Array], Array], size: int, starts: int, seed
     ]
     best = min(results, key=lambda result: result.cost)
     if not best.cost < 1e3:
-        raise StudyError("no constants within the bounds give finite stresses; widen the bounds of the fit")
+        raise md.MorphError("no constants within the bounds give finite stresses; widen the bounds of the fit")
     return best.x
 
 
