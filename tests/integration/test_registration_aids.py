@@ -24,7 +24,7 @@ from morph_dslam.slam.map_files import save_map
 from morph_dslam.slam.rigid_map import GOOD, Keyframe, RigidMap
 from morph_dslam.tracking.estimator import Estimator
 from morph_dslam.tracking.patches import normalize_contrast
-from morph_dslam.tracking.relocalization import RelocalizationOptions, state_from_matches
+from morph_dslam.tracking.relocalization import LEAST_MATCHES, state_from_matches
 from morph_dslam.tracking.run_live import LiveOptions, run_live
 from morph_dslam.tracking.setup import ObjectOptions
 from morph_dslam.tracking.state import BoundPoints, State
@@ -350,7 +350,6 @@ def test_matches_of_one_spot_span_no_pose(scene):
     """A texture that repeats makes many matches of the same few points; they must not stop a run."""
     points = BoundPoints.from_surface(scene.model, SurfacePoints(np.full(20, 5), np.tile([0.2, 0.3, 0.5], (20, 1))))
     pixels = np.random.default_rng(0).uniform(100.0, 300.0, (20, 2))
-    options = RelocalizationOptions()
-    state, agreeing = state_from_matches(Estimator(scene.model, CAMERA), points, pixels, [scene.model.default], options)
+    state, agreeing = state_from_matches(Estimator(scene.model, CAMERA), points, pixels, [scene.model.default])
     assert state is None
-    assert agreeing.sum() < options.least_matches
+    assert agreeing.sum() < LEAST_MATCHES

@@ -23,7 +23,7 @@ from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.sources.frames import read_image
 from morph_dslam.tracking.binding import DrawnSurface, draw_view, nearest_surface_points, view_of
 from morph_dslam.tracking.estimator import Estimate, EstimationOptions, Estimator
-from morph_dslam.tracking.relocalization import RelocalizationOptions, state_from_matches
+from morph_dslam.tracking.relocalization import state_from_matches
 from morph_dslam.tracking.state import BoundPoints, Prior, State
 
 #: A coordinate or an angle. None is meant by what is larger: in millimetres it would be ten kilometres.
@@ -72,7 +72,7 @@ Image = NDArray[np.uint8]
 
 N_FEATURES, RATIO = 3000, 0.8
 
-MATCHING = RelocalizationOptions(pnp_px=6.0, least_matches=15)
+MATCH_PX, LEAST_MATCHES = 6.0, 15
 
 #: Shapes tried for a first pose, landmarks made of the matches, and the standard deviation of one, pixels.
 N_SHAPES, N_LANDMARKS, LANDMARK_PX = 9, 60, 0.3
@@ -207,13 +207,13 @@ def _matches(picture: Image, grey: Image) -> tuple[Array, Array]:
 def _agreeing(model: ReducedModel, camera: Camera, points: Array, pixels: Array) -> NDArray[np.bool_]:
     """Which matches (k,) agree on one state of the object; none if they are too few."""
     none = np.zeros(len(points), dtype=bool)
-    if len(points) < MATCHING.least_matches:
+    if len(points) < LEAST_MATCHES:
         return none
     surface, _ = nearest_surface_points(model.nodes, model.triangles, points)
     bound = BoundPoints.from_surface(model, surface)
     shapes = shape_starts(model)
     some = shapes[:: max(1, len(shapes) // N_SHAPES)]
-    state, agreeing = state_from_matches(Estimator(model, camera), bound, pixels, some, MATCHING)
+    state, agreeing = state_from_matches(Estimator(model, camera), bound, pixels, some, MATCH_PX, LEAST_MATCHES)
     return none if state is None else agreeing
 
 

@@ -6,7 +6,7 @@ Decisions rest on these types; the texts are for people and are made here only.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import ClassVar
 
@@ -193,23 +193,6 @@ class CameraIgnored(TrackingWarning):
         if self.rejection is None:
             return f"camera {self.camera} contradicts the others and does not count"
         return f"camera {self.camera}: {self.status}: {self.rejection.text}"
-
-
-@dataclass(frozen=True)
-class DiagnosticFinding(TrackingWarning):
-    """What an opt-in diagnostic found.
-
-    Attributes
-    ----------
-    diagnostic : its name.
-    message : what it found.
-    data : the figures behind it.
-    """
-
-    template: ClassVar[str] = "{message}"
-    diagnostic: str
-    message: str
-    data: dict[str, float] = field(default_factory=dict, compare=False)
 
 
 def reason_text(

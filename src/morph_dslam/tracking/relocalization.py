@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +15,12 @@ from morph_dslam.tracking.patches import detect_orb, match_descriptors
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class RelocalizationOptions:
-    """``pnp_px``: reprojection error that a match may have before its shape is estimated; generous, because
-    the shape is only guessed then. ``least_matches``: fewer matches that agree are not believed."""
-
-    n_features: int = 1000
-    pnp_px: float = 8.0
-    least_matches: int = 12
+#: Features of an image.
+N_FEATURES = 1000
+#: Reprojection error, pixels, that a match may have before its shape is estimated; the shape is only guessed then.
+PNP_PX = 8.0
+#: Fewer matches that agree are not accepted.
+LEAST_MATCHES = 12
 
 
 class Relocalizer:
@@ -37,17 +33,10 @@ class Relocalizer:
     """
 
     def __init__(
-        self,
-        estimator: Estimator,
-        drawn: ReducedModel,
-        grey: NDArray[np.uint8],
-        mask: NDArray[np.uint8],
-        view: View,
-        options: RelocalizationOptions | None = None,
+        self, estimator: Estimator, drawn: ReducedModel, grey: NDArray[np.uint8], mask: NDArray[np.uint8], view: View
     ) -> None:
-        self.options = options or RelocalizationOptions()
         self._estimator = estimator
-        pixels, descriptors = detect_orb(grey, self.options.n_features, mask)
+        pixels, descriptors = detect_orb(grey, N_FEATURES, mask)
         surface, met = bind_pixels(drawn, estimator.camera, view, pixels)
         self._points = BoundPoints.from_surface(estimator.model, surface)
         self._descriptors = descriptors[met]
@@ -64,19 +53,24 @@ class Relocalizer:
 
         Returns
         -------
-        None in place of the state when fewer matches than ``least_matches`` agree on one.
+        None in place of the state when fewer matches than `LEAST_MATCHES` agree on one.
         """
-        pixels, descriptors = detect_orb(grey, self.options.n_features, mask)
+        pixels, descriptors = detect_orb(grey, N_FEATURES, mask)
         mine, theirs = match_descriptors(self._descriptors, descriptors)
-        if len(mine) < self.options.least_matches:
+        if len(mine) < LEAST_MATCHES:
             return None, len(mine)
         points = BoundPoints.from_surface(self._estimator.model, self._points.surface.take(mine))
-        state, agreeing = state_from_matches(self._estimator, points, pixels[theirs], shapes, self.options)
+        state, agreeing = state_from_matches(self._estimator, points, pixels[theirs], shapes)
         return state, int(agreeing.sum())
 
 
 def state_from_matches(
-    estimator: Estimator, points: BoundPoints, pixels: Array, shapes: list[Array], options: RelocalizationOptions
+    estimator: Estimator,
+    points: BoundPoints,
+    pixels: Array,
+    shapes: list[Array],
+    pnp_px: float = PNP_PX,
+    least: int = LEAST_MATCHES,
 ) -> tuple[State | None, NDArray[np.bool_]]:
     """The object's state from matches of which many may be wrong, and which of them (k,) agree with it.
 
@@ -86,22 +80,22 @@ def state_from_matches(
 
     Returns
     -------
-    None in place of the state when fewer than ``least_matches`` agree on one.
+    None in place of the state when fewer than ``least`` agree on one.
     """
     best, inliers = None, np.zeros(len(points), dtype=bool)
     for shape in shapes:
         positions = points.rest + points.field.value(shape)
-        pose, agreeing = _ransac(positions, pixels, estimator.camera.matrix, options.pnp_px)
+        pose, agreeing = _ransac(positions, pixels, estimator.camera.matrix, pnp_px)
         if pose is not None and agreeing.sum() > inliers.sum():
             best, inliers = State(shape, pose), agreeing
-    if best is None or inliers.sum() < options.least_matches:
+    if best is None or inliers.sum() < least:
         return None, inliers
     # Estimated from the agreeing matches, then once more from all that agree with the result.
     for _ in range(2):
         estimate = estimator.estimate(points, pixels, inliers.astype(float), best)
         best = estimate.state
-        inliers = np.linalg.norm(estimate.residuals, axis=1) < options.pnp_px
-    return (best if inliers.sum() >= options.least_matches else None), inliers
+        inliers = np.linalg.norm(estimate.residuals, axis=1) < pnp_px
+    return (best if inliers.sum() >= least else None), inliers
 
 
 def _ransac(

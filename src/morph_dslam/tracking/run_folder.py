@@ -28,7 +28,7 @@ from morph_dslam.tracking.observability import (
     statement,
     untold_in_run,
 )
-from morph_dslam.tracking.outcomes import DiagnosticFinding, ModelDoesNotExplain, ObjectMoved, Status
+from morph_dslam.tracking.outcomes import ModelDoesNotExplain, ObjectMoved, Status
 from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE
 
@@ -390,21 +390,8 @@ def flags(run: RunResults) -> list[str]:
             f"the frames contradict the reference state: {worse:.1f} times its stated deviation, and all deviations "
             "are that much wider; check the landmarks and whether the object has the model's dimensions"
         )
-    for name, (count, first, message) in _found_by_diagnostics(run).items():
-        found.append(f"{message} in {count} of {len(run)} frames, first in frame {first} (diagnostic '{name}')")
     found += _at_bound(run)
     return found + _untold(run)
-
-
-def _found_by_diagnostics(run: RunResults) -> dict[str, tuple[int, int, str]]:
-    """Of each diagnostic in how many frames it found something, the first of them, and its last message."""
-    found: dict[str, tuple[int, int, str]] = {}
-    for frame, result in zip(run.frames, run.results, strict=True):
-        finding = result.warning(DiagnosticFinding)
-        if finding is not None:
-            count, first, _ = found.get(finding.diagnostic, (0, frame, ""))
-            found[finding.diagnostic] = count + 1, first, finding.message
-    return found
 
 
 def _at_bound(run: RunResults) -> list[str]:

@@ -1,1 +1,0 @@
-"""What results say about themselves: duplicates, wrong dimensions, reference errors."""
