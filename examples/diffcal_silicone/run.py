@@ -110,10 +110,10 @@ class Hanger:
         self.problem = hanging_problem(bar, options)
         self.triangles = self.problem.mesh.surface_triangles()
         start = self.problem.initial_state()
-        self._state = advance(self.problem, start, np.array([1.0, start.mu[1]])).states[-1]
+        self._state = advance(self.problem, start, np.array([1.0, start.mu[1]]))[-1]
 
     def state(self, shear: float) -> State:
-        self._state = advance(self.problem, self._state, np.array([1.0, shear])).states[-1]
+        self._state = advance(self.problem, self._state, np.array([1.0, shear]))[-1]
         return self._state
 
     def distances(self, nodes: Array, shift: float) -> Array:

@@ -12,7 +12,8 @@ from morph_dslam.mechanics.materials.base import Material
 from morph_dslam.mechanics.materials.isotropic import NeoHookean
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solid import SolidProblem
-from morph_dslam.mechanics.solvers.newton import State, advance
+from morph_dslam.mechanics.solvers.continuation import advance
+from morph_dslam.mechanics.solvers.newton import State
 from morph_dslam.mechanics.supports import AffineMotion
 from morph_dslam.meshing.generators import block
 from morph_dslam.meshing.meshes import CellBlock, Mesh
@@ -112,4 +113,4 @@ def merged(meshes: list[Mesh]) -> Mesh:
 
 def solved(problem: SolidProblem, *mu: float) -> State:
     """The solution at ``mu``, along a straight line from the parameters' defaults."""
-    return advance(problem, problem.initial_state(), np.array(mu, dtype=float)).states[-1]
+    return advance(problem, problem.initial_state(), np.array(mu, dtype=float))[-1]

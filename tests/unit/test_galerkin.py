@@ -5,8 +5,9 @@ import pytest
 from scipy.optimize import root
 from scipy.sparse import csr_matrix
 
+from morph_dslam.mechanics.solvers.continuation import advance
 from morph_dslam.mechanics.solvers.linear_solver import AssembledLinearisation, LinearSolver
-from morph_dslam.mechanics.solvers.newton import State, advance, sensitivities, solve
+from morph_dslam.mechanics.solvers.newton import State, sensitivities, solve
 from morph_dslam.reduction.galerkin import GalerkinEquations, galerkin_modes, newton_correction
 
 SPRINGS = 30
@@ -69,7 +70,7 @@ UPPER = np.array([3.0, 60.0, 8.0])
 
 
 def solved(mu):
-    return advance(CHAIN, REST, mu).states[-1]
+    return advance(CHAIN, REST, mu)[-1]
 
 
 def by_scipy(mu):
@@ -98,7 +99,7 @@ def test_all_modes_give_the_full_solution():
 def test_few_modes_solve_unseen_parameters(projected):
     start = State(REST.mu, np.zeros(projected.n_dofs))
     for mu in (np.array([1.1, 33.0, 6.5]), np.array([2.7, 55.0, 1.5])):
-        found = advance(projected, start, mu).states[-1]
+        found = advance(projected, start, mu)[-1]
         missed = projected.lift(found.dofs, mu) - by_scipy(mu)
         assert projected.n_dofs <= 8
         assert np.linalg.norm(missed) < 1e-3 * np.linalg.norm(by_scipy(mu))
@@ -106,7 +107,7 @@ def test_few_modes_solve_unseen_parameters(projected):
 
 def test_projected_sensitivities_are_the_differences_of_projected_solutions(projected):
     mu, step = np.array([2.0, 40.0, 5.0]), 1e-5
-    start = advance(projected, State(REST.mu, np.zeros(projected.n_dofs)), mu).states[-1]
+    start = advance(projected, State(REST.mu, np.zeros(projected.n_dofs)), mu)[-1]
     slopes = projected.lift_slopes(sensitivities(projected, start), mu)
     for k in range(3):
         change = step * np.eye(3)[k] * UPPER
@@ -119,7 +120,7 @@ def test_projected_sensitivities_are_the_differences_of_projected_solutions(proj
 def test_newton_correction_measures_the_error_of_a_projected_solution(projected):
     mu = np.array([2.6, 52.0, 7.0])
     coarse = GalerkinEquations(CHAIN, projected.modes[:3])
-    found = advance(coarse, State(REST.mu, np.zeros(3)), mu).states[-1]
+    found = advance(coarse, State(REST.mu, np.zeros(3)), mu)[-1]
     x = coarse.lift(found.dofs, mu)
     error = np.linalg.norm(by_scipy(mu) - x)
     assert error > 1e-5

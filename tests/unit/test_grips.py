@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.mechanics.gripped_sheet import mesh_lines
-from morph_dslam.mechanics.supports import ARC_SLOPE, Grips
+from morph_dslam.mechanics.grips import ARC_SLOPE, Grips
 
 GRIPS = Grips(length=0.42, depth=0.012, height=0.034, centre_left=0.05, centre_right=0.06)
 
@@ -16,7 +16,7 @@ def test_arc_slope_is_that_of_a_shallow_parabola() -> None:
     """z = h (1 - 4 x^2 / L^2): end slope 4 h / L over the weighted mean height, integrated numerically."""
     x = np.linspace(-0.5, 0.5, 200_001) * GRIPS.free_length
     height = 1.0 - 4.0 * x**2 / GRIPS.free_length**2
-    weight = GRIPS.bulge_weight(x)
+    weight = np.cos(np.pi * x / GRIPS.free_length) ** 2
     mean = np.sum(weight * height) / np.sum(weight)
     assert pytest.approx(4.0 / mean, rel=1e-6) == ARC_SLOPE
 

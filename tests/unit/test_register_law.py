@@ -11,7 +11,7 @@ from morph_dslam.extend import register_law
 from morph_dslam.mechanics.materials import base
 from morph_dslam.mechanics.materials.base import Constant
 from morph_dslam.mechanics.materials.isotropic import Rubber, first_invariant
-from morph_dslam.mechanics.solvers.newton import advance
+from morph_dslam.mechanics.solvers.continuation import advance
 
 STUDY = {
     "name": "strip",
@@ -44,7 +44,7 @@ def test_a_law_of_ones_own_is_named_in_a_study_and_solved(registry):
             return 0.5 * self.mu / self.growth * (ngs.exp(self.growth * (first_invariant(F, J) - 3.0)) - 1.0)
 
     problem = make_study(STUDY).problem()
-    state = advance(problem, problem.initial_state(), np.array([0.6])).states[-1]
+    state = advance(problem, problem.initial_state(), np.array([0.6]))[-1]
     force = problem.reactions(state.dofs, state.mu, "x_max")[0][0]
     # Uniaxial and incompressible: P = mu exp(b (I1 - 3)) (l - l^-2).
     stretch, first = 1.6, 1.6**2 + 2.0 / 1.6

@@ -18,7 +18,7 @@ from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.recovery import locate
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning
-from morph_dslam.mechanics.solvers.newton import PathError
+from morph_dslam.mechanics.solvers.continuation import PathError
 from morph_dslam.mechanics.supports import ElasticFoundation, PrescribedDisplacement, RigidRotation, fixed
 from morph_dslam.meshing.generators import block, sheet
 from morph_dslam.model import Parameter
@@ -141,7 +141,7 @@ def test_a_load_that_cannot_be_carried_keeps_what_converged() -> None:
     problem = SolidProblem(mesh, {"all": RUBBER}, [fixed("x_min")], [load], symbols)
     with pytest.raises(PathError, match="last parameters that converged") as caught:
         solved(problem, 200.0)
-    kept = caught.value.path.states[-1]
+    kept = caught.value.states[-1]
     assert 0.0 < kept.mu[0] < 200.0
     residual = problem.residual(kept.dofs, kept.mu)
     assert np.abs(residual[problem.free]).max() < 1e-6 * np.abs(residual).max()

@@ -7,9 +7,8 @@ import pytest
 
 from morph_dslam.errors import SolverError
 from morph_dslam.mechanics.gripped_sheet import GrippedSheet
+from morph_dslam.mechanics.grips import Grips
 from morph_dslam.mechanics.shell import OrthotropicSheet
-from morph_dslam.mechanics.solvers.continuation import advance
-from morph_dslam.mechanics.supports import Grips
 
 LENGTH, WIDTH, DEPTH = 0.42, 0.297, 0.01
 YOUNG, THICKNESS = 5e9, 5e-4
@@ -37,7 +36,7 @@ def test_clamped_buckling_shape_and_energy(planar: GrippedSheet) -> None:
     (4 pi^2 E I / L^2) L / E A = pi^2 t^2 / 3 L.
     """
     start = planar.first_state(0.004)
-    state, _ = advance(planar, start, np.array([0.003, 0.0, 0.0, 0.0]))
+    state = planar.advance(start, np.array([0.003, 0.0, 0.0, 0.0]))
     amplitude = 4.0 / 3.0 * 0.003
     stiffness = YOUNG * THICKNESS**3 / 12.0
     approach = np.pi**2 * (amplitude**2 / (4.0 * FREE) + THICKNESS**2 / (3.0 * FREE))
@@ -62,7 +61,7 @@ def test_both_sides_are_mirror_images(held: GrippedSheet) -> None:
     result = []
     for sign in (1.0, -1.0):
         start = held.first_state(sign * 0.012)
-        state, _ = advance(held, start, np.array([sign * 0.02, 0.8, sign * 0.05, 0.1]))
+        state = held.advance(start, np.array([sign * 0.02, 0.8, sign * 0.05, 0.1]))
         result.append(held.shell.sample(state.dofs, points)[0] * [1.0, 1.0, sign])
         assert held.bulge() == pytest.approx(sign * 0.02, abs=1e-8)
     assert result[0] == pytest.approx(result[1], abs=1e-7)
@@ -70,7 +69,7 @@ def test_both_sides_are_mirror_images(held: GrippedSheet) -> None:
 
 def test_sensitivities_match_differences_of_solutions(held: GrippedSheet) -> None:
     coordinates = np.array([0.02, 0.8, 0.05, 0.1])
-    state, _ = advance(held, held.first_state(0.012), coordinates)
+    state = held.advance(held.first_state(0.012), coordinates)
     slopes, motions = held.sensitivities(state)
     displacements = slice(0, 3 * held.shell.scalar_space.ndof)
     for k, step in enumerate([1e-5, 1e-3, 1e-3, 1e-3]):
@@ -85,4 +84,4 @@ def test_sensitivities_match_differences_of_solutions(held: GrippedSheet) -> Non
 
 def test_unreachable_coordinates_are_named(held: GrippedSheet) -> None:
     with pytest.raises(SolverError, match=r"no equilibrium found at bulge .* % of the way"):
-        advance(held, held.first_state(0.012), np.array([0.5, 1.0, 0.0, 0.0]))
+        held.advance(held.first_state(0.012), np.array([0.5, 1.0, 0.0, 0.0]))

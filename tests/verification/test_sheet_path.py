@@ -9,10 +9,11 @@ import pytest
 from morph_dslam.mechanics.sheet_equations import SheetEquations
 from morph_dslam.mechanics.shell import KoiterSheet, OrthotropicSheet, rectangle_mesh
 from morph_dslam.mechanics.solvers.arc_length import ArcLength, ArcOptions, missed_bifurcations
-from morph_dslam.mechanics.solvers.newton import NewtonOptions, State, advance, sensitivities
+from morph_dslam.mechanics.solvers.continuation import advance
+from morph_dslam.mechanics.solvers.newton import State, sensitivities
 
 #: For differences of solutions.
-PRECISE = NewtonOptions(tolerance=1e-12)
+PRECISE = 1e-12
 
 
 def isotropic(young: float, poisson: float, thickness: float, **more: float) -> OrthotropicSheet:
@@ -31,7 +32,7 @@ def small_sheet(condensed: bool = True) -> SheetEquations:
 
 def arched(equations: SheetEquations) -> State:
     start = State(np.zeros(2), np.zeros(equations.n_dofs))
-    return advance(equations, start, np.array([1e-4, 1.0]), PRECISE).states[-1]
+    return advance(equations, start, np.array([1e-4, 1.0]), PRECISE)[-1]
 
 
 def test_condensed_and_whole_tangents_agree_and_match_differences() -> None:
@@ -62,9 +63,7 @@ def test_sensitivities_match_differences() -> None:
     for parameter, step in ((0, 1e-7), (1, 1e-4)):
         change = np.zeros(2)
         change[parameter] = step
-        above, below = (
-            advance(equations, state, state.mu + sign * change, PRECISE).states[-1].dofs for sign in (1.0, -1.0)
-        )
+        above, below = (advance(equations, state, state.mu + sign * change, PRECISE)[-1].dofs for sign in (1.0, -1.0))
         difference = (above - below) / (2.0 * step)
         error = np.abs(slopes[parameter] - difference)[up].max()
         assert error < 1e-5 * np.abs(difference[up]).max()
@@ -118,7 +117,7 @@ def test_a_strip_pulled_off_its_middle_bends() -> None:
     material = isotropic(young, 0.0, thickness, offset=offset)
     load = {"right": np.array([pull, 0.0, 0.0])}
     equations = SheetEquations(KoiterSheet(mesh, material, 3, clamped="left", dead_load=load), {}, length)
-    state = advance(equations, State(np.zeros(2), np.zeros(equations.n_dofs)), np.array([0.0, 1.0])).states[-1]
+    state = advance(equations, State(np.zeros(2), np.zeros(equations.n_dofs)), np.array([0.0, 1.0]))[-1]
     displacement, stress = equations.shell.sample(state.dofs, np.array([[length, 0.01], [0.05, 0.01]]))
     stiffness = young * thickness**3 / 12.0
     # The middle lies above the pull, so that the tip turns up.

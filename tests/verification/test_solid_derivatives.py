@@ -21,13 +21,14 @@ from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden, tu
 from morph_dslam.mechanics.materials.isotropic import NeoHookean
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.mechanics.solvers.continuation import advance
 from morph_dslam.mechanics.solvers.linear_solver import default_engine
-from morph_dslam.mechanics.solvers.newton import NewtonOptions, advance, sensitivities, solve
+from morph_dslam.mechanics.solvers.newton import sensitivities, solve
 from morph_dslam.mechanics.supports import ElasticFoundation, PrescribedDisplacement, RigidRotation, fixed
 from morph_dslam.meshing.generators import block
 from tests.support.solids import RUBBER, distorted, load_parameter
 
-EXACT = NewtonOptions(tolerance=1e-13)
+EXACT = 1e-13
 MESH = distorted(block((1.0, 0.5, 0.5), (3, 2, 2), "hex8"), 0.04)
 DOWN = (0.0, 0.0, -2e4)
 
@@ -111,7 +112,7 @@ def test_derivatives_by_a_parameter(make: Callable[[ParameterSymbols], SolidProb
     problem = make(load_parameter(p=0.0 if make in (by_rotation, by_displacement) else 0.3))
     start = problem.initial_state()
     mu = np.array([0.3])
-    state = solve(problem, mu, advance(problem, start, mu).states[-1], EXACT)
+    state = solve(problem, mu, advance(problem, start, mu)[-1], EXACT)
     slopes = sensitivities(problem, state)
     fields = problem.sample_slopes(state.dofs, state.mu, slopes)
     step = 1e-4
@@ -182,7 +183,7 @@ def test_reactions_balance_the_loads() -> None:
     loads = [DeadTraction("y_max", (1e4, 2e4, -5e3))]
     supports = [fixed("x_min"), RigidRotation("x_max", (0.0, 0.0, 1.0), mu["p"])]
     problem = SolidProblem(MESH, {"all": RUBBER}, supports, loads, mu)
-    state = advance(problem, problem.initial_state(), np.array([0.3])).states[-1]
+    state = advance(problem, problem.initial_state(), np.array([0.3]))[-1]
     about = np.array([0.3, -0.2, 0.7])
     reactions = [problem.reactions(state.dofs, state.mu, name, about) for name in ("x_min", "x_max")]
     applied = 0.5 * np.array([1e4, 2e4, -5e3])  # the face is 1 m by 0.5 m

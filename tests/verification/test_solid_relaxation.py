@@ -9,7 +9,7 @@ from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.mechanics.materials.isotropic import NeoHookean
 from morph_dslam.mechanics.materials.viscoelastic import Prony
 from morph_dslam.mechanics.solid import SolidProblem
-from morph_dslam.mechanics.solvers.newton import advance
+from morph_dslam.mechanics.solvers.continuation import advance
 from morph_dslam.mechanics.supports import PrescribedDisplacement, fixed
 from morph_dslam.meshing.generators import block
 from tests.support.solids import distorted, load_parameter
@@ -29,11 +29,11 @@ def test_relaxation(cell_type: str) -> None:
     ]
     mesh = distorted(block((1.0, 1.0, 1.0), (2, 2, 2), cell_type), 0.05)
     problem = SolidProblem(mesh, {"all": LAW}, supports, parameters=symbols, time=symbols["time"])
-    state = advance(problem, problem.initial_state(), np.array([0.5, 0.0])).states[-1]
+    state = advance(problem, problem.initial_state(), np.array([0.5, 0.0]))[-1]
     at_once = problem.reactions(state.dofs, state.mu, "x_max")[0][0]
     assert at_once == pytest.approx(1.075843e6, rel=1e-6)
     for time, remaining in ((1.0, 0.763918), (4.0, 0.481201)):
-        state = advance(problem, state, np.array([0.5, time])).states[-1]
+        state = advance(problem, state, np.array([0.5, time]))[-1]
         force = problem.reactions(state.dofs, state.mu, "x_max")[0][0]
         assert force / at_once == pytest.approx(remaining, rel=1e-5)
         fields = problem.recovery.at_nodes(state.dofs, state.mu, ("first_piola_kirchhoff", "stress"))

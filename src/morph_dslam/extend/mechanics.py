@@ -28,7 +28,8 @@ from morph_dslam.mechanics.materials.viscoelastic import Prony
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solid import SolidOptions
 from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning
-from morph_dslam.mechanics.solvers.newton import State, advance, sensitivities, solve
+from morph_dslam.mechanics.solvers.continuation import advance
+from morph_dslam.mechanics.solvers.newton import State, sensitivities, solve
 from morph_dslam.mechanics.supports import ElasticFoundation, PrescribedDisplacement, RigidRotation, fixed
 from morph_dslam.meshing.generators import Profile, block, revolution, sheet, tube
 from morph_dslam.meshing.mesh_checks import check_mesh

@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError
+from morph_dslam.mechanics.grips import FREE_MOTIONS, MOTION, Grips
 from morph_dslam.mechanics.shell import KoiterSheet, OrthotropicSheet, rectangle_mesh
-from morph_dslam.mechanics.supports import FREE_MOTIONS, MOTION, Grips
+from morph_dslam.mechanics.solvers.continuation import step_towards
 
 Array = NDArray[np.float64]
 
@@ -62,8 +63,11 @@ class GrippedSheet:
 
     Parameters
     ----------
+    material : of the sheet.
+    grips : where they are.
     width : of the sheet along y, m; the length is the grips'.
     divisions : elements along x between the grips, and along y.
+    order : polynomial degree of the displacements.
     """
 
     def __init__(
@@ -76,8 +80,6 @@ class GrippedSheet:
         self.shell = KoiterSheet(mesh, material, order, rigid_elements=rigid)
         self._find_held_dofs(rigid)
         self._bulge_row = self._bulge_functional()
-
-    # -- set-up ---------------------------------------------------------------------------------------
 
     def _find_held_dofs(self, rigid_elements: list[int]) -> None:
         """Dofs under the grips: those of vertices move with the grip, those of higher order stay zero."""
@@ -111,8 +113,6 @@ class GrippedSheet:
         form.Assemble()
         total = ngs.Integrate(weight * ngs.dx(bonus_intorder=4), self.shell.mesh)
         return form.vec.FV().NumPy() / total
-
-    # -- pieces of the equations ----------------------------------------------------------------------
 
     def _by_component(self, vectors: Array) -> Array:
         """(n_held, 3, ...) to the order of the held dofs: all x, then y, then z."""
@@ -184,8 +184,6 @@ class GrippedSheet:
             border[1, other] += (forward - backward)[:, turn] @ reactions[0] / (2.0 * step)
         return border, residual
 
-    # -- solution -------------------------------------------------------------------------------------
-
     def solve(self, coordinates: Array, start: EquilibriumState) -> EquilibriumState:
         """Newton's method from ``start`` to equilibrium at ``coordinates`` (4,).
 
@@ -219,6 +217,21 @@ class GrippedSheet:
             if largest < TOLERANCE * length:
                 return EquilibriumState(coordinates.copy(), motion.copy(), vector.copy())
         raise SolverError(f"no equilibrium found at {_describe(coordinates)}")
+
+    def advance(self, start: EquilibriumState, target: Array) -> EquilibriumState:
+        """Solve at ``target`` (4,) along the straight line from ``start``.
+
+        Raises
+        ------
+        SolverError
+            Naming the last coordinates that converged.
+        """
+        origin = start.coordinates
+
+        def attempt(fraction: float, nearby: EquilibriumState) -> EquilibriumState:
+            return self.solve(origin + fraction * (target - origin), nearby)
+
+        return step_towards(attempt, start)
 
     def sensitivities(self, state: EquilibriumState) -> tuple[Array, Array]:
         """Derivatives of the dofs (4, n_dofs) and of the grip motion (4, 5) by the coordinates.

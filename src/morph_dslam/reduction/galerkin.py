@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.mechanics.solid import SolidProblem
-from morph_dslam.mechanics.solvers.newton import Equations, Linearisation, State, advance, solve
+from morph_dslam.mechanics.solvers.continuation import advance
+from morph_dslam.mechanics.solvers.newton import Equations, Linearisation, State, solve
 from morph_dslam.reduction.pod import compute_pod
 from morph_dslam.reduction.regression import fit_functions
 from morph_dslam.studies.problem import SweepProblem
@@ -290,7 +291,7 @@ class ReducedSolver:
         except SolverError:
             nearest = self._nearest(self._solutions.samples, mu)
             state = State(self._solutions.samples[nearest], self._known[nearest])
-            return advance(self.galerkin, state, mu).states[-1].dofs
+            return advance(self.galerkin, state, mu)[-1].dofs
 
     def lift(self, y: Array, mu: Array) -> Array:
         """Full state (n_dofs,) of coefficients ``y``."""

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from morph_dslam.mechanics.gripped_sheet import EquilibriumState, GrippedSheet
+from morph_dslam.mechanics.grips import COORDINATES, Grips
 from morph_dslam.mechanics.shell import OrthotropicSheet
-from morph_dslam.mechanics.solvers.continuation import advance
-from morph_dslam.mechanics.supports import COORDINATES, Grips
 from morph_dslam.model import Parameter
 from morph_dslam.studies.problem import ModelMesh, Snapshot
 from morph_dslam.studies.sections import (
@@ -196,7 +195,7 @@ class GripsSection(Section):
 
 
 class SheetParametersSection(Section):
-    """Ranges of the four coordinates (`morph_dslam.mechanics.supports` says what they mean)."""
+    """Ranges of the four coordinates (`morph_dslam.mechanics.grips` says what they mean)."""
 
     bulge: tuple[Length, Length]
     bend: tuple[Number, Number]
@@ -205,7 +204,7 @@ class SheetParametersSection(Section):
 
     @property
     def bounds(self) -> Array:
-        """Ranges (4, 2) in the order of `morph_dslam.mechanics.supports.COORDINATES`, SI."""
+        """Ranges (4, 2) in the order of `morph_dslam.mechanics.grips.COORDINATES`, SI."""
         return np.array([getattr(self, name) for name in COORDINATES])
 
     @model_validator(mode="after")
@@ -408,7 +407,7 @@ class GrippedSheetSweep:
         return EquilibriumState(arrays["coordinates"], arrays["motion"], arrays["dofs"])
 
     def advance(self, start: EquilibriumState, target: Array) -> EquilibriumState:
-        return advance(self.sheet, start, target)[0]
+        return self.sheet.advance(start, target)
 
     def take_snapshot(self, state: EquilibriumState) -> Snapshot:
         return take_snapshot(self.sheet, state, self.points, self.thickness_ratio)

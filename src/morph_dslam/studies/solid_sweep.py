@@ -11,16 +11,8 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError
 from morph_dslam.mechanics.solid import SolidProblem
-from morph_dslam.mechanics.solvers.newton import (
-    Linearisation,
-    PathError,
-    State,
-    advance,
-    loaded_state,
-    sensitivities,
-    solve,
-    solve_with_kept_tangent,
-)
+from morph_dslam.mechanics.solvers.continuation import PathError, advance, loaded_state
+from morph_dslam.mechanics.solvers.newton import Linearisation, State, sensitivities, solve, solve_with_kept_tangent
 from morph_dslam.studies.problem import Snapshot, SweepProblem
 
 Array = NDArray[np.float64]
@@ -108,11 +100,11 @@ def follow(problem: SolidProblem, start: State, target: Array) -> State:
         Naming, in the parameters' units, where the last solution converged.
     """
     try:
-        return advance(problem, start, target).states[-1]
+        return advance(problem, start, target)[-1]
     except PathError as error:
         last = ", ".join(
             f"{parameter.name} {parameter.display(value):.5g} {parameter.unit}".removesuffix(" 1")
-            for parameter, value in zip(problem.symbols.parameters, error.path.states[-1].mu, strict=True)
+            for parameter, value in zip(problem.symbols.parameters, error.states[-1].mu, strict=True)
         )
         raise SolverError(f"no equilibrium found beyond {last}, where the last solution converged") from error
 

@@ -1,9 +1,10 @@
-"""Linear buckling: the parameters at which the tangent, extrapolated from the unloaded state, is singular.
+"""Arc length continuation: paths through limit points, with any parameter as the path's own.
 
-With K0 the tangent at the base state and K' its derivative along the response to one parameter, modes and
-critical values solve (K0 + lambda K') phi = 0 (Bathe, Finite Element Procedures, section 6.8.2). Solved as
-K0^-1 K' phi = -phi / lambda, so that the parameters nearest to the base state come first. Arnoldi's method
-is used, since in mixed formulations K0 is indefinite and does not give the inner product that Lanczos' needs.
+The unknowns are the dofs and one parameter; the added equation fixes the length of the step along the tangent (Keller,
+"Numerical solution of bifurcation and nonlinear eigenvalue problems", 1977; Crisfield, Computers & Structures 13,
+1981). The bordered system is solved by two solves of one factorisation, so that K itself keeps its symmetry and its
+inertia gives the stability. Each converged point is linearised once, for its tangent; the same factorisation then
+serves the next step's corrections as long as they shrink fast enough.
 """
 
 from __future__ import annotations
@@ -11,111 +12,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
-import scipy.sparse.linalg
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from morph_dslam.errors import SolverError
-from morph_dslam.mechanics.solvers.continuation import step_towards
-from morph_dslam.mechanics.solvers.newton import (
-    Equations,
-    Linearisation,
-    StabilityChange,
-    State,
-    correction,
-    sensitivities,
-    size,
-    stability_change,
-)
+from morph_dslam.mechanics.solvers.newton import Equations, Linearisation, State, correction, size
 
 Array = NDArray[np.float64]
-
-sla: Any = scipy.sparse.linalg
-
-
-@dataclass(frozen=True)
-class BucklingMode:
-    """One mode.
-
-    Attributes
-    ----------
-    change : of the parameter from the base state to buckling.
-    shape : (n,) dofs; the largest measured entry (see `Equations.scale`) is one unit of the scale.
-    """
-
-    change: float
-    shape: Array
-
-
-def buckling_modes(
-    equations: Equations, base: State, parameter: int, step: float, count: int = 1
-) -> list[BucklingMode]:
-    """The first modes as a parameter grows from ``base``, nearest first.
-
-    ``equations`` must give linearisations that stay usable after the next one is made.
-
-    Parameters
-    ----------
-    base : a stable equilibrium, before buckling.
-    parameter : index in mu of the parameter that makes the body buckle.
-    step : of that parameter, for differencing K along the response; well below the critical change.
-
-    Raises
-    ------
-    SolverError
-        If no mode is found for growing parameters.
-    """
-    direction = np.zeros(len(base.mu))
-    direction[parameter] = step
-    response = step * sensitivities(equations, base)[parameter]
-    above = equations.linearise(base.dofs + response, base.mu + direction)
-    below = equations.linearise(base.dofs - response, base.mu - direction)
-    centre = equations.linearise(base.dofs, base.mu)
-    free = np.flatnonzero(equations.free)
-
-    def apply(free_values: Array) -> Array:
-        vector = np.zeros(equations.n_dofs)
-        vector[free] = np.ravel(free_values)
-        slope = (above.apply(vector) - below.apply(vector)) / (2.0 * step)
-        return -centre.solve(slope)[free]
-
-    values, vectors = _largest(apply, len(free), count)
-    modes = []
-    for value, vector in zip(values, vectors.T, strict=True):
-        shape = np.zeros(equations.n_dofs)
-        shape[free] = vector
-        measured = np.abs(shape / equations.scale)
-        largest = int(np.argmax(measured))
-        modes.append(BucklingMode(1.0 / value, shape / np.copysign(measured[largest], shape[largest])))
-    if not modes:
-        raise SolverError("no buckling mode was found for a growing parameter: is the step's sign right?")
-    return modes
-
-
-def _largest(apply: Any, n: int, count: int) -> tuple[Array, Array]:
-    """The ``count`` largest positive eigenvalues, falling, of an operator on n dofs, and their vectors."""
-    if n <= 2 * count + 2:
-        values, vectors = np.linalg.eig(np.column_stack([apply(unit) for unit in np.eye(n)]))
-    else:
-        operator = sla.LinearOperator((n, n), matvec=apply, dtype=float)
-        start = np.random.default_rng(0).standard_normal(n)
-        values, vectors = sla.eigs(operator, k=count, which="LR", v0=start, tol=1e-8)
-    values, vectors = np.real(values), np.real(vectors)
-    order = np.argsort(-values)
-    order = order[values[order] > 0.0][:count]
-    return values[order], vectors[:, order]
-
-
-# Arc length continuation: paths through limit points, with any parameter as the path's own.
-# The unknowns are the dofs and one parameter; the added equation fixes the length of the step along the
-# tangent (Keller, "Numerical solution of bifurcation and nonlinear eigenvalue problems", 1977; Crisfield,
-# Computers & Structures 13, 1981). The bordered system is solved by two solves of one factorisation, so that
-# K itself keeps its symmetry and its inertia tells the stability. Each converged point is linearised once,
-# for its tangent; the same factorisation then serves the next step's corrections as long as they shrink fast
-# enough.
 
 
 @dataclass(frozen=True)
@@ -124,7 +29,9 @@ class ArcOptions:
 
     Attributes
     ----------
-    first, smallest, largest : step lengths.
+    first : step length.
+    smallest : step length at which the path is given up.
+    largest : step length.
     corrections : a step that takes so many is repeated at the same length; with fewer it grows.
     max_corrections : more than these, and the step is halved.
     contraction : the tangent is renewed where a correction is larger than this part of the one before.
@@ -150,7 +57,8 @@ class PathPoint:
     ----------
     state : parameters, dofs and negative pivots, these of the tangent at this very point.
     length : of the path from its start.
-    tangent, rate : derivatives of the dofs (n,) and of the path's parameter by the length.
+    tangent : (n,) derivative of the dofs by the length.
+    rate : derivative of the path's parameter by the length.
     step : length of the step that led here, 0 at the start.
     corrections : back-substitutions that the step took.
     """
@@ -168,7 +76,9 @@ class ArcLength:
 
     Parameters
     ----------
+    equations : what is solved.
     parameter : index of the path's own parameter in mu.
+    options : step control.
     """
 
     def __init__(self, equations: Equations, parameter: int = 0, options: ArcOptions | None = None) -> None:
@@ -177,8 +87,6 @@ class ArcLength:
         scale = np.broadcast_to(np.asarray(equations.scale, dtype=float), equations.n_dofs)
         self._weights = 1.0 / scale**2 / np.count_nonzero(np.isfinite(scale))
         self._latest: tuple[PathPoint, Linearisation, Array] | None = None
-
-    # -- pieces -----------------------------------------------------------------------------------------
 
     def _product(self, a: Array, b: Array) -> float:
         return float(np.sum(self._weights * a * b))
@@ -190,7 +98,7 @@ class ArcLength:
         return moved - linearisation.solve(load + linearisation.apply(moved))
 
     def _point(self, x: Array, mu: Array, forwards: Callable[[Array], float], **kept: float) -> PathPoint:
-        """Linearise at a converged point; ``forwards`` tells the sense of a tangent by its sign."""
+        """Linearise at a converged point; the sign of ``forwards`` is the sense of a tangent."""
         linearisation = self.equations.linearise(x, mu)
         response = self._response(linearisation, x, mu)
         rate = 1.0 / np.sqrt(self._product(response, response))
@@ -257,8 +165,6 @@ class ArcLength:
             before = largest
         raise SolverError(f"a step of {length:.1e} along the path does not converge from {point.state.mu}")
 
-    # -- the path ---------------------------------------------------------------------------------------
-
     def begin(self, start: State, sense: float = 1.0) -> PathPoint:
         """The path's first point, the parameter growing from there (``sense`` = 1) or falling (-1)."""
         return self._point(start.dofs, start.mu, lambda _: sense, length=0.0)
@@ -266,25 +172,14 @@ class ArcLength:
     def locate(self, point: PathPoint, length: float, following: PathPoint | None = None) -> State:
         """The solution at ``length`` along the tangent of ``point``, without a tangent or pivots of its own.
 
-        Between two points of a path it costs a few corrections only, the first point's factorisation serving
-        all: they begin from the cubic interpolation if the ``following`` point is given.
-
-        Raises
-        ------
-        SolverError
-            If the corrections do not converge.
+        Between two points of a path it costs a few corrections only, the first point's factorisation serving all: they
+        begin from the cubic interpolation if the ``following`` point is given. Raises SolverError as `step` does.
         """
         x, mu, _ = self._correct(point, length, following)
         return State(mu, x)
 
     def step(self, point: PathPoint, length: float) -> PathPoint:
-        """One step of ``length`` along the path.
-
-        Raises
-        ------
-        SolverError
-            If the corrections do not converge; a shorter step may.
-        """
+        """One step of ``length`` along the path; SolverError if its corrections do not converge."""
         x, mu, count = self._correct(point, length)
         following = self._point(
             x,
@@ -298,21 +193,6 @@ class ArcLength:
             raise SolverError(f"the path turns sharply, or was lost for another, beyond {point.state.mu}")
         return following
 
-    def advance(self, point: PathPoint, length: float) -> PathPoint:
-        """The point at ``length`` further on, in one step or, where that fails, in shorter ones.
-
-        Raises
-        ------
-        SolverError
-            Naming the last parameters that converged.
-        """
-        begin = point.length
-
-        def attempt(fraction: float, nearby: PathPoint) -> PathPoint:
-            return self.step(nearby, begin + fraction * length - nearby.length)
-
-        return step_towards(attempt, point)[0]
-
     def follow(
         self, start: State | PathPoint, end: Callable[[State], float], sense: float = 1.0
     ) -> Iterator[PathPoint]:
@@ -321,8 +201,8 @@ class ArcLength:
         Parameters
         ----------
         start : the path's first solution, or a point of a path to go on from.
-        end : a function of the state that is negative before the path's end and grows through zero at it: the
-            last point is where it vanishes. ``lambda state: state.mu[0] - target`` ends at a parameter.
+        end : a function of the state that is negative before the path's end and grows through zero at it: the last
+            point is where it vanishes. ``lambda state: state.mu[0] - target`` ends at a parameter.
         sense : whether the parameter first grows (1) or falls (-1); a point knows its own.
 
         Raises
@@ -361,14 +241,39 @@ class ArcLength:
         return self.step(point, float(brentq(remaining, 0.0, length, xtol=1e-12, rtol=1e-9)))  # type: ignore[arg-type]
 
 
+@dataclass(frozen=True)
+class StabilityChange:
+    """Negative pivots that change between neighbouring points: the path has met a bifurcation between them.
+
+    Attributes
+    ----------
+    before : (d,) parameters of the first point.
+    after : (d,) parameters of the second.
+    pivots : negative pivots at the two.
+    """
+
+    before: Array
+    after: Array
+    pivots: tuple[int, int]
+
+    def __str__(self) -> str:
+        return (
+            f"negative pivots change from {self.pivots[0]} to {self.pivots[1]} between {self.before} and "
+            f"{self.after}: a bifurcation was passed; start from a buckling mode as imperfection to follow it"
+        )
+
+
 def missed_bifurcations(points: list[PathPoint]) -> tuple[StabilityChange, ...]:
     """Neighbours whose negative pivots differ although no limit point lies between them.
 
-    At a limit point the parameter turns round and one pivot changes its sign. Any other change means that the
-    path crossed another one, without branching off.
+    At a limit point the parameter turns round and one pivot changes its sign. Any other change means that the path
+    crossed another one, without branching off.
     """
-    changes = (
-        stability_change(before.state, after.state, expected=int(before.rate * after.rate < 0.0))
-        for before, after in pairwise(points)
-    )
-    return tuple(change for change in changes if change)
+    changes = []
+    for before, after in pairwise(points):
+        pivots = before.state.negative_pivots, after.state.negative_pivots
+        if pivots[0] is None or pivots[1] is None:
+            continue
+        if abs(pivots[1] - pivots[0]) != int(before.rate * after.rate < 0.0):
+            changes.append(StabilityChange(before.state.mu, after.state.mu, (pivots[0], pivots[1])))
+    return tuple(changes)

@@ -1,15 +1,16 @@
-"""Load stepping from a solved state to new coordinates: increments shrink on failure and grow again."""
+"""Load stepping: from a solved state to new parameters, and from the undeformed body to its first loads."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError
-from morph_dslam.mechanics.gripped_sheet import EquilibriumState
+from morph_dslam.mechanics.solvers.newton import TOLERANCE, Equations, Linearisation, State, solve
 
 Array = NDArray[np.float64]
 
@@ -19,33 +20,37 @@ AnyState = TypeVar("AnyState")
 SMALLEST_INCREMENT = 1.0 / 64.0
 
 
-class Problem(Protocol):
-    """Anything that can be solved at given coordinates from a nearby state."""
+@runtime_checkable
+class History(Protocol):
+    """Equations whose response depends on the path (internal variables): told of each accepted solution."""
 
-    def solve(self, coordinates: Array, start: EquilibriumState) -> EquilibriumState: ...
+    def advance_history(self, x: Array, mu: Array) -> None: ...
 
 
-def step_towards(attempt: Callable[[float, AnyState], AnyState], start: AnyState) -> tuple[AnyState, int]:
-    """Solve at the end of a path, going there in one increment if possible.
+class PathError(SolverError):
+    """The path could not be followed to its end; ``states`` keeps what was solved."""
+
+    def __init__(self, message: str, states: list[State]) -> None:
+        super().__init__(message)
+        self.states = states
+
+
+def step_towards(attempt: Callable[[float, AnyState], AnyState], start: AnyState) -> AnyState:
+    """The state at the end of a path, in one increment if possible; they shrink on failure and grow again.
 
     Parameters
     ----------
     attempt : solves at a fraction of the path from a solved state.
     start : state at fraction 0.
 
-    Returns
-    -------
-    The state at fraction 1 and how many solves it took.
-
     Raises
     ------
     SolverError
         If the increments become too small.
     """
-    state, done, increment, solves = start, 0.0, 1.0, 0
+    state, done, increment = start, 0.0, 1.0
     while done < 1.0:
         step = min(increment, 1.0 - done)
-        solves += 1
         try:
             state = attempt(done + step, state)
         except SolverError as error:
@@ -55,22 +60,97 @@ def step_towards(attempt: Callable[[float, AnyState], AnyState], start: AnyState
             continue
         done += step
         increment = min(1.0, 2.0 * step)
-    return state, solves
+    return state
 
 
-def advance(problem: Problem, start: EquilibriumState, target: Array) -> tuple[EquilibriumState, int]:
-    """Solve at ``target`` (d,) along the straight line from ``start``.
+def advance(equations: Equations, start: State, target: Array, tolerance: float = TOLERANCE) -> list[State]:
+    """Solve at ``target`` (d,) along the straight line from ``start``, in increments as large as converge.
 
-    Returns the state and how many solves it took.
+    Returns
+    -------
+    The states along the line, ``start`` first.
+
+    Raises
+    ------
+    PathError
+        Naming the last parameters that converged; it carries the states up to there.
+    """
+    origin, goal = start.mu, np.asarray(target, dtype=float)
+    states: list[State] = [start]
+
+    def attempt(fraction: float, nearby: State) -> State:
+        state = solve(equations, origin + fraction * (goal - origin), nearby, tolerance)
+        if isinstance(equations, History):
+            equations.advance_history(state.dofs, state.mu)
+        states.append(state)
+        return state
+
+    try:
+        step_towards(attempt, start)
+    except SolverError as error:
+        raise PathError(
+            f"{error}; the last parameters that converged are {states[-1].mu}. A load that the body cannot "
+            "carry (a limit point) needs arc length, or an imposed displacement in its place",
+            states,
+        ) from error
+    return states
+
+
+@dataclass
+class _Shifted:
+    """A linearisation with another residual."""
+
+    original: Linearisation
+    residual: Array
+
+    @property
+    def negative_pivots(self) -> int | None:
+        return self.original.negative_pivots
+
+    def solve(self, right: Array) -> Array:
+        return self.original.solve(right)
+
+    def apply(self, vectors: Array) -> Array:
+        return self.original.apply(vectors)
+
+
+class _LoadRamp:
+    """Equations in one parameter: the share s of all loads and motions at the parameters ``full``.
+
+    The residual r(x) - (1 - s) r(0) is that of the share s of every dead load (Newton's homotopy; Allgower and Georg,
+    Numerical Continuation Methods, 1990, section 1.2): x = 0 solves it at s = 0, and s = 1 is the problem itself.
+    """
+
+    def __init__(self, equations: Equations, full: Array) -> None:
+        self._equations, self._full = equations, full
+        self.n_dofs, self.free, self.scale = equations.n_dofs, equations.free, equations.scale
+        self._unloaded = np.where(self.free, equations.residual(np.zeros(self.n_dofs), full), 0.0)
+
+    def prescribed(self, mu: Array) -> Array:
+        return mu[0] * self._equations.prescribed(self._full)
+
+    def prescribed_slopes(self, mu: Array) -> Array:
+        return self._equations.prescribed(self._full)[None]
+
+    def residual(self, x: Array, mu: Array) -> Array:
+        return self._equations.residual(x, self._full) - (1.0 - mu[0]) * self._unloaded
+
+    def residual_slopes(self, x: Array, mu: Array) -> Array:
+        return self._unloaded[None]
+
+    def linearise(self, x: Array, mu: Array) -> Linearisation:
+        original = self._equations.linearise(x, self._full)
+        return _Shifted(original, original.residual - (1.0 - mu[0]) * self._unloaded)
+
+
+def loaded_state(equations: Equations, mu: Array) -> State:
+    """Equilibrium at ``mu`` (d,), reached from the undeformed, stress-free body while all loads grow together.
 
     Raises
     ------
     SolverError
-        Naming the last coordinates that converged.
+        If the loads cannot be carried.
     """
-    origin = start.coordinates
-
-    def attempt(fraction: float, nearby: EquilibriumState) -> EquilibriumState:
-        return problem.solve(origin + fraction * (target - origin), nearby)
-
-    return step_towards(attempt, start)
+    start = State(np.zeros(1), np.zeros(equations.n_dofs))
+    reached = advance(_LoadRamp(equations, mu), start, np.ones(1))[-1]
+    return State(np.array(mu, dtype=float), reached.dofs, reached.negative_pivots, reached.iterations)
