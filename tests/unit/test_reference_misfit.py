@@ -56,10 +56,10 @@ def test_a_reference_that_is_off_more_than_stated_is_found_to_be(times):
         estimate = replace(estimate, covariance=np.zeros((9, 9)))
         for _ in range(20):
             stated = errors.added(estimate, used, 0.0)
-        found.append(errors.worse)
+        found.append(errors.reference_factor)
         unlearnt = errors_of(estimator, points, off, np.diag(SPREAD**2))
         before = unlearnt.added(estimate, used, 0.0, learns=False).covariance
-        np.testing.assert_allclose(stated.covariance, errors.worse**2 * before, rtol=1e-9)
+        np.testing.assert_allclose(stated.covariance, errors.reference_factor**2 * before, rtol=1e-9)
     found = np.sqrt(np.mean(np.square(found)))
     # It is never below one, so that it is above one on average where all is as stated.
     assert found == pytest.approx(max(times, 1.25), rel=0.25)

@@ -7,7 +7,9 @@ import pytest
 
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator
+from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.observability import position_std
+from morph_dslam.tracking.sequence_filter import SequenceFilter
 from morph_dslam.tracking.state import moved
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.one_view import errors_of
@@ -131,3 +133,25 @@ def test_a_smooth_error_of_the_model_is_stated_as_large_as_it_is_though_the_fit_
     assert np.sqrt(np.median(off) / np.median(stated)) == pytest.approx(1.0, abs=0.4)
     # Five times what is stated is exceeded by none.
     assert (np.sqrt(off) < 5.0 * np.sqrt(stated)).all()
+
+
+def test_an_error_of_the_reference_stays_in_a_shared_parameter_as_predicted(model, estimator, pixels):
+    """The arch, the same in all frames, is estimated from five; the last by itself would hardly show it."""
+    true_points, weights = bound(model, REFERENCE, pixels), np.ones(len(pixels))
+    step = np.array([0.0, 2e-3, 5e-4, 3e-4, -3e-4, 2e-4, 2e-4, -1e-4, 5e-4])
+    off = moved(REFERENCE, step)
+    points = bound(model, off, pixels)
+    errors = errors_of(estimator, points, off, np.outer(step, step))
+    filtered = SequenceFilter(estimator, [0])
+    for time in (0.5, 0.6, 0.7, 0.8, 0.9):
+        truth = replace(sheet_state(time), parameters=np.array([0.03, *sheet_state(time).parameters[1:]]))
+        seen = CAMERA.project(true_points.in_camera(truth))
+        used = weights if time < 0.9 else 1e-4 * weights
+        measured = Observations(points, seen, used, np.zeros_like(seen), np.eye(len(seen)))
+        fused = filtered.fuse(measured, estimator.fit(measured, truth))
+        plain = replace(fused, covariance=np.zeros((9, 9)))
+        stated = errors.added(
+            plain, used, 0.0, past_information=filtered.past_information, keeps=filtered.keeps, learns=False
+        )
+        off_by = abs(fused.state.parameters[0] - 0.03)
+        assert stated.parameter_std[0] == pytest.approx(off_by, rel=0.1), time

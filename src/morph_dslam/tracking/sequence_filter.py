@@ -228,6 +228,11 @@ class SequenceFilter(Generic[Frame]):
     ----------
     indices : of the parameters that are one per sequence; none is allowed, and only covariances are found.
     steps : of parameters that walk, by index: the standard deviation of their change from frame to frame, SI.
+
+    Attributes
+    ----------
+    past_information : (d + 6, d + 6) with which the past counts in the last estimate, as a term of its cost
+    keeps : whether the last estimate is the past of the next one
     """
 
     def __init__(
@@ -248,16 +253,7 @@ class SequenceFilter(Generic[Frame]):
         self._past: Past | None = None
         self._untold = np.zeros(len(self._constant))
         self._conflicts = 0
-
-    @property
-    def constant(self) -> NDArray[np.int64]:
-        """Indices (k,) of the parameters that are one per sequence."""
-        return self._constant
-
-    @property
-    def unobservable(self) -> NDArray[np.bool_]:
-        """Of which of these (k,) the last frame told nothing by itself."""
-        return self._untold > 0.0
+        self.past_information, self.keeps = np.zeros((self._unknowns,) * 2), True
 
     def change_points(self, change: PointChange) -> None:
         """Go on with the points of another view; what those so far have put into the past stays in it."""
@@ -273,6 +269,7 @@ class SequenceFilter(Generic[Frame]):
         alone : the estimate from the frame's measurements, and ``known``, only.
         known : what is known of the frame's pose or parameters from elsewhere, if anything.
         """
+        self.past_information, self.keeps = np.zeros((self._unknowns,) * 2), True
         linear = self._estimator.linear(measured, alone)
         self._noise.add(alone.residuals, measured, _taken(measured, linear, alone.state, known))
         self._untold = self._without_effect(measured, linear, alone, known)
@@ -287,9 +284,11 @@ class SequenceFilter(Generic[Frame]):
         if self._past is None:
             self._keep(by_itself, errors)
             return by_itself
+        self.keeps = not conflict
         if conflict and (self._walks or not self._is_far_surer(self._past, by_itself)):
             return by_itself
         past = self._prior(self._past, measured, errors)
+        self.past_information[:-6, :-6] = past.information
         prior = past if known is None else past.joined(known)
         fused = self._estimator.fit(measured, self._start(by_itself), prior)
         linear = self._estimator.linear(measured, fused)

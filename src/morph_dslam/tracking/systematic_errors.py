@@ -13,6 +13,9 @@ wider than the windows that are compared. Their covariance is measured from pair
 not overlap, and enters the estimate through the same H^-1 J' W. An estimate takes up most of such an error by
 a wrong pose and shape, so that its residuals show only the rest: what they show is divided by that share, as
 in restricted maximum likelihood (Patterson & Thompson 1971).
+
+Where earlier frames decide on an estimate too, with the information I, H is the sum of both, and the error T
+of their estimate enters as H^-1 I T. Both errors are thus considered over all frames, as in Schmidt's filter.
 """
 
 from __future__ import annotations
@@ -30,16 +33,16 @@ from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, Pri
 
 Array = NDArray[np.float64]
 
-#: More than this, pixels, and more than half of the residuals' variance, is stated as the model's failure.
+#: More than this, pixels, and more than half of the residuals' variance, counts as the model's failure.
 UNEXPLAINED_PX = 0.5
 
-#: What comparing windows leaves in neighbours alike, pixels: an expectation well below tells nothing.
+#: What comparing windows leaves in neighbours alike, pixels: an expectation well below says nothing.
 FLOOR_PX = 0.05
 
 #: Frames over which what was learnt of the reference fades, by a factor e.
 MEMORY = 600.0
 
-#: More than so many times the stated deviation is said of a frame and of the run.
+#: More than so many times the stated deviation of the reference is a warning.
 CLEARLY_WORSE = 2.0
 
 #: A triangle seen so much flatter in the reference view than in another says nothing of the motion there.
@@ -52,7 +55,8 @@ class Unexplained:
 
     Attributes
     ----------
-    px : standard deviation of a pixel coordinate that neighbours have in common. total_px : of all of it.
+    px : standard deviation of a pixel coordinate that neighbours have in common
+    total_px : standard deviation of a pixel coordinate, all of it
     """
 
     px: float
@@ -65,40 +69,47 @@ class Unexplained:
 
 
 @dataclass(frozen=True)
-class _Linear:
+class _Linearization:
     """A frame's points about its estimate; all is zero for those that do not count.
 
     Attributes
     ----------
-    usable : (p,) those that count. weights : (p,) how much. residuals : (p, 2), pixels.
-    jacobian : (p, 2, d + 6) of the pixels. scores : (p, 2, d + 6) that times the weights.
+    usable : (p,) those that count
+    residuals : (p, 2), pixels
+    jacobian : (p, 2, d + 6) of the pixels
+    weighted_jacobian : (p, 2, d + 6), that times the weights
     """
 
     usable: NDArray[np.bool_]
-    weights: Array
     residuals: Array
     jacobian: Array
-    scores: Array
+    weighted_jacobian: Array
+
+    @property
+    def hessian(self) -> Array:
+        """J' W J (d + 6, d + 6)."""
+        return self.products(self.jacobian)
 
     def products(self, rows: Array) -> Array:
-        """Sums (d + 6, m) over all coordinates of the scores times ``rows`` (p, 2, m)."""
-        return self.scores.reshape(-1, self.scores.shape[2]).T @ rows.reshape(-1, rows.shape[2])
+        """J' W times ``rows`` (p, 2, m): (d + 6, m)."""
+        weighted = self.weighted_jacobian
+        return weighted.reshape(-1, weighted.shape[2]).T @ rows.reshape(-1, rows.shape[2])
 
-    def left(self, moved: Array, gain: Array) -> Array:
-        """What an estimate of this ``gain`` (d + 6, d + 6) leaves of motions (p, 2, m) of the pixels."""
-        taken = self.jacobian.reshape(-1, len(gain)) @ (gain @ self.products(moved))
+    def left(self, moved: Array, transfer: Array) -> Array:
+        """What an estimate that moves by ``transfer`` (d + 6, m) leaves of motions (p, 2, m) of the pixels."""
+        taken = self.jacobian.reshape(-1, len(transfer)) @ transfer
         return np.where(self.usable[:, None, None], moved - taken.reshape(moved.shape), 0.0)
 
 
 class ReferenceMisfit:
     """By how much the reference state is worse known than was stated, as the frames of a sequence show it.
 
-    The stated covariance of the reference state lets expect e px² a coordinate of what neighbours have in
-    common in the residuals; the frame shows o px². One factor f of the variance holds for the whole sequence,
-    o = f e: the least squares slope over the frames, in which those that expect much count most (a variance
-    component by the method of moments; Rao 1971, J. Multivariate Analysis 1, 257). A frame in which the
-    object is as in the reference view expects nothing. So the factor starts as one, as if a frame with
-    `FLOOR_PX` of both had said so.
+    By the stated covariance of the reference state neighbours have e px² a coordinate in common in the
+    residuals; the frame shows o px². One factor f of the variance holds for the whole sequence, o = f e: the
+    least squares slope over the frames, in which those that expect much count most (a variance component by
+    the method of moments; Rao 1971, J. Multivariate Analysis 1, 257). A frame in which the object is as in
+    the reference view expects nothing. So the factor starts as one, as if a frame with `FLOOR_PX` of both had
+    said so.
     """
 
     def __init__(self) -> None:
@@ -122,36 +133,39 @@ class SystematicErrors:
 
     Parameters
     ----------
-    points : (p) the texture's points. parts : the reference pictures that they were bound in.
-    window : side of the square that is compared around a point, pixels.
+    estimator : of the model and the camera
+    points : (p) the texture's points
+    parts : the reference images that they were bound in
+    window : side of the square that is compared around a point, pixels
     """
 
     def __init__(self, estimator: Estimator, points: BoundPoints, parts: Sequence[BoundPart], window: int) -> None:
         self._estimator, self._points = estimator, points
         self._misfit = ReferenceMisfit()
         self._corners = _corners(estimator, points)
-        self._jacobian = self._by_parts(parts, lambda state: self._project(points, state)[1])
-        self._edges = self._by_parts(parts, lambda state: _edges(estimator.camera, self._corners, state))
-        self._moved = self._by_causes(parts)
+        self._edges = _by_parts(parts, lambda state: _edges(estimator.camera, self._corners, state))
+        self._moved = self._by_error_factors(parts)
         self._common = SharedErrors(self._places(parts[0].state), window)
+        self.forget_frames()
 
-    def _by_parts(self, parts: Sequence[BoundPart], of_state: Callable[[State], Array]) -> Array:
-        """What ``of_state`` gives for all points (p, ...), of each part's points in its own state."""
-        return np.concatenate([of_state(part.state)[part.rows] for part in parts])
-
-    def _by_causes(self, parts: Sequence[BoundPart]) -> Array | None:
-        """By what each cause moves the points' pixels (p, 2, c) in their pictures; None where not known."""
-        moved = []
-        for part in parts:
-            if part.error_factors is None:
-                return None
-            moved.append(self._jacobian[part.rows] @ part.error_factors)
-        return np.concatenate(moved)
+    def _by_error_factors(self, parts: Sequence[BoundPart]) -> Array | None:
+        """By what each error factor moves the points' pixels (p, 2, c) in their images; None if not known."""
+        jacobian = _by_parts(parts, lambda state: self._project(state)[1])
+        if any(part.error_factors is None for part in parts):
+            return None
+        return np.concatenate([jacobian[part.rows] @ part.error_factors for part in parts])
 
     def _places(self, state: State) -> Array:
         """Places (p, 3) of the points in an object of this state, in pixels at its depth."""
         camera, positions = self._estimator.camera, self._points.in_camera(state)
         return np.asarray(positions * 0.5 * (camera.fx + camera.fy) / np.median(positions[:, 2]))
+
+    def forget_frames(self) -> None:
+        """The next estimate does not rest on earlier ones, or their errors are in its covariance already."""
+        size = len(self._estimator.scale)
+        n_factors = 0 if self._moved is None else self._moved.shape[2]
+        self._by_reference = np.zeros((size, n_factors))
+        self._by_model = np.zeros((size, 2 * self._common.factor.shape[1]))
 
     def unexplained(self, estimate: Estimate, used: NDArray[np.bool_]) -> Unexplained:
         """What the model leaves of the residuals of the points ``used`` (p,)."""
@@ -161,40 +175,55 @@ class SystematicErrors:
         return Unexplained(float(np.sqrt(max(common, 0.0))), float(np.sqrt(total)))
 
     @property
-    def worse(self) -> float:
+    def reference_factor(self) -> float:
         """By how much larger than stated the reference's deviation is, as the frames so far show it."""
         return float(np.sqrt(self._misfit.factor))
 
     def added(
-        self, estimate: Estimate, weights: Array, alike_px: float, prior: Prior | None = None, learns: bool = True
+        self,
+        estimate: Estimate,
+        weights: Array,
+        common_px: float,
+        prior: Prior | None = None,
+        learns: bool = True,
+        past_information: Array | None = None,
+        keeps: bool = True,
     ) -> Estimate:
         """The estimate with a covariance that holds both errors.
 
         Parameters
         ----------
-        weights : (p,) of the points, zero for those that do not support it. prior : that it was found with.
-        alike_px : standard deviation of a pixel coordinate that neighbours have in common in the residuals,
-            as of `unexplained`.
-        learns : whether the residuals are the object's, so that they tell how well the reference is known.
+        estimate : of a frame
+        weights : (p,) of the points, zero for those that do not support it
+        common_px : standard deviation of a pixel coordinate that neighbours have in common in the residuals,
+            as of `unexplained`
+        prior : what was known of the frame's pose
+        learns : whether the residuals are the object's, so that they show how well the reference is known
+        past_information : (d + 6, d + 6) with which earlier frames count in it; None where they do not
+        keeps : whether later frames rest on it
         """
-        frame = self._linear(estimate, weights)
-        hessian = frame.products(frame.jacobian)
+        frame = self._linearized(estimate, weights)
+        past = np.zeros_like(estimate.covariance) if past_information is None else past_information
+        hessian = frame.hessian + past
         if prior is not None:
             hessian = hessian + prior.terms(estimate.state)[1]
         gain = inverse_of_seen(hessian, self._estimator.scale)
-        covariance = estimate.covariance.copy()
+        covariance, by_reference = estimate.covariance.copy(), self._by_reference
         if self._moved is not None:
             moved = self._warps(estimate.state) @ self._moved
+            by_reference = gain @ (frame.products(moved) + past @ self._by_reference)
             if learns:
-                self._learn_reference(frame, frame.left(moved, gain))
-            transfer = gain @ frame.products(moved)
-            covariance += self._misfit.factor * transfer @ transfer.T
-        gradients = self._common.gradients(frame.scores)
+                self._learn_reference(frame, frame.left(moved, by_reference))
+            covariance += self._misfit.factor * by_reference @ by_reference.T
+        gradients = self._common.gradients(frame.weighted_jacobian)
         share = self._common.share_left(frame.usable, frame.jacobian, gradients, gain)
-        covariance += alike_px**2 / share * (gain @ (gradients.T @ gradients) @ gain)
+        by_model = gain @ (common_px / np.sqrt(share) * gradients.T + past @ self._by_model)
+        covariance += by_model @ by_model.T
+        if keeps:
+            self._by_reference, self._by_model = by_reference, by_model
         return replace(estimate, covariance=covariance)
 
-    def _learn_reference(self, frame: _Linear, left: Array) -> None:
+    def _learn_reference(self, frame: _Linearization, left: Array) -> None:
         """Take in what a frame shows of the reference's error, which would leave ``left`` (p, 2, c) in it."""
         n_pairs = self._common.n_pairs(frame.usable)
         both = (frame.residuals[:, :, None], left)
@@ -204,16 +233,18 @@ class SystematicErrors:
     def pushed(self, estimate: Estimate, weights: Array) -> tuple[Array, Array]:
         """How points of these ``weights`` (p,) determine the estimate, and how the reference's error enters.
 
-        J' W J, (d + 6, d + 6), and J' W M J0 times the error factors of the reference's error, (d + 6, c).
+        Returns
+        -------
+        hessian : (d + 6, d + 6), J' W J
+        push : (d + 6, c), J' W M J0 times the error factors of the reference
         """
         assert self._moved is not None
-        frame = self._linear(estimate, weights)
-        carried = self._warps(estimate.state) @ self._moved
-        return frame.products(frame.jacobian), frame.products(carried)
+        frame = self._linearized(estimate, weights)
+        return frame.hessian, frame.products(self._warps(estimate.state) @ self._moved)
 
-    def _linear(self, estimate: Estimate, weights: Array) -> _Linear:
+    def _linearized(self, estimate: Estimate, weights: Array) -> _Linearization:
         """The frame of an estimate whose points had these ``weights`` (p,)."""
-        _, jacobian = self._project(self._points, estimate.state)
+        _, jacobian = self._project(estimate.state)
         residuals = estimate.residuals[: len(weights)]
         length = np.linalg.norm(residuals, axis=1)
         usable = (weights > 0.0) & np.isfinite(length) & np.isfinite(jacobian).all(axis=(1, 2))
@@ -221,15 +252,14 @@ class SystematicErrors:
         weights = np.where(usable, weights * np.minimum(1.0, huber / np.maximum(length, 1e-300)), 0.0)
         residuals = np.where(usable[:, None], residuals, 0.0)
         jacobian = np.where(usable[:, None, None], jacobian, 0.0)
-        return _Linear(usable, weights, residuals, jacobian, weights[:, None, None] * jacobian)
+        return _Linearization(usable, residuals, jacobian, weights[:, None, None] * jacobian)
 
-    def _project(self, points: BoundPoints, state: State) -> tuple[Array, Array]:
-        pose = state.camera_from_object
-        functions = points.field.functions.rows(state.parameters)
-        intrinsics = self._estimator.camera.intrinsics
+    def _project(self, state: State) -> tuple[Array, Array]:
+        points, pose = self._points, state.camera_from_object
         return project_with_jacobian(
-            functions, pose.rotation, pose.translation, points.rest, points.field.modes, intrinsics
-        )
+            points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
+            points.field.modes, self._estimator.camera.intrinsics,
+        )  # fmt: skip
 
     def _warps(self, state: State) -> Array:
         """How pixels (p, 2, 2) move in a view where they move by one in the reference view."""
@@ -248,6 +278,11 @@ def inverse_of_seen(hessian: Array, scale: Array) -> Array:
     seen = values > max(values[-1], 1e-30) * EIGENVALUE_FLOOR
     inverse = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T
     return np.asarray(inverse * np.outer(scale, scale), dtype=np.float64)
+
+
+def _by_parts(parts: Sequence[BoundPart], of_state: Callable[[State], Array]) -> Array:
+    """What ``of_state`` gives for all points (p, ...), of each part's points in its own state."""
+    return np.concatenate([of_state(part.state)[part.rows] for part in parts])
 
 
 def _corners(estimator: Estimator, points: BoundPoints) -> BoundPoints:

@@ -327,7 +327,7 @@ class Tracker:
             n_inliers=n_inliers,
             residual_rms_px=float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))),
             unexplained_px=unexplained_px,
-            reference_factor=self._view.systematic.worse,
+            reference_factor=self._view.systematic.reference_factor,
             view=self._view.number,
             discrepancy=hypothesis.discrepancy,
         )
@@ -346,14 +346,17 @@ class Tracker:
         left = systematic.unexplained(hypothesis.estimate, hypothesis.inliers)
         doubt_px, whole = recovery.doubt(hypothesis), not recovery.partly_hidden(hypothesis)
         common_px = max(left.px, doubt_px)
-        estimate = systematic.added(hypothesis.estimate, hypothesis.weights, common_px, hypothesis.prior, whole)
+        past, keeps = self._filter.past_information, self._filter.keeps
+        estimate = systematic.added(
+            hypothesis.estimate, hypothesis.weights, common_px, hypothesis.prior, whole, past, keeps
+        )
         warnings: list[TrackingWarning] = []
         if doubt_px:
             warnings.append(FewPointsAgree(hypothesis.estimate.sigma_px))
         if left.is_failure:
             warnings.append(ModelDoesNotExplain(left.px))
-        if systematic.worse > CLEARLY_WORSE:
-            warnings.append(ReferenceContradicted(systematic.worse))
+        if systematic.reference_factor > CLEARLY_WORSE:
+            warnings.append(ReferenceContradicted(systematic.reference_factor))
         return estimate, left.px, warnings
 
     # -- reference views and state ------------------------------------------------------------------------
@@ -437,6 +440,7 @@ class Tracker:
             return None
         self._filter.change_points(self._views.point_change(change.view, self._unfiltered))
         self._unfiltered = np.zeros_like(self._unfiltered)
+        change.view.systematic.forget_frames()
         self._views.active, self._anchoring.reference = change.view, change.view.reference
         self._supported, self._pixels = change.supported, change.pixels
         return change
