@@ -150,10 +150,12 @@ class SystematicErrors:
 
     def _by_error_factors(self, parts: Sequence[BoundPart]) -> Array | None:
         """By what each error factor moves the points' pixels (p, 2, c) in their images; None if not known."""
-        jacobian = _by_parts(parts, lambda state: self._project(state)[1])
-        if any(part.error_factors is None for part in parts):
-            return None
-        return np.concatenate([jacobian[part.rows] @ part.error_factors for part in parts])
+        moved = []
+        for part in parts:
+            if part.error_factors is None:
+                return None
+            moved.append(self._project(part.state)[1][part.rows] @ part.error_factors)
+        return np.concatenate(moved)
 
     def _places(self, state: State) -> Array:
         """Places (p, 3) of the points in an object of this state, in pixels at its depth."""
