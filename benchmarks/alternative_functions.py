@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from morph_dslam.model.functions import Functions
+from morph_dslam.extend.models import Functions
 
 Array = NDArray[np.float64]
 

@@ -29,17 +29,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alternative_functions import Differenced, Hats, Linearised
-from morph_dslam.camera import Camera
-from morph_dslam.errors import MorphError
-from morph_dslam.geometry import RigidTransform
-from morph_dslam.io.camera_files import load_camera
-from morph_dslam.io.tables import Landmarks
-from morph_dslam.model import ReducedModel, load_model
-from morph_dslam.registration.registration import Registration, register_by_landmarks
-from morph_dslam.sources import open_source
-from morph_dslam.threads import one_thread_for_algebra
-from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State, moved
-from morph_dslam.tracking.tracker import Tracker
+from morph_dslam import Camera, MorphError, ReducedModel, Registration, Tracker, load_camera, load_model, open_source
+from morph_dslam.extend import one_thread_for_algebra
+from morph_dslam.extend.geometry import RigidTransform
+from morph_dslam.extend.registration import Landmarks
+from morph_dslam.extend.tracking import BoundPoints, Estimate, Estimator, State, moved
+from morph_dslam.registration.registration import register_by_landmarks
 
 Array = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parents[1]
@@ -135,7 +130,7 @@ def landmarks_at(folder: Path, frame: int, camera: Camera, model: ReducedModel) 
 
 def _seen(model: ReducedModel, camera: Camera, state: State):
     """Surface points of pixels that the object covers."""
-    from morph_dslam.tracking.binding import bind_pixels, draw_view, view_of
+    from morph_dslam.extend.tracking import bind_pixels, draw_view, view_of
 
     view = view_of(model, camera, state)
     rows, columns = np.nonzero(draw_view(view, model.triangles, camera).covered)

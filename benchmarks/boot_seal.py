@@ -61,13 +61,18 @@ def bellows() -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
 
 def follow_path() -> dict:
     """Solve the path with this project."""
-    from morph_dslam.mechanics.materials.isotropic import NeoHookean
-    from morph_dslam.mechanics.parameters import ParameterSymbols
-    from morph_dslam.mechanics.solid import SolidProblem
-    from morph_dslam.mechanics.solvers.newton import State, solve
-    from morph_dslam.mechanics.supports import PrescribedDisplacement, RigidRotation, fixed
-    from morph_dslam.meshing.meshes import CellBlock, Mesh
-    from morph_dslam.model import Parameter
+    from morph_dslam import Parameter, SolidProblem
+    from morph_dslam.extend.mechanics import (
+        CellBlock,
+        Mesh,
+        NeoHookean,
+        ParameterSymbols,
+        PrescribedDisplacement,
+        RigidRotation,
+        State,
+        fixed,
+        solve,
+    )
 
     nodes, hexes, sets = bellows()
     symbols = ParameterSymbols((Parameter("lever", "angle", "deg", 0.0, float(ANGLES[-1]), 0.0),))

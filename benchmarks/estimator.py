@@ -13,18 +13,11 @@ from time import perf_counter
 import numpy as np
 from scipy.optimize import least_squares
 
-from morph_dslam.camera import Camera
-from morph_dslam.geometry import RigidTransform, cross_matrix, rotation_exp
-from morph_dslam.model import Parameter, ReducedModel, SeparatedField, SurfacePoints
-from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
-from morph_dslam.tracking.estimator import (
-    BoundPoints,
-    Estimator,
-    State,
-    linearise_numpy,
-    moved,
-    project_with_jacobian_numpy,
-)
+from morph_dslam import Camera, Parameter, ReducedModel
+from morph_dslam.extend.geometry import RigidTransform, cross_matrix, rotation_exp
+from morph_dslam.extend.models import ParameterFunctions, SeparatedField, SurfacePoints, total_degree_indices
+from morph_dslam.extend.tracking import BoundPoints, Estimator, State, moved
+from morph_dslam.tracking.estimator import linearise_numpy, project_with_jacobian_numpy
 
 N_POINTS, N_MODES, DEGREE = 500, 16, 7
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)

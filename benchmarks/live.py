@@ -28,12 +28,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.cli.app import run_and_report_errors
-from morph_dslam.errors import SourceError
+from morph_dslam import Frame, MorphError, open_source
+from morph_dslam.extend import run_and_report_errors
+from morph_dslam.extend.registration import run_registration
+from morph_dslam.extend.slam import SlamRunOptions, run_slam
 from morph_dslam.io.video import VideoWriter
-from morph_dslam.registration.run import run_registration
-from morph_dslam.slam.run import SlamRunOptions, run_slam
-from morph_dslam.sources import Frame, open_source
 from morph_dslam.sources.live import PacedRecording
 from morph_dslam.tracking.drawing import AugmentedView
 from morph_dslam.tracking.live import LivePicture, LiveSession, OneObject, VideoSink
@@ -92,7 +91,7 @@ def large_scene(folder: Path) -> Path:
     }
     for before, after in wanted.items():
         if before not in text:
-            raise SourceError(f"{EXAMPLE / 'scene.toml'} has changed: it does not say '{before}'")
+            raise MorphError(f"{EXAMPLE / 'scene.toml'} has changed: it does not say '{before}'")
         text = text.replace(before, after)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "scene.toml"
@@ -127,13 +126,13 @@ def run(arguments: argparse.Namespace) -> None:
     model = EXAMPLE / "output" / "boot_seal.morph"
     folder = EXAMPLE / "output"
     if not model.is_file():
-        raise SourceError(f"there is no {model}: make it with examples/boot_seal/run.py first")
+        raise MorphError(f"there is no {model}: make it with examples/boot_seal/run.py first")
     if arguments.size == "1280x720":
         folder = ROOT / "benchmarks" / "output" / "live"
         make_large(folder, model)
     place = folder / "registration" / "registration.json"
     if not place.is_file():
-        raise SourceError(f"there is no {place}: make it with examples/boot_seal/track.py first")
+        raise MorphError(f"there is no {place}: make it with examples/boot_seal/track.py first")
     setup = load_setup(
         ObjectOptions(
             model=model,

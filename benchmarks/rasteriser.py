@@ -14,10 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import Camera
-from morph_dslam.render.overlay import draw_overlay
-from morph_dslam.render.rasteriser import rasterise, rasterise_numpy
-from morph_dslam.render.texture import render_textured
+from morph_dslam import Camera
+from morph_dslam.extend.rendering import draw_overlay, rasterise, render_textured
+from morph_dslam.render.rasteriser import rasterise_numpy
 
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 COLUMNS, ROWS = 59, 44

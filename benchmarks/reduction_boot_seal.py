@@ -20,9 +20,8 @@ from types import ModuleType
 
 from matplotlib.figure import Figure
 
-from morph_dslam.cli.app import run_and_report_errors
-from morph_dslam.reduction.certificate import compression_percent
-from morph_dslam.reduction.report_pictures import read_reference_curve
+from morph_dslam.extend import run_and_report_errors
+from morph_dslam.extend.reduction import compression_percent, read_reference_curve
 from reduction_snapshots import SolvedStudy, solve_study
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "boot_seal"

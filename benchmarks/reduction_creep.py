@@ -14,18 +14,16 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from morph_dslam.cli.app import run_and_report_errors
-from morph_dslam.errors import StudyError
-from morph_dslam.io.tables import read_toml
-from morph_dslam.model import ReducedModel
-from morph_dslam.studies.solid_study import SolidStudy
-from morph_dslam.studies.study import make_study
+from morph_dslam import ReducedModel, make_study
+from morph_dslam.extend import run_and_report_errors
+from morph_dslam.extend.studies import SolidStudy
 from reduction_snapshots import SolvedStudy, solve_study
 
 STUDY = Path(__file__).resolve().parent / "studies" / "creep.toml"
@@ -38,7 +36,7 @@ METHODS: dict[str, dict[str, Any]] = {
 
 def read_study(points: list[int] | None, held_out: int | None, divisions: list[int] | None) -> SolidStudy:
     """The study, if wished with another grid, number of held-out samples and mesh."""
-    content = read_toml(STUDY, "study file", StudyError)
+    content = tomllib.loads(STUDY.read_text())
     sampling, mesh = content["sampling"], content["mesh"]
     sampling["points"] = points or sampling["points"]
     sampling["held_out"] = held_out or sampling["held_out"]

@@ -17,26 +17,13 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from morph_dslam.model.basis_functions import (
-    Basis,
-    chebyshev_basis,
-    cubic_spline_basis,
-    hat_basis,
-    kriging_basis,
-    p_spline_basis,
-)
-from morph_dslam.model.separated import SeparatedField
-from morph_dslam.model.tensor_functions import CPFunctions, TensorFunctions, TensorTrainFunctions, TuckerFunctions
+from morph_dslam.extend.models import Basis, CPFunctions, SeparatedField, chebyshev_basis, cubic_spline_basis, hat_basis
+from morph_dslam.extend.reduction import cp, cp_functions
+from morph_dslam.model.basis_functions import kriging_basis, p_spline_basis
+from morph_dslam.model.tensor_functions import TensorFunctions, TensorTrainFunctions, TuckerFunctions
 from morph_dslam.reduction.pod import Pod, compute_pod
 from morph_dslam.reduction.sparse_pgd import SparsePgdOptions, fit_sparse_pgd
-from morph_dslam.reduction.tensor_formats import (
-    cp,
-    cp_functions,
-    tensor_train,
-    tensor_train_functions,
-    tucker,
-    tucker_functions,
-)
+from morph_dslam.reduction.tensor_formats import tensor_train, tensor_train_functions, tucker, tucker_functions
 
 Array = NDArray[np.float64]
 

@@ -15,17 +15,15 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from morph_dslam.cli.app import run_and_report_errors
-from morph_dslam.errors import StudyError
-from morph_dslam.io.tables import read_toml
-from morph_dslam.model import ReducedModel
-from morph_dslam.studies.solid_study import SolidStudy
-from morph_dslam.studies.study import make_study
+from morph_dslam import ReducedModel, make_study
+from morph_dslam.extend import run_and_report_errors
+from morph_dslam.extend.studies import SolidStudy
 from reduction_snapshots import SolvedStudy, solve_study
 
 STUDIES = Path(__file__).resolve().parent / "studies"
@@ -61,7 +59,7 @@ def freed(content: dict[str, Any], count: int) -> dict[str, Any]:
 
 def study_of(count: int, training: int, held_out: int) -> SolidStudy:
     """The bar with its first ``count`` parameters."""
-    content = freed(read_toml(STUDIES / "bar.toml", "study file", StudyError), count)
+    content = freed(tomllib.loads((STUDIES / "bar.toml").read_text()), count)
     content["sampling"] = {"training": training, "held_out": held_out}
     study = make_study(content, STUDIES, "bar.toml")
     assert isinstance(study, SolidStudy)

@@ -29,18 +29,18 @@ import numpy as np
 import tensorly.decomposition as tensorly
 from numpy.typing import NDArray
 
-from morph_dslam.cli.app import run_and_report_errors
-from morph_dslam.model import ReducedModel, SeparatedField
-from morph_dslam.model.basis_functions import chebyshev_basis
+from morph_dslam import ReducedModel, load_study
+from morph_dslam.extend import run_and_report_errors
+from morph_dslam.extend.models import SeparatedField, chebyshev_basis
+from morph_dslam.extend.reduction import cp, cp_functions
+from morph_dslam.extend.studies import Snapshot, SolidStudy
 from morph_dslam.reduction.grid_functions import interpolation_nodes
 from morph_dslam.reduction.linear_solid import LinearSolid, linear_solid
 from morph_dslam.reduction.pod import Pod, compute_pod
 from morph_dslam.reduction.separation import SeparatedVector
-from morph_dslam.reduction.tensor_formats import CP, Tucker, cp, cp_functions, tucker, tucker_functions
+from morph_dslam.reduction.tensor_formats import CP, Tucker, tucker, tucker_functions
 from morph_dslam.studies.build import certified_model, solve_or_read
-from morph_dslam.studies.problem import Snapshot
-from morph_dslam.studies.solid_study import SolidStudy
-from morph_dslam.studies.study import load_study, resolve_defaults
+from morph_dslam.studies.study import resolve_defaults
 from peer_environment import peer_python
 
 Array = NDArray[np.float64]

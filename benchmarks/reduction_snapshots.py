@@ -8,14 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
-from morph_dslam.model import ReducedModel
-from morph_dslam.reduction.certificate import certify
-from morph_dslam.reduction.method import METHODS, ReductionTask
-from morph_dslam.studies.problem import Snapshot
-from morph_dslam.studies.sampling import held_out_samples, training_samples
-from morph_dslam.studies.snapshots import load_snapshot
-from morph_dslam.studies.solid_study import SolidStudy
-from morph_dslam.studies.sweep import default_executor, run_sweep
+from morph_dslam import ReducedModel
+from morph_dslam.extend.reduction import METHODS, ReductionTask, certify
+from morph_dslam.extend.studies import (
+    Snapshot,
+    SolidStudy,
+    default_executor,
+    held_out_samples,
+    load_snapshot,
+    run_sweep,
+    training_samples,
+)
 
 
 @dataclass(frozen=True)

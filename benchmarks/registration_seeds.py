@@ -29,13 +29,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.errors import RegistrationError
-from morph_dslam.geometry import RigidTransform, cross_matrix, fit_similarity
-from morph_dslam.io.camera_files import load_camera
-from morph_dslam.registration.run import run_registration
+from morph_dslam import MorphError, load_camera
+from morph_dslam.extend.geometry import RigidTransform, cross_matrix, fit_similarity
+from morph_dslam.extend.registration import run_registration
+from morph_dslam.extend.slam import SlamRunOptions, run_slam
 from morph_dslam.slam.map_files import load_map
 from morph_dslam.slam.rigid_map import RigidMap
-from morph_dslam.slam.run import SlamRunOptions, run_slam
 from support import keep_sequence
 
 Array = NDArray[np.float64]
@@ -224,7 +223,7 @@ def main() -> int:
         map_path, camera = folder / "scan" / "map.h5", folder / "recording" / "camera.yaml"
         try:
             content = run_registration(map_path, MODEL, camera, folder / "registration")
-        except RegistrationError as error:
+        except MorphError as error:
             print(f"seed={seed} not registered: {error}", flush=True)
             continue
         truth = np.load(folder / "recording" / "truth.npz")["camera_from_object"]

@@ -28,16 +28,11 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from morph_dslam.camera import Camera
-from morph_dslam.errors import MorphError
+from morph_dslam import Camera, Frame, MorphError, open_source
 from morph_dslam.evaluation.trajectory import absolute_error, match
+from morph_dslam.extend import threads_side_by_side
+from morph_dslam.extend.slam import Slam, SlamFrame, trajectory_of, warm_up
 from morph_dslam.io.trajectory import load_trajectory
-from morph_dslam.slam.frame_images import SlamFrame
-from morph_dslam.slam.output import trajectory_of
-from morph_dslam.slam.run import warm_up
-from morph_dslam.slam.slam import Slam
-from morph_dslam.sources import Frame, open_source
-from morph_dslam.threads import threads_side_by_side
 
 ROOT = Path(__file__).parents[2]
 FPS = 30.0

@@ -34,13 +34,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.support.rendered_room import CAMERA, RoomFilm, closed_room, hand_held, round_trip
 
-from morph_dslam.camera import Camera
-from morph_dslam.errors import MorphError
-from morph_dslam.slam.frame_images import SlamFrame
-from morph_dslam.slam.run import warm_up
-from morph_dslam.slam.slam import Slam
-from morph_dslam.sources import open_source
-from morph_dslam.threads import threads_side_by_side
+from morph_dslam import Camera, MorphError, open_source
+from morph_dslam.extend import threads_side_by_side
+from morph_dslam.extend.slam import Slam, SlamFrame, warm_up
 
 Image = NDArray[np.uint8]
 

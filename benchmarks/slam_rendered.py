@@ -39,11 +39,8 @@ from tests.support.rendered_room import (
     wall,
 )
 
-from morph_dslam.geometry import fit_similarity
-from morph_dslam.slam.frame_images import SlamFrame
-from morph_dslam.slam.output import trajectory_of
-from morph_dslam.slam.run import warm_up
-from morph_dslam.slam.slam import Slam
+from morph_dslam.extend.geometry import fit_similarity
+from morph_dslam.extend.slam import Slam, SlamFrame, trajectory_of, warm_up
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

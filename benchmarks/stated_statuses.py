@@ -41,11 +41,11 @@ from tests.support.shown_frames import (
 from tests.support.staged_scenes import SCENES, Scene, drawn_out
 from tests.support.stated_cases import InMap, Outcome, Shown, in_unit, landmarks, placed_by_landmarks, run_case, stated
 
-from morph_dslam.geometry import SimilarityTransform
+from morph_dslam import Registration
+from morph_dslam.extend import one_thread_for_algebra
+from morph_dslam.extend.geometry import SimilarityTransform
 from morph_dslam.registration.landmarks import register
 from morph_dslam.registration.mesh import register_mesh
-from morph_dslam.registration.registration import Registration
-from morph_dslam.threads import one_thread_for_algebra
 
 Case = tuple[str, Callable[[], Outcome]]
 #: The scene whose object stays in its place while the camera goes round it, as one in a map does.

@@ -23,8 +23,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.registration.run import run_registration
-from morph_dslam.tracking.track import TrackOptions, track
+from morph_dslam import TrackOptions, track
+from morph_dslam.extend.registration import run_registration
 from registration_seeds import MODEL, PATH, mapped, scene_text
 from support import keep_sequence
 

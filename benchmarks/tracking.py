@@ -22,19 +22,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import Camera
-from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.model import Parameter, ReducedModel, SeparatedField, SurfacePoints, load_model
-from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
+from morph_dslam import Camera, FrameResult, Parameter, ReducedModel, Registration, Tracker, load_model
+from morph_dslam.extend import one_thread_for_algebra
+from morph_dslam.extend.geometry import RigidTransform, rotation_exp
+from morph_dslam.extend.models import ParameterFunctions, SeparatedField, SurfacePoints, total_degree_indices
+from morph_dslam.extend.rendering import rasterise, render_textured
+from morph_dslam.extend.tracking import BoundPoints, Estimator, State, moved
 from morph_dslam.model.revolution import with_revolution_angle
-from morph_dslam.registration.registration import Registration
-from morph_dslam.render.rasteriser import rasterise
-from morph_dslam.render.texture import render_textured
-from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.tracking.binding import DrawnSurface
-from morph_dslam.tracking.estimator import BoundPoints, Estimator, State, moved
-from morph_dslam.tracking.result import STAGES, FrameResult
-from morph_dslam.tracking.tracker import Tracker
+from morph_dslam.tracking.result import STAGES
 
 Array = NDArray[np.float64]
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)

@@ -14,11 +14,17 @@ from morph_dslam._version import __version__ as __version__
 __all__ = [
     "Camera",
     "Frame",
+    "FrameResult",
     "MorphError",
     "Parameter",
     "ReducedModel",
+    "Registration",
     "SolidProblem",
+    "Status",
     "TrackOptions",
+    "Tracker",
+    "TrackerOptions",
+    "TrackingWarning",
     "build",
     "calibrate",
     "evaluate",
@@ -26,6 +32,7 @@ __all__ = [
     "evaluate_trajectory",
     "load_camera",
     "load_model",
+    "load_registration",
     "load_study",
     "make_study",
     "open_live",
@@ -40,11 +47,17 @@ __all__ = [
 _MODULES = {
     "Camera": "camera",
     "Frame": "sources.frames",
+    "FrameResult": "tracking.result",
     "MorphError": "errors",
     "Parameter": "model",
     "ReducedModel": "model",
+    "Registration": "registration.registration",
     "SolidProblem": "mechanics.solid",
+    "Status": "tracking.outcomes",
     "TrackOptions": "tracking.track",
+    "Tracker": "tracking.tracker",
+    "TrackerOptions": "tracking.options",
+    "TrackingWarning": "tracking.outcomes",
     "build": "studies.build",
     "calibrate": "calibration.calibrate",
     "evaluate": "evaluation.evaluate",
@@ -52,6 +65,7 @@ _MODULES = {
     "evaluate_trajectory": "evaluation.trajectory",
     "load_camera": "io.camera_files",
     "load_model": "model",
+    "load_registration": "registration.registration",
     "load_study": "studies.study",
     "make_study": "studies.study",
     "open_live": "sources",
@@ -72,12 +86,17 @@ if TYPE_CHECKING:  # the same for editors and type checkers
     from morph_dslam.mechanics.solid import SolidProblem
     from morph_dslam.model import Parameter, ReducedModel, load_model, save_model
     from morph_dslam.reduction.report import write_build_report
+    from morph_dslam.registration.registration import Registration, load_registration
     from morph_dslam.render.simulation import simulate
     from morph_dslam.sources import open_live, open_source
     from morph_dslam.sources.frames import Frame
     from morph_dslam.studies.build import build
     from morph_dslam.studies.study import load_study, make_study
+    from morph_dslam.tracking.options import TrackerOptions
+    from morph_dslam.tracking.outcomes import Status, TrackingWarning
+    from morph_dslam.tracking.result import FrameResult
     from morph_dslam.tracking.track import TrackOptions, track
+    from morph_dslam.tracking.tracker import Tracker
 
 
 def __getattr__(name: str) -> Any:

@@ -28,6 +28,12 @@ def test_examples_import_public_names_only():
     assert inner == []
 
 
+def test_benchmarks_hardly_import_anything_else():
+    files = (PROJECT / "benchmarks").glob("*.py")
+    inner = [(path.name, line) for path in files for line in INNER.findall(path.read_text())]
+    assert len(inner) <= 40, inner
+
+
 def test_there_are_few_public_names():
     assert 15 <= len(md.__all__) <= 45
     assert list(md.__all__) == sorted(md.__all__)

@@ -21,14 +21,23 @@ file that registers it. Building blocks stand in a module for each subject:
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__all__ = ["frame_range", "register_law", "register_source", "run_and_report_errors"]
+__all__ = [
+    "frame_range",
+    "one_thread_for_algebra",
+    "register_law",
+    "register_source",
+    "run_and_report_errors",
+    "threads_side_by_side",
+]
 
 #: The module of each name, as in the imports below; imported when it is first used.
 _MODULES = {
     "frame_range": "cli.arguments",
+    "one_thread_for_algebra": "threads",
     "register_law": "mechanics.materials.base",
     "register_source": "sources",
     "run_and_report_errors": "cli.app",
+    "threads_side_by_side": "threads",
 }
 
 if TYPE_CHECKING:
@@ -36,6 +45,7 @@ if TYPE_CHECKING:
     from morph_dslam.cli.arguments import frame_range
     from morph_dslam.mechanics.materials.base import register_law
     from morph_dslam.sources import register_source
+    from morph_dslam.threads import one_thread_for_algebra, threads_side_by_side
 
 
 def __getattr__(name: str) -> Any:
