@@ -99,9 +99,9 @@ def run(arguments: argparse.Namespace) -> None:
     draw(curves, arguments.output / "error_by_modes.png")
     print_curves(curves)
     certificate = model.certificate
-    solved = len(positions.seen) + len(positions.unseen)
+    solved = len(positions.training) + len(positions.held_out)
     print(
-        f"positions={solved} held_out={len(positions.unseen)} modes={model.displacement.n_modes} "
+        f"positions={solved} held_out={len(positions.held_out)} modes={model.displacement.n_modes} "
         f"mean_mm={certificate['displacement']['mean_mm']:.6f} "
         f"max_mm={certificate['displacement']['max_mm']:.5f} "
         f"von_mises_error={certificate['stress_solid']['von_mises']['relative_l2']:.2e} "

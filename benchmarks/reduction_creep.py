@@ -72,13 +72,13 @@ def draw(model: ReducedModel, solved: SolvedStudy, path: Path) -> None:
     figure = Figure(figsize=(7.5, 5.0), layout="constrained")
     axes = figure.subplots()
     end = np.flatnonzero(model.nodes[:, 2] > model.nodes[:, 2].max() - 1e-9)
-    pulls = np.unique([snapshot.coordinates[1] for snapshot in solved.seen])
+    pulls = np.unique([snapshot.coordinates[1] for snapshot in solved.training])
     times = np.linspace(model.lower[0], model.upper[0], 200)
     for pull in pulls[np.linspace(0, len(pulls) - 1, 4).astype(int)]:
         line = [model.displacement.value(np.array([t, pull]))[end, 2].mean() for t in times]
         axes.plot(times, 1e3 * np.array(line), color="#2f6690")
         axes.annotate(f"{1e-3 * pull:.0f} kPa", (times[-1], 1e3 * line[-1]), (5, -3), textcoords="offset points")
-        solutions = [s for s in solved.seen if s.coordinates[1] == pull]
+        solutions = [s for s in solved.training if s.coordinates[1] == pull]
         means = [1e3 * s.fields["displacement"][end, 2].mean() for s in solutions]
         axes.plot([s.coordinates[0] for s in solutions], means, "k.", markersize=4)
     axes.plot([], [], "k.", label="solved")
@@ -91,13 +91,13 @@ def draw(model: ReducedModel, solved: SolvedStudy, path: Path) -> None:
 def run(arguments: argparse.Namespace) -> None:
     study = read_study(arguments.points, arguments.held_out, arguments.divisions)
     solved = solve_study(study, arguments.output / "snapshots", arguments.workers)
-    print(f"{len(solved.seen)} solutions seen, {len(solved.unseen)} held out, {solved.seconds:.0f} s")
+    print(f"{len(solved.training)} training solutions, {len(solved.held_out)} held out, {solved.seconds:.0f} s")
     print(f"{'method':11s} {'modes':>5s} {'floats':>8s} {'error':>8s} {'Mises':>8s} {'s':>6s}")
     models = {method: reduce_and_report(solved, method) for method in METHODS}
     draw(models["pod"], solved, arguments.output / "creep.png")
     error, stress = errors_of(models["pod"])
     print(
-        f"solves={len(solved.seen)} held_out={len(solved.unseen)} modes={models['pod'].displacement.n_modes} "
+        f"solves={len(solved.training)} held_out={len(solved.held_out)} modes={models['pod'].displacement.n_modes} "
         f"relative_error={error:.2e} von_mises_error={stress:.2e}"
     )
 

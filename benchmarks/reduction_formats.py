@@ -22,7 +22,7 @@ from morph_dslam.extend.reduction import cp, cp_functions
 from morph_dslam.model.basis_functions import kriging_basis, p_spline_basis
 from morph_dslam.model.tensor_functions import TensorFunctions, TensorTrainFunctions, TuckerFunctions
 from morph_dslam.reduction.pod import Pod, compute_pod
-from morph_dslam.reduction.sparse_pgd import SparsePgdOptions, fit_sparse_pgd
+from morph_dslam.reduction.sparse_pgd import fit_sparse_pgd
 from morph_dslam.reduction.tensor_formats import tensor_train, tensor_train_functions, tucker, tucker_functions
 
 Array = NDArray[np.float64]
@@ -154,8 +154,8 @@ def scattered_formats(report: Report) -> None:
         "Chebyshev": chebyshev_basis(-1.0, 1.0, 8),
     }
     for name, basis in bases.items():
-        fit = fit_sparse_pgd(mu, snapshots, (basis,) * 3, SparsePgdOptions(max_modes=N_MODES, pod_tolerance=1e-5))
-        report.line(f"sparse PGD {fit.n_products}, {name}", fit.pod, fit.functions, len(mu))
+        fit = fit_sparse_pgd(mu, snapshots, (basis,) * 3, N_MODES, pod_tolerance=1e-5)
+        report.line(f"sparse PGD {len(fit.functions.mixing)}, {name}", fit.pod, fit.functions, len(mu))
 
 
 def time_thirty_modes() -> str:

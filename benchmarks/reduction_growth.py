@@ -68,10 +68,10 @@ def study_of(count: int, training: int, held_out: int) -> SolidStudy:
 
 def worst_error(model: ReducedModel, solved: SolvedStudy) -> float:
     """Largest L2 error of a held-out solution over the root mean square of all their norms."""
-    truths = [snapshot.fields["displacement"].astype(np.float64) for snapshot in solved.unseen]
+    truths = [snapshot.fields["displacement"].astype(np.float64) for snapshot in solved.held_out]
     missed = [
         np.linalg.norm(model.displacement.value(snapshot.coordinates) - truth)
-        for snapshot, truth in zip(solved.unseen, truths, strict=True)
+        for snapshot, truth in zip(solved.held_out, truths, strict=True)
     ]
     return float(np.max(missed) / np.sqrt(np.mean([np.sum(truth**2) for truth in truths])))
 
@@ -86,7 +86,7 @@ def row(count: int, method: str, solved: SolvedStudy, **options: Any) -> tuple[s
     slopes = max(entry["relative_l2"] for entry in certificate["sensitivity"].values())
     stress = certificate["stress_solid"]["von_mises"]["relative_l2"]
     line = (
-        f"{count:2d} {len(solved.seen):6d} {solved.seconds:7.0f} {method:11s} {seconds:7.0f} "
+        f"{count:2d} {len(solved.training):6d} {solved.seconds:7.0f} {method:11s} {seconds:7.0f} "
         f"{model.displacement.n_modes:5d} {model.displacement.n_floats:8d} {error:8.1e} "
         f"{worst_error(model, solved):8.1e} {slopes:8.1e} {stress:8.1e}"
     )

@@ -39,8 +39,9 @@ from morph_dslam.reduction.linear_solid import LinearSolid, linear_solid
 from morph_dslam.reduction.pod import Pod, compute_pod
 from morph_dslam.reduction.separation import SeparatedVector
 from morph_dslam.reduction.tensor_formats import CP, Tucker, tucker, tucker_functions
-from morph_dslam.studies.build import certified_model, solve_or_read
-from morph_dslam.studies.study import resolve_defaults
+from morph_dslam.studies.build import certified_model
+from morph_dslam.studies.defaults import resolve_defaults
+from morph_dslam.studies.solutions import take_snapshots
 from peer_environment import peer_python
 
 Array = NDArray[np.float64]
@@ -64,9 +65,9 @@ MOST_TERMS = 40
 class Table:
     """Lines as they are found, and the errors for the last one."""
 
-    def __init__(self, unseen: list[Snapshot]) -> None:
-        self.samples = np.array([snapshot.coordinates for snapshot in unseen])
-        self.truth = np.array([snapshot.fields["displacement"] for snapshot in unseen], dtype=np.float64)
+    def __init__(self, held_out: list[Snapshot]) -> None:
+        self.samples = np.array([snapshot.coordinates for snapshot in held_out])
+        self.truth = np.array([snapshot.fields["displacement"] for snapshot in held_out], dtype=np.float64)
         self.errors: dict[str, float] = {}
         print(f"{'method':22s} {'solves':>6s} {'modes':>5s} {'error':>8s} {'s':>7s} {'query, us':>9s}", flush=True)
 
@@ -95,7 +96,7 @@ def own_model(study: SolidStudy, held_out: Path, folder: Path) -> tuple[ReducedM
     """A model made in a folder that has the held-out solutions and no others yet, and its time."""
     shutil.copytree(held_out, folder)
     began = time.process_time()
-    model = certified_model(solve_or_read(study, folder, workers=1), study.reduction, study.name)
+    model = certified_model(take_snapshots(study, folder, workers=1), study.reduction, study.name)
     return model, time.process_time() - began
 
 
@@ -181,7 +182,7 @@ def run(arguments: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         held_out = folder / "held_out"
-        table = Table(solve_or_read(reduced_by(study, "pgd"), held_out, workers=1).unseen)
+        table = Table(take_snapshots(reduced_by(study, "pgd"), held_out, workers=1).held_out)
         for method in arguments.methods:
             model, seconds = own_model(reduced_by(study, method), held_out, folder / method)
             solves = model.certificate["samples"]["training"]

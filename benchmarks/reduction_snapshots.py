@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from morph_dslam import ReducedModel
-from morph_dslam.extend.reduction import METHODS, ReductionTask, certify
+from morph_dslam.extend.reduction import ReductionTask, certify, reduction_method
 from morph_dslam.extend.studies import (
     Snapshot,
     SolidStudy,
@@ -28,12 +28,12 @@ class SolvedStudy:
     Attributes
     ----------
     seconds : that the solves took; close to none where they were kept.
-    files : of the solutions seen.
+    files : of the training solutions.
     """
 
     study: SolidStudy
-    seen: list[Snapshot]
-    unseen: list[Snapshot]
+    training: list[Snapshot]
+    held_out: list[Snapshot]
     seconds: float
     files: tuple[Path, ...]
 
@@ -44,7 +44,7 @@ class SolvedStudy:
         return ReductionTask(
             self.study.model_mesh(),
             self.study.model_parameters(),
-            [[snapshot] for snapshot in self.seen],
+            [[snapshot] for snapshot in self.training],
             changed,
             self.study.name,
             self.study.sweep_problem,
@@ -53,17 +53,17 @@ class SolvedStudy:
 
     def reduce(self, method: str, **options: object) -> ReducedModel:
         """A model by one method, certified by the held-out solutions."""
-        model = METHODS[method](self.task(method=method, **options))
-        model.certificate.update(certify(model, self.unseen))
+        model = reduction_method(method).reduce(self.task(method=method, **options))
+        model.certificate.update(certify(model, self.held_out))
         return model
 
     def displacements(self) -> SolvedStudy:
         """The same with displacements alone and without derivatives: what the paper's method is given."""
-        seen, unseen = (
+        training, held_out = (
             [Snapshot(s.coordinates, {"displacement": s.fields["displacement"]}) for s in part]
-            for part in (self.seen, self.unseen)
+            for part in (self.training, self.held_out)
         )
-        return SolvedStudy(self.study, seen, unseen, self.seconds, self.files)
+        return SolvedStudy(self.study, training, held_out, self.seconds, self.files)
 
 
 def solve_study(study: SolidStudy, folder: Path, workers: int | None = None) -> SolvedStudy:

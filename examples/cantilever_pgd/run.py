@@ -11,8 +11,8 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -21,7 +21,7 @@ from figures import draw_errors, draw_modes
 from numpy.typing import NDArray
 
 from morph_dslam.extend import run_and_report_errors
-from morph_dslam.extend.reduction import PgdOptions, PgdSolution, factorise, khatri_rao, solve_pgd
+from morph_dslam.extend.reduction import PgdSolution, factorise, khatri_rao, solve_pgd
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ OUTPUT = HERE / "output"
 MODE_COUNTS = (1, 3, 5, 10, 20)
 STIFFNESS_MODES = 40
 #: The tail of nearly equal singular values asks for more iterations than the default spends.
-TIGHT = PgdOptions(tolerance=0.0, inner_tolerance=1e-4, inner_iterations=60, progress=False)
+TIGHT: dict[str, Any] = {"tolerance": 0.0, "inner_tolerance": 1e-4, "inner_iterations": 60}
 #: Stiffness ratios of the direct solves that the two-parameter solution is compared with.
 HELD_OUT = np.geomspace(*STIFFNESS_RATIO, 40)
 
@@ -67,7 +67,7 @@ def compare_one_parameter(beam: Cantilever) -> tuple[PgdSolution, dict[str, list
     results: dict[str, list[float]] = {key: [] for key in ("energy", "l2", "dual")}
     solution = None
     for count in MODE_COUNTS:
-        solution = solve_pgd(problem, replace(TIGHT, max_modes=count))
+        solution = solve_pgd(problem, count, **TIGHT)
         error = on_grid(solution, beam.positions) - exact
         results["energy"].append(norm(error, stiffness) / norm(exact, stiffness))
         results["l2"].append(norm(error, beam.mass) / norm(exact, beam.mass))
@@ -78,7 +78,7 @@ def compare_one_parameter(beam: Cantilever) -> tuple[PgdSolution, dict[str, list
 
 def compare_two_parameters(beam: Cantilever) -> float:
     """Relative L2 error of the solution with a stiffness parameter, over positions and held-out ratios."""
-    solution = solve_pgd(moving_load_and_stiffness(beam), PgdOptions(max_modes=STIFFNESS_MODES, tolerance=0.0))
+    solution = solve_pgd(moving_load_and_stiffness(beam), STIFFNESS_MODES, tolerance=0.0)
     missed = total = 0.0
     found = on_grid(solution, beam.positions, np.log(HELD_OUT))
     for i, ratio in enumerate(HELD_OUT):

@@ -24,13 +24,13 @@ import morph_dslam as md
 from morph_dslam.extend import mechanics
 from morph_dslam.extend.models import CPFunctions, cubic_spline_basis, von_mises
 from morph_dslam.extend.reduction import (
-    METHODS,
     ReductionSection,
     ReductionTask,
     certify,
     compression_percent,
     cp,
     cp_functions,
+    reduction_method,
 )
 from morph_dslam.extend.studies import ModelMesh, Snapshot
 
@@ -91,7 +91,7 @@ def reduce_positions(snapshots: Sequence[Snapshot], every: int, grid: Grid) -> R
     seen = list(snapshots[::every])
     unseen = [s for i, s in enumerate(snapshots) if every == 1 or i % every]
     task = ReductionTask(grid.mesh(), (PATH,), [[snapshot] for snapshot in seen], OPTIONS, "paper sheet")
-    model = METHODS["pod"](task)
+    model = reduction_method("pod").reduce(task)
     model.certificate.update(certify(model, unseen))
     model.certificate["compression_percent"] = compression_percent(model, len(snapshots))
     model.certificate["samples"] = {"training": len(seen), "held_out": len(unseen), "failed": []}

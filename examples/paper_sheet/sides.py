@@ -14,7 +14,7 @@ import numpy as np
 from reduction import NODES, OPTIONS, Grid
 
 import morph_dslam as md
-from morph_dslam.extend.reduction import METHODS, ReductionTask, certify
+from morph_dslam.extend.reduction import ReductionTask, certify, reduction_method
 from morph_dslam.extend.studies import Snapshot
 
 PATH = md.Parameter("path", "ratio", "1", -1.0, 1.0, 0.0, "part of the path to full height; negative below the plane")
@@ -43,7 +43,7 @@ def tracked_model(snapshots: Sequence[Snapshot], grid: Grid) -> md.ReducedModel:
     every = max(1, round((len(snapshots) - 1) / (NODES - 1)))
     seen, unseen = snapshots[::every], [s for i, s in enumerate(snapshots) if i % every]
     task = ReductionTask(grid.mesh(), (PATH,), [[s] for s in both_sides(seen)], OPTIONS, "paper sheet, either side")
-    model = METHODS["pod"](task)
+    model = reduction_method("pod").reduce(task)
     model.certificate.update(certify(model, [*unseen, *map(below, unseen)]))
     return model
 
@@ -53,4 +53,4 @@ def filmed_model(snapshots: Sequence[Snapshot], grid: Grid) -> md.ReducedModel:
     task = ReductionTask(
         grid.mesh(), (PATH,), [[s] for s in both_sides(snapshots)], FILMED, "paper sheet, every position"
     )
-    return METHODS["pod"](task)
+    return reduction_method("pod").reduce(task)

@@ -14,10 +14,10 @@ from morph_dslam.mechanics.gripped_sheet import GrippedSheet
 from morph_dslam.model import load_model
 from morph_dslam.studies.build import build
 from morph_dslam.studies.problem import bounds
-from morph_dslam.studies.sample_task import neighbour_tree
 from morph_dslam.studies.sampling import sample_box
 from morph_dslam.studies.snapshots import load_snapshot
 from morph_dslam.studies.study import load_study
+from morph_dslam.studies.sweep import neighbour_tree
 
 STUDY = """
 name = "tiny sheet"

@@ -14,12 +14,13 @@ import pytest
 
 from morph_dslam.cli.app import main
 from morph_dslam.errors import WorkerError
-from morph_dslam.studies import sweep as cluster
+from morph_dslam.studies import executors as cluster
+from morph_dslam.studies.executors import default_executor
 from morph_dslam.studies.sampling import training_samples
 from morph_dslam.studies.snapshots import damage
 from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.studies.study import load_study
-from morph_dslam.studies.sweep import default_executor, run_sweep
+from morph_dslam.studies.sweep import run_sweep
 from tests.support.block_study import write_study
 
 pytest.importorskip("distributed", reason="needs the extra 'dask'")

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from morph_dslam.studies import solid_sweep, sweep
+from morph_dslam.studies.executors import SerialExecutor
 from morph_dslam.studies.sampling import training_samples
 from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.studies.study import make_study
-from morph_dslam.studies.sweep import SerialExecutor
 
 BAR = {
     "name": "bar",

@@ -22,7 +22,7 @@ N_SAMPLES = 30
 STOPPED_WHILE_SENDING = """
 import time
 from concurrent.futures import wait
-from morph_dslam.studies.sweep import default_executor
+from morph_dslam.studies.executors import default_executor
 
 if __name__ == "__main__":
     with default_executor(2) as executor:

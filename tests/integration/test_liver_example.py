@@ -18,7 +18,7 @@ from morph_dslam.model import Parameter, ReducedModel, SeparatedField, load_mode
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.model.inner_structure import save_inner_structure
 from morph_dslam.render.simulation import simulate
-from morph_dslam.studies.build import place_inner_structure
+from morph_dslam.studies.inner_structures import place_inner_structure
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "liver"
 SIZE = (0.12, 0.08, 0.06)

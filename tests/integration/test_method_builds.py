@@ -12,7 +12,7 @@ from morph_dslam import build, make_study
 from morph_dslam.cli import app as cli
 from morph_dslam.errors import StudyError
 from morph_dslam.model import load_model
-from morph_dslam.studies.study import resolve_defaults
+from morph_dslam.studies.defaults import resolve_defaults
 from tests.support.block_study import STUDY, write_study
 
 BEAM = {

@@ -9,7 +9,7 @@ from morph_dslam import make_study
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.solid import SolidProblem
 from morph_dslam.model import ReducedModel
-from morph_dslam.reduction.pgd import reduce_by_pgd
+from morph_dslam.reduction.pgd_method import reduce_by_pgd
 from morph_dslam.reduction.task import ReductionTask
 from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.studies.solid_sweep import support_reactions

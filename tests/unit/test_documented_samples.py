@@ -22,8 +22,8 @@ from morph_dslam.registration.board import load_board
 from morph_dslam.registration.guess import load_guess, load_picture
 from morph_dslam.render.scene_file import load_scene_file
 from morph_dslam.studies.affine import read_affine
-from morph_dslam.studies.build import place_inner_structure
 from morph_dslam.studies.external import ExternalStudy, read_table
+from morph_dslam.studies.inner_structures import place_inner_structure
 from morph_dslam.studies.sheet_study import SheetStudy
 from morph_dslam.studies.solid_study import SolidStudy
 from tests.support.bent_sheet import bent_sheet_model

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from morph_dslam.reduction.galerkin_method import worst_candidates
+from morph_dslam.reduction.adaptive_sampling import worst_candidates
 
 NOTHING_KNOWN = np.full(5, np.inf)
 

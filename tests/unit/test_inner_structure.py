@@ -13,7 +13,7 @@ from morph_dslam.model import ReducedModel, SeparatedField, save_model
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.model.inner_structure import load_inner_structure, save_inner_structure
 from morph_dslam.render.overlay import draw_inner_surface, draw_overlay
-from morph_dslam.studies.build import place_inner_structure
+from morph_dslam.studies.inner_structures import place_inner_structure
 from morph_dslam.tracking.estimator import Estimate, State, moved
 from morph_dslam.tracking.run_folder import centre_and_std
 from tests.support.bent_sheet import bent_sheet_model

@@ -7,7 +7,7 @@ import pytest
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial.distance import cdist
 
-from morph_dslam.studies.sample_task import neighbour_tree
+from morph_dslam.studies.sweep import neighbour_tree
 
 
 def grid(*axes: np.ndarray) -> np.ndarray:

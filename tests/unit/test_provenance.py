@@ -9,7 +9,7 @@ from importlib.metadata import version
 import numpy as np
 
 from morph_dslam import make_study
-from morph_dslam.studies.study import mesh_hash, provenance
+from morph_dslam.studies.provenance import mesh_hash, provenance
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.stretched_block import stretched_block_model
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.model.basis_functions import chebyshev_basis
-from morph_dslam.reduction.separation import (
+from morph_dslam.reduction.sparse_expansion import (
     ScatteredValues,
     expansion_rows,
     expansion_train,

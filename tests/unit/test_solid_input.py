@@ -23,7 +23,8 @@ from morph_dslam.mechanics.supports import ElasticFoundation, PrescribedDisplace
 from morph_dslam.meshing.generators import block, sheet
 from morph_dslam.model import Parameter
 from morph_dslam.studies.build import build_warnings
-from morph_dslam.studies.study import load_study, locking_warnings, make_study
+from morph_dslam.studies.provenance import locking_warnings
+from morph_dslam.studies.study import load_study, make_study
 from tests.support.block_study import write_study
 from tests.support.solids import RUBBER, load_parameter, solved
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import qmc
 
 from morph_dslam.model.basis_functions import chebyshev_basis, hat_basis, kriging_basis, p_spline_basis
-from morph_dslam.reduction.sparse_pgd import SamplingWarning, SparsePgd, SparsePgdOptions, fit_sparse_pgd, smoothed_fit
+from morph_dslam.reduction.sparse_pgd import SamplingWarning, SparsePgd, fit_sparse_pgd, smoothed_fit
 
 SPACE = np.linspace(0.0, 1.0, 25)
 MODES = np.stack([np.sin(np.pi * SPACE), SPACE**2])
@@ -54,14 +54,14 @@ def relative(error: np.ndarray, reference: np.ndarray) -> float:
 )
 def test_ishigamis_function_is_found_from_scattered_samples(name: str, tolerance: float) -> None:
     mu, new = samples(150), np.random.default_rng(1).uniform(-0.95, 0.95, (100, 3))
-    fit = fit_sparse_pgd(mu, ishigami(mu), (BASES[name],) * 3, SparsePgdOptions(max_modes=6))
+    fit = fit_sparse_pgd(mu, ishigami(mu), (BASES[name],) * 3, max_modes=6)
     assert len(fit.pod.modes) == 2  # the field has two modes in space
     assert relative(predicted(fit, new) - ishigami(new), ishigami(new)) <= tolerance
 
 
 def test_its_sensitivities_are_those_of_the_function() -> None:
     mu, new = samples(150), np.random.default_rng(1).uniform(-0.95, 0.95, (50, 3))
-    fit = fit_sparse_pgd(mu, ishigami(mu), (BASES["chebyshev"],) * 3, SparsePgdOptions(max_modes=6))
+    fit = fit_sparse_pgd(mu, ishigami(mu), (BASES["chebyshev"],) * 3, max_modes=6)
     slopes = np.stack([fit.functions.evaluate(m)[1][2] for m in new]) @ fit.pod.modes
     assert relative(slopes - ishigami_slope_of_c(new), ishigami_slope_of_c(new)) <= 2e-3
 
@@ -72,9 +72,8 @@ def test_two_products_are_enough_for_a_sum_of_two() -> None:
         return np.column_stack([np.exp(a) * (1.0 + b) * c, (2.0 + a) * np.cos(b)]) @ MODES
 
     mu, new = samples(120), np.random.default_rng(2).uniform(-1.0, 1.0, (50, 3))
-    options = SparsePgdOptions(max_modes=2, refit_every=2, refit_sweeps=60)
-    fit = fit_sparse_pgd(mu, field(mu), (BASES["chebyshev"],) * 3, options)
-    assert fit.n_products == 2
+    fit = fit_sparse_pgd(mu, field(mu), (BASES["chebyshev"],) * 3, max_modes=2)
+    assert len(fit.functions.mixing) == 2
     assert relative(predicted(fit, new) - field(new), field(new)) <= 1e-5
 
 
@@ -84,21 +83,19 @@ def test_noise_stops_the_enrichment_and_is_smoothed() -> None:
     mu, new = samples(200), rng.uniform(-0.95, 0.95, (100, 3))
     scale = np.sqrt(np.mean(ishigami(mu) ** 2))
     noisy = ishigami(mu) + 0.05 * scale * rng.normal(size=(len(mu), len(SPACE)))
-    options = SparsePgdOptions(max_modes=30, pod_tolerance=0.05)
-    fit = fit_sparse_pgd(mu, noisy, (BASES["p-splines"],) * 3, options)
-    assert fit.n_products <= 9
-    assert fit.n_products == min(fit.validation_errors, key=lambda n: fit.validation_errors[n])
+    fit = fit_sparse_pgd(mu, noisy, (BASES["p-splines"],) * 3, pod_tolerance=0.05)
+    assert len(fit.functions.mixing) <= 9
+    assert len(fit.functions.mixing) == min(fit.validation_errors, key=lambda n: fit.validation_errors[n])
     assert relative(predicted(fit, new) - ishigami(new), ishigami(new)) <= 0.03
 
 
 def test_too_few_samples_are_warned_of() -> None:
     mu = samples(30)
-    options = SparsePgdOptions(max_modes=6, validation_fraction=0.1)
     with pytest.warns(SamplingWarning, match="30 samples for . products of 10 functions"):
-        fit_sparse_pgd(mu, ishigami(mu), (BASES["p-splines"],) * 3, options)
+        fit_sparse_pgd(mu, ishigami(mu), (BASES["p-splines"],) * 3, max_modes=6)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        fit_sparse_pgd(samples(150), ishigami(samples(150)), (BASES["p-splines"],) * 3, options)
+        fit_sparse_pgd(samples(150), ishigami(samples(150)), (BASES["p-splines"],) * 3, max_modes=6)
 
 
 def test_the_smoothing_weight_has_the_least_score_of_cross_validation() -> None:
@@ -135,5 +132,5 @@ def test_samples_that_are_met_exactly_end_the_enrichment(n_samples: int, degree:
 def test_one_parameter_is_allowed() -> None:
     x = np.linspace(-1.0, 1.0, 40)[:, None]
     field = np.column_stack([np.exp(x[:, 0]), np.cos(2.0 * x[:, 0])]) @ MODES
-    fit = fit_sparse_pgd(x, field, (BASES["chebyshev"],), SparsePgdOptions(max_modes=3))
+    fit = fit_sparse_pgd(x, field, (BASES["chebyshev"],), max_modes=3)
     assert predicted(fit, x) == pytest.approx(field, abs=1e-5)

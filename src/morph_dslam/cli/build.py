@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.scheduler is None:
         cluster = nullcontext()
     else:
-        from morph_dslam.studies.sweep import cluster_executor
+        from morph_dslam.studies.executors import cluster_executor
 
         cluster = cluster_executor(arguments.scheduler)
     with cluster as executor, warnings.catch_warnings():

@@ -22,7 +22,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Place the structure."""
     from morph_dslam import load_model
     from morph_dslam.model.inner_structure import save_inner_structure
-    from morph_dslam.studies.build import read_inner_structure
+    from morph_dslam.studies.inner_structures import read_inner_structure
 
     model = load_model(arguments.model)
     name = arguments.name or arguments.surface.stem

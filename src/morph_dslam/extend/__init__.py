@@ -25,6 +25,7 @@ __all__ = [
     "frame_range",
     "one_thread_for_algebra",
     "register_law",
+    "register_reduction",
     "register_source",
     "run_and_report_errors",
     "threads_side_by_side",
@@ -35,6 +36,7 @@ _MODULES = {
     "frame_range": "cli.arguments",
     "one_thread_for_algebra": "threads",
     "register_law": "mechanics.materials.base",
+    "register_reduction": "reduction.registry",
     "register_source": "sources",
     "run_and_report_errors": "cli.app",
     "threads_side_by_side": "threads",
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
     from morph_dslam.cli.app import run_and_report_errors
     from morph_dslam.cli.arguments import frame_range
     from morph_dslam.mechanics.materials.base import register_law
+    from morph_dslam.reduction.registry import register_reduction
     from morph_dslam.sources import register_source
     from morph_dslam.threads import one_thread_for_algebra, threads_side_by_side
 

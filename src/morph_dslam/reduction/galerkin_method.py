@@ -1,20 +1,23 @@
-"""Weak greedy choice of samples, as reduced-basis methods make it.
+"""The method "galerkin": few full solutions, many reduced ones, functions of the parameters through these.
 
-The next full solution is taken where the reduced model is estimated to err most among candidates. An estimate
-hardly ever grows as the basis does, so one from an earlier round bounds the present one (the saturation
-assumption: Hesthaven, Stamm and Zhang, ESAIM: M2AN 48, 2014): candidates are estimated anew from the largest
-down, until those on top are all up to date. Most keep their old estimate, and cost nothing.
+The equations are projected on the modes of the training solutions and solved wherever the functions need it
+(`galerkin`), and each field is recovered there as it is from full solutions. Each field has modes of its own:
+those of the training snapshots and of their sensitivities times the ranges of the parameters. Up to four
+parameters the samples form a full grid (`grid_functions`); beyond, a sparse expansion is fitted to scattered
+ones (`sparse_expansion`). Last, every field keeps the modes that the tolerance asks for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.mechanics.loads import with_reactions
+from morph_dslam.mechanics.solid import SolidProblem
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.basis_functions import chebyshev_basis
 from morph_dslam.model.functions import Functions
@@ -26,83 +29,128 @@ from morph_dslam.reduction.grid_functions import (
     sizes_along_lines,
     values_on_grid,
 )
-from morph_dslam.reduction.pod import keep_modes
-from morph_dslam.reduction.sampled_fields import SampledFields, field_modes
-from morph_dslam.reduction.separable_problem import SeparableProblem, factorise
-from morph_dslam.reduction.separation import ScatteredValues, expansion_train, fit_expansion, polynomial_functions
-from morph_dslam.reduction.task import ReductionTask, field_names, model_of, parameter_bases
+from morph_dslam.reduction.pod import compute_pod, weighted
+from morph_dslam.reduction.registry import register_reduction
+from morph_dslam.reduction.sparse_expansion import ScatteredValues, expansion_train, fit_expansion, polynomial_functions
+from morph_dslam.reduction.task import ReductionTask, parameter_bases
+from morph_dslam.reduction.truncation import truncate
+from morph_dslam.studies.problem import Snapshot
+from morph_dslam.studies.solid_sweep import snapshot_fields, support_reactions
 
 Array = NDArray[np.float64]
 
+#: Error allowed in all fields but the displacement, as a multiple of the tolerance.
+OTHER_FIELDS = 40.0
 
-def worst_candidates(estimate: Callable[[int], float], earlier: Array, count: int) -> tuple[NDArray[np.int64], Array]:
-    """The candidates with the largest estimated errors.
+#: Modes of a field are kept until so little is left out, as a part of the tolerance, and at most so many.
+MODE_TOLERANCE, MOST_MODES = 0.1, 80
+
+
+def solid_displacement(problem: SolidProblem, dofs: Array, mu: Array) -> Array:
+    """Displacement (n, 3) of a state from the mesh's nodes, the change of the undeformed shape included."""
+    displacement = problem.nodal_displacement(dofs)
+    if problem.shape.functions:
+        problem.symbols.set(mu)
+        moved = problem.displacements.node_values @ problem.shape.coordinates(problem.symbols)
+        displacement = displacement + moved - problem.mesh.nodes
+    return displacement
+
+
+def solid_snapshot(problem: SolidProblem, dofs: Array, mu: Array, reactions: Sequence[str] = ()) -> Snapshot:
+    """The fields of a state at the nodes, with the reactions named."""
+    fields = snapshot_fields(problem.sample(dofs, mu)) | {"displacement": solid_displacement(problem, dofs, mu)}
+    outputs = support_reactions(problem, dofs, mu) if reactions else {}
+    return with_reactions(Snapshot(mu, fields, outputs=outputs), reactions)
+
+
+class FieldModes:
+    """Orthonormal modes (k, n_points, n_components) of one field.
 
     Parameters
     ----------
-    estimate : present estimate at a candidate, by its index.
-    earlier : (n,) last estimate of each; infinite where there is none, minus infinity for candidates that are
-        out of the choice.
-    count : how many to choose.
+    values : (n, n_points, n_components) vectors that the modes span.
+    weights : (n_points,).
+    tolerance : relative error that the reduction may have.
+    n_values : how many of them, the first ones, are values of the field and no sensitivities.
 
-    Returns
-    -------
-    chosen : (count,) indices, the largest estimate first; fewer where no more are in the choice.
-    estimates : (n,) with those made anew.
-    """
-    estimates, current = earlier.copy(), np.isneginf(earlier)
-    while True:
-        chosen = np.argsort(-estimates, kind="stable")[: min(count, int(np.sum(~np.isneginf(estimates))))]
-        stale = chosen[~current[chosen]]
-        if not len(stale):
-            return chosen, estimates
-        estimates[stale[0]] = estimate(int(stale[0]))
-        current[stale[0]] = True
-
-
-# The dual norm of a separated solution's residual: the stopping measure of PGD.
-
-
-class DualResidual:
-    """sqrt(int r(mu)^T K0^-1 r(mu) dmu), K0 the problem's metric.
-
-    It equals the energy norm of the error where the operator is K0 for all parameters, and is equivalent to
-    it otherwise. As the residual is a sum of products, its norm needs only the Gram matrices of its space
-    vectors and of its functions of each parameter. These cancel, so relative values below about 1e-7 mean no
-    more than "small".
+    Attributes
+    ----------
+    largest : norm of the largest value.
     """
 
-    def __init__(self, problem: SeparableProblem) -> None:
-        self._problem = problem
-        self._inverse = factorise(problem.metric, True)
-        self._lifted = self._inverse.solve(problem.loads)
-        self.load_norm = self._norm(problem.loads, self._lifted, list(problem.load_functions))
+    def __init__(self, values: Array, weights: Array, tolerance: float, n_values: int) -> None:
+        shape = values.shape[1:]
+        pod = compute_pod(
+            values.reshape(len(values), -1), np.repeat(weights, shape[1]), MODE_TOLERANCE * tolerance, MOST_MODES
+        )
+        self._pod = pod
+        self.modes = pod.modes.reshape(-1, *shape)
+        self.largest = float(np.linalg.norm(pod.project(values.reshape(len(values), -1)[:n_values]), axis=1).max())
+        self._square, self._missed = 0.0, 0.0
 
-    def _norm(self, vectors: Array, lifted: Array, functions: list[Array]) -> float:
-        """Of sum_s vectors[:, s] prod_k functions[k][s], with ``lifted`` = K0^-1 vectors."""
-        product = vectors.T @ lifted
-        for axis, values in zip(self._problem.axes, functions, strict=True):
-            product = product * ((values * axis.weights) @ values.T)
-        return float(np.sqrt(max(np.sum(product), 0.0)))
+    def coefficients(self, values: Array) -> Array:
+        """Coefficients (k,) of a field (n_points, n_components); what is left out is added to the tally."""
+        flat = values.ravel()
+        found = self._pod.project(flat)
+        square = float(flat @ weighted(flat, self._pod.weights))
+        self._square += square
+        self._missed += max(square - float(found @ found), 0.0)
+        return found
 
-    def relative(self, modes: Array, coefficients: list[Array]) -> float:
-        """Residual of the sum with ``modes`` (n, m) and ``coefficients`` [(n_free, m)], over that of zero."""
-        problem = self._problem
-        images = np.concatenate([matrix @ modes for matrix in problem.matrices], axis=1)
-        functions = [
-            np.concatenate([g, np.swapaxes(image @ c, 1, 2).reshape(images.shape[1], -1)])
-            for g, image, c in zip(problem.load_functions, problem.images, coefficients, strict=True)
+    @property
+    def left_out(self) -> float:
+        """Relative norm of the fields so far that the modes do not hold."""
+        return float(np.sqrt(self._missed / self._square)) if self._square else 0.0
+
+
+def field_modes(task: ReductionTask, name: str, spread: Array, tolerance: float) -> FieldModes:
+    """Modes of a field's values and of its sensitivities times the parameters' ranges ``spread`` (d,)."""
+    snapshots, values = task.snapshots, list(task.values(name))
+    if name in snapshots[0].sensitivities:
+        values += [
+            slope * length
+            for snapshot in snapshots
+            for slope, length in zip(snapshot.sensitivities[name], spread, strict=True)
         ]
-        vectors = np.concatenate([problem.loads, -images], axis=1)
-        lifted = np.concatenate([self._lifted, -self._inverse.solve(images)], axis=1)
-        return self._norm(vectors, lifted, functions) / self.load_norm
+    return FieldModes(np.array(values), task.weights(len(values[0])), tolerance, len(snapshots))
 
 
-# The method "galerkin": few full solutions, many reduced ones, functions of the parameters through these.
-# The equations are projected on the modes of the training solutions (`galerkin`), solved wherever the
-# functions need it (`reduced_solver`), and each field is recovered there as it is from full solutions. Up to
-# four parameters the samples form a full grid (`grid_functions`); beyond, a sparse expansion is fitted to
-# scattered ones (`scattered_functions`). Last, every field keeps the modes that the tolerance asks for.
+class SampledFields:
+    """Coefficients of all fields at any parameters, one after another in one vector.
+
+    Parameters
+    ----------
+    modes : of each field by name; names of reactions begin with "reaction_".
+    tolerance : error allowed in the displacement, relative to its largest value.
+
+    Attributes
+    ----------
+    parts : where the coefficients of each field are.
+    """
+
+    def __init__(
+        self, solver: ReducedSolver, problem: SolidProblem, modes: dict[str, FieldModes], tolerance: float
+    ) -> None:
+        self._solver, self._problem, self.modes = solver, problem, modes
+        self._reactions = [name.removeprefix("reaction_") for name in modes if name.startswith("reaction_")]
+        self._allowed = tolerance * np.concatenate(
+            [
+                np.full(len(m.modes), m.largest * (1.0 if name == "displacement" else OTHER_FIELDS))
+                for name, m in modes.items()
+            ]
+        )
+        ends = np.cumsum([0, *(len(field.modes) for field in modes.values())])
+        self.parts = {name: slice(a, b) for name, a, b in zip(modes, ends[:-1], ends[1:], strict=True)}
+
+    def __call__(self, mu: Array) -> Array:
+        """Coefficients of all fields (n,) at ``mu`` (d,)."""
+        dofs = self._solver.lift(self._solver.solve(mu), mu)
+        snapshot = solid_snapshot(self._problem, dofs, mu, self._reactions)
+        return np.concatenate([field.coefficients(snapshot.fields[name]) for name, field in self.modes.items()])
+
+    def in_allowed_units(self, mu: Array) -> Array:
+        """The same in units of the error allowed in each field."""
+        return self(mu) / self._allowed
 
 
 #: A full grid is sampled up to so many parameters.
@@ -121,19 +169,16 @@ def reduce_by_galerkin(task: ReductionTask) -> ReducedModel:
         If the study is not that of a hyperelastic solid.
     """
     problem = solid_equations(task.problem() if task.problem else None)
-    snapshots = [snapshot for group in task.groups for snapshot in group]
     box, tolerance = task.box, task.options.tolerance
     solver = ReducedSolver(problem, FullSolutions.read(task.files), box, tolerance)
     spread = np.diff(box, axis=1)[:, 0]
-    modes = {
-        name: field_modes(snapshots, name, task.mesh.weights, spread, tolerance) for name in field_names(snapshots)
-    }
+    modes = {name: field_modes(task, name, spread, tolerance) for name in task.field_names}
     sampled = SampledFields(solver, problem, modes, SHARE * tolerance)
     dense = _on_grid(task, sampled) if _grid_is_used(task) else _scattered(task, sampled)
     fields, summaries = {}, {}
     for name, part in sampled.parts.items():
         flat = dense.coefficients[part].reshape(part.stop - part.start, -1)
-        kept = keep_modes(task, name, modes[name].modes, flat)
+        kept = truncate(task, name, modes[name].modes, flat)
         fields[name] = kept.field(dense.functions(kept.rotation, part, task, SHARE * tolerance))
         summaries[name] = {
             "modes": len(kept.modes),
@@ -147,7 +192,7 @@ def reduce_by_galerkin(task: ReductionTask) -> ReducedModel:
         **dense.summary,
         **summaries["displacement"],
     }
-    return model_of(task, fields, summary)
+    return task.model(fields, summary)
 
 
 def _grid_is_used(task: ReductionTask) -> bool:
@@ -219,3 +264,15 @@ def _scattered(task: ReductionTask, sampled: SampledFields) -> _Expansion:
         "expansion_error": error,
     }
     return _Expansion(indices, coefficients.T, len(scattered.samples), summary)
+
+
+def _offered_functions(dimension: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    if dimension <= MOST_GRID_PARAMETERS:
+        return ("tucker", "tensor_train", "cp", "polynomial"), ("chebyshev", "cubic_spline", "hat", "fourier")
+    return ("tensor_train", "polynomial"), ("chebyshev",)
+
+
+_PROPERTIES = {"equations": True, "adaptive": True, "functions": _offered_functions}
+
+register_reduction("galerkin", reduce_by_galerkin, **_PROPERTIES)
+register_reduction("reduced_basis", reduce_by_galerkin, greedy=True, **_PROPERTIES)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
 from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
-from morph_dslam.reduction.separation import weighted_degree_indices
+from morph_dslam.reduction.sparse_expansion import weighted_degree_indices
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import scipy.linalg
@@ -21,15 +21,24 @@ from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.model.basis_functions import Basis
 from morph_dslam.model.tensor_functions import CPFunctions
 from morph_dslam.reduction.pod import Pod, compute_pod
-from morph_dslam.reduction.task import ReductionTask, field_names, field_values, model_of, parameter_bases
+from morph_dslam.reduction.registry import register_reduction
+from morph_dslam.reduction.task import ReductionTask, parameter_bases
+from morph_dslam.studies.sections import BasisName
 
 Array = NDArray[np.float64]
 
 #: Candidates of the smoothing weight, relative to the ratio of the data's and the penalty's traces.
 SMOOTHING = np.logspace(-14.0, 2.0, 33)
 
-#: Sweeps over all modes end when one lowers the misfit by less than this, relatively.
-SETTLED = 0.02
+#: The alternating directions of one enrichment end at this relative change, or after so many iterations.
+INNER_TOLERANCE, INNER_ITERATIONS = 1e-4, 30
+
+#: All modes are refitted after so many enrichments, by so many sweeps at most, and until a sweep lowers the
+#: misfit by less than this, relatively.
+REFIT_EVERY, REFIT_SWEEPS, SETTLED = 2, 30, 0.02
+
+#: Share of the samples kept aside to choose the number of modes, and refits without a better prediction.
+VALIDATION_SHARE, PATIENCE = 0.15, 3
 
 #: A relative misfit that is rounding: what is left has no direction to be enriched by.
 EXACT = 1e-12
@@ -37,30 +46,6 @@ EXACT = 1e-12
 
 class SamplingWarning(UserWarning):
     """There are too few samples for the number of unknowns."""
-
-
-@dataclass(frozen=True)
-class SparsePgdOptions:
-    """How far to enrich.
-
-    Attributes
-    ----------
-    max_modes : at most this many products.
-    refit_every, refit_sweeps : all modes are refitted after so many enrichments, by so many sweeps at most.
-    inner_tolerance, inner_iterations : the alternating directions of one enrichment stop there.
-    validation_fraction : share of the samples kept aside to choose the number of modes.
-    patience : refits without a better prediction before the search ends.
-    pod_tolerance : relative energy (root) that the compression may leave out.
-    """
-
-    max_modes: int = 30
-    refit_every: int = 2
-    refit_sweeps: int = 30
-    inner_tolerance: float = 1e-4
-    inner_iterations: int = 30
-    validation_fraction: float = 0.15
-    patience: int = 3
-    pod_tolerance: float = 1e-7
 
 
 @dataclass(frozen=True)
@@ -78,17 +63,17 @@ class SparsePgd:
     functions: CPFunctions
     validation_errors: dict[int, float]
 
-    @property
-    def n_products(self) -> int:
-        return self.functions.mixing.shape[0]
-
 
 def smoothed_fit(gram: Array, right: Array, square: float, count: int, penalty: Array) -> Array:
     """Coefficients minimising |y - W a|^2 + weight a' P a, with the weight of least GCV score.
 
     Parameters
     ----------
-    gram : W'W (s, s). right : W'y (s,). square : y'y. count : number of data y. penalty : P (s, s).
+    gram : W'W (s, s).
+    right : W'y (s,).
+    square : y'y.
+    count : number of data y.
+    penalty : P (s, s).
     """
     size = len(gram)
     base = gram + 1e-13 * np.trace(gram) / size * np.eye(size)
@@ -123,13 +108,13 @@ class _Fit:
         missed = np.linalg.norm(self.data - self._products() @ self.mixing)
         return len(self.mixing) > 0 and bool(missed <= EXACT * np.linalg.norm(self.data))
 
-    def enrich(self, tolerance: float, max_iterations: int) -> None:
+    def enrich(self) -> None:
         """Add the product that alternating least squares settles on for the residual."""
         residual = self.data - self._products() @ self.mixing
         new = [self._start(t) for t in self.tables]
         values = [t @ a for t, a in zip(self.tables, new, strict=True)]
         previous, amplitude = np.inf, np.zeros(self.data.shape[1])
-        for _ in range(max_iterations):
+        for _ in range(INNER_ITERATIONS):
             product = np.prod(values, axis=0)
             amplitude = residual.T @ product / (product @ product)
             target = residual @ amplitude / (amplitude @ amplitude)
@@ -142,7 +127,7 @@ class _Fit:
                 scale = max(float(np.sqrt(np.mean((table @ a) ** 2))), np.finfo(float).tiny)
                 new[k], values[k] = a / scale, table @ a / scale
             size = float(np.linalg.norm(amplitude))
-            if abs(size - previous) <= tolerance * size:
+            if abs(size - previous) <= INNER_TOLERANCE * size:
                 break
             previous = size
         product = np.prod(values, axis=0)
@@ -155,10 +140,10 @@ class _Fit:
         a = ones + 0.1 * np.abs(ones).max() * self._random.standard_normal(len(ones))
         return a / np.sqrt(np.mean((table @ a) ** 2))
 
-    def refit(self, max_sweeps: int) -> None:
+    def refit(self) -> None:
         """All modes together, one parameter after the other, the amplitudes in between, until it settles."""
         previous = np.inf
-        for _ in range(max_sweeps):
+        for _ in range(REFIT_SWEEPS):
             for k in range(len(self.tables)):
                 self._refit_amplitudes()
                 self._refit_parameter(k)
@@ -194,37 +179,44 @@ def fit_sparse_pgd(
     samples: Array,
     values: Array,
     bases: tuple[Basis, ...],
-    options: SparsePgdOptions | None = None,
+    max_modes: int = 30,
+    pod_tolerance: float = 1e-7,
     labels: NDArray[np.int64] | None = None,
 ) -> SparsePgd:
-    """Fit fields ``values`` (N, n) at ``samples`` (N, d) by a sum of products of functions in ``bases``.
+    """Fit fields by a sum of products of functions of the parameters.
 
-    Samples of one label in ``labels`` (N,), mirror images say, are kept aside together; all differ if absent.
+    Parameters
+    ----------
+    samples : (N, d) parameters.
+    values : (N, n) fields at the samples.
+    bases : of the functions of each parameter.
+    max_modes : at most this many products.
+    pod_tolerance : relative energy (root) that the compression of the values may leave out.
+    labels : (N,); samples of one label, mirror images say, are kept aside together. All differ if absent.
 
     Warns
     -----
     SamplingWarning
         If there are fewer samples than modes times functions of one parameter.
     """
-    options = options or SparsePgdOptions()
-    pod = compute_pod(values, np.ones(values.shape[1]), options.pod_tolerance, min(values.shape))
+    pod = compute_pod(values, np.ones(values.shape[1]), pod_tolerance, min(values.shape))
     data = pod.project(values)
     tables = [b.evaluate(samples[:, k]) for k, b in enumerate(bases)]
     penalties = [b.penalty() for b in bases]
     labels = np.arange(len(samples)) if labels is None else labels
     order = np.random.default_rng(0).permutation(np.unique(labels))
-    n_aside = max(1, round(options.validation_fraction * len(order)))
+    n_aside = max(1, round(VALIDATION_SHARE * len(order)))
     kept_aside = np.isin(labels, order[:n_aside])
     aside, used = np.flatnonzero(kept_aside), np.flatnonzero(~kept_aside)
     fit = _Fit([t[used] for t in tables], penalties, data[used])
     errors: dict[int, float] = {}
     best: tuple[Array, list[Array]] = (fit.mixing, fit.coefficients)
     since = 0
-    while since < options.patience and len(fit.mixing) < options.max_modes and not fit.is_exact:
-        for _ in range(min(options.refit_every, options.max_modes - len(fit.mixing))):
+    while since < PATIENCE and len(fit.mixing) < max_modes and not fit.is_exact:
+        for _ in range(min(REFIT_EVERY, max_modes - len(fit.mixing))):
             if not fit.is_exact:
-                fit.enrich(options.inner_tolerance, options.inner_iterations)
-        fit.refit(options.refit_sweeps)
+                fit.enrich()
+        fit.refit()
         products = np.prod([t[aside] @ c for t, c in zip(tables, fit.coefficients, strict=True)], axis=0)
         error = float(np.linalg.norm(products @ fit.mixing - data[aside]) / np.linalg.norm(data[aside]))
         since = since + 1
@@ -233,7 +225,7 @@ def fit_sparse_pgd(
         errors[len(fit.mixing)] = error
     final = _Fit(tables, penalties, data)
     final.mixing, final.coefficients = best[0], list(best[1])
-    final.refit(options.refit_sweeps)
+    final.refit()
     _warn_if_undersampled(len(samples), len(final.mixing), bases)
     return SparsePgd(pod, CPFunctions(bases, tuple(final.coefficients), final.mixing), errors)
 
@@ -247,9 +239,6 @@ def _warn_if_undersampled(n_samples: int, n_modes: int, bases: tuple[Basis, ...]
             SamplingWarning,
             stacklevel=3,
         )
-
-
-# The method "sparse_pgd": a sum of products for every field, fitted to the training solutions.
 
 
 def reduce_by_sparse_pgd(task: ReductionTask) -> ReducedModel:
@@ -268,37 +257,25 @@ def reduce_by_sparse_pgd(task: ReductionTask) -> ReducedModel:
     options, dimension = task.options, len(task.parameters)
     basis = options.basis or "chebyshev"
     bases = parameter_bases(basis, task.parameters, (options.max_degree + 1,) * dimension)
-    snapshots = [snapshot for group in task.groups for snapshot in group]
-    samples = np.array([snapshot.coordinates for snapshot in snapshots])
-    labels = np.concatenate([np.full(len(group), index) for index, group in enumerate(task.groups)])
     fields: dict[str, SeparatedField] = {}
     summaries: dict[str, dict[str, Any]] = {}
     notes: list[str] = []
-    for name in field_names(snapshots):
-        values = field_values(snapshots, name)
-        weights = task.mesh.weights if values.shape[1] == len(task.mesh.weights) else np.ones(values.shape[1])
+    for name in task.field_names:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", SamplingWarning)
-            fields[name], summaries[name] = _fit_field(
-                samples, values, weights, bases, SparsePgdOptions(max_modes=options.max_modes), labels
-            )
+            fields[name], summaries[name] = _fit_field(task, name, bases)
         notes += [f"{name}: {w.message}" for w in caught if issubclass(w.category, SamplingWarning)]
     summary: dict[str, Any] = {"method": "sparse_pgd", "basis": basis, **summaries["displacement"]}
-    return model_of(task, fields, summary | ({"warnings": notes} if notes else {}))
+    return task.model(fields, summary | ({"warnings": notes} if notes else {}))
 
 
-def _fit_field(
-    samples: Array,
-    values: Array,
-    weights: Array,
-    bases: tuple[Basis, ...],
-    options: SparsePgdOptions,
-    labels: NDArray[np.int64],
-) -> tuple[SeparatedField, dict[str, Any]]:
-    """One field of values (n_samples, n_points, n_components), points by ``weights``, and its summary."""
+def _fit_field(task: ReductionTask, name: str, bases: tuple[Basis, ...]) -> tuple[SeparatedField, dict[str, Any]]:
+    """One field, and its summary."""
+    values = task.values(name)
     shape = values.shape[1:]
-    root = np.sqrt(np.repeat(weights, shape[1]))
-    fit = fit_sparse_pgd(samples, values.reshape(len(values), -1) * root, bases, options, labels)
+    root = np.sqrt(np.repeat(task.weights(shape[0]), shape[1]))
+    flat = values.reshape(len(values), -1) * root
+    fit = fit_sparse_pgd(task.samples, flat, bases, task.options.max_modes, labels=task.labels)
     modes = (fit.functions.mixing @ fit.pod.modes / root).reshape(-1, *shape)
     functions = CPFunctions(bases, fit.functions.factors, np.eye(len(modes)))
     summary = {
@@ -308,3 +285,8 @@ def _fit_field(
         "validation_errors": {str(count): error for count, error in fit.validation_errors.items()},
     }
     return SeparatedField(modes, functions), summary
+
+
+register_reduction(
+    "sparse_pgd", reduce_by_sparse_pgd, modes=False, functions=lambda dimension: (("cp",), get_args(BasisName))
+)

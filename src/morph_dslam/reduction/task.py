@@ -1,9 +1,10 @@
-"""What every method of reduction is given."""
+"""What every method of reduction is given, and functions of one parameter by the names that study files use."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,9 @@ from morph_dslam.studies.sections import BasisName, ReductionSection
 Array = NDArray[np.float64]
 
 
+STRESS = "stress_"
+
+
 @dataclass(frozen=True)
 class ReductionTask:
     """Solutions to reduce.
@@ -36,7 +40,7 @@ class ReductionTask:
     ----------
     mesh : that of the model.
     parameters : with the box that the functions are fitted in.
-    groups : snapshots to make the model from; those of one group are mirror images of one solution.
+    groups : training snapshots; those of one group are mirror images of one solution.
     options : the study's [reduction].
     name : the study's name.
     problem : makes what the study is solved with; None for solutions of another program.
@@ -56,8 +60,53 @@ class ReductionTask:
         """Lower and upper ends (d, 2) of the parameters, SI."""
         return np.array([[parameter.lower, parameter.upper] for parameter in self.parameters])
 
+    @cached_property
+    def snapshots(self) -> list[Snapshot]:
+        """The training snapshots of all groups, one after another."""
+        return [snapshot for group in self.groups for snapshot in group]
 
-# Functions of one parameter, by the names that study files give them.
+    @cached_property
+    def samples(self) -> Array:
+        """Parameters (n, d) of the snapshots, SI."""
+        return np.array([snapshot.coordinates for snapshot in self.snapshots])
+
+    @cached_property
+    def labels(self) -> NDArray[np.int64]:
+        """The group (n,) that each snapshot belongs to: mirror images are left out of a fit together."""
+        return np.repeat(np.arange(len(self.groups)), [len(group) for group in self.groups])
+
+    @property
+    def field_names(self) -> list[str]:
+        """The names of all fields, as the model file has them; "displacement" is always among them."""
+        return list(self.snapshots[0].fields)
+
+    def values(self, name: str) -> Array:
+        """The values (n, n_points, n_components) of a field in all snapshots."""
+        return np.array([snapshot.fields[name] for snapshot in self.snapshots], dtype=np.float64)
+
+    def weights(self, n_points: int) -> Array:
+        """Weights (n_points,) of a field's points: the nodes' shares of the volume; 1 for other points."""
+        return self.mesh.weights if n_points == len(self.mesh.weights) else np.ones(n_points)
+
+    def model(self, fields: Mapping[str, SeparatedField], summary: dict[str, Any]) -> ReducedModel:
+        """The reduced model of separated fields by name, with what the method says of itself."""
+        return ReducedModel(
+            name=self.name,
+            nodes=self.mesh.nodes,
+            triangles=self.mesh.triangles,
+            cells=self.mesh.cells,
+            parameters=self.parameters,
+            displacement=fields["displacement"],
+            stresses=_without_prefix(fields, STRESS),
+            strain=fields.get("strain"),
+            reactions=_without_prefix(fields, REACTION),
+            certificate={"reduction": summary},
+        )
+
+
+def _without_prefix(fields: Mapping[str, SeparatedField], prefix: str) -> dict[str, SeparatedField]:
+    """The fields whose names start with ``prefix``, under the rest of their names."""
+    return {name.removeprefix(prefix): field for name, field in fields.items() if name.startswith(prefix)}
 
 
 #: Correlation length of kriging over the size of the range.
@@ -106,17 +155,6 @@ def parameter_bases(name: BasisName, parameters: tuple[Parameter, ...], sizes: t
     return tuple(parameter_basis(name, p, size) for p, size in zip(parameters, sizes, strict=True))
 
 
-# The fields that snapshots hold, and the reduced model that separated fields make.
-
-
-STRESS = "stress_"
-
-
-def field_names(snapshots: Sequence[Snapshot]) -> list[str]:
-    """The names of all fields, as the model file has them."""
-    return list(snapshots[0].fields)
-
-
 class FieldRows:
     """One field of all snapshots as rows (n_snapshots, n_points * n_components), gathered when sliced.
 
@@ -131,29 +169,3 @@ class FieldRows:
     def __getitem__(self, rows: slice) -> Array:
         values = [snapshot.fields[self._name].ravel() for snapshot in self._snapshots[rows]]
         return np.array(values, dtype=np.float64)
-
-
-def field_values(snapshots: Sequence[Snapshot], name: str) -> Array:
-    """The values (n_snapshots, n_points, n_components) of one field in all snapshots."""
-    return np.array([snapshot.fields[name] for snapshot in snapshots], dtype=np.float64)
-
-
-def model_of(task: ReductionTask, fields: Mapping[str, SeparatedField], summary: dict[str, Any]) -> ReducedModel:
-    """The reduced model of separated fields by name, with what the method says of itself."""
-    return ReducedModel(
-        name=task.name,
-        nodes=task.mesh.nodes,
-        triangles=task.mesh.triangles,
-        cells=task.mesh.cells,
-        parameters=task.parameters,
-        displacement=fields["displacement"],
-        stresses=_without_prefix(fields, STRESS),
-        strain=fields.get("strain"),
-        reactions=_without_prefix(fields, REACTION),
-        certificate={"reduction": summary},
-    )
-
-
-def _without_prefix(fields: Mapping[str, SeparatedField], prefix: str) -> dict[str, SeparatedField]:
-    """The fields whose names start with ``prefix``, under the rest of their names."""
-    return {name.removeprefix(prefix): field for name, field in fields.items() if name.startswith(prefix)}

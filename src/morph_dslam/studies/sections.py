@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
 from morph_dslam.errors import StudyError
+from morph_dslam.reduction.registry import reduction_method
 from morph_dslam.studies.affine import LARGEST, possible
 from morph_dslam.units import to_si
 
@@ -90,9 +91,7 @@ class SamplingSection(Section):
         return self
 
 
-#: Names of the methods of reduction, of formats of several parameters, and of functions of one.
-MethodName = Literal["galerkin", "pod", "reduced_basis", "sparse_pgd", "pgd"]
-
+#: Names of formats of functions of several parameters, and of functions of one.
 FormatName = Literal["tucker", "tensor_train", "cp", "polynomial"]
 
 BasisName = Literal["chebyshev", "cubic_spline", "p_spline", "kriging", "fourier", "hat"]
@@ -110,7 +109,7 @@ class ReductionSection(Section):
     take, in 1e9 bytes; more of them are decomposed in blocks.
     """
 
-    method: MethodName | None = None
+    method: str | None = None
     format: FormatName | None = None
     basis: BasisName | None = None
     inner_product: Literal["mass", "energy"] = "mass"
@@ -119,6 +118,14 @@ class ReductionSection(Section):
     max_modes: int = Field(default=24, ge=1)
     max_degree: int = Field(default=8, ge=1, le=40)
     memory_gb: float = Field(default=4.0, gt=0, allow_inf_nan=False)
+
+    @field_validator("method")
+    @classmethod
+    def _check_method(cls, method: str | None) -> str | None:
+        try:
+            return method and reduction_method(method).name
+        except StudyError as error:
+            raise ValueError(str(error)) from error
 
 
 class WorkSection(Section):

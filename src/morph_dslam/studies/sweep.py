@@ -1,280 +1,113 @@
-"""Where a sweep's samples are solved: in this process, or in worker processes of this machine.
+"""The sweep: every sample solved once, each from its nearest solved neighbour, on any Executor.
 
-An executor's ``slots`` is how many samples may be on their way at once, so that no more starts wait in memory
-than keep the workers busy.
+Which sample starts from which depends on the samples alone, never on the number of workers, their timing, or
+what an earlier build had solved when it was stopped: the numbers are the same every time.
 """
 
 from __future__ import annotations
 
 import fcntl
-import logging
-import multiprocessing
-import os
-import signal
+import hashlib
 import sys
-import threading
-import warnings
-from collections.abc import Iterator
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Collection, Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
-from multiprocessing.connection import wait as wait_for
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from morph_dslam.errors import StudyError, WorkerError
+from morph_dslam.errors import StudyError
+from morph_dslam.studies.executors import slots
 from morph_dslam.studies.problem import ParametricStudy
-from morph_dslam.studies.sample_task import FailedAttempts, SampleResult, forget_problem, neighbour_tree, solve_sample
-from morph_dslam.studies.snapshots import PARTIAL, damage, load_state, snapshot_keys, write_atomically
-
-if TYPE_CHECKING:
-    from distributed import Client
-
-
-#: Of executors that do not say.
-DEFAULT_SLOTS = 16
-
-
-def slots(executor: Executor) -> int:
-    """How many samples may be on their way at once."""
-    return getattr(executor, "slots", DEFAULT_SLOTS)
-
-
-class SerialExecutor(Executor):
-    """Runs each task here, when it is submitted: no second process, so the least memory."""
-
-    slots = 1
-
-    def submit(self, fn, /, *args, **kwargs) -> Future:
-        future: Future = Future()
-        future.set_result(fn(*args, **kwargs))
-        return future
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Give back the memory of the problem."""
-        forget_problem()
-
-
-class WorkerProcesses(ProcessPoolExecutor):
-    """Processes that leave Ctrl-C to the main process and end when it does, however that ends."""
-
-    def __init__(self, count: int) -> None:
-        context = multiprocessing.get_context("spawn")
-        super().__init__(count, mp_context=context, initializer=_start_worker)
-        self.slots = 2 * count
-        self._others = set(multiprocessing.active_children())
-
-    def end_now(self) -> None:
-        """Stop the workers where they are; what they were solving is lost.
-
-        A worker may be stopped half-way through sending a result. The thread that receives it would wait for
-        the rest for ever, and the interpreter for the thread, as long as this process has the sending end of
-        that pipe open too.
-        """
-        results = self._result_queue
-        self.shutdown(wait=False, cancel_futures=True)
-        for worker in set(multiprocessing.active_children()) - self._others:
-            worker.terminate()
-        if results is not None:  # None once it was shut down
-            results._writer.close()  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def _start_worker() -> None:
-    warnings.filterwarnings("ignore", message=".* nearly incompressible")  # said once, by the build
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """A main process that is killed cannot end its workers: each watches it."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        wait_for([parent.sentinel])
-        os._exit(1)
-
-
-@contextmanager
-def default_executor(workers: int | None) -> Iterator[Executor]:
-    """Worker processes, one a core unless ``workers`` says otherwise; ended at once on an interruption.
-
-    A single worker is this process itself.
-
-    Raises
-    ------
-    WorkerError
-        If a worker process died.
-    """
-    if workers == 1:
-        with SerialExecutor() as executor:
-            yield executor
-        return
-    executor = WorkerProcesses(workers or os.cpu_count() or 1)
-    try:
-        yield executor
-    except BaseException as error:
-        executor.end_now()
-        if isinstance(error, BrokenProcessPool):
-            raise WorkerError(
-                "a worker process died, most likely for want of memory; take fewer with --workers. What was "
-                "solved is kept, and the same command goes on from there"
-            ) from error
-        raise
-    executor.shutdown()
-
-
-# A Dask cluster to solve on, by the address of its scheduler.
-# Starts are sent to its workers and snapshots come back, so they need no folder in common with the build. A
-# worker that is lost is no harm: the scheduler gives its samples to others.
-
-
-#: Seconds to wait for a scheduler to answer.
-PATIENCE = 10.0
-
-#: What must be of one version here and on the workers, by the name that Python imports.
-PACKAGES = ("morph_dslam", "ngsolve", "numpy", "scipy", "dask", "distributed")
-
-
-class ClusterExecutor(Executor):
-    """A Dask client as an Executor that says how much it can have on its way."""
-
-    def __init__(self, client: Client) -> None:
-        self._client, self._executor = client, client.get_executor(pure=False)
-
-    @property
-    def slots(self) -> int:
-        """Twice as many as the workers' threads now; workers may come and go."""
-        try:
-            threads: dict[str, int] = self._client.nthreads()  # type: ignore[assignment]
-        except OSError as error:  # a time-out too
-            raise ConnectionResetError(str(error)) from error
-        return 2 * max(1, sum(threads.values()))
-
-    def submit(self, fn, /, *args, **kwargs) -> Future:
-        return self._executor.submit(fn, *args, **kwargs)
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Wait for what is on its way, or cancel it."""
-        self._executor.shutdown(wait=wait and not cancel_futures)
-
-
-@contextmanager
-def cluster_executor(address: str) -> Iterator[ClusterExecutor]:
-    """The cluster whose scheduler listens at ``address``, "tcp://host:8786" say.
-
-    Raises
-    ------
-    WorkerError
-        If dask.distributed is not installed, the scheduler does not answer, no worker is there, a version
-        differs, or the cluster is lost while it works.
-    """
-    try:
-        import dask.config
-        from distributed import Client, KilledWorker
-        from distributed.comm.core import CommClosedError
-    except ImportError as error:
-        raise WorkerError("--scheduler needs dask.distributed: pip install 'morph-dslam[dask]'") from error
-    with (
-        # A start is an argument as large as a solution, which is no mistake here.
-        dask.config.set({"distributed.admin.large-graph-warning-threshold": "1TiB"}),
-        _quiet_client(),
-        _connected(Client, address) as client,
-    ):
-        _check_workers(client, address)
-        executor = ClusterExecutor(client)
-        try:
-            yield executor
-        except KilledWorker as error:
-            raise WorkerError(
-                f"{error}. Most likely the workers want memory: start fewer on each machine. What was solved "
-                "is kept, and the same command goes on from there"
-            ) from error
-        except (CancelledError, CommClosedError, ConnectionResetError) as error:
-            raise WorkerError(
-                f"the connection to the scheduler at {address} was lost. What was solved is kept: start the "
-                "scheduler again, and the same command goes on from there"
-            ) from error
-        finally:
-            executor.shutdown(wait=False)
-
-
-@contextmanager
-def _quiet_client() -> Iterator[None]:
-    """The client logs a traceback when it loses its scheduler, which is reported in one message here."""
-    logger = logging.getLogger("distributed.client")
-    before = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        logger.setLevel(before)
-
-
-@contextmanager
-def _connected(client_type: type[Client], address: str) -> Iterator[Client]:
-    """A client of the scheduler; versions are compared by `_check_workers`, so dask need not warn of them."""
-    from distributed.comm.addressing import get_address_host
-    from distributed.versions import VersionMismatchWarning
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", VersionMismatchWarning)
-        try:
-            get_address_host(address)  # a client that cannot be made for it would not be closed cleanly
-            client = client_type(address, timeout=PATIENCE, set_as_default=False)
-        except (OSError, ValueError, TypeError) as error:
-            raise WorkerError(
-                f"no Dask scheduler answers at {address} ({_first_line(error)}): start one with "
-                "`dask scheduler`, which prints its address, and workers with `dask worker ADDRESS`"
-            ) from error
-    with client:
-        yield client
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0]
-
-
-def _check_workers(client: Client, address: str) -> None:
-    """Refuse a cluster without workers, and one whose programs differ from this one."""
-    if not client.nthreads():
-        raise WorkerError(
-            f"the scheduler at {address} has no workers: start some with `dask worker {address} --nthreads 1`"
-        )
-    found: Any = client.get_versions(packages=list(PACKAGES))
-    here = _versions(found["client"])
-    for worker, content in found["workers"].items():
-        there = _versions(content)
-        wrong = [
-            f"{name} {there.get(name) or 'missing'} (here {version})"
-            for name, version in here.items()
-            if there.get(name) != version
-        ]
-        if wrong:
-            raise WorkerError(
-                f"the worker {worker} does not fit this program: {', '.join(wrong)}; install the same "
-                "versions on every machine"
-            )
-
-
-def _versions(content: dict[str, Any]) -> dict[str, str | None]:
-    """Versions by package, of the report that a client or worker gives of itself."""
-    python = ".".join(content["host"]["python"].split(".")[:2])
-    return {"python": python} | {name: content["packages"].get(name) for name in PACKAGES}
-
-
-# The sweep: every sample solved once, each from its nearest solved neighbour, on any Executor.
-# Which sample starts from which depends on the samples alone, never on the number of workers, their timing,
-# or what an earlier build had solved when it was stopped: the numbers are the same every time.
-
+from morph_dslam.studies.sample_task import SampleResult, solve_sample
+from morph_dslam.studies.snapshots import PARTIAL, SOLVER_VERSION, damage, load_state, snapshot_keys, write_atomically
 
 Array = NDArray[np.float64]
 
 #: A sample is given up after so many attempts from different neighbours.
 MOST_ATTEMPTS = 2
+
+
+#: Steps and paths that differ by less, relatively, are equally long: rounding decides nothing.
+TIE = 1e-9
+
+
+def neighbour_tree(
+    samples: Array, scale: Array, root: Array, solved: Collection[int] = (), failed: Collection[int] = ()
+) -> tuple[list[int], list[int]]:
+    """Prim's order of the samples that are not solved yet, and the neighbour that each starts from.
+
+    The tree is as short as can be. Among equally short steps, as a grid has, the one is taken whose path from
+    the root is shortest: every path of a grid then leads outwards from the defaults and never back, so that
+    loads only grow along it and branches can be walked in parallel.
+
+    Parameters
+    ----------
+    samples : (n, d). scale : (d,) lengths in which steps are measured. root : (d,).
+    solved, failed : samples that may be started from already, and samples that nothing is to start from.
+
+    Returns
+    -------
+    order : the unsolved samples. parent : for every sample, another one or -1 for the root state.
+    """
+    points = samples / scale
+    distance = np.linalg.norm(points - root / scale, axis=1)
+    path = distance.copy()
+    parent = np.full(len(points), -1)
+    waiting = np.ones(len(points), dtype=bool)
+    known = sorted(solved)
+    order: list[int] = []
+    for step in range(len(points)):
+        nearest = known[step] if step < len(known) else _next(waiting, distance, path)
+        if step >= len(known):
+            order.append(nearest)
+        waiting[nearest] = False
+        if nearest in failed:
+            continue
+        to_new = np.linalg.norm(points - points[nearest], axis=1)
+        through_new = path[nearest] + to_new
+        as_close = (to_new <= distance * (1.0 + TIE)) & (through_new < path * (1.0 - TIE))
+        closer = waiting & ((to_new < distance * (1.0 - TIE)) | as_close)
+        distance[closer], path[closer], parent[closer] = to_new[closer], through_new[closer], nearest
+    return order, parent.tolist()
+
+
+def _next(waiting: NDArray[np.bool_], distance: Array, path: Array) -> int:
+    """The waiting sample of the shortest step and, among equals, of the shortest path."""
+    left = np.flatnonzero(waiting)
+    equals = left[distance[left] <= distance[left].min() * (1.0 + TIE)]
+    shortest = path[equals].min()
+    return int(equals[np.argmax(path[equals] <= shortest * (1.0 + TIE))])
+
+
+class FailedAttempts:
+    """Small text files beside the snapshots, one for each attempt, that hold the reason.
+
+    Parameters
+    ----------
+    keys : of the samples, by index (`morph_dslam.studies.snapshots.snapshot_keys`).
+    """
+
+    def __init__(self, folder: Path, keys: list[str]) -> None:
+        self._folder, self._keys = folder, keys
+        self._code = f"solver version {SOLVER_VERSION}"
+
+    def _file(self, origin: int, sample: int) -> Path:
+        start = self._keys[origin] if origin >= 0 else "root"
+        name = hashlib.sha256(f"{self._code} {start} {self._keys[sample]}".encode()).hexdigest()[:24]
+        return self._folder / f"{name}.failed"
+
+    def reason(self, origin: int, sample: int) -> str | None:
+        """Why ``sample`` could not be solved from ``origin`` (-1 for the root); None if never tried."""
+        file = self._file(origin, sample)
+        return file.read_text(errors="replace") if file.is_file() else None
+
+    def record(self, origin: int, sample: int, reason: str) -> None:
+        """Keep the reason of an attempt that failed."""
+        write_atomically(self._file(origin, sample), reason.encode())
 
 
 @dataclass

@@ -5,8 +5,8 @@ import pytest
 
 from morph_dslam.errors import StudyError
 from morph_dslam.model import Parameter
-from morph_dslam.reduction.pod import keep_modes
 from morph_dslam.reduction.task import ReductionTask
+from morph_dslam.reduction.truncation import truncate
 from morph_dslam.studies.problem import ModelMesh
 from morph_dslam.studies.sections import ReductionSection
 from morph_dslam.studies.solid_study import SolidStudy
@@ -29,7 +29,7 @@ def norm(fields):
 
 def test_truncation_is_that_of_the_singular_value_decomposition():
     """The fields are modes of their own; Eckart and Young: what is left out are the last singular values."""
-    kept = keep_modes(task(tolerance=1e-6, max_modes=3), "displacement", FIELDS, np.eye(6))
+    kept = truncate(task(tolerance=1e-6, max_modes=3), "displacement", FIELDS, np.eye(6))
     truth = np.linalg.svd((FIELDS * np.sqrt(WEIGHTS)[:, None]).reshape(6, -1), compute_uv=False)
     assert kept.singular_values == pytest.approx(truth)
     missed = np.tensordot(kept.rotation.T, kept.modes, axes=1) - FIELDS
@@ -37,13 +37,13 @@ def test_truncation_is_that_of_the_singular_value_decomposition():
 
 
 def test_components_have_modes_of_their_own():
-    kept = keep_modes(task(tolerance=1e-8, components="separate"), "displacement", FIELDS, np.eye(6))
+    kept = truncate(task(tolerance=1e-8, components="separate"), "displacement", FIELDS, np.eye(6))
     assert kept.components is not None
     assert np.bincount(kept.components).tolist() == [6, 6, 6]
     assert np.all(np.diff(kept.singular_values) <= 0.0)
     back = np.tensordot(kept.rotation.T, kept.modes, axes=1)
     assert back == pytest.approx(FIELDS, abs=1e-10)
-    coarse = keep_modes(task(tolerance=0.05, components="separate"), "displacement", FIELDS, np.eye(6))
+    coarse = truncate(task(tolerance=0.05, components="separate"), "displacement", FIELDS, np.eye(6))
     assert set(coarse.components.tolist()) == {0, 1}, "the third component is 1 % of the first"
 
 
@@ -57,11 +57,11 @@ def test_energy_counts_by_the_stiffness_of_the_body():
     stretch[:, 2] = 0.01 * mesh.nodes[:, 2]
     options = ReductionSection(inner_product="energy", tolerance=1e-4)
     energy_task = ReductionTask(mesh, study.model_parameters(), [], options, problem=lambda: sweep)
-    kept = keep_modes(energy_task, "displacement", np.array([shift, stretch]), np.eye(2))
+    kept = truncate(energy_task, "displacement", np.array([shift, stretch]), np.eye(2))
     assert kept.singular_values[0] ** 2 == pytest.approx(3e6 * 0.02**2 * 0.04 * 0.01**2)
     assert len(kept.modes) == 1
 
 
 def test_energy_needs_a_solid():
     with pytest.raises(StudyError, match="needs the stiffness of a solid"):
-        keep_modes(task(inner_product="energy"), "displacement", FIELDS, np.eye(6))
+        truncate(task(inner_product="energy"), "displacement", FIELDS, np.eye(6))

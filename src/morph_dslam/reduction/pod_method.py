@@ -1,0 +1,152 @@
+"""The method "pod": modes of the snapshots, functions of the parameters through their coefficients.
+
+Snapshots on a full, evenly spaced grid (of one parameter, a line) are interpolated by splines, so that all
+that is left of the error is what the modes leave out. Scattered ones are fitted by polynomials of the total
+degree that predicts left-out samples best, with sensitivities where they are known.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from morph_dslam.errors import StudyError
+from morph_dslam.model import ReducedModel
+from morph_dslam.model.basis_functions import chebyshev_basis
+from morph_dslam.model.functions import Functions, ParameterFunctions
+from morph_dslam.reduction.grid_functions import EvenGrid, functions_on_grid
+from morph_dslam.reduction.pod import Pod, compute_pod
+from morph_dslam.reduction.registry import register_reduction
+from morph_dslam.reduction.regression import fit_functions
+from morph_dslam.reduction.sparse_expansion import expansion_train
+from morph_dslam.reduction.task import FieldRows, ReductionTask, parameter_bases
+from morph_dslam.reduction.truncation import Truncation, truncate
+from morph_dslam.studies.problem import Snapshot
+
+Array = NDArray[np.float64]
+
+#: Bases that interpolate on a grid, and error of a separated form there as a part of the tolerance.
+GRID_BASES, SHARE = ("cubic_spline", "hat"), 0.2
+
+#: Modes that those kept are chosen from: to this part of the tolerance, and so many times ``max_modes``.
+FINER, MORE_MODES = 0.1, 3
+
+
+def reduce_by_pod(task: ReductionTask) -> ReducedModel:
+    """A reduced model of every field that the snapshots hold.
+
+    Snapshots of one group (mirror images) are left out together in cross-validation.
+
+    Raises
+    ------
+    StudyError
+        If the basis or the format that the study asks for does not suit its samples.
+    """
+    snapshots, grid = task.snapshots, EvenGrid.of(task.samples, task.box)
+    _check_choices(task, grid)
+    use_grid = grid is not None and task.options.basis in (None, *GRID_BASES) and task.options.format != "polynomial"
+    fields, summaries = {}, {}
+    for name in tqdm(task.field_names, desc="modes and functions", unit="field"):
+        rows = FieldRows(snapshots, name)
+        pod = _field_pod(task, rows)
+        # One snapshot at a time: all of them together may not fit in memory.
+        coefficients = np.array([pod.project(rows[i : i + 1])[0] for i in range(len(snapshots))])
+        kept = truncate(task, name, pod.modes.reshape(-1, *rows.field_shape), coefficients.T)
+        coefficients = coefficients @ kept.rotation.T
+        if use_grid:
+            assert grid is not None
+            functions, summary = _interpolated(task, grid, coefficients)
+        else:
+            functions, summary = _fitted(task, coefficients, _slopes(snapshots, name, pod, kept))
+        fields[name] = kept.field(functions)
+        summaries[name] = summary | {"modes": len(kept.modes), "singular_values": kept.singular_values[:60].tolist()}
+    return task.model(fields, {"method": "pod", **summaries["displacement"]})
+
+
+def _check_choices(task: ReductionTask, grid: EvenGrid | None) -> None:
+    options = task.options
+    if options.basis not in (None, "chebyshev", *GRID_BASES):
+        raise StudyError(
+            f'reduction.method = "pod" has no functions "{options.basis}": use "chebyshev", on even samples '
+            'and grids "cubic_spline" or "hat", or method = "sparse_pgd", which has all of them'
+        )
+    if options.basis in GRID_BASES and grid is None:
+        raise StudyError(
+            f'reduction.basis = "{options.basis}" interpolates on even samples, at least 4 along each '
+            'parameter and all of them solved: use sampling.scheme = "even" (one parameter) or "grid", '
+            'or basis = "chebyshev"'
+        )
+    if (grid is None or options.basis == "chebyshev") and options.format in ("tucker", "cp"):
+        raise StudyError(
+            f'reduction.format = "{options.format}" of method "pod" needs samples on a grid and splines: '
+            'use "polynomial" or "tensor_train", or sampling.scheme = "grid"'
+        )
+
+
+def _field_pod(task: ReductionTask, rows: FieldRows) -> Pod:
+    """More modes of a field in all snapshots than are kept; points count by the nodes' weights."""
+    n_points, n_components = rows.field_shape
+    weights, options = np.repeat(task.weights(n_points), n_components), task.options
+    most = MORE_MODES * options.max_modes
+    return compute_pod(rows, weights, FINER * options.tolerance, most, 1e9 * options.memory_gb)
+
+
+def _slopes(snapshots: list[Snapshot], name: str, pod: Pod, kept: Truncation) -> Array | None:
+    """Derivatives (n_snapshots, d, n_modes) of a field's coefficients; None where they are unknown."""
+    if name not in snapshots[0].sensitivities:
+        return None
+    # One snapshot at a time: the slopes of all of them together would be the largest array of a build.
+    slopes = [
+        pod.project(values.reshape(len(values), -1).astype(np.float64)) @ kept.rotation.T
+        for values in (snapshot.sensitivities[name] for snapshot in snapshots)
+    ]
+    return np.array(slopes)
+
+
+def _interpolated(task: ReductionTask, grid: EvenGrid, coefficients: Array) -> tuple[Functions, dict[str, Any]]:
+    """Splines through coefficients (n_snapshots, n_modes) on a grid."""
+    options = task.options
+    basis = options.basis or "cubic_spline"
+    form = options.format or ("tucker" if len(task.parameters) > 1 else "tensor_train")
+    bases = parameter_bases(basis, task.parameters, grid.counts)
+    functions = functions_on_grid(grid.tensor(coefficients), bases, form, SHARE * options.tolerance)
+    return functions, {"format": form, "basis": basis, "grid": list(grid.counts)}
+
+
+def _fitted(task: ReductionTask, coefficients: Array, slopes: Array | None) -> tuple[Functions, dict[str, Any]]:
+    """Polynomials fitted to the coefficients (n_snapshots, n_modes) of a field at scattered samples."""
+    options, box = task.options, task.box
+    functions, errors = fit_functions(
+        task.samples, coefficients, slopes, box[:, 0], box[:, 1], options.max_degree, task.labels, raise_single=True
+    )
+    summary = {
+        "format": options.format or "polynomial",
+        "basis": "chebyshev",
+        "degree": int(functions.multi_indices.sum(axis=1).max()),
+        "degrees": functions.multi_indices.max(axis=0).tolist(),
+        "terms": len(functions.multi_indices),
+        "cross_validation": {str(degree): error for degree, error in errors.items()},
+    }
+    if options.format == "tensor_train":
+        return _train(functions, SHARE * options.tolerance), summary
+    return functions, summary
+
+
+def _train(functions: ParameterFunctions, tolerance: float) -> Functions:
+    """The same polynomials as a tensor train."""
+    degrees = functions.multi_indices.max(axis=0)
+    bases = tuple(
+        chebyshev_basis(lower, upper, int(degree))
+        for lower, upper, degree in zip(functions.lower, functions.upper, degrees, strict=True)
+    )
+    return expansion_train(functions.multi_indices, functions.coefficients, bases, tolerance)
+
+
+def _offered_functions(dimension: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    return ("polynomial", "tucker", "tensor_train", "cp"), ("chebyshev", *GRID_BASES)
+
+
+register_reduction("pod", reduce_by_pod, functions=_offered_functions)

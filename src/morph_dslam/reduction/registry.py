@@ -1,0 +1,89 @@
+"""The methods of reduction by their names in study files.
+
+A method is a function from a `ReductionTask` to a `ReducedModel` with all fields that the solutions hold; what
+it says of itself goes under "reduction" into the model's certificate, and the build adds the held-out errors.
+Every method, the built-in ones too, becomes known by `register_reduction`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from morph_dslam.errors import StudyError
+
+if TYPE_CHECKING:
+    from morph_dslam.model import ReducedModel
+    from morph_dslam.reduction.task import ReductionTask
+
+Reduce = Callable[["ReductionTask"], "ReducedModel"]
+
+#: For a number of parameters, the names of formats and of bases that a method has, its default first.
+OfferedFunctions = Callable[[int], tuple[tuple[str, ...], tuple[str, ...]]]
+
+#: Modules that register the built-in methods.
+_BUILT_IN = ("galerkin_method", "pod_method", "sparse_pgd", "pgd_method")
+
+
+@dataclass(frozen=True)
+class ReductionMethod:
+    """A method of reduction.
+
+    Attributes
+    ----------
+    name : as ``[reduction] method`` names it.
+    reduce : makes a reduced model from a `ReductionTask`.
+    equations : whether it needs the equations of a solid without memory.
+    solutions : whether it needs training solutions; held-out ones are always solved.
+    adaptive : whether samples are chosen by the Galerkin model's estimated error, unless the study says otherwise.
+    greedy : whether adaptive sampling solves one sample at a time, and begins with as few as can be.
+    modes : whether it keeps modes of the solutions, for which ``components`` and ``inner_product`` are meant.
+    functions : formats and bases that a study may ask for; any, if None.
+    """
+
+    name: str
+    reduce: Reduce
+    equations: bool = False
+    solutions: bool = True
+    adaptive: bool = False
+    greedy: bool = False
+    modes: bool = True
+    functions: OfferedFunctions | None = None
+
+
+_methods: dict[str, ReductionMethod] = {}
+
+
+def register_reduction(name: str, reduce: Reduce, **properties: Any) -> None:
+    """Make a method of reduction known to study files, or replace the one of this name.
+
+    Parameters
+    ----------
+    name : as ``[reduction] method`` names it.
+    reduce : makes a reduced model from a `ReductionTask`.
+    properties : other attributes of `ReductionMethod`.
+    """
+    _methods[name] = ReductionMethod(name, reduce, **properties)
+
+
+def reduction_methods() -> dict[str, ReductionMethod]:
+    """All methods known, by name."""
+    for module in _BUILT_IN:
+        import_module(f"morph_dslam.reduction.{module}")
+    return _methods
+
+
+def reduction_method(name: str) -> ReductionMethod:
+    """The method of this name.
+
+    Raises
+    ------
+    StudyError
+        If there is none; the names known are listed.
+    """
+    known = reduction_methods()
+    if name not in known:
+        raise StudyError(f"'{name}' is no method of reduction; known are {', '.join(sorted(known))}")
+    return known[name]

@@ -1,0 +1,86 @@
+"""What a study leaves open: its method of reduction and its scheme of sampling."""
+
+from __future__ import annotations
+
+from morph_dslam.errors import StudyError
+from morph_dslam.reduction.registry import ReductionMethod, reduction_method, reduction_methods
+from morph_dslam.studies.external import ExternalStudy
+from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section
+from morph_dslam.studies.sheet_study import SheetStudy
+from morph_dslam.studies.study import Study
+
+#: Solves that greedy sampling starts with, beside one for each parameter.
+FEWEST = 4
+
+
+def resolve_defaults(study: Study) -> Study:
+    """The study with its method of reduction and its scheme of sampling chosen.
+
+    Solids with several parameters are reduced by "galerkin", everything else by "pod"; Galerkin models are
+    sampled adaptively, up to ``sampling.training`` solves, unless the study has another scheme.
+
+    Raises
+    ------
+    StudyError
+        If the study asks for a method that does not suit it, or for functions or samples that the method lacks.
+    """
+    method = _method(study)
+    update: dict[str, Section] = {"reduction": study.reduction.model_copy(update={"method": method.name})}
+    if not isinstance(study, ExternalStudy):
+        dimension = len(study.model_parameters())
+        _check_functions(study.reduction, method, dimension)
+        update["sampling"] = _sampling(study.sampling, method, dimension, _why_no_equations(study) is None)
+    return study.model_copy(update=update)
+
+
+def _why_no_equations(study: Study) -> str | None:
+    """Why no method can use the equations of a study; None where one can."""
+    if isinstance(study, ExternalStudy):
+        return "the equations behind another program's solutions are not known"
+    if isinstance(study, SheetStudy):
+        return "a sheet's solutions lie on branches that no projection follows"
+    return None if study.time is None else "the memory of a viscoelastic solid is not projected"
+
+
+def _method(study: Study) -> ReductionMethod:
+    """The method that the study asks for, or the default for its kind."""
+    reason = _why_no_equations(study)
+    several = reason is None and len(study.model_parameters()) > 1  # type: ignore[union-attr]
+    method = reduction_method(study.reduction.method or ("galerkin" if several else "pod"))
+    if method.equations and reason is not None:
+        usable = " or ".join(f'"{name}"' for name, known in reduction_methods().items() if not known.equations)
+        raise StudyError(f'reduction.method = "{method.name}" does not suit this study: {reason}. Use {usable}')
+    return method
+
+
+def _sampling(sampling: SamplingSection, method: ReductionMethod, dimension: int, equations: bool) -> SamplingSection:
+    scheme = sampling.scheme or ("adaptive" if method.adaptive else "sobol")
+    if scheme == "adaptive" and not method.adaptive:
+        raise StudyError(
+            f'sampling.scheme = "adaptive" needs an estimate of the error, which method "{method.name}" '
+            'lacks: use scheme = "sobol"' + (', or method = "galerkin"' if equations else "")
+        )
+    first = sampling.first
+    if method.greedy and "first" not in sampling.model_fields_set:
+        first = dimension + FEWEST  # each choice knows all before it
+    return sampling.model_copy(update={"scheme": scheme, "first": min(first, sampling.training)})
+
+
+def _check_functions(options: ReductionSection, method: ReductionMethod, dimension: int) -> None:
+    """Refuse a format, a basis or modes that a method does not have (StudyError)."""
+    formats, bases = method.functions(dimension) if method.functions else (None, None)
+    for key, asked, offered in (("format", options.format, formats), ("basis", options.basis, bases)):
+        if asked is not None and offered is not None and asked not in offered:
+            usable = ", ".join(f'"{name}"' for name in offered)
+            raise StudyError(
+                f'reduction.{key} = "{asked}" is none that method "{method.name}" has for {dimension} parameter'
+                f"{'s' if dimension > 1 else ''}: leave it out, or use one of {usable}"
+            )
+    if options.format == "polynomial" and method.adaptive and options.basis not in (None, "chebyshev"):
+        raise StudyError('reduction.format = "polynomial" has Chebyshev polynomials: leave out reduction.basis')
+    for key, default in (("components", "together"), ("inner_product", "mass")):
+        if not method.modes and getattr(options, key) != default:
+            raise StudyError(
+                f'reduction.{key} is for modes of solutions, and method "{method.name}" has products of its '
+                'own: leave it out, or use method "galerkin" or "pod"'
+            )

@@ -1,0 +1,87 @@
+"""Where a model comes from, and what could be wrong with its elements. Nothing in it changes from run to run."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+
+from morph_dslam.mechanics.solid_materials import NEARLY_INCOMPRESSIBLE
+from morph_dslam.mechanics.solvers.linear_solver import default_engine
+from morph_dslam.model import ReducedModel
+from morph_dslam.studies.affine import read_affine
+from morph_dslam.studies.external import ExternalStudy
+from morph_dslam.studies.sheet_study import SheetStudy
+from morph_dslam.studies.solid_study import SolidStudy
+from morph_dslam.studies.study import Study
+
+#: Packages whose release may change a model; one that is not installed is left out.
+PACKAGES = ("morph-dslam", "ngsolve", "pypardiso", "mkl", "numba", "numpy", "scipy")
+
+
+def mesh_hash(model: ReducedModel) -> str:
+    """SHA-256 of the mesh: nodes, triangles and cells as they are in memory (float64 and int64)."""
+    digest = hashlib.sha256(model.nodes.tobytes() + model.triangles.tobytes())
+    for cell_type, connectivity in sorted(model.cells.items()):
+        digest.update(cell_type.encode() + connectivity.tobytes())
+    return digest.hexdigest()
+
+
+def linear_solver(study: Study) -> str | None:
+    """What factorised the tangents of a study's solves; None for solutions of another program."""
+    if isinstance(study, ExternalStudy):
+        return None
+    return "sparsecholesky" if isinstance(study, SheetStudy) else default_engine()
+
+
+def provenance(study_text: str, study: Study, model: ReducedModel) -> dict[str, Any]:
+    """What a model file says of its origin, in plain JSON types; ``study_text`` is the file's."""
+    return {
+        "study": study_text,
+        "mesh_sha256": mesh_hash(model),
+        "linear_solver": linear_solver(study),
+        "versions": _versions(),
+    }
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def locking_warnings(study: Study) -> list[str]:
+    """A sentence for each material that is nearly incompressible in displacement elements.
+
+    Constants that are parameters count with their defaults. Mixed elements lock neither; materials without a
+    volumetric part stay in displacement elements in a mixed study too.
+    """
+    if not isinstance(study, SolidStudy):
+        return []
+    parameters = study.model_parameters()
+    defaults = np.array([parameter.default for parameter in parameters])
+
+    def read(value: Any, quantity: str | None) -> float:
+        return read_affine(value, quantity, parameters)(defaults)
+
+    materials = {f"'{name}'": section.make(read) for name, section in study.materials.items()}
+    mixed = study.solver.formulation == "mixed"
+    return [
+        f"the material {name} is nearly incompressible (Poisson's ratio {law.equivalent_poisson:.4f}) in "
+        f"displacement elements, which lock: {_advice(mixed)}"
+        for name, law in materials.items()
+        if not (mixed and law.volumetric_modulus is not None) and law.equivalent_poisson >= NEARLY_INCOMPRESSIBLE
+    ]
+
+
+def _advice(mixed: bool) -> str:
+    if mixed:
+        return "give it a law with a volumetric part, which mixed elements need"
+    return 'set solver.formulation = "mixed"'
