@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from morph_dslam import Frame, MorphError, open_source
 from morph_dslam.extend import run_and_report_errors
 from morph_dslam.extend.registration import run_registration
-from morph_dslam.extend.slam import SlamRunOptions, run_slam
+from morph_dslam.extend.slam import run_slam
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.sources.live import PacedRecording
 from morph_dslam.tracking.drawing import AugmentedView
@@ -107,15 +107,13 @@ def make_large(folder: Path, model: Path) -> None:
 
     def scan() -> None:
         run_slam(
-            SlamRunOptions(
-                source=sequence / "frames",
-                camera=camera,
-                output=folder / "scan",
-                first=0,
-                last=SCANNED,
-                overwrite=True,
-                video=False,
-            )
+            source=sequence / "frames",
+            camera=camera,
+            output=folder / "scan",
+            first=0,
+            last=SCANNED,
+            overwrite=True,
+            video=False,
         )
         run_registration(folder / "scan" / "map.h5", model, camera, folder / "registration")
 

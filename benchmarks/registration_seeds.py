@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from morph_dslam import MorphError, load_camera
 from morph_dslam.extend.geometry import RigidTransform, cross_matrix, fit_similarity
 from morph_dslam.extend.registration import run_registration
-from morph_dslam.extend.slam import SlamRunOptions, run_slam
+from morph_dslam.extend.slam import run_slam
 from morph_dslam.slam.map_files import load_map
 from morph_dslam.slam.rigid_map import RigidMap
 from support import keep_sequence
@@ -119,14 +119,12 @@ def mapped(folder: Path, again: bool, last: int | None = None) -> None:
     """The map of a recording up to its frame ``last``, made once."""
     if again or not (folder / "scan" / "map.h5").is_file():
         run_slam(
-            SlamRunOptions(
-                source=folder / "recording" / "frames",
-                camera=folder / "recording" / "camera.yaml",
-                output=folder / "scan",
-                last=last,
-                video=False,
-                overwrite=True,
-            )
+            source=folder / "recording" / "frames",
+            camera=folder / "recording" / "camera.yaml",
+            output=folder / "scan",
+            last=last,
+            video=False,
+            overwrite=True,
         )
 
 

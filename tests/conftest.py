@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from morph_dslam.io.trajectory import Trajectory, save_trajectory
 from tests.support.rendered_anchored import make_anchored_recording
 from tests.support.rendered_anchored_rig import (
     load_truth,
@@ -19,7 +20,7 @@ from tests.support.rendered_anchored_rig import (
     make_mirrored_recording,
     make_rig_recording,
 )
-from tests.support.rendered_room import RoomFilm, hand_held
+from tests.support.rendered_room import RoomFilm, hand_held, write_film
 
 
 def pytest_configure(config):
@@ -58,6 +59,17 @@ def room_film(made_once):
 
     folder = made_once("room", make)
     return list(np.load(folder / "images.npy")), np.load(folder / "path.npy")
+
+
+@pytest.fixture(scope="session")
+def room_folder(room_film, made_once):
+    """The first 40 frames of the room: `film/`, `camera.yaml` and `truth.txt`."""
+
+    def make(folder):
+        write_film(folder, room_film[0][:40])
+        save_trajectory(folder / "truth.txt", Trajectory(np.arange(40) / 30.0, room_film[1][:40]))
+
+    return made_once("room_folder", make)
 
 
 @pytest.fixture(scope="session")

@@ -29,7 +29,7 @@ from morph_dslam.extend import run_and_report_errors
 from morph_dslam.extend.geometry import RigidTransform, rotation_exp
 from morph_dslam.extend.registration import registration_line, run_registration
 from morph_dslam.extend.reports import depth_line
-from morph_dslam.extend.slam import SlamRunOptions, run_slam
+from morph_dslam.extend.slam import run_slam
 from support import keep_sequence
 
 Array = NDArray[np.float64]
@@ -112,11 +112,7 @@ def run(arguments: argparse.Namespace) -> None:
         raise md.MorphError(f"there is no model {model}: build it with `python {HERE.name}/run.py` first")
     keep_sequence(scene, model, sequence)
     camera, frames = sequence / "camera.yaml", sequence / "frames"
-    run_slam(
-        SlamRunOptions(
-            source=frames, camera=camera, output=output / "scan", first=0, last=arguments.frozen_at, overwrite=True
-        )
-    )
+    run_slam(source=frames, camera=camera, output=output / "scan", first=0, last=arguments.frozen_at, overwrite=True)
     registration = run_registration(output / "scan" / "map.h5", model, camera, output / "registration")
     print(registration_line(registration))
     summary = md.track(

@@ -28,7 +28,7 @@ from morph_dslam.extend import run_and_report_errors
 from morph_dslam.extend.models import CarriedStructure, MaterialPoints, save_inner_structure
 from morph_dslam.extend.registration import registration_line, run_registration
 from morph_dslam.extend.reports import distances_to_surface
-from morph_dslam.extend.slam import SlamRunOptions, run_slam
+from morph_dslam.extend.slam import run_slam
 from morph_dslam.extend.studies import load_snapshot, place_inner_structure, snapshot_key
 from support import keep, keep_sequence
 
@@ -95,7 +95,7 @@ def track_from_map(folder: Path) -> dict:
     """Map the scene, find the liver in the map, and track from there."""
     camera, frames = SEQUENCE / "camera.yaml", SEQUENCE / "frames"
     scan, place = OUTPUT / "scan", OUTPUT / "registration"
-    run_slam(SlamRunOptions(source=frames, camera=camera, output=scan, first=0, last=FROZEN_AT, overwrite=True))
+    run_slam(source=frames, camera=camera, output=scan, first=0, last=FROZEN_AT, overwrite=True)
     print(registration_line(run_registration(scan / "map.h5", MODEL, camera, place)))
     return md.track(
         md.TrackOptions(

@@ -19,6 +19,7 @@ __all__ = [
     "Parameter",
     "ReducedModel",
     "Registration",
+    "Scene",
     "SolidProblem",
     "Status",
     "TrackOptions",
@@ -33,8 +34,10 @@ __all__ = [
     "load_camera",
     "load_model",
     "load_registration",
+    "load_scene",
     "load_study",
     "make_study",
+    "map_scene",
     "open_live",
     "open_source",
     "save_model",
@@ -52,6 +55,7 @@ _MODULES = {
     "Parameter": "model",
     "ReducedModel": "model",
     "Registration": "registration.registration",
+    "Scene": "slam.scene",
     "SolidProblem": "mechanics.solid",
     "Status": "tracking.outcomes",
     "TrackOptions": "tracking.track",
@@ -66,8 +70,10 @@ _MODULES = {
     "load_camera": "io.camera_files",
     "load_model": "model",
     "load_registration": "registration.registration",
+    "load_scene": "slam.scene",
     "load_study": "studies.study",
     "make_study": "studies.study",
+    "map_scene": "slam.scene",
     "open_live": "sources",
     "open_source": "sources",
     "save_model": "model",
@@ -88,6 +94,7 @@ if TYPE_CHECKING:  # the same for editors and type checkers
     from morph_dslam.reduction.report import write_build_report
     from morph_dslam.registration.registration import Registration, load_registration
     from morph_dslam.render.simulation import simulate
+    from morph_dslam.slam.scene import Scene, load_scene, map_scene
     from morph_dslam.sources import open_live, open_source
     from morph_dslam.sources.frames import Frame
     from morph_dslam.studies.build import build

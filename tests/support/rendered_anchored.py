@@ -14,7 +14,7 @@ from morph_dslam.geometry import fit_similarity
 from morph_dslam.io.camera_files import load_camera
 from morph_dslam.render.simulation import simulate
 from morph_dslam.slam.map_files import save_map
-from morph_dslam.slam.output import trajectory_of
+from morph_dslam.slam.scene import trajectory_of
 from morph_dslam.slam.slam import Slam
 from morph_dslam.sources import open_source
 from tests.support.scenes import write_scene

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import Camera
+from morph_dslam.geometry import fit_similarity
+from morph_dslam.io.camera_files import save_camera
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
+from morph_dslam.sources import Frame
 from tests.support.rendered_sequence import printed_texture
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -147,3 +151,54 @@ def hand_held(n, seed=0, reach=0.5):
     positions = waves[:, :3] * [reach, 0.4 * reach, 0.5 * reach]
     turns = waves[:, 3:] * [0.06, 0.22, 0.05]
     return np.array([pose(p, t) for p, t in zip(positions, turns, strict=True)])
+
+
+class Film:
+    """Images as a recording in memory, 30 a second; ``more`` are further fields of each `Frame`."""
+
+    name, fps = "film", 30.0
+
+    def __init__(self, images, more=None, first=0):
+        more = more or [{}] * len(images)
+        self.frames = [
+            Frame(first + i, (first + i) / 30.0, image, **m)
+            for i, (image, m) in enumerate(zip(images, more, strict=True))
+        ]
+        self.has_registered_depth = any("depth" in m for m in more)
+
+    def __len__(self):
+        return len(self.frames)
+
+    def __iter__(self):
+        return iter(self.frames)
+
+
+def follow(slam, images, more=None, first=0):
+    """What `Slam` makes of each image."""
+    frames = Film(images, more, first).frames
+    return [slam.process_frame(f.image, f.index, f.timestamp, f.depth, f.right) for f in frames]
+
+
+def write_film(folder, images, camera=CAMERA):
+    """Images as numbered PNG files in ``film``, and ``camera.yaml``."""
+    (folder / "film").mkdir(parents=True)
+    for index, image in enumerate(images):
+        cv2.imwrite(str(folder / "film" / f"{index:04d}.png"), image)
+    save_camera(folder / "camera.yaml", camera)
+
+
+def to_truth(trajectory, truth):
+    """The similarity transform from a path to the true poses (n, 4, 4), by its frame numbers."""
+    return fit_similarity(trajectory.positions, truth[trajectory.indices][:, :3, 3])
+
+
+def path_errors(trajectory, truth):
+    """Distances of the camera's centres after Sim(3), in parts of the length of the true path."""
+    expected = truth[trajectory.indices][:, :3, 3]
+    found = to_truth(trajectory, truth).apply(trajectory.positions)
+    return np.linalg.norm(found - expected, axis=1) / np.linalg.norm(np.diff(expected, axis=0), axis=1).sum()
+
+
+def off_the_walls(points):
+    """How far points (n, 3) are outside of the room's walls, x = -2, 2, and z = 4, and its floor, y = 1.3, metres."""
+    return np.maximum.reduce([np.abs(points[:, 0]) - 2.0, points[:, 2] - 4.0, points[:, 1] - 1.3])

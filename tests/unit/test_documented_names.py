@@ -18,7 +18,8 @@ from morph_dslam.mechanics.materials.library import constant_quantities, laws
 from morph_dslam.registration.board import BoardFile
 from morph_dslam.registration.guess import GuessFile, PictureFile
 from morph_dslam.render.scene_file import Scene
-from morph_dslam.slam.output import write_run as write_slam_run
+from morph_dslam.slam.run import write_run as write_slam_run
+from morph_dslam.slam.scene import finish_scene
 from morph_dslam.slam.slam import Slam
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.sheet_study import SheetStudy
@@ -87,7 +88,7 @@ def test_every_result_of_a_run_is_documented(tmp_path):
 def test_every_result_of_camera_tracking_is_documented(tmp_path):
     slam = Slam(Camera(640, 480, 528.0, 528.0, 320.0, 240.0))
     frame = slam.process_frame(np.zeros((480, 640, 3), np.uint8), 0, 0.0)
-    found = set(write_slam_run(tmp_path, slam, [frame.record(is_final=False)], {}))
+    found = set(write_slam_run(tmp_path, finish_scene(slam, [frame.record(is_final=False)]), {}))
     columns = (tmp_path / "frames.csv").read_text().splitlines()[0].split(",")
     found |= {name for name in columns if not name.endswith("_ms")}
     assert len(found) > 35

@@ -167,7 +167,7 @@ def test_every_program_is_run_by_a_test():
         "materials": 1,
         "meshes": 1,
         "model-file": 2,
-        "slam": 1,
+        "slam": 2,
         "solid-study": 2,
         "tracking": 1,
     }

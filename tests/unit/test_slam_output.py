@@ -3,13 +3,13 @@
 import cv2
 import numpy as np
 
-from morph_dslam.slam.frame_images import SlamFrame
-from morph_dslam.slam.output import draw_frame
+from morph_dslam.slam.result import SlamFrame, SlamStatus
 from morph_dslam.slam.rigid_map import NOWHERE
+from morph_dslam.slam.run import draw_frame
 
 
 def drawn(height, pixel):
-    frame = SlamFrame(7, 0.2, "tracked", "", candidates=np.array([pixel], dtype=float), points=NOWHERE)
+    frame = SlamFrame(7, 0.2, SlamStatus.TRACKED, candidates=np.array([pixel], dtype=float), points=NOWHERE)
     return draw_frame(np.full((height, height * 4 // 3, 3), 128, dtype=np.uint8), frame)
 
 

@@ -60,26 +60,25 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Map the scene and print the figures."""
-    from morph_dslam.slam.run import SlamRunOptions, run_slam
+    from morph_dslam.slam.options import SlamOptions
+    from morph_dslam.slam.run import run_slam
 
-    first, last = arguments.range
     summary = run_slam(
-        SlamRunOptions(
-            source=arguments.source,
-            camera=arguments.camera,
-            output=arguments.output,
-            first=first,
-            last=last,
-            map_path=arguments.map,
-            trajectory=arguments.trajectory,
-            images=arguments.images,
+        arguments.source,
+        arguments.camera,
+        arguments.output,
+        *arguments.range,
+        options=SlamOptions(
+            use_depth=not arguments.no_depth,
             extend=arguments.extend,
             freeze_at=arguments.freeze_at,
             freeze_when_deforming=arguments.freeze_when_deforming,
-            use_depth=not arguments.no_depth,
-            video=not arguments.no_video,
-            overwrite=arguments.overwrite,
-        )
+        ),
+        map_path=arguments.map,
+        trajectory=arguments.trajectory,
+        images=arguments.images,
+        video=not arguments.no_video,
+        overwrite=arguments.overwrite,
     )
     for flag in summary["flags"]:
         print(f"note: {flag}")

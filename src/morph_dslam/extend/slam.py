@@ -1,8 +1,21 @@
 """Tracking and mapping of a rigid scene, frame by frame, beside `morph_dslam.map_scene`."""
 
-from morph_dslam.slam.frame_images import SlamFrame
-from morph_dslam.slam.output import trajectory_of
-from morph_dslam.slam.run import SlamRunOptions, run_slam, warm_up
+from morph_dslam.io.camera_files import load_camera_or_pair
+from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.result import NoPose, SlamFrame, SlamReason, SlamStatus
+from morph_dslam.slam.run import run_slam
+from morph_dslam.slam.scene import trajectory_of, warm_up
 from morph_dslam.slam.slam import Slam
 
-__all__ = ["Slam", "SlamFrame", "SlamRunOptions", "run_slam", "trajectory_of", "warm_up"]
+__all__ = [
+    "NoPose",
+    "Slam",
+    "SlamFrame",
+    "SlamOptions",
+    "SlamReason",
+    "SlamStatus",
+    "load_camera_or_pair",
+    "run_slam",
+    "trajectory_of",
+    "warm_up",
+]

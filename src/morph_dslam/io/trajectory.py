@@ -31,15 +31,26 @@ class Trajectory:
 
     Attributes
     ----------
-    timestamps : (n,) ascending, seconds; frame numbers where the file has no times.
-    world_from_camera : (n, 4, 4), translations in metres, or in the map's unit where it has no scale.
+    timestamps : (n,) ascending, seconds; frame numbers where the file has no times
+    world_from_camera : (n, 4, 4), translations in metres, or in the map's unit where it has no scale
+    indices : (n,) frame numbers; 0, 1, ... where they are not known
     """
 
     timestamps: Array
     world_from_camera: Array
+    indices: NDArray[np.int64] = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        if self.indices is None:
+            object.__setattr__(self, "indices", np.arange(len(self.timestamps)))
 
     def __len__(self) -> int:
         return len(self.timestamps)
+
+    @property
+    def camera_from_world(self) -> Array:
+        """The inverse poses (n, 4, 4)."""
+        return np.linalg.inv(self.world_from_camera).astype(np.float64)
 
     @property
     def positions(self) -> Array:

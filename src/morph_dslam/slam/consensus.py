@@ -12,8 +12,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.options import INLIER_PX, LEAST_INLIERS
 from morph_dslam.slam.pose import PoseEstimate, find_pose, refine_pose, reprojection_errors
+from morph_dslam.slam.result import NoPose, SlamReason
 from morph_dslam.slam.rigid_map import Followed, RigidMap
 
 Array = NDArray[np.float64]
@@ -41,7 +42,7 @@ MOST_MISFIT, CLEARLY_BETTER = 0.35, 0.85
 SENIOR_AGE, LEAST_SENIORS = 3, 30
 
 #: Points that leave together, by a motion of their own, and are as many as this part of those that stay: then
-#: it cannot be told which of them stands still.
+#: which of them stands still is ambiguous.
 RIVAL_SHARE = 0.6
 
 
@@ -58,24 +59,24 @@ class Sight:
     seen : map points, and where the frame shows them.
     """
 
-    def __init__(self, rigid_map: RigidMap, seen: Followed, intrinsics: Array, options: SlamOptions) -> None:
-        self._seen, self._intrinsics, self._options = seen, intrinsics, options
+    def __init__(self, rigid_map: RigidMap, seen: Followed, intrinsics: Array) -> None:
+        self._seen, self._intrinsics = seen, intrinsics
         self._positions, self._baseline_px = rigid_map.positions[seen.ids], rigid_map.baseline_px
         senior = rigid_map.first_keyframe[seen.ids] < len(rigid_map.keyframes) - SENIOR_AGE
         self._judges = senior if senior.sum() >= LEAST_SENIORS else np.ones(len(senior), dtype=bool)
         usual_px = rigid_map.usual_rms_px
         self._huber_px = min(HUBER_RATIO * usual_px, MOST_HUBER_PX)
-        self._inlier_px = min(max(INLIER_RATIO * usual_px, LEAST_INLIER_PX), options.inlier_px)
+        self._inlier_px = min(max(INLIER_RATIO * usual_px, LEAST_INLIER_PX), INLIER_PX)
         self._core_px = min(max(CORE_RATIO * usual_px, LEAST_CORE_PX), self._inlier_px)
 
-    def pose(self, predicted: Array) -> PoseEstimate | str:
+    def pose(self, predicted: Array) -> PoseEstimate | NoPose:
         """The pose, from a predicted one (4, 4), or why there is none.
 
         Least squares first; where that is worse than usual, RANSAC with P3P (Fischler and Bolles 1981).
         """
-        n_seen, least = len(self._seen.ids), self._options.least_inliers
+        n_seen, least = len(self._seen.ids), LEAST_INLIERS
         if n_seen < least:
-            return f"only {n_seen} map points were found in this frame"
+            return NoPose(SlamReason.FEW_POINTS, (n_seen,))
         errors = self._errors(predicted)
         near = errors < max(TRUSTED_RATIO * float(np.median(errors)), self._inlier_px)
         pose = self._fit(predicted, near)
@@ -83,9 +84,9 @@ class Sight:
             pose = self._of_most(pose)
         n = int(pose.inliers.sum())
         if n < max(least, 0.3 * n_seen):
-            return f"only {n} of {n_seen} map points agree on a pose"
+            return NoPose(SlamReason.FEW_INLIERS, (n, n_seen))
         if self._has_rival(pose):
-            return "two parts of the scene move apart, and it cannot be told which of them stands still"
+            return NoPose(SlamReason.RIVAL_MOTIONS)
         return pose
 
     def _errors(self, pose: Array) -> Array:
@@ -110,7 +111,7 @@ class Sight:
     def _of_most(self, fitted: PoseEstimate) -> PoseEstimate:
         """The pose that the judging points fit clearly better than ``fitted``, if there is one."""
         judges = self._judges
-        found = self._found(judges, self._core_px, self._options.least_inliers)
+        found = self._found(judges, self._core_px, LEAST_INLIERS)
         if found is None:
             return fitted
         near = judges & (self._errors(found.camera_from_world) < self._inlier_px)
@@ -121,5 +122,5 @@ class Sight:
     def _has_rival(self, pose: PoseEstimate) -> bool:
         """Whether judges that do not fit agree on another pose, and are nearly as many as the rest."""
         others, n_fit = self._judges & ~pose.inliers, int((self._judges & pose.inliers).sum())
-        enough = max(self._options.least_inliers, int(np.ceil(RIVAL_SHARE * n_fit)))
+        enough = max(LEAST_INLIERS, int(np.ceil(RIVAL_SHARE * n_fit)))
         return bool(others.sum() >= enough) and self._found(others, self._inlier_px, enough) is not None

@@ -14,12 +14,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.options import FLOW, LEAST_CORRELATION, PATCH_HALF
 from morph_dslam.tracking.patches import FlowOptions, follow, patch_correlation
 
 Array = NDArray[np.float64]
 
 Image = NDArray[np.uint8]
+
+#: Largest disparity of stereo pairs, pixels; nearer points have no depth from one frame.
+MOST_DISPARITY_PX = 128
 
 #: Disparities of neighbouring pixels of a depth image that differ by more are an edge, pixels.
 MOST_STEP = 1.5
@@ -78,11 +81,10 @@ class StereoImages:
 
     left: Image
     right: Image
-    options: SlamOptions
 
     def right_columns(self, pixels: Array, expected: Array | None = None) -> Array:
         """As `FrameDepth` says: the place in the row that looks most alike, refined by Lucas-Kanade."""
-        low, high = np.zeros(len(pixels)), np.full(len(pixels), float(self.options.most_disparity_px))
+        low, high = np.zeros(len(pixels)), np.full(len(pixels), float(MOST_DISPARITY_PX))
         if expected is not None:
             disparity = np.nan_to_num(pixels[:, 0] - expected)
             low, high = np.maximum(disparity - SEARCH_PX, 0.0), disparity + SEARCH_PX
@@ -90,9 +92,9 @@ class StereoImages:
         rough = _row_disparities(self.left, self.right, pixels, low, high, ROW_HALF, clearness)
         result, rows = np.full(len(pixels), np.nan), np.flatnonzero(np.isfinite(rough))
         seen, guesses = pixels[rows], pixels[rows] - np.column_stack([rough[rows], np.zeros(len(rows))])
-        found, good = follow(self.left, self.right, seen, guesses, FlowOptions(self.options.flow.window, 0))
-        likeness = patch_correlation(self.left, self.right, seen, found, self.options.patch_half)
-        good &= (likeness > self.options.least_correlation) & (np.abs(found[:, 1] - seen[:, 1]) < MOST_ROW_ERROR)
+        found, good = follow(self.left, self.right, seen, guesses, FlowOptions(FLOW.window, 0))
+        likeness = patch_correlation(self.left, self.right, seen, found, PATCH_HALF)
+        good &= (likeness > LEAST_CORRELATION) & (np.abs(found[:, 1] - seen[:, 1]) < MOST_ROW_ERROR)
         result[rows[good]] = found[good, 0]
         return _near(result, expected)
 

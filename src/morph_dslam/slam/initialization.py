@@ -15,13 +15,26 @@ from numpy.typing import NDArray
 from morph_dslam.geometry import rotation_log
 from morph_dslam.slam.bundle_adjustment import Observations, adjust
 from morph_dslam.slam.frame_images import FrameView
-from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.options import FLOW, LEAST_CORRELATION, LEAST_START_POINTS, PATCH_HALF
 from morph_dslam.slam.pose import TwoViewHypothesis, rays, refine_pose, reprojection_errors, two_view_hypotheses
+from morph_dslam.slam.result import NoPose, SlamReason
 from morph_dslam.tracking.patches import follow, patch_correlation, spread_corners
 
 Array = NDArray[np.float64]
 
 Mask = NDArray[np.bool_]
+
+#: Corners that are followed from the first view.
+START_CORNERS = 500
+
+#: Median angle between the first two views' rays, degrees.
+START_PARALLAX_DEG = 1.2
+
+#: Error in pixels, and share of the points that must fit, in three views.
+START_RMS_PX, START_SHARE = 1.0, 0.9
+
+#: How much larger a rejected hypothesis' squared error must be than the accepted one's.
+START_CLEARNESS = 1.5
 
 #: Squared error at which an observation stops to count more, px^2.
 MOST_SQUARED = 16.0
@@ -84,9 +97,8 @@ class MapInitializer:
     intrinsics : (4,) fx, fy, cx, cy of the undistorted images.
     """
 
-    def __init__(self, intrinsics: Array, options: SlamOptions) -> None:
+    def __init__(self, intrinsics: Array) -> None:
         self._intrinsics = intrinsics
-        self._options = options
         self.reset()
 
     def reset(self) -> None:
@@ -101,61 +113,62 @@ class MapInitializer:
         """Pixels (n, 2) of the corners followed in the newest frame."""
         return self._pixels[self._alive]
 
-    def process(self, frame: FrameView) -> MapStart | str:
+    def process(self, frame: FrameView) -> MapStart | NoPose:
         """Take in a frame; a start, or the reason why there is none yet."""
         if self._first is None:
             return self._take_reference(frame)
         self._follow(frame.normalized)
-        if self._alive.sum() < max(self._options.least_start_points, 0.4 * len(self._alive)):
+        if self._alive.sum() < max(LEAST_START_POINTS, 0.4 * len(self._alive)):
             reason = self._take_reference(frame)
-            return f"the first view was lost from sight; {reason}"
+            return NoPose(SlamReason.FIRST_VIEW_LOST, cause=reason)
         view = View(frame, self._pixels.copy())
         return self._verify(view) if self._second is not None else self._propose(view)
 
-    def _take_reference(self, frame: FrameView) -> str:
+    def _take_reference(self, frame: FrameView) -> NoPose:
         mask = np.zeros(frame.normalized.shape, dtype=np.uint8)
-        border = self._options.flow.window
+        border = FLOW.window
         mask[border:-border, border:-border] = 255
-        corners = spread_corners(frame.normalized, mask, self._options.start_corners)
+        corners = spread_corners(frame.normalized, mask, START_CORNERS)
         self.reset()
-        if len(corners) < self._options.least_start_points:
-            return f"too little texture: {len(corners)} corners"
+        if len(corners) < LEAST_START_POINTS:
+            return NoPose(SlamReason.LITTLE_TEXTURE, (len(corners),))
         self._first = View(frame, corners)
         self._pixels, self._alive = corners.copy(), np.ones(len(corners), dtype=bool)
-        return "waiting for the camera to move"
+        return NoPose(SlamReason.NO_MOTION)
 
     def _follow(self, normalized: NDArray[np.uint8]) -> None:
         assert self._first is not None
         rows = np.flatnonzero(self._alive)
-        start, flow = self._first.pixels[rows], self._options.flow
+        start, flow = self._first.pixels[rows], FLOW
         first = self._first.frame.normalized
         found, ok = follow(first, normalized, start, self._pixels[rows], flow)
         back, ok_back = follow(normalized, first, found, start, flow)
         ok &= ok_back & (np.linalg.norm(back - start, axis=1) < 1.0)
-        likeness = patch_correlation(first, normalized, start, found, self._options.patch_half)
-        ok &= likeness > self._options.least_correlation
+        likeness = patch_correlation(first, normalized, start, found, PATCH_HALF)
+        ok &= likeness > LEAST_CORRELATION
         self._alive[rows[~ok]] = False
         self._pixels[rows] = found
 
-    def _propose(self, view: View) -> str:
+    def _propose(self, view: View) -> NoPose:
         """List what two views allow."""
         assert self._first is not None
         rows = np.flatnonzero(self._alive)
         first, second = self._first.pixels[rows], view.pixels[rows]
-        needed = np.radians(self._options.start_parallax_deg) * self._intrinsics[0]
+        needed = np.radians(START_PARALLAX_DEG) * self._intrinsics[0]
         # No triangulation needed to see that the camera has hardly moved, or only turned.
         if turn_residual_px(first, second, self._intrinsics) < 0.25 * needed:
-            return "not enough parallax: the camera has to move sideways, not only turn"
+            return NoPose(SlamReason.ONLY_TURNED)
         hypotheses = two_view_hypotheses(first, second, self._intrinsics)
-        if not hypotheses or hypotheses[0].good.sum() < self._options.start_share * len(rows):
-            return "two views do not agree on a motion yet"
+        if not hypotheses or hypotheses[0].good.sum() < START_SHARE * len(rows):
+            return NoPose(SlamReason.NO_TWO_VIEW_MOTION)
         likely = [h for h in hypotheses if h.good.sum() >= 0.6 * hypotheses[0].good.sum()]
-        if max(h.parallax_deg for h in likely) < self._options.start_parallax_deg:
-            return f"not enough parallax: {max(h.parallax_deg for h in likely):.1f} degrees"
+        parallax_deg = max(h.parallax_deg for h in likely)
+        if parallax_deg < START_PARALLAX_DEG:
+            return NoPose(SlamReason.LITTLE_PARALLAX, (parallax_deg,))
         self._second, self._hypotheses, self._rows = view, likely, rows
-        return f"waiting for a third view to choose between {len(likely)} possible motions"
+        return NoPose(SlamReason.THIRD_VIEW_NEEDED, (len(likely),))
 
-    def _verify(self, view: View) -> MapStart | str:
+    def _verify(self, view: View) -> MapStart | NoPose:
         """Accept the hypothesis that a third view singles out."""
         assert self._first is not None
         assert self._second is not None
@@ -164,14 +177,14 @@ class MapInitializer:
         between = turn_residual_px(self._second.pixels[rows], view.pixels[rows], self._intrinsics)
         before = turn_residual_px(self._first.pixels[rows], self._second.pixels[rows], self._intrinsics)
         if between < 0.3 * before:
-            return "waiting for a third view from another place"
+            return NoPose(SlamReason.THIRD_VIEW_TOO_NEAR)
         views = (self._first, self._second, view)
         pixels = [v.pixels[rows] for v in views]
         found = [self._structure(h, h.points[alive], pixels) for h in self._hypotheses]
         found = sorted((s for s in found if s is not None), key=lambda s: s.mean_squared)
         self._open_views += 1
         reason = self._objection(found, len(rows))
-        if reason:
+        if reason is not None:
             if self._open_views >= MOST_OPEN_VIEWS:
                 self._drop_second()
             return reason
@@ -188,7 +201,7 @@ class MapInitializer:
     def _structure(self, hypothesis: TwoViewHypothesis, points: Array, pixels: list[Array]) -> Structure | None:
         """A hypothesis adjusted to three views; None if the third camera cannot be placed."""
         known = np.isfinite(points[:, 0])
-        if known.sum() < self._options.least_start_points:
+        if known.sum() < LEAST_START_POINTS:
             return None
         pose = refine_pose(
             hypothesis.second_from_first, points[known], pixels[2][known], self._intrinsics, inlier_px=6.0
@@ -212,20 +225,19 @@ class MapInitializer:
         all_points[known] = adjusted.points
         return Structure(adjusted.camera_from_world, all_points, fits, rms, mean_squared)
 
-    def _objection(self, found: list[Structure], n_points: int) -> str:
-        """Why the best structure may not be accepted; empty if it may."""
-        options = self._options
+    def _objection(self, found: list[Structure], n_points: int) -> NoPose | None:
+        """Why the best structure may not be accepted; None if it may."""
         if not found:
-            return "no motion of two views explains the third"
+            return NoPose(SlamReason.THIRD_VIEW_UNEXPLAINED)
         best = found[0]
-        if best.fits.sum() < max(options.least_start_points, options.start_share * n_points):
-            return f"only {best.fits.sum()} of {n_points} points fit a rigid scene in three views"
-        if best.rms_px > options.start_rms_px:
-            return f"three views fit a rigid scene to {best.rms_px:.1f} px only"
+        if best.fits.sum() < max(LEAST_START_POINTS, START_SHARE * n_points):
+            return NoPose(SlamReason.FEW_RIGID_POINTS, (int(best.fits.sum()), n_points))
+        if best.rms_px > START_RMS_PX:
+            return NoPose(SlamReason.LARGE_RIGID_ERROR, (best.rms_px,))
         for other in found[1:]:
-            if other.mean_squared < options.start_clearness * best.mean_squared and not _same(best, other):
-                return "two motions explain the views about equally well"
-        return ""
+            if other.mean_squared < START_CLEARNESS * best.mean_squared and not _same(best, other):
+                return NoPose(SlamReason.AMBIGUOUS_MOTION)
+        return None
 
 
 def _same(one: Structure, other: Structure) -> bool:

@@ -10,12 +10,22 @@ from numpy.typing import NDArray
 
 from morph_dslam.slam.bundle_adjustment import Adjustment, Observations, adjust
 from morph_dslam.slam.depth import FrameDepth, depth_of
-from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.options import FLOW
 from morph_dslam.slam.pose import check_points, project, rays, reprojection_errors, triangulate, world_points
 from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, Followed, Indices, Keyframe, RigidMap
 from morph_dslam.tracking.patches import spread_corners
 
 Array = NDArray[np.float64]
+
+#: Disparity from which the depth of a point in one frame makes it a map point, pixels; the baseline of depth images
+#: counts as 8 cm.
+LEAST_DISPARITY_PX = 10.0
+
+#: Points and candidates that a keyframe is filled up to, and how far new corners keep from followed points, pixels.
+MAP_CORNERS, CORNER_DISTANCE_PX = 450, 9
+
+#: Angle between rays from which a candidate becomes a map point.
+TRIANGULATION_DEG = 1.2
 
 #: Points that miss a view by more than this multiple of the usual error are at no place; bounds in pixels.
 NEW_POINT_MISS_RATIO, NEW_POINT_LEAST_MISS_PX, NEW_POINT_MOST_MISS_PX = 4.0, 1.5, 4.0
@@ -27,17 +37,17 @@ SAME_PIXEL, SAME_DEPTH = 2.0, 0.1
 LEAST_MISSING = 10
 
 
-def free_corners(normalized: NDArray[np.uint8], taken: Array, options: SlamOptions) -> Array:
+def free_corners(normalized: NDArray[np.uint8], taken: Array) -> Array:
     """Corners (c, 2) of a contrast-normalized image, as many as are missing, away from the pixels (n, 2) taken."""
-    missing = options.map_corners - len(taken)
+    missing = MAP_CORNERS - len(taken)
     if missing < LEAST_MISSING:
         return np.empty((0, 2))
     mask = np.full(normalized.shape, 255, dtype=np.uint8)
     columns, rows = np.rint(taken).astype(int).clip(0, np.array(mask.shape[::-1]) - 1).T
     mask[rows, columns] = 0
-    reach = 2 * options.corner_distance_px + 1
+    reach = 2 * CORNER_DISTANCE_PX + 1
     mask = np.asarray(cv2.erode(mask, np.ones((reach, reach), np.uint8)), dtype=np.uint8)
-    border = options.flow.window
+    border = FLOW.window
     mask[:border], mask[-border:], mask[:, :border], mask[:, -border:] = 0, 0, 0, 0
     return spread_corners(normalized, mask, missing)
 
@@ -45,8 +55,8 @@ def free_corners(normalized: NDArray[np.uint8], taken: Array, options: SlamOptio
 class PointMaker:
     """Adds the points that a keyframe makes known to a map."""
 
-    def __init__(self, rigid_map: RigidMap, intrinsics: Array, options: SlamOptions) -> None:
-        self._map, self._intrinsics, self._options = rigid_map, intrinsics, options
+    def __init__(self, rigid_map: RigidMap, intrinsics: Array) -> None:
+        self._map, self._intrinsics = rigid_map, intrinsics
 
     def add_candidates(self, number: int, corners: Array, depth: float) -> None:
         """Follow corners (c, 2) of a keyframe; their depth is a guess until they are triangulated."""
@@ -62,7 +72,7 @@ class PointMaker:
             return
         rows = np.flatnonzero(rigid_map.state[keyframe.point_ids] == CANDIDATE)
         right = depth.right_columns(keyframe.pixels[rows])
-        near = keyframe.pixels[rows, 0] - right >= self._options.least_disparity_px
+        near = keyframe.pixels[rows, 0] - right >= LEAST_DISPARITY_PX
         rows, right = rows[near], right[near]
         columns = keyframe.right.copy()
         columns[rows] = right
@@ -92,7 +102,7 @@ class PointMaker:
         first_rays, second_rays = rays(first_pixels, self._intrinsics), rays(pixels, self._intrinsics)
         a, b = first_rays @ start[:3, :3], second_rays @ now[:3, :3]
         cosine = np.einsum("nx,nx->n", a, b) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
-        open_enough = cosine < np.cos(np.radians(self._options.triangulation_deg))
+        open_enough = cosine < np.cos(np.radians(TRIANGULATION_DEG))
         if not open_enough.any():
             return ids[:0]
         points = triangulate(start, now, first_rays[open_enough], second_rays[open_enough])
@@ -146,6 +156,9 @@ HUBER_RATIO, LEAST_HUBER_PX, MOST_HUBER_PX = 2.0, 0.2, 1.5
 
 TOLERANCE = 1e-4
 
+#: Keyframes that local bundle adjustment moves, and those that hold it.
+WINDOW, FIXED_WINDOW = 8, 6
+
 
 @dataclass(frozen=True)
 class MapProblem:
@@ -196,18 +209,18 @@ def usual_error(errors: Array) -> float:
     return float(np.median(errors)) if len(errors) else float("inf")
 
 
-def local_window(rigid_map: RigidMap, options: SlamOptions) -> tuple[Indices, Indices]:
+def local_window(rigid_map: RigidMap) -> tuple[Indices, Indices]:
     """The newest keyframe and those that see the same points, to be adjusted, and others to hold them."""
     newest = len(rigid_map.keyframes) - 1
     ids = rigid_map.keyframes[newest].point_ids
     shared = rigid_map.shared_points(ids[rigid_map.state[ids] == GOOD])
     shared[newest] = np.iinfo(np.int64).max
-    window = np.argsort(-shared, kind="stable")[: options.window]
+    window = np.argsort(-shared, kind="stable")[:WINDOW]
     window = window[shared[window] > 0]
     local = np.unique(np.concatenate([rigid_map.keyframes[k].point_ids for k in window]))
     around = rigid_map.shared_points(local[rigid_map.state[local] == GOOD])
     around[window] = 0
-    holders = np.argsort(-around, kind="stable")[: options.fixed_window]
+    holders = np.argsort(-around, kind="stable")[:FIXED_WINDOW]
     return np.sort(window), np.sort(holders[around[holders] > 0])
 
 

@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.slam.frame_images import FrameView
 from morph_dslam.slam.mapping import Mapper, Work, one_step
-from morph_dslam.slam.options import SlamOptions
 from morph_dslam.slam.pose import project
 from morph_dslam.slam.relocalization import Relocalizer
 from morph_dslam.slam.rigid_map import GOOD, Followed, RigidMap
@@ -180,12 +179,12 @@ class LoopCloser:
     n_closed : loops closed so far.
     """
 
-    def __init__(self, rigid_map: RigidMap, intrinsics: Array, options: SlamOptions, mapper: Mapper) -> None:
+    def __init__(self, rigid_map: RigidMap, intrinsics: Array, mapper: Mapper) -> None:
         self._map, self._intrinsics, self._mapper = rigid_map, intrinsics, mapper
         # Loops are looked for in the map as it was, while it goes on growing.
         self._copy = RigidMap(rigid_map.baseline_px)
-        self._relocaliser = Relocalizer(self._copy, intrinsics, options)
-        self._tracker = Tracker(self._copy, intrinsics, options)
+        self._relocaliser = Relocalizer(self._copy, intrinsics)
+        self._tracker = Tracker(self._copy, intrinsics)
         self._found: Loop | None = None
         self.n_closed = 0
 

@@ -14,7 +14,7 @@ from morph_dslam.io.colmap import ColmapImage, ColmapModel
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam.frame_images import OCTAVES, FrameImages, FrameView, describe
 from morph_dslam.slam.mapping import Mapper, do_all
-from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.options import FLOW, INLIER_PX, LEAST_START_POINTS, PATCH_HALF
 from morph_dslam.slam.pose import PoseEstimate, inside, inverse, reprojection_errors
 from morph_dslam.slam.rigid_map import GOOD, NOWHERE, POINT_ARRAYS, Followed, Keyframe, RigidMap
 from morph_dslam.slam.tracking import Tracked, Tracker
@@ -34,9 +34,7 @@ FAR = 100.0
 LEAST_FOUND = 0.4
 
 
-def map_from_trajectory(
-    trajectory: Trajectory, source: FrameSource, images: FrameImages, options: SlamOptions
-) -> RigidMap:
+def map_from_trajectory(trajectory: Trajectory, source: FrameSource, images: FrameImages) -> RigidMap:
     """Points triangulated from the frames of a recording that have a pose, with these poses.
 
     Lengths are the trajectory's.
@@ -47,8 +45,8 @@ def map_from_trajectory(
         If fewer than three frames have a pose, or too few points obey the poses.
     """
     rigid_map, intrinsics = RigidMap(), np.asarray(images.camera.intrinsics)
-    mapper = Mapper(rigid_map, intrinsics, options, hold_poses=True, unknown_depth=FAR * trajectory.length)
-    tracker = _PosedTracker(rigid_map, intrinsics, options)
+    mapper = Mapper(rigid_map, intrinsics, hold_poses=True, unknown_depth=FAR * trajectory.length)
+    tracker = _PosedTracker(rigid_map, intrinsics)
     times, n_posed = [], 0
     for frame in source:
         times.append(frame.timestamp)
@@ -66,19 +64,12 @@ def map_from_trajectory(
         if mapper.wants_keyframe(tracked, view.index):
             do_all(mapper.insert(tracked, view))
             tracker.points = rigid_map.keyframes[-1].seen
-    _check(trajectory, source, options, n_posed, times, rigid_map)
+    _check(trajectory, source, n_posed, times, rigid_map)
     mapper.adjust_all()
     return rigid_map
 
 
-def _check(
-    trajectory: Trajectory,
-    source: FrameSource,
-    options: SlamOptions,
-    n_posed: int,
-    times: list[float],
-    rigid_map: RigidMap,
-) -> None:
+def _check(trajectory: Trajectory, source: FrameSource, n_posed: int, times: list[float], rigid_map: RigidMap) -> None:
     """Refuse what gives no map."""
     if n_posed < 3:
         raise MapError(
@@ -87,7 +78,7 @@ def _check(
             f"{trajectory.timestamps[-1]:.3f} s, and may differ by {1e3 * MOST_TIME_DIFFERENCE:.0f} ms"
         )
     share = float(rigid_map.n_found.sum() / max(rigid_map.n_expected.sum(), 1))
-    if share < LEAST_FOUND or len(rigid_map.good) < options.least_start_points:
+    if share < LEAST_FOUND or len(rigid_map.good) < LEAST_START_POINTS:
         raise MapError(
             f"the poses of the trajectory do not fit the images of {source.name}: "
             f"{len(rigid_map.good)} points were made, found again in {share:.0%} of the frames. Check that "
@@ -101,15 +92,14 @@ class _PosedTracker(Tracker):
 
     def track_at(self, normalized: NDArray[np.uint8], camera_from_world: Array) -> Tracked:
         """The points of the next frame, at its pose (4, 4)."""
-        options = self._options
-        flow = FlowOptions(options.flow.window, options.flow.levels + 1)
+        flow = FlowOptions(FLOW.window, FLOW.levels + 1)
         found = self._follow(normalized, camera_from_world, flow)
         found = found.joined(self._search(normalized, camera_from_world, found.ids))
         known = self._map.state[found.ids] == GOOD
         positions, pixels = self._map.positions[found.ids[known]], found.pixels[known]
         errors = reprojection_errors(camera_from_world, positions, pixels, self._intrinsics)
         rms = float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0
-        pose = PoseEstimate(camera_from_world, np.zeros((6, 6)), errors < options.inlier_px, rms)
+        pose = PoseEstimate(camera_from_world, np.zeros((6, 6)), errors < INLIER_PX, rms)
         result = self._tracked(normalized, pose, found, NOWHERE)
         self.camera_from_world, self.points = camera_from_world, result.points
         return result
@@ -122,9 +112,11 @@ FORMAT, VERSION = "morph-dslam map", 3
 
 KEYFRAME_ARRAYS = ("normalized", "camera_from_world", "point_ids", "pixels", "right", "described_ids", "descriptors")
 
+TRAJECTORY_ARRAYS = ("timestamps", "world_from_camera", "indices")
 
-def save_map(path: Path, rigid_map: RigidMap, camera: Camera) -> None:
-    """Write points, keyframes with their contrast-normalized images, and the camera that they are of, as HDF5."""
+
+def save_map(path: Path, rigid_map: RigidMap, camera: Camera, trajectory: Trajectory | None = None) -> None:
+    """Write points, keyframes with their contrast-normalized images, their camera, and its path, as HDF5."""
     with h5py.File(path, "w") as file:
         file.attrs.update({"format": FORMAT, "version": VERSION, "usual_rms_px": rigid_map.usual_rms_px})
         file.attrs["baseline_px"] = rigid_map.baseline_px
@@ -142,10 +134,17 @@ def save_map(path: Path, rigid_map: RigidMap, camera: Camera) -> None:
             for name in KEYFRAME_ARRAYS:
                 packed = {"compression": "gzip", "compression_opts": 1} if name == "normalized" else {}
                 group.create_dataset(name, data=getattr(keyframe, name), **packed)
+        for name in TRAJECTORY_ARRAYS if trajectory is not None else ():
+            file[f"trajectory/{name}"] = getattr(trajectory, name)
 
 
 def load_map(path: Path, camera: Camera) -> RigidMap:
-    """Read a map.
+    """The map alone of a file, as `load_scene` reads it."""
+    return load_map_and_trajectory(path, camera)[0]
+
+
+def load_map_and_trajectory(path: Path, camera: Camera) -> tuple[RigidMap, Trajectory]:
+    """Read a map and the path of the run that made it, which is empty where the file holds none.
 
     Raises
     ------
@@ -156,7 +155,9 @@ def load_map(path: Path, camera: Camera) -> RigidMap:
         raise MapError(f"there is no map {path}")
     try:
         with h5py.File(path, "r") as file:
-            return _read(path, file, camera)
+            none = Trajectory(np.empty(0), np.empty((0, 4, 4)))
+            path_of_run = [np.asarray(file[f"trajectory/{name}"]) for name in TRAJECTORY_ARRAYS if "trajectory" in file]
+            return _read(path, file, camera), Trajectory(*path_of_run) if path_of_run else none
     except (OSError, KeyError) as error:
         raise MapError(f"{path} is no map of `morph slam`, or damaged: {error}") from error
 
@@ -194,7 +195,7 @@ def _read(path: Path, file: h5py.File, camera: Camera) -> RigidMap:
 MOST_ERROR_PX = 4.0
 
 
-def map_from_colmap(model: ColmapModel, source: FrameSource, images: FrameImages, options: SlamOptions) -> RigidMap:
+def map_from_colmap(model: ColmapModel, source: FrameSource, images: FrameImages) -> RigidMap:
     """The points of a model, with the frames of a recording that are its images as keyframes.
 
     A frame is an image if its number is the last one in the image's name. Lengths are the model's.
@@ -212,7 +213,7 @@ def map_from_colmap(model: ColmapModel, source: FrameSource, images: FrameImages
         numbers.append(frame.index)
         if frame.index in wanted:
             view = images.prepare(frame.image, frame.index, frame.timestamp)
-            errors.append(_add_keyframe(rigid_map, wanted[frame.index], view, model, images, options))
+            errors.append(_add_keyframe(rigid_map, wanted[frame.index], view, model, images))
     if not rigid_map.keyframes:
         raise MapError(
             f"none of the {len(wanted)} images of the COLMAP model ({min(wanted)}-{max(wanted)}, by the "
@@ -230,12 +231,7 @@ def map_from_colmap(model: ColmapModel, source: FrameSource, images: FrameImages
 
 
 def _add_keyframe(
-    rigid_map: RigidMap,
-    image: ColmapImage,
-    view: FrameView,
-    model: ColmapModel,
-    images: FrameImages,
-    options: SlamOptions,
+    rigid_map: RigidMap, image: ColmapImage, view: FrameView, model: ColmapModel, images: FrameImages
 ) -> Array:
     """Add an image of the model; returns by how much its points (n, 3) miss their pixels (n,)."""
     # A point may have several keypoints in an image: the first counts.
@@ -243,7 +239,7 @@ def _add_keyframe(
     pixels = images.camera.undistort_pixels(image.pixels[rows])
     intrinsics = np.asarray(images.camera.intrinsics)
     errors = reprojection_errors(image.camera_from_world, model.points[ids], pixels, intrinsics)
-    good = (errors < MOST_ERROR_PX) & inside(pixels, view.normalized.shape, options.patch_half + 2)
+    good = (errors < MOST_ERROR_PX) & inside(pixels, view.normalized.shape, PATCH_HALF + 2)
     seen = Followed(ids, pixels)[good]
     keyframe = Keyframe(
         view.index, view.timestamp, view.normalized, image.camera_from_world, seen.ids, seen.pixels, seen.right

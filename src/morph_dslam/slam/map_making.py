@@ -9,7 +9,6 @@ from morph_dslam.slam.frame_images import FrameView
 from morph_dslam.slam.initialization import MapStart
 from morph_dslam.slam.loop_closing import LoopCloser
 from morph_dslam.slam.mapping import Mapper, MappingWork, Work, one_step
-from morph_dslam.slam.options import SlamOptions
 from morph_dslam.slam.rigid_map import Indices, RigidMap
 from morph_dslam.slam.tracking import Tracked, Tracker
 
@@ -28,14 +27,12 @@ class MapMaking:
         after each step. Tracking then changes nothing of the map but its counts.
     """
 
-    def __init__(
-        self, rigid_map: RigidMap, intrinsics: Array, options: SlamOptions, tracker: Tracker, threaded: bool
-    ) -> None:
+    def __init__(self, rigid_map: RigidMap, intrinsics: Array, tracker: Tracker, threaded: bool) -> None:
         self._map, self._tracker, self._threaded = rigid_map, tracker, threaded
         self._draft = RigidMap(rigid_map.baseline_px) if threaded else rigid_map
         self._renew()
-        self._mapper = Mapper(self._draft, intrinsics, options)
-        self._loops = LoopCloser(self._draft, intrinsics, options, self._mapper)
+        self._mapper = Mapper(self._draft, intrinsics)
+        self._loops = LoopCloser(self._draft, intrinsics, self._mapper)
         self._work, self._search = MappingWork(threaded, self._renew, self._publish), MappingWork(threaded)
         self._kept: tuple[FrameView, Tracked] | None = None
 
@@ -49,10 +46,10 @@ class MapMaking:
         """Whether nothing is under way that later frames go on with."""
         return self._work.is_idle and self._search.is_idle
 
-    @property
-    def is_running(self) -> bool:
-        """Whether something is being done beside the frames just now."""
-        return self._work.is_running or self._search.is_running
+    def wait(self) -> None:
+        """Wait until nothing is being done beside the frames."""
+        self._work.wait()
+        self._search.wait()
 
     @property
     def n_loops(self) -> int:

@@ -6,7 +6,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Generator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +14,26 @@ from numpy.typing import NDArray
 from morph_dslam.slam.frame_images import OCTAVES, FrameView, describe
 from morph_dslam.slam.initialization import MapStart
 from morph_dslam.slam.local_map import PointMaker, free_corners, gather, local_window, put_back
-from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.options import LEAST_INLIERS
 from morph_dslam.slam.pose import camera_centre, inverse, project
 from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, NOWHERE, Followed, Indices, Keyframe, RigidMap
 from morph_dslam.slam.tracking import Tracked
 
 Array = NDArray[np.float64]
+
+
+#: A keyframe is due when fewer than this share of the last one's points are left, when points have moved this far
+#: since it (median), or when the camera has moved this part of the median depth.
+KEYFRAME_SHARE, KEYFRAME_MOTION_PX, KEYFRAME_BASELINE = 0.75, 30.0, 0.06
+
+#: Where keyframes can wait, they wait for frames in which the image moves less than this, pixels: fast motion blurs,
+#: and most cameras read their rows one after the other, which bends what they see.
+QUIET_PX = 5.0
+
+#: They cannot wait when fewer than this share of the last one's points are left.
+URGENT_SHARE = 0.6
+
+LEAST_FRAMES_BETWEEN = 3
 
 
 def median_depth(rigid_map: RigidMap, pose: Array, ids: Indices, intrinsics: Array, unknown: float) -> float:
@@ -37,10 +51,10 @@ class KeyframeChoice:
     unknown_depth : depth of a scene of which nothing is known.
     """
 
-    def __init__(self, rigid_map: RigidMap, intrinsics: Array, options: SlamOptions, unknown_depth: float) -> None:
-        self._map, self._intrinsics, self._options = rigid_map, intrinsics, options
+    def __init__(self, rigid_map: RigidMap, intrinsics: Array, unknown_depth: float) -> None:
+        self._map, self._intrinsics = rigid_map, intrinsics
         self.unknown_depth = unknown_depth
-        self._n_points, self._frame_index = 0, -options.least_frames_between
+        self._n_points, self._frame_index = 0, -LEAST_FRAMES_BETWEEN
 
     def kept(self, number: int, frame_index: int) -> int:
         """Note a new keyframe; returns how many map points it sees."""
@@ -50,25 +64,24 @@ class KeyframeChoice:
 
     def wants(self, tracked: Tracked, frame_index: int) -> bool:
         """Whether the map should keep this view."""
-        options = self._options
-        if frame_index - self._frame_index < options.least_frames_between:
+        if frame_index - self._frame_index < LEAST_FRAMES_BETWEEN:
             return False
-        if tracked.n_inliers < max(options.urgent_share * self._n_points, 4 * options.least_inliers):
+        if tracked.n_inliers < max(URGENT_SHARE * self._n_points, 4 * LEAST_INLIERS):
             return True
-        if tracked.image_motion_px > options.quiet_px:
+        if tracked.image_motion_px > QUIET_PX:
             return False
-        return tracked.n_inliers < options.keyframe_share * self._n_points or self._has_moved_on(tracked)
+        return tracked.n_inliers < KEYFRAME_SHARE * self._n_points or self._has_moved_on(tracked)
 
     def _has_moved_on(self, tracked: Tracked) -> bool:
         """Whether points, or the camera, have moved far since the last keyframe."""
-        options, last, pose = self._options, self._map.keyframes[-1], tracked.pose.camera_from_world
+        last, pose = self._map.keyframes[-1], tracked.pose.camera_from_world
         rows, seen = last.rows_of(tracked.points.ids)
         if not seen.any():
             return True
         motion = np.linalg.norm(tracked.points.pixels[seen] - last.pixels[rows[seen]], axis=1)
         baseline = np.linalg.norm(camera_centre(pose) - camera_centre(last.camera_from_world))
         depth = median_depth(self._map, pose, tracked.points.ids, self._intrinsics, self.unknown_depth)
-        return bool(np.median(motion) > options.keyframe_motion_px or baseline / depth > options.keyframe_baseline)
+        return bool(np.median(motion) > KEYFRAME_MOTION_PX or baseline / depth > KEYFRAME_BASELINE)
 
 
 # Taking out keyframes that show hardly anything that others do not show.
@@ -145,17 +158,12 @@ class Mapper:
     """
 
     def __init__(
-        self,
-        rigid_map: RigidMap,
-        intrinsics: Array,
-        options: SlamOptions,
-        hold_poses: bool = False,
-        unknown_depth: float = 1.0,
+        self, rigid_map: RigidMap, intrinsics: Array, hold_poses: bool = False, unknown_depth: float = 1.0
     ) -> None:
-        self._map, self._intrinsics, self._options = rigid_map, intrinsics, options
+        self._map, self._intrinsics = rigid_map, intrinsics
         self._hold_poses = hold_poses
-        self._points = PointMaker(rigid_map, intrinsics, options)
-        self._choice = KeyframeChoice(rigid_map, intrinsics, options, unknown_depth)
+        self._points = PointMaker(rigid_map, intrinsics)
+        self._choice = KeyframeChoice(rigid_map, intrinsics, unknown_depth)
 
     def begin(self, start: MapStart) -> None:
         """Fill the empty map from three views, median depth 1 in the first."""
@@ -204,7 +212,7 @@ class Mapper:
     def _finish(self, number: int, view: FrameView) -> Work:
         """New corners to follow, and a description of what the view sees, so that it can be recognised."""
         keyframe = self._map.keyframes[number]
-        corners = free_corners(keyframe.normalized, keyframe.pixels, self._options)
+        corners = free_corners(keyframe.normalized, keyframe.pixels)
         if len(corners):
             depth = median_depth(
                 self._map, keyframe.camera_from_world, keyframe.point_ids, self._intrinsics, self._choice.unknown_depth
@@ -222,7 +230,7 @@ class Mapper:
 
     def _adjust_locally(self) -> None:
         """Bundle adjustment of the newest keyframes that see the same points, held by others that do."""
-        window, holders = local_window(self._map, self._options)
+        window, holders = local_window(self._map)
         self._adjust(window, holders, LOCAL_ITERATIONS)
 
     def _adjust(self, free: Indices, fixed: Indices, iterations: int) -> None:
@@ -304,10 +312,10 @@ class MappingWork:
         """Whether nothing is under way."""
         return self._work is None
 
-    @property
-    def is_running(self) -> bool:
-        """Whether a step is being done in the thread."""
-        return self._running is not None and not self._running.done()
+    def wait(self) -> None:
+        """Wait until no step is being done in the thread."""
+        if self._running is not None:
+            wait([self._running])
 
     def begin(self, work: Work) -> None:
         """Begin new work: do its first step, or have it done."""

@@ -23,8 +23,9 @@ from morph_dslam.slam.frame_images import (
     least_distances,
     match_points,
 )
-from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.options import FLOW, INLIER_PX, LEAST_INLIERS, PATCH_HALF
 from morph_dslam.slam.pose import PoseEstimate, find_pose, inside, project, refine_pose
+from morph_dslam.slam.result import NoPose, SlamReason
 from morph_dslam.slam.rigid_map import GOOD, Followed, RigidMap
 from morph_dslam.slam.tracking import Tracker
 from morph_dslam.tracking.patches import FlowOptions, spread_corners
@@ -164,27 +165,26 @@ def _described_corners(view: FrameView) -> _Corners:
 class Relocalizer:
     """Finds the camera from the keyframes of a map."""
 
-    def __init__(self, rigid_map: RigidMap, intrinsics: Array, options: SlamOptions) -> None:
+    def __init__(self, rigid_map: RigidMap, intrinsics: Array) -> None:
         self._map = rigid_map
         self._intrinsics = intrinsics
-        self._options = options
         self.places = PlaceIndex(rigid_map)
         self._turn = 0
 
-    def find(self, view: FrameView, tracker: Tracker) -> tuple[PoseEstimate, Followed] | str:
+    def find(self, view: FrameView, tracker: Tracker) -> tuple[PoseEstimate, Followed] | NoPose:
         """The pose and the points that support it, or why there is none."""
         found = self._where_it_was(view, tracker)
         if found is not None:
             return found
         corners = _described_corners(view)
-        if len(corners.rows) < self._options.least_inliers:
-            return f"too little texture: {len(corners.pixels)} corners"
+        if len(corners.rows) < LEAST_INLIERS:
+            return NoPose(SlamReason.LITTLE_TEXTURE, (len(corners.pixels),))
         self.places.update()
         for number in self._candidates(corners.descriptors):
             found = self._locate(view, corners, self.group(number), tracker)
             if found is not None:
                 return found
-        return "the view resembles no keyframe"
+        return NoPose(SlamReason.NO_SIMILAR_KEYFRAME)
 
     def _where_it_was(self, view: FrameView, tracker: Tracker) -> tuple[PoseEstimate, Followed] | None:
         """The pose if the camera is still near where it was lost: of places that look alike the likeliest."""
@@ -236,14 +236,12 @@ class Relocalizer:
         ids = np.unique(np.concatenate([self._map.keyframes[k].point_ids for k in group]))
         ids = ids[self._map.state[ids] == GOOD]
         guesses, depths = project(pose, self._map.positions[ids], self._intrinsics)
-        seen = inside(guesses, normalized.shape, self._options.patch_half + 2)
-        seen &= tracker.looks_alike(ids, pose, depths)
-        flow = FlowOptions(self._options.flow.window, 2)
+        seen = inside(guesses, normalized.shape, PATCH_HALF + 2)
+        seen &= tracker.is_similar_view(ids, pose, depths)
+        flow = FlowOptions(FLOW.window, 2)
         found = tracker.find(normalized, Followed(ids[seen], guesses[seen]), pose, flow)
-        refined = refine_pose(
-            pose, self._map.positions[found.ids], found.pixels, self._intrinsics, inlier_px=self._options.inlier_px
-        )
-        enough = max(self._options.least_inliers, LEAST_FIT * len(found.ids), LEAST_SHARE * int(seen.sum()))
+        refined = refine_pose(pose, self._map.positions[found.ids], found.pixels, self._intrinsics, inlier_px=INLIER_PX)
+        enough = max(LEAST_INLIERS, LEAST_FIT * len(found.ids), LEAST_SHARE * int(seen.sum()))
         most = max(MOST_ERROR_RATIO * self._map.usual_rms_px, MOST_ERROR_PX)
         if refined.inliers.sum() < enough or refined.rms_px > most:
             return None

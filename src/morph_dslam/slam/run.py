@@ -1,81 +1,79 @@
-"""`morph slam`: track the camera through a recording, map the scene, write the run folder."""
+"""`morph slam`: track the camera through a source, map the scene, write the run folder."""
 
 from __future__ import annotations
 
+import csv
+import json
 import sys
-from collections.abc import Sized
+from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
-from tqdm import tqdm
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from morph_dslam.camera import Camera, StereoCamera
 from morph_dslam.errors import MapError
 from morph_dslam.io.camera_files import load_camera_or_pair
-from morph_dslam.io.colmap import read_colmap_model
-from morph_dslam.io.trajectory import load_trajectory
+from morph_dslam.io.colmap import ColmapImage, ColmapModel, read_colmap_model, write_colmap_model
+from morph_dslam.io.tables import save_ply
+from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
 from morph_dslam.io.video import VideoWriter
-from morph_dslam.slam.bundle_adjustment import Observations, adjust
-from morph_dslam.slam.frame_images import SlamFrame, least_distances, orientations
-from morph_dslam.slam.map_files import load_map, map_from_colmap, map_from_trajectory
+from morph_dslam.slam.frame_images import FrameImages
 from morph_dslam.slam.options import SlamOptions
-from morph_dslam.slam.output import draw_frame, write_run
-from morph_dslam.slam.pose import refine_pose
-from morph_dslam.slam.relocalization import bit_counts
-from morph_dslam.slam.rigid_map import RigidMap
-from morph_dslam.slam.slam import Slam
-from morph_dslam.sources import FrameStream, open_source, open_stream
-from morph_dslam.sources.frames import has_registered_depth
-from morph_dslam.sources.live import LiveCamera
-from morph_dslam.threads import threads_side_by_side
-from morph_dslam.tracking.patches import patch_correlation
+from morph_dslam.slam.result import STAGES, SlamFrame
+from morph_dslam.slam.rigid_map import GOOD
+from morph_dslam.slam.scene import Scene, finish_scene, load_scene, start_slam, track_frames
+from morph_dslam.sources import open_source, open_stream
+from morph_dslam.sources.live import LiveStream
 from morph_dslam.tracking.run_folder import check_run_folder
 
+Array = NDArray[np.float64]
 
-@dataclass(frozen=True)
-class SlamRunOptions:
-    """What to track and where the results go.
+DPI = 110
 
-    Attributes
+PATH_COLOUR, POINT_COLOUR = "#b4530a", "#8fb3d9"
+
+#: Blue, green, red of what the video shows.
+INLIER, CANDIDATE, DISAGREEING = (80, 200, 60), (200, 150, 40), (40, 40, 230)
+
+
+def run_slam(
+    source: str | Path,
+    camera: Path,
+    output: Path,
+    first: int | None = None,
+    last: int | None = None,
+    *,
+    options: SlamOptions | None = None,
+    map_path: Path | None = None,
+    trajectory: Path | None = None,
+    images: Path | None = None,
+    video: bool = True,
+    overwrite: bool = False,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Track the camera through a recording, or a live camera's frames, and write the run folder.
+
+    An interrupt, or a source that ends early, keeps what was done: the run folder is completed with the frames
+    so far and the exception goes on.
+
+    Parameters
     ----------
-    source : recording, or `webcam:0`. camera : camera file, or that of a stereo pair. output : run folder.
-    use_depth : use the depth images of a recording that has them for its colour pixels.
-    first, last : frame numbers, both included; all by default.
-    map_path : a map of an earlier run with the same camera, or the folder of a COLMAP model; a new map by
-        default. trajectory : file of poses to make the map with instead. images : recording that belongs to
-        the model or the trajectory; the source by default. extend : let the map grow, instead of keeping it
-        as it is.
-    freeze_at : frame number from which the map is kept as it is; never by default. freeze_when_deforming :
-        keep it from when something in the scene begins to move or to deform.
-    video : draw the video with the points followed. overwrite : replace a run that is there already.
-    """
-
-    source: Path
-    camera: Path
-    output: Path
-    first: int | None = None
-    last: int | None = None
-    map_path: Path | None = None
-    trajectory: Path | None = None
-    images: Path | None = None
-    extend: bool = False
-    freeze_at: int | None = None
-    freeze_when_deforming: bool = False
-    use_depth: bool = True
-    video: bool = True
-    overwrite: bool = False
-    slam: SlamOptions = field(default_factory=SlamOptions)
-
-
-def run_slam(options: SlamRunOptions) -> dict[str, Any]:
-    """Track the camera through a recording, or a live camera's, and write the run folder.
-
-    The map is made in step with a recording's frames, and beside those of a live camera. An interrupt, or a
-    source that ends early, keeps what was done: the run folder is completed with the frames so far and the
-    exception goes on.
+    source : recording, or `webcam:0`
+    camera : camera file, or that of a stereo pair
+    output : run folder
+    first, last : range of frame numbers, both included; all by default
+    options : choices of the run
+    map_path : map of an earlier run with the same camera, or folder of a COLMAP model; a new map by default
+    trajectory : file of poses to make the map with instead
+    images : recording that the model or the trajectory belongs to; the source by default
+    video : draw the video with the points followed
+    overwrite : replace a run that is there already
+    progress : whether to show a bar
 
     Returns
     -------
@@ -87,83 +85,156 @@ def run_slam(options: SlamRunOptions) -> dict[str, Any]:
         If an input cannot be used (CameraError, SourceError, MapError) or the run folder holds a run
         (TrackingError).
     """
-    if options.extend and options.map_path is None and options.trajectory is None:
+    options, is_model = options or SlamOptions(), map_path is not None and map_path.is_dir()
+    if options.extend and map_path is None and trajectory is None:
         raise MapError("--extend needs the map that is to grow: --map run/map.h5")
-    if options.map_path is not None and options.trajectory is not None:
+    if map_path is not None and trajectory is not None:
         raise MapError("a map comes either from --map or from --trajectory, not from both")
-    needs_images = options.trajectory is not None or (options.map_path is not None and options.map_path.is_dir())
-    if options.images is not None and not needs_images:
+    if images is not None and trajectory is None and not is_model:
         raise MapError("--images says what a COLMAP model (--map MODEL) or poses (--trajectory) are of")
-    camera = load_camera_or_pair(options.camera)
-    source = open_stream(options.source, options.first, options.last)
-    with source if isinstance(source, LiveCamera) else nullcontext():
-        check_run_folder(options.output, options.overwrite, "trajectory.txt")
-        warm_up()
-        return _run(options, camera, source)
-
-
-def _run(options: SlamRunOptions, camera: Camera | StereoCamera, source: FrameStream) -> dict[str, Any]:
-    with_depth = options.use_depth and isinstance(camera, Camera) and has_registered_depth(source)
-    is_live = isinstance(source, LiveCamera)
-    slam, frames = Slam(camera, options.slam, with_depth, options.freeze_when_deforming, is_live), []
-    known = _known_map(options, slam)
-    if known is not None:
-        slam.use_map(known, options.extend)
-    n_before = source.dropped if isinstance(source, LiveCamera) else 0
-    try:
-        with threads_side_by_side() if is_live else nullcontext():
-            _process(slam, source, options, frames)
-    finally:
-        dropped = {"n_dropped": source.dropped - n_before} if isinstance(source, LiveCamera) else {}
-        summary = _finish(slam, frames, options, dropped) if frames else {}
+    one_or_two, stream = load_camera_or_pair(camera), open_stream(source, first, last)
+    with stream if isinstance(stream, LiveStream) else nullcontext():
+        check_run_folder(output, overwrite, "trajectory.txt")
+        known: Scene | Trajectory | ColmapModel | None = None
+        if trajectory is not None:
+            known = load_trajectory(trajectory)
+        elif map_path is not None:
+            known = read_colmap_model(map_path) if is_model else load_scene(map_path, FrameImages(one_or_two).camera)
+        recorded = open_source(images or source) if isinstance(known, Trajectory | ColmapModel) else None
+        if progress:
+            print("preparing: compiling the inner loops (half a minute the first time) ...", file=sys.stderr)
+        slam, frames = start_slam(stream, one_or_two, options, known, recorded), list[SlamFrame]()
+        n_before = stream.dropped if isinstance(stream, LiveStream) else 0
+        size = (slam.camera.width, slam.camera.height)
+        try:
+            with VideoWriter(output / "tracked.mp4", stream.fps, size) if video else nullcontext() as writer:
+                watch = (lambda image, frame: writer.write(draw_frame(image, frame))) if writer else None
+                for frame in track_frames(slam, stream, progress, watch):
+                    frames.append(frame)
+        finally:
+            more: dict[str, Any] = {"inputs": {"source": str(source), "camera": str(camera)}}
+            if isinstance(stream, LiveStream):
+                more["n_dropped"] = stream.dropped - n_before
+            summary = write_run(output, finish_scene(slam, frames), more) if frames else {}
     return summary
 
 
-def _known_map(options: SlamRunOptions, slam: Slam) -> RigidMap | None:
-    """The map to find the camera in; None where a new one is to be made."""
-    path = options.map_path
-    if options.trajectory is None and (path is None or not path.is_dir()):
-        return None if path is None else load_map(path, slam.camera)
-    source, images = open_source(options.images or options.source), slam.frame_images
-    if options.trajectory is not None:
-        return map_from_trajectory(load_trajectory(options.trajectory), source, images, options.slam)
-    assert path is not None
-    return map_from_colmap(read_colmap_model(path), source, images, options.slam)
+def write_run(folder: Path, scene: Scene, more: dict[str, Any]) -> dict[str, Any]:
+    """Write all files but the video; returns the content of ``summary.json``, of which ``more`` is a part."""
+    save_trajectory(folder / "trajectory.txt", scene.trajectory)
+    save_ply(folder / "map.ply", scene.points)
+    scene.save(folder / "map.h5")
+    _write_colmap(folder / "colmap", scene)
+    _write_csv(folder / "frames.csv", scene)
+    plots = folder / "plots"
+    plots.mkdir(exist_ok=True)
+    _plot_trajectory(plots / "trajectory.png", scene)
+    _plot_frames(plots / "frames.png", scene.frames)
+    summary = scene.summary() | more
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2, default=str) + "\n")
+    return summary
 
 
-def _process(slam: Slam, source: FrameStream, options: SlamRunOptions, frames: list[SlamFrame]) -> None:
-    """Process all frames into ``frames``."""
-    size = (slam.camera.width, slam.camera.height)
-    video = VideoWriter(options.output / "tracked.mp4", source.fps, size) if options.video else nullcontext()
-    with video as writer:
-        total = len(source) if isinstance(source, Sized) else None
-        for frame in tqdm(source, total=total, desc="tracking", unit="frame"):
-            if options.freeze_at is not None and frame.index >= options.freeze_at and not slam.is_frozen:
-                slam.freeze()
-            result = slam.process_frame(frame.image, frame.index, frame.timestamp, frame.depth, frame.right)
-            frames.append(result.record(is_final=slam.is_frozen))
-            if writer is not None:
-                writer.write(draw_frame(slam.undistort(frame.image), result))
+def _write_colmap(folder: Path, scene: Scene) -> None:
+    """The map's points and keyframes as a COLMAP model."""
+    good = scene.map.state == GOOD
+    rows = np.cumsum(good) - 1
+    images = []
+    for keyframe in scene.keyframes:
+        seen = keyframe.seen[good[keyframe.point_ids]]
+        name = f"{keyframe.index:06d}.png"
+        images.append(ColmapImage(name, keyframe.camera_from_world, rows[seen.ids], seen.pixels))
+    write_colmap_model(folder, scene.camera, images, scene.points)
 
 
-def _finish(slam: Slam, frames: list[SlamFrame], options: SlamRunOptions, extra: dict[str, Any]) -> dict[str, Any]:
-    slam.refine_map()
-    inputs = {"source": str(options.source), "camera": str(options.camera)}
-    return write_run(options.output, slam, frames, {"inputs": inputs} | extra)
+def _write_csv(path: Path, scene: Scene) -> None:
+    header = ["frame", "timestamp_s", "status", "reason", *"xyz", "qx", "qy", "qz", "qw"]
+    header += ["position_std", "rotation_std_deg", "rms_px", "n_points", "n_candidates", "n_disagreeing"]
+    header += ["is_keyframe", *(f"{stage}_ms" for stage in STAGES), "total_ms"]
+    poses = dict(zip(scene.trajectory.indices.tolist(), scene.trajectory.world_from_camera, strict=True))
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        for frame in scene.frames:
+            row: list[Any] = [frame.index, f"{frame.timestamp:.6f}", frame.status, frame.reason or ""]
+            row += _pose_columns(poses[frame.index], frame) if frame.index in poses else [""] * 10
+            row += [frame.n_points, frame.n_candidates, frame.n_disagreeing]
+            row += [int(frame.is_keyframe), *(f"{frame.timings_ms[s]:.3f}" for s in STAGES)]
+            writer.writerow([*row, f"{frame.total_ms:.3f}"])
 
 
-def warm_up() -> None:
-    """Compile the inner loops, so that no frame has to wait for it."""
-    print("preparing: compiling the inner loops (half a minute the first time) ...", file=sys.stderr)
-    rng = np.random.default_rng(0)
-    points, intrinsics = rng.uniform([-1, -1, 3], [1, 1, 4], size=(20, 3)), np.array([100.0, 100.0, 0.0, 0.0])
-    pixels = points[:, :2] / points[:, 2:] * 100.0
-    refine_pose(np.eye(4), points, pixels, intrinsics)
-    seen = Observations(np.repeat([0, 1], 20), np.tile(np.arange(20), 2), np.concatenate([pixels, pixels]))
-    adjust(np.stack([np.eye(4)] * 2), points, seen, intrinsics, np.array([True, False]), iterations=1)
-    image, centre = rng.integers(0, 255, (32, 32)).astype(np.uint8), np.array([[16.0, 16.0]])
-    patch_correlation(image, image, centre, centre, 5)
-    orientations(image, centre)
-    words, rows = rng.integers(0, 255, (4, 32)).astype(np.uint8), np.arange(4)
-    least_distances(words, rows, words, rows)
-    bit_counts(words, rows, len(words))
+def _pose_columns(world_from_camera: Array, frame: SlamFrame) -> list[str]:
+    assert frame.pose is not None
+    variances = np.diag(frame.pose.covariance)
+    quaternion = Rotation.from_matrix(world_from_camera[:3, :3]).as_quat(canonical=True)
+    deviations = [np.sqrt(variances[3:].sum()), np.degrees(np.sqrt(variances[:3].sum()))]
+    return [
+        *(f"{value:.6f}" for value in (*world_from_camera[:3, 3], *quaternion)),
+        *(f"{value:.3g}" for value in deviations),
+        f"{frame.pose.rms_px:.4f}",
+    ]
+
+
+def _plot_trajectory(path: Path, scene: Scene) -> None:
+    """The path and the map from above and from the side, as the first view stands."""
+    points, unit = scene.points, "m" if scene.is_metric else "map unit"
+    figure = Figure(figsize=(10.0, 4.6), layout="constrained")
+    if len(points):
+        # A few distant points would shrink everything else.
+        low, high = np.percentile(points, [2, 98], axis=0)
+        points = points[((points >= low) & (points <= high)).all(axis=1)]
+    for axes, vertical, name in zip(figure.subplots(1, 2), (2, 1), ("from above", "from the front"), strict=True):
+        axes.plot(points[:, 0], points[:, vertical], ".", color=POINT_COLOUR, markersize=2, label="map points")
+        path_points = scene.trajectory.positions
+        axes.plot(path_points[:, 0], path_points[:, vertical], color=PATH_COLOUR, linewidth=1.4, label="camera")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_xlabel(f"x [{unit}]")
+        axes.set_ylabel(f"{'xyz'[vertical]} [{unit}]")
+        axes.set_title(name, fontsize=10)
+        if vertical == 1:
+            axes.invert_yaxis()
+    figure.axes[0].legend(fontsize=8, frameon=False)
+    figure.savefig(path, dpi=DPI)
+
+
+def _plot_frames(path: Path, frames: Sequence[SlamFrame]) -> None:
+    """Points, errors and times of every frame."""
+    figure = Figure(figsize=(9.0, 6.0), layout="constrained")
+    counts, errors, times = figure.subplots(3, 1, sharex=True)
+    numbers = [frame.index for frame in frames]
+    counts.plot(numbers, [f.n_points for f in frames], color=PATH_COLOUR, label="map points")
+    counts.plot(numbers, [f.n_candidates for f in frames], color=POINT_COLOUR, label="corners without depth")
+    counts.set_ylabel("points followed")
+    counts.legend(fontsize=8, frameon=False)
+    errors.plot(numbers, [f.pose.rms_px if f.pose else np.nan for f in frames], color=PATH_COLOUR)
+    errors.set_ylabel("RMS error [px]")
+    times.plot(numbers, [f.total_ms for f in frames], color=POINT_COLOUR, linewidth=0.9)
+    keyframes = [f for f in frames if f.is_keyframe]
+    times.plot([f.index for f in keyframes], [f.total_ms for f in keyframes], ".", color=PATH_COLOUR)
+    times.set_ylabel("time [ms]")
+    times.legend(["frame", "keyframe"], fontsize=8, frameon=False)
+    times.set_xlabel("frame")
+    for axes in (counts, errors, times):
+        axes.set_ylim(bottom=0.0)
+        for frame in frames:
+            if frame.pose is None:
+                axes.axvspan(frame.index - 0.5, frame.index + 0.5, color="#d9534f", alpha=0.15, linewidth=0)
+    figure.savefig(path, dpi=DPI)
+
+
+def draw_frame(image: NDArray[np.uint8], frame: SlamFrame) -> NDArray[np.uint8]:
+    """The undistorted image (h, w, 3) with map points green, corners blue, what disagrees red."""
+    drawn = image.copy()
+    size = max(1.0, image.shape[0] / 480)  # of what is drawn, so that it stays as large beside a larger picture
+    for pixels, colour in (
+        (frame.candidates, CANDIDATE),
+        (frame.points.pixels, INLIER),
+        (frame.disagreeing.pixels, DISAGREEING),
+    ):
+        for x, y in np.rint(pixels).astype(int).tolist():
+            cv2.circle(drawn, (x, y), round(2 * size), colour, -1, cv2.LINE_AA)
+    text, corner = f"{frame.index}  {frame.status}  {frame.reason or ''}", (round(8 * size), round(18 * size))
+    for thickness, grey in ((3, 0), (1, 255)):
+        width = round(thickness * size)
+        cv2.putText(drawn, text, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.45 * size, (grey, grey, grey), width, cv2.LINE_AA)
+    return drawn

@@ -7,26 +7,33 @@ its first view is 1. With depth images, or a stereo pair, it is metric and begin
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera, StereoCamera
 from morph_dslam.errors import MapError
-from morph_dslam.slam.frame_images import STAGES, FrameImages, FrameView, SlamFrame, corners_of, points_of
+from morph_dslam.slam.frame_images import FrameImages, FrameView
 from morph_dslam.slam.initialization import MapInitializer, MapStart
+from morph_dslam.slam.local_map import WINDOW
 from morph_dslam.slam.map_making import MapMaking
 from morph_dslam.slam.mapping import pose_in_keyframe
-from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.options import INLIER_PX, LEAST_INLIERS, LEAST_START_POINTS, SlamOptions
 from morph_dslam.slam.pose import refine_pose
 from morph_dslam.slam.relocalization import Relocalizer
+from morph_dslam.slam.result import STAGES, NoPose, SlamFrame, SlamReason, SlamStatus
 from morph_dslam.slam.rigid_map import CANDIDATE, NOWHERE, Followed, RigidMap
 from morph_dslam.slam.tracking import Tracked, Tracker
-from morph_dslam.timing import StageClock, WaitClock
+from morph_dslam.timing import WaitClock, frame_clock, stage
 
 Array = NDArray[np.float64]
 
 #: Frames that a relocalised pose has to be tracked for before the map grows again.
 HELD_FRAMES = 3
+
+#: The scene deforms when more than this share of its points disagree with a rigid one in so many frames on end.
+DEFORMING_SHARE, DEFORMING_FRAMES = 0.12, 5
 
 
 class Slam:
@@ -34,18 +41,20 @@ class Slam:
 
     Parameters
     ----------
-    camera : of all frames; a stereo pair, whose rectified left camera is then what the map and the poses
-        are of.
-    with_depth : whether frames come with depth images that belong to them pixel by pixel.
-    freeze_when_deforming : whether to freeze the map by itself when points begin to disagree with it.
-    threaded : whether the map is made beside the frames, in a thread that they never wait for, instead of
-        in step with them: for live cameras. What comes out then depends on how fast the machine is.
+    camera : of all frames; a stereo pair, whose rectified left camera is then what the map and the poses are of
+    options : when to keep the map as it is, or to give it up
+    with_depth : whether frames come with depth images that belong to them pixel by pixel
+    threaded : whether the map is made beside the frames, in a thread that they never wait for, instead of in
+        step with them: for live cameras. What comes out then depends on how fast the machine is.
 
     Attributes
     ----------
-    camera : the camera of the undistorted images. frame_images : makes these of the frames.
-    map : what is known of the scene; replaced when a young map is given up (``n_restarts`` counts these).
-    is_frozen : whether the map is kept as it is. frozen_at : frame from which on it froze by itself, or None.
+    camera : the camera of the undistorted images
+    frame_images : makes these of the frames
+    map : what is known of the scene; replaced when a young map is given up
+    n_restarts : how many young maps were given up
+    is_frozen : whether the map is kept as it is
+    frozen_at : frame from which on it froze because the scene deformed, or None
     """
 
     def __init__(
@@ -53,21 +62,19 @@ class Slam:
         camera: Camera | StereoCamera,
         options: SlamOptions | None = None,
         with_depth: bool = False,
-        freeze_when_deforming: bool = False,
         threaded: bool = False,
     ) -> None:
         self.options = options or SlamOptions()
-        self.frame_images = FrameImages(camera, self.options, with_depth)
+        self.frame_images = FrameImages(camera, with_depth)
         self.camera = self.frame_images.camera
-        self._freezes_by_itself = freeze_when_deforming
         self.is_frozen, self.frozen_at = False, None
-        self.n_restarts, self._threaded = 0, threaded
+        self.n_restarts, self.threaded = 0, threaded
         self._begin(RigidMap(self.frame_images.baseline_px))
 
-    def use_map(self, rigid_map: RigidMap, extend: bool = False) -> None:
+    def use_map(self, rigid_map: RigidMap) -> None:
         """Go on in a map from an earlier run with the same camera, or from another program.
 
-        Frames are lost until the camera is found in it. It is kept as it is, or grows with ``extend``.
+        Frames are lost until the camera is found in it. It is kept as it is unless the options let it grow.
 
         Raises
         ------
@@ -75,7 +82,7 @@ class Slam:
             If the map is to grow, but its depth comes from another kind of camera.
         """
         if rigid_map.baseline_px != self.frame_images.baseline_px:
-            if extend:
+            if self.options.extend:
                 raise MapError(
                     "a map can only be extended by the kind of camera that made it: its depth comes from "
                     f"{_origin_of(rigid_map.baseline_px)}, "
@@ -83,7 +90,7 @@ class Slam:
                 )
             # The map's own depths are enough to find the camera in it.
             self.frame_images.baseline_px = 0.0
-        self.is_frozen = not extend
+        self.is_frozen = not self.options.extend
         self._begin(rigid_map)
 
     def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -100,11 +107,11 @@ class Slam:
         self._begin(RigidMap(self.frame_images.baseline_px))
 
     def _begin(self, rigid_map: RigidMap) -> None:
-        self.map, k, options = rigid_map, self.camera.intrinsics, self.options
-        self._initialiser = MapInitializer(k, options)
-        self._tracker = Tracker(self.map, k, options)
-        self._making = MapMaking(self.map, k, options, self._tracker, self._threaded)
-        self._relocaliser = Relocalizer(self.map, k, options)
+        self.map, k = rigid_map, self.camera.intrinsics
+        self._initializer = MapInitializer(k)
+        self._tracker = Tracker(self.map, k)
+        self._making = MapMaking(self.map, k, self._tracker, self.threaded)
+        self._relocalizer = Relocalizer(self.map, k)
         # In a map from elsewhere the camera is lost until it is found.
         self._n_lost, self._n_held, self._n_deforming = int(bool(rigid_map.keyframes)), 0, 0
         if self.is_frozen:
@@ -118,40 +125,38 @@ class Slam:
         depth: NDArray[np.float32] | None = None,
         right: NDArray[np.uint8] | None = None,
     ) -> SlamFrame:
-        """Take in the next frame, as recorded.
+        """Take in the next frame, as recorded; it may lack depth or right image.
 
         Parameters
         ----------
-        image : (h, w, 3) or (h, w). depth : (h, w) metres, NaN where not measured; right : (h, w[, 3]) the
-            right image of a stereo pair. A frame may lack them.
+        image : (h, w, 3) or (h, w)
+        index, timestamp : number of the frame, and its time in seconds
+        depth : (h, w) metres, NaN where not measured
+        right : (h, w[, 3]) the right image of a stereo pair
 
         Raises
         ------
         CameraError
             If an image has not the camera's size.
         """
-        clock, waits = StageClock(STAGES), WaitClock()
-        is_beside = self._threaded and self.is_mapping
-        with clock.stage("prepare"):
-            view = self.frame_images.prepare(image, index, timestamp, depth, right)
-        with clock.stage("map"):
-            self._making.advance()
-        if not self.map.keyframes:
-            result = self._start(view, clock)
-        elif self._n_lost:
-            result = self._relocalise(view, clock)
-        else:
-            result = self._track(view, clock)
-        if not self.is_frozen:
-            self._making.end_frame()
-        self._n_lost = self._n_lost + 1 if result["status"] == "lost" else 0
-        is_young = len(self.map.keyframes) < self.options.window and not self.is_frozen
-        if is_young and self._n_lost > self.options.restart_after:
-            self._restart()
-        is_beside |= self._threaded and self.is_mapping
+        if self.options.freeze_at is not None and index >= self.options.freeze_at and not self.is_frozen:
+            self.freeze()
+        waits, is_beside = WaitClock(), self.threaded and self.is_mapping
+        with frame_clock(STAGES) as clock:
+            with stage("prepare"):
+                view = self.frame_images.prepare(image, index, timestamp, depth, right)
+            with stage("map"):
+                self._making.advance()
+            frame = self._locate(view)
+            if not self.is_frozen:
+                self._making.end_frame()
+            self._n_lost = self._n_lost + 1 if frame.status is SlamStatus.LOST else 0
+            is_young = len(self.map.keyframes) < WINDOW and not self.is_frozen
+            if is_young and self._n_lost > self.options.restart_after:
+                self._restart()
+        is_beside |= self.threaded and self.is_mapping
         waited = waits.milliseconds + clock.milliseconds["map"] if is_beside else 0.0
-        times = {"timings_ms": clock.milliseconds, "total_ms": clock.total, "waited_ms": waited}
-        return SlamFrame(index, timestamp, **result, **times)
+        return replace(frame, timings_ms=clock.milliseconds, total_ms=clock.total, waited_ms=waited)
 
     def freeze(self) -> None:
         """Keep the map as it is from now on and only find the camera in it; before a start, do nothing.
@@ -179,6 +184,10 @@ class Slam:
         """Whether the mapper has work under way that later frames go on with."""
         return not self._making.is_idle
 
+    def wait(self) -> None:
+        """Wait for what is being done beside the frames, where frames come faster than a camera's."""
+        self._making.wait()
+
     def is_placed(self, frame: SlamFrame) -> bool:
         """Whether a frame has a pose in the map that there is now."""
         return frame.from_keyframe is not None and frame.map_number == self.n_restarts
@@ -192,104 +201,113 @@ class Slam:
             return None
         start = frame.from_keyframe @ self.map.pose_of(frame.keyframe)
         points = self.map.good_of(frame.points)
-        if len(points.ids) < self.options.least_inliers:
+        if len(points.ids) < LEAST_INLIERS:
             return start
-        known = self.map.positions[points.ids]
         estimate = refine_pose(
             start,
-            known,
+            self.map.positions[points.ids],
             points.pixels,
             self.camera.intrinsics,
-            inlier_px=self.options.inlier_px,
+            inlier_px=INLIER_PX,
             right=points.right,
             baseline_px=self.map.baseline_px,
         )
-        enough = estimate.inliers.sum() >= self.options.least_inliers
-        return estimate.camera_from_world if enough else start
+        return estimate.camera_from_world if estimate.inliers.sum() >= LEAST_INLIERS else start
 
-    def _start(self, view: FrameView, clock: StageClock) -> dict:
-        with clock.stage("start"):
+    def _locate(self, view: FrameView) -> SlamFrame:
+        if not self.map.keyframes:
+            return self._start(view)
+        return self._relocalize(view) if self._n_lost else self._track(view)
+
+    def _start(self, view: FrameView) -> SlamFrame:
+        with stage("start"):
             points = self._start_metric(view) if self.map.is_metric else self._start_moving(view)
-            if not isinstance(points, Followed):
-                return {"status": "waiting", "reason": points} | corners_of(self._initialiser.followed)
+            if isinstance(points, NoPose):
+                return self._without_pose(view, SlamStatus.WAITING, points)
             self._tracker.place(self.map.keyframes[-1].camera_from_world, points)
             tracked = self._tracker.track(view.normalized, view.depth)
-        if not isinstance(tracked, Tracked):
+        if isinstance(tracked, NoPose):
             self._restart()
-            return {"status": "waiting", "reason": f"the first map did not hold: {tracked}"}
-        return self._result("tracked", tracked, is_keyframe=True)
+            return self._without_pose(view, SlamStatus.WAITING, NoPose(SlamReason.FIRST_MAP_FAILED, cause=tracked))
+        return self._with_pose(view, SlamStatus.TRACKED, tracked, is_keyframe=True)
 
-    def _start_moving(self, view: FrameView) -> Followed | str:
-        start = self._initialiser.process(view)
+    def _start_moving(self, view: FrameView) -> Followed | NoPose:
+        start = self._initializer.process(view)
         if not isinstance(start, MapStart):
             return start
         self._making.begin(start)
         return self.map.keyframes[-1].seen
 
-    def _start_metric(self, view: FrameView) -> Followed | str:
+    def _start_metric(self, view: FrameView) -> Followed | NoPose:
         if view.depth is None:
-            return "this frame has no depth"
-        n, least = self._making.begin_at(view, np.eye(4)), self.options.least_start_points
-        if n < least:
+            return NoPose(SlamReason.NO_DEPTH)
+        n = self._making.begin_at(view, np.eye(4))
+        if n < LEAST_START_POINTS:
             self._begin(RigidMap(self.frame_images.baseline_px))
-            return f"only {n} corners with depth, {least} are needed"
+            return NoPose(SlamReason.FEW_DEPTHS, (n, LEAST_START_POINTS))
         return self.map.keyframes[-1].seen
 
-    def _track(self, view: FrameView, clock: StageClock) -> dict:
-        with clock.stage("track"):
+    def _track(self, view: FrameView) -> SlamFrame:
+        with stage("track"):
             tracked = self._tracker.track(view.normalized, view.depth)
-        if not isinstance(tracked, Tracked):
-            found = self._relocalise(view, clock)
-            return found if found["status"] != "lost" else {"status": "lost", "reason": tracked}
-        with clock.stage("map"):
+        if isinstance(tracked, NoPose):
+            found = self._relocalize(view)
+            return self._without_pose(view, SlamStatus.LOST, tracked) if found.pose is None else found
+        with stage("map"):
             # A pose found again has to hold for some frames before the map is built on it.
             self._n_held += 1
-            self._watch(tracked, view.index)
+            self._freeze_if_deforming(tracked, view.index)
             keeps = (
                 not self.is_frozen and self._n_held > HELD_FRAMES and self._making.wants_keyframe(tracked, view.index)
             )
             if keeps:
                 self._making.keep(tracked, view)
-        return self._result("tracked", tracked, keeps)
+        return self._with_pose(view, SlamStatus.TRACKED, tracked, keeps)
 
-    def _watch(self, tracked: Tracked, index: int) -> None:
-        """Freeze the map when the scene begins to deform, if that is wanted."""
+    def _freeze_if_deforming(self, tracked: Tracked, index: int) -> None:
         n = len(tracked.disagreeing.ids)
-        deforms = n > self.options.deforming_share * (n + tracked.n_inliers)
+        deforms = n > DEFORMING_SHARE * (n + tracked.n_inliers)
         self._n_deforming = self._n_deforming + 1 if deforms else 0
-        if (
-            self._freezes_by_itself
-            and not self.is_frozen
-            and self._making.can_keep
-            and self._n_deforming >= self.options.deforming_frames
-        ):
+        is_due = self.options.freeze_when_deforming and self._n_deforming >= DEFORMING_FRAMES
+        if is_due and not self.is_frozen and self._making.can_keep:
             self.freeze()
             self.frozen_at = index
 
-    def _relocalise(self, view: FrameView, clock: StageClock) -> dict:
-        with clock.stage("relocalise"):
-            found = self._relocaliser.find(view, self._tracker)
-            if isinstance(found, str):
-                return {"status": "lost", "reason": found}
+    def _relocalize(self, view: FrameView) -> SlamFrame:
+        with stage("relocalise"):
+            found = self._relocalizer.find(view, self._tracker)
+            if isinstance(found, NoPose):
+                return self._without_pose(view, SlamStatus.LOST, found)
             pose, points = found
             self._n_held = 0
             self._tracker.place(pose.camera_from_world, points)
         tracked = Tracked(pose, points, int(pose.inliers.sum()), NOWHERE)
-        return self._result("relocalised", tracked, is_keyframe=False)
+        return self._with_pose(view, SlamStatus.RELOCALIZED, tracked, is_keyframe=False)
 
-    def _result(self, status: str, tracked: Tracked, is_keyframe: bool) -> dict:
+    def _without_pose(self, view: FrameView, status: SlamStatus, reason: NoPose) -> SlamFrame:
+        corners = self._initializer.followed if status is SlamStatus.WAITING else NOWHERE.pixels
+        return SlamFrame(view.index, view.timestamp, status, reason, candidates=corners, n_candidates=len(corners))
+
+    def _with_pose(self, view: FrameView, status: SlamStatus, tracked: Tracked, is_keyframe: bool) -> SlamFrame:
         number = len(self.map.keyframes) - 1
-        camera_from_world = self._tracker.camera_from_world
         is_candidate = self.map.state[tracked.points.ids] == CANDIDATE
-        return points_of(tracked, is_candidate) | {
-            "status": status,
-            "reason": "",
-            "pose": tracked.pose,
-            "keyframe": number,
-            "from_keyframe": pose_in_keyframe(camera_from_world, self.map.keyframes[number]),
-            "map_number": self.n_restarts,
-            "is_keyframe": is_keyframe,
-        }
+        points, candidates = tracked.points[~is_candidate], tracked.points.pixels[is_candidate]
+        return SlamFrame(
+            view.index,
+            view.timestamp,
+            status,
+            pose=tracked.pose,
+            points=points,
+            candidates=candidates,
+            disagreeing=tracked.disagreeing,
+            keyframe=number,
+            from_keyframe=pose_in_keyframe(self._tracker.camera_from_world, self.map.keyframes[number]),
+            map_number=self.n_restarts,
+            is_keyframe=is_keyframe,
+            n_points=len(points.ids),
+            n_candidates=len(candidates),
+            n_disagreeing=len(tracked.disagreeing.ids),
+        )
 
 
 def _origin_of(baseline_px: float) -> str:

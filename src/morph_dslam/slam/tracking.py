@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.slam.consensus import Sight
 from morph_dslam.slam.depth import FrameDepth
-from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.options import FLOW, INLIER_PX, LEAST_CORRELATION, PATCH_HALF
 from morph_dslam.slam.pose import (
     LEAST_DEPTH,
     PoseEstimate,
@@ -25,6 +25,7 @@ from morph_dslam.slam.pose import (
     project,
     reprojection_errors,
 )
+from morph_dslam.slam.result import NoPose
 from morph_dslam.slam.rigid_map import (
     CANDIDATE,
     FIRST_RMS_PX,
@@ -178,6 +179,15 @@ DOUBTFUL_SHARE = 0.25
 #: than this share of the points that agree.
 MOST_LEAVING = 0.1
 
+#: Lost points looked for in a frame, from at most so many keyframes.
+SEARCH_POINTS, SEARCH_KEYFRAMES = 80, 3
+
+#: In a frozen map lost points are looked for while fewer than this are followed.
+ENOUGH_POINTS = 340
+
+#: How far from its predicted pixel a lost point may be found.
+SEARCH_RADIUS_PX = 5.0
+
 #: Weight of the newest frame in the usual error.
 USUAL_RATE = 0.1
 
@@ -210,10 +220,9 @@ class Tracker:
     camera_from_world : (4, 4) the newest pose. points : what is followed.
     """
 
-    def __init__(self, rigid_map: RigidMap, intrinsics: Array, options: SlamOptions) -> None:
+    def __init__(self, rigid_map: RigidMap, intrinsics: Array) -> None:
         self._map = rigid_map
         self._intrinsics = intrinsics
-        self._options = options
         self._motion = np.eye(4)
         self._warped = WarpedViews(intrinsics)
         self._templates: FewTemplates | None = None
@@ -245,15 +254,12 @@ class Tracker:
         """The map is complete: look for points from the few keyframes that show most of them."""
         self._templates = FewTemplates(self._map)
 
-    def track(self, normalized: Image, depth: FrameDepth | None = None) -> Tracked | str:
+    def track(self, normalized: Image, depth: FrameDepth | None = None) -> Tracked | NoPose:
         """Pose and points of the next frame, or why it is lost; then the newest pose stays what it was."""
-        reason = ""
-        deeper = FlowOptions(self._options.flow.window, self._options.flow.levels + 1)
+        reasons = []
+        deeper = FlowOptions(FLOW.window, FLOW.levels + 1)
         # The prediction is that the motion goes on; if it has changed abruptly, that the camera stands still.
-        for predicted, flow in (
-            (self._motion @ self.camera_from_world, self._options.flow),
-            (self.camera_from_world, deeper),
-        ):
+        for predicted, flow in ((self._motion @ self.camera_from_world, FLOW), (self.camera_from_world, deeper)):
             found = self._follow(normalized, predicted, flow)
             result = self._estimate(normalized, depth, predicted, found)
             if isinstance(result, Tracked):
@@ -264,8 +270,8 @@ class Tracker:
                 self._map.usual_rms_px += rate * (result.pose.rms_px - self._map.usual_rms_px)
                 self._note_candidates(result.points)
                 return result
-            reason = reason or result
-        return reason
+            reasons.append(result)
+        return reasons[0]
 
     def _note_candidates(self, points: Followed) -> None:
         """Let the map know where points without depth are."""
@@ -295,7 +301,7 @@ class Tracker:
         followed = followed[self._map.state[followed.ids] == GOOD]
         positions = self._map.positions[followed.ids]
         errors = reprojection_errors(pose, positions, followed.pixels, self._intrinsics)
-        return followed[errors > self._options.inlier_px]
+        return followed[errors > INLIER_PX]
 
     def find(self, normalized: Image, guesses: Followed, pose: Array, flow: FlowOptions) -> Followed:
         """Points found near their guessed pixels, by the patches of their keyframes as seen from a pose."""
@@ -309,8 +315,8 @@ class Tracker:
             rows = np.flatnonzero((views == view) & inside(guesses.pixels, normalized.shape, 0.0))
             source, starts = self._seen_from(pose, int(view), ids[rows], templates[rows])
             pixels, ok = follow(source, normalized, starts, guesses.pixels[rows], flow)
-            likeness = patch_correlation(source, normalized, starts, pixels, self._options.patch_half)
-            found[rows], good[rows] = pixels, ok & (likeness > self._options.least_correlation)
+            likeness = patch_correlation(source, normalized, starts, pixels, PATCH_HALF)
+            found[rows], good[rows] = pixels, ok & (likeness > LEAST_CORRELATION)
         return Followed(ids, found)[good]
 
     def _seen_from(self, pose: Array, number: int, ids: Indices, pixels: Array) -> tuple[Image, Array]:
@@ -336,19 +342,19 @@ class Tracker:
 
     def _estimate(
         self, normalized: Image, depth: FrameDepth | None, predicted: Array, found: Followed
-    ) -> Tracked | str:
+    ) -> Tracked | NoPose:
         """Pose from what was followed, then with the lost points that are found again."""
         was_astray = np.isin(found.ids, self._astray.ids)
         followed_astray, found = found[was_astray], self.measured(found[~was_astray], predicted, depth)
         pose = self._pose(predicted, found)
-        if isinstance(pose, str):
+        if isinstance(pose, NoPose):
             return pose
         astray = self._still_astray(pose.camera_from_world, followed_astray)
         searched = self._search(normalized, pose.camera_from_world, np.concatenate([found.ids, astray.ids]))
         if len(searched.ids):
             found = found.joined(self.measured(searched, pose.camera_from_world, depth))
             pose = self._pose(pose.camera_from_world, found)
-            if isinstance(pose, str):
+            if isinstance(pose, NoPose):
                 return pose
         return self._tracked(normalized, pose, found, astray)
 
@@ -361,7 +367,7 @@ class Tracker:
         self._map.n_expected[np.union1d(np.union1d(wanted, found.ids[known]), astray.ids)] += 1
         self._map.n_found[found.ids[fits]] += 1
         keep = fits | (self._map.state[found.ids] == CANDIDATE)
-        keep &= inside(found.pixels, normalized.shape, self._options.patch_half + 2)
+        keep &= inside(found.pixels, normalized.shape, PATCH_HALF + 2)
         before, _ = project(self.camera_from_world, self._map.positions[found.ids[fits]], self._intrinsics)
         moved = np.linalg.norm(found.pixels[fits] - np.nan_to_num(before), axis=1)
         leaving = found[known & ~fits]
@@ -373,34 +379,33 @@ class Tracker:
             pose, found[keep], int(fits.sum()), disagreeing, left, float(np.median(moved)) if len(moved) else 0.0
         )
 
-    def _pose(self, start: Array, found: Followed) -> PoseEstimate | str:
+    def _pose(self, start: Array, found: Followed) -> PoseEstimate | NoPose:
         known = found[self._map.state[found.ids] == GOOD]
-        return Sight(self._map, known, self._intrinsics, self._options).pose(start)
+        return Sight(self._map, known, self._intrinsics).pose(start)
 
     def _search(self, normalized: Image, pose: Array, followed: Indices) -> Followed:
         """Map points that are not followed but in view, found where the pose says."""
-        options = self._options
         # In a complete map points have no need to be seen again for their own sake.
-        most = options.search_points
+        most = SEARCH_POINTS
         if self._templates is not None:
-            most = min(options.enough_points - len(followed), most)
+            most = min(ENOUGH_POINTS - len(followed), most)
             if most <= 0:
                 return NOWHERE
         lost = self._map.state == GOOD
         lost[followed] = False
         ids = np.flatnonzero(lost)
         pixels, depths = project(pose, self._map.positions[ids], self._intrinsics)
-        seen = inside(pixels, normalized.shape, options.flow.window) & self.looks_alike(ids, pose, depths)
+        seen = inside(pixels, normalized.shape, FLOW.window) & self.is_similar_view(ids, pose, depths)
         wanted = Followed(ids, pixels)[seen]
         wanted = wanted[self._chosen(wanted.ids, most)]
         if not len(wanted.ids):
             return wanted
-        found = self.find(normalized, wanted, pose, FlowOptions(options.flow.window, 1))
+        found = self.find(normalized, wanted, pose, FlowOptions(FLOW.window, 1))
         errors = reprojection_errors(pose, self._map.positions[found.ids], found.pixels, self._intrinsics)
         self._map.n_expected[np.setdiff1d(wanted.ids, found.ids)] += 1
-        return found[errors < options.search_radius_px]
+        return found[errors < SEARCH_RADIUS_PX]
 
-    def looks_alike(self, ids: Indices, pose: Array, depths: Array) -> Mask:
+    def is_similar_view(self, ids: Indices, pose: Array, depths: Array) -> Mask:
         """Whether points look from here about as from their keyframe."""
         numbers, views = np.unique(self._map.template_keyframe[ids], return_inverse=True)
         poses = np.array([self._map.keyframes[k].camera_from_world for k in numbers]).reshape(-1, 4, 4)
@@ -417,7 +422,7 @@ class Tracker:
         """Rows of at most ``most`` points to look for: of keyframes that saw most, reliable ones first."""
         views = self._map.template_keyframe[ids]
         numbers, counts = np.unique(views, return_counts=True)
-        best = numbers[np.argsort(-counts, kind="stable")[: self._options.search_keyframes]]
+        best = numbers[np.argsort(-counts, kind="stable")[:SEARCH_KEYFRAMES]]
         rows = np.flatnonzero(np.isin(views, best))
         expected, found = self._map.n_expected[ids[rows]], self._map.n_found[ids[rows]]
         doubtful = (expected >= 8) & (found < DOUBTFUL_SHARE * expected)

@@ -21,7 +21,7 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.model.reduced_model import spread_over
 from morph_dslam.registration.landmarks import shape_starts
 from morph_dslam.registration.registration import MapRegistration, PosePrior
-from morph_dslam.slam.frame_images import SlamFrame
+from morph_dslam.slam.result import SlamFrame
 from morph_dslam.slam.rigid_map import RigidMap
 from morph_dslam.slam.slam import Slam
 from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR

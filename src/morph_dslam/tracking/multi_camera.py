@@ -21,7 +21,6 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.slam.frame_images import FrameImages
-from morph_dslam.slam.options import SlamOptions
 from morph_dslam.sources import open_source
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import FIRST_SIGMA_PX, HELD, LEAST_SIGMA_PX
@@ -231,7 +230,7 @@ def pictures_from(path: Path, camera: Camera, numbers: Collection[int]) -> dict[
     SourceError
         If it cannot be read. CameraError if a frame has not the camera's size.
     """
-    images, pictures = FrameImages(camera, SlamOptions()), {}
+    images, pictures = FrameImages(camera), {}
     for frame in open_source(path):
         if frame.index in numbers:
             view = images.prepare(frame.image, frame.index, frame.timestamp)

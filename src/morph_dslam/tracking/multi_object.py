@@ -117,9 +117,8 @@ class MultiObjectTracker:
         if self._anchor is None:
             return {}
         known, camera = self._anchor.locate(frame.image, frame.index, frame.timestamp)
-        return {
-            name: CameraLocalization(known.get(name), camera.reason, camera.total_ms) for name in self._anchor.names
-        }
+        reason = str(camera.reason or "")
+        return {name: CameraLocalization(known.get(name), reason, camera.total_ms) for name in self._anchor.names}
 
     def track(self, frame: Frame, located: Mapping[str, CameraLocalization]) -> dict[str, FrameResult]:
         """Find the objects in a frame that `locate` has seen."""

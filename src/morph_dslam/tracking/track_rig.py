@@ -17,7 +17,6 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import CameraError, RegistrationError, SourceError, TrackingError
 from morph_dslam.io.camera_files import load_rig
 from morph_dslam.slam.frame_images import FrameImages
-from morph_dslam.slam.options import SlamOptions
 from morph_dslam.sources import Frame, FrameSource, open_source
 from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.tracking.estimator import State
@@ -139,7 +138,7 @@ def _check_scan(camera: Camera, keyframe: Image, frames: Path, number: int) -> N
     The other cameras' reference frames are those of that number, in which the object is undeformed.
     """
     try:
-        view = FrameImages(camera, SlamOptions()).prepare(_frame(frames, number).image, number, 0.0)
+        view = FrameImages(camera).prepare(_frame(frames, number).image, number, 0.0)
         is_keyframe = np.corrcoef(view.normalized.ravel(), keyframe.normalized.ravel())[0, 1] > SAME_IMAGE
     except SourceError:
         is_keyframe = False

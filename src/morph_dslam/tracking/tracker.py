@@ -178,7 +178,7 @@ class Tracker:
         if self.anchor is None:
             return CameraLocalization()
         poses, camera = self.anchor.locate(frame.image, frame.index, frame.timestamp)
-        return CameraLocalization(next(iter(poses.values()), None), camera.reason, camera.total_ms)
+        return CameraLocalization(next(iter(poses.values()), None), str(camera.reason or ""), camera.total_ms)
 
     # -- the steps of a frame -----------------------------------------------------------------------------
 
