@@ -20,6 +20,7 @@ __all__ = [
     "ReducedModel",
     "Registration",
     "Scene",
+    "SlamOptions",
     "SolidProblem",
     "Status",
     "TrackOptions",
@@ -56,6 +57,7 @@ _MODULES = {
     "ReducedModel": "model",
     "Registration": "registration.registration",
     "Scene": "slam.scene",
+    "SlamOptions": "slam.options",
     "SolidProblem": "mechanics.solid",
     "Status": "tracking.outcomes",
     "TrackOptions": "tracking.track",
@@ -94,6 +96,7 @@ if TYPE_CHECKING:  # the same for editors and type checkers
     from morph_dslam.reduction.report import write_build_report
     from morph_dslam.registration.registration import Registration, load_registration
     from morph_dslam.render.simulation import simulate
+    from morph_dslam.slam.options import SlamOptions
     from morph_dslam.slam.scene import Scene, load_scene, map_scene
     from morph_dslam.sources import open_live, open_source
     from morph_dslam.sources.frames import Frame
