@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from morph_dslam._version import __version__ as __version__
 
 __all__ = [
+    "Board",
     "Camera",
     "Frame",
     "FrameResult",
@@ -49,6 +50,7 @@ __all__ = [
 
 #: The module of each public name, as in the imports below.
 _MODULES = {
+    "Board": "calibration.board",
     "Camera": "camera",
     "Frame": "sources.frames",
     "FrameResult": "tracking.result",
@@ -85,6 +87,7 @@ _MODULES = {
 }
 
 if TYPE_CHECKING:  # the same for editors and type checkers
+    from morph_dslam.calibration.board import Board
     from morph_dslam.calibration.calibrate import calibrate
     from morph_dslam.camera import Camera
     from morph_dslam.errors import MorphError

@@ -53,6 +53,15 @@ def test_every_public_name_is_documented_and_known_to_type_checkers(package):
     assert set(typed) == set(package.__all__)
 
 
+def test_paths_may_be_given_as_text():
+    functions = [value for name in md.__all__ if inspect.isfunction(value := getattr(md, name))]
+    assert len(functions) > 10
+    for function in functions:
+        for parameter in inspect.signature(function).parameters.values():
+            kinds = re.split(r"[\[\]| ]+", str(parameter.annotation))
+            assert ("Path" in kinds) <= ("str" in kinds), f"{function.__name__}({parameter})"
+
+
 def test_a_name_that_does_not_exist_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no_such_name"):
         md.no_such_name  # noqa: B018

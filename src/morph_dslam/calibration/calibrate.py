@@ -138,7 +138,7 @@ class Calibration:
 
 
 def calibrate(
-    sources: Sequence[Path], board: Board, output: Path, lens_model: LensModel = "radial-tangential"
+    sources: Sequence[str | Path], board: Board, output: str | Path, lens_model: LensModel = "radial-tangential"
 ) -> Calibration:
     """Calibrate a camera and write the camera file and, beside it, a picture (`picture_path`).
 
@@ -154,12 +154,13 @@ def calibrate(
     SourceError
         If an image or a video cannot be read.
     """
+    output = Path(output)
     if output.suffix not in (".yaml", ".yml"):
         raise CameraError(f"cannot write {output}: a camera file has the ending .yaml")
     if not output.parent.is_dir():
         raise CameraError(f"cannot write {output}: there is no folder {output.parent}")
     picture = picture_path(output)
-    found = collect_views(sources, board, ignored=picture)
+    found = collect_views([Path(source) for source in sources], board, ignored=picture)
     calibration = Calibration(solve_intrinsics(found.views, board, found.size, lens_model), found, board)
     try:
         save_camera(output, calibration.solution.camera)

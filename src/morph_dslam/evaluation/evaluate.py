@@ -21,7 +21,7 @@ from morph_dslam.evaluation.run_report import (
 from morph_dslam.evaluation.trajectory import summarise_alignment
 
 
-def evaluate(folder: Path, truth_path: Path, bind_frame: int) -> dict[str, Any]:
+def evaluate(folder: str | Path, truth_path: str | Path, bind_frame: int) -> dict[str, Any]:
     """Compare a run with truth points and write ``evaluation.json``, pictures and ``report.html`` into it.
 
     Parameters
@@ -37,6 +37,7 @@ def evaluate(folder: Path, truth_path: Path, bind_frame: int) -> dict[str, Any]:
     EvaluationError
         If the run and the truth cannot be read or do not fit together.
     """
+    folder, truth_path = Path(folder), Path(truth_path)
     run, truth = load_run(folder), load_truth(truth_path)
     error = material_error(run, truth, bind_frame)
     figures = {
@@ -56,7 +57,7 @@ def evaluate(folder: Path, truth_path: Path, bind_frame: int) -> dict[str, Any]:
 
 
 def evaluate_depth(
-    folder: Path, depth: Path, base_frame: int | None = None, values_per_metre: float | None = None
+    folder: str | Path, depth: str | Path, base_frame: int | None = None, values_per_metre: float | None = None
 ) -> dict[str, Any]:
     """Compare a run's surfaces with depth images; writes ``depth_evaluation.json`` and pictures into it.
 
@@ -74,6 +75,7 @@ def evaluate_depth(
     EvaluationError
         If the run or the depth images cannot be read or do not fit together.
     """
+    folder, depth = Path(folder), Path(depth)
     run = load_run(folder)
     error = depth_error(run, depth, base_frame, values_per_metre)
     figures = {

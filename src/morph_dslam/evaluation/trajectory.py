@@ -234,7 +234,7 @@ DPI = 110
 TRUTH, ESTIMATE = "#1b1f24", "#b4530a"
 
 
-def evaluate_trajectory(run: Path, truth_path: Path) -> dict[str, Any]:
+def evaluate_trajectory(run: str | Path, truth_path: str | Path) -> dict[str, Any]:
     """Compare the camera path of a run with the truth.
 
     Writes ``trajectory_evaluation.json`` and ``trajectory_evaluation.png`` beside the trajectory.
@@ -254,10 +254,11 @@ def evaluate_trajectory(run: Path, truth_path: Path) -> dict[str, Any]:
     TrajectoryError
         If one of them cannot be read.
     """
-    path = run / "trajectory.txt" if run.is_dir() else run
+    path = Path(run)
+    path = path / "trajectory.txt" if path.is_dir() else path
     if not path.is_file():
         raise EvaluationError(f"there is no trajectory {path}: give a run folder with one, or a trajectory file")
-    loaded, loaded_truth = load_trajectory(path), load_trajectory(truth_path)
+    loaded, loaded_truth = load_trajectory(path), load_trajectory(Path(truth_path))
     estimate, truth = match(loaded, loaded_truth)
     figures: dict[str, Any] = {
         "truth": str(truth_path),

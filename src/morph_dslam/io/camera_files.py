@@ -83,7 +83,7 @@ class _CameraFile(BaseModel):
     lens: str = "radial-tangential"
 
 
-def load_camera(path: Path) -> Camera:
+def load_camera(path: str | Path) -> Camera:
     """Read a camera file, or a calibration by OpenCV, ROS, ORB-SLAM, Kalibr, EuRoC or COLMAP (cameras.txt).
 
     Parameters

@@ -144,7 +144,7 @@ VERSION = 3
 _PLAIN = " !#$&'()*+,:;=?@[]"
 
 
-def save_model(path: Path, model: ReducedModel) -> None:
+def save_model(path: str | Path, model: ReducedModel) -> None:
     """Write a model file; the file appears under its name only when it is complete.
 
     Raises
@@ -153,6 +153,7 @@ def save_model(path: Path, model: ReducedModel) -> None:
         If the parts of the model do not fit together: such a file could not be read again.
     """
     check_model(model)
+    path = Path(path)
     partial = path.with_name(path.name + ".partial")
     with h5py.File(partial, "w", userblock_size=BLOCK) as file:
         file.attrs["format"] = FORMAT
@@ -227,7 +228,7 @@ def _open_and_read(path: Path) -> ReducedModel:
         return _read_model(file)
 
 
-def load_model(path: Path) -> ReducedModel:
+def load_model(path: str | Path) -> ReducedModel:
     """Read and check a model file.
 
     Raises
@@ -235,6 +236,7 @@ def load_model(path: Path) -> ReducedModel:
     ModelFileError
         If the file is missing, cut short, damaged, not a model, or of another version.
     """
+    path = Path(path)
     if not path.is_file():
         raise ModelFileError(f"there is no model file {path}; `morph build study.toml -o {path.name}` makes one")
     try:

@@ -35,7 +35,7 @@ def report_path(model_file: Path) -> Path:
     return model_file.with_name(f"{model_file.name.removesuffix('.morph')}.report.html")
 
 
-def write_build_report(path: Path, model: ReducedModel, reference: ReferenceCurve | None = None) -> None:
+def write_build_report(path: str | Path, model: ReducedModel, reference: ReferenceCurve | None = None) -> None:
     """Write the report of a certified model.
 
     It is made from the model alone, so it can be written again at any time. A plot that cannot be drawn is
@@ -60,7 +60,7 @@ def write_build_report(path: Path, model: ReducedModel, reference: ReferenceCurv
                 progress.update()
             sections.append(Section(heading, blocks))
     try:
-        write_report(path, f"{model.name}: report of the reduced model", sections)
+        write_report(Path(path), f"{model.name}: report of the reduced model", sections)
     except OSError as error:
         raise StudyError(f"the model is complete, but its report cannot be written: {error}") from error
 

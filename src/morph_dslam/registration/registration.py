@@ -228,7 +228,7 @@ class Registration:
         return cls(model, None, state, {}, (), covariance=covariance)
 
 
-def load_registration(path: Path, model: ReducedModel) -> Registration:
+def load_registration(path: str | Path, model: ReducedModel) -> Registration:
     """The object as `morph register` placed it, undeformed, in the last keyframe of the map.
 
     Raises
@@ -236,6 +236,7 @@ def load_registration(path: Path, model: ReducedModel) -> Registration:
     RegistrationError
         If the file is missing, not one of `morph register`, or places another object.
     """
+    path = Path(path)
     try:
         content = json.loads(path.read_text())
         keyframe = max(content["keyframes"], key=lambda entry: entry["frame"])

@@ -255,7 +255,7 @@ def _write_lists(output: Path, world: _World) -> None:
         (output / f"{name}.txt").write_text("\n".join(lines) + "\n")
 
 
-def simulate(scene_path: Path, output: Path, progress: bool = True) -> None:
+def simulate(scene_path: str | Path, output: str | Path, progress: bool = True) -> None:
     """Render a scene and write it with its truth.
 
     Parameters

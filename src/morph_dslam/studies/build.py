@@ -24,7 +24,7 @@ FEWEST_HELD_OUT = 4
 
 
 def build(
-    study: Path | Study, output: Path, workers: int | None = None, executor: Executor | None = None
+    study: str | Path | Study, output: str | Path, workers: int | None = None, executor: Executor | None = None
 ) -> ReducedModel:
     """Solve a study and write its model file.
 
@@ -42,6 +42,7 @@ def build(
     StudyError
         If the study is wrong or too few samples converge.
     """
+    output = Path(output)
     if not output.parent.is_dir():
         raise StudyError(f"the folder {output.parent} for the model file does not exist: make it first")
     described, text = _read(study)
@@ -55,11 +56,12 @@ def build(
     return model
 
 
-def _read(study: Path | Study) -> tuple[Study, str]:
+def _read(study: str | Path | Study) -> tuple[Study, str]:
     """A study and the text that says what it is."""
-    if not isinstance(study, Path):
+    if not isinstance(study, str | Path):
         return study, study.model_dump_json()
-    path = study / "study.toml" if study.is_dir() else study
+    path = Path(study)
+    path = path / "study.toml" if path.is_dir() else path
     return load_study(path), path.read_text()
 
 

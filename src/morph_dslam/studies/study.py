@@ -22,7 +22,7 @@ from morph_dslam.studies.solid_study import SolidStudy
 Study = SheetStudy | SolidStudy | ExternalStudy
 
 
-def load_study(path: Path) -> Study:
+def load_study(path: str | Path) -> Study:
     """Read a study file; paths in it are relative to it.
 
     Raises
@@ -30,10 +30,11 @@ def load_study(path: Path) -> Study:
     StudyError
         If it is missing, is not TOML, has an unknown or missing key, or a value that cannot be.
     """
+    path = Path(path)
     return make_study(read_toml(path, "study file", StudyError), path.parent, str(path))
 
 
-def make_study(content: Mapping[str, Any], folder: Path = Path(), where: str = "the study") -> Study:
+def make_study(content: Mapping[str, Any], folder: str | Path = Path(), where: str = "the study") -> Study:
     """A study from the content of a study file.
 
     Parameters
@@ -48,7 +49,7 @@ def make_study(content: Mapping[str, Any], folder: Path = Path(), where: str = "
     """
     kind = _kind(content)
     try:
-        return kind.model_validate(dict(content), context={"folder": folder})
+        return kind.model_validate(dict(content), context={"folder": Path(folder)})
     except ValidationError as error:
         explained = dict.fromkeys(_explain(kind, entry) for entry in error.errors())
         raise StudyError(f"{where}: " + "; ".join(explained)) from error
