@@ -6,11 +6,12 @@ import pytest
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.tracking.depth import DepthOptions, PointDepths, linearise_depths, linearise_depths_numpy
+from morph_dslam.tracking.depth import DepthOptions, PointDepths, linearise_depths
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State, moved
 from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.numpy_twins import tracking as plain
 
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 MODEL = bent_sheet_model(22, 16)
@@ -47,8 +48,8 @@ def test_compiled_and_plain_normal_equations_agree():
     points = bound()
     depths = measured_depths(points, np.random.default_rng(1), 2e-3)
     given = arguments(points, moved(TRUTH, np.full(9, 4e-3)), depths)
-    for compiled, plain in zip(linearise_depths(*given), linearise_depths_numpy(*given), strict=True):
-        np.testing.assert_allclose(compiled, plain, rtol=1e-9, atol=1e-9 * np.abs(plain).max())
+    for compiled, expected in zip(linearise_depths(*given), plain.linearise_depths(*given), strict=True):
+        np.testing.assert_allclose(compiled, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
 
 
 def test_gradient_is_that_of_the_cost_of_depths():

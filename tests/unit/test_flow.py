@@ -7,7 +7,7 @@ import pytest
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.tracking.binding import view_of
 from morph_dslam.tracking.estimator import State
-from morph_dslam.tracking.measurement import ReferenceAppearance, draw_textured, draw_textured_numpy
+from morph_dslam.tracking.measurement import ReferenceAppearance, draw_textured
 from morph_dslam.tracking.patches import (
     NEUTRAL,
     FlowOptions,
@@ -19,6 +19,7 @@ from morph_dslam.tracking.patches import (
     spread_corners,
 )
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.numpy_twins import tracking as plain
 from tests.support.rendered_sequence import CAMERA, SheetFilm, printed_texture, sheet_state
 
 OPTIONS = FlowOptions()
@@ -116,7 +117,7 @@ def test_drawing_in_one_pass_equals_drawing_in_two(closed):
     texture = np.random.default_rng(4).integers(0, 256, (480, 640)).astype(np.uint8)
     view, other = (view_of(model, CAMERA, sheet_state(bend)) for bend in (0.0, 0.15))
     pictures, places = [], view.pixels[model.triangles]
-    for draw in (draw_textured, draw_textured_numpy):
+    for draw in (draw_textured, plain.draw_textured):
         image, depth = np.full((480, 640), NEUTRAL, np.uint8), np.full((480, 640), np.inf, np.float32)
         # Something is drawn there already, nearer than the right half.
         depth[:, 320:400] = 0.01

@@ -9,8 +9,9 @@ import pytest
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.tracking.estimator import State, moved
-from morph_dslam.tracking.outline import Outline, OutlineOptions, rim, search_outline, search_outline_numpy
+from morph_dslam.tracking.outline import Outline, OutlineOptions, rim, search_outline
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.numpy_twins import tracking as plain
 
 CAMERA = Camera(640, 480, 520.0, 520.0, 320.0, 240.0)
 POSE = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.55]))
@@ -87,8 +88,8 @@ def test_compiled_and_plain_search_agree(model):
     angle = rng.uniform(0.0, 2.0 * np.pi, 200)
     normals = np.column_stack([np.cos(angle), np.sin(angle)])
     given = (image, pixels, normals, rng.uniform(100.0, 150.0, 200), 10, 3, 5.0, 0.1)
-    compiled, plain = search_outline(*given), search_outline_numpy(*given)
-    np.testing.assert_allclose(compiled, plain, atol=1e-6)
+    compiled = search_outline(*given)
+    np.testing.assert_allclose(compiled, plain.search_outline(*given), atol=1e-6)
     assert 40 < np.isfinite(compiled).sum() < 160
 
 

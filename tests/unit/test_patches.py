@@ -8,13 +8,12 @@ from scipy.ndimage import shift
 from morph_dslam.tracking.patches import (
     FlowOptions,
     compare_patches,
-    compare_patches_numpy,
     follow,
     normalize_contrast,
     patch_correlation,
-    patch_correlation_numpy,
     spread_corners,
 )
+from tests.support.numpy_twins import tracking as plain
 from tests.support.rendered_sequence import printed_texture
 
 OPTIONS = FlowOptions()
@@ -42,14 +41,14 @@ def test_compiled_and_plain_comparison_agree(image):
     second = first + rng.uniform(-2, 2, first.shape)
     other = shifted(image, 1.0, 0.5)
     compiled = compare_patches(image, other, first, second, 7)
-    plain = compare_patches_numpy(image, other, first, second, 7)
-    for one, twin in zip(compiled, plain, strict=True):
+    expected = plain.compare_patches(image, other, first, second, 7)
+    for one, twin in zip(compiled, expected, strict=True):
         np.testing.assert_allclose(one, twin, atol=1e-6)
     # Blank paper, and what leaves the image, tells no place.
     assert np.isinf(compiled[2][compiled[1] == -1.0]).all()
     np.testing.assert_allclose(
         patch_correlation(image, other, first, second, 7),
-        patch_correlation_numpy(image, other, first, second, 7),
+        plain.patch_correlation(image, other, first, second, 7),
         atol=1e-6,
     )
 

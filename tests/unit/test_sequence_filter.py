@@ -8,9 +8,10 @@ from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
 from morph_dslam.registration.registration import PosePrior
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, Prior, State, moved
-from morph_dslam.tracking.noise import Observations, window_correlation, window_correlation_numpy
+from morph_dslam.tracking.noise import Observations, window_correlation
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.numpy_twins import tracking as plain
 
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 MODEL = bent_sheet_model(22, 16)
@@ -210,7 +211,7 @@ def test_windows_correlate_by_what_they_share():
     many = np.random.default_rng(0).uniform(0.0, 60.0, (40, 2))
     many[3] = np.nan
     compiled = window_correlation(many, 17).toarray()
-    np.testing.assert_allclose(compiled, window_correlation_numpy(many, 17), atol=1e-12)
+    np.testing.assert_allclose(compiled, plain.window_correlation(many, 17), atol=1e-12)
     np.testing.assert_array_equal(compiled[3], np.eye(40)[3])
 
 

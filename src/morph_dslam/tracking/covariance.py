@@ -191,24 +191,3 @@ def huber_covariance(hessian, residuals, weights, numbers, huber_px, scale):
     return sigma, variance * ((vectors / floored) @ vectors.T) * np.outer(scale, scale)
 
 
-def huber_covariance_numpy(
-    hessian: Array, residuals: Array, weights: Array, numbers: NDArray[np.integer], huber_px: float, scale: Array
-) -> tuple[float, Array]:
-    """The plain twin of `huber_covariance`."""
-    size = len(hessian)
-    count = int(numbers.sum())
-    freedom = count - size
-    if freedom <= 0:
-        return float("inf"), np.full((size, size), np.inf)
-    length = np.linalg.norm(residuals, axis=1)
-    # The length of a Gaussian pair has the median 1.1774 sigma (Rayleigh).
-    pairs = (np.sqrt(weights) * length)[numbers == 2]
-    sigma = float(np.median(pairs) / 1.1774 * np.sqrt(count / freedom)) if len(pairs) else float("inf")
-    factor = np.minimum(1.0, huber_px / np.maximum(length, 1e-300))
-    psi_squared = float(np.sum(weights * (factor * length) ** 2)) / freedom
-    mean_slope = max(float(np.mean(0.5 * (factor + (length <= huber_px)))), 1e-3)
-    eigenvalues, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
-    floored = np.maximum(eigenvalues, max(eigenvalues[-1], 1e-30) * EIGENVALUE_FLOOR)
-    inverse = (vectors / floored) @ vectors.T
-    variance = psi_squared * float(factor.mean()) / mean_slope**2
-    return sigma, variance * inverse * np.outer(scale, scale)

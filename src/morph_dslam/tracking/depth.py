@@ -193,17 +193,3 @@ def linearise_depths(functions, rotation, translation, rest, modes, depths, weig
     return cost, hessian, gradient, residuals
 
 
-def linearise_depths_numpy(functions, rotation, translation, rest, modes, depths, weights, huber):
-    """The plain twin of `linearise_depths`."""
-    fields = np.tensordot(functions, modes, axes=1)
-    turned = (rest + fields[0]) @ rotation.T
-    residuals = np.where(weights > 0.0, weights * (turned[:, 2] + translation[2] - depths), 0.0)
-    zero = np.zeros(len(rest))
-    slopes = weights[:, None] * np.column_stack(
-        [(fields[1:] @ rotation[2]).T, turned[:, 1], -turned[:, 0], zero, zero, zero, zero + 1.0]
-    )
-    length = np.abs(residuals)
-    outside = length > huber
-    cost = np.sum(np.where(outside, huber * (length - 0.5 * huber), 0.5 * length**2))
-    factor = np.where(outside, huber / np.maximum(length, 1e-300), 1.0)
-    return cost, (slopes.T * factor) @ slopes, slopes.T @ (factor * residuals), residuals

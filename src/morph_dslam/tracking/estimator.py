@@ -7,7 +7,7 @@ of the camera's, the pose's and the model's derivative (the paper's projected se
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,7 +16,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.geometry import cross_matrix
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.separated import combine_modes
 from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR, huber_covariance
@@ -146,45 +145,6 @@ def project_with_jacobian(functions, rotation, translation, rest, modes, intrins
         pixels[j, 1] = intrinsics[1] * y + intrinsics[3]
         _point_jacobian(jacobian[j], fields, j, rotation, turned, 1.0 / depth, x, y, intrinsics)
     return pixels, jacobian
-
-
-def project_with_jacobian_numpy(functions, rotation, translation, rest, modes, intrinsics):
-    """The plain twin of `project_with_jacobian`."""
-    fields = np.tensordot(functions, modes, axes=1)
-    turned = (rest + fields[0]) @ rotation.T
-    x, y, z = (turned + translation).T
-    z = np.where(z < MINIMUM_DEPTH, np.nan, z)
-    fx, fy, cx, cy = intrinsics
-    pixels = np.column_stack([fx * x / z + cx, fy * y / z + cy])
-    d = len(functions) - 1
-    of_position = np.zeros((len(rest), 2, 3))
-    of_position[:, 0, 0], of_position[:, 0, 2] = fx / z, -fx * x / z**2
-    of_position[:, 1, 1], of_position[:, 1, 2] = fy / z, -fy * y / z**2
-    of_unknowns = np.zeros((len(rest), 3, d + 6))
-    of_unknowns[:, :, :d] = np.moveaxis(fields[1:] @ rotation.T, 0, 2)
-    of_unknowns[:, :, d : d + 3] = -cross_matrix(turned)
-    of_unknowns[:, :, d + 3 :] = np.eye(3)
-    return pixels, of_position @ of_unknowns
-
-
-def linearise_numpy(functions, rotation, translation, rest, modes, intrinsics, pixels, weights, normals, huber):
-    """The plain twin of `linearise`."""
-    projected, jacobian = project_with_jacobian_numpy(functions, rotation, translation, rest, modes, intrinsics)
-    residuals = projected - pixels
-    directed = (normals != 0.0).any(axis=1)
-    onto = np.where(directed[:, None, None], normals[:, :, None] * normals[:, None, :], np.eye(2))
-    residuals, jacobian = np.einsum("pab,pb->pa", onto, residuals), onto @ jacobian
-    length = np.linalg.norm(residuals, axis=1)
-    seen = np.isfinite(length)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        outside = length > huber
-        rho = np.where(outside, huber * (length - 0.5 * huber), 0.5 * length**2)
-        factor = np.where(outside, weights * huber / length, weights)
-    cost = np.sum(weights[seen] * rho[seen]) + UNSEEN_COST * weights[~seen].sum()
-    used, r, w = jacobian[seen], residuals[seen], factor[seen]
-    hessian = np.einsum("p,pca,pcb->ab", w, used, used, optimize=True)
-    gradient = np.einsum("p,pca,pc->a", w, used, r, optimize=True)
-    return cost, hessian, gradient, residuals
 
 
 # A cost about its minimum: how errors of measurements enter the estimate.
@@ -343,21 +303,11 @@ class Estimate:
 
 
 class Estimator:
-    """Finds states from pixels of bound points, with one camera and one model.
+    """Finds states from pixels of bound points, with one camera and one model."""
 
-    ``linearise`` may be replaced by its numpy twin to compare them.
-    """
-
-    def __init__(
-        self,
-        model: ReducedModel,
-        camera: Camera,
-        options: EstimationOptions | None = None,
-        linearise: Callable = linearise,
-    ) -> None:
+    def __init__(self, model: ReducedModel, camera: Camera, options: EstimationOptions | None = None) -> None:
         self.model, self.camera = model, camera
         self.options = options or EstimationOptions()
-        self._linearise = linearise
         self.box = Box.of(model)
 
     @property
@@ -388,7 +338,7 @@ class Estimator:
         """
         pose = state.camera_from_object
         normals = np.zeros_like(pixels) if normals is None else normals
-        cost, hessian, gradient, residuals = self._linearise(
+        cost, hessian, gradient, residuals = linearise(
             points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
             points.field.modes, self.camera.intrinsics, pixels, weights, normals, self.options.huber_px,
         )  # fmt: skip

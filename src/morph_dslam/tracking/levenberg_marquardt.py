@@ -57,22 +57,6 @@ def bounded_step(hessian, gradient, lower, upper):
     return step
 
 
-def bounded_step_numpy(hessian: Array, gradient: Array, lower: Array, upper: Array) -> Array:
-    """The plain twin of `bounded_step`."""
-    step = np.zeros_like(gradient)
-    free = ~(((lower == 0.0) & (gradient > 0.0)) | ((upper == 0.0) & (gradient < 0.0)))
-    while free.any():
-        held = ~free
-        right = -gradient[free] - hessian[np.ix_(free, held)] @ step[held]
-        step[free] = np.linalg.solve(hessian[np.ix_(free, free)], right)
-        outside = free & ((step < lower) | (step > upper))
-        if not outside.any():
-            break
-        step[outside] = np.clip(step[outside], lower[outside], upper[outside])
-        free &= ~outside
-    return step
-
-
 # Levenberg-Marquardt over parameters inside their box and a pose.
 # The steps are taken in scaled unknowns (half a parameter range, one radian, the object's size), so that the
 # damping treats them alike. Directions that the cost does not see get no step: the damping has a floor

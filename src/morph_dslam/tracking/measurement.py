@@ -19,12 +19,10 @@ from morph_dslam.render.rasteriser import (
     is_inside,
     load_triangle,
     pixel_window,
-    rasterise,
     visible_points,
     weight_steps,
     weights_at,
 )
-from morph_dslam.render.texture import render_textured
 from morph_dslam.tracking.binding import View, facing, signed_areas
 from morph_dslam.tracking.patches import NEUTRAL, FlowOptions, compare_patches, follow
 
@@ -151,15 +149,6 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
         for corner in range(3):
             x[corner], y[corner] = coordinates[t, corner, 0], coordinates[t, corner, 1]
         _draw_triangle(area, u, v, q, x, y, texture, image, depth)
-
-
-def draw_textured_numpy(pixels, depths, triangles, coordinates, texture, closed, image, depth):
-    """The plain twin of `draw_textured`, in two passes."""
-    buffers = rasterise(pixels, depths, triangles, *depth.shape, closed=closed)
-    nearest = buffers.depth < depth
-    corners = np.arange(3 * len(triangles)).reshape(-1, 3)
-    image[nearest] = render_textured(buffers, corners, coordinates.reshape(-1, 2), texture)[nearest]
-    depth[nearest] = buffers.depth[nearest]
 
 
 # Where the object's bound points are seen in a frame, and which of these measurements to believe.

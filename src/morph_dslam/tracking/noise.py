@@ -106,15 +106,6 @@ def _overlaps(pixels, window):
     return values, columns, begins
 
 
-def window_correlation_numpy(pixels: Array, window: int) -> Array:
-    """The plain twin of `window_correlation`."""
-    overlap = np.ones((len(pixels), len(pixels)))
-    for column in pixels.T:
-        overlap *= np.fmax(0.0, 1.0 - np.abs(column[:, None] - column[None]) / window)
-    np.fill_diagonal(overlap, 1.0)
-    return overlap
-
-
 #: An estimate that takes up more of the variance leaves too little, as a share, to tell how large it is.
 LEAST_LEFT = 0.25
 

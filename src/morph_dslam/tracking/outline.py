@@ -206,27 +206,3 @@ def search_outline(grey, pixels, normals, brightness, reach, side, least_contras
     return result
 
 
-def search_outline_numpy(grey, pixels, normals, brightness, reach, side, least_contrast, tolerance):
-    """The plain twin of `search_outline`, on scipy's bilinear sampling."""
-    from scipy.ndimage import map_coordinates
-
-    height, width = grey.shape
-    steps = np.arange(-reach - side, reach + side + 1)
-    result = np.full(len(pixels), np.nan)
-    for j in np.flatnonzero(np.isfinite(pixels[:, 0]) & np.isfinite(brightness)):
-        x, y = (pixels[j] + steps[:, None] * normals[j]).T
-        if min(x.min(), y.min()) < 0.0 or x.max() >= width - 1 or y.max() >= height - 1:
-            continue
-        profile = map_coordinates(grey.astype(float), [y, x], order=1)
-        windows = np.lib.stride_tricks.sliding_window_view(profile, 2 * side + 1)
-        inner, outer = windows[:, :side].mean(axis=1), windows[:, side + 1 :].mean(axis=1)
-        alike = np.abs(inner - brightness[j]) <= tolerance * brightness[j]
-        scores = np.where(alike, np.abs(inner - outer), 0.0)
-        best = int(np.argmax(scores))
-        if scores[best] <= least_contrast or best in (0, 2 * reach):
-            continue
-        before, at, after = scores[best - 1 : best + 2]
-        bend = before - 2.0 * at + after
-        shift = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
-        result[j] = best - reach + np.clip(shift, -0.5, 0.5)
-    return result

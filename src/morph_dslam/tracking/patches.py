@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 Array = NDArray[np.float64]
 
@@ -209,57 +208,6 @@ def compare_patches(first, second, first_points, second_points, half):
         if inverse < np.inf:
             places[j] += step
             spread[j] = np.sqrt(_worst_quarter(a, b, size) * inverse)
-    return places, correlation, spread
-
-
-def _sampled(image: NDArray[np.uint8], centre: Array, half: int) -> Array | None:
-    """The patch (n, n) of an image about a point, bilinearly; None where it leaves the image."""
-    limit = np.array(image.shape[::-1]) - 1
-    if (centre - half < 0).any() or (centre + half >= limit).any():
-        return None
-    offsets = np.mgrid[-half : half + 1, -half : half + 1].astype(float)
-    return map_coordinates(image.astype(float), centre[::-1, None, None] + offsets, order=1)
-
-
-def _correlated(a: Array, b: Array) -> float:
-    a, b = a - a.mean(), b - b.mean()
-    squares = float((a * a).sum() * (b * b).sum())
-    return float((a * b).sum()) / np.sqrt(squares) if squares > 1e-6 else 0.0
-
-
-def patch_correlation_numpy(
-    first: NDArray[np.uint8], second: NDArray[np.uint8], first_points: Array, second_points: Array, half: int
-) -> Array:
-    """The plain twin of `patch_correlation`, on scipy's bilinear sampling."""
-    found = np.full(len(first_points), -1.0)
-    for j, (p, q) in enumerate(zip(first_points, second_points, strict=True)):
-        a, b = _sampled(first, p, half), _sampled(second, q, half)
-        if a is not None and b is not None:
-            found[j] = _correlated(a, b)
-    return found
-
-
-def compare_patches_numpy(
-    first: NDArray[np.uint8], second: NDArray[np.uint8], first_points: Array, second_points: Array, half: int
-) -> tuple[Array, Array, Array]:
-    """The plain twin of `compare_patches`: scipy's bilinear sampling, least squares of all six unknowns."""
-    count, n, inner = len(first_points), 2 * half + 1, slice(1, -1)
-    places, correlation, spread = second_points.astype(float), np.full(count, -1.0), np.full(count, np.inf)
-    y, x = np.mgrid[-half : half + 1, -half : half + 1].astype(float)
-    for j, (p, q) in enumerate(zip(first_points, second_points, strict=True)):
-        a, b = _sampled(first, p, half + 1), _sampled(second, q, half + 1)
-        if a is None or b is None:
-            continue
-        down, right = (np.asarray(np.gradient(0.5 * (a + b), axis=k))[inner, inner] for k in (0, 1))
-        a, b = a[inner, inner], b[inner, inner]
-        correlation[j] = _correlated(a, b)
-        rows = np.stack([-right, -down, np.ones_like(x), x, y, a - 128.0], axis=-1).reshape(-1, 6)
-        solution, _, rank, _ = np.linalg.lstsq(rows, (b - a).ravel(), rcond=1e-10)
-        if rank == 6 and np.linalg.norm(solution[:2]) < LONGEST_STEP:
-            places[j] += solution[:2]
-            ends = [slice(0, half), slice(n - half, n)]
-            worst = max(np.var((b - a)[part, side]) for part in ends for side in ends)
-            spread[j] = np.sqrt(0.5 * worst * np.trace(np.linalg.inv(rows.T @ rows)[:2, :2]))
     return places, correlation, spread
 
 
