@@ -189,5 +189,3 @@ def huber_covariance(hessian, residuals, weights, numbers, huber_px, scale):
     values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
     floored = np.maximum(values, max(values[-1], 1e-30) * EIGENVALUE_FLOOR)
     return sigma, variance * ((vectors / floored) @ vectors.T) * np.outer(scale, scale)
-
-

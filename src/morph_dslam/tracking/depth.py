@@ -191,5 +191,3 @@ def linearise_depths(functions, rotation, translation, rest, modes, depths, weig
             for b in range(size):
                 hessian[a, b] += factor * slope[a] * slope[b]
     return cost, hessian, gradient, residuals
-
-

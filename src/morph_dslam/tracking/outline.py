@@ -204,5 +204,3 @@ def search_outline(grey, pixels, normals, brightness, reach, side, least_contras
         shift = 0.5 * (scores[best - 1] - scores[best + 1]) / bend if bend < 0.0 else 0.0
         result[j] = best - reach + min(max(shift, -0.5), 0.5)
     return result
-
-
