@@ -62,10 +62,11 @@ class Grid:
     def mesh(self) -> ModelMesh:
         """Nodes, triangles and weights as the model file holds them."""
         nx, ny = self.cells
-        made = mechanics.sheet(self.size, self.cells)  # its nodes are counted with y fastest
-        order = np.arange(made.n_nodes).reshape(nx + 1, ny + 1).T.ravel()
-        middle = np.array([*self.size, 0.0]) / 2.0
-        return mechanics.model_mesh_of(made.renumbered(np.argsort(order), made.nodes[order] - middle))
+        x, y = self.axes()
+        nodes = np.column_stack([np.tile(x, ny + 1), np.repeat(y, nx + 1), np.zeros((nx + 1) * (ny + 1))])
+        corner = (np.arange(ny)[:, None] * (nx + 1) + np.arange(nx)).ravel()
+        quads = np.column_stack([corner, corner + 1, corner + nx + 2, corner + nx + 1])
+        return mechanics.model_mesh_of(mechanics.Mesh(nodes, (mechanics.CellBlock("quad4", quads),)))
 
 
 @dataclass(frozen=True)

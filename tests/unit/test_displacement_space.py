@@ -12,13 +12,14 @@ from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.loads import DeadTraction
 from morph_dslam.mechanics.materials.isotropic import NeoHookean
 from morph_dslam.mechanics.ngsolve_mesh import NgsolveMesh, reference_points
-from morph_dslam.mechanics.recovery import locate
+from morph_dslam.mechanics.point_location import locate
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.solvers.newton import solve
 from morph_dslam.mechanics.spaces import DisplacementSpace
 from morph_dslam.mechanics.supports import fixed
 from morph_dslam.meshing.generators import block, tube
-from morph_dslam.meshing.meshes import CellBlock, Mesh, cell_volumes
+from morph_dslam.meshing.meshes import CellBlock, Mesh
+from tests.support.meshes import cell_volumes
 from tests.support.solids import SOLID_CELLS, distorted
 
 

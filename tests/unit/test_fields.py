@@ -7,7 +7,7 @@ import pytest
 from scipy.special import eval_chebyt
 
 from morph_dslam.errors import ParameterError, StudyError
-from morph_dslam.mechanics.recovery import material_points
+from morph_dslam.mechanics.point_location import material_points
 from morph_dslam.model import SeparatedField, SurfacePoints
 from morph_dslam.model.basis_functions import chebyshev_basis, cubic_spline_basis, fourier_basis
 from morph_dslam.model.functions import ParameterFunctions, total_degree_indices

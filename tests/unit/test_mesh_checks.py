@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.meshing.generators import block, sheet
+from morph_dslam.meshing.generators import block
 from morph_dslam.meshing.mesh_checks import check_mesh
 from morph_dslam.meshing.meshes import CellBlock, Mesh
+from tests.support.meshes import SHEET
 
 
 def cube(name="hex8", size=0.1):
@@ -96,7 +97,7 @@ def test_a_wrong_mesh_is_refused(mesh, message):
         check_mesh(mesh)
 
 
-@pytest.mark.parametrize("mesh", [cube("hex27"), cube("prism15"), sheet((0.2, 0.3), (3, 2)), cube(size=2.5)])
+@pytest.mark.parametrize("mesh", [cube("hex27"), cube("prism15"), SHEET, cube(size=2.5)])
 def test_a_sound_mesh_passes(mesh):
     check_mesh(mesh, sets=("x_min",), regions=("all",))
 

@@ -13,7 +13,7 @@ from morph_dslam.errors import StudyError
 from morph_dslam.meshing.generators import block
 from morph_dslam.meshing.mesh_checks import check_mesh
 from morph_dslam.meshing.mesh_files import load_mesh
-from morph_dslam.meshing.meshes import cell_volumes, surface_area
+from tests.support.meshes import cell_volumes, surface_area
 from tests.support.real_data import real_data
 
 ABAQUS = {

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.meshing.generators import SOLIDS, Collar, block, revolution, sheet, tube
+from morph_dslam.meshing.generators import SOLIDS, Collar, block, revolution, tube
 from morph_dslam.meshing.mesh_checks import check_mesh
-from morph_dslam.meshing.meshes import cell_volumes, centroid, surface_area
+from tests.support.meshes import cell_volumes, centroid, surface_area
 
 #: A boot of a gear lever: cuff, four round folds, neck; radius and height in millimetres.
 BOOT = [
@@ -44,18 +44,6 @@ def _on_plane(mesh, axis, side):
 def test_second_order_nodes_are_as_many_as_the_grid_of_half_steps_holds(name, nodes):
     # (2+1)(3+1)(2+1) corners; (5)(7)(5) half steps; hex20 leaves out 52 faces' and 12 cells' centres.
     assert block((1.0, 1.0, 1.0), (2, 3, 2), name).n_nodes == nodes
-
-
-@pytest.mark.parametrize(("name", "area"), [("quad4", 1), ("tri3", 2)])
-def test_a_sheet_has_its_area_and_edges(name, area):
-    mesh = sheet((0.3, 0.2), (3, 4), name)
-    check_mesh(mesh)
-    assert mesh.n_cells == 12 * area
-    assert cell_volumes(mesh).sum() == pytest.approx(0.06, rel=1e-12)
-    corners = mesh.nodes[mesh.surface_triangles()]
-    assert np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2].min() > 0
-    np.testing.assert_allclose(mesh.nodes[mesh.node_sets["x_max"], 0], 0.3)
-    assert [len(mesh.node_sets[f"{a}_{b}"]) for a in "xy" for b in ("min", "max")] == [5, 5, 4, 4]
 
 
 @pytest.mark.parametrize(("name", "around", "tolerance"), [

@@ -15,17 +15,18 @@ from morph_dslam.mechanics.kinematics import ShapeField
 from morph_dslam.mechanics.loads import DeadTraction, FollowerPressure, MovingPatch, PointLoad
 from morph_dslam.mechanics.materials.isotropic import NeoHookean
 from morph_dslam.mechanics.parameters import ParameterSymbols
-from morph_dslam.mechanics.recovery import locate
+from morph_dslam.mechanics.point_location import locate
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning
 from morph_dslam.mechanics.solvers.continuation import PathError
 from morph_dslam.mechanics.supports import ElasticFoundation, PrescribedDisplacement, RigidRotation, fixed
-from morph_dslam.meshing.generators import block, sheet
+from morph_dslam.meshing.generators import block
 from morph_dslam.model import Parameter
 from morph_dslam.studies.build import build_warnings
 from morph_dslam.studies.provenance import locking_warnings
 from morph_dslam.studies.study import load_study, make_study
 from tests.support.block_study import write_study
+from tests.support.meshes import SHEET
 from tests.support.solids import RUBBER, load_parameter, solved
 
 MESH = block((1.0, 1.0, 1.0), (2, 1, 1), "hex8")
@@ -105,7 +106,7 @@ def test_locking_elements_are_flagged_and_mixed_ones_are_not() -> None:
 
 def test_cells_that_do_not_serve_are_refused() -> None:
     with pytest.raises(StudyError, match="quad4 are no solids"):
-        SolidProblem(sheet((1.0, 1.0), (1, 1)), {"all": RUBBER})
+        SolidProblem(SHEET, {"all": RUBBER})
     tetrahedra = block((1.0, 1.0, 1.0), (1, 1, 1), "tet4")
     with pytest.raises(StudyError, match="use tet10"):
         SolidProblem(tetrahedra, {"all": SOFT}, [fixed("x_min")], options=SolidOptions(mixed=True))

@@ -14,7 +14,7 @@ from morph_dslam.mechanics.morphing import radius_field, thickness_field
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.supports import ElasticFoundation, RigidRotation, fixed
 from morph_dslam.meshing.generators import block, tube
-from morph_dslam.meshing.meshes import cell_volumes
+from tests.support.meshes import cell_volumes
 from tests.support.solids import RUBBER, load_parameter, solved
 
 

@@ -31,10 +31,11 @@ from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning
 from morph_dslam.mechanics.solvers.continuation import advance
 from morph_dslam.mechanics.solvers.newton import State, sensitivities, solve
 from morph_dslam.mechanics.supports import ElasticFoundation, PrescribedDisplacement, RigidRotation, fixed
-from morph_dslam.meshing.generators import Profile, block, revolution, sheet, tube
+from morph_dslam.meshing.generators import Profile, block, revolution, tube
 from morph_dslam.meshing.mesh_checks import check_mesh
-from morph_dslam.meshing.mesh_files import load_mesh, to_second_order
+from morph_dslam.meshing.mesh_files import load_mesh
 from morph_dslam.meshing.meshes import CellBlock, Mesh, model_mesh_of
+from morph_dslam.meshing.second_order import to_second_order
 
 __all__ = [
     "BodyForce",
@@ -80,7 +81,6 @@ __all__ = [
     "right_cauchy_green",
     "second_invariant",
     "sensitivities",
-    "sheet",
     "solve",
     "to_second_order",
     "tube",

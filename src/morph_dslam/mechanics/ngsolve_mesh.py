@@ -31,6 +31,12 @@ def reference_points(shape: str, points: Array) -> Array:
     return np.column_stack([1.0 - x - y - z, x, y] if shape == "tet" else [1.0 - x - y, x, z])
 
 
+def corner_monomials(count: int, points: Array) -> Array:
+    """Values (p, count) at points (p, 3) of as many monomials as a reference cell has corners; 1 is the constant."""
+    x, y, z = points.T
+    return np.column_stack([np.ones_like(x), x, y, z, x * z, y * z, x * y, x * y * z][:count])
+
+
 class NgsolveMesh:
     """A mesh, its counterpart in NGSolve and the numbering between them.
 

@@ -1,9 +1,15 @@
-"""Where points lie in a mesh: the cell, and the coordinates in its reference cell."""
+"""Fields of a solved solid at its nodes, and their derivatives by the parameters.
+
+Stresses and strains are taken at the quadrature points where they are most accurate (two in each direction: Barlow,
+IJNME 10, 1976), extrapolated within each cell and averaged, unweighted, over the cells around the node, across
+materials too; displacements need none of this. Derivatives are total: by the displacements and pressures, which follow
+the parameters, and by the parameters where constants or the undeformed shape contain them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -11,130 +17,28 @@ import ngsolve as ngs
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
-from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.kinematics import Kinematics
 from morph_dslam.mechanics.materials.base import VOIGT, green_lagrange
-from morph_dslam.mechanics.ngsolve_mesh import reference_points
+from morph_dslam.mechanics.ngsolve_mesh import corner_monomials, reference_points
 from morph_dslam.meshing.cell_types import CellType
-from morph_dslam.meshing.meshes import CellBlock, Mesh
-from morph_dslam.model import MaterialPoints, ReducedModel
+from morph_dslam.model.reduced_model import von_mises
 
 if TYPE_CHECKING:
     from morph_dslam.mechanics.solid import SolidProblem
 
-
 Array = NDArray[np.float64]
 
-Indices = NDArray[np.int64]
-
-#: Cells tried for a point, nearest first.
-CANDIDATES = 24
-
-NEWTON_STEPS = 20
-
-#: How far outside of the reference cell still counts as inside.
-TOLERANCE = 1e-8
-
-
-@dataclass(frozen=True)
-class LocatedPoints:
-    """Points of the solid.
-
-    Attributes
-    ----------
-    cells : (p,) cell indices. reference : (p, 3) coordinates in the reference cell of the `CellType`.
-    """
-
-    cells: Indices
-    reference: Array
-
-
-def outside_by(shape: str, reference: Array) -> Array:
-    """How far (p,) points (p, 3) lie outside of a reference cell; negative inside."""
-    x, y, z = reference.T
-    bounds = [-x, -y, -z]
-    bounds += {"hex": [x - 1.0, y - 1.0, z - 1.0], "tet": [x + y + z - 1.0], "prism": [x + y - 1.0, z - 1.0]}[shape]
-    return np.max(bounds, axis=0)
-
-
-def _inverse_map(kind: CellType, corners: Array, points: Array) -> Array:
-    """Reference coordinates (p, 3) of points (p, 3) in cells with nodes (p, k, 3), by Newton's method."""
-    reference = np.tile(kind.nodes[: kind.corners].mean(axis=0), (len(points), 1))
-    for _ in range(NEWTON_STEPS):
-        gap = points - np.einsum("pk,pkx->px", kind.shape_functions(reference), corners)
-        jacobian = np.einsum("pka,pkx->pxa", kind.shape_gradients(reference), corners)
-        jacobian[np.abs(np.linalg.det(jacobian)) < 1e-300] = np.eye(3)
-        step = np.linalg.solve(jacobian, gap[:, :, None])[:, :, 0]
-        reference = np.clip(reference + step, -2.0, 3.0)
-        if np.abs(step).max(initial=0.0) < 1e-13:
-            break
-    return reference
-
-
-def locate(mesh: Mesh, points: Array) -> LocatedPoints:
-    """The cells that points (p, 3) of the undeformed solid, m, lie in.
-
-    Raises
-    ------
-    StudyError
-        If a point lies outside of the mesh.
-    """
-    points = np.atleast_2d(np.asarray(points, dtype=float))
-    centres = np.concatenate([mesh.nodes[b.connectivity].mean(axis=1) for b in mesh.blocks])
-    starts = mesh.block_starts()
-    _, near = KDTree(centres).query(points, k=min(CANDIDATES, len(centres)))
-    near = near.reshape(len(points), -1)
-    cells, reference = np.full(len(points), -1, dtype=np.int64), np.zeros((len(points), 3))
-    for candidate in near.T:
-        for block, start, stop in zip(mesh.blocks, starts[:-1], starts[1:], strict=True):
-            rows = np.flatnonzero((cells < 0) & (candidate >= start) & (candidate < stop))
-            if not len(rows):
-                continue
-            nodes = mesh.nodes[block.connectivity[candidate[rows] - start]]
-            found = _inverse_map(block.type, nodes, points[rows])
-            inside = outside_by(block.type.shape, found) < TOLERANCE
-            cells[rows[inside]] = candidate[rows[inside]]
-            reference[rows[inside]] = found[inside]
-    if (cells < 0).any():
-        lost = points[np.flatnonzero(cells < 0)[0]]
-        raise StudyError(
-            f"{int((cells < 0).sum())} of {len(points)} points lie outside of the solid, the first at "
-            f"({', '.join(f'{round(1e3 * value, 3):g}' for value in lost)}) mm"
-        )
-    return LocatedPoints(cells, reference)
-
-
-# Fields of a solved solid at its nodes and at any point, and their derivatives by the parameters.
-# At points, fields are what the finite elements say there. At nodes, stresses and strains are taken at the
-# quadrature points where they are most accurate (two in each direction: Barlow, IJNME 10, 1976), extrapolated
-# within each cell and averaged, unweighted, over the cells around the node, across materials too;
-# displacements need none of this.
-# Derivatives are total: by the displacements and pressures, which follow the parameters, and by the
-# parameters where constants or the undeformed shape contain them.
-
-
 #: Components of each field: symmetric tensors in Voigt's order (xx, yy, zz, yz, xz, xy), others row by row.
-COMPONENTS = {
-    "deformation_gradient": 9,
-    "strain": 6,
-    "first_piola_kirchhoff": 9,
-    "second_piola_kirchhoff": 6,
-    "stress": 6,
-}
+COMPONENTS = {"deformation_gradient": 9, "strain": 6, "first_piola_kirchhoff": 9, "stress": 6}
 
-STRESSES = ("first_piola_kirchhoff", "second_piola_kirchhoff", "stress")
+STRESSES = ("first_piola_kirchhoff", "stress")
 
 _VOIGT_COLUMNS = [3 * i + j for i, j in VOIGT]
 
-_ELEMENT_TYPES = {"hex": ngs.HEX, "tet": ngs.TET, "prism": ngs.PRISM}
 
-
-def overstress(name: str, F: Array, remembered: Array) -> Array:
+def _overstress(name: str, F: Array, remembered: Array) -> Array:
     """Part (p, 3, 3) of a stress due to a ``remembered`` second Piola-Kirchhoff stress (p, 3, 3), Pa."""
-    if name == "second_piola_kirchhoff":
-        return remembered
     first = F @ remembered
     if name == "first_piola_kirchhoff":
         return first
@@ -145,13 +49,6 @@ def _components(name: str, tensors: Array) -> Array:
     """Columns (p, c) of a field's 3x3 values."""
     values = tensors.reshape(-1, 9)
     return values[:, _VOIGT_COLUMNS] if COMPONENTS[name] == 6 else values
-
-
-def von_mises(stress: Array) -> Array:
-    """Von Mises stress (...,) of Cauchy stresses (..., 6) in Voigt's order, Pa."""
-    xx, yy, zz, yz, xz, xy = np.moveaxis(stress, -1, 0)
-    normal = (xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2
-    return np.sqrt(0.5 * normal + 3.0 * (yz**2 + xz**2 + xy**2))
 
 
 @dataclass(frozen=True)
@@ -192,12 +89,9 @@ class Recovery:
             "deformation_gradient": F,
             "strain": green_lagrange(F),
             "first_piola_kirchhoff": P,
-            "second_piola_kirchhoff": ngs.Inv(F) * P,
             "stress": P * F.trans / ngs.Det(F),
         }
         return _RegionFields(fields, F, pressure)
-
-    # -- values -----------------------------------------------------------------------------------------
 
     def at_nodes(self, dofs: Array, mu: Array, names: tuple[str, ...] = ("strain", "stress")) -> dict[str, Array]:
         """Fields by name at the nodes: "displacement" (n, 3) m, and ``names`` of `COMPONENTS` (n, c), SI.
@@ -208,25 +102,9 @@ class Recovery:
         result = {"displacement": self._problem.nodal_displacement(dofs)}
         for name in names:
             result[name] = average @ self._evaluate(name, dofs, mu, points)
-        return _with_von_mises(result)
-
-    def at_points(
-        self, dofs: Array, mu: Array, points: Array, names: tuple[str, ...] = ("strain", "stress")
-    ) -> dict[str, Array]:
-        """The same at points (p, 3) of the mesh, m, without any averaging.
-
-        Raises
-        ------
-        StudyError
-            If a point lies outside of the mesh.
-        """
-        where = self._mesh_points(points)
-        self._set(dofs, mu)
-        displacement = np.asarray(self._kinematics.displacement(where)).reshape(len(where), 3)
-        result = {"displacement": displacement}
-        for name in names:
-            result[name] = self._evaluate(name, dofs, mu, where)
-        return _with_von_mises(result)
+        if "stress" in names:
+            result["von_mises"] = von_mises(result["stress"])
+        return result
 
     def slopes_at_nodes(
         self, dofs: Array, mu: Array, dof_slopes: Array, names: tuple[str, ...] = ("strain", "stress")
@@ -259,7 +137,7 @@ class Recovery:
         history = self._problem.history
         if history and name in STRESSES:
             F = self._by_region([region.gradient for region in self._regions], points)
-            values += overstress(name, F, history.remembered_at(points))
+            values += _overstress(name, F, history.remembered_at(points))
         return _components(name, values)
 
     def _slopes(self, name: str, dofs: Array, mu: Array, dof_slopes: Array, points: NDArray) -> list[Array]:
@@ -269,13 +147,13 @@ class Recovery:
             for region, dp in zip(self._regions, self._pressure_directions, strict=True)
         ]
         result = []
+        by_parameter = [self._problem.symbols.derivatives(region.fields[name]) for region in self._regions]
         for index, slope in enumerate(dof_slopes):
             self._direction.vec.FV().NumPy()[:] = slope
             total = self._by_region(through_state, points)
-            explicit = [self._problem.symbols.derivatives(r.fields[name]).get(index) for r in self._regions]
-            if any(e is not None for e in explicit):
+            if any(index in explicit for explicit in by_parameter):
                 zero = ngs.CF((0.0,) * 9, dims=(3, 3))
-                total += self._by_region([zero if e is None else e for e in explicit], points)
+                total += self._by_region([explicit.get(index, zero) for explicit in by_parameter], points)
             if self._problem.history and name in STRESSES:
                 total += self._overstress_slope(name, index, points)
             result.append(_components(name, total))
@@ -297,7 +175,7 @@ class Recovery:
         if explicit is not None:
             dF += self._by_region([explicit] * len(self._regions), points)
         H, step = history.remembered_at(points), 1e-6
-        return (overstress(name, F + step * dF, H) - overstress(name, F - step * dF, H)) / (2.0 * step)
+        return (_overstress(name, F + step * dF, H) - _overstress(name, F - step * dF, H)) / (2.0 * step)
 
     def _by_region(self, expressions: list[Any], points: NDArray) -> Array:
         """Values (p, 3, 3) of one 3x3 expression for each region at mesh points."""
@@ -307,19 +185,6 @@ class Recovery:
             rows = np.flatnonzero(owners == number)
             values[rows] = np.asarray(expression.Compile()(points[rows])).reshape(len(rows), 9)
         return values.reshape(-1, 3, 3)
-
-    # -- where ------------------------------------------------------------------------------------------
-
-    def _mesh_points(self, points: Array) -> NDArray:
-        """NGSolve's mesh points of points (p, 3) of the mesh, m."""
-        geometry = self._problem.geometry
-        located = locate(geometry.mesh, points)
-        reference = np.empty(located.reference.shape)
-        starts = geometry.mesh.block_starts()
-        for block, start, stop in zip(geometry.mesh.blocks, starts[:-1], starts[1:], strict=True):
-            rows = (located.cells >= start) & (located.cells < stop)
-            reference[rows] = reference_points(block.type.shape, located.reference[rows])
-        return geometry.mesh_points(geometry.element_of_cell[located.cells], reference)
 
     def _node_rule(self) -> tuple[NDArray, sp.csr_matrix]:
         """Mesh points (q,) in all cells, and the matrix (n_nodes, q) that takes values there to nodes."""
@@ -362,41 +227,5 @@ def _extrapolation(kind: CellType, order: int) -> tuple[Array, Array]:
     else:
         triangle = np.array([[1.0, 1.0], [4.0, 1.0], [1.0, 4.0]]) / 6.0
         points = np.array([[*xy, z] for xy, z in product(triangle, gauss)])
-
-    def monomials(p: Array) -> Array:
-        x, y, z = p.T
-        terms = [np.ones_like(x), x, y, z, x * z, y * z, x * y, x * y * z]
-        return np.column_stack(terms[: {1: 1, 4: 4, 6: 6, 8: 8}[len(points)]])
-
+    monomials = partial(corner_monomials, len(points))
     return points, monomials(kind.nodes) @ np.linalg.inv(monomials(points))
-
-
-def _with_von_mises(fields: Mapping[str, Array]) -> dict[str, Array]:
-    result = dict(fields)
-    if "stress" in result:
-        result["von_mises"] = von_mises(result["stress"])
-    return result
-
-
-# Points inside of a solid as the reduced model takes them: nodes of their cells and shape functions.
-
-
-def material_points(model: ReducedModel, positions: Array) -> MaterialPoints:
-    """The points at ``positions`` (p, 3) of the undeformed solid, metres, for `ReducedModel.restrict`.
-
-    Raises
-    ------
-    StudyError
-        If a point lies outside of the solid.
-    """
-    blocks = tuple(CellBlock(name, connectivity) for name, connectivity in model.cells.items())
-    mesh = Mesh(model.nodes, blocks)
-    located, starts = locate(mesh, positions), mesh.block_starts()
-    width = max(block.connectivity.shape[1] for block in blocks)
-    corners, weights = np.zeros((len(positions), width), dtype=np.int64), np.zeros((len(positions), width))
-    for block, start, stop in zip(blocks, starts[:-1], starts[1:], strict=True):
-        rows = np.flatnonzero((located.cells >= start) & (located.cells < stop))
-        size = block.connectivity.shape[1]
-        corners[rows, :size] = block.connectivity[located.cells[rows] - start]
-        weights[rows, :size] = block.type.shape_functions(located.reference[rows])
-    return MaterialPoints(corners, weights)

@@ -24,11 +24,14 @@ from numpy.typing import NDArray
 from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.mechanics.materials.base import Material
 from morph_dslam.mechanics.materials.viscoelastic import Prony
+from morph_dslam.mechanics.ngsolve_mesh import corner_monomials
 from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
 from morph_dslam.mechanics.solid_materials import MaterialRegion
 from morph_dslam.mechanics.spaces import DisplacementSpace
 
 Array = NDArray[np.float64]
+
+_CORNERS = {ngs.TET: 4, ngs.PRISM: 6, ngs.HEX: 8}
 
 
 class ViscousHistory:
@@ -156,13 +159,13 @@ class ViscousHistory:
         for kind in set(kinds):
             of_kind = np.flatnonzero(kinds == kind)
             source = np.array(self.rules[kind].points)
-            fit = np.linalg.pinv(_corner_monomials(kind, source)) if len(source) > 1 else np.ones((1, 1))
+            count = _CORNERS[kind] if len(source) > 1 else 1
+            fit = np.linalg.pinv(corner_monomials(count, source))
             coefficients = np.einsum("tq,eqc->etc", fit, values[np.array([dofs[e] for e in of_kind])])
             rows = np.flatnonzero(np.isin(which, of_kind))
             target = np.column_stack([points[axis][rows] for axis in "xyz"])
-            functions = _corner_monomials(kind, target)[:, : coefficients.shape[1]]
             local = np.searchsorted(of_kind, which[rows])
-            result[rows] = np.einsum("pt,ptc->pc", functions, coefficients[local])
+            result[rows] = np.einsum("pt,ptc->pc", corner_monomials(count, target), coefficients[local])
         return result.reshape(-1, 3, 3)
 
 
@@ -184,10 +187,3 @@ def _names(region: ngs.Region) -> list[str]:
     """NGSolve's names of the materials in a region."""
     inside = np.array(region.Mask(), dtype=bool)
     return [name for name, chosen in zip(region.mesh.GetMaterials(), inside, strict=True) if chosen]
-
-
-def _corner_monomials(kind: Any, points: Array) -> Array:
-    """As many monomials (p, t) as the reference element of NGSolve's ``kind`` has corners."""
-    x, y, z = points.T
-    terms = [np.ones_like(x), x, y, z, x * z, y * z, x * y, x * y * z]
-    return np.column_stack(terms[: {ngs.TET: 4, ngs.PRISM: 6, ngs.HEX: 8}[kind]])

@@ -177,7 +177,3 @@ def cell_type(name: str) -> CellType:
         nodes=np.vstack([corners, *middle]),
         faces=tuple(_with_middle_nodes(face, node_between) for face in _CORNER_FACES[shape]),
     )
-
-
-#: Every name of a cell type, solids and then sheets.
-CELL_TYPES = tuple(sorted(_SHAPES, key=lambda name: (_SHAPES[name] in ("tri", "quad"), name)))

@@ -1,4 +1,8 @@
-"""Structured grids of unit cells, which the mesh generators bend into shape."""
+"""Structured meshes: block, tube and body of revolution, each with its natural sets named.
+
+Every generator meshes a grid of unit cells, gives it middle nodes where the cell type has them, and only then bends it
+into shape, so that second-order cells have their middle nodes on the curved surfaces.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +16,10 @@ from scipy.interpolate import Akima1DInterpolator
 
 from morph_dslam.errors import StudyError
 from morph_dslam.meshing.cell_types import cell_type
-from morph_dslam.meshing.mesh_files import FIRST_ORDER, to_second_order
 from morph_dslam.meshing.meshes import CellBlock, Mesh
+from morph_dslam.meshing.second_order import FIRST_ORDER, to_second_order
+
+Array = NDArray[np.float64]
 
 Indices = NDArray[np.int64]
 
@@ -27,24 +33,18 @@ CUTS: dict[str, tuple[tuple[int, ...], ...]] = {
     "tet4": (
         (0, 1, 2, 6), (0, 2, 3, 6), (0, 3, 7, 6), (0, 7, 4, 6), (0, 4, 5, 6), (0, 5, 1, 6),
     ),
-    "quad4": ((0, 1, 2, 3),),
-    "tri3": ((0, 1, 2), (0, 2, 3)),
 }  # fmt: skip
 
 
-def check_divisions(divisions: tuple[int, ...], count: int, names: str) -> None:
-    """Raise StudyError unless there are ``count`` divisions, whole and positive; ``names`` says of what."""
-    if len(divisions) != count or any(int(n) != n or n < 1 for n in divisions):
-        raise StudyError(f"divisions are {tuple(divisions)}; give {count} whole numbers of at least 1: {names}")
+def _check(divisions: tuple[int, int, int], names: str, cell_type: str) -> None:
+    """Raise StudyError unless divisions are whole and positive, and the cell type is known; ``names`` says of what."""
+    if len(divisions) != 3 or any(int(n) != n or n < 1 for n in divisions):
+        raise StudyError(f"divisions are {tuple(divisions)}; give 3 whole numbers of at least 1: {names}")
+    if cell_type not in SOLIDS:
+        raise StudyError(f"'{cell_type}' is not a cell type of this generator; use one of {', '.join(SOLIDS)}")
 
 
-def check_type(name: str, known: tuple[str, ...]) -> None:
-    """Raise StudyError unless the cell type is one that the generator knows."""
-    if name not in known:
-        raise StudyError(f"'{name}' is not a cell type of this generator; use one of {', '.join(known)}")
-
-
-def unit_grid(kept: NDArray[np.bool_], name: str) -> Mesh:
+def _unit_grid(kept: NDArray[np.bool_], name: str) -> Mesh:
     """Unit cubes at whole-number coordinates, where ``kept`` (n, m, l) is true, cut into cells of a type."""
     shape = tuple(n + 1 for n in kept.shape)
     strides = np.array([shape[1] * shape[2], shape[2], 1])
@@ -57,16 +57,21 @@ def unit_grid(kept: NDArray[np.bool_], name: str) -> Mesh:
     return mesh if first_order == name else to_second_order(mesh, name)
 
 
-def with_surfaces(mesh: Mesh, surfaces: dict[str, Indices]) -> Mesh:
+def _with_surfaces(mesh: Mesh, surfaces: dict[str, Indices]) -> Mesh:
     """Name surfaces, and the set of nodes of each by the same name; empty ones are left out."""
     mesh = replace(mesh, surfaces={name: faces for name, faces in surfaces.items() if len(faces)})
     return replace(mesh, node_sets={name: mesh.surface_nodes(name) for name in mesh.surfaces})
 
 
-# Profiles: the midline of a wall of revolution, walked by arc length.
+def _plane_surfaces(grid: Mesh, planes: dict[str, tuple[int, int]], rest: str = "") -> dict[str, Indices]:
+    """Boundary faces of a grid in coordinate planes, given as name: (axis, value); all others by the name ``rest``."""
+    faces = grid.boundary_faces()
+    points = grid.nodes[grid.face_nodes(faces, corners_only=True)[:, :3]]
+    on = {name: (points[:, :, axis] == value).all(axis=1) for name, (axis, value) in planes.items()}
+    if rest:
+        on[rest] = ~np.any(list(on.values()), axis=0)
+    return {name: faces[mask] for name, mask in on.items()}
 
-
-Array = NDArray[np.float64]
 
 #: Points between two given ones at which arc length is summed; the sum's relative error is about 1e-6.
 _SAMPLES = 400
@@ -149,9 +154,6 @@ class Profile:
         return lambda fractions: np.interp(fractions, places, np.broadcast_to(given, places.shape))
 
 
-# Bodies of revolution: a wall around a midline, thickened outside over some stretches.
-
-
 @dataclass(frozen=True)
 class Collar:
     """A stretch of a wall of revolution that is thickened on its outer side.
@@ -217,17 +219,10 @@ def _closed(grid: Mesh, around: int) -> tuple[Mesh, Array]:
 
 def _wall_surfaces(grid: Mesh, divisions: tuple[int, int, int], full: bool) -> dict[str, Indices]:
     """Boundary faces of the grid by the side of the wall that they lie on; a closed turn has no ends."""
-    faces = grid.boundary_faces()
-    points = grid.nodes[grid.face_nodes(faces, corners_only=True)[:, :3]]
-
-    def lie_at(axis: int, value: int) -> NDArray[np.bool_]:
-        return (points[:, :, axis] == value).all(axis=1)
-
     along, _, around = divisions
-    sides = {"start": lie_at(2, 0), "end": lie_at(2, around), "inner": lie_at(1, 0)}
-    sides |= {"bottom": lie_at(0, 0), "top": lie_at(0, along)}
-    sides["outer"] = ~np.any(list(sides.values()), axis=0)
-    return {name: faces[on] for name, on in sides.items() if not (full and name in ("start", "end"))}
+    planes = {"start": (2, 0), "end": (2, around), "inner": (1, 0), "bottom": (0, 0), "top": (0, along)}
+    sides = _plane_surfaces(grid, planes, rest="outer")
+    return {name: faces for name, faces in sides.items() if not (full and name in ("start", "end"))}
 
 
 def _revolved(
@@ -283,8 +278,7 @@ def revolution(
     StudyError
         If the profile or a collar cannot be, the wall reaches the axis, or the angles are not in order.
     """
-    check_type(cell_type, SOLIDS)
-    check_divisions(divisions, 3, "along the profile, through the wall and around")
+    _check(divisions, "along the profile, through the wall and around", cell_type)
     turn, around = angles[1] - angles[0], divisions[2]
     full = abs(turn - 2.0 * pi) < 1e-9
     if not (full or 0.0 < turn < 2.0 * pi) or (full and around < 3):
@@ -293,28 +287,13 @@ def revolution(
             "go forwards by a full turn at most, and in 3 cells or more for a full turn"
         )
     curve = Profile(profile)
-    grid = unit_grid(_kept_cells(divisions, collars), cell_type)
+    grid = _unit_grid(_kept_cells(divisions, collars), cell_type)
     surfaces = _wall_surfaces(grid, divisions, full)
     coordinates = grid.nodes
     if full:
         grid, coordinates = _closed(grid, around)
     mesh = replace(grid, nodes=_revolved(coordinates, divisions, curve, thickness, angles, collars))
-    return with_surfaces(mesh, surfaces)
-
-
-# Structured meshes: block, sheet, tube and body of revolution, each with its natural sets named.
-# Every solid generator meshes a grid of unit cells, gives it middle nodes where the cell type has them, and
-# only then bends it into shape, so that second-order cells have their middle nodes on the curved surfaces.
-
-
-__all__ = ["Collar", "block", "revolution", "sheet", "tube"]
-
-
-def _plane_surfaces(grid: Mesh, names: dict[str, tuple[int, int]]) -> dict[str, Indices]:
-    """Boundary faces of a grid that lie in coordinate planes, given as name: (axis, value)."""
-    faces = grid.boundary_faces()
-    points = grid.nodes[grid.face_nodes(faces, corners_only=True)[:, :3]]
-    return {name: faces[(points[:, :, axis] == value).all(axis=1)] for name, (axis, value) in names.items()}
+    return _with_surfaces(mesh, surfaces)
 
 
 def block(size: tuple[float, float, float], divisions: tuple[int, int, int], cell_type: str = "hex20") -> Mesh:
@@ -336,52 +315,14 @@ def block(size: tuple[float, float, float], divisions: tuple[int, int, int], cel
     StudyError
         If a size or a division is not positive, or the cell type is unknown.
     """
-    check_type(cell_type, SOLIDS)
-    check_divisions(divisions, 3, "along x, y and z")
+    _check(divisions, "along x, y and z", cell_type)
     if len(size) != 3 or min(size) <= 0.0:
         raise StudyError(f"the block's size is {tuple(size)} m; give three positive lengths")
-    grid = unit_grid(np.ones(divisions, dtype=bool), cell_type)
+    grid = _unit_grid(np.ones(divisions, dtype=bool), cell_type)
     names = {f"{axis}_min": (i, 0) for i, axis in enumerate("xyz")}
     names |= {f"{axis}_max": (i, divisions[i]) for i, axis in enumerate("xyz")}
     mesh = replace(grid, nodes=grid.nodes * (np.array(size) / np.array(divisions)))
-    return with_surfaces(mesh, _plane_surfaces(grid, names))
-
-
-def sheet(size: tuple[float, float], divisions: tuple[int, int], cell_type: str = "quad4") -> Mesh:
-    """A flat rectangle in the plane z = 0 with one corner at the origin, seen from +z.
-
-    Parameters
-    ----------
-    size : extents along x and y, metres.
-    divisions : cells along x and y; each square is cut in two for "tri3".
-    cell_type : "quad4" or "tri3".
-
-    Returns
-    -------
-    Mesh
-        Node sets "x_min", "x_max", "y_min", "y_max" of its edges; surface "top", all of it.
-
-    Raises
-    ------
-    StudyError
-        As `block`.
-    """
-    check_type(cell_type, ("quad4", "tri3"))
-    check_divisions(divisions, 2, "along x and y")
-    if len(size) != 2 or min(size) <= 0.0:
-        raise StudyError(f"the sheet's size is {tuple(size)} m; give two positive lengths")
-    shape = np.array(divisions) + 1
-    corners = np.argwhere(np.ones(shape, dtype=bool))
-    squares = np.argwhere(np.ones(divisions, dtype=bool))
-    numbers = (squares[:, None, :] + np.array([[0, 0], [1, 0], [1, 1], [0, 1]])) @ np.array([shape[1], 1])
-    cut = np.array(CUTS[cell_type])
-    flat = corners * (np.array(size) / np.array(divisions))
-    mesh = Mesh(
-        np.column_stack([flat, np.zeros(len(flat))]), (CellBlock(cell_type, numbers[:, cut].reshape(-1, cut.shape[1])),)
-    )
-    edges = {f"{axis}_min": np.flatnonzero(corners[:, i] == 0) for i, axis in enumerate("xy")}
-    edges |= {f"{axis}_max": np.flatnonzero(corners[:, i] == divisions[i]) for i, axis in enumerate("xy")}
-    return replace(mesh, node_sets=edges, surfaces={"top": mesh.all_faces()})
+    return _with_surfaces(mesh, _plane_surfaces(grid, names))
 
 
 def tube(

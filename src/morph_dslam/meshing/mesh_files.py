@@ -1,4 +1,4 @@
-"""Cells of first order to second order and back: middle nodes added halfway between corners, or dropped."""
+"""Mesh files of every kind that is read: Abaqus, Gmsh, VTK, closed surfaces, STEP; with their named sets."""
 
 from __future__ import annotations
 
@@ -17,89 +17,96 @@ from numpy.typing import NDArray
 from morph_dslam.errors import StudyError
 from morph_dslam.io.inp_file import InpFile, SurfacePart, read_inp
 from morph_dslam.meshing.cell_types import cell_type
-from morph_dslam.meshing.mesh_checks import reoriented, without_collapsed_cells
+from morph_dslam.meshing.mesh_repair import reoriented, without_collapsed_cells
 from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces
 from morph_dslam.meshing.netgen_meshing import SURFACES, mesh_step_file, mesh_surface_file
 from morph_dslam.units import to_si
 
 Indices = NDArray[np.int64]
 
-#: Second-order types by the first-order type that they refine.
-SECOND_ORDER: dict[str, tuple[str, ...]] = {
-    "hex8": ("hex20", "hex27"),
-    "tet4": ("tet10",),
-    "prism6": ("prism15", "prism18"),
-}
-
-FIRST_ORDER = {name: linear for linear, names in SECOND_ORDER.items() for name in names}
+_VOLUMES = (".inp", ".msh", ".vtk", ".vtu", ".step", ".stp")
 
 
-def _target(block: CellBlock, wanted: tuple[str, ...]) -> str:
-    known = SECOND_ORDER.get(block.cell_type, ())
-    if not known:
-        raise StudyError(f"{block.cell_type} cells cannot be given middle nodes; only {', '.join(SECOND_ORDER)} can")
-    return next((name for name in wanted if name in known), known[0])
-
-
-def _corners_around(connectivity: Indices, parents: tuple[tuple[int, ...], ...]) -> Indices:
-    """(m * len(parents), 8) sorted corners around each middle node; shorter rows begin with -1."""
-    around = np.full((len(connectivity), len(parents), 8), -1, dtype=np.int64)
-    for i, parent in enumerate(parents):
-        around[:, i, : len(parent)] = connectivity[:, parent]
-    return np.sort(around.reshape(-1, 8), axis=1)
-
-
-def to_second_order(mesh: Mesh, *wanted: str) -> Mesh:
-    """Give every cell its middle nodes, halfway between the corners around them.
-
-    A node set takes in the middle nodes all of whose corners it holds; one that bears the name of a surface
-    takes in that surface's. Surfaces and cell sets stay as they are.
+def load_mesh(path: Path | str, unit: str, size: float | None = None) -> Mesh:
+    """Read a mesh file, or mesh the volume that a surface or a STEP file describes.
 
     Parameters
     ----------
-    mesh : cells of first order only.
-    wanted : second-order types such as "hex20"; the first of each type in `SECOND_ORDER` where none is named.
+    path : .inp (Abaqus, CalculiX), .msh (Gmsh), .vtk, .vtu; .stl, .obj, .ply (closed surfaces); .step, .stp.
+    unit : the unit of length in which the file was drawn: "m", "cm" or "mm".
+    size : longest edge of a cell where Netgen meshes the volume, metres; other files take none.
+
+    Returns
+    -------
+    Mesh
+        In metres, without the nodes that no cell uses, mended by `mesh_repair`; `check_mesh` checks it.
 
     Raises
     ------
     StudyError
-        If a cell has no second-order type (sheets), or is of second order already.
+        If the kind of file or the unit is not known, or the file is damaged.
     """
-    targets = [_target(block, wanted) for block in mesh.blocks]
-    around = [
-        _corners_around(block.connectivity, cell_type(name).parents)
-        for block, name in zip(mesh.blocks, targets, strict=True)
-    ]
-    corners, numbers = np.unique(np.concatenate(around), axis=0, return_inverse=True)
-    valid = corners >= 0
-    positions = np.where(valid[:, :, None], mesh.nodes[corners], 0.0).sum(axis=1) / valid.sum(axis=1)[:, None]
-    blocks, first = [], 0
-    for block, name, rows in zip(mesh.blocks, targets, around, strict=True):
-        middle = mesh.n_nodes + numbers.ravel()[first : first + len(rows)]
-        first += len(rows)
-        new = np.hstack([block.connectivity, middle.reshape(len(block.connectivity), -1)])
-        blocks.append(CellBlock(name, new))
-    sets = {}
-    for name, nodes in mesh.node_sets.items():
-        member = np.zeros(mesh.n_nodes, dtype=bool)
-        member[nodes] = True
-        added = mesh.n_nodes + np.flatnonzero((member[corners] | ~valid).all(axis=1))
-        sets[name] = np.concatenate([np.unique(nodes), added])
-    refined = replace(mesh, nodes=np.vstack([mesh.nodes, positions]), blocks=tuple(blocks), node_sets=sets)
-    on_surfaces = {name: refined.surface_nodes(name) for name in sets if name in mesh.surfaces}
-    return replace(refined, node_sets={**sets, **on_surfaces})
+    path, scale = Path(path), to_si(1.0, unit, "length")
+    kind = path.suffix.lower()
+    if kind not in _VOLUMES + SURFACES:
+        raise StudyError(f"{path} is no mesh file that is read; use {', '.join(_VOLUMES + SURFACES)}")
+    if size is not None and size <= 0.0:
+        raise StudyError(f"a cell size of {size} m cannot be; give a positive length")
+    if size is not None and kind not in (*SURFACES, ".step", ".stp"):
+        raise StudyError(f"{path} is meshed already; a cell size is for surfaces and STEP files")
+    if kind in SURFACES:
+        return mesh_surface_file(path, None if size is None else size / scale).scaled(scale)
+    if kind in (".step", ".stp"):
+        return mesh_step_file(path, unit, None if size is None else size * 1e3).scaled(1e-3)
+    mesh = _mesh_from_inp(read_inp(path)) if kind == ".inp" else _read_with_meshio(path)
+    return reoriented(without_collapsed_cells(mesh)).scaled(scale)
 
 
-def to_first_order(mesh: Mesh) -> Mesh:
-    """Drop the middle nodes of second-order cells; the corners keep their positions and their order."""
-    blocks = tuple(
-        CellBlock(FIRST_ORDER.get(block.cell_type, block.cell_type), block.connectivity[:, : block.type.corners])
-        for block in mesh.blocks
+#: Abaqus lists a C3D27's centre before the centres of its faces S1 to S6; VTK has opposite faces, then it.
+_HEX27_FROM_ABAQUS = [*range(20), 26, 24, 23, 25, 21, 22, 20]
+
+
+def _positions(labels: Indices, wanted: Indices) -> Indices:
+    """Positions of wanted labels in a list that holds them all."""
+    order = np.argsort(labels)
+    return order[np.searchsorted(labels, wanted, sorter=order)]
+
+
+def _mesh_from_inp(file: InpFile) -> Mesh:
+    """The mesh of an Abaqus input file, in file units; element sets become cell sets."""
+    blocks = []
+    for part in file.elements:
+        connectivity = _positions(file.node_labels, part.connectivity)
+        if part.cell_type == "hex27":
+            connectivity = connectivity[:, _HEX27_FROM_ABAQUS]
+        blocks.append(CellBlock(part.cell_type, connectivity))
+    element_labels = np.concatenate([part.labels for part in file.elements])
+    mesh = Mesh(
+        nodes=file.nodes,
+        blocks=tuple(blocks),
+        node_sets={name: _positions(file.node_labels, nodes) for name, nodes in file.node_sets.items()},
+        cell_sets={name: _positions(element_labels, cells) for name, cells in file.element_sets.items()},
     )
-    return replace(mesh, blocks=blocks).without_unused_nodes()
+    surfaces = {
+        name: np.concatenate([_part_faces(mesh, part, element_labels) for part in parts])
+        for name, parts in file.surfaces.items()
+    }
+    return replace(mesh, surfaces=surfaces).without_unused_nodes()
 
 
-# Gmsh, VTK and VTU files through meshio, with their physical groups and integer data as sets.
+def _part_faces(mesh: Mesh, part: SurfacePart, element_labels: Indices) -> Indices:
+    cells = _positions(element_labels, part.elements)
+    if not part.face:
+        boundary = mesh.boundary_faces()
+        return boundary[np.isin(boundary[:, 0], cells)]
+    starts = mesh.block_starts()
+    types = [mesh.blocks[i].type for i in np.unique(np.searchsorted(starts, cells, side="right") - 1)]
+    number = int(part.face[1:]) - 1 if part.face[1:].isdigit() else 0
+    for cell in types:
+        faces = ["SPOS"] if cell.dimension == 2 else [f"S{i + 1}" for i in range(len(cell.faces))]
+        if part.face not in faces:
+            raise part.line.error(f"a {cell.name} element has no face {part.face}; use {', '.join(faces)}")
+    return np.column_stack([cells, np.full(len(cells), number)])
 
 
 #: Our cell types by meshio's names; its node order is VTK's, save that linear prisms are as Abaqus's.
@@ -116,17 +123,12 @@ _BOUNDING = {"vertex": 0, "line": 1, "line3": 1, "triangle6": 2, "quad8": 2, "qu
 _MOST_GROUPS = 256
 
 
-def read_with_meshio(path: Path) -> Mesh:
+def _read_with_meshio(path: Path) -> Mesh:
     """Read a .msh, .vtk or .vtu file; nodes in file units.
 
-    Cells of the highest dimension make the mesh. Gmsh's physical groups of that dimension become cell sets;
-    those of faces of solids become surfaces, and all lower ones node sets. In VTK files integer cell data
-    named d with value v becomes the cell set "d_v", and integer point data the node set "d_v".
-
-    Raises
-    ------
-    StudyError
-        If the file cannot be read, is cut short, or holds cells that are not known.
+    Cells of the highest dimension make the mesh. Gmsh's physical groups of that dimension become cell sets; those of
+    faces of solids become surfaces, and all lower ones node sets. In VTK files integer cell data named d with value v
+    becomes the cell set "d_v", and integer point data the node set "d_v".
     """
     content = _read(path)
     dimension = max((_dimension(block.type, path) for block in content.cells), default=0)
@@ -275,97 +277,3 @@ def _column(values: np.ndarray) -> np.ndarray:
 
 def _is_one_integer_each(values: np.ndarray) -> bool:
     return values.ndim == 1 and np.issubdtype(values.dtype, np.integer)
-
-
-# Mesh files of every kind that is read, by one function.
-
-
-#: Abaqus lists a C3D27's centre before the centres of its faces S1 to S6; VTK has opposite faces, then it.
-_HEX27_FROM_ABAQUS = [*range(20), 26, 24, 23, 25, 21, 22, 20]
-
-_VOLUMES = (".inp", ".msh", ".vtk", ".vtu", ".step", ".stp")
-
-
-def load_mesh(path: Path | str, unit: str, size: float | None = None) -> Mesh:
-    """Read a mesh file, or mesh the volume that a surface or a STEP file describes.
-
-    Parameters
-    ----------
-    path : .inp (Abaqus, CalculiX), .msh (Gmsh), .vtk, .vtu; .stl, .obj, .ply (closed surfaces); .step, .stp.
-    unit : the unit of length in which the file was drawn: "m", "cm" or "mm".
-    size : longest edge of a cell where Netgen meshes the volume, metres; other files take none.
-
-    Returns
-    -------
-    Mesh
-        In metres, without the nodes that no cell uses; see `mesh_repair` for what is mended. Not yet checked:
-        see `check_mesh`.
-
-    Raises
-    ------
-    StudyError
-        If the kind of file or the unit is not known, or the file is damaged.
-    """
-    path, scale = Path(path), to_si(1.0, unit, "length")
-    kind = path.suffix.lower()
-    if kind not in _VOLUMES + SURFACES:
-        raise StudyError(f"{path} is no mesh file that is read; use {', '.join(_VOLUMES + SURFACES)}")
-    if size is not None and size <= 0.0:
-        raise StudyError(f"a cell size of {size} m cannot be; give a positive length")
-    if size is not None and kind not in (*SURFACES, ".step", ".stp"):
-        raise StudyError(f"{path} is meshed already; a cell size is for surfaces and STEP files")
-    if kind in SURFACES:
-        return mesh_surface_file(path, None if size is None else size / scale).transformed(scale)
-    if kind in (".step", ".stp"):
-        return mesh_step_file(path, unit, None if size is None else size * 1e3).transformed(1e-3)
-    mesh = mesh_from_inp(read_inp(path)) if kind == ".inp" else read_with_meshio(path)
-    return reoriented(without_collapsed_cells(mesh)).transformed(scale)
-
-
-def _positions(labels: Indices, wanted: Indices) -> Indices:
-    """Positions of wanted labels in a list that holds them all."""
-    order = np.argsort(labels)
-    return order[np.searchsorted(labels, wanted, sorter=order)]
-
-
-def mesh_from_inp(file: InpFile) -> Mesh:
-    """The mesh of an input file, in file units; element sets become cell sets.
-
-    Raises
-    ------
-    StudyError
-        If a surface names a face that its elements do not have.
-    """
-    blocks = []
-    for part in file.elements:
-        connectivity = _positions(file.node_labels, part.connectivity)
-        if part.cell_type == "hex27":
-            connectivity = connectivity[:, _HEX27_FROM_ABAQUS]
-        blocks.append(CellBlock(part.cell_type, connectivity))
-    element_labels = np.concatenate([part.labels for part in file.elements])
-    mesh = Mesh(
-        nodes=file.nodes,
-        blocks=tuple(blocks),
-        node_sets={name: _positions(file.node_labels, nodes) for name, nodes in file.node_sets.items()},
-        cell_sets={name: _positions(element_labels, cells) for name, cells in file.element_sets.items()},
-    )
-    surfaces = {
-        name: np.concatenate([_part_faces(mesh, part, element_labels) for part in parts])
-        for name, parts in file.surfaces.items()
-    }
-    return replace(mesh, surfaces=surfaces).without_unused_nodes()
-
-
-def _part_faces(mesh: Mesh, part: SurfacePart, element_labels: Indices) -> Indices:
-    cells = _positions(element_labels, part.elements)
-    if not part.face:
-        boundary = mesh.boundary_faces()
-        return boundary[np.isin(boundary[:, 0], cells)]
-    starts = mesh.block_starts()
-    types = [mesh.blocks[i].type for i in np.unique(np.searchsorted(starts, cells, side="right") - 1)]
-    number = int(part.face[1:]) - 1 if part.face[1:].isdigit() else 0
-    for cell in types:
-        faces = ["SPOS"] if cell.dimension == 2 else [f"S{i + 1}" for i in range(len(cell.faces))]
-        if part.face not in faces:
-            raise part.line.error(f"a {cell.name} element has no face {part.face}; use {', '.join(faces)}")
-    return np.column_stack([cells, np.full(len(cells), number)])

@@ -9,15 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
-from morph_dslam.meshing.cell_types import CELL_TYPES, CellType, cell_type
+from morph_dslam.meshing.cell_types import CellType, cell_type
 from morph_dslam.studies.problem import ModelMesh
 
 Array = NDArray[np.float64]
 
 Indices = NDArray[np.int64]
-
-#: For each cell type the nodes of its faces; see `CellType.faces`.
-FACES: dict[str, tuple[tuple[int, ...], ...]] = {name: cell_type(name).faces for name in CELL_TYPES}
 
 #: Triangles that draw a face of so many nodes (corners, then middle nodes), turning as the face does.
 _FACE_TRIANGLES: dict[int, tuple[tuple[int, int, int], ...]] = {
@@ -58,7 +55,7 @@ class Mesh:
     blocks : the cells, numbered through all blocks in order.
     node_sets : node indices by name.
     cell_sets : cell indices by name; materials are given by cell set, and "all" always means every cell.
-    surfaces : faces by name, (f, 2): cell index and local face number (the position in ``FACES[cell_type]``).
+    surfaces : faces by name, (f, 2): cell index and local face number, the position in `CellType.faces`.
     """
 
     nodes: Array
@@ -80,19 +77,13 @@ class Mesh:
         return np.cumsum([0, *(len(block.connectivity) for block in self.blocks)])
 
     def cells(self, name: str) -> Indices:
-        """Indices of the cells of a set; "all" is every cell. Raises StudyError if there is no such set."""
+        """Indices of the cells of a set; "all" is every cell. StudyError if there is no such set."""
         if name == "all":
             return np.arange(self.n_cells)
         return self._named(self.cell_sets, name, "cell set")
 
     def set_nodes(self, name: str) -> Indices:
-        """Sorted nodes of the node set, or else of the surface, of this name.
-
-        Raises
-        ------
-        StudyError
-            If the mesh has neither.
-        """
+        """Sorted nodes of the node set, or else of the surface, of this name; StudyError if there is neither."""
         if name not in self.node_sets and name in self.surfaces:
             return self.surface_nodes(name)
         return np.unique(self._named(self.node_sets, name, "node set or surface", self.surfaces))
@@ -158,14 +149,9 @@ class Mesh:
         """Outward triangles (t, 3) of the outer surface, through corner and middle nodes; for drawing."""
         return self.face_triangles(self.boundary_faces())
 
-    def transformed(self, scale: float = 1.0, rotation: Array | None = None, translation: Array | None = None) -> Mesh:
-        """The mesh with nodes at ``scale * rotation @ node + translation`` (metres)."""
-        nodes = self.nodes * scale
-        if rotation is not None:
-            nodes = nodes @ np.asarray(rotation).T
-        if translation is not None:
-            nodes = nodes + np.asarray(translation)
-        return replace(self, nodes=nodes)
+    def scaled(self, factor: float) -> Mesh:
+        """The mesh with its coordinates times ``factor``."""
+        return replace(self, nodes=self.nodes * factor)
 
     def renumbered(self, new_index: Indices, nodes: Array) -> Mesh:
         """The mesh on other ``nodes``: old node i becomes ``new_index[i]``; -1 drops it from all sets."""
@@ -184,9 +170,6 @@ class Mesh:
         for block in self.blocks:
             used[block.connectivity] = True
         return self.renumbered(np.where(used, np.cumsum(used) - 1, -1), self.nodes[used])
-
-
-# From a finite element mesh to that of a model file: visible surface, cells, and weights of the nodes.
 
 
 #: Cells whose Jacobians are held at once.
@@ -219,9 +202,6 @@ def lumped_weights(mesh: Mesh) -> Array:
     return weights / weights.sum()
 
 
-# Finding the cell face that has given corner nodes.
-
-
 def _packed(corners: Indices) -> NDArray[np.void]:
     """Rows of sorted corners as single comparable values; rows of three corners end in -1."""
     padded = np.full((len(corners), 4), -1, dtype=np.int64)
@@ -246,9 +226,6 @@ def find_faces(mesh: Mesh, corners: Indices) -> Indices:
     return np.where(found[:, None], faces[first[place]], -1)
 
 
-# Measures of a mesh by quadrature on its cells: volumes, centroids, areas, Jacobians.
-
-
 def jacobian_determinants(mesh: Mesh, block: CellBlock) -> Array:
     """Volume (sheets: area) stretch (m, p) of each cell of a block at its quadrature points; SI.
 
@@ -260,28 +237,3 @@ def jacobian_determinants(mesh: Mesh, block: CellBlock) -> Array:
     if block.type.dimension == 2:
         return np.linalg.norm(np.cross(jacobians[..., 0], jacobians[..., 1]), axis=-1)
     return np.linalg.det(jacobians)
-
-
-def cell_volumes(mesh: Mesh) -> Array:
-    """Volume (m^3) of each cell, (n_cells,); of a sheet's cells the area (m^2)."""
-    parts = [jacobian_determinants(mesh, block) @ block.type.quadrature()[1] for block in mesh.blocks]
-    return np.concatenate(parts) if parts else np.empty(0)
-
-
-def centroid(mesh: Mesh) -> Array:
-    """Centre of volume (3,) of the mesh (of area, for sheets), metres."""
-    moment, volume = np.zeros(3), 0.0
-    for block in mesh.blocks:
-        points, weights = block.type.quadrature()
-        measures = jacobian_determinants(mesh, block) * weights
-        places = np.einsum("pk,mka->mpa", block.type.shape_functions(points), mesh.nodes[block.connectivity])
-        moment += np.einsum("mp,mpa->a", measures, places)
-        volume += measures.sum()
-    return moment / volume
-
-
-def surface_area(mesh: Mesh, name: str) -> float:
-    """Area (m^2) of a named surface, drawn through corner and middle nodes; raises StudyError if unknown."""
-    corners = mesh.nodes[mesh.face_triangles(mesh.surface(name))]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return float(0.5 * np.linalg.norm(normals, axis=1).sum())

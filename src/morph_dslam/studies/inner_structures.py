@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
-from morph_dslam.mechanics.recovery import material_points
+from morph_dslam.mechanics.point_location import material_points
 from morph_dslam.meshing.netgen_meshing import read_surface
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.inner_structure import InnerStructure

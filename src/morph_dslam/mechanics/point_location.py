@@ -1,0 +1,107 @@
+"""Where points lie in a mesh: the cell, and the coordinates in its reference cell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from morph_dslam.errors import StudyError
+from morph_dslam.meshing.cell_types import CellType
+from morph_dslam.meshing.meshes import CellBlock, Mesh
+from morph_dslam.model import MaterialPoints, ReducedModel
+
+Array = NDArray[np.float64]
+
+Indices = NDArray[np.int64]
+
+#: Cells tried for a point, nearest first.
+CANDIDATES = 24
+
+NEWTON_STEPS = 20
+
+#: How far outside of the reference cell still counts as inside.
+TOLERANCE = 1e-8
+
+
+@dataclass(frozen=True)
+class LocatedPoints:
+    """Points of the solid.
+
+    Attributes
+    ----------
+    cells : (p,) cell indices.
+    reference : (p, 3) coordinates in the reference cell of the `CellType`.
+    """
+
+    cells: Indices
+    reference: Array
+
+
+def _outside_by(shape: str, reference: Array) -> Array:
+    """How far (p,) points (p, 3) lie outside of a reference cell; negative inside."""
+    x, y, z = reference.T
+    bounds = [-x, -y, -z]
+    bounds += {"hex": [x - 1.0, y - 1.0, z - 1.0], "tet": [x + y + z - 1.0], "prism": [x + y - 1.0, z - 1.0]}[shape]
+    return np.max(bounds, axis=0)
+
+
+def _inverse_map(kind: CellType, corners: Array, points: Array) -> Array:
+    """Reference coordinates (p, 3) of points (p, 3) in cells with nodes (p, k, 3), by Newton's method."""
+    reference = np.tile(kind.nodes[: kind.corners].mean(axis=0), (len(points), 1))
+    for _ in range(NEWTON_STEPS):
+        gap = points - np.einsum("pk,pkx->px", kind.shape_functions(reference), corners)
+        jacobian = np.einsum("pka,pkx->pxa", kind.shape_gradients(reference), corners)
+        jacobian[np.abs(np.linalg.det(jacobian)) < 1e-300] = np.eye(3)
+        step = np.linalg.solve(jacobian, gap[:, :, None])[:, :, 0]
+        reference = np.clip(reference + step, -2.0, 3.0)
+        if np.abs(step).max(initial=0.0) < 1e-13:
+            break
+    return reference
+
+
+def locate(mesh: Mesh, points: Array) -> LocatedPoints:
+    """The cells that points (p, 3) of the undeformed solid, m, lie in; StudyError if one lies outside."""
+    points = np.atleast_2d(np.asarray(points, dtype=float))
+    centres = np.concatenate([mesh.nodes[b.connectivity].mean(axis=1) for b in mesh.blocks])
+    starts = mesh.block_starts()
+    _, near = KDTree(centres).query(points, k=min(CANDIDATES, len(centres)))
+    near = near.reshape(len(points), -1)
+    cells, reference = np.full(len(points), -1, dtype=np.int64), np.zeros((len(points), 3))
+    for candidate in near.T:
+        for block, start, stop in zip(mesh.blocks, starts[:-1], starts[1:], strict=True):
+            rows = np.flatnonzero((cells < 0) & (candidate >= start) & (candidate < stop))
+            if not len(rows):
+                continue
+            nodes = mesh.nodes[block.connectivity[candidate[rows] - start]]
+            found = _inverse_map(block.type, nodes, points[rows])
+            inside = _outside_by(block.type.shape, found) < TOLERANCE
+            cells[rows[inside]] = candidate[rows[inside]]
+            reference[rows[inside]] = found[inside]
+    if (cells < 0).any():
+        lost = points[np.flatnonzero(cells < 0)[0]]
+        raise StudyError(
+            f"{int((cells < 0).sum())} of {len(points)} points lie outside of the solid, the first at "
+            f"({', '.join(f'{round(1e3 * value, 3):g}' for value in lost)}) mm"
+        )
+    return LocatedPoints(cells, reference)
+
+
+def material_points(model: ReducedModel, positions: Array) -> MaterialPoints:
+    """The points at ``positions`` (p, 3) of the undeformed solid, m, as nodes of their cells and shape functions.
+
+    `ReducedModel.restrict` takes them. Raises StudyError if a point lies outside of the solid.
+    """
+    blocks = tuple(CellBlock(name, connectivity) for name, connectivity in model.cells.items())
+    mesh = Mesh(model.nodes, blocks)
+    located, starts = locate(mesh, positions), mesh.block_starts()
+    width = max(block.connectivity.shape[1] for block in blocks)
+    corners, weights = np.zeros((len(positions), width), dtype=np.int64), np.zeros((len(positions), width))
+    for block, start, stop in zip(blocks, starts[:-1], starts[1:], strict=True):
+        rows = np.flatnonzero((located.cells >= start) & (located.cells < stop))
+        size = block.connectivity.shape[1]
+        corners[rows, :size] = block.connectivity[located.cells[rows] - start]
+        weights[rows, :size] = block.type.shape_functions(located.reference[rows])
+    return MaterialPoints(corners, weights)
