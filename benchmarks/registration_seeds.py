@@ -134,7 +134,9 @@ class Outcome:
 
     Attributes
     ----------
-    scale : relative. places : (k,) of the seal's middle in the keyframes, metres. tilt : of the axis, rad.
+    scale : relative.
+    places : (k,) of the seal's middle in the keyframes, metres.
+    tilt : of the axis, rad.
     normalised : of scale, tilts and place in the last keyframe over their standard deviations.
     """
 

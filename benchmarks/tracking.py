@@ -164,12 +164,12 @@ def compare(model: ReducedModel, distance: float, frames: int) -> None:
     for name, found in results.items():
         stages = {stage: np.median([result.timings_ms[stage] for result in found]) for stage in STAGES}
         errors = [error_mm(model, r, s) for r, s in zip(found, film.states[1:], strict=True)]
-        told = ", ".join(f"{stage} {value:.1f}" for stage, value in stages.items() if value > 0.05)
+        shares = ", ".join(f"{stage} {value:.1f}" for stage, value in stages.items() if value > 0.05)
         tracked = sum(result.estimate is not None for result in found)
         median = float(np.median(times[name]))
         print(
             f"{name:<12}{median:>11.2f}{median / base:>8.2f}{np.nanmean(errors):>12.3f}"
-            f"{tracked:>5}/{len(found):<3}   {told}"
+            f"{tracked:>5}/{len(found):<3}   {shares}"
         )
 
 

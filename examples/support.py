@@ -6,6 +6,7 @@ Each example adds the folder of this file to the path that Python imports from.
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,11 @@ from typing import Any
 import morph_dslam as md
 from morph_dslam.extend.registration import load_landmarks
 from morph_dslam.extend.reports import alignment_line, load_truth, remarks, result_line
+
+
+def data_folder(name: str) -> Path:
+    """Where measurements that are not part of the project are looked for: under $MORPH_DATA, or beside the project."""
+    return Path(os.environ.get("MORPH_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / name
 
 
 def keep(product: Path, ingredients: Sequence[Path], make: Callable[[], object]) -> bool:

@@ -50,8 +50,10 @@ def write_comparison(run: Path, frames: Array, nodes: Array, lever: Array, side:
 
     Parameters
     ----------
-    frames : (f,) in which the seal is deformed. nodes : (f, n) errors of the solid's nodes, mm.
-    lever, side : (f,) errors of the angles, degrees. depth : content of ``depth_evaluation.json``.
+    frames : (f,) in which the seal is deformed.
+    nodes : (f, n) errors of the solid's nodes, mm.
+    lever, side : (f,) errors of the angles, degrees.
+    depth : content of ``depth_evaluation.json``.
 
     Returns
     -------

@@ -32,7 +32,9 @@ class Cantilever:
     inner, outer : (n, n) stiffness of the inner and of the outer half, N/m.
     mass : (n, n), of unit density, for the L2 norm.
     loads : (n, N_POSITIONS) for the force at each of the ``positions`` (N_POSITIONS,), m from the clamp.
-    vertices : (v, 2) of the mesh, m. triangles : (t, 3). vertical : (v, n) picks their vertical displacement.
+    vertices : (v, 2) of the mesh, m.
+    triangles : (t, 3).
+    vertical : (v, n) picks their vertical displacement.
     """
 
     inner: sp.csc_array

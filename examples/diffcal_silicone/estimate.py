@@ -18,6 +18,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import cv2
 import numpy as np
 from bar_models import CONVERGED, FINER, PUBLISHED, Discretisation, bar_model
@@ -25,13 +27,14 @@ from fitting import MARKER_STD, Fit, fit
 from numpy.typing import NDArray
 from pictures import Picture, colour_picture, depth_picture
 from recording import load_bar
-from run import OUTPUT, default_data
+from run import OUTPUT
 from silicone import PUBLISHED_SHEAR
 
 import morph_dslam as md
 from morph_dslam.extend import reports, run_and_report_errors
 from morph_dslam.extend.rendering import draw_overlay
 from morph_dslam.extend.reports import Section, Table, Text, distances_to_surface, write_report
+from support import data_folder
 
 Array = NDArray[np.float64]
 
@@ -156,7 +159,9 @@ def run(arguments: argparse.Namespace) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=default_data(), help="the recordings' folder (%(default)s)")
+    parser.add_argument(
+        "--data", type=Path, default=data_folder("diffcal_silicone"), help="the recordings' folder (%(default)s)"
+    )
     return run_and_report_errors(run, parser.parse_args(), "models built so far are kept")
 
 

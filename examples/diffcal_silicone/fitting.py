@@ -50,7 +50,8 @@ class Fit:
 
     Attributes
     ----------
-    state : softness and pose. softness_std : its standard deviation.
+    state : softness and pose.
+    softness_std : its standard deviation.
     outline_rms : px, at least `LEAST_PX`.
     alike : neighbouring points of the outline that have one error together, on average.
     turn : by which the pose differs from the marker's, radians.

@@ -31,8 +31,10 @@ class Picture:
 
     Attributes
     ----------
-    image : (h, w, 3) uint8 to draw on. camera_from_object : by the recording's marker.
-    place_std : of the bar's place by it, m. outline : (k, 2) of the bar, pixels.
+    image : (h, w, 3) uint8 to draw on.
+    camera_from_object : by the recording's marker.
+    place_std : of the bar's place by it, m.
+    outline : (k, 2) of the bar, pixels.
     depth : (h, w) metres, NaN where unknown; None of a colour camera.
     """
 

@@ -31,8 +31,10 @@ class HangingBar:
 
     Attributes
     ----------
-    nodes : (n, 3) undeformed, metres. tetrahedra : (m, 4).
-    camera_from_object : (4, 4). intrinsics : (3, 3).
+    nodes : (n, 3) undeformed, metres.
+    tetrahedra : (m, 4).
+    camera_from_object : (4, 4).
+    intrinsics : (3, 3).
     depth : (h, w) metres, 0 where nothing was measured.
     points : (p, 3) measured on the bar, in the mesh's frame, metres.
     """

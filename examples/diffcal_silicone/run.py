@@ -14,10 +14,11 @@ is measured on the front face, which stays in its plane, and errors are given wi
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import cv2
 import numpy as np
@@ -40,6 +41,7 @@ from morph_dslam.extend.mechanics import (
 )
 from morph_dslam.extend.rendering import draw_overlay
 from morph_dslam.extend.reports import distances_to_surface
+from support import data_folder
 
 Array = NDArray[np.float64]
 HERE = Path(__file__).resolve().parent
@@ -181,14 +183,11 @@ def run(arguments: argparse.Namespace) -> None:
     )
 
 
-def default_data() -> Path:
-    """Where the recording is looked for: under $MORPH_DATA, or beside the project."""
-    return Path(os.environ.get("MORPH_DATA", HERE.parents[2] / "shared" / "data")) / "diffcal_silicone"
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=default_data(), help="the recordings' folder (%(default)s)")
+    parser.add_argument(
+        "--data", type=Path, default=data_folder("diffcal_silicone"), help="the recordings' folder (%(default)s)"
+    )
     return run_and_report_errors(run, parser.parse_args(), "pictures drawn so far are kept")
 
 

@@ -41,7 +41,7 @@ def outline_of(level: NDArray[np.float32], inside: Array) -> Array:
     columns, rows = np.rint(inside).astype(int).T
     bright, dark = float(np.median(level[rows, columns])), float(np.median(level))
     if bright < dark + 0.1 * float(level.max() - dark):
-        raise md.MorphError("the bar cannot be told from its surroundings in this image")
+        raise md.MorphError("the bar does not stand out from its surroundings in this image")
     fine = cv2.resize(level, None, fx=FINER, fy=FINER, interpolation=cv2.INTER_LINEAR)
     mask = (fine > 0.5 * (bright + dark)).astype(np.uint8)
     _, labels = cv2.connectedComponents(mask)
@@ -62,7 +62,9 @@ class Matches:
 
     Attributes
     ----------
-    points : bound, p of them. pixels : (p, 2) nearest on the outline. normals : (p, 2) across it.
+    points : bound, p of them.
+    pixels : (p, 2) nearest on the outline.
+    normals : (p, 2) across it.
     places : (p,) how far along the outline they are, in its points.
     """
 

@@ -9,24 +9,18 @@ its own camera.yaml and landmarks.csv.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from morph_dslam.extend import frame_range, run_and_report_errors
-from support import Recording, check_recording, keep_model, report, track_and_evaluate
+from support import Recording, check_recording, data_folder, keep_model, report, track_and_evaluate
 
 HERE = Path(__file__).resolve().parent
 OUTPUT = HERE / "output"
 #: The frame in which landmarks.csv was annotated; the sheet is nearly flat there.
 REFERENCE_FRAME = 9
-
-
-def default_data() -> Path:
-    """Where the recording is looked for: under $MORPH_DATA, or beside the project."""
-    return Path(os.environ.get("MORPH_DATA", HERE.parents[2] / "shared" / "data")) / "kinect_paper"
 
 
 def own_or_example(data: Path, name: str) -> Path:
@@ -54,7 +48,9 @@ def run(arguments: argparse.Namespace) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=default_data(), help="folder of the recording (%(default)s)")
+    parser.add_argument(
+        "--data", type=Path, default=data_folder("kinect_paper"), help="folder of the recording (%(default)s)"
+    )
     parser.add_argument("--frames", type=frame_range, default=(9, 100), help="frames to track (9-100)")
     return run_and_report_errors(run, parser.parse_args(), "what was built and tracked so far is kept")
 

@@ -25,8 +25,10 @@ class Comparison:
 
     Attributes
     ----------
-    frames : (f,) numbers. deformed : (f,) in which frames the organ is deformed.
-    tumour : (f,) mean over the tumour's nodes. organ : (f,) mean over all nodes of the organ.
+    frames : (f,) numbers.
+    deformed : (f,) in which frames the organ is deformed.
+    tumour : (f,) mean over the tumour's nodes.
+    organ : (f,) mean over all nodes of the organ.
     undeformed : (f,) the tumour's error if the organ were placed rightly and taken for undeformed.
     centre, centre_std : (f, 3) error of the tumour's centre, and its predicted standard deviation.
     parameters, parameter_std, truth : (f, d) SI.

@@ -41,7 +41,8 @@ def voxels(mesh: Mesh, spacing: float, margin: float) -> tuple[NDArray[np.bool_]
 
     Parameters
     ----------
-    spacing : of the grid, metres. margin : of empty space around the mesh, metres.
+    spacing : of the grid, metres.
+    margin : of empty space around the mesh, metres.
 
     Returns
     -------

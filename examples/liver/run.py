@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from pathlib import Path
 
@@ -30,7 +29,7 @@ from morph_dslam.extend.registration import registration_line, run_registration
 from morph_dslam.extend.reports import distances_to_surface
 from morph_dslam.extend.slam import run_slam
 from morph_dslam.extend.studies import load_snapshot, place_inner_structure, snapshot_key
-from support import keep, keep_sequence
+from support import data_folder, keep, keep_sequence
 
 HERE = Path(__file__).resolve().parent
 OUTPUT = HERE / "output"
@@ -142,14 +141,11 @@ def run(arguments: argparse.Namespace) -> None:
         print(result_line(found, summary))
 
 
-def default_data() -> Path:
-    """Where the mesh is looked for: under $MORPH_DATA, or beside the project."""
-    return Path(os.environ.get("MORPH_DATA", HERE.parents[2] / "shared" / "data")) / "fem_reference"
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=default_data(), help="folder of meshes (%(default)s)")
+    parser.add_argument(
+        "--data", type=Path, default=data_folder("fem_reference"), help="folder of meshes (%(default)s)"
+    )
     return run_and_report_errors(run, parser.parse_args(), "what was done so far is kept")
 
 

@@ -113,7 +113,8 @@ class BucklingFolder:
 
     Attributes
     ----------
-    root : see `of`. count : number of positions.
+    root : see `of`.
+    count : number of positions.
     """
 
     root: Path

@@ -89,16 +89,16 @@ class Reduced:
 
 def reduce_positions(snapshots: Sequence[Snapshot], every: int, grid: Grid) -> Reduced:
     """Both forms from every so many positions; where that is all of them, the errors are on themselves."""
-    seen = list(snapshots[::every])
-    unseen = [s for i, s in enumerate(snapshots) if every == 1 or i % every]
-    task = ReductionTask(grid.mesh(), (PATH,), [[snapshot] for snapshot in seen], OPTIONS, "paper sheet")
+    training = list(snapshots[::every])
+    held_out = [s for i, s in enumerate(snapshots) if every == 1 or i % every]
+    task = ReductionTask(grid.mesh(), (PATH,), [[snapshot] for snapshot in training], OPTIONS, "paper sheet")
     model = reduction_method("pod").reduce(task)
-    model.certificate.update(certify(model, unseen))
+    model.certificate.update(certify(model, held_out))
     model.certificate["compression_percent"] = compression_percent(model, len(snapshots))
-    model.certificate["samples"] = {"training": len(seen), "held_out": len(unseen), "failed": []}
-    separated = {name: separate_space(seen, name, grid) for name in FIELDS}
+    model.certificate["samples"] = {"training": len(training), "held_out": len(held_out), "failed": []}
+    separated = {name: separate_space(training, name, grid) for name in FIELDS}
     stored = separated["displacement"].n_floats / (len(snapshots) * 3 * len(task.mesh.nodes))
-    return Reduced(model, separated, _separated_errors(separated, unseen, grid), 100.0 * (1.0 - stored))
+    return Reduced(model, separated, _separated_errors(separated, held_out, grid), 100.0 * (1.0 - stored))
 
 
 def separate_space(snapshots: Sequence[Snapshot], name: str, grid: Grid) -> CPFunctions:
@@ -152,8 +152,8 @@ def write_reduction(snapshots: Sequence[Snapshot], grid: Grid, output: Path) -> 
     reduced = reduce_positions(snapshots, every, grid)
     print(_table_row(reduced))
     md.save_model(output / "paper_sheet.morph", reduced.model)
-    unseen = [snapshot for i, snapshot in enumerate(snapshots) if i % every]
-    draw_reduction(output / "reduction.png", reduced, unseen, grid)
+    held_out = [snapshot for i, snapshot in enumerate(snapshots) if i % every]
+    draw_reduction(output / "reduction.png", reduced, held_out, grid)
     certificate, figures = reduced.model.certificate, reduced.errors
     stress = max(certificate[f"stress_{face}"]["von_mises"]["relative_l2"] for face in ("top", "bottom"))
     return (
@@ -171,7 +171,7 @@ TABLE_HEAD = f"{'positions':>9s}" + 2 * f" {'count':>8s} {'error':>9s} {'Mises':
 
 
 def _table_row(reduced: Reduced) -> str:
-    """Positions seen; modes or products, errors of displacement and stress, and compression of each form."""
+    """Training positions; modes or products, errors of displacement and stress, and compression of each form."""
     certificate, separated = reduced.model.certificate, reduced.separated["displacement"]
     stress = max(certificate[f"stress_{face}"]["von_mises"]["relative_l2"] for face in ("top", "bottom"))
     return (
@@ -182,7 +182,7 @@ def _table_row(reduced: Reduced) -> str:
     )
 
 
-def draw_reduction(file: Path, reduced: Reduced, unseen: Sequence[Snapshot], grid: Grid) -> None:
+def draw_reduction(file: Path, reduced: Reduced, held_out: Sequence[Snapshot], grid: Grid) -> None:
     """Errors against the number of modes and of products, and the first products' functions of X, Y, path."""
     figure = Figure(figsize=(11.0, 7.5), layout="constrained")
     (error_axes, x_axes), (y_axes, path_axes) = figure.subplots(2, 2)
@@ -190,7 +190,7 @@ def draw_reduction(file: Path, reduced: Reduced, unseen: Sequence[Snapshot], gri
     error_axes.semilogy(range(1, len(by_modes) + 1), by_modes, "o-", label="modes in space x path")
     functions = reduced.separated["displacement"]
     counts = range(1, len(functions.mixing) + 1)
-    by_products = [_mean_distance(functions, unseen, grid, count) for count in counts]
+    by_products = [_mean_distance(functions, held_out, grid, count) for count in counts]
     error_axes.semilogy(counts, by_products, "s-", label="products of X, Y and path")
     error_axes.set(xlabel="modes or products", ylabel="mean error on positions left out / mm")
     error_axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -208,10 +208,10 @@ def draw_reduction(file: Path, reduced: Reduced, unseen: Sequence[Snapshot], gri
     figure.savefig(file, dpi=100)
 
 
-def _mean_distance(functions: CPFunctions, unseen: Sequence[Snapshot], grid: Grid, products: int) -> float:
+def _mean_distance(functions: CPFunctions, held_out: Sequence[Snapshot], grid: Grid, products: int) -> float:
     """Mean distance from the truth over nodes and snapshots, mm."""
     means = []
-    for snapshot in unseen:
+    for snapshot in held_out:
         found = evaluate_separated(functions, grid, snapshot.coordinates[0], products)
         means.append(np.linalg.norm(found - snapshot.fields["displacement"], axis=1).mean())
     return 1e3 * float(np.mean(means))

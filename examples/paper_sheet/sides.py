@@ -41,10 +41,10 @@ def both_sides(snapshots: Sequence[Snapshot]) -> list[Snapshot]:
 def tracked_model(snapshots: Sequence[Snapshot], grid: Grid) -> md.ReducedModel:
     """The model that the tracker has: of few positions, certified on all others."""
     every = max(1, round((len(snapshots) - 1) / (NODES - 1)))
-    seen, unseen = snapshots[::every], [s for i, s in enumerate(snapshots) if i % every]
-    task = ReductionTask(grid.mesh(), (PATH,), [[s] for s in both_sides(seen)], OPTIONS, "paper sheet, either side")
+    training, held_out = snapshots[::every], [s for i, s in enumerate(snapshots) if i % every]
+    task = ReductionTask(grid.mesh(), (PATH,), [[s] for s in both_sides(training)], OPTIONS, "paper sheet, either side")
     model = reduction_method("pod").reduce(task)
-    model.certificate.update(certify(model, [*unseen, *map(below, unseen)]))
+    model.certificate.update(certify(model, [*held_out, *map(below, held_out)]))
     return model
 
 

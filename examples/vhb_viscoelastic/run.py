@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import re
 import sys
 import zipfile
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import matplotlib
 import numpy as np
@@ -25,6 +26,7 @@ from tension_fit import Fit, TensionTest, evaluate_tests, fit_law, relative_erro
 import morph_dslam as md
 from morph_dslam.extend import run_and_report_errors
 from morph_dslam.extend.mechanics import Ogden
+from support import data_folder
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -37,12 +39,6 @@ FITTED = {RELAXATION: ("1d5", "2d5", "3d5", "5d0"), LOOPS: ("1d5", "2d5")}
 #: Points kept of each test: a relaxation's fast beginning and its slow end, or an even choice of a loop.
 POINTS = 120
 KILOPASCAL = 1e3
-
-
-def default_data() -> Path:
-    """Where the measurements are looked for: under $MORPH_DATA, or beside the project."""
-    root = Path(os.environ.get("MORPH_DATA", HERE.parents[2] / "shared" / "data"))
-    return root / "fem_reference" / "vhb4910"
 
 
 def read_sheet(path: Path) -> np.ndarray:
@@ -160,7 +156,9 @@ def run(arguments: argparse.Namespace) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=default_data(), help="folder of the tests (%(default)s)")
+    parser.add_argument(
+        "--data", type=Path, default=data_folder("fem_reference/vhb4910"), help="folder of the tests (%(default)s)"
+    )
     return run_and_report_errors(run, parser.parse_args(), "nothing was written")
 
 

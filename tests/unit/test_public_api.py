@@ -1,6 +1,7 @@
 """The names that scripts may rely on: they exist, cost nothing until they are used, and examples need no others."""
 
 import ast
+import importlib
 import inspect
 import re
 import subprocess
@@ -39,6 +40,19 @@ def test_there_are_few_public_names():
     assert list(md.__all__) == sorted(md.__all__)
     assert set(md.__all__) <= set(dir(md))
     assert Path(md.__file__).with_name("py.typed").is_file()
+
+
+#: The modules of building blocks.
+EXTEND = sorted(path.stem for path in Path(extend.__file__).parent.glob("[a-z]*.py"))
+
+
+@pytest.mark.parametrize("name", EXTEND)
+def test_building_blocks_are_listed_and_documented(name):
+    module = importlib.import_module(f"morph_dslam.extend.{name}")
+    assert f"`extend.{name}`" in str(extend.__doc__)
+    imports = (node for node in ast.parse(inspect.getsource(module)).body if isinstance(node, ast.ImportFrom))
+    assert {each.name for node in imports for each in node.names} == set(module.__all__)
+    assert [each for each in module.__all__ if not inspect.getdoc(getattr(module, each))] == []
 
 
 @pytest.mark.parametrize("package", [md, extend])
