@@ -27,13 +27,7 @@ FACTORS: dict[str, dict[str, float]] = {
 
 
 def quantity_of(unit: str) -> str:
-    """The quantity that ``unit`` measures, "stress" for "MPa".
-
-    Raises
-    ------
-    StudyError
-        If it is not a unit known here.
-    """
+    """The quantity that ``unit`` measures, "stress" for "MPa". Raises StudyError if it is not a unit known here."""
     for quantity, known in FACTORS.items():
         if unit in known:
             return quantity
@@ -42,13 +36,7 @@ def quantity_of(unit: str) -> str:
 
 
 def to_si(value: float, unit: str, quantity: str) -> float:
-    """Convert ``value`` in ``unit`` to SI.
-
-    Raises
-    ------
-    StudyError
-        If ``unit`` does not measure ``quantity``.
-    """
+    """Convert ``value`` in ``unit`` to SI. Raises StudyError if ``unit`` does not measure ``quantity``."""
     known = FACTORS[quantity]
     if unit not in known:
         raise StudyError(f"'{unit}' is not a unit of {quantity}; use one of {', '.join(known)}")

@@ -121,10 +121,7 @@ def _card(path: Path, number: int, text: str) -> Card:
 def read_cards(path: Path) -> list[Card]:
     """The cards of an input file and of those that it includes, in order.
 
-    Raises
-    ------
-    StudyError
-        If a file cannot be read, is not text, includes itself, or begins with data.
+    Raises StudyError if a file cannot be read, is not text, includes itself, or begins with data.
     """
     cards: list[Card] = []
     for source, number, text in _lines(Path(path)):
@@ -214,14 +211,12 @@ class LabelSets:
     def resolved(self, defined: Labels) -> dict[str, Labels]:
         """Sorted labels of each set by name.
 
+        Raises StudyError if a line names a label that is not defined, a set that is not there, or one that holds
+        itself.
+
         Parameters
         ----------
         defined : the labels that the file defines; a range keeps those of its labels that are among them.
-
-        Raises
-        ------
-        StudyError
-            If a line names a label that is not defined, a set that is not there, or one that holds itself.
         """
         return {entry.name: self._expand(entry, defined, ()) for entry in self._sets.values()}
 

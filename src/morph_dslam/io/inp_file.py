@@ -186,11 +186,8 @@ def _refuse_what_moves_nodes(cards: list[Card]) -> None:
 def read_inp(path: Path) -> InpFile:
     """Read an input file.
 
-    Raises
-    ------
-    StudyError
-        Naming file and line, if a card is malformed, cut short, of an unknown type, or refers to what is
-        not there.
+    Raises StudyError naming file and line, if a card is malformed, cut short, of an unknown type, or refers to what is
+    not there.
     """
     path = Path(path)
     cards = read_cards(path)

@@ -187,10 +187,7 @@ class GrippedSheet:
     def solve(self, coordinates: Array, start: EquilibriumState) -> EquilibriumState:
         """Newton's method from ``start`` to equilibrium at ``coordinates`` (4,).
 
-        Raises
-        ------
-        SolverError
-            If it does not converge; the caller may try smaller increments.
+        Raises SolverError if it does not converge; the caller may try smaller increments.
         """
         shell, length = self.shell, self.grips.length
         vector = shell.state_vector()
@@ -221,10 +218,7 @@ class GrippedSheet:
     def advance(self, start: EquilibriumState, target: Array) -> EquilibriumState:
         """Solve at ``target`` (4,) along the straight line from ``start``.
 
-        Raises
-        ------
-        SolverError
-            Naming the last coordinates that converged.
+        Raises SolverError naming the last coordinates that converged.
         """
         origin = start.coordinates
 
@@ -252,13 +246,8 @@ class GrippedSheet:
     def first_state(self, bulge: float) -> EquilibriumState:
         """Equilibrium of the gently arched sheet, bend = 1, from a circular arc as the first guess.
 
-        Should Newton's method not converge from there, a flatter arch is tried: the state returned may bulge
-        less than asked.
-
-        Raises
-        ------
-        SolverError
-            If no arch converges.
+        Should Newton's method not converge from there, a flatter arch is tried: the state returned may bulge less than
+        asked. Raises SolverError if no arch converges.
         """
         shell = self.shell
         half = self.grips.free_length / 2.0

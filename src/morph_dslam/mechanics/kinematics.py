@@ -43,10 +43,7 @@ class ShapeField:
 class Shape:
     """The undeformed shape: amplitudes with fields in the displacement space.
 
-    Raises
-    ------
-    StudyError
-        If a field has not one row for each node.
+    Raises StudyError if a field has not one row for each node.
     """
 
     def __init__(self, space: DisplacementSpace, fields: Sequence[ShapeField]) -> None:

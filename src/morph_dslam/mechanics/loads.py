@@ -180,13 +180,7 @@ Array = NDArray[np.float64]
 
 
 class NodalForces:
-    """The point loads of a solid.
-
-    Raises
-    ------
-    StudyError
-        If a load names an unknown set.
-    """
+    """The point loads of a solid. Raises StudyError if a load names an unknown set."""
 
     def __init__(self, space: DisplacementSpace, loads: Sequence[PointLoad], symbols: ParameterSymbols) -> None:
         self._loads, self._symbols, self._n_scalar = loads, symbols, space.n_scalar

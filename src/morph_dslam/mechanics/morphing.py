@@ -23,14 +23,11 @@ Indices = NDArray[np.int64]
 def radius_field(nodes: Array, point: Array, direction: Array) -> Array:
     """Unit vectors (n, 3) that point away from an axis, zero on it: a larger radius, the same wall.
 
+    Raises StudyError if the axis has no direction.
+
     Parameters
     ----------
     nodes : (n, 3), m. point : on the axis (3,), m. direction : of the axis (3,); its length does not matter.
-
-    Raises
-    ------
-    StudyError
-        If the axis has no direction.
     """
     length = np.linalg.norm(direction)
     if not length > 0.0:
@@ -44,13 +41,9 @@ def radius_field(nodes: Array, point: Array, direction: Array) -> Array:
 def thickness_field(mesh: Mesh, moved: str, kept: str) -> Array:
     """Field (n, 3) that moves one surface along its outward normal by 1 and keeps the opposite one.
 
-    Nodes between them follow in the direction of the nearest moved node's normal, by a share that satisfies
-    Laplace's equation, so that layers of cells keep their proportions.
-
-    Raises
-    ------
-    StudyError
-        If a surface is unknown, or the two share nodes.
+    Nodes between them follow in the direction of the nearest moved node's normal, by a share that satisfies Laplace's
+    equation, so that layers of cells keep their proportions. Raises StudyError if a surface is unknown, or the two
+    share nodes.
     """
     moved_nodes, kept_nodes = mesh.surface_nodes(moved), mesh.surface_nodes(kept)
     shared = np.intersect1d(moved_nodes, kept_nodes)

@@ -40,17 +40,14 @@ def corner_monomials(count: int, points: Array) -> Array:
 class NgsolveMesh:
     """A mesh, its counterpart in NGSolve and the numbering between them.
 
+    Raises StudyError if the mesh has cells that are not solids.
+
     Attributes
     ----------
     mesh : the mesh it was made from.
     ngs : NGSolve's mesh of the corners.
     node_of_vertex : (n_vertices,) node index of each of NGSolve's vertices.
     element_of_cell : (n_cells,) NGSolve's element number of each cell; ``cell_of_element`` is its inverse.
-
-    Raises
-    ------
-    StudyError
-        If the mesh has cells that are not solids.
     """
 
     def __init__(self, mesh: Mesh) -> None:

@@ -61,6 +61,8 @@ class SolidOptions:
 class SolidProblem:
     """A solid with its materials, supports, loads and parameters.
 
+    Raises StudyError for unknown sets, cells with no material or with two, unstable materials, missing supports.
+
     Parameters
     ----------
     mesh : in metres.
@@ -77,11 +79,6 @@ class SolidProblem:
     n_dofs, free, scale : see `newton.Equations`. The first 3 n_scalar dofs are displacements, those of x
         first; pressures follow.
     flags : what a result obtained with this discretisation must be doubted for; empty if nothing.
-
-    Raises
-    ------
-    StudyError
-        For unknown sets, cells with no material or with two, unstable materials, missing supports.
     """
 
     def __init__(

@@ -74,10 +74,7 @@ class MaterialRegion:
 def owners_of_cells(mesh: Mesh, materials: Mapping[str, Material]) -> NDArray[np.int64]:
     """Position (n_cells,) in ``materials`` of each cell's; "all" takes the cells that no other set names.
 
-    Raises
-    ------
-    StudyError
-        If a set is unknown, or a cell has no material or two.
+    Raises StudyError if a set is unknown, or a cell has no material or two.
     """
     owners = np.full(mesh.n_cells, -1, dtype=np.int64)
     names = list(materials)
@@ -103,15 +100,12 @@ def place_materials(
 ) -> list[MaterialRegion]:
     """A region for each material that has cells, in the order of ``materials``.
 
+    Raises StudyError if a material is unstable, or the cells have no mixed form.
+
     Parameters
     ----------
     owners : of `owners_of_cells`.
     mixed : use the mixed form for materials that have a volumetric part.
-
-    Raises
-    ------
-    StudyError
-        If a material is unstable, or the cells have no mixed form.
     """
     regions = space.geometry.partition(owners)
     return [

@@ -55,7 +55,8 @@ class _BlockBasis:
 class DisplacementSpace:
     """Continuous displacements of first or second order.
 
-    Scalar dofs are numbered 0 ... n_scalar - 1; a displacement field has n_scalar of x, then of y, then of z.
+    Scalar dofs are numbered 0 ... n_scalar - 1; a displacement field has n_scalar of x, then of y, then of z. Raises
+    StudyError if cell types do not go together, or the order is below that of the cells.
 
     Parameters
     ----------
@@ -70,11 +71,6 @@ class DisplacementSpace:
     coefficients : sparse (n_scalar, n_nodes): coefficients of the interpolation of nodal values.
     coordinates : (n_scalar, 3) coefficients of the position X, m.
     bonus_order : what integrals over cells need beyond NGSolve's own order of quadrature.
-
-    Raises
-    ------
-    StudyError
-        If cell types do not go together, or the order is below that of the cells.
     """
 
     def __init__(self, geometry: NgsolveMesh, order: int | None = None, full: bool = False) -> None:

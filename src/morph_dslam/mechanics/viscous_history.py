@@ -37,6 +37,8 @@ _CORNERS = {ngs.TET: 4, ngs.PRISM: 6, ngs.HEX: 8}
 class ViscousHistory:
     """Steps from the last accepted solution to the present parameters.
 
+    Raises StudyError if there is no time, or a material in mixed form relaxes in volume.
+
     Parameters
     ----------
     space : of the displacements.
@@ -48,11 +50,6 @@ class ViscousHistory:
     ----------
     regions : the same materials, with the stress left from earlier steps.
     rules : quadrature rules that energies must be integrated with.
-
-    Raises
-    ------
-    StudyError
-        If there is no time, or a material in mixed form relaxes in volume.
     """
 
     def __init__(

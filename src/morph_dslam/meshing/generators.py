@@ -80,18 +80,13 @@ _SAMPLES = 400
 class Profile:
     """A smooth curve (r, z) through given points, from the bottom upwards.
 
-    Akima's interpolation (J. ACM 17, 1970) by chord length: a straight stretch of points stays straight, and
-    the curve does not overshoot where it meets a fold.
+    Akima's interpolation (J. ACM 17, 1970) by chord length: a straight stretch of points stays straight, and the curve
+    does not overshoot where it meets a fold. Raises StudyError if there are fewer than two points, two in a row
+    coincide, a radius is not positive, or the profile runs downwards.
 
     Parameters
     ----------
     points : (p, 2) radius and height, metres.
-
-    Raises
-    ------
-    StudyError
-        If there are fewer than two points, two in a row coincide, a radius is not positive, or the profile
-        runs downwards.
     """
 
     def __init__(self, points: Sequence[Sequence[float]] | Array):
@@ -139,10 +134,7 @@ class Profile:
     def spread(self, values: float | Sequence[float] | Array, what: str) -> Callable[[Array], Array]:
         """A function of fractions of the arc length: linear between values given at the profile's points.
 
-        Raises
-        ------
-        StudyError
-            If there is neither one value nor one for each point; ``what`` names them.
+        Raises StudyError if there is neither one value nor one for each point; ``what`` names them.
         """
         given = np.atleast_1d(np.asarray(values, dtype=np.float64))
         if given.shape not in ((1,), (len(self._points_at),)):
@@ -259,6 +251,8 @@ def revolution(
 ) -> Mesh:
     """A wall of revolution around the z axis.
 
+    Raises StudyError if the profile or a collar cannot be, the wall reaches the axis, or the angles are not in order.
+
     Parameters
     ----------
     profile : (p, 2) points (r, z) of the wall's midline from the bottom upwards, metres; see `Profile`.
@@ -272,11 +266,6 @@ def revolution(
     -------
     Mesh
         Surfaces and node sets "inner", "outer", "bottom", "top" and, unless the turn is full, "start", "end".
-
-    Raises
-    ------
-    StudyError
-        If the profile or a collar cannot be, the wall reaches the axis, or the angles are not in order.
     """
     _check(divisions, "along the profile, through the wall and around", cell_type)
     turn, around = angles[1] - angles[0], divisions[2]
@@ -299,6 +288,8 @@ def revolution(
 def block(size: tuple[float, float, float], divisions: tuple[int, int, int], cell_type: str = "hex20") -> Mesh:
     """A rectangular block with one corner at the origin.
 
+    Raises StudyError if a size or a division is not positive, or the cell type is unknown.
+
     Parameters
     ----------
     size : extents along x, y and z, metres.
@@ -309,11 +300,6 @@ def block(size: tuple[float, float, float], divisions: tuple[int, int, int], cel
     -------
     Mesh
         Surfaces and node sets "x_min", "x_max", "y_min", "y_max", "z_min", "z_max".
-
-    Raises
-    ------
-    StudyError
-        If a size or a division is not positive, or the cell type is unknown.
     """
     _check(divisions, "along x, y and z", cell_type)
     if len(size) != 3 or min(size) <= 0.0:

@@ -30,6 +30,8 @@ _VOLUMES = (".inp", ".msh", ".vtk", ".vtu", ".step", ".stp")
 def load_mesh(path: Path | str, unit: str, size: float | None = None) -> Mesh:
     """Read a mesh file, or mesh the volume that a surface or a STEP file describes.
 
+    Raises StudyError if the kind of file or the unit is not known, or the file is damaged.
+
     Parameters
     ----------
     path : .inp (Abaqus, CalculiX), .msh (Gmsh), .vtk, .vtu; .stl, .obj, .ply (closed surfaces); .step, .stp.
@@ -40,11 +42,6 @@ def load_mesh(path: Path | str, unit: str, size: float | None = None) -> Mesh:
     -------
     Mesh
         In metres, without the nodes that no cell uses, mended by `mesh_repair`; `check_mesh` checks it.
-
-    Raises
-    ------
-    StudyError
-        If the kind of file or the unit is not known, or the file is damaged.
     """
     path, scale = Path(path), to_si(1.0, unit, "length")
     kind = path.suffix.lower()

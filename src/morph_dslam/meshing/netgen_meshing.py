@@ -43,10 +43,7 @@ class TriangleSurface:
 def read_surface(path: Path) -> TriangleSurface:
     """Read a surface; polygons are cut into triangles and coincident points made one.
 
-    Raises
-    ------
-    StudyError
-        If it is a file of another kind, cannot be read, or holds no faces.
+    Raises StudyError if it is a file of another kind, cannot be read, or holds no faces.
     """
     if path.suffix.lower() not in SURFACES:
         raise StudyError(f"{path} is no surface file that is read; use {', '.join(SURFACES)}")
@@ -189,6 +186,8 @@ def _volume_mesh(content: Any, path: Path) -> Mesh:
 def mesh_surface_file(path: Path, size: float | None) -> Mesh:
     """Fill a closed surface with tetrahedra; file units.
 
+    Raises StudyError if the surface is unreadable, not closed, or cannot be filled.
+
     Parameters
     ----------
     path : .stl, .obj or .ply file.
@@ -199,11 +198,6 @@ def mesh_surface_file(path: Path, size: float | None) -> Mesh:
     -------
     Mesh
         Surfaces "face_1", ..., one for each smooth part of a surface meshed anew.
-
-    Raises
-    ------
-    StudyError
-        If the surface is unreadable, not closed, or cannot be filled.
     """
     surface = read_surface(path)
     check_watertight(surface, path)
@@ -242,15 +236,12 @@ def _meshed_anew(surface: TriangleSurface, size: float) -> Any:
 def mesh_step_file(path: Path, unit: str, size: float | None) -> Mesh:
     """Mesh the solids of a STEP file with tetrahedra; in millimetres, which the STEP reader converts to.
 
+    Raises StudyError if the file cannot be read or states another unit, or its solids cannot be meshed.
+
     Parameters
     ----------
     unit : the declared unit; it must be the one that the file itself states.
     size : longest edge of a cell, millimetres; a tenth of the solids' diagonal by default.
-
-    Raises
-    ------
-    StudyError
-        If the file cannot be read or states another unit, or its solids cannot be meshed.
     """
     try:
         text = path.read_text(encoding="utf-8", errors="replace")

@@ -41,18 +41,14 @@ def _corners_around(connectivity: Indices, parents: tuple[tuple[int, ...], ...])
 def to_second_order(mesh: Mesh, *wanted: str) -> Mesh:
     """Give every cell its middle nodes, halfway between the corners around them.
 
-    A node set takes in the middle nodes all of whose corners it holds; one that bears the name of a surface
-    takes in that surface's. Surfaces and cell sets stay as they are.
+    A node set takes in the middle nodes all of whose corners it holds; one that bears the name of a surface takes in
+    that surface's. Surfaces and cell sets stay as they are. Raises StudyError if a cell has no second-order type
+    (sheets), or is of second order already.
 
     Parameters
     ----------
     mesh : cells of first order only.
     wanted : second-order types such as "hex20"; the first of each type in `SECOND_ORDER` where none is named.
-
-    Raises
-    ------
-    StudyError
-        If a cell has no second-order type (sheets), or is of second order already.
     """
     targets = [_target(block, wanted) for block in mesh.blocks]
     around = [

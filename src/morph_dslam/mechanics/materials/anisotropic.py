@@ -42,10 +42,7 @@ def unit_direction(direction: Direction, law: str) -> Any:
 def turned_direction(angle: Constant, start: tuple[float, ...], towards: tuple[float, ...]) -> Any:
     """cos(angle) start + sin(angle) towards, both made orthonormal first; the angle (rad) may be a parameter.
 
-    Raises
-    ------
-    StudyError
-        If the two directions are zero or parallel.
+    Raises StudyError if the two directions are zero or parallel.
     """
     a, b = np.asarray(start, dtype=float), np.asarray(towards, dtype=float)
     if a.shape != (3,) or b.shape != (3,) or not np.linalg.norm(np.cross(a, b)) > 1e-9 * (a @ a + b @ b):

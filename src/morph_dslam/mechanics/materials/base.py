@@ -111,10 +111,7 @@ class Material(ABC):
     def check(self) -> None:
         """Refuse constants that make the undeformed solid unstable; parameters at their present values.
 
-        Raises
-        ------
-        StudyError
-            If a constant is not finite, or some small strain would lower the energy.
+        Raises StudyError if a constant is not finite, or some small strain would lower the energy.
         """
         for name, constant in self.constants().items():
             if not np.all(np.isfinite(evaluate(constant))):

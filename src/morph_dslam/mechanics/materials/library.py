@@ -60,16 +60,13 @@ def constant_quantities(law: str) -> dict[str, str]:
 def material_from_table(table: Mapping[str, Any], folder: Path = Path()) -> Material:
     """The material that a study's section describes.
 
+    Raises StudyError for an unknown law or key, a missing constant, or a value of the wrong kind; `Material.check`
+    finds constants that are unstable.
+
     Parameters
     ----------
     table : law and constants, see above.
     folder : where a user's "file.py:name" is sought.
-
-    Raises
-    ------
-    StudyError
-        For an unknown law or key, a missing constant, or a value of the wrong kind; `Material.check` finds constants
-        that are unstable.
     """
     table = dict(table)
     if "law" not in table:

@@ -198,17 +198,14 @@ class ArcLength:
     ) -> Iterator[PathPoint]:
         """Points of the path, its start first, with steps as long as they converge quickly.
 
+        Raises SolverError naming the last parameters that converged, when steps become too short.
+
         Parameters
         ----------
         start : the path's first solution, or a point of a path to go on from.
         end : a function of the state that is negative before the path's end and grows through zero at it: the last
             point is where it vanishes. ``lambda state: state.mu[0] - target`` ends at a parameter.
         sense : whether the parameter first grows (1) or falls (-1); a point knows its own.
-
-        Raises
-        ------
-        SolverError
-            Naming the last parameters that converged, when steps become too short.
         """
         options = self.options
         point = self.begin(start, sense) if isinstance(start, State) else start

@@ -43,6 +43,8 @@ def buckling_modes(
 ) -> list[BucklingMode]:
     """The first modes as a parameter grows from ``base``, nearest first.
 
+    Raises SolverError if no mode is found for growing parameters.
+
     Parameters
     ----------
     equations : their linearisations must stay usable after the next one is made.
@@ -50,11 +52,6 @@ def buckling_modes(
     parameter : index in mu of the parameter that makes the body buckle.
     step : of that parameter, for differencing K along the response; well below the critical change.
     count : how many modes.
-
-    Raises
-    ------
-    SolverError
-        If no mode is found for growing parameters.
     """
     direction = np.zeros(len(base.mu))
     direction[parameter] = step

@@ -38,15 +38,12 @@ class PathError(SolverError):
 def step_towards(attempt: Callable[[float, AnyState], AnyState], start: AnyState) -> AnyState:
     """The state at the end of a path, in one increment if possible; they shrink on failure and grow again.
 
+    Raises SolverError if the increments become too small.
+
     Parameters
     ----------
     attempt : solves at a fraction of the path from a solved state.
     start : state at fraction 0.
-
-    Raises
-    ------
-    SolverError
-        If the increments become too small.
     """
     state, done, increment = start, 0.0, 1.0
     while done < 1.0:
@@ -66,14 +63,11 @@ def step_towards(attempt: Callable[[float, AnyState], AnyState], start: AnyState
 def advance(equations: Equations, start: State, target: Array, tolerance: float = TOLERANCE) -> list[State]:
     """Solve at ``target`` (d,) along the straight line from ``start``, in increments as large as converge.
 
+    Raises PathError naming the last parameters that converged; it carries the states up to there.
+
     Returns
     -------
     The states along the line, ``start`` first.
-
-    Raises
-    ------
-    PathError
-        Naming the last parameters that converged; it carries the states up to there.
     """
     origin, goal = start.mu, np.asarray(target, dtype=float)
     states: list[State] = [start]
@@ -146,10 +140,7 @@ class _LoadRamp:
 def loaded_state(equations: Equations, mu: Array) -> State:
     """Equilibrium at ``mu`` (d,), reached from the undeformed, stress-free body while all loads grow together.
 
-    Raises
-    ------
-    SolverError
-        If the loads cannot be carried.
+    Raises SolverError if the loads cannot be carried.
     """
     start = State(np.zeros(1), np.zeros(equations.n_dofs))
     reached = advance(_LoadRamp(equations, mu), start, np.ones(1))[-1]

@@ -215,10 +215,7 @@ class Engine(Protocol):
 def default_engine() -> str:
     """Name of the engine in use: the environment's choice, or PARDISO where it is installed.
 
-    Raises
-    ------
-    SolverError
-        If the environment asks for an engine that is unknown or not installed.
+    Raises SolverError if the environment asks for an engine that is unknown or not installed.
     """
     installed = find_spec("pypardiso") is not None
     chosen = os.environ.get(ENVIRONMENT_VARIABLE, "pardiso" if installed else "sparsecholesky")
@@ -305,6 +302,8 @@ class Factorisation:
     def solve(self, right: Array) -> Array:
         """K_ff^-1 right_f.
 
+        Raises SolverError if neither the engine nor SuperLU gives a small residual: the matrix is singular.
+
         Parameters
         ----------
         right : (n,) or (k, n) over all dofs; what it holds at prescribed dofs does not matter.
@@ -312,11 +311,6 @@ class Factorisation:
         Returns
         -------
         The same shape, zero at prescribed dofs.
-
-        Raises
-        ------
-        SolverError
-            If neither the engine nor SuperLU gives a small residual: the matrix is singular.
         """
         free = self._solver.free
         solution = np.zeros(right.shape)
@@ -378,12 +372,7 @@ class LinearSolver:
     def factorise(self, data: Array, indices: Integers, indptr: Integers) -> Factorisation:
         """Factorise the free block of K, given in CSR form with sorted indices.
 
-        A symmetric K may come whole or as its lower or upper triangle.
-
-        Raises
-        ------
-        SolverError
-            If an entry is not finite.
+        A symmetric K may come whole or as its lower or upper triangle. Raises SolverError if an entry is not finite.
         """
         if not np.all(np.isfinite(data)):
             raise SolverError("the tangent matrix is not finite: the deformation is too large or inside out")

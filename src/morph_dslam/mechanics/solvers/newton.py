@@ -128,10 +128,7 @@ def correction(linearisation: Linearisation, residual: Array, gap: Array) -> Arr
 def solve(equations: Equations, mu: Array, start: State, tolerance: float = TOLERANCE) -> State:
     """Equilibrium at ``mu`` (d,) by Newton's method from ``start``.
 
-    Raises
-    ------
-    SolverError
-        If it stalls, diverges, or meets values that are not finite; smaller increments may help.
+    Raises SolverError if it stalls, diverges, or meets values that are not finite; smaller increments may help.
     """
     mu = np.array(mu, dtype=float)
     x, target = start.dofs.copy(), equations.prescribed(mu)
