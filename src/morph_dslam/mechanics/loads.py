@@ -1,7 +1,7 @@
 """Loads on a solid, any of them a function of parameters.
 
-Dead loads have an energy; the follower pressure has none, and makes the tangent unsymmetric. All areas and
-volumes are those of the undeformed solid, whatever its shape parameters.
+Dead loads have an energy; the follower pressure has none, and makes the tangent unsymmetric. All areas and volumes are
+those of the undeformed solid, whatever its shape parameters.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from morph_dslam.mechanics.kinematics import Kinematics
 from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
 from morph_dslam.mechanics.spaces import DisplacementSpace
 from morph_dslam.studies.problem import Snapshot
+
+Array = NDArray[np.float64]
 
 Vector = tuple[Scalar, Scalar, Scalar]
 
@@ -103,9 +105,9 @@ class PointLoad:
 class MovingPatch:
     """Dead force spread around a point that moves over a surface, with a Gaussian density.
 
-    t(X) = force exp(-r^2 / 2 w^2) / (2 pi w^2), r the distance of X from the centre: the whole force on a
-    flat surface that reaches 4 widths around the centre; nearer to its rim the rest falls beside it.
-    Smooth in the position, so that solutions have derivatives by it.
+    t(X) = force exp(-r^2 / 2 w^2) / (2 pi w^2), r the distance of X from the centre: the whole force on a flat surface
+    that reaches 4 widths around the centre; nearer to its rim the rest falls beside it. Smooth in the position, so that
+    solutions have derivatives by it.
 
     Attributes
     ----------
@@ -173,14 +175,8 @@ def _check_width(on: str, width: float) -> None:
         raise StudyError(f"the moving load on '{on}' has width {width:g} m; it must be positive")
 
 
-# Point loads as forces on the dofs of the displacements.
-
-
-Array = NDArray[np.float64]
-
-
 class NodalForces:
-    """The point loads of a solid. Raises StudyError if a load names an unknown set."""
+    """The point loads of a solid, as forces on the dofs of its displacements; StudyError if one names an unknown set."""
 
     def __init__(self, space: DisplacementSpace, loads: Sequence[PointLoad], symbols: ParameterSymbols) -> None:
         self._loads, self._symbols, self._n_scalar = loads, symbols, space.n_scalar
@@ -201,9 +197,6 @@ class NodalForces:
         for load, share in zip(self._loads, self._shares, strict=True):
             slopes += np.column_stack([self._symbols.slopes(f) for f in load.force])[:, :, None] * share
         return slopes.reshape(len(self._symbols), -1)
-
-
-# Reactions of the supports as fields of one point, so that they are reduced and certified like any other.
 
 
 #: Name of a reaction's field: this and the name of the output, "force_SET" (N) or "moment_SET" (N m).

@@ -86,8 +86,6 @@ class SheetEquations:
         initial[rotations.start : rotations.stop] = 0.0
         self._initial, self.unloaded = initial, shape
 
-    # -- Equations --------------------------------------------------------------------------------------
-
     def prescribed(self, mu: Array) -> Array:
         return mu[0] * self._motion
 
@@ -127,8 +125,6 @@ class SheetEquations:
     def _use(self, x: Array, mu: Array) -> None:
         self.shell.state_vector()[:] = x
         self.shell.load_factor.Set(float(mu[1]))
-
-    # -- results ----------------------------------------------------------------------------------------
 
     def end_force(self, x: Array, mu: Array) -> float:
         """Force along the motion of the edges, conjugate to mu[0]: d energy / d mu[0], N."""

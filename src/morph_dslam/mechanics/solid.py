@@ -117,8 +117,6 @@ class SolidProblem:
         points = [load for load in loads if isinstance(load, PointLoad)]
         self._nodal_forces = NodalForces(self.displacements, points, self.symbols)
 
-    # -- set-up ---------------------------------------------------------------------------------------
-
     def _make_history(self, time: Scalar | None) -> ViscousHistory | None:
         if all(region.material.prony is None for region in self.regions):
             return None
@@ -193,8 +191,6 @@ class SolidProblem:
         """The linear solver, made when first needed."""
         return LinearSolver(self.free & self.assembly.coupled, self.assembly.symmetric, threads=self.options.threads)
 
-    # -- the equations ----------------------------------------------------------------------------------
-
     def initial_state(self) -> State:
         """The undeformed solid at the parameters' defaults: where every path starts."""
         return State(self.symbols.default, np.zeros(self.n_dofs))
@@ -244,8 +240,6 @@ class SolidProblem:
         result = np.zeros((*displacement_part.shape[:-1], self.n_dofs))
         result[..., : displacement_part.shape[-1]] = displacement_part
         return result
-
-    # -- results ----------------------------------------------------------------------------------------
 
     @cached_property
     def recovery(self) -> Recovery:

@@ -1,9 +1,9 @@
 """The finite element space of the displacements of a solid, and its relation to the mesh's nodes.
 
-NGSolve's basis is hierarchical: vertex functions have nodal values for coefficients; edges, faces and cells
-add bubbles (Zaglmayr, High Order Finite Element Methods for Electromagnetic Field Computation, PhD thesis,
-Linz 2006, chapter 5). A solid knows nodes: this module translates in both directions, says which coefficients
-a set of nodes holds, and hands NGSolve the curved shape of second-order cells.
+NGSolve's basis is hierarchical: vertex functions have nodal values for coefficients; edges, faces and cells add bubbles
+(Zaglmayr, High Order Finite Element Methods for Electromagnetic Field Computation, PhD thesis, Linz 2006, chapter 5). A
+solid knows nodes: this module translates in both directions, says which coefficients a set of nodes holds, and hands
+NGSolve the curved shape of second-order cells.
 """
 
 from __future__ import annotations
@@ -151,8 +151,8 @@ class DisplacementSpace:
     def dofs_on(self, nodes: Indices) -> Indices:
         """Scalar dofs (sorted) that a set of nodes holds.
 
-        Those of its own nodes; and where elements have functions beyond the nodes of the cells, those on
-        edges and faces all of whose nodes are in the set. Functions inside of cells are never held.
+        Those of its own nodes; and where elements have functions beyond the nodes of the cells, those on edges and
+        faces all of whose nodes are in the set. Functions inside of cells are never held.
         """
         inside = np.zeros(self.geometry.mesh.n_nodes, dtype=bool)
         inside[nodes] = True
@@ -192,17 +192,6 @@ def _rows_once(
     return matrix
 
 
-# Pressures of nearly incompressible solids: the mixed form and the space that makes it stable.
-# The energy remainder(F) + p g(F) - p^2 / (2 K) (see `materials.base`) needs displacements rich enough for
-# the pressures (the inf-sup condition of Ladyzhenskaya, Babuska and Brezzi). Pairs used here:
-# hexahedra, second order 27 nodes with a linear pressure in each cell, discontinuous: stable (Boffi, Brezzi
-# and Fortin, Mixed Finite Element Methods and Applications, 2013, section 8.6), and condensed cell by cell so
-# that it costs next to nothing tetrahedra and prisms, Taylor and Hood's: pressures linear in each cell and
-# continuous within a material second order hexahedra, first order one pressure a cell (mean dilatation: Simo,
-# Taylor and Pister, 1985). Displacements are good; neighbouring pressures may alternate, and average out at
-# nodes
-
-
 def check_mixed(mesh: Mesh, order: int) -> None:
     """Refuse cells that have no stable mixed element (StudyError)."""
     shapes = {block.type.shape for block in mesh.blocks}
@@ -214,7 +203,13 @@ def check_mixed(mesh: Mesh, order: int) -> None:
 
 
 class PressureSpace:
-    """Pressures on one region, as a combination of scalar unknowns.
+    """Pressures on one region, as a combination of scalar unknowns: the mixed form of `materials.base`.
+
+    Displacements must be rich enough for them (the inf-sup condition). Hexahedra of second order take a pressure linear
+    in each cell and discontinuous (Boffi, Brezzi and Fortin, Mixed Finite Element Methods and Applications, 2013,
+    section 8.6), condensed cell by cell; tetrahedra and prisms Taylor and Hood's, linear and continuous within a
+    material; hexahedra of first order one pressure a cell (Simo, Taylor and Pister, 1985), which may alternate between
+    neighbours.
 
     Parameters
     ----------

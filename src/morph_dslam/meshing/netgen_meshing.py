@@ -1,4 +1,4 @@
-"""Triangulated surfaces from STL, OBJ and PLY files, and whether they close a volume."""
+"""Volumes meshed by Netgen: from closed triangulated surfaces (STL, OBJ, PLY) and from STEP solids."""
 
 # Netgen's Python modules are filled at run time by its C++ library, out of pyright's sight.
 # pyright: reportAttributeAccessIssue=false
@@ -134,9 +134,6 @@ def check_watertight(surface: TriangleSurface, path: Path) -> None:
     a, b, c = (surface.points[t[:, i]] for i in range(3))
     if np.einsum("ti,ti->", a, np.cross(b, c)) <= 0.0:
         raise StudyError(f"the triangles of {path} face inwards; flip its normals")
-
-
-# Volumes meshed by Netgen: from closed triangulated surfaces (STL, OBJ, PLY) and from STEP solids.
 
 
 #: STEP length units as the file names them, by ours.

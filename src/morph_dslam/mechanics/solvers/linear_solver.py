@@ -1,6 +1,12 @@
-"""The libraries behind `linear_solver`: PARDISO, NGSolve's sparse Cholesky, SuperLU.
+"""Sparse direct solution of K_ff x = b with the inertia of K_ff, every solve's residual checked.
 
-Symmetric matrices come as their upper triangle in CSR form with every diagonal entry stored.
+PARDISO (Intel MKL, through the optional package pypardiso) where it is installed, NGSolve's `sparsecholesky` otherwise;
+the environment variable MORPH_LINEAR_SOLVER = pardiso | sparsecholesky overrides the choice. A solve whose residual
+iterative refinement cannot mend is done again by SuperLU, whose pivoting is safer and slower. With PARDISO's defaults a
+saddle-point matrix comes back with a relative residual of 1e-3 and no warning: scaling and weighted matching prevent
+that.
+
+Symmetric matrices come to the libraries as their upper triangle in CSR form with every diagonal entry stored.
 """
 
 from __future__ import annotations
@@ -28,13 +34,13 @@ Matrix = Any
 
 sla: Any = scipy.sparse.linalg
 
-#: PARDISO's settings, numbered from 1 as in its manual: own settings; METIS ordering; refinement only where
-#: pivots were perturbed (`linear_solver` refines where a residual asks for it);
-#: perturbation of zero pivots 1e-8; Bunch-Kaufman pivoting.
+#: PARDISO's settings, numbered from 1 as in its manual: own settings; METIS ordering; refinement only where pivots were
+#: perturbed (`linear_solver` refines where a residual asks for it); perturbation of zero pivots 1e-8; Bunch-Kaufman
+#: pivoting.
 PARDISO_SETTINGS = {1: 1, 2: 2, 8: 0, 10: 8, 21: 1}
 
-#: Scaling and weighted matching. Saddle points need them; where all diagonals are positive they cost a fifth
-#: of the time for nothing.
+#: Scaling and weighted matching. Saddle points need them; where all diagonals are positive they cost a fifth of the
+#: time for nothing.
 SCALING, MATCHING = 11, 13
 
 REAL_SYMMETRIC_INDEFINITE, REAL_UNSYMMETRIC = -2, 11
@@ -93,10 +99,6 @@ class Pardiso:
             return None
         return int(self._handle.get_iparm(NEGATIVE_EIGENVALUES))
 
-    def release(self) -> None:
-        self._handle.free_memory(everything=True)
-        self._matrix = None
-
 
 def _same_pattern(one: Matrix, other: Matrix) -> bool:
     return np.array_equal(one.indptr, other.indptr) and np.array_equal(one.indices, other.indices)
@@ -133,8 +135,8 @@ class SparseCholesky:
     def negative_pivots(self) -> int | None:
         """An estimate by Lanczos' method on the inverse, since NGSolve keeps its pivots to itself.
 
-        The eigenvalues nearest to zero are looked at: a structure that loses its stability shows it there.
-        None if all of them are negative, for then there may be more, or if they are not found.
+        The eigenvalues nearest to zero are looked at: a structure that loses its stability shows it there. None if all
+        of them are negative, for then there may be more, or if they are not found.
         """
         if self._size <= 4 * LOOKED_AT:
             inverse = self.solve(np.eye(self._size))
@@ -149,9 +151,6 @@ class SparseCholesky:
             return None
         negative = int(np.count_nonzero(nearest < 0.0))
         return None if negative == LOOKED_AT else negative
-
-    def release(self) -> None:
-        self._inverse = None
 
 
 class SuperLU:
@@ -176,18 +175,6 @@ class SuperLU:
         assert self._factors is not None
         return self._factors.solve(right)
 
-    def release(self) -> None:
-        self._factors = None
-
-
-# Sparse direct solution of K_ff x = b with the inertia of K_ff, every solve's residual checked.
-# PARDISO (Intel MKL, through the optional package pypardiso) where it is installed: its ordering and symbolic
-# factorisation are kept as long as the pattern stays. NGSolve's `sparsecholesky` otherwise. The environment
-# variable MORPH_LINEAR_SOLVER = pardiso | sparsecholesky overrides the choice. A solve whose residual
-# iterative refinement cannot mend is done again by SuperLU, whose pivoting is safer and slower.
-# PARDISO's settings matter: with its defaults a saddle-point matrix comes back with a relative residual of
-# 1e-3 and no warning. Scaling and weighted matching (iparm 11, 13) prevent that; `sparse_engines` sets them.
-
 
 Integers = NDArray[np.integer]
 
@@ -209,7 +196,6 @@ class Engine(Protocol):
     def solve(self, right: Array) -> Array: ...
     @property
     def negative_pivots(self) -> int | None: ...
-    def release(self) -> None: ...
 
 
 def default_engine() -> str:
@@ -351,8 +337,8 @@ class LinearSolver:
     free : (n,) dofs that are solved for.
     symmetric : whether the matrices are (then one triangle of them is enough).
     threads : of PARDISO; None leaves MKL's own choice.
-    engine : "pardiso" or "sparsecholesky"; None for `default_engine`. Unsymmetric matrices go to SuperLU
-        where PARDISO is not used, since `sparsecholesky` reads one triangle only.
+    engine : "pardiso" or "sparsecholesky"; None for `default_engine`. Unsymmetric matrices go to SuperLU where PARDISO
+        is not used, since `sparsecholesky` reads one triangle only.
     """
 
     def __init__(
@@ -410,11 +396,6 @@ class LinearSolver:
             self._substitute = SuperLU(triangular=self.symmetric)
             self._substitute.factorise(matrix)
         yield self._substitute
-
-    def release(self) -> None:
-        """Give the factorisation's memory back; the next `factorise` begins anew."""
-        self.engine.release()
-        self.latest = self._substitute = None
 
 
 class AssembledLinearisation:
