@@ -176,7 +176,7 @@ def _check_width(on: str, width: float) -> None:
 
 
 class NodalForces:
-    """The point loads of a solid, as forces on the dofs of its displacements; StudyError if one names an unknown set."""
+    """The point loads of a solid as forces on the dofs of its displacements; StudyError if one names an unknown set."""
 
     def __init__(self, space: DisplacementSpace, loads: Sequence[PointLoad], symbols: ParameterSymbols) -> None:
         self._loads, self._symbols, self._n_scalar = loads, symbols, space.n_scalar
