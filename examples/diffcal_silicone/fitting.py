@@ -14,7 +14,6 @@ from silicone import PUBLISHED_SHEAR
 import morph_dslam as md
 from morph_dslam.extend.tracking import (
     BoundPoints,
-    DepthOptions,
     EstimationOptions,
     Estimator,
     PointDepths,
@@ -145,4 +144,4 @@ def _with_depths(
     points = matches.points.joined(inner)
     pixels = np.concatenate([matches.pixels, pixels[met][shown]])
     used = np.arange(len(points)) >= len(matches.points)
-    return (points, pixels, PointDepths.sampled(picture.depth, pixels, used, picture.camera, variance, DepthOptions()))
+    return (points, pixels, PointDepths.sampled(picture.depth, pixels, used, picture.camera, variance))

@@ -35,9 +35,7 @@ def known_views(film, step=None, deviations=None):
             error_factors = np.vstack([np.zeros((2, 6)), np.diag(deviations)])
         if step is not None:
             state = moved(state, np.concatenate([np.zeros(2), step]))
-        views.append(
-            PosedImage(Image(grey, normalize_contrast(grey, OPTIONS.flow.contrast_window)), state, error_factors)
-        )
+        views.append(PosedImage(Image(grey, normalize_contrast(grey)), state, error_factors))
     return views
 
 

@@ -6,7 +6,7 @@ import pytest
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.tracking.depth import DepthOptions, PointDepths, linearise_depths
+from morph_dslam.tracking.depth import SIGMA_AT_1M, PointDepths, linearise_depths
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State, moved
 from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.sequence_filter import SequenceFilter
@@ -117,14 +117,14 @@ def test_depth_between_pixels_of_a_slanted_plane_with_holes_is_that_of_the_plane
     pixels = rng.uniform([10, 10], [630, 470], (50, 2))
     used = np.ones(50, dtype=bool)
     used[7] = False
-    found = PointDepths.sampled(image, pixels, used, CAMERA, SIGMA_PX**2, DepthOptions())
+    found = PointDepths.sampled(image, pixels, used, CAMERA, SIGMA_PX**2)
     exact = 0.6 / (CAMERA.rays(pixels) @ normal)
     assert found.weights[7] == 0.0
     seen = found.weights > 0.0
     assert seen.sum() > 45
     np.testing.assert_allclose(found.depths[seen], exact[seen], rtol=3e-5)
     # The weight: half the deviation at half the distance squared.
-    expected = SIGMA_PX / (DepthOptions().sigma_at_1m * exact[seen] ** 2 * 3 / 5)
+    expected = SIGMA_PX / (SIGMA_AT_1M * exact[seen] ** 2 * 3 / 5)
     np.testing.assert_allclose(found.weights[seen], expected, rtol=1e-3)
 
 
@@ -133,7 +133,7 @@ def test_jumps_holes_and_the_image_border_have_no_depth():
     image[:, 320:] = 0.9
     image[100:110, 100:110] = np.nan
     pixels = np.array([[200.0, 200.0], [319.0, 200.0], [105.0, 105.0], [1.0, 200.0], [np.nan, 3.0]])
-    found = PointDepths.sampled(image, pixels, np.ones(5, dtype=bool), CAMERA, 1.0, DepthOptions())
+    found = PointDepths.sampled(image, pixels, np.ones(5, dtype=bool), CAMERA, 1.0)
     assert (found.weights > 0.0).tolist() == [True, False, False, False, False]
 
 
@@ -146,7 +146,7 @@ def test_lens_is_taken_into_account():
     rays = camera.rays(camera.undistort_pixels(recorded))
     image = (0.6 / (rays @ normal)).reshape(480, 640).astype(np.float32)
     pixels = np.array([[60.0, 60.0], [580.0, 400.0]])
-    found = PointDepths.sampled(image, pixels, np.ones(2, dtype=bool), camera, 1.0, DepthOptions())
+    found = PointDepths.sampled(image, pixels, np.ones(2, dtype=bool), camera, 1.0)
     np.testing.assert_allclose(found.depths, 0.6 / (camera.rays(pixels) @ normal), atol=1e-4)
 
 

@@ -10,7 +10,6 @@ from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.measurement import ReferenceAppearance, draw_textured
 from morph_dslam.tracking.patches import (
     NEUTRAL,
-    FlowOptions,
     detect_orb,
     follow,
     interior,
@@ -21,8 +20,6 @@ from morph_dslam.tracking.patches import (
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.numpy_twins import tracking as plain
 from tests.support.rendered_sequence import CAMERA, SheetFilm, printed_texture, sheet_state
-
-OPTIONS = FlowOptions()
 
 
 def shifted(image, x, y):
@@ -38,22 +35,22 @@ def image():
 def test_flattening_removes_slow_shading(image):
     rows = np.linspace(0.0, 40.0, 480)[:, None]
     shaded = np.clip(image.astype(float) * 0.8 + rows, 0, 255).astype(np.uint8)
-    plain = normalize_contrast((image * 0.8).astype(np.uint8), OPTIONS.contrast_window).astype(int)
-    difference = normalize_contrast(shaded, OPTIONS.contrast_window).astype(int) - plain
+    plain = normalize_contrast((image * 0.8).astype(np.uint8)).astype(int)
+    difference = normalize_contrast(shaded).astype(int) - plain
     assert np.abs(difference[20:-20, 20:-20]).max() <= 2
 
 
 def test_followed_points_move_by_the_shift(image):
     normalized = normalize_contrast(image, 31)
     points = spread_corners(normalized, np.pad(np.full((400, 560), 255, np.uint8), 40), 150)
-    found, ok = follow(normalized, normalize_contrast(shifted(image, 7.25, -4.5), 31), points, points, OPTIONS)
+    found, ok = follow(normalized, normalize_contrast(shifted(image, 7.25, -4.5), 31), points, points)
     assert ok.mean() > 0.95
     np.testing.assert_allclose(np.median(found - points, axis=0), [7.25, -4.5], atol=0.06)
     assert np.percentile(np.abs(found[ok] - points[ok] - [7.25, -4.5]), 95) < 0.15
 
 
 def test_following_no_points_is_allowed(image):
-    found, ok = follow(image, image, np.empty((0, 2)), np.empty((0, 2)), OPTIONS)
+    found, ok = follow(image, image, np.empty((0, 2)), np.empty((0, 2)))
     assert found.shape == (0, 2)
     assert ok.shape == (0,)
 

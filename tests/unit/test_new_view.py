@@ -9,6 +9,7 @@ import pytest
 from morph_dslam.tracking.estimator import Estimator
 from morph_dslam.tracking.frame_estimation import FrameEstimation
 from morph_dslam.tracking.hypothesis import Image
+from morph_dslam.tracking.measurement import PATCH_HALF
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.patches import normalize_contrast
 from morph_dslam.tracking.reference import PosedImage, ReferenceView, SurfaceSamples
@@ -21,7 +22,7 @@ OPTIONS, NOW = TrackerOptions(), sheet_state(0.1)
 
 def picture(image, **others):
     grey = np.ascontiguousarray(image[:, :, 0])
-    return Image(grey, normalize_contrast(grey, OPTIONS.flow.contrast_window), **others)
+    return Image(grey, normalize_contrast(grey), **others)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def scene():
 
 def fit(view, made, attempt, unexplained_px=0.1, spread=0.01, **changed):
     estimate = replace(attempt.estimate, **changed)
-    attempt, half = replace(attempt, estimate=estimate), OPTIONS.measurement.patch_half
+    attempt, half = replace(attempt, estimate=estimate), PATCH_HALF
     known = is_known_well(attempt, spread, unexplained_px, OPTIONS)
     return known and is_sharp(made, attempt, view.rendered(estimate.state), half)
 

@@ -9,7 +9,7 @@ import pytest
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.tracking.estimator import State, moved
-from morph_dslam.tracking.outline import Outline, OutlineOptions, rim, search_outline
+from morph_dslam.tracking.outline import Outline, rim, search_outline
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.numpy_twins import tracking as plain
 
@@ -47,7 +47,7 @@ def test_rim_of_a_grid_is_its_boundary(model):
 def test_outline_is_found_where_it_was_drawn(model):
     """Searched for from a state some pixels off, it lies on the projected rim of the true state."""
     true = State(model.default, POSE)
-    outline = Outline(model, CAMERA, drawn(model, true), true, OutlineOptions())
+    outline = Outline(model, CAMERA, drawn(model, true), true)
     off = moved(true, np.r_[np.zeros(len(model.parameters)), 0.0, 0.0, 0.01, 0.004, -0.003, 0.0])
     shown = State(np.where(np.arange(len(model.parameters)) == 0, 0.03, model.default), POSE)
     for state in (true, shown):
@@ -65,7 +65,7 @@ def test_normals_point_outwards_on_either_side(model):
     for rotation in (np.diag([1.0, -1.0, -1.0]), np.diag([-1.0, -1.0, 1.0])):
         state = State(model.default, RigidTransform(rotation, np.array([0.0, 0.0, 0.55])))
         image = drawn(model, state)
-        seen = Outline(model, CAMERA, image, state, OutlineOptions()).measure(image, state, 6)
+        seen = Outline(model, CAMERA, image, state).measure(image, state, 6)
         ahead = np.round(seen.pixels + 5.0 * seen.normals).astype(int)
         behind = np.round(seen.pixels - 5.0 * seen.normals).astype(int)
         assert (image[ahead[:, 1], ahead[:, 0]] == 70).mean() > 0.95
@@ -75,7 +75,7 @@ def test_normals_point_outwards_on_either_side(model):
 def test_wrong_brightness_inside_is_not_taken_for_the_sheet(model):
     """A sheet half as bright as in the reference view is something else."""
     state = State(model.default, POSE)
-    outline = Outline(model, CAMERA, drawn(model, state), state, OutlineOptions())
+    outline = Outline(model, CAMERA, drawn(model, state), state)
     assert not outline.measure(drawn(model, state, inner=100, outer=20), state, 14).valid.any()
     assert not outline.measure(np.full((480, 640), 210, np.uint8), state, 14).valid.any()
 

@@ -6,7 +6,7 @@ import pytest
 from scipy.ndimage import shift
 
 from morph_dslam.tracking.patches import (
-    FlowOptions,
+    FLOW_WINDOW,
     compare_patches,
     follow,
     normalize_contrast,
@@ -16,7 +16,6 @@ from morph_dslam.tracking.patches import (
 from tests.support.numpy_twins import tracking as plain
 from tests.support.rendered_sequence import printed_texture
 
-OPTIONS = FlowOptions()
 SHIFT = np.array([0.3, -0.2])
 
 
@@ -60,7 +59,7 @@ def test_light_that_slopes_over_the_windows_does_not_move_what_is_found(image):
     columns = np.arange(640.0)
     shadow = 15.0 * np.sin(2.0 * np.pi * columns / 80.0)[None, :]
     target = np.clip(0.8 * shifted(dull, *SHIFT).astype(float) + 20.0 + shadow, 0, 255).astype(np.uint8)
-    found, ok = follow(dull, target, points, points, OPTIONS)
+    found, ok = follow(dull, target, points, points)
     places, correlation, spread = compare_patches(dull, target, points, found, 7)
     good = ok & (correlation > 0.6) & np.isfinite(spread)
     good &= np.linalg.norm(found - points - SHIFT, axis=1) < 0.8
@@ -72,7 +71,7 @@ def test_light_that_slopes_over_the_windows_does_not_move_what_is_found(image):
 
 def test_without_a_change_of_light_the_places_stay_as_they_are_found(image):
     points = spread_points(image)
-    found, ok = follow(image, shifted(image, *SHIFT), points, points, OPTIONS)
+    found, ok = follow(image, shifted(image, *SHIFT), points, points)
     places, _, spread = compare_patches(image, shifted(image, *SHIFT), points, found, 7)
     good = ok & np.isfinite(spread)
     assert good.mean() > 0.9
@@ -82,13 +81,13 @@ def test_without_a_change_of_light_the_places_stay_as_they_are_found(image):
 def test_the_spread_of_a_patch_is_how_far_off_points_are_found(image):
     """Points are followed into images with more and more noise; in each the errors are as told."""
     normalized = normalize_contrast(image, 31)
-    points, half = spread_points(normalized), OPTIONS.window // 2
+    points, half = spread_points(normalized), FLOW_WINDOW // 2
     errors, told = [], []
     for noise in (2.0, 8.0, 16.0):
         rng = np.random.default_rng(int(noise))
         noisy = np.clip(image + noise * rng.standard_normal(image.shape), 0, 255).astype(np.uint8)
         target = normalize_contrast(noisy, 31)
-        found, ok = follow(normalized, target, points, points, OPTIONS)
+        found, ok = follow(normalized, target, points, points)
         close = ok & (np.linalg.norm(found - points, axis=1) < 2.0)
         places, _, spread = compare_patches(normalized, target, points[close], found[close], half)
         known = np.isfinite(spread)
@@ -105,7 +104,7 @@ def test_a_window_that_is_covered_in_part_is_told_by_its_spread(image):
     covered = image.copy()
     cv2.circle(covered, (320, 240), 90, 150, -1, cv2.LINE_AA)
     target = normalize_contrast(covered, 31)
-    found, ok = follow(normalized, target, points, points, OPTIONS)
+    found, ok = follow(normalized, target, points, points)
     places, correlation, spread = compare_patches(normalized, target, points, found, 7)
     far = np.linalg.norm(points - [320.0, 240.0], axis=1)
     off = np.linalg.norm(places - points, axis=1)

@@ -5,7 +5,6 @@ import pytest
 
 from morph_dslam.errors import RegistrationError
 from morph_dslam.model import SurfacePoints
-from morph_dslam.tracking.depth import DepthOptions
 from morph_dslam.tracking.estimator import BoundPoints, Estimator
 from morph_dslam.tracking.refinement import refine_by_depth
 from tests.support.bent_sheet import bent_sheet_model
@@ -36,7 +35,7 @@ def test_depth_places_the_object_along_the_sight_line():
     for seed in range(4):
         landmarks, pixels, start = by_landmarks(seed)
         image = sheet_depth(MODEL, TRUTH, np.random.default_rng(seed))
-        found = refine_by_depth(Estimator(MODEL, CAMERA), landmarks, pixels, start.state, 1.5, image, DepthOptions())
+        found = refine_by_depth(Estimator(MODEL, CAMERA), landmarks, pixels, start.state, 1.5, image)
         before.append(along_the_sight_line(start.state))
         after.append(along_the_sight_line(found.state))
         assert (found.pose_std < start.pose_std).all()
@@ -48,4 +47,4 @@ def test_depth_of_something_else_is_refused():
     landmarks, pixels, start = by_landmarks(0)
     image = sheet_depth(MODEL, TRUTH, np.random.default_rng(0)) + np.float32(0.3)
     with pytest.raises(RegistrationError, match="is the depth registered to this camera"):
-        refine_by_depth(Estimator(MODEL, CAMERA), landmarks, pixels, start.state, 1.5, image, DepthOptions())
+        refine_by_depth(Estimator(MODEL, CAMERA), landmarks, pixels, start.state, 1.5, image)

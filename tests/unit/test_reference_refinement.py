@@ -8,7 +8,7 @@ from morph_dslam.model import SurfacePoints
 from morph_dslam.registration.landmarks import register
 from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
-from morph_dslam.tracking.refinement import Keyframe, RefinementOptions, choose_keyframes, refine_reference
+from morph_dslam.tracking.refinement import Keyframe, choose_keyframes, refine_reference
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import mean_error, sheet_state
 
@@ -39,7 +39,7 @@ def test_other_frames_correct_a_reference_that_bad_landmarks_spoiled():
         CAMERA.project(points.in_camera(truth)),
         registered,
         keyframes,
-        RefinementOptions(landmark_px=1.5),
+        landmark_px=1.5,
     )
     before, after = mean_error(model, registered, truth), mean_error(model, refined, truth)
     assert before > 2e-3

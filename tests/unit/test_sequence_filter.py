@@ -140,7 +140,7 @@ def test_walking_parameter_is_smoothed_as_much_as_its_step_says():
         states = [truth(number, twist) for number, twist in enumerate(twists)]
         errors = SIGMA * rng.standard_normal((frames, 40, 2))
         for found, steps in ((raw, None), (smooth, {TWIST: step})):
-            estimates = fused(SequenceFilter(ESTIMATOR, [], None, steps), points, errors, states, np.eye(40))
+            estimates = fused(SequenceFilter(ESTIMATOR, [], steps), points, errors, states, np.eye(40))
             found.append(twist_errors(estimates, states))
             if steps:
                 stated.append([np.sqrt(e.measured_covariance[TWIST, TWIST]) for e in estimates[5:]])

@@ -1,12 +1,11 @@
 """Points bound to a model, and the estimator of parameters and pose that `morph_dslam.Tracker` is built on."""
 
 from morph_dslam.tracking.binding import bind_pixels, draw_view, facing, view_of
-from morph_dslam.tracking.depth import DepthOptions, PointDepths
+from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOptions, Estimator, Prior, State, moved
 
 __all__ = [
     "BoundPoints",
-    "DepthOptions",
     "Estimate",
     "EstimationOptions",
     "Estimator",

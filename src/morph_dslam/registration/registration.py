@@ -19,7 +19,7 @@ from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.registration.landmarks import CLICK_PX, bind_landmarks, register
 from morph_dslam.slam.pose import PoseEstimate
-from morph_dslam.tracking.depth import DepthOptions
+from morph_dslam.tracking.depth import SIGMA_AT_1M
 from morph_dslam.tracking.estimator import Estimator, State
 from morph_dslam.tracking.refinement import refine_by_depth
 from morph_dslam.tracking.state import Prior
@@ -304,13 +304,14 @@ def register_by_landmarks(
     landmarks: Landmarks,
     click_px: float = CLICK_PX,
     depth: NDArray[np.float32] | None = None,
-    sensor: DepthOptions | None = None,
+    depth_sigma: float = SIGMA_AT_1M,
 ) -> Registration:
     """The object in the frame of the landmarks; raises RegistrationError as `register` does.
 
     Parameters
     ----------
-    depth : (h, w) of that frame, metres, NaN where unknown; None without a depth camera, ``sensor``.
+    depth : (h, w) of that frame, metres, NaN where unknown; None without a depth camera.
+    depth_sigma : standard deviation of a pixel's depth at 1 m, metres.
     """
     registration = register(model, camera, landmarks.points, landmarks.pixels, click_px)
     facts = {
@@ -332,7 +333,7 @@ def register_by_landmarks(
             placed.state,
             sigma,
             depth,
-            sensor or DepthOptions(),
+            depth_sigma,
         )
         facts["along_the_sight_line"], covariance = "by depth", placed.covariance
     return Registration(model, None, placed.state, facts, registration.flags, covariance=covariance)

@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from morph_dslam.slam.options import FLOW, LEAST_CORRELATION, PATCH_HALF
-from morph_dslam.tracking.patches import FlowOptions, follow, patch_correlation
+from morph_dslam.slam.options import LEAST_CORRELATION, PATCH_HALF
+from morph_dslam.tracking.patches import follow, patch_correlation
 
 Array = NDArray[np.float64]
 
@@ -92,7 +92,7 @@ class StereoImages:
         rough = _row_disparities(self.left, self.right, pixels, low, high, ROW_HALF, clearness)
         result, rows = np.full(len(pixels), np.nan), np.flatnonzero(np.isfinite(rough))
         seen, guesses = pixels[rows], pixels[rows] - np.column_stack([rough[rows], np.zeros(len(rows))])
-        found, good = follow(self.left, self.right, seen, guesses, FlowOptions(FLOW.window, 0))
+        found, good = follow(self.left, self.right, seen, guesses, 0)
         likeness = patch_correlation(self.left, self.right, seen, found, PATCH_HALF)
         good &= (likeness > LEAST_CORRELATION) & (np.abs(found[:, 1] - seen[:, 1]) < MOST_ROW_ERROR)
         result[rows[good]] = found[good, 0]

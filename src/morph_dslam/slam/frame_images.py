@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera, StereoCamera
 from morph_dslam.errors import CameraError
 from morph_dslam.slam.depth import DepthImage, FrameDepth, StereoImages
-from morph_dslam.slam.options import FLOW
 from morph_dslam.slam.pose import inside
 from morph_dslam.tracking.patches import normalize_contrast
 
@@ -231,7 +230,7 @@ class FrameImages:
         return self._remapped(np.asarray(grey, dtype=np.uint8), maps)
 
     def _normalized(self, grey: Image) -> Image:
-        return normalize_contrast(grey, FLOW.contrast_window)
+        return normalize_contrast(grey)
 
     @staticmethod
     def _remapped(image: Image, maps: tuple[NDArray, NDArray] | None) -> Image:

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from morph_dslam.geometry import rotation_log
 from morph_dslam.slam.bundle_adjustment import Observations, adjust
 from morph_dslam.slam.frame_images import FrameView
-from morph_dslam.slam.options import FLOW, LEAST_CORRELATION, LEAST_START_POINTS, PATCH_HALF
+from morph_dslam.slam.options import LEAST_CORRELATION, LEAST_START_POINTS, PATCH_HALF
 from morph_dslam.slam.pose import TwoViewHypothesis, rays, refine_pose, reprojection_errors, two_view_hypotheses
 from morph_dslam.slam.result import NoPose, SlamReason
-from morph_dslam.tracking.patches import follow, patch_correlation, spread_corners
+from morph_dslam.tracking.patches import FLOW_WINDOW, follow, patch_correlation, spread_corners
 
 Array = NDArray[np.float64]
 
@@ -126,7 +126,7 @@ class MapInitializer:
 
     def _take_reference(self, frame: FrameView) -> NoPose:
         mask = np.zeros(frame.normalized.shape, dtype=np.uint8)
-        border = FLOW.window
+        border = FLOW_WINDOW
         mask[border:-border, border:-border] = 255
         corners = spread_corners(frame.normalized, mask, START_CORNERS)
         self.reset()
@@ -139,10 +139,10 @@ class MapInitializer:
     def _follow(self, normalized: NDArray[np.uint8]) -> None:
         assert self._first is not None
         rows = np.flatnonzero(self._alive)
-        start, flow = self._first.pixels[rows], FLOW
+        start = self._first.pixels[rows]
         first = self._first.frame.normalized
-        found, ok = follow(first, normalized, start, self._pixels[rows], flow)
-        back, ok_back = follow(normalized, first, found, start, flow)
+        found, ok = follow(first, normalized, start, self._pixels[rows])
+        back, ok_back = follow(normalized, first, found, start)
         ok &= ok_back & (np.linalg.norm(back - start, axis=1) < 1.0)
         likeness = patch_correlation(first, normalized, start, found, PATCH_HALF)
         ok &= likeness > LEAST_CORRELATION

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from morph_dslam.slam.bundle_adjustment import Adjustment, Observations, adjust
 from morph_dslam.slam.depth import FrameDepth, depth_of
-from morph_dslam.slam.options import FLOW
 from morph_dslam.slam.pose import check_points, project, rays, reprojection_errors, triangulate, world_points
 from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, Followed, Indices, Keyframe, RigidMap
-from morph_dslam.tracking.patches import spread_corners
+from morph_dslam.tracking.patches import FLOW_WINDOW, spread_corners
 
 Array = NDArray[np.float64]
 
@@ -47,7 +46,7 @@ def free_corners(normalized: NDArray[np.uint8], taken: Array) -> Array:
     mask[rows, columns] = 0
     reach = 2 * CORNER_DISTANCE_PX + 1
     mask = np.asarray(cv2.erode(mask, np.ones((reach, reach), np.uint8)), dtype=np.uint8)
-    border = FLOW.window
+    border = FLOW_WINDOW
     mask[:border], mask[-border:], mask[:, :border], mask[:, -border:] = 0, 0, 0, 0
     return spread_corners(normalized, mask, missing)
 

@@ -14,12 +14,12 @@ from morph_dslam.io.colmap import ColmapImage, ColmapModel
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam.frame_images import OCTAVES, FrameImages, FrameView, describe
 from morph_dslam.slam.mapping import Mapper, do_all
-from morph_dslam.slam.options import FLOW, INLIER_PX, LEAST_START_POINTS, PATCH_HALF
+from morph_dslam.slam.options import INLIER_PX, LEAST_START_POINTS, PATCH_HALF
 from morph_dslam.slam.pose import PoseEstimate, inside, inverse, reprojection_errors
 from morph_dslam.slam.rigid_map import GOOD, NOWHERE, POINT_ARRAYS, Followed, Keyframe, RigidMap
 from morph_dslam.slam.tracking import Tracked, Tracker
 from morph_dslam.sources import FrameSource
-from morph_dslam.tracking.patches import FlowOptions
+from morph_dslam.tracking.patches import LEVELS
 
 Array = NDArray[np.float64]
 
@@ -92,8 +92,7 @@ class _PosedTracker(Tracker):
 
     def track_at(self, normalized: NDArray[np.uint8], camera_from_world: Array) -> Tracked:
         """The points of the next frame, at its pose (4, 4)."""
-        flow = FlowOptions(FLOW.window, FLOW.levels + 1)
-        found = self._follow(normalized, camera_from_world, flow)
+        found = self._follow(normalized, camera_from_world, LEVELS + 1)
         found = found.joined(self._search(normalized, camera_from_world, found.ids))
         known = self._map.state[found.ids] == GOOD
         positions, pixels = self._map.positions[found.ids[known]], found.pixels[known]

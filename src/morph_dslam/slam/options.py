@@ -4,11 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from morph_dslam.tracking.patches import FlowOptions
-
-#: Lucas-Kanade on contrast-normalized images.
-FLOW = FlowOptions()
-
 #: Half width, pixels, of patches that must agree, and how well: their correlation.
 PATCH_HALF, LEAST_CORRELATION = 6, 0.6
 

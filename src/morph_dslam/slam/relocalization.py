@@ -23,12 +23,12 @@ from morph_dslam.slam.frame_images import (
     least_distances,
     match_points,
 )
-from morph_dslam.slam.options import FLOW, INLIER_PX, LEAST_INLIERS, PATCH_HALF
+from morph_dslam.slam.options import INLIER_PX, LEAST_INLIERS, PATCH_HALF
 from morph_dslam.slam.pose import PoseEstimate, find_pose, inside, project, refine_pose
 from morph_dslam.slam.result import NoPose, SlamReason
 from morph_dslam.slam.rigid_map import GOOD, Followed, RigidMap
 from morph_dslam.slam.tracking import Tracker
-from morph_dslam.tracking.patches import FlowOptions, spread_corners
+from morph_dslam.tracking.patches import spread_corners
 
 Array = NDArray[np.float64]
 
@@ -238,8 +238,7 @@ class Relocalizer:
         guesses, depths = project(pose, self._map.positions[ids], self._intrinsics)
         seen = inside(guesses, normalized.shape, PATCH_HALF + 2)
         seen &= tracker.is_similar_view(ids, pose, depths)
-        flow = FlowOptions(FLOW.window, 2)
-        found = tracker.find(normalized, Followed(ids[seen], guesses[seen]), pose, flow)
+        found = tracker.find(normalized, Followed(ids[seen], guesses[seen]), pose, 2)
         refined = refine_pose(pose, self._map.positions[found.ids], found.pixels, self._intrinsics, inlier_px=INLIER_PX)
         enough = max(LEAST_INLIERS, LEAST_FIT * len(found.ids), LEAST_SHARE * int(seen.sum()))
         most = max(MOST_ERROR_RATIO * self._map.usual_rms_px, MOST_ERROR_PX)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.slam.consensus import Sight
 from morph_dslam.slam.depth import FrameDepth
-from morph_dslam.slam.options import FLOW, INLIER_PX, LEAST_CORRELATION, PATCH_HALF
+from morph_dslam.slam.options import INLIER_PX, LEAST_CORRELATION, PATCH_HALF
 from morph_dslam.slam.pose import (
     LEAST_DEPTH,
     PoseEstimate,
@@ -37,7 +37,7 @@ from morph_dslam.slam.rigid_map import (
     Keyframe,
     RigidMap,
 )
-from morph_dslam.tracking.patches import NEUTRAL, FlowOptions, follow, patch_correlation
+from morph_dslam.tracking.patches import FLOW_WINDOW, LEVELS, NEUTRAL, follow, patch_correlation
 
 Array = NDArray[np.float64]
 
@@ -257,10 +257,12 @@ class Tracker:
     def track(self, normalized: Image, depth: FrameDepth | None = None) -> Tracked | NoPose:
         """Pose and points of the next frame, or why it is lost; then the newest pose stays what it was."""
         reasons = []
-        deeper = FlowOptions(FLOW.window, FLOW.levels + 1)
         # The prediction is that the motion goes on; if it has changed abruptly, that the camera stands still.
-        for predicted, flow in ((self._motion @ self.camera_from_world, FLOW), (self.camera_from_world, deeper)):
-            found = self._follow(normalized, predicted, flow)
+        for predicted, levels in (
+            (self._motion @ self.camera_from_world, LEVELS),
+            (self.camera_from_world, LEVELS + 1),
+        ):
+            found = self._follow(normalized, predicted, levels)
             result = self._estimate(normalized, depth, predicted, found)
             if isinstance(result, Tracked):
                 self._motion = result.pose.camera_from_world @ inverse(self.camera_from_world)
@@ -282,7 +284,7 @@ class Tracker:
         at = self._map.keyframes[newest].camera_from_world
         self._map.passing.note(newest, at, self.camera_from_world, waiting.ids, waiting.pixels)
 
-    def _follow(self, normalized: Image, predicted: Array, flow: FlowOptions) -> Followed:
+    def _follow(self, normalized: Image, predicted: Array, levels: int) -> Followed:
         """Followed points, astray ones too, found again, begun where the predicted motion takes them."""
         # A further keyframe costs as much as all points of one: those astray come along with others only.
         views = self._map.template_keyframe
@@ -294,7 +296,7 @@ class Tracker:
         before, _ = project(self.camera_from_world, positions, self._intrinsics)
         after, _ = project(predicted, positions, self._intrinsics)
         guesses = points.pixels + np.nan_to_num(after - before)
-        return self.find(normalized, Followed(points.ids, guesses), predicted, flow)
+        return self.find(normalized, Followed(points.ids, guesses), predicted, levels)
 
     def _still_astray(self, pose: Array, followed: Followed) -> Followed:
         """Those of the points that had left the rigid scene that are still away from their places."""
@@ -303,7 +305,7 @@ class Tracker:
         errors = reprojection_errors(pose, positions, followed.pixels, self._intrinsics)
         return followed[errors > INLIER_PX]
 
-    def find(self, normalized: Image, guesses: Followed, pose: Array, flow: FlowOptions) -> Followed:
+    def find(self, normalized: Image, guesses: Followed, pose: Array, levels: int) -> Followed:
         """Points found near their guessed pixels, by the patches of their keyframes as seen from a pose."""
         ids = guesses.ids
         if self._templates is not None:
@@ -314,7 +316,7 @@ class Tracker:
         for view in np.unique(views):
             rows = np.flatnonzero((views == view) & inside(guesses.pixels, normalized.shape, 0.0))
             source, starts = self._seen_from(pose, int(view), ids[rows], templates[rows])
-            pixels, ok = follow(source, normalized, starts, guesses.pixels[rows], flow)
+            pixels, ok = follow(source, normalized, starts, guesses.pixels[rows], levels)
             likeness = patch_correlation(source, normalized, starts, pixels, PATCH_HALF)
             found[rows], good[rows] = pixels, ok & (likeness > LEAST_CORRELATION)
         return Followed(ids, found)[good]
@@ -395,12 +397,12 @@ class Tracker:
         lost[followed] = False
         ids = np.flatnonzero(lost)
         pixels, depths = project(pose, self._map.positions[ids], self._intrinsics)
-        seen = inside(pixels, normalized.shape, FLOW.window) & self.is_similar_view(ids, pose, depths)
+        seen = inside(pixels, normalized.shape, FLOW_WINDOW) & self.is_similar_view(ids, pose, depths)
         wanted = Followed(ids, pixels)[seen]
         wanted = wanted[self._chosen(wanted.ids, most)]
         if not len(wanted.ids):
             return wanted
-        found = self.find(normalized, wanted, pose, FlowOptions(FLOW.window, 1))
+        found = self.find(normalized, wanted, pose, 1)
         errors = reprojection_errors(pose, self._map.positions[found.ids], found.pixels, self._intrinsics)
         self._map.n_expected[np.setdiff1d(wanted.ids, found.ids)] += 1
         return found[errors < SEARCH_RADIUS_PX]

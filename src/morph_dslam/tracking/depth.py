@@ -21,28 +21,20 @@ from morph_dslam.tracking.state import BoundPoints, State
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class DepthOptions:
-    """What is taken for granted of the sensor.
+#: Standard deviation of one pixel's depth at 1 m, metres; it grows with the distance squared.
+SIGMA_AT_1M = 2.0e-3
 
-    Attributes
-    ----------
-    sigma_at_1m : standard deviation of one pixel's depth at 1 m, metres; it grows with the distance squared.
-    alike_px : neighbours nearer than this have the same error, as those of structured light have.
-    window : side of the square of pixels through which a plane is laid.
-    largest_step : depths in the square that differ by more than this share of the depth are of two surfaces.
-    huber_sigmas : residual in standard deviations where Huber's cost turns linear.
-    """
+#: Neighbours nearer than this, pixels, have the same error, as those of structured light have.
+ALIKE_PX = 3
 
-    sigma_at_1m: float = 2.0e-3
-    alike_px: int = 3
-    window: int = 5
-    largest_step: float = 0.03
-    huber_sigmas: float = 2.0
+#: Side of the square of pixels through which a plane is laid.
+DEPTH_WINDOW = 5
 
-    def sigma(self, depths: Array) -> Array:
-        """Standard deviations (p,) of a plane through the square at these depths (p,), metres."""
-        return self.sigma_at_1m * depths**2 * min(self.alike_px / self.window, 1.0)
+#: Depths in the square that differ by more than this share of the depth are of two surfaces.
+LARGEST_STEP = 0.03
+
+#: Residual in standard deviations where Huber's cost turns linear.
+HUBER_SIGMAS = 2.0
 
 
 @dataclass(frozen=True)
@@ -69,7 +61,7 @@ class PointDepths:
         used: NDArray[np.bool_],
         camera: Camera,
         squared_px: float,
-        options: DepthOptions,
+        sigma_at_1m: float = SIGMA_AT_1M,
     ) -> PointDepths:
         """From a depth image.
 
@@ -81,12 +73,12 @@ class PointDepths:
         """
         depths = np.full(len(pixels), np.nan)
         rows = np.flatnonzero(used & np.isfinite(pixels).all(axis=1))
-        depths[rows] = _plane_depth(image, camera.distort_pixels(pixels[rows]), options)
+        depths[rows] = _plane_depth(image, camera.distort_pixels(pixels[rows]))
         known = np.isfinite(depths)
         depths = np.where(known, depths, 1.0)
         sigma_px = float(np.sqrt(squared_px))
-        weights = np.where(known, sigma_px / options.sigma(depths), 0.0)
-        return cls(depths, weights, squared_px, options.huber_sigmas * sigma_px)
+        weights = np.where(known, sigma_px / (sigma_at_1m * depths**2 * min(ALIKE_PX / DEPTH_WINDOW, 1.0)), 0.0)
+        return cls(depths, weights, squared_px, HUBER_SIGMAS * sigma_px)
 
     @property
     def count(self) -> int:
@@ -117,13 +109,13 @@ class PointDepths:
         )  # fmt: skip
 
 
-def _plane_depth(image: NDArray[np.float32], pixels: Array, options: DepthOptions) -> Array:
+def _plane_depth(image: NDArray[np.float32], pixels: Array) -> Array:
     """Depths (p,) at pixels (p, 2): of the plane through the square about each that fits best.
 
     NaN at jumps, and where half of the square or more is unknown. A mean would be of another place where what
     is unknown lies to one side.
     """
-    half, (height, width) = options.window // 2, image.shape
+    half, (height, width) = DEPTH_WINDOW // 2, image.shape
     places = np.nan_to_num(pixels, nan=-1.0)
     columns, rows = np.rint(places).astype(int).T
     inside = (columns >= half) & (rows >= half) & (columns < width - half) & (rows < height - half)
@@ -135,7 +127,7 @@ def _plane_depth(image: NDArray[np.float32], pixels: Array, options: DepthOption
     count = known.sum(axis=1)
     step = np.max(values, axis=1) - np.min(np.where(known, values, np.inf), axis=1)
     mean = values.sum(axis=1) / np.maximum(count, 1)
-    whole = (2 * count > len(down)) & (step < options.largest_step * mean)
+    whole = (2 * count > len(down)) & (step < LARGEST_STEP * mean)
     offsets = np.stack([columns[:, None] + right, rows[:, None] + down], axis=2) - places[:, None]
     design = known[:, :, None] * np.concatenate([np.ones_like(offsets[:, :, :1]), offsets], axis=2)
     normal = np.einsum("pwa,pwb->pab", design, design)

@@ -16,9 +16,10 @@ from morph_dslam.timing import stage
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis
-from morph_dslam.tracking.measurement import Measurement
+from morph_dslam.tracking.measurement import PATCH_WINDOW, Measurement
 from morph_dslam.tracking.noise import Observations, PointNoise, RigObservations, window_correlation
 from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.outline import OUTLINE_WEIGHT, REACH_PX
 from morph_dslam.tracking.reference import ReferenceView
 from morph_dslam.tracking.sequence_filter import Fitter, SequenceFilter
 from morph_dslam.tracking.shape_search import ShapeSearch
@@ -99,17 +100,17 @@ class FrameEstimation:
 
     def fit_outline(self, picture: Image, attempt: PoseHypothesis) -> PoseHypothesis:
         """Estimate from the supporting points and the outline together; searched far first, then near."""
-        outline, options = self._reference.outline, self._options.outline
+        outline = self._reference.outline
         if outline is None:
             return attempt
         estimate, count, seen = attempt.estimate, len(self._reference.points), None
         # After the first search the state only says where to look the second time: it need not be exact.
-        for reach, estimator in ((options.reach_px, self._scout), (options.reach_px // 2, self._estimator)):
+        for reach, estimator in ((REACH_PX, self._scout), (REACH_PX // 2, self._estimator)):
             seen = outline.measure(picture.grey, estimate.state, reach)
             estimate = estimator.estimate(
                 self._reference.all_points,
                 np.concatenate([attempt.measurement.pixels, seen.pixels]),
-                np.concatenate([attempt.weights, np.where(seen.valid, options.weight, 0.0)]),
+                np.concatenate([attempt.weights, np.where(seen.valid, OUTLINE_WEIGHT, 0.0)]),
                 estimate.state,
                 np.concatenate([np.zeros((count, 2)), seen.normals]),
                 attempt.prior,
@@ -122,8 +123,8 @@ class FrameEstimation:
             return attempt
         # Points whose windows overlap err alike in the image, and each counts for less than its depth does.
         squared_px = self._reference.redundancy * max(attempt.estimate.sigma_px, LEAST_SIGMA_PX) ** 2
-        pixels, camera, options = attempt.measurement.pixels, self._estimator.camera, self._options.depth
-        depths = PointDepths.sampled(picture.depth, pixels, attempt.inliers, camera, squared_px, options).padded(
+        pixels, camera, sigma = attempt.measurement.pixels, self._estimator.camera, self._options.depth_sigma
+        depths = PointDepths.sampled(picture.depth, pixels, attempt.inliers, camera, squared_px, sigma).padded(
             len(self._reference.all_points)
         )
         attempt = replace(attempt, depths=depths)
@@ -139,8 +140,8 @@ class FrameEstimation:
         normals, seen = np.zeros_like(pixels), attempt.outline
         if seen is not None:
             pixels, normals = np.concatenate([pixels, seen.pixels]), np.concatenate([normals, seen.normals])
-            weights = np.concatenate([weights, np.where(seen.valid, self._options.outline.weight, 0.0)])
-        correlation = window_correlation(pixels, self._options.measurement.window)
+            weights = np.concatenate([weights, np.where(seen.valid, OUTLINE_WEIGHT, 0.0)])
+        correlation = window_correlation(pixels, PATCH_WINDOW)
         return Observations(self._reference.all_points, pixels, weights, normals, correlation, attempt.depths)
 
 
@@ -170,7 +171,7 @@ def new_filter(estimator: Fitter[Frame], options: TrackerOptions) -> SequenceFil
             raise TrackingError(f"the step of the random walk of '{name}' must be a positive number")
     kept = [names.index(name) for name in options.per_sequence]
     steps = {names.index(name): step for name, step in walking.items()}
-    return SequenceFilter(estimator, kept, options.filter, steps)
+    return SequenceFilter(estimator, kept, steps)
 
 
 def at_constant_velocity(before: State, last: State) -> State:

@@ -7,7 +7,7 @@ from frame to frame, and points that were hidden come back by themselves.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -24,7 +24,7 @@ from morph_dslam.render.rasteriser import (
     weights_at,
 )
 from morph_dslam.tracking.binding import View, facing, signed_areas
-from morph_dslam.tracking.patches import NEUTRAL, FlowOptions, compare_patches, follow
+from morph_dslam.tracking.patches import NEUTRAL, compare_patches, follow
 
 Array = NDArray[np.float64]
 
@@ -157,29 +157,18 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
 #: Pyramid levels that reach as far as a correction may: a quarter of the size, with windows of 17 pixels.
 CORRECTION_LEVELS = 2
 
+#: Patches compared are (2 PATCH_HALF + 1) pixels wide.
+PATCH_HALF = 7
+PATCH_WINDOW = 2 * PATCH_HALF + 1
+
+#: Patches of the rendering and of the frame that agree less are rejected.
+LEAST_CORRELATION = 0.6
+
+#: A point found farther from where the rendering shows it, pixels, is rejected.
+LARGEST_CORRECTION_PX = 12.0
+
 #: A point this share of the object's depth behind the z-buffer counts as hidden.
 DEPTH_TOLERANCE = 0.01
-
-
-@dataclass(frozen=True)
-class MeasurementOptions:
-    """What a measurement must satisfy.
-
-    Attributes
-    ----------
-    patch_half : patches compared are (2 patch_half + 1) pixels wide.
-    least_correlation : patches of the rendering and of the frame that agree less are rejected.
-    largest_correction_px : a point found farther from where the rendering shows it is rejected.
-    """
-
-    patch_half: int = 7
-    least_correlation: float = 0.6
-    largest_correction_px: float = 12.0
-
-    @property
-    def window(self) -> int:
-        """Side of the patches that tell where a point is, pixels."""
-        return 2 * self.patch_half + 1
 
 
 @dataclass(frozen=True)
@@ -223,13 +212,7 @@ def visible_surface(
 
 
 def compare_with_rendering(
-    frame: NDArray[np.uint8],
-    rendering: Rendering,
-    predicted: Array,
-    guesses: Array,
-    visible: NDArray[np.bool_],
-    flow: FlowOptions,
-    options: MeasurementOptions,
+    frame: NDArray[np.uint8], rendering: Rendering, predicted: Array, guesses: Array, visible: NDArray[np.bool_]
 ) -> Measurement:
     """Follow points from the rendered reference view to the frame.
 
@@ -239,12 +222,11 @@ def compare_with_rendering(
     guesses : (p, 2) where to start looking for them in the frame.
     """
     rows = np.flatnonzero(visible)
-    near = replace(flow, levels=min(flow.levels, CORRECTION_LEVELS))
-    found, ok = follow(rendering.image, frame, predicted[rows], guesses[rows], near)
-    found, correlation, exactness = compare_patches(rendering.image, frame, predicted[rows], found, options.patch_half)
+    found, ok = follow(rendering.image, frame, predicted[rows], guesses[rows], CORRECTION_LEVELS)
+    found, correlation, exactness = compare_patches(rendering.image, frame, predicted[rows], found, PATCH_HALF)
     correction = np.linalg.norm(found - predicted[rows], axis=1)
-    ok &= (correction < options.largest_correction_px) & np.isfinite(exactness)
-    ok &= correlation > options.least_correlation
+    ok &= (correction < LARGEST_CORRECTION_PX) & np.isfinite(exactness)
+    ok &= correlation > LEAST_CORRELATION
     pixels, valid = predicted.copy(), np.zeros(len(predicted), dtype=bool)
     spread = np.full(len(predicted), np.inf)
     pixels[rows], valid[rows], spread[rows] = found, ok, exactness

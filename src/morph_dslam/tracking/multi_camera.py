@@ -29,6 +29,7 @@ from morph_dslam.tracking.estimator import Estimate, EstimationOptions, Estimato
 from morph_dslam.tracking.frame_estimation import new_filter
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.levenberg_marquardt import minimise
+from morph_dslam.tracking.measurement import PATCH_WINDOW
 from morph_dslam.tracking.noise import RigObservations
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import (
@@ -164,9 +165,7 @@ class RigReference:
         self._cameras, self._scale = cameras, trackers[0].estimator.scale
         self._chains = [part.chain(len(self._scale) - 6) for part in cameras]
         self._systematic = [
-            SystematicErrors(
-                tracker.estimator, tracker.reference.points, tracker.reference.parts, tracker.options.measurement.window
-            )
+            SystematicErrors(tracker.estimator, tracker.reference.points, tracker.reference.parts, PATCH_WINDOW)
             for tracker in trackers
         ]
         self._counts = [len(tracker.reference.points) for tracker in trackers]

@@ -5,13 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from morph_dslam.tracking.depth import DepthOptions
+from morph_dslam.tracking.depth import SIGMA_AT_1M
 from morph_dslam.tracking.discrepancy import DiscrepancyOptions
 from morph_dslam.tracking.estimator import EstimationOptions
-from morph_dslam.tracking.measurement import MeasurementOptions
-from morph_dslam.tracking.outline import OutlineOptions
-from morph_dslam.tracking.patches import FlowOptions
-from morph_dslam.tracking.sequence_filter import FilterOptions
 
 #: Where the search for a frame's state starts.
 StartFrom = Literal["previous", "constant-velocity"]
@@ -39,6 +35,7 @@ class TrackerOptions:
     look_every : a hidden object is looked for elsewhere in every so many frames.
     use_outline : whether the object's outline counts too; it needs a background that it stands out from.
     use_depth : whether the depth images of frames that have them count too.
+    depth_sigma : standard deviation of one pixel's depth at 1 m, metres; it grows with the distance squared.
     discrepancy : look for what the object's shape has beyond the model's; None for the model alone.
     per_sequence : names of the parameters that are one over the whole sequence.
     random_walk : names of parameters that hardly change from frame to frame, each with the standard deviation
@@ -75,9 +72,5 @@ class TrackerOptions:
     new_views: bool = True
     max_views: int = 12
     further_views: bool = True
-    flow: FlowOptions = field(default_factory=FlowOptions)
-    measurement: MeasurementOptions = field(default_factory=MeasurementOptions)
-    outline: OutlineOptions = field(default_factory=OutlineOptions)
-    depth: DepthOptions = field(default_factory=DepthOptions)
+    depth_sigma: float = SIGMA_AT_1M
     estimation: EstimationOptions = field(default_factory=EstimationOptions)
-    filter: FilterOptions = field(default_factory=FilterOptions)

@@ -19,28 +19,25 @@ from morph_dslam.tracking.estimator import BoundPoints, State
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class OutlineOptions:
-    """How the outline is searched for.
+#: Points on the rim, evenly spread.
+N_POINTS = 120
 
-    Attributes
-    ----------
-    n_points : points on the rim, evenly spread.
-    reach_px : how far to either side of where the estimate shows the outline.
-    side_px : pixels averaged on each side of a candidate.
-    least_contrast : grey levels by which the two sides must differ.
-    brightness_tolerance : largest difference of the inner side from its brightness in the reference view,
-        relative to that; shading changes it as the surface bends.
-    weight : of an outline point relative to a texture point: it gives one number, not two, and stands for
-        all of the bare margin behind it.
-    """
+#: How far the outline is searched for to either side of where the estimate shows it, pixels.
+REACH_PX = 14
 
-    n_points: int = 120
-    reach_px: int = 14
-    side_px: int = 4
-    least_contrast: float = 10.0
-    brightness_tolerance: float = 0.35
-    weight: float = 2.0
+#: Pixels averaged on each side of a candidate.
+SIDE_PX = 4
+
+#: Grey levels by which the two sides must differ.
+LEAST_CONTRAST = 10.0
+
+#: Largest difference of the inner side from its brightness in the reference view, relative to that; shading
+#: changes it as the surface bends.
+BRIGHTNESS_TOLERANCE = 0.35
+
+#: Weight of an outline point relative to a texture point: it gives one number, not two, and stands for all of
+#: the bare margin behind it.
+OUTLINE_WEIGHT = 2.0
 
 
 @dataclass(frozen=True)
@@ -73,17 +70,15 @@ class Outline:
     grey : (h, w) undistorted reference image. state : the object in it.
     """
 
-    def __init__(
-        self, model: ReducedModel, camera: Camera, grey: NDArray[np.uint8], state: State, options: OutlineOptions
-    ) -> None:
-        self._camera, self.options = camera, options
-        edges = _spread(model.nodes, rim(model.triangles), options.n_points)
+    def __init__(self, model: ReducedModel, camera: Camera, grey: NDArray[np.uint8], state: State) -> None:
+        self._camera = camera
+        edges = _spread(model.nodes, rim(model.triangles), N_POINTS)
         self.points = BoundPoints.from_surface(model, _on_edges(model.triangles, edges))
         # The direction along the rim comes from the edge's own ends; evaluated with the points at once.
         ends = [BoundPoints.from_surface(model, _at_nodes(model.triangles, edges[:, k])) for k in range(2)]
         self._with_ends = self.points.joined(ends[0]).joined(ends[1])
         pixels, normals = self._predict(state)
-        self._brightness = _inner_brightness(grey, pixels, normals, options.side_px)
+        self._brightness = _inner_brightness(grey, pixels, normals)
 
     def _predict(self, state: State) -> tuple[Array, Array]:
         """Pixels (p, 2) of the rim points and outward normals (p, 2); NaN behind the camera."""
@@ -105,11 +100,9 @@ class Outline:
         grey : (h, w) undistorted image. reach : how far to search to either side, pixels.
         """
         pixels, normals = self._predict(state)
-        options = self.options
         offsets = search_outline(
-            grey, pixels, normals, self._brightness, reach, options.side_px,
-            options.least_contrast, options.brightness_tolerance,
-        )  # fmt: skip
+            grey, pixels, normals, self._brightness, reach, SIDE_PX, LEAST_CONTRAST, BRIGHTNESS_TOLERANCE
+        )
         valid = np.isfinite(offsets)
         moved = pixels + np.where(valid, offsets, 0.0)[:, None] * normals
         return OutlineMeasurement(np.nan_to_num(moved), np.nan_to_num(normals), valid)
@@ -143,17 +136,17 @@ def _at_nodes(
     return SurfacePoints(chosen, weights)
 
 
-def _inner_brightness(grey: NDArray[np.uint8], pixels: Array, normals: Array, side: int) -> Array:
-    """Mean grey (p,) of the ``side`` pixels just inside each rim point; NaN outside the image."""
+def _inner_brightness(grey: NDArray[np.uint8], pixels: Array, normals: Array) -> Array:
+    """Mean grey (p,) of the `SIDE_PX` pixels just inside each rim point; NaN outside the image."""
     height, width = grey.shape
     total = np.zeros(len(pixels))
-    for depth in range(2, side + 2):
+    for depth in range(2, SIDE_PX + 2):
         x, y = np.round(pixels - depth * normals).T
         with np.errstate(invalid="ignore"):
             inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
         values = grey[np.where(inside, y, 0).astype(int), np.where(inside, x, 0).astype(int)].astype(float)
         total += np.where(inside, values, np.nan)
-    return total / side
+    return total / SIDE_PX
 
 
 @njit(cache=True, nogil=True)

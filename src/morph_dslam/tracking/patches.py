@@ -9,8 +9,6 @@ patches as in Benhimane and Malis, IROS 2004).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numba import njit
@@ -220,23 +218,21 @@ def compare_patches(first, second, first_points, second_points, half):
 NEUTRAL = 128
 
 
-@dataclass(frozen=True)
-class FlowOptions:
-    """Lucas-Kanade's window in pixels and pyramid levels above the image itself."""
+#: Lucas-Kanade's window, pixels, and pyramid levels above the image itself.
+FLOW_WINDOW, LEVELS = 17, 3
 
-    window: int = 17
-    levels: int = 3
-    contrast_window: int = 31
+#: Side of the square over whose mean contrast is normalized, pixels.
+CONTRAST_WINDOW = 31
 
 
-def normalize_contrast(grey: NDArray[np.uint8], window: int) -> NDArray[np.uint8]:
+def normalize_contrast(grey: NDArray[np.uint8], window: int = CONTRAST_WINDOW) -> NDArray[np.uint8]:
     """Grey image (h, w) minus its mean over a square window, plus `NEUTRAL`; clipped to 0..255."""
     mean = cv2.boxFilter(grey, -1, (window, window), borderType=cv2.BORDER_REFLECT)
     return cv2.addWeighted(grey, 1.0, mean, -1.0, NEUTRAL)  # type: ignore[return-value]
 
 
 def follow(
-    source: NDArray[np.uint8], target: NDArray[np.uint8], points: Array, guesses: Array, options: FlowOptions
+    source: NDArray[np.uint8], target: NDArray[np.uint8], points: Array, guesses: Array, levels: int = LEVELS
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Follow points from one contrast-normalized image to another (Bouguet's pyramidal Lucas-Kanade).
 
@@ -255,8 +251,8 @@ def follow(
         target,
         points.astype(np.float32),
         guesses.astype(np.float32),
-        winSize=(options.window, options.window),
-        maxLevel=options.levels,
+        winSize=(FLOW_WINDOW, FLOW_WINDOW),
+        maxLevel=levels,
         criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.02),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )

@@ -13,6 +13,7 @@ from morph_dslam.registration.landmarks import shape_starts, solve_pnp
 from morph_dslam.timing import stage
 from morph_dslam.tracking.frame_estimation import FrameEstimation
 from morph_dslam.tracking.hypothesis import MOST_AGREE, Image, PoseHypothesis, reject
+from morph_dslam.tracking.measurement import LARGEST_CORRECTION_PX
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import Rejection, RejectionReason
 from morph_dslam.tracking.reference import ReferenceView
@@ -161,7 +162,7 @@ class Recovery:
     def _apart(self, found: PoseHypothesis, other: PoseHypothesis) -> bool:
         """Whether two attempts are of different places in the image."""
         between = np.linalg.norm(found.measurement.pixels - other.measurement.pixels, axis=1)
-        return float(np.nanmedian(between)) > self._options.measurement.largest_correction_px
+        return float(np.nanmedian(between)) > LARGEST_CORRECTION_PX
 
     def _shapes(self, last: Array) -> list[Array]:
         """Parameters to look with: the last known, the default, each parameter near both ends."""

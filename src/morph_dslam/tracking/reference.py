@@ -35,6 +35,8 @@ from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.measurement import (
     DEPTH_TOLERANCE,
+    PATCH_HALF,
+    PATCH_WINDOW,
     Measurement,
     ReferenceAppearance,
     Rendering,
@@ -235,7 +237,7 @@ class ReferenceView:
         self._mask, self._mesh = masks[0], meshes[0]
         self.outline, self.all_points = None, self.points
         if options.use_outline:
-            self.outline = Outline(model, camera, first.picture.grey, self.state, options.outline)
+            self.outline = Outline(model, camera, first.picture.grey, self.state)
             self.all_points = self.points.joined(self.outline.points)
         self.correlation = self._correlation()
 
@@ -311,15 +313,7 @@ class ReferenceView:
             guesses = predicted
             if followed is not None:
                 guesses = np.where(followed.valid[:, None], followed.pixels, predicted)
-            return compare_with_rendering(
-                picture.normalized,
-                rendering,
-                predicted,
-                guesses,
-                visible,
-                self._options.flow,
-                self._options.measurement,
-            )
+            return compare_with_rendering(picture.normalized, rendering, predicted, guesses, visible)
 
     def _draw(self, meshes: Sequence[View]) -> tuple[list[NDArray[np.uint8]], float]:
         """Make the texture.
@@ -341,7 +335,7 @@ class ReferenceView:
             )
         normalized_images = [view.picture.normalized for view in self._views]
         self.appearance = ReferenceAppearance(drawn, camera, normalized_images, meshes, sources, closed)
-        masks = [interior(seen, self._options.measurement.patch_half + 2) for seen, _ in shown]
+        masks = [interior(seen, PATCH_HALF + 2) for seen, _ in shown]
         per_pixel = self._options.n_points / max(np.count_nonzero(masks[0]), 1)
         for number, (mask, buffer) in enumerate(zip(masks, buffers, strict=True)):
             mask[~part_from(number, buffer.triangle_ids, sources)] = 0
@@ -367,7 +361,7 @@ class ReferenceView:
 
     def _correlation(self) -> Correlation:
         """Of the points' errors (p, p): those of one picture share what their windows do."""
-        camera, window, blocks = self._estimator.camera, self._options.measurement.window, []
+        camera, window, blocks = self._estimator.camera, PATCH_WINDOW, []
         ends = [*(part.rows.stop for part in self.parts[:-1]), len(self.all_points)]
         for part, end in zip(self.parts, ends, strict=True):
             rows = slice(part.rows.start, end)

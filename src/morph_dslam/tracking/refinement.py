@@ -18,9 +18,9 @@ from scipy.optimize import least_squares
 
 from morph_dslam.errors import RegistrationError
 from morph_dslam.tracking.binding import bind_pixels, draw_view, view_of
-from morph_dslam.tracking.depth import DepthOptions, PointDepths
+from morph_dslam.tracking.depth import SIGMA_AT_1M, PointDepths
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOptions, Estimator, State, moved
-from morph_dslam.tracking.outline import Outline, OutlineMeasurement
+from morph_dslam.tracking.outline import OUTLINE_WEIGHT, Outline, OutlineMeasurement
 
 Array = NDArray[np.float64]
 
@@ -57,31 +57,26 @@ class Keyframe:
             seen = self.outline
             points = points.joined(outline.points)
             pixels = np.concatenate([pixels, seen.pixels])
-            weights = np.concatenate([weights, np.where(seen.valid, outline.options.weight, 0.0)])
+            weights = np.concatenate([weights, np.where(seen.valid, OUTLINE_WEIGHT, 0.0)])
             normals = np.concatenate([normals, seen.normals])
         return points, pixels, weights, normals
 
 
-@dataclass(frozen=True)
-class RefinementOptions:
-    """How much to trust what.
+#: How many independent points a keyframe counts for: its residuals are mostly the model's, which are alike
+#: over wide parts of the surface.
+EFFECTIVE_POINTS = 30.0
 
-    Attributes
-    ----------
-    landmark_px : standard deviation of a landmark; `track` takes it from the registration's residuals.
-    effective_points : how many independent points a keyframe counts for; its residuals are mostly the
-        model's, which are alike over wide parts of the surface.
-    least_sigma_px : residuals smaller than this tell no more.
-    n_keyframes : frames used, spread over the sequence.
-    """
+#: Residuals smaller than this, pixels, say no more.
+LEAST_SIGMA_PX = 0.3
 
-    landmark_px: float = 0.5
-    effective_points: float = 30.0
-    least_sigma_px: float = 0.3
-    n_keyframes: int = 25
+#: Keyframes used, spread over the sequence.
+N_KEYFRAMES = 25
+
+#: Standard deviation of a landmark, pixels, where the registration does not say it.
+LANDMARK_PX = 0.5
 
 
-def choose_keyframes(keyframes: Sequence[Keyframe], count: int) -> list[Keyframe]:
+def choose_keyframes(keyframes: Sequence[Keyframe], count: int = N_KEYFRAMES) -> list[Keyframe]:
     """At most ``count`` of them, evenly spread over the sequence."""
     rows = np.unique(np.linspace(0, len(keyframes) - 1, count).round().astype(int))
     return [keyframes[row] for row in rows] if len(keyframes) else []
@@ -94,8 +89,8 @@ def refine_reference(
     reference_pixels: Array,
     start: State,
     keyframes: Sequence[Keyframe],
-    options: RefinementOptions | None = None,
     outline: Outline | None = None,
+    landmark_px: float = LANDMARK_PX,
 ) -> State:
     """The reference state that explains the landmarks and the keyframes best.
 
@@ -105,7 +100,6 @@ def refine_reference(
     reference_pixels : (p, 2) of the followed points in the reference view.
     start : the registered state. outline : of the object, if the keyframes saw it.
     """
-    options = options or RefinementOptions()
     model, camera = estimator.model, estimator.camera
     inner = Estimator(model, camera, EstimationOptions(max_iterations=8, tolerance=1e-5))
     d = len(model.parameters)
@@ -119,11 +113,11 @@ def refine_reference(
     def residuals(step: Array) -> Array:
         state = reference(step)
         seen = camera.project(landmarks.in_camera(state))
-        parts = [((seen - landmark_pixels) / options.landmark_px).ravel()]
+        parts = [((seen - landmark_pixels) / landmark_px).ravel()]
         surface, met = bind_pixels(model, camera, view_of(model, camera, state), reference_pixels)
         points = BoundPoints.from_surface(model, surface)
         for frame in keyframes:
-            parts.append(_frame_residuals(inner, points, met, frame, options, outline))
+            parts.append(_frame_residuals(inner, points, met, frame, outline))
         return np.concatenate(parts)
 
     bounds = np.full((2, d + 6), np.inf) * [[-1.0], [1.0]]
@@ -136,20 +130,15 @@ def refine_reference(
 
 
 def _frame_residuals(
-    inner: Estimator,
-    points: BoundPoints,
-    met: NDArray[np.bool_],
-    frame: Keyframe,
-    options: RefinementOptions,
-    outline: Outline | None,
+    inner: Estimator, points: BoundPoints, met: NDArray[np.bool_], frame: Keyframe, outline: Outline | None
 ) -> Array:
     """Scaled residuals of a keyframe at its best state, with Huber weights; 0 for points unused."""
     points, pixels, weights, normals = frame.measured(points, met, outline)
     estimate = inner.estimate(points, pixels, weights, frame.state, normals)
     length = np.linalg.norm(estimate.residuals, axis=1)
     huber = np.minimum(1.0, inner.options.huber_px / np.maximum(length, 1e-12))
-    sigma = max(frame.sigma_px, options.least_sigma_px)
-    share = np.sqrt(options.effective_points / max(weights.sum(), 1.0)) / sigma
+    sigma = max(frame.sigma_px, LEAST_SIGMA_PX)
+    share = np.sqrt(EFFECTIVE_POINTS / max(weights.sum(), 1.0)) / sigma
     found = (share * np.sqrt(weights * huber))[:, None] * np.nan_to_num(estimate.residuals)
     scaled = np.zeros((len(met) + len(found) - int(met.sum()), 2))
     scaled[: len(met)][met], scaled[len(met) :] = found[: met.sum()], found[met.sum() :]
@@ -178,7 +167,7 @@ def refine_by_depth(
     state: State,
     sigma_px: float,
     image: NDArray[np.float32],
-    options: DepthOptions,
+    sigma_at_1m: float = SIGMA_AT_1M,
 ) -> Estimate:
     """The state of an object from landmarks and a depth image of the same view.
 
@@ -197,7 +186,7 @@ def refine_by_depth(
     for _ in range(ROUNDS):
         points, places = _surface_in_view(estimator, state)
         seen = np.ones(len(points), dtype=bool)
-        depths = PointDepths.sampled(image, places, seen, estimator.camera, sigma_px**2, options)
+        depths = PointDepths.sampled(image, places, seen, estimator.camera, sigma_px**2, sigma_at_1m)
         size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
         near = np.abs(depths.depths - points.in_camera(state)[:, 2]) < LARGEST_DISTANCE * size
         depths = depths.only(near)

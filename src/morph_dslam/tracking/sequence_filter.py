@@ -184,6 +184,13 @@ def without_clear_effect(
 #: The weight of the past in the mean of past and frame stays below this.
 LARGEST_WEIGHT = 0.999
 
+#: Frames over which the past fades, by a factor e.
+MEMORY = 600.0
+
+#: A frame whose own estimate is so many standard deviations off the past's changes nothing of it; it stands
+#: by itself, unless the past is far surer of what does not change. After so many in a row the past is forgotten.
+GATE, PATIENCE = 5.0, 3
+
 #: A past with this part of a frame's standard deviation is believed against it.
 FAR_SURER = 0.2
 
@@ -204,23 +211,6 @@ class Fitter(Protocol[_Taken]):
     def linear(self, measured: _Taken, estimate: Estimate) -> LinearCost: ...
 
 
-@dataclass(frozen=True)
-class FilterOptions:
-    """How the filter trusts the past.
-
-    Attributes
-    ----------
-    memory : frames over which the past fades, by a factor e.
-    gate : a frame whose own estimate is so many standard deviations off the past's changes nothing of it.
-        It stands by itself, unless the past is far surer of what does not change.
-    patience : after so many such frames in a row the past was wrong and is forgotten.
-    """
-
-    memory: float = 600.0
-    gate: float = 5.0
-    patience: int = 3
-
-
 class SequenceFilter(Generic[Frame]):
     """Fuses the estimates of the frames of one sequence.
 
@@ -236,20 +226,15 @@ class SequenceFilter(Generic[Frame]):
     """
 
     def __init__(
-        self,
-        estimator: Fitter[Frame],
-        indices: Sequence[int],
-        options: FilterOptions | None = None,
-        steps: Mapping[int, float] | None = None,
+        self, estimator: Fitter[Frame], indices: Sequence[int], steps: Mapping[int, float] | None = None
     ) -> None:
-        self.options = options or FilterOptions()
         walking = dict(steps or {})
         self._estimator, self._constant = estimator, np.array(indices, dtype=np.int64)
         self._kept = np.concatenate([self._constant, np.array(list(walking), dtype=np.int64)])
         self._step = np.diag([0.0] * len(indices) + [step**2 for step in walking.values()])
         self._walks = bool(walking)
         self._unknowns = len(estimator.model.parameters) + 6
-        self._noise = PixelNoise(self.options.memory)
+        self._noise = PixelNoise(MEMORY)
         self._past: Past | None = None
         self._untold = np.zeros(len(self._constant))
         self._conflicts = 0
@@ -279,7 +264,7 @@ class SequenceFilter(Generic[Frame]):
             return by_itself
         conflict = self._past is not None and self._contradicts(self._past, by_itself)
         self._conflicts = self._conflicts + 1 if conflict else 0
-        if self._conflicts >= self.options.patience:
+        if self._conflicts >= PATIENCE:
             self._past, self._conflicts = None, 0
         if self._past is None:
             self._keep(by_itself, errors)
@@ -347,7 +332,7 @@ class SequenceFilter(Generic[Frame]):
 
     def _keep(self, estimate: Estimate, errors: Errors) -> None:
         """Make the estimate's parameters that are one per sequence the past of the next frame."""
-        grown = np.exp(1.0 / self.options.memory)
+        grown = np.exp(1.0 / MEMORY)
         self._past = Past(
             estimate.state.parameters[self._kept],
             grown * self._of_kept(errors.covariance) + self._step,
@@ -391,7 +376,7 @@ class SequenceFilter(Generic[Frame]):
         """Whether a frame by itself says something else than all those before."""
         apart = estimate.state.parameters[self._kept] - past.mean
         spread = self._of_kept(estimate.covariance) + past.covariance
-        return float(apart @ np.linalg.solve(spread, apart)) > self.options.gate**2
+        return float(apart @ np.linalg.solve(spread, apart)) > GATE**2
 
     def _is_far_surer(self, past: Past, estimate: Estimate) -> bool:
         """Whether the past knows far better than a frame by itself whatever both tell of."""

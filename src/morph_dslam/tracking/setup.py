@@ -229,7 +229,7 @@ class Setup:
         assert self.landmarks is not None
         options = self.options
         return register_by_landmarks(
-            self.model, self.camera, self.landmarks, options.click_px, depth, options.tracker.depth
+            self.model, self.camera, self.landmarks, options.click_px, depth, options.tracker.depth_sigma
         )
 
     def carried(self, model: ReducedModel) -> list[CarriedStructure]:

@@ -19,7 +19,7 @@ from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.tracking.discrepancy import DiscrepancyFit, Reference, refine_discrepancy
 from morph_dslam.tracking.drawing import AugmentedView, DrawOptions, write_video
 from morph_dslam.tracking.hypothesis import Image
-from morph_dslam.tracking.refinement import Keyframe, RefinementOptions, choose_keyframes, refine_reference
+from morph_dslam.tracking.refinement import LANDMARK_PX, Keyframe, choose_keyframes, refine_reference
 from morph_dslam.tracking.run_folder import RunResults, check_run_folder
 from morph_dslam.tracking.run_writing import RunInputs, write_run
 from morph_dslam.tracking.setup import ObjectOptions, Reregistration, Setup, load_setup
@@ -53,7 +53,6 @@ class TrackOptions(ObjectOptions):
     overlay: bool = True
     drawing: DrawOptions = field(default_factory=DrawOptions)
     overwrite: bool = False
-    refinement: RefinementOptions = field(default_factory=RefinementOptions)
 
 
 @one_thread_for_algebra
@@ -178,17 +177,17 @@ def _refined(
     assert landmarks is not None
     # How well the landmarks fit tells how carefully they were set, where they are enough to tell.
     sigma = registration.facts["sigma_px"]
-    stated = options.refinement.landmark_px
-    trust = replace(options.refinement, landmark_px=max(sigma, 0.1) if np.isfinite(sigma) else stated)
+    landmark_px = max(sigma, 0.1) if np.isfinite(sigma) else LANDMARK_PX
     bound = bind_landmarks(registration.model, landmarks.points)
     seen = setup.camera.undistort_pixels(landmarks.pixels)
-    chosen = choose_keyframes(keyframes, options.refinement.n_keyframes)
+    chosen = choose_keyframes(keyframes)
     pixels, outline, sought = tracker.reference.pixels, tracker.reference.outline, tracker.options.discrepancy
     if sought is None:
-        state = refine_reference(tracker.estimator, bound, seen, pixels, registration.state, chosen, trust, outline)
+        start = registration.state
+        state = refine_reference(tracker.estimator, bound, seen, pixels, start, chosen, outline, landmark_px)
         return replace(registration, state=state, covariance=None)
     # What the state is wrong by counts with the discrepancy: both at once would be the same twice.
-    known = Reference(registration.state, pixels, bound, seen, trust.landmark_px)
+    known = Reference(registration.state, pixels, bound, seen, landmark_px)
     fit = DiscrepancyFit(registration.model, setup.camera, sought)
     found = refine_discrepancy(fit, tracker.estimator, known, chosen, outline)
     return replace(registration, discrepancy=found, covariance=None)
@@ -228,11 +227,7 @@ def write_results(
         "depth_used": options.use_depth,
         "discrepancy_used": options.use_discrepancy,
         "pose": options.pose if setup.map_path is not None else "free",
-        "settings": {
-            "click_px": options.click_px,
-            "refinement": asdict(options.refinement),
-            "tracker": asdict(tracker),
-        },
+        "settings": {"click_px": options.click_px, "tracker": asdict(tracker)},
     }
     inputs = RunInputs(options.model, options.camera, named)
     summary = write_run(options.output, run, inputs, registration, carried, tracker, extra)

@@ -205,8 +205,7 @@ class Tracker:
         with stage("flow"):
             rows = np.flatnonzero(self._supported)
             guesses = self._pixels + self._expected_motion(prior)
-            options = self.options.flow
-            found, ok = follow(self._image.normalized, image.normalized, self._pixels[rows], guesses[rows], options)
+            found, ok = follow(self._image.normalized, image.normalized, self._pixels[rows], guesses[rows])
             pixels, valid = guesses, np.zeros(len(guesses), dtype=bool)
             pixels[rows], valid[rows] = found, ok
             return Measurement(pixels, valid, self._supported, np.ones(len(pixels)))
@@ -397,7 +396,7 @@ class Tracker:
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         if self._undistortion is not None:
             grey = cv2.remap(grey, *self._undistortion, interpolation=cv2.INTER_LINEAR)
-        normalized = normalize_contrast(grey, self.options.flow.contrast_window)  # type: ignore[arg-type]
+        normalized = normalize_contrast(grey)  # type: ignore[arg-type]
         return Image(grey, normalized)  # type: ignore[arg-type]
 
     def _expected_motion(self, prior: Prior | None) -> Array:

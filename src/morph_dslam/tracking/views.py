@@ -20,7 +20,7 @@ from morph_dslam.tracking.covariance import error_factors_of
 from morph_dslam.tracking.estimator import Estimate, Estimator, State
 from morph_dslam.tracking.frame_estimation import FrameEstimation
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
-from morph_dslam.tracking.measurement import Rendering
+from morph_dslam.tracking.measurement import PATCH_HALF, PATCH_WINDOW, Rendering
 from morph_dslam.tracking.observability import position_std
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.recovery import Recovery
@@ -257,8 +257,7 @@ class ActiveView:
         """A view that is to be followed from now on, with these numbers."""
         estimation = FrameEstimation(estimator, reference, options)
         recovery = Recovery(estimator.model, estimator.camera, reference, estimation, options)
-        window = options.measurement.window
-        systematic = SystematicErrors(estimator, reference.points, reference.parts, window)
+        systematic = SystematicErrors(estimator, reference.points, reference.parts, PATCH_WINDOW)
         return cls(number, reference, estimation, recovery, systematic, error)
 
 
@@ -389,7 +388,7 @@ class ViewSet:
         if not is_known_well(attempt, spread / self._size, unexplained_px, options):
             return None
         should_be = old.rendered(stated.state)
-        if not is_sharp(picture, attempt, should_be, options.measurement.patch_half):
+        if not is_sharp(picture, attempt, should_be, PATCH_HALF):
             return None
         seen = seen_part(picture, attempt, should_be, old)
         try:
