@@ -13,7 +13,6 @@ import cv2
 from threadpoolctl import threadpool_limits
 
 P = ParamSpec("P")
-
 R = TypeVar("R")
 
 

@@ -66,7 +66,6 @@ def read_opencv_yaml(path: Path) -> object:
 
 #: No focal length or principal point is meant by what is larger, pixels.
 LARGEST_PX = 1e7
-
 #: Image sides of more pixels are refused before memory is asked for them.
 LARGEST_SIDE_PX = 65_535
 
@@ -243,7 +242,6 @@ def _first(content: Mapping, names: tuple[str, ...]) -> Any:
 
 
 _MATRIX_NAMES = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "k", "M1")
-
 _DISTORTION_NAMES = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D", "d", "D1")
 
 

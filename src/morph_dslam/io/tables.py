@@ -40,10 +40,8 @@ def read_toml(path: Path, what: str, error_class: type[MorphError]) -> dict[str,
 
 
 Array = NDArray[np.float64]
-
 #: No millimetres or pixels are meant by what is larger.
 LARGEST = 1e7
-
 HEADER = ("x_mm", "y_mm", "z_mm", "u_px", "v_px")
 
 

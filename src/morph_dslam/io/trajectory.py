@@ -15,12 +15,10 @@ from morph_dslam.errors import TrajectoryError
 from morph_dslam.geometry import RigidTransform
 
 Array = NDArray[np.float64]
-
 #: Larger values are not meant: timestamps in nanoseconds are smaller.
 LARGEST = 1e20
 #: Quaternions and matrices are written with few digits; more than this off, they are no rotations.
 ROTATION_TOLERANCE = 0.02
-
 #: 7-Scenes were recorded at 30 frames a second and carry no timestamps.
 SEVEN_SCENES_FPS = 30.0
 

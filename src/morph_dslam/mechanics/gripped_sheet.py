@@ -22,19 +22,14 @@ from morph_dslam.mechanics.shell import KoiterSheet, OrthotropicSheet, rectangle
 from morph_dslam.mechanics.solvers.continuation import step_towards
 
 Array = NDArray[np.float64]
-
 #: Newton has converged when no dof changes by more than this part of the sheet's length.
 TOLERANCE = 1e-7
-
 MAX_ITERATIONS = 14
-
 #: After so many iterations the update must be below this part of the first: an iteration that wanders hardly
 #: ever comes back, and a smaller increment is cheaper than waiting for it.
 PATIENCE, PROGRESS = 6, 0.25
-
 #: Longest displacement update, as a part of the length; longer ones are scaled back.
 MAX_UPDATE = 0.06
-
 #: An update longer than this means divergence; NaN does too.
 DIVERGED = 2.0
 

@@ -32,19 +32,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-
 #: End slope of a shallow circular arc over (mean height / free length), the mean weighted by cos^2 over the free
 #: length.
 ARC_SLOPE = 4.0 / (4.0 * (0.25 - (1.0 / 12.0 - 1.0 / (2.0 * np.pi**2))))
-
 #: The twist grows in proportion to the bulge up to about this part of the free length, then levels off: what a slightly
 #: bent sheet can follow would tear a strongly bent one apart.
 LEVELLING = 0.1
-
 MOTION = ("bend_left", "bend_right", "twist", "approach", "turn")
-
 COORDINATES = ("bulge", "bend", "skew", "slant")
-
 #: Motions that are unknowns of the equilibrium problem: found from the bulge and from zero moment.
 FREE_MOTIONS = (3, 4)
 

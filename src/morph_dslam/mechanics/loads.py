@@ -21,7 +21,6 @@ from morph_dslam.mechanics.spaces import DisplacementSpace
 from morph_dslam.studies.problem import Snapshot
 
 Array = NDArray[np.float64]
-
 Vector = tuple[Scalar, Scalar, Scalar]
 
 
@@ -201,7 +200,6 @@ class NodalForces:
 
 #: Name of a reaction's field: this and the name of the output, "force_SET" (N) or "moment_SET" (N m).
 REACTION, FORCE, MOMENT = "reaction_", "force_", "moment_"
-
 #: A reaction that never exceeds so much of the largest is rounding, and has nothing to be reduced.
 NEGLIGIBLE = 1e-6
 

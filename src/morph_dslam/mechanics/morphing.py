@@ -16,7 +16,6 @@ from morph_dslam.mechanics.spaces import DisplacementSpace
 from morph_dslam.meshing.meshes import Mesh
 
 Array = NDArray[np.float64]
-
 Indices = NDArray[np.int64]
 
 

@@ -19,7 +19,6 @@ from morph_dslam.errors import StudyError
 from morph_dslam.meshing.meshes import Mesh
 
 Array = NDArray[np.float64]
-
 Indices = NDArray[np.int64]
 
 

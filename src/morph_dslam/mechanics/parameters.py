@@ -21,7 +21,6 @@ from morph_dslam.mechanics.materials.base import evaluate
 from morph_dslam.model import Parameter
 
 Array = NDArray[np.float64]
-
 #: A number, or an expression of parameter symbols.
 Scalar = Any
 

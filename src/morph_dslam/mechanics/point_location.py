@@ -14,14 +14,10 @@ from morph_dslam.meshing.meshes import CellBlock, Mesh
 from morph_dslam.model import MaterialPoints, ReducedModel
 
 Array = NDArray[np.float64]
-
 Indices = NDArray[np.int64]
-
 #: Cells tried for a point, nearest first.
 CANDIDATES = 24
-
 NEWTON_STEPS = 20
-
 #: How far outside of the reference cell still counts as inside.
 TOLERANCE = 1e-8
 

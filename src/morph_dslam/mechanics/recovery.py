@@ -28,12 +28,9 @@ if TYPE_CHECKING:
     from morph_dslam.mechanics.solid import SolidProblem
 
 Array = NDArray[np.float64]
-
 #: Components of each field: symmetric tensors in Voigt's order (xx, yy, zz, yz, xz, xy), others row by row.
 COMPONENTS = {"deformation_gradient": 9, "strain": 6, "first_piola_kirchhoff": 9, "stress": 6}
-
 STRESSES = ("first_piola_kirchhoff", "stress")
-
 _VOIGT_COLUMNS = [3 * i + j for i, j in VOIGT]
 
 

@@ -36,7 +36,6 @@ from morph_dslam.mechanics.viscous_history import ViscousHistory
 from morph_dslam.meshing.meshes import Mesh
 
 Array = NDArray[np.float64]
-
 Support = PrescribedMotion | ElasticFoundation
 
 

@@ -21,7 +21,6 @@ from morph_dslam.mechanics.solvers.linear_solver import AssembledLinearisation, 
 from morph_dslam.mechanics.solvers.newton import Linearisation
 
 Array = NDArray[np.float64]
-
 #: Dofs up to which one thread assembles faster than several.
 SMALL = 5000
 

@@ -22,14 +22,10 @@ from morph_dslam.meshing.cell_types import CellType, cell_type
 from morph_dslam.meshing.meshes import Mesh
 
 Array = NDArray[np.float64]
-
 Indices = NDArray[np.int64]
-
 #: The cell type of each shape that has a node for every function of second order.
 FULL_TYPE = {"tet": "tet10", "prism": "prism18", "hex": "hex27"}
-
 SERENDIPITY = {"prism15", "hex20"}
-
 #: Mid-side nodes nearer than this part of the mesh's size to the middle of straight edges count as straight.
 STRAIGHT = 1e-12
 

@@ -16,9 +16,7 @@ from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
 from morph_dslam.mechanics.spaces import DisplacementSpace
 
 Array = NDArray[np.float64]
-
 Indices = NDArray[np.int64]
-
 #: A rigid motion whose held part is below this is free.
 FREE_MOTION = 1e-6
 
@@ -53,10 +51,6 @@ class Constraints:
                 held[component, new] = True
                 self._parts.append((motion, int(component), new))
         self.held: NDArray[np.bool_] = held.ravel()
-
-    def dofs_of(self, name: str) -> Indices:
-        """Scalar dofs that belong to a node set or surface. Raises StudyError if there is none."""
-        return self._space.dofs_on(self._mesh.set_nodes(name))
 
     def values(self) -> Array:
         """(3 n_scalar,) prescribed values at the present parameters; 0 where nothing is held."""
@@ -102,7 +96,7 @@ class Constraints:
         """
         if about is None:
             about = self.centroid(name)[0]
-        dofs = self.dofs_of(name)
+        dofs = self._space.dofs_on(self._mesh.set_nodes(name))
         constant, f = self._constant[dofs], forces[:, dofs]
         arms = (self._shape.coordinates(self._symbols)[dofs] + displacement[:, dofs].T).T
         arms = arms - np.outer(about, constant)
@@ -152,11 +146,14 @@ def _describe(free: Array) -> str:
 
 @dataclass(frozen=True)
 class AffineMotion:
-    """u(X) = matrix X + shift of the held points.
+    """u(X) = matrix X + shift of the held points: second-order elements, which are isoparametric, take it exactly.
 
     Attributes
     ----------
-    matrix (3, 3), shift (3,) in m; matrix_slopes (d, 3, 3) and shift_slopes (d, 3) by the parameters.
+    matrix : (3, 3).
+    shift : (3,), m.
+    matrix_slopes : (d, 3, 3) derivatives of the matrix by the parameters.
+    shift_slopes : (d, 3) derivatives of the shift.
     """
 
     matrix: Array

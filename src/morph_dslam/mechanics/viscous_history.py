@@ -30,7 +30,6 @@ from morph_dslam.mechanics.solid_materials import MaterialRegion
 from morph_dslam.mechanics.spaces import DisplacementSpace
 
 Array = NDArray[np.float64]
-
 _CORNERS = {ngs.TET: 4, ngs.PRISM: 6, ngs.HEX: 8}
 
 

@@ -20,9 +20,7 @@ from morph_dslam.meshing.meshes import CellBlock, Mesh
 from morph_dslam.meshing.second_order import FIRST_ORDER, to_second_order
 
 Array = NDArray[np.float64]
-
 Indices = NDArray[np.int64]
-
 #: Solid cell types, all of which the solid generators make.
 SOLIDS = ("hex8", "hex20", "hex27", "tet4", "tet10", "prism6", "prism15", "prism18")
 

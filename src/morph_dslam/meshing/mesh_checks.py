@@ -13,7 +13,6 @@ from morph_dslam.errors import StudyError
 from morph_dslam.meshing.meshes import Mesh, jacobian_determinants
 
 Indices = NDArray[np.int64]
-
 #: Diagonals of the bounding box (metres) beyond which a length unit was probably mistaken.
 LARGEST, SMALLEST = 5.0, 1e-4
 

@@ -23,7 +23,6 @@ from morph_dslam.meshing.netgen_meshing import SURFACES, mesh_step_file, mesh_su
 from morph_dslam.units import to_si
 
 Indices = NDArray[np.int64]
-
 _VOLUMES = (".inp", ".msh", ".vtk", ".vtu", ".step", ".stp")
 
 
@@ -115,7 +114,6 @@ _CELLS = {
 
 #: Dimension of the cells that may only bound others.
 _BOUNDING = {"vertex": 0, "line": 1, "line3": 1, "triangle6": 2, "quad8": 2, "quad9": 2}
-
 #: Integer data with more values than this number things rather than group them.
 _MOST_GROUPS = 256
 

@@ -13,7 +13,6 @@ from morph_dslam.meshing.cell_types import CellType, cell_type
 from morph_dslam.studies.problem import ModelMesh
 
 Array = NDArray[np.float64]
-
 Indices = NDArray[np.int64]
 
 #: Triangles that draw a face of so many nodes (corners, then middle nodes), turning as the face does.

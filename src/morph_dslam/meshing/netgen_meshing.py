@@ -25,9 +25,7 @@ from morph_dslam.errors import StudyError
 from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces
 
 Array = NDArray[np.float64]
-
 Indices = NDArray[np.int64]
-
 #: Endings of the files that are read.
 SURFACES = (".stl", ".obj", ".ply")
 

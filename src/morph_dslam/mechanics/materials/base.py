@@ -29,10 +29,8 @@ if TYPE_CHECKING:
     from morph_dslam.mechanics.materials.viscoelastic import Prony
 
 Array = NDArray[np.float64]
-
 #: A material constant: a number, or an NGSolve parameter (or an expression of some) that a study varies.
 Constant = Any
-
 #: Voigt's order of the components of a symmetric tensor.
 VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
@@ -148,7 +146,6 @@ class Material(ABC):
 
 
 _Law = TypeVar("_Law", bound=type[Material])
-
 _LAWS: dict[str, type[Material]] = {}
 
 

@@ -223,14 +223,10 @@ class Gent(Rubber):
 
 #: Where the series take over: relative size of the deviator, and (q / mean of the pair)^2.
 _NEARLY_SPHERICAL = 0.03
-
 _NEARLY_PAIRED = 1e-3
-
 #: Terms that bring the series to double precision at those bounds.
 _SPHERICAL_TERMS = 10
-
 _PAIR_TERMS = 5
-
 #: Newton steps from a straight line to double precision of a root and its second derivative.
 _ROOT_STEPS = 5
 

@@ -20,7 +20,6 @@ from morph_dslam.errors import SolverError
 from morph_dslam.mechanics.solvers.newton import Equations, State, sensitivities
 
 Array = NDArray[np.float64]
-
 _sla: Any = scipy.sparse.linalg
 
 

@@ -13,9 +13,7 @@ from morph_dslam.errors import SolverError
 from morph_dslam.mechanics.solvers.newton import TOLERANCE, Equations, Linearisation, State, solve
 
 Array = NDArray[np.float64]
-
 AnyState = TypeVar("AnyState")
-
 #: The path is given up when an increment falls below this part of it.
 SMALLEST_INCREMENT = 1.0 / 64.0
 

@@ -28,27 +28,19 @@ from numpy.typing import NDArray
 from morph_dslam.errors import SolverError
 
 Array = NDArray[np.float64]
-
 #: scipy.sparse.csr_matrix, which has no usable type stubs.
 Matrix = Any
-
 sla: Any = scipy.sparse.linalg
-
 #: PARDISO's settings, numbered from 1 as in its manual: own settings; METIS ordering; refinement only where pivots were
 #: perturbed (`linear_solver` refines where a residual asks for it); perturbation of zero pivots 1e-8; Bunch-Kaufman
 #: pivoting.
 PARDISO_SETTINGS = {1: 1, 2: 2, 8: 0, 10: 8, 21: 1}
-
 #: Scaling and weighted matching. Saddle points need them; where all diagonals are positive they cost a fifth of the
 #: time for nothing.
 SCALING, MATCHING = 11, 13
-
 REAL_SYMMETRIC_INDEFINITE, REAL_UNSYMMETRIC = -2, 11
-
 ANALYSE, FACTORISE, SOLVE = 11, 22, 33
-
 PERTURBED_PIVOTS, NEGATIVE_EIGENVALUES = 14, 23
-
 #: Without PARDISO, negative eigenvalues are counted among so many nearest to zero.
 LOOKED_AT = 6
 
@@ -177,15 +169,11 @@ class SuperLU:
 
 
 Integers = NDArray[np.integer]
-
 #: A solve is good when its residual is below this part of the right-hand side ...
 RESIDUAL_TOLERANCE = 1e-9
-
 #: ... or below this part of |A| |x| + |b|, which double precision cannot improve (Rigal and Gaches, 1967).
 BACKWARD_ERROR = 1e-14
-
 REFINEMENTS = 4
-
 ENVIRONMENT_VARIABLE = "MORPH_LINEAR_SOLVER"
 
 

@@ -20,22 +20,16 @@ from numpy.typing import NDArray
 from morph_dslam.errors import SolverError
 
 Array = NDArray[np.float64]
-
 #: Size of the last correction, in units of `Equations.scale`.
 TOLERANCE = 1e-8
-
 #: Factorisations after which an iteration is given up.
 MAX_ITERATIONS = 20
-
 #: Size of an update that is certainly wrong.
 DIVERGED = 10.0
-
 #: A step damped further has stalled.
 SMALLEST_DAMPING = 1.0 / 64.0
-
 #: A tangent is kept where so many more corrections with it should do, judged by the last two ...
 MOST_CHORDS = 4
-
 #: ... and these end at this part of the tolerance.
 CHORD_TARGET = 0.01
 
@@ -223,9 +217,7 @@ def sensitivities(equations: Equations, state: State, linearisation: Linearisati
 #: Two iterations with a kept tangent must shrink the correction to this part, or the tangent is too far off. Single
 #: ones need not: bending and stretching of thin walls converge in turns.
 KEPT_CONTRACTION = 0.2
-
 MAX_KEPT_ITERATIONS, MAX_KEPT_TANGENTS = 14, 2
-
 #: The error left is about as large as the last correction times the contraction, so stop later than Newton.
 KEPT_TOLERANCE = 0.1 * TOLERANCE
 
