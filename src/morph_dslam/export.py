@@ -62,13 +62,7 @@ def _to_range(parameter: Parameter, value: float, where: str) -> float:
 
 
 def fixed_values(model: ReducedModel, settings: Sequence[str]) -> Array:
-    """The parameters (d,) with some of them set by texts "name=value"; the others keep their defaults.
-
-    Raises
-    ------
-    ExportError
-        If a text is not of that form, or names no parameter, or its value is outside the range.
-    """
+    """The parameters (d,) with some of them set by texts "name=value"; the others keep their defaults."""
     mu = model.default
     for text in settings:
         matched = re.fullmatch(r"(\w+)=([^:]+)", text)
@@ -89,12 +83,6 @@ def grid(model: ReducedModel, ranges: Sequence[str], base: Array) -> Array:
     Parameters
     ----------
     base : (d,) values of the parameters without a range, SI.
-
-    Raises
-    ------
-    ExportError
-        If a text is not of that form, names no parameter or one twice, leaves the box, or if the states
-        are more than `MOST_STATES`.
     """
     axes: dict[int, Array] = {}
     for text in ranges:
@@ -140,11 +128,6 @@ def read_path(model: ReducedModel, path: Path, base: Array) -> Array:
     A column is headed "name [unit]", as in the table of an export, or "name_unit", as in the ``frames.csv``
     of a run. Other columns are passed over, and so are rows without values: frames that were not tracked.
     Parameters without a column keep their value in ``base``.
-
-    Raises
-    ------
-    ExportError
-        If the file cannot be read, has no column of a parameter, or holds a value outside its range.
     """
     try:
         with path.open(newline="") as file:
@@ -403,13 +386,7 @@ class StateChoice:
     at: Sequence[str] = ()
 
     def states(self, model: ReducedModel) -> NDArray[np.float64]:
-        """The states (s, d), SI; with neither ranges nor a path, a tour of all parameters.
-
-        Raises
-        ------
-        ExportError
-            If the choices contradict each other, or do not fit the model.
-        """
+        """The states (s, d), SI; with neither ranges nor a path, a tour of all parameters."""
         twice = {text.partition("=")[0] for text in self.vary} & {text.partition("=")[0] for text in self.at}
         if twice:
             raise ExportError(f"'{min(twice)}' is both varied and fixed: leave out its --vary or its --at")

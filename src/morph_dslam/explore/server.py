@@ -69,13 +69,7 @@ class ModelSurface:
         self._stresses = {place: field.restrict(used[:, None], one) for place, field in model.stresses.items()}
 
     def values(self, mu: Array, key: str) -> Array:
-        """The field ``key`` (n,) for parameters ``mu`` (d,) in the unit of its colours: mm or MPa.
-
-        Raises
-        ------
-        KeyError
-            If the model has no such field.
-        """
+        """The field ``key`` (n,) for parameters ``mu`` (d,) in the unit of its colours: mm or MPa."""
         if key == "displacement":
             return 1e3 * np.linalg.norm(self._displacement.value(mu), axis=1)
         return 1e-6 * von_mises(self._stresses[key].value(mu))
@@ -164,13 +158,7 @@ class Answers:
         self._shape = self._surface.shape()
 
     def answer(self, target: str) -> tuple[str, bytes] | None:
-        """The answer to a request's path and query, None where there is nothing.
-
-        Raises
-        ------
-        _BadRequest
-            If the query of a state does not name a field and the value of every parameter.
-        """
+        """The answer to a request's path and query, None where there is nothing."""
         url = urlsplit(target)
         if url.path in _FILES:
             name = _FILES[url.path]
@@ -249,13 +237,7 @@ class _Server(ThreadingHTTPServer):
 
 
 def make_server(model: ReducedModel, port: int) -> ThreadingHTTPServer:
-    """A server for one model on this computer's own address; ``port`` 0 takes any free one.
-
-    Raises
-    ------
-    ExploreError
-        If the port cannot be taken.
-    """
+    """A server for one model on this computer's own address; ``port`` 0 takes any free one."""
     try:
         return _Server((HOST, port), partial(_Handler, Answers(model)))
     except (OSError, OverflowError) as error:

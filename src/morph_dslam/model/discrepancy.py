@@ -135,13 +135,7 @@ def save_discrepancies(file: h5py.File, found: Sequence[Discrepancy | None]) -> 
 
 
 def load_discrepancies(file: h5py.File) -> dict[int, Discrepancy]:
-    """The discrepancies of a run by row; empty where the file has none.
-
-    Raises
-    ------
-    ValueError
-        If their arrays do not belong together.
-    """
+    """The discrepancies of a run by row; empty where the file has none."""
     if "discrepancy" not in file:
         return {}
     centres = read_array(file, "discrepancy/centres", 2)

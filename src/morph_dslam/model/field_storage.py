@@ -149,13 +149,7 @@ def _write_functions(group: h5py.Group, functions: Functions) -> None:
 
 
 def read_field(group: h5py.Group, lower: Array, upper: Array) -> SeparatedField:
-    """Read a field over the box [lower, upper] (d,).
-
-    Raises
-    ------
-    ValueError
-        If anything in the group is missing, misshapen or not finite, or does not fit the rest.
-    """
+    """Read a field over the box [lower, upper] (d,)."""
     functions = read_functions(read_group(group, "functions"), lower, upper)
     form = read_text(group, "modes")
     if form == "full":

@@ -69,13 +69,7 @@ class InnerStructure:
     points: MaterialPoints
 
     def carried_by(self, model: ReducedModel) -> CarriedStructure:
-        """The structure as ``model`` moves it.
-
-        Raises
-        ------
-        ModelFileError
-            If the structure was made for a model of another mesh.
-        """
+        """The structure as ``model`` moves it."""
         same = self.points.corners.max(initial=-1) < len(model.nodes)
         if same:
             gap = np.abs(model.rest_positions(self.points) - self.rest).max(initial=0.0)
@@ -89,13 +83,7 @@ class InnerStructure:
 
 
 def save_inner_structure(path: Path, structure: InnerStructure) -> None:
-    """Write a file that `load_inner_structure` reads.
-
-    Raises
-    ------
-    ModelFileError
-        If it cannot be written.
-    """
+    """Write a file that `load_inner_structure` reads."""
     try:
         with h5py.File(path, "w") as file:
             file.attrs.update({"format": FORMAT, "version": VERSION, "name": structure.name})

@@ -111,15 +111,7 @@ def write_checksum(path: Path) -> None:
 
 
 def check_checksum(path: Path) -> None:
-    """Compare a model file with its checksum.
-
-    Raises
-    ------
-    ModelFileError
-        If it is an HDF5 file of something else.
-    ValueError
-        If it begins otherwise, or a single byte differs from what was written.
-    """
+    """Compare a model file with its checksum."""
     with path.open("rb") as file:
         found = file.read(BLOCK)
     if found.startswith(HDF5_SIGNATURE):

@@ -44,11 +44,6 @@ def sample_adaptively(
 
     Sampling ends when the largest estimate is below the tolerance of the reduction, or at
     ``sampling.training`` samples.
-
-    Raises
-    ------
-    StudyError
-        If the study has no Galerkin model, or too few samples converge.
     """
     equations = solid_equations(problem)
     samples = training_samples(study)

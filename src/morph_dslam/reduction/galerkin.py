@@ -82,11 +82,6 @@ class GalerkinEquations:
     ----------
     equations : the full ones.
     modes : (k, n), zero at prescribed dofs (`galerkin_modes`).
-
-    Raises
-    ------
-    ValueError
-        If a mode moves prescribed dofs.
     """
 
     def __init__(self, equations: Equations, modes: Array) -> None:
@@ -192,13 +187,7 @@ class FullSolutions:
 
 
 def solid_equations(sweep: SweepProblem | None) -> SolidProblem:
-    """The full equations that a sweep solves.
-
-    Raises
-    ------
-    StudyError
-        If they are not those of a solid without memory.
-    """
+    """The full equations that a sweep solves."""
     problem = getattr(sweep, "problem", None)
     if not isinstance(problem, SolidProblem) or problem.history is not None:
         raise StudyError(
@@ -252,13 +241,7 @@ class ReducedSolver:
         self._next_fit = REFIT * comb(len(box) + 3, 3)
 
     def solve(self, mu: Array) -> Array:
-        """Coefficients (k,) of the modes at ``mu`` (d,).
-
-        Raises
-        ------
-        SolverError
-            If no equilibrium is found from the nearest full solution either.
-        """
+        """Coefficients (k,) of the modes at ``mu`` (d,)."""
         nearest = self._nearest(np.array(self._samples), mu)
         predicted, _ = self._prediction.evaluate(mu)
         start = predicted + self._values[nearest] - self._prediction.evaluate(self._samples[nearest])[0]

@@ -161,13 +161,7 @@ SHARE = 0.5
 
 
 def reduce_by_galerkin(task: ReductionTask) -> ReducedModel:
-    """A reduced model of every field from densely sampled Galerkin solutions.
-
-    Raises
-    ------
-    StudyError
-        If the study is not that of a hyperelastic solid.
-    """
+    """A reduced model of every field from densely sampled Galerkin solutions."""
     problem = solid_equations(task.problem() if task.problem else None)
     box, tolerance = task.box, task.options.tolerance
     solver = ReducedSolver(problem, FullSolutions.read(task.files), box, tolerance)

@@ -190,11 +190,6 @@ def solve_pgd(
         refits make up for what they leave.
     inner_iterations : at most so many of them.
     refit_every : all modes and all their functions are refitted after so many enrichments, and at the end.
-
-    Raises
-    ------
-    SolverError
-        If the space problem of a minimal-residual step does not converge.
     """
     system = galerkin_system if symmetric else minimal_residual_system
     state = _AlternatingDirections(system(problem))

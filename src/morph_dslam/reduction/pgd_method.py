@@ -142,11 +142,6 @@ def reduce_by_pgd(task: ReductionTask) -> ReducedModel:
     ``options.basis`` names the functions of the parameters (cubic splines if absent), of which as many are
     used as load, prescribed displacements and flexibility ask for. There are at most ``options.max_modes``
     products; the enrichment ends earlier where the relative dual residual is below ``options.tolerance``.
-
-    Raises
-    ------
-    StudyError
-        If the study is not linear, or not separable in its parameters; see `linear_solid`.
     """
     if task.problem is None:
         raise StudyError(

@@ -39,11 +39,6 @@ def reduce_by_pod(task: ReductionTask) -> ReducedModel:
     """A reduced model of every field that the snapshots hold.
 
     Snapshots of one group (mirror images) are left out together in cross-validation.
-
-    Raises
-    ------
-    StudyError
-        If the basis or the format that the study asks for does not suit its samples.
     """
     snapshots, grid = task.snapshots, EvenGrid.of(task.samples, task.box)
     _check_choices(task, grid)

@@ -121,11 +121,6 @@ def fit_functions(
     Returns
     -------
     The functions and, by total degree, the relative root-mean-square error of cross-validation.
-
-    Raises
-    ------
-    StudyError
-        If there are too few samples for polynomials of degree 2.
     """
     half = (upper - lower) / 2.0
     targets = values[None]

@@ -248,11 +248,6 @@ def reduce_by_sparse_pgd(task: ReductionTask) -> ReducedModel:
     are ``max_degree + 1``, and ``options.max_modes`` bounds the products of a field; how many there are,
     samples kept aside decide. Mirror images of one solution are kept aside together. Too few samples are said
     under "warnings" of the certificate's "reduction".
-
-    Raises
-    ------
-    StudyError
-        If Fourier functions are asked for and no parameter is a full turn.
     """
     options, dimension = task.options, len(task.parameters)
     basis = options.basis or "chebyshev"

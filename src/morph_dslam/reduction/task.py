@@ -140,13 +140,7 @@ def parameter_basis(name: BasisName, parameter: Parameter, size: int) -> Basis:
 
 
 def parameter_bases(name: BasisName, parameters: tuple[Parameter, ...], sizes: tuple[int, ...]) -> tuple[Basis, ...]:
-    """A basis for each parameter (`parameter_basis`).
-
-    Raises
-    ------
-    StudyError
-        If Fourier functions are asked for and no parameter is a full turn.
-    """
+    """A basis for each parameter (`parameter_basis`)."""
     if name == "fourier" and not any(is_periodic(parameter) for parameter in parameters):
         raise StudyError(
             'reduction.basis = "fourier" is for angles whose range is a full turn (360 deg), and this '

@@ -93,11 +93,6 @@ def default_executor(workers: int | None) -> Iterator[Executor]:
     """Worker processes, one a core unless ``workers`` says otherwise; ended at once on an interruption.
 
     A single worker is this process itself.
-
-    Raises
-    ------
-    WorkerError
-        If a worker process died.
     """
     if workers == 1:
         with SerialExecutor() as executor:

@@ -124,13 +124,7 @@ class ExternalStudy(Section):
         return fields
 
     def split(self, count: int) -> tuple[list[int], list[int]]:
-        """Training and held-out solutions, by index.
-
-        Raises
-        ------
-        StudyError
-            If too few are left to train on.
-        """
+        """Training and held-out solutions, by index."""
         held_out = self.sampling.held_out or max(4, count // 5)
         if count - held_out < 8:
             raise StudyError(
@@ -142,13 +136,7 @@ class ExternalStudy(Section):
 
 
 def read_table(path: Path) -> tuple[tuple[Parameter, ...], Array, list[dict[str, str]]]:
-    """The parameter table: parameters, their values (n, d) in SI, and the rows.
-
-    Raises
-    ------
-    StudyError
-        If it cannot be read, or a header or a value is wrong.
-    """
+    """The parameter table: parameters, their values (n, d) in SI, and the rows."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file, skipinitialspace=True)

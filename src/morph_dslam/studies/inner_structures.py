@@ -26,11 +26,6 @@ def place_inner_structure(model: ReducedModel, name: str, nodes: Array, triangle
     name : of the structure.
     nodes : (p, 3) in the object frame, metres.
     triangles : (m, 3) its surface, node indices.
-
-    Raises
-    ------
-    StudyError
-        If the model is that of a sheet, or a node lies outside of the solid.
     """
     if not model.cells:
         raise StudyError(f"'{model.name}' is the model of a sheet: it has no inside for '{name}'")
@@ -50,12 +45,6 @@ def place_inner_structure(model: ReducedModel, name: str, nodes: Array, triangle
 
 
 def read_inner_structure(model: ReducedModel, name: str, path: Path, unit: str) -> InnerStructure:
-    """The same from a surface file (.stl, .obj, .ply) drawn in ``unit`` in the object frame.
-
-    Raises
-    ------
-    StudyError
-        If the file cannot be read, or as of `place_inner_structure`.
-    """
+    """The same from a surface file (.stl, .obj, .ply) drawn in ``unit`` in the object frame."""
     surface = read_surface(path)
     return place_inner_structure(model, name, to_si(1.0, unit, "length") * surface.points, surface.triangles)

@@ -55,13 +55,7 @@ class MaterialSection(Section):
         return path.read_text() if path is not None and path.is_file() else ""
 
     def make(self, read: Reader) -> Material:
-        """The material, its constants read as numbers or expressions.
-
-        Raises
-        ------
-        StudyError
-            If the law or one of its constants is unknown, missing or of another quantity.
-        """
+        """The material, its constants read as numbers or expressions."""
         quantities: dict[str, str] = {**constant_quantities(self.law), **_SERIES}
         table = {name: _read(name, value, read, quantities) for name, value in self.constants.items()}
         return material_from_table({"law": self.law, **table})

@@ -35,13 +35,7 @@ class ParameterSection(Section):
         return self
 
     def parameter(self, name: str) -> Parameter:
-        """The parameter as the model file states it.
-
-        Raises
-        ------
-        StudyError
-            If the ends measure different things, or are not in order.
-        """
+        """The parameter as the model file states it."""
         unit = _unit(self.range[0])
         measured = quantity_of(unit)
         lower, upper = (read_affine(end, measured, ()).constant for end in self.range)

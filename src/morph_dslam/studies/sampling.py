@@ -24,13 +24,7 @@ MOST_GRID_POINTS = 100_000
 
 
 def training_samples(study: ParametricStudy) -> Array:
-    """The samples (n, d) that the model is made from; with "adaptive", those that are solved first.
-
-    Raises
-    ------
-    StudyError
-        If the scheme does not suit the number of parameters.
-    """
+    """The samples (n, d) that the model is made from; with "adaptive", those that are solved first."""
     sampling = study.sampling
     if sampling.scheme == "even":
         return study.admissible(_even(study, sampling.training))
@@ -87,13 +81,7 @@ def _grid(study: ParametricStudy) -> Array:
 
 
 def grid_axes(study: ParametricStudy) -> list[Array]:
-    """Values of each parameter on the full grid, both ends included.
-
-    Raises
-    ------
-    StudyError
-        If ``sampling.points`` does not suit the number of parameters, or makes too many points.
-    """
+    """Values of each parameter on the full grid, both ends included."""
     box, points = bounds(study), study.sampling.points
     counts = (points,) * len(box) if isinstance(points, int) else tuple(points or ())
     if len(counts) != len(box):

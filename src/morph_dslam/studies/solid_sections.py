@@ -163,13 +163,7 @@ def file_stamp(path: Path) -> tuple[int, int]:
 
 
 def make_mesh(section: Any) -> Mesh:
-    """The mesh of a `MeshSection`, checked; made once, and again when its file has been written again.
-
-    Raises
-    ------
-    StudyError
-        If it cannot be made or read, or is not fit to be solved on.
-    """
+    """The mesh of a `MeshSection`, checked; made once, and again when its file has been written again."""
     return _made(section, file_stamp(section.file) if isinstance(section, FileMesh) else None)
 
 
@@ -237,13 +231,7 @@ ShapeSection = Annotated[ThicknessShape | RadiusShape, Field(discriminator="kind
 def shape_fields(
     sections: Sequence[ThicknessShape | RadiusShape], mesh: Mesh, symbols: ParameterSymbols
 ) -> list[ShapeField]:
-    """The shape as the solver takes it, checked at the ends of the parameters that it depends on.
-
-    Raises
-    ------
-    StudyError
-        If a surface is unknown, or cells are inverted where parameters are at an end of their range.
-    """
+    """The shape as the solver takes it, checked at the ends of the parameters that it depends on."""
     parameters = symbols.parameters
     amplitudes = [read_affine(section.amplitude, "length", parameters) for section in sections]
     fields = [section.field(mesh) for section in sections]

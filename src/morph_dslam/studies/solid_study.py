@@ -153,13 +153,7 @@ class SolidStudy(Section):
         return tuple(section.parameter(name) for name, section in self.parameters.items())
 
     def solid_mesh(self) -> Mesh:
-        """The mesh, checked together with the sets that the study names.
-
-        Raises
-        ------
-        StudyError
-            If it cannot be made, is not fit to be solved on, or lacks a set.
-        """
+        """The mesh, checked together with the sets that the study names."""
         mesh = make_mesh(self.mesh)  # type: ignore[arg-type]
         held = [part.on for part in self.supports]
         regions = [material.on for material in self.materials.values()]

@@ -92,13 +92,7 @@ class SolidSweep:
 
 
 def follow(problem: SolidProblem, start: State, target: Array) -> State:
-    """Solve at ``target`` (d,) in increments from ``start``.
-
-    Raises
-    ------
-    SolverError
-        Naming, in the parameters' units, where the last solution converged.
-    """
+    """Solve at ``target`` (d,) in increments from ``start``."""
     try:
         return advance(problem, start, target)[-1]
     except PathError as error:
