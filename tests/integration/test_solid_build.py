@@ -100,7 +100,7 @@ def test_a_report_stands_beside_the_model(built):
     page = (built / "block.report.html").read_text()
     assert "could not be made" not in page
     assert "<td>moment on z_max</td>" in page
-    assert page.count("data:image/") == 6
+    assert page.count("data:image/") == 4
 
 
 def test_the_model_moves_its_end_as_a_rigid_body(built):

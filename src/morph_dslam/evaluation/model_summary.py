@@ -97,16 +97,6 @@ def held_out_facts(model: ReducedModel) -> Facts:
     return facts
 
 
-def parameter_table(parameters: Sequence[Parameter]) -> Table:
-    """Ranges and defaults in the unit of each parameter."""
-    rows = []
-    for parameter in parameters:
-        values = (parameter.lower, parameter.upper, parameter.default)
-        numbers = [f"{parameter.display(value):.4g}" for value in values]
-        rows.append([parameter.name, *numbers, _unit(parameter) or "–", parameter.description])
-    return Table(rows, ("parameter", "from", "to", "default", "unit", "meaning"))
-
-
 def _unit(parameter: Parameter) -> str:
     return "" if parameter.unit == "1" else parameter.unit
 

@@ -9,25 +9,19 @@ from typing import Any
 from tqdm import tqdm
 
 from morph_dslam.errors import StudyError
-from morph_dslam.evaluation.model_summary import describe_point, held_out_facts, parameter_table, summarise_model
-from morph_dslam.evaluation.points import error_table, sensitivity_table
+from morph_dslam.evaluation.model_summary import describe_point, summarise_model
 from morph_dslam.evaluation.report import Block, KeyFigures, Listing, Section, Table, Text, write_report
 from morph_dslam.model import ReducedModel
 from morph_dslam.reduction.report_pictures import (
     ReferenceCurve,
-    draw_model_states,
     draw_modes,
     plot_convergence,
-    plot_error_maps,
     plot_errors_by_parameter,
     plot_parameter_functions,
 )
 from morph_dslam.studies.build import build_warnings
 
-#: Parts of the model's summary that the report repeats as they are.
-_REPEATED = ("fields", "memory and samples", "error estimator", "reduction", "made with")
-
-Part = tuple[str, list[Callable[[], Block]]]
+_Part = tuple[str, list[Callable[[], Block]]]
 
 
 def report_path(model_file: Path) -> Path:
@@ -43,6 +37,8 @@ def write_build_report(path: str | Path, model: ReducedModel, reference: Referen
 
     Parameters
     ----------
+    path : the page to write.
+    model : with the certificate of its build.
     reference : a published curve, drawn beside the error against the number of modes.
 
     Raises
@@ -73,28 +69,29 @@ def _made(make: Callable[[], Block]) -> Block:
         return Text(f"This part could not be made: {type(error).__name__}: {error}", warning=True)
 
 
-def _parts(model: ReducedModel, reference: ReferenceCurve | None) -> list[Part]:
+def _parts(model: ReducedModel, reference: ReferenceCurve | None) -> list[_Part]:
     """Headings and what makes the blocks under each."""
-    certificate, several = model.certificate, len(model.parameters) > 1
-    maps = [lambda: plot_error_maps(model)] if several else []
-    summary = summarise_model(model)
-    repeated: list[Part] = [
-        (name.capitalize(), [lambda name=name: summary[name]]) for name in _REPEATED if name in summary
+    certificate = model.certificate
+    warnings = [lambda line=line: Text(line, warning=True) for line in build_warnings(certificate)]
+    tables: list[_Part] = [
+        (heading.capitalize(), [lambda table=table: table])
+        for heading, table in summarise_model(model).items()
+        if heading != "warnings"
     ]
+    failed = [
+        [describe_point(model.parameters, entry["coordinates"]), entry["reason"]]
+        for entry in certificate.get("samples", {}).get("failed", [])
+    ]
+    study = model.provenance.get("study")
     return [
-        ("In short", [lambda: _key_figures(model), *_warnings(certificate)]),
-        ("Parameters", [lambda: parameter_table(model.parameters)]),
-        ("States", [lambda: draw_model_states(model)]),
-        ("Errors on held-out solves", [lambda: error_table(certificate), lambda: Table.of(held_out_facts(model))]),
-        ("Errors of the displacement's sensitivities", _sensitivities(certificate)),
+        ("In short", [lambda: _key_figures(model), *warnings]),
         ("Error against number of modes", [lambda: plot_convergence(model, reference)]),
-        ("Errors over the parameter box", [lambda: plot_errors_by_parameter(model), *maps]),
+        ("Errors over the parameter box", [lambda: plot_errors_by_parameter(model)]),
         ("Modes in space", [lambda: draw_modes(model)]),
         ("Functions of the parameters", [lambda: plot_parameter_functions(model)]),
-        ("Stability", _stability(certificate)),
-        ("Samples that failed", _failed(model)),
-        *repeated,
-        ("Study", _study(model)),
+        *tables,
+        ("Samples that failed", [lambda: Table(failed, ("sample", "why"))] if failed else []),
+        ("Study", [lambda: Listing("The study as it was built", study)] if study else []),
     ]
 
 
@@ -120,38 +117,3 @@ def _largest_relative(name: str, entries: Iterable[dict[str, Any]]) -> dict[str,
     """The largest relative L2 error, if there is any, under its name."""
     errors = [entry["relative_l2"] for entry in entries if entry["relative_l2"] is not None]
     return {name: f"{100.0 * max(errors):.2g} %"} if errors else {}
-
-
-def _warnings(certificate: dict[str, Any]) -> list[Callable[[], Block]]:
-    return [lambda line=line: Text(line, warning=True) for line in build_warnings(certificate)]
-
-
-def _sensitivities(certificate: dict[str, Any]) -> list[Callable[[], Block]]:
-    if "sensitivity" not in certificate:
-        return [lambda: Text("The solutions came without derivatives by the parameters.")]
-    return [lambda: sensitivity_table(certificate)]
-
-
-def _stability(certificate: dict[str, Any]) -> list[Callable[[], Block]]:
-    report = certificate.get("stability")
-    if report is None:
-        return []
-    rows = [
-        [" and ".join(place["between"]), " to ".join(str(count) for count in place["negative_pivots"])]
-        for place in report["passed"]
-    ]
-    table = [lambda: Table(rows, ("between", "negative pivots"))] if rows else []
-    return [lambda: Text(report["statement"][:1].upper() + report["statement"][1:] + "."), *table]
-
-
-def _failed(model: ReducedModel) -> list[Callable[[], Block]]:
-    rows = [
-        [describe_point(model.parameters, entry["coordinates"]), entry["reason"]]
-        for entry in model.certificate.get("samples", {}).get("failed", [])
-    ]
-    return [lambda: Table(rows, ("sample", "why"))] if rows else []
-
-
-def _study(model: ReducedModel) -> list[Callable[[], Block]]:
-    text = model.provenance.get("study")
-    return [] if text is None else [lambda: Listing("The study as it was built", text)]
