@@ -7,7 +7,7 @@ import pytest
 
 from morph_dslam.model import Parameter
 from morph_dslam.model.basis_functions import cubic_spline_basis
-from morph_dslam.reduction.separable_problem import Terms, multiplied, spline_terms
+from morph_dslam.reduction.separated_terms import Terms, multiplied, spline_terms
 from morph_dslam.reduction.separation import separate
 
 PARAMETERS = (Parameter("force", "force", "N", -1.0, 2.0, 0.0), Parameter("place", "length", "mm", 0.1, 0.4, 0.1))

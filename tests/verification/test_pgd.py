@@ -8,7 +8,7 @@ import scipy.linalg
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from morph_dslam.model.basis_functions import chebyshev_basis, cubic_spline_basis, hat_basis
+from morph_dslam.model.basis_functions import cubic_spline_basis, hat_basis
 from morph_dslam.reduction.pgd import PgdSolution, solve_pgd
 from morph_dslam.reduction.separable_problem import ParameterAxis, SeparableProblem, collocation_axis, galerkin_axis
 from morph_dslam.reduction.tensor_formats import khatri_rao
@@ -106,95 +106,6 @@ def test_a_stiffness_as_second_parameter_agrees_with_direct_solves() -> None:
     _, slopes = solution.functions.evaluate(mu)
     up, down = (solution.functions.evaluate(mu + np.array([0.0, step]))[0] for step in (h, -h))
     np.testing.assert_allclose(slopes[1], (up - down) / (2.0 * h), rtol=1e-5, atol=1e-7)
-
-
-def test_every_enrichment_by_itself_lowers_the_residual_it_minimises() -> None:
-    """Without refits in between, which would hide a wrong step."""
-    problem, _ = beam_with_moving_load_and_stiffness()
-    residuals = solve_pgd(problem, 9, tolerance=0.0, refit_every=100, symmetric=False).residuals
-    assert (np.diff(residuals) < 0.0).all()
-    assert residuals[-2] < 0.5 * residuals[0]
-
-
-# --- advection and diffusion: not symmetric ---
-
-
-def advection_diffusion(nodes: int = 15) -> tuple[SeparableProblem, tuple[sp.csc_array, ...], np.ndarray]:
-    """-laplace u + v (1, 2) . grad u = 1 on the unit square, upwind differences, v a parameter in [0, 50]."""
-    h = 1.0 / (nodes + 1)
-    second = sp.diags_array([-np.ones(nodes - 1), 2.0 * np.ones(nodes), -np.ones(nodes - 1)], offsets=[-1, 0, 1])
-    upwind = sp.diags_array([-np.ones(nodes - 1), np.ones(nodes)], offsets=[-1, 0])
-    unit = sp.eye_array(nodes)
-    diffusion = sp.csc_array((sp.kron(second, unit) + sp.kron(unit, second)) / h**2)
-    advection = sp.csc_array((sp.kron(upwind, unit) + 2.0 * sp.kron(unit, upwind)) / h)
-    axis = galerkin_axis(chebyshev_basis(0.0, 50.0, 40))
-    points = len(axis.points)
-    problem = SeparableProblem(
-        (axis,),
-        (diffusion, advection),
-        (axis.multiplied_by([np.ones(points), axis.points]),),
-        np.ones((nodes**2, 1)),
-        (np.ones((1, points)),),
-        diffusion,
-    )
-    return problem, (diffusion, advection), np.linspace(0.0, 50.0, 11)
-
-
-def test_advection_and_diffusion_converge_by_minimal_residual() -> None:
-    problem, (diffusion, advection), speeds = advection_diffusion()
-    exact = np.stack([splu(sp.csc_array(diffusion + v * advection)).solve(problem.loads[:, 0]) for v in speeds], 1)
-    errors = {}
-    for n_modes in (2, 4, 8, 16):
-        solution = solve_pgd(problem, max_modes=n_modes, tolerance=0.0, symmetric=False)
-        errors[n_modes] = np.linalg.norm(on_grid(solution, speeds) - exact) / np.linalg.norm(exact)
-    assert errors[2] > 5.0 * errors[4] > 25.0 * errors[8]
-    assert errors[16] <= 1e-5
-
-
-def test_the_minimal_residual_never_grows_with_the_modes() -> None:
-    problem, _, _ = advection_diffusion(8)
-    residuals = solve_pgd(problem, max_modes=8, tolerance=0.0, symmetric=False).residuals
-    assert (np.diff(residuals) < 0.0).all()
-
-
-# --- time as a coordinate ---
-
-
-def test_time_is_a_coordinate_like_another() -> None:
-    """Heat on a rod from u0 = sin(pi x): u_t = c u_xx, so u = exp(-c pi^2 t) sin(pi x).
-
-    Posed for w = u - u0: w_t - c w_xx = c u0_xx, w(0) = 0. Parameters: time and the conductivity c.
-    """
-    nodes = 30
-    h = 1.0 / (nodes + 1)
-    x = h * np.arange(1, nodes + 1)
-    mass = sp.csc_array(sp.eye_array(nodes) * h)
-    laplace = sp.csc_array(
-        sp.diags_array([-np.ones(nodes - 1), 2.0 * np.ones(nodes), -np.ones(nodes - 1)], offsets=[-1, 0, 1]) / h
-    )
-    start = np.sin(np.pi * x)
-    rate = (start @ (laplace @ start)) / (start @ (mass @ start))  # the discrete pi^2: start is an eigenvector
-    knots = np.linspace(0.0, 0.2, 14)
-    time = galerkin_axis(cubic_spline_basis(knots), fixed=(0,))
-    conductivity = galerkin_axis(chebyshev_basis(0.5, 2.0, 8))
-    n_times, n_conductivities = len(time.points), len(conductivity.points)
-    problem = SeparableProblem(
-        (time, conductivity),
-        (mass, laplace),
-        (
-            np.stack([time.differentiated(), time.multiplied_by(np.ones(n_times))]),
-            conductivity.multiplied_by([np.ones(n_conductivities), conductivity.points]),
-        ),
-        -(laplace @ start)[:, None],
-        (np.ones((1, n_times)), conductivity.points[None, :]),
-        laplace,
-    )
-    solution = solve_pgd(problem, max_modes=12, tolerance=1e-6, symmetric=False)
-    times, values = np.linspace(0.0, 0.2, 9), np.array([0.5, 0.9, 1.7, 2.0])
-    found = start[:, None, None] + on_grid(solution, times, values)
-    exact = start[:, None, None] * np.exp(-rate * np.outer(times, values))
-    np.testing.assert_allclose(found, exact, atol=1e-3)
-    np.testing.assert_allclose(found[:, 0], np.repeat(start[:, None], 4, axis=1), atol=1e-12)
 
 
 # --- the interface ---

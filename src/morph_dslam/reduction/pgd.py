@@ -6,8 +6,7 @@ Decompositions", 2016); then the functions of each parameter are refitted for al
 stops on the dual norm of the residual, which is the energy error where the operator does not depend on the
 parameters; the ratio of the last mode to the first is no measure of the error.
 
-Operators that are not symmetric are treated by minimal residual (Nouy, Comput. Methods Appl. Mech. Eng.
-2010): Galerkin's alternating directions minimise nothing there and need not converge.
+The operator must be symmetric and positive definite: alternating directions minimise nothing otherwise.
 """
 
 from __future__ import annotations
@@ -21,15 +20,12 @@ from scipy.sparse.linalg import splu
 from tqdm import tqdm
 
 from morph_dslam.model.tensor_functions import CPFunctions
-from morph_dslam.reduction.separable_problem import (
-    DualResidual,
-    SeparableProblem,
-    SeparatedSystem,
-    galerkin_system,
-    minimal_residual_system,
-)
+from morph_dslam.reduction.separable_problem import DualResidual, SeparableProblem, SeparatedSystem
 
 Array = NDArray[np.float64]
+
+#: All modes and all their functions are refitted after so many enrichments, and at the end.
+REFIT_EVERY = 5
 
 
 @dataclass(frozen=True)
@@ -173,10 +169,8 @@ def solve_pgd(
     max_modes: int = 40,
     tolerance: float = 1e-4,
     *,
-    symmetric: bool = True,
     inner_tolerance: float = 1e-3,
     inner_iterations: int = 25,
-    refit_every: int = 5,
 ) -> PgdSolution:
     """Enrich until the dual residual meets the tolerance or the modes run out.
 
@@ -185,21 +179,18 @@ def solve_pgd(
     problem : what to solve.
     max_modes : at most this many products.
     tolerance : stop when the relative dual norm of the residual falls below.
-    symmetric : whether the operator is symmetric positive definite; otherwise the residual is minimised.
     inner_tolerance : change of the functions at which the alternating directions of one enrichment stop; the
         refits make up for what they leave.
     inner_iterations : at most so many of them.
-    refit_every : all modes and all their functions are refitted after so many enrichments, and at the end.
     """
-    system = galerkin_system if symmetric else minimal_residual_system
-    state = _AlternatingDirections(system(problem))
+    state = _AlternatingDirections(SeparatedSystem.of(problem))
     dual = DualResidual(problem)
     residuals: list[float] = []
     iterations: list[int] = []
     bar = tqdm(total=max_modes, desc="PGD", unit="mode")
     while len(residuals) < max_modes:
         iterations.append(state.enrich(inner_tolerance, inner_iterations))
-        if len(iterations) == max_modes or len(iterations) % refit_every == 0:
+        if len(iterations) == max_modes or len(iterations) % REFIT_EVERY == 0:
             state.refit()
         residuals.append(dual.relative(state.modes, state.coefficients))
         bar.update()
@@ -207,7 +198,6 @@ def solve_pgd(
         if residuals[-1] <= tolerance:
             break
     bar.close()
-    factors = tuple(a.all_coefficients(c) for a, c in zip(problem.axes, state.coefficients, strict=True))
-    functions = CPFunctions(tuple(a.basis for a in problem.axes), factors, np.eye(len(residuals)))
+    functions = CPFunctions(tuple(a.basis for a in problem.axes), tuple(state.coefficients), np.eye(len(residuals)))
     converged = residuals[-1] <= tolerance
     return PgdSolution(state.modes.T, functions, np.array(residuals), np.array(iterations), converged)

@@ -21,7 +21,7 @@ from morph_dslam.model.basis_functions import Basis, chebyshev_basis
 from morph_dslam.reduction.linear_solid import LinearSolid, linear_solid
 from morph_dslam.reduction.pgd import PgdSolution, solve_pgd
 from morph_dslam.reduction.registry import register_reduction
-from morph_dslam.reduction.separable_problem import Terms, multiplied, spline_terms
+from morph_dslam.reduction.separated_terms import Terms, multiplied, spline_terms
 from morph_dslam.reduction.separation import VectorFunction, fibre_series, generic_points, separate
 from morph_dslam.reduction.task import ReductionTask, parameter_basis
 from morph_dslam.studies.problem import Snapshot
