@@ -9,7 +9,6 @@ ones (`sparse_expansion`). Last, every field keeps the modes that the tolerance 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,8 +33,7 @@ from morph_dslam.reduction.registry import register_reduction
 from morph_dslam.reduction.sparse_expansion import ScatteredValues, expansion_train, fit_expansion, polynomial_functions
 from morph_dslam.reduction.task import ReductionTask, parameter_bases
 from morph_dslam.reduction.truncation import truncate
-from morph_dslam.studies.problem import Snapshot
-from morph_dslam.studies.solid_sweep import snapshot_fields, support_reactions
+from morph_dslam.studies.solid_sweep import solid_snapshot
 
 Array = NDArray[np.float64]
 
@@ -44,23 +42,6 @@ OTHER_FIELDS = 40.0
 
 #: Modes of a field are kept until so little is left out, as a part of the tolerance, and at most so many.
 MODE_TOLERANCE, MOST_MODES = 0.1, 80
-
-
-def solid_displacement(problem: SolidProblem, dofs: Array, mu: Array) -> Array:
-    """Displacement (n, 3) of a state from the mesh's nodes, the change of the undeformed shape included."""
-    displacement = problem.nodal_displacement(dofs)
-    if problem.shape.functions:
-        problem.symbols.set(mu)
-        moved = problem.displacements.node_values @ problem.shape.coordinates(problem.symbols)
-        displacement = displacement + moved - problem.mesh.nodes
-    return displacement
-
-
-def solid_snapshot(problem: SolidProblem, dofs: Array, mu: Array, reactions: Sequence[str] = ()) -> Snapshot:
-    """The fields of a state at the nodes, with the reactions named."""
-    fields = snapshot_fields(problem.sample(dofs, mu)) | {"displacement": solid_displacement(problem, dofs, mu)}
-    outputs = support_reactions(problem, dofs, mu) if reactions else {}
-    return with_reactions(Snapshot(mu, fields, outputs=outputs), reactions)
 
 
 class FieldModes:
@@ -145,7 +126,8 @@ class SampledFields:
     def __call__(self, mu: Array) -> Array:
         """Coefficients of all fields (n,) at ``mu`` (d,)."""
         dofs = self._solver.lift(self._solver.solve(mu), mu)
-        snapshot = solid_snapshot(self._problem, dofs, mu, self._reactions)
+        snapshot = solid_snapshot(self._problem, dofs, mu, reactions=bool(self._reactions))
+        snapshot = with_reactions(snapshot, self._reactions)
         return np.concatenate([field.coefficients(snapshot.fields[name]) for name, field in self.modes.items()])
 
     def in_allowed_units(self, mu: Array) -> Array:

@@ -26,7 +26,7 @@ from morph_dslam.model.basis_functions import Basis
 from morph_dslam.reduction.separable_problem import SeparableProblem, galerkin_axis
 from morph_dslam.reduction.separation import SeparatedVector, generic_points, separate
 from morph_dslam.studies.problem import SweepProblem
-from morph_dslam.studies.solid_sweep import MorphedSweep, SolidSweep
+from morph_dslam.studies.solid_sweep import SolidSweep
 
 Array = NDArray[np.float64]
 
@@ -133,11 +133,11 @@ def _refuse(why: str) -> StudyError:
 
 def _solid_of(sweep: SweepProblem) -> SolidProblem:
     """The solid behind a sweep, if it is of the kind that PGD solves."""
-    if isinstance(sweep, MorphedSweep):
-        raise _refuse("its stiffness is no short sum of products where [[shape]] moves the mesh")
     if not isinstance(sweep, SolidSweep):
         raise _refuse("this study's solutions depend on their past, or are those of a sheet")
     problem = sweep.problem
+    if problem.shape.functions:
+        raise _refuse("its stiffness is no short sum of products where [[shape]] moves the mesh")
     if problem.options.mixed:
         raise StudyError(
             'reduction.method = "pgd" has no pressures: leave out solver.formulation = "mixed", or use '

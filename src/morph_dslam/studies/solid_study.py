@@ -35,7 +35,7 @@ from morph_dslam.studies.solid_sections import (
     mesh_fingerprint,
     shape_fields,
 )
-from morph_dslam.studies.solid_sweep import MorphedSweep, RepeatableSweep, ViscousSweep
+from morph_dslam.studies.solid_sweep import SolidSweep, ViscousSweep
 
 Array = NDArray[np.float64]
 
@@ -223,12 +223,9 @@ class SolidStudy(Section):
 
     def sweep_problem(self) -> SweepProblem:
         """What the sweep solves with."""
-        problem = self.problem()
         if self.time is None:
-            sweep = RepeatableSweep(problem)
-        else:
-            sweep = ViscousSweep(problem, list(self.parameters).index(self.time.parameter), self.time.step)
-        return MorphedSweep(sweep, problem) if self.shape else sweep
+            return SolidSweep(self.problem())
+        return ViscousSweep(self.problem(), list(self.parameters).index(self.time.parameter), self.time.step)
 
     def model_mesh(self) -> ModelMesh:
         """The nodes of the mesh, its outer surface, its cells, and the volume of each node."""

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,7 @@ from morph_dslam.errors import SolverError
 from morph_dslam.mechanics.solid import SolidProblem
 from morph_dslam.mechanics.solvers.continuation import PathError, advance, loaded_state
 from morph_dslam.mechanics.solvers.newton import Linearisation, State, sensitivities, solve, solve_with_kept_tangent
-from morph_dslam.studies.problem import Snapshot, SweepProblem
+from morph_dslam.studies.problem import Snapshot
 
 Array = NDArray[np.float64]
 
@@ -21,74 +20,47 @@ Array = NDArray[np.float64]
 _FIELDS = {"displacement": "displacement", "stress_solid": "stress", "strain": "strain"}
 
 
-@dataclass(frozen=True)
-class SolidState:
-    """A solution and its derivatives.
+def solid_snapshot(
+    problem: SolidProblem, dofs: Array, mu: Array, slopes: Array | None = None, reactions: bool = True
+) -> Snapshot:
+    """Displacement, Cauchy stress and Green-Lagrange strain at the nodes, and what supports exert.
 
-    Attributes
+    The solver's displacements count from the undeformed shape, which may move with the parameters; those of a
+    snapshot count from the mesh's nodes, so that deformed positions are these nodes plus the displacement.
+
+    Parameters
     ----------
-    mu : (d,). dofs : (n,). slopes : (d, n) of the dofs by the parameters. negative_pivots : of the tangent.
+    problem : the solid.
+    dofs : (n,) of the solution.
+    mu : (d,) parameters, SI.
+    slopes : (d, n) of the dofs by the parameters; None where they are unknown.
+    reactions : whether forces (N) and moments (N m, about the origin) on each set held are among the outputs.
     """
+    fields = _named(problem.sample(dofs, mu))
+    derivatives = {} if slopes is None else _named(problem.sample_slopes(dofs, mu, slopes))
+    if problem.shape.functions:
+        problem.symbols.set(mu)
+        at_nodes = problem.displacements.node_values
+        moved = at_nodes @ problem.shape.coordinates(problem.symbols) - problem.mesh.nodes
+        fields["displacement"] = fields["displacement"] + moved
+        if derivatives:
+            changes = [at_nodes @ change for change in problem.shape.coordinate_slopes(problem.symbols)]
+            derivatives["displacement"] = derivatives["displacement"] + np.array(changes)
+    return Snapshot(mu, fields, derivatives, support_reactions(problem, dofs, mu) if reactions else {})
 
-    mu: Array
-    dofs: Array
-    slopes: Array
-    negative_pivots: int | None
+
+def _named(recovered: dict[str, Array]) -> dict[str, Array]:
+    """Recovered fields under the names that they have in snapshots and model files."""
+    return {name: recovered[key] for name, key in _FIELDS.items()}
 
 
-class SolidSweep:
-    """Solves a solid at one parameter point after another (`morph_dslam.studies.problem.SweepProblem`)."""
-
-    def __init__(self, problem: SolidProblem) -> None:
-        self.problem = problem
-        self._tangent: tuple[Array, Linearisation] | None = None
-
-    def first_state(self) -> SolidState:
-        """Equilibrium at the parameters' defaults, all loads grown together."""
-        return self._with_slopes(loaded_state(self.problem, self.problem.symbols.default))
-
-    def pack(self, state: SolidState) -> dict[str, Array]:
-        pivots = -1 if state.negative_pivots is None else state.negative_pivots
-        return {"mu": state.mu, "dofs": state.dofs, "slopes": state.slopes, "pivots": np.array(pivots)}
-
-    def unpack(self, arrays: dict[str, Array]) -> SolidState:
-        pivots = int(arrays["pivots"])
-        return SolidState(arrays["mu"], arrays["dofs"], arrays["slopes"], None if pivots < 0 else pivots)
-
-    def advance(self, start: SolidState, target: Array) -> SolidState:
-        """Solve at ``target``: from the prediction of the sensitivities, or else in increments.
-
-        If the tangent at ``start`` is still at hand, as in a sweep along one parameter, it serves first.
-        """
-        predicted = start.dofs + (target - start.mu) @ start.slopes
-        at_hand = self._tangent is not None and np.array_equal(self._tangent[0], start.mu)
-        tangent = self._tangent[1] if self._tangent and at_hand else None
-        self._tangent = None
-        try:
-            state = solve_with_kept_tangent(self.problem, target, predicted, tangent)
-            state = state or solve(self.problem, target, State(target, predicted))
-        except SolverError:
-            state = follow(self.problem, State(start.mu, start.dofs), target)
-        return self._with_slopes(state)
-
-    def _with_slopes(self, state: State) -> SolidState:
-        self._tangent = None
-        tangent = self.problem.linearise(state.dofs, state.mu)
-        slopes = sensitivities(self.problem, state, tangent)
-        self._tangent = state.mu, tangent
-        return SolidState(state.mu, state.dofs, slopes, tangent.negative_pivots)
-
-    def take_snapshot(self, state: SolidState) -> Snapshot:
-        """Displacement, Cauchy stress and Green-Lagrange strain at nodes, their slopes, and reactions."""
-        outputs = support_reactions(self.problem, state.dofs, state.mu)
-        if state.negative_pivots is not None:
-            outputs["negative_pivots"] = np.array(state.negative_pivots)
-        return Snapshot(
-            state.mu,
-            snapshot_fields(self.problem.sample(state.dofs, state.mu)),
-            snapshot_fields(self.problem.sample_slopes(state.dofs, state.mu, state.slopes)),
-            outputs,
-        )
+def support_reactions(problem: SolidProblem, dofs: Array, mu: Array) -> dict[str, Array]:
+    """Force (N) and moment (N m, about the object frame's origin) on each set that is held."""
+    outputs = {}
+    for support in problem.supports:
+        force, moment = problem.reactions(dofs, mu, support.on, np.zeros(3))
+        outputs[f"force_{support.on}"], outputs[f"moment_{support.on}"] = force, moment
+    return outputs
 
 
 def follow(problem: SolidProblem, start: State, target: Array) -> State:
@@ -103,97 +75,95 @@ def follow(problem: SolidProblem, start: State, target: Array) -> State:
         raise SolverError(f"no equilibrium found beyond {last}, where the last solution converged") from error
 
 
-def snapshot_fields(recovered: dict[str, Array]) -> dict[str, Array]:
-    """Recovered fields under the names that they have in snapshots and model files."""
-    return {name: recovered[key] for name, key in _FIELDS.items()}
+@dataclass(frozen=True)
+class SolidState:
+    """A solution and its derivatives.
+
+    Attributes
+    ----------
+    mu : (d,).
+    dofs : (n,).
+    slopes : (d, n) of the dofs by the parameters.
+    negative_pivots : of the tangent; None if they are not known.
+    """
+
+    mu: Array
+    dofs: Array
+    slopes: Array
+    negative_pivots: int | None
 
 
-def support_reactions(problem: SolidProblem, dofs: Array, mu: Array) -> dict[str, Array]:
-    """Force (N) and moment (N m, about the object frame's origin) on each set that is held."""
-    outputs = {}
-    for support in problem.supports:
-        force, moment = problem.reactions(dofs, mu, support.on, np.zeros(3))
-        outputs[f"force_{support.on}"], outputs[f"moment_{support.on}"] = force, moment
-    return outputs
+class SolidSweep:
+    """Solves a solid at one parameter point after another (`morph_dslam.studies.problem.SweepProblem`).
 
-
-# A solid of variable shape as the sweep sees it: its snapshots' displacements count from the mesh.
-# The solver's displacements count from the undeformed shape, which itself moves with the parameters. A model
-# file has the nodes of one mesh, so that deformed positions are these nodes plus the displacement.
-
-
-class MorphedSweep:
-    """Adds the change of shape to another sweep's snapshots (`morph_dslam.studies.problem.SweepProblem`)."""
-
-    def __init__(self, sweep: SweepProblem, problem: SolidProblem) -> None:
-        self._sweep, self.problem = sweep, problem
-
-    def first_state(self) -> Any:
-        return self._sweep.first_state()
-
-    def pack(self, state: Any) -> dict[str, Array]:
-        return self._sweep.pack(state)
-
-    def unpack(self, arrays: dict[str, Array]) -> Any:
-        return self._sweep.unpack(arrays)
-
-    def advance(self, start: Any, target: Array) -> Any:
-        return self._sweep.advance(start, target)
-
-    def take_snapshot(self, state: Any) -> Snapshot:
-        """The sweep's snapshot with displacements from the mesh's nodes."""
-        snapshot = self._sweep.take_snapshot(state)
-        shape, symbols = self.problem.shape, self.problem.symbols
-        at_nodes = self.problem.displacements.node_values
-        symbols.set(snapshot.coordinates)
-        fields, slopes = dict(snapshot.fields), dict(snapshot.sensitivities)
-        fields["displacement"] = (
-            fields["displacement"] + at_nodes @ shape.coordinates(symbols) - self.problem.mesh.nodes
-        )
-        if "displacement" in slopes:
-            changes = [at_nodes @ change for change in shape.coordinate_slopes(symbols)]
-            slopes["displacement"] = slopes["displacement"] + np.array(changes)
-        return replace(snapshot, fields=fields, sensitivities=slopes)
-
-
-# A solid's sweep whose solutions do not depend on what its worker solved before.
-
-
-class RepeatableSweep(SolidSweep):
-    """Has the tangent of every start at hand: kept where this worker solved it last, or else made anew.
-
-    Whether a solution is reached with one tangent or another shows in the last digits of the iteration's
-    tolerance; so the numbers of a sweep are the same whatever the number of workers and their timing.
+    It has the tangent of every start at hand: kept where this worker solved it last, or else made anew. Whether a
+    solution is reached with one tangent or another shows in the last digits of the iteration's tolerance; so the
+    numbers of a sweep are the same whatever the number of workers and their timing.
     """
 
     def __init__(self, problem: SolidProblem) -> None:
-        super().__init__(problem)
+        self.problem = problem
+        self._tangent: tuple[Array, Linearisation] | None = None
         self._solved: Array | None = None
 
+    def first_state(self) -> SolidState:
+        """Equilibrium at the parameters' defaults, all loads grown together."""
+        return self._with_slopes(loaded_state(self.problem, self.problem.symbols.default))
+
+    def pack(self, state: SolidState) -> dict[str, Array]:
+        pivots = -1 if state.negative_pivots is None else state.negative_pivots
+        return {"mu": state.mu, "dofs": state.dofs, "slopes": state.slopes, "pivots": np.array(pivots)}
+
     def unpack(self, arrays: dict[str, Array]) -> SolidState:
-        state = super().unpack(arrays)
+        pivots = int(arrays["pivots"])
+        state = SolidState(arrays["mu"], arrays["dofs"], arrays["slopes"], None if pivots < 0 else pivots)
         if self._solved is None or not np.array_equal(self._solved, state.dofs):
             self._tangent = None  # its memory is needed for the next one
             self._tangent = state.mu, self.problem.linearise(state.dofs, state.mu)
             self._solved = state.dofs
         return state
 
+    def advance(self, start: SolidState, target: Array) -> SolidState:
+        """Solve at ``target``: from the prediction of the sensitivities, or else in increments.
+
+        If the tangent at ``start`` is still at hand it serves first.
+        """
+        predicted = start.dofs + (target - start.mu) @ start.slopes
+        at_hand = self._tangent is not None and np.array_equal(self._tangent[0], start.mu)
+        tangent = self._tangent[1] if self._tangent and at_hand else None
+        self._tangent = None
+        try:
+            state = solve_with_kept_tangent(self.problem, target, predicted, tangent)
+            state = state or solve(self.problem, target, State(target, predicted))
+        except SolverError:
+            state = follow(self.problem, State(start.mu, start.dofs), target)
+        return self._with_slopes(state)
+
     def _with_slopes(self, state: State) -> SolidState:
-        self._solved = None
-        result = super()._with_slopes(state)
-        self._solved = result.dofs
-        return result
+        self._tangent = self._solved = None
+        tangent = self.problem.linearise(state.dofs, state.mu)
+        slopes = sensitivities(self.problem, state, tangent)
+        self._tangent, self._solved = (state.mu, tangent), state.dofs
+        return SolidState(state.mu, state.dofs, slopes, tangent.negative_pivots)
 
-
-# A viscoelastic solid as the sweep sees it: every sample is followed through time from the start.
-# All parameters but the time keep their values from the beginning on: the body is loaded in an instant, and
-# then time runs. What it remembers depends on the whole path, so derivatives by the parameters at a fixed
-# memory would be wrong ones; snapshots carry none, and the functions of the parameters are fitted to values.
+    def take_snapshot(self, state: SolidState) -> Snapshot:
+        """Fields at the nodes, their slopes, reactions, and the tangent's negative pivots."""
+        snapshot = solid_snapshot(self.problem, state.dofs, state.mu, state.slopes)
+        if state.negative_pivots is not None:
+            snapshot.outputs["negative_pivots"] = np.array(state.negative_pivots)
+        return snapshot
 
 
 @dataclass(frozen=True)
 class ViscousSolution:
-    """A solution and what the materials remember: parameters (d,), dofs (n,), internal variables (h,)."""
+    """A solution and what the materials remember.
+
+    Attributes
+    ----------
+    mu : (d,).
+    dofs : (n,).
+    memory : (h,) internal variables.
+    """
 
     mu: Array
     dofs: Array
@@ -203,10 +173,15 @@ class ViscousSolution:
 class ViscousSweep:
     """Solves a viscoelastic solid (`morph_dslam.studies.problem.SweepProblem`).
 
+    All parameters but the time keep their values from the beginning on: the body is loaded in an instant, and
+    then time runs. What it remembers depends on the whole path, so derivatives by the parameters at a fixed
+    memory would be wrong ones; snapshots carry none, and the functions of the parameters are fitted to values.
+
     Parameters
     ----------
-    problem : at rest; its clock stands at the default of the time. clock : index of the parameter that is the
-        time. step : longest increment of time, s.
+    problem : at rest; its clock stands at the default of the time.
+    clock : index of the parameter that is the time.
+    step : longest increment of time, s.
     """
 
     def __init__(self, problem: SolidProblem, clock: int, step: float) -> None:
@@ -242,24 +217,22 @@ class ViscousSweep:
             start = self._loaded
         self.problem.history.restore(start.memory)
         state = State(start.mu, start.dofs)
-        at_once = target.copy()
-        at_once[self._clock] = start.mu[self._clock]
+        begin, end = start.mu[self._clock], target[self._clock]
+        at_once = self._at_time(target, begin)
         if not np.array_equal(at_once, start.mu):
             state = follow(self.problem, state, at_once)
-        begin, end = start.mu[self._clock], target[self._clock]
         count = int(np.ceil((end - begin) / self._step - 1e-9))
         for time in np.linspace(begin, end, count + 1)[1:]:
-            at_time = target.copy()
-            at_time[self._clock] = time
-            state = follow(self.problem, state, at_time)
+            state = follow(self.problem, state, self._at_time(target, time))
         return self._with_memory(State(target, state.dofs))
 
+    def _at_time(self, mu: Array, time: float) -> Array:
+        moment = mu.copy()
+        moment[self._clock] = time
+        return moment
+
     def take_snapshot(self, state: ViscousSolution) -> Snapshot:
-        """Displacement, Cauchy stress, Green-Lagrange strain and reactions; no derivatives."""
+        """Fields at the nodes and reactions; no derivatives."""
         assert self.problem.history is not None
         self.problem.history.restore(state.memory)
-        return Snapshot(
-            state.mu,
-            snapshot_fields(self.problem.sample(state.dofs, state.mu)),
-            outputs=support_reactions(self.problem, state.dofs, state.mu),
-        )
+        return solid_snapshot(self.problem, state.dofs, state.mu)
