@@ -66,9 +66,11 @@ class InpFile:
 
     Attributes
     ----------
-    node_labels, nodes : (n,) labels and (n, 3) coordinates, file units.
+    node_labels : (n,) labels.
+    nodes : (n, 3) coordinates, file units.
     elements : the elements, one entry for each *ELEMENT card.
-    node_sets, element_sets : labels by name, as the file spells it first.
+    node_sets : labels by name, as the file spells it first.
+    element_sets : labels by name, likewise.
     surfaces : parts of each element surface by name.
     """
 

@@ -88,7 +88,9 @@ class Kinematics:
 
     Attributes
     ----------
-    displacement : u. position : undeformed position X. gradient : du/dXi.
+    displacement : u.
+    position : undeformed position X.
+    gradient : du/dXi.
     """
 
     def __init__(self, displacement: Any, shape: Shape) -> None:

@@ -30,7 +30,8 @@ class DeadTraction:
 
     Attributes
     ----------
-    on : surface. traction : Pa.
+    on : surface.
+    traction : Pa.
     """
 
     on: str
@@ -50,7 +51,8 @@ class FollowerPressure:
 
     Attributes
     ----------
-    on : surface. pressure : Pa, positive pushes inwards.
+    on : surface.
+    pressure : Pa, positive pushes inwards.
     """
 
     on: str
@@ -68,7 +70,8 @@ class BodyForce:
 
     Attributes
     ----------
-    force : N/m3. on : cell set.
+    force : N/m3.
+    on : cell set.
     """
 
     force: Vector
@@ -93,7 +96,8 @@ class PointLoad:
 
     Attributes
     ----------
-    on : node set or surface. force : total, N.
+    on : node set or surface.
+    force : total, N.
     """
 
     on: str
@@ -110,7 +114,8 @@ class MovingPatch:
 
     Attributes
     ----------
-    on : surface. force : N.
+    on : surface.
+    force : N.
     centre : m, expressions of the parameter that is the position.
     width : w, m; at least about half an element, or quadrature misses it.
     """
@@ -139,7 +144,8 @@ class MovingLine:
 
     Attributes
     ----------
-    on : surface. force : per length of the line, N/m.
+    on : surface.
+    force : per length of the line, N/m.
     centre : a point of the line, m, expressions of the parameter that is the position.
     direction : (3,) of the line; its length does not matter.
     width : w, m; at least about half an element, or quadrature misses it.

@@ -26,7 +26,9 @@ def radius_field(nodes: Array, point: Array, direction: Array) -> Array:
 
     Parameters
     ----------
-    nodes : (n, 3), m. point : on the axis (3,), m. direction : of the axis (3,); its length does not matter.
+    nodes : (n, 3), m.
+    point : on the axis (3,), m.
+    direction : of the axis (3,); its length does not matter.
     """
     length = np.linalg.norm(direction)
     if not length > 0.0:

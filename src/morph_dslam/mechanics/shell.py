@@ -36,7 +36,8 @@ class OrthotropicSheet:
 
     Attributes
     ----------
-    young_fibre, young_cross : Young's moduli along and across the fibres, Pa.
+    young_fibre : Young's modulus along the fibres, Pa.
+    young_cross : Young's modulus across them, Pa.
     poisson : contraction across under tension along the fibres, nu_12.
     shear : shear modulus G_12, Pa.
     thickness : metres.

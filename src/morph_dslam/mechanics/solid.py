@@ -75,8 +75,9 @@ class SolidProblem:
 
     Attributes
     ----------
-    n_dofs, free, scale : see `newton.Equations`. The first 3 n_scalar dofs are displacements, those of x
-        first; pressures follow.
+    n_dofs : see `newton.Equations`. The first 3 n_scalar dofs are displacements, those of x first; pressures follow.
+    free : see `newton.Equations`.
+    scale : see `newton.Equations`.
     flags : what a result obtained with this discretisation must be doubted for; empty if nothing.
     """
 

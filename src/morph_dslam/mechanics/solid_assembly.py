@@ -149,7 +149,7 @@ class Assembly:
 class _MixedLinearisation(AssembledLinearisation):
     """A linearisation with pressures, whose block of K is negative: each adds a negative pivot of its own.
 
-    K has as many more than K_uu - K_up K_pp^-1 K_pu, which tells the solid's stability, as there are
+    K has as many more than K_uu - K_up K_pp^-1 K_pu, whose pivots are the solid's stability, as there are
     pressures (Haynsworth, Linear Algebra and its Applications 1, 1968).
     """
 

@@ -62,7 +62,8 @@ class DisplacementSpace:
 
     Attributes
     ----------
-    scalar, vector : NGSolve's spaces.
+    scalar : NGSolve's space of one component.
+    vector : NGSolve's space of the displacements.
     node_values : sparse (n_nodes, n_scalar): values at nodes from coefficients.
     coefficients : sparse (n_scalar, n_nodes): coefficients of the interpolation of nodal values.
     coordinates : (n_scalar, 3) coefficients of the position X, m.

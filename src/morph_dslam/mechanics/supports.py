@@ -191,7 +191,9 @@ class PrescribedDisplacement:
     Attributes
     ----------
     on : node set or surface.
-    x, y, z : displacement, m: a number or an expression of parameters.
+    x : displacement, m: a number or an expression of parameters.
+    y : displacement likewise.
+    z : displacement likewise.
     """
 
     on: str

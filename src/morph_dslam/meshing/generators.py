@@ -150,7 +150,8 @@ class Collar:
 
     Attributes
     ----------
-    start, stop : where it begins and ends, as fractions of the profile's length; moved to the nearest cells.
+    start : where it begins, as a fraction of the profile's length; moved to the nearest cells.
+    stop : where it ends, likewise.
     thickness : what it adds to the wall, metres.
     layers : cells through that thickness.
     """

@@ -20,7 +20,7 @@ SMALLEST_INCREMENT = 1.0 / 64.0
 
 @runtime_checkable
 class History(Protocol):
-    """Equations whose response depends on the path (internal variables): told of each accepted solution."""
+    """Equations whose response depends on the path (internal variables): each accepted solution advances it."""
 
     def advance_history(self, x: Array, mu: Array) -> None: ...
 

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.util import find_spec
-from typing import Any, Protocol
+from typing import Any
 
 import ngsolve as ngs
 import numpy as np
@@ -146,7 +146,7 @@ class SparseCholesky:
 
 
 class SuperLU:
-    """Scipy's SuperLU, with partial pivoting: the slowest and the safest; it tells no inertia."""
+    """Scipy's SuperLU, with partial pivoting: the slowest and the safest; it gives no inertia."""
 
     negative_pivots = None
 
@@ -177,13 +177,8 @@ REFINEMENTS = 4
 ENVIRONMENT_VARIABLE = "MORPH_LINEAR_SOLVER"
 
 
-class Engine(Protocol):
-    """One library's factorisation of a square matrix; `factorise` replaces the one before."""
-
-    def factorise(self, matrix: Matrix) -> None: ...
-    def solve(self, right: Array) -> Array: ...
-    @property
-    def negative_pivots(self) -> int | None: ...
+#: One library's factorisation of a square matrix; `factorise` replaces the one before.
+_Engine = Pardiso | SparseCholesky | SuperLU
 
 
 def default_engine() -> str:
@@ -243,7 +238,7 @@ class _FreeBlock:
 
 
 def multiply(matrix: Matrix, vectors: Array, triangular: bool) -> Array:
-    """Matrix times ``vectors`` (n,) or (n, k), of a symmetric matrix stored as one triangle if so told."""
+    """Matrix times ``vectors`` (n,) or (n, k), of a symmetric matrix stored as one triangle if ``triangular``."""
     product = matrix @ vectors
     if triangular:
         diagonal = matrix.diagonal()
@@ -270,7 +265,7 @@ class Factorisation:
 
     @property
     def negative_pivots(self) -> int | None:
-        """Number of negative eigenvalues of K_ff (Sylvester's law of inertia); None if it cannot be told."""
+        """Number of negative eigenvalues of K_ff (Sylvester's law of inertia); None if it is not known."""
         return self._solver.engine.negative_pivots if self._matrix.shape[0] else 0
 
     def solve(self, right: Array) -> Array:
@@ -334,7 +329,7 @@ class LinearSolver:
     ) -> None:
         self.free, self.symmetric = np.asarray(free, dtype=bool), symmetric
         if (engine or default_engine()) == "pardiso":
-            self.engine: Engine = Pardiso(symmetric, threads)
+            self.engine: _Engine = Pardiso(symmetric, threads)
         else:
             self.engine = SparseCholesky() if symmetric else SuperLU(triangular=False)
         self._block: _FreeBlock | None = None
@@ -377,7 +372,7 @@ class LinearSolver:
             self._triangle = matrix.indices, one_sided
         return self._triangle[1]
 
-    def engines_to_try(self, matrix: Matrix) -> Iterator[Engine]:
+    def engines_to_try(self, matrix: Matrix) -> Iterator[_Engine]:
         """The engine, then (lazily, once for each matrix) SuperLU in its place."""
         yield self.engine
         if self._substitute is None:
