@@ -1,14 +1,15 @@
-"""Lens distortion: where a lens images a direction, and the direction that it images at a point.
+"""The camera: projection, its derivative, and the way between recorded and undistorted images.
 
-Both models map points of the camera frame to the image plane at unit focal length; intrinsics then give
-pixels. Coefficients and their order are OpenCV's.
+Pixel (0, 0) is the centre of the first pixel. The camera looks along +z, x to the right, y down. Tracking works on
+undistorted images, whatever the lens, so `Camera.project` is the ideal pinhole's; `project_recorded` says where a
+point is in the image as recorded. Lens coefficients and their order are OpenCV's.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, Literal, Protocol
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -21,50 +22,27 @@ Array = NDArray[np.float64]
 
 LensModel = Literal["radial-tangential", "fisheye"]
 
+#: For `cv2.remap`: where each pixel of an image comes from.
+Maps = tuple[NDArray, NDArray]
+
 #: Newton stops when the image point is met to this distance at unit focal length, 1e-7 px at 1000 px.
 TOLERANCE = 1e-10
 
 MOST_ITERATIONS = 50
 
-
-class Lens(Protocol):
-    """What every lens model offers."""
-
-    def image(self, points: Array) -> Array:
-        """Image points (n, 2) at unit focal length of points (n, 3) in the camera frame; NaN where unseen."""
-        ...
-
-    def image_jacobian(self, points: Array) -> Array:
-        """Derivative (n, 2, 3) of `image` with respect to the points, per metre."""
-        ...
-
-    def ideal(self, image_points: Array) -> Array:
-        """Pinhole image points (n, 2) at unit focal length of the recorded ones (n, 2).
-
-        NaN where no direction within a right angle of the axis is imaged, or only one beyond the angle at
-        which the distortion folds the image over, where coefficients mean nothing.
-        """
-        ...
+#: Numbers of coefficients of each lens model.
+COUNTS: dict[str, tuple[int, ...]] = {"radial-tangential": (4, 5, 8), "fisheye": (4,)}
 
 
-@dataclass(frozen=True)
-class RadialTangential:
-    """Brown's radial and tangential distortion (Brown 1966) with OpenCV's rational extension.
+class _RadialTangential:
+    """Brown's radial and tangential distortion (1966) with OpenCV's rational extension, at unit focal length."""
 
-    Attributes
-    ----------
-    coefficients : k1, k2, p1, p2[, k3[, k4, k5, k6]].
-    """
-
-    coefficients: tuple[float, ...]
-    counts: ClassVar[tuple[int, ...]] = (4, 5, 8)
-
-    def _padded(self) -> tuple[float, ...]:
-        return (*self.coefficients, *([0.0] * (8 - len(self.coefficients))))
+    def __init__(self, coefficients: tuple[float, ...]) -> None:
+        self._coefficients = (*coefficients, *([0.0] * (8 - len(coefficients))))
 
     def image(self, points: Array) -> Array:
-        """See `Lens`; points that are not in front have no image."""
-        k1, k2, p1, p2, k3, k4, k5, k6 = self._padded()
+        """Image points (n, 2) of points (n, 3) in the camera frame; NaN for those not in front."""
+        k1, k2, p1, p2, k3, k4, k5, k6 = self._coefficients
         depth = np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
         x, y = points[:, 0] / depth, points[:, 1] / depth
         s = x * x + y * y
@@ -76,65 +54,52 @@ class RadialTangential:
             ]
         )
 
-    def image_jacobian(self, points: Array) -> Array:
-        """See `Lens`."""
-        k1, k2, p1, p2, k3, k4, k5, k6 = self._padded()
-        z = points[:, 2]
-        x, y = points[:, 0] / z, points[:, 1] / z
-        s = x * x + y * y
-        above, below = 1.0 + s * (k1 + s * (k2 + s * k3)), 1.0 + s * (k4 + s * (k5 + s * k6))
-        radial = above / below
-        slope = (k1 + s * (2.0 * k2 + 3.0 * s * k3) - radial * (k4 + s * (2.0 * k5 + 3.0 * s * k6))) / below
-        plane = np.empty((len(points), 2, 2))
-        plane[:, 0, 0] = radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
-        plane[:, 0, 1] = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
-        plane[:, 1, 0] = plane[:, 0, 1]
-        plane[:, 1, 1] = radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
-        result = np.empty((len(points), 2, 3))
-        result[:, :, :2] = plane / z[:, None, None]
-        result[:, :, 2] = -np.einsum("nij,nj->ni", plane, np.column_stack([x, y])) / z[:, None]
-        return result
-
     def ideal(self, image_points: Array) -> Array:
-        """See `Lens`; by Newton's method from the recorded points."""
+        """Pinhole image points (n, 2) of recorded ones (n, 2), by Newton's method from these.
+
+        NaN beyond the radius at which the distortion folds the image over, where coefficients mean nothing.
+        """
         points = np.column_stack([image_points, np.ones(len(image_points))]).astype(float)
         with np.errstate(all="ignore"):
             for _ in range(MOST_ITERATIONS):
                 residual = self.image(points) - image_points
                 if not (np.abs(residual) > TOLERANCE).any():
                     break
-                points[:, :2] -= _solve(self.image_jacobian(points)[:, :, :2], residual)
+                (a, b), (c, d) = self._slopes(points)
+                determinant, (u, v) = a * d - b * c, residual.T
+                points[:, :2] -= np.column_stack([d * u - b * v, a * v - c * u]) / determinant[:, None]
             missed = np.abs(self.image(points) - image_points).max(axis=1)
-            plane = self.image_jacobian(points)[:, :, :2]
-            determinant, trace = np.linalg.det(plane), np.trace(plane, axis1=1, axis2=2)
+            (a, b), (c, d) = self._slopes(points)
             # A negative determinant or trace: a solution on the far side of the fold.
-            good = (missed <= 1e3 * TOLERANCE) & (determinant > 0.0) & (trace > 0.0)
+            good = (missed <= 1e3 * TOLERANCE) & (a * d - b * c > 0.0) & (a + d > 0.0)
         return np.where(good[:, None], points[:, :2], np.nan)
 
+    def _slopes(self, points: Array) -> Array:
+        """Derivatives (2, 2, n) of image points by ideal ones, by central differences."""
+        steps = 1e-6 * np.eye(3)[:2]
+        by = [(self.image(points + step) - self.image(points - step)) / 2e-6 for step in steps]
+        return np.array(by).transpose(2, 0, 1)
 
-@dataclass(frozen=True)
-class Equidistant:
-    """The fisheye of Kannala and Brandt (2006): the angle from the axis, corrected, is the image radius.
 
-    It images directions of more than a right angle from the axis as well.
+class _Fisheye:
+    """The fisheye of Kannala and Brandt (2006) at unit focal length: the corrected angle is the image radius.
 
-    Attributes
-    ----------
-    coefficients : k1, k2, k3, k4 of angle * (1 + k1 angle^2 + k2 angle^4 + k3 angle^6 + k4 angle^8).
+    The radius is angle (1 + k1 angle^2 + k2 angle^4 + k3 angle^6 + k4 angle^8). It images directions of more than a
+    right angle from the axis as well.
     """
 
-    coefficients: tuple[float, ...]
-    counts: ClassVar[tuple[int, ...]] = (4,)
+    def __init__(self, coefficients: tuple[float, ...]) -> None:
+        self._coefficients = coefficients
 
     def _radius(self, angle: Array) -> tuple[Array, Array]:
         """Image radius (n,) and its derivative by the angle (n,)."""
-        k1, k2, k3, k4 = self.coefficients
+        k1, k2, k3, k4 = self._coefficients
         s = angle * angle
         radius = angle * (1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4))))
         return radius, 1.0 + s * (3.0 * k1 + s * (5.0 * k2 + s * (7.0 * k3 + s * 9.0 * k4)))
 
     def image(self, points: Array) -> Array:
-        """See `Lens`."""
+        """Image points (n, 2) of points (n, 3) in the camera frame; NaN straight behind it."""
         x, y, z = points.T
         distance = np.hypot(x, y)
         radius, _ = self._radius(np.arctan2(distance, z))
@@ -143,27 +108,11 @@ class Equidistant:
             scale = np.where(distance > 0.0, radius / distance, np.where(z > 0.0, 1.0 / z, np.nan))
         return np.column_stack([scale * x, scale * y])
 
-    def image_jacobian(self, points: Array) -> Array:
-        """See `Lens`."""
-        x, y, z = points.T
-        # The limit on the axis is smooth; this distance is far below what float64 resolves of the result.
-        distance = np.maximum(np.hypot(x, y), 1e-9 * np.abs(z))
-        squared = distance**2 + z**2
-        radius, slope = self._radius(np.arctan2(distance, z))
-        along, across = slope * z / squared, radius / distance
-        cosine, sine = x / distance, y / distance
-        result = np.empty((len(points), 2, 3))
-        result[:, 0, 0] = along * cosine**2 + across * sine**2
-        result[:, 0, 1] = result[:, 1, 0] = (along - across) * cosine * sine
-        result[:, 1, 1] = along * sine**2 + across * cosine**2
-        result[:, 0, 2] = -slope * distance / squared * cosine
-        result[:, 1, 2] = -slope * distance / squared * sine
-        on_axis = (x == 0.0) & (y == 0.0)
-        result[on_axis, 0, 0] = result[on_axis, 1, 1] = 1.0 / z[on_axis]
-        return result
-
     def ideal(self, image_points: Array) -> Array:
-        """See `Lens`; by Newton's method for the angle, as OpenCV does."""
+        """Pinhole image points (n, 2) of recorded ones (n, 2), by Newton's method for the angle, as OpenCV does.
+
+        NaN where no direction within a right angle of the axis is imaged, and beyond the fold.
+        """
         distance = np.linalg.norm(image_points, axis=1)
         angle = np.minimum(distance, 0.5 * np.pi)
         with np.errstate(all="ignore"):
@@ -179,59 +128,18 @@ class Equidistant:
         return np.where(good[:, None], scale[:, None] * image_points, np.nan)
 
 
-LENSES: dict[LensModel, type[RadialTangential] | type[Equidistant]] = {
-    "radial-tangential": RadialTangential,
-    "fisheye": Equidistant,
-}
-
-
-def make_lens(model: LensModel, coefficients: tuple[float, ...]) -> Lens | None:
-    """The lens with these coefficients, None for the ideal pinhole.
-
-    Raises
-    ------
-    CameraError
-        If the model is unknown or takes another number of coefficients.
-    """
-    if model not in LENSES:
-        raise CameraError(f"unknown lens model '{model}'; use one of {', '.join(LENSES)}")
-    kind = LENSES[model]
-    if model == "radial-tangential" and not coefficients:
-        return None
-    if len(coefficients) not in kind.counts:
-        counts = " or ".join(str(count) for count in kind.counts)
-        none = ", or none" if model == "radial-tangential" else ""
-        raise CameraError(f"{model} distortion has {len(coefficients)} values; give {counts}{none}")
-    return kind(coefficients)
-
-
-def _solve(jacobian: Array, residual: Array) -> Array:
-    """Solutions (n, 2) of 2x2 systems."""
-    a, b, c, d = jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 1, 0], jacobian[:, 1, 1]
-    determinant = a * d - b * c
-    return np.column_stack(
-        [
-            (d * residual[:, 0] - b * residual[:, 1]) / determinant,
-            (a * residual[:, 1] - c * residual[:, 0]) / determinant,
-        ]
-    )
-
-
-# The camera: projection, its derivative, and the way between recorded and undistorted images.
-# Pixel (0, 0) is the centre of the first pixel. The camera looks along +z, x to the right, y down.
-# The online part works on undistorted images, whatever the lens, so `project` is the ideal pinhole's and
-# `undistortion_maps` prepares the images; `project_recorded` says where a point is in the image as recorded.
-
-
 @dataclass(frozen=True)
 class Camera:
     """The intrinsics of a camera, in pixels, and its lens.
 
     Attributes
     ----------
-    distortion : k1, k2, p1, p2[, k3[, k4, k5, k6]] of a radial-tangential lens, empty for none; k1, k2, k3,
-        k4 of a fisheye (`morph_dslam.lens`).
-    lens_model : "radial-tangential", or "fisheye" for the equidistant model.
+    width, height : of the images
+    fx, fy : focal lengths
+    cx, cy : principal point
+    distortion : k1, k2, p1, p2[, k3[, k4, k5, k6]] of a radial-tangential lens, empty for none; k1, k2, k3, k4 of a
+        fisheye
+    lens_model : "radial-tangential", or "fisheye" for the equidistant model
 
     Raises
     ------
@@ -249,12 +157,20 @@ class Camera:
     lens_model: LensModel = "radial-tangential"
 
     def __post_init__(self) -> None:
-        make_lens(self.lens_model, self.distortion)
+        model, counts, n = self.lens_model, COUNTS.get(self.lens_model), len(self.distortion)
+        if counts is None:
+            raise CameraError(f"unknown lens model '{model}'; use one of {', '.join(COUNTS)}")
+        may_be_none = model == "radial-tangential"
+        if n not in counts and (n or not may_be_none):
+            known = " or ".join(str(count) for count in counts) + (", or none" if may_be_none else "")
+            raise CameraError(f"{model} distortion has {n} values; give {known}")
 
     @cached_property
-    def lens(self) -> Lens | None:
+    def _lens(self) -> _RadialTangential | _Fisheye | None:
         """The lens, None where recorded images are the ideal pinhole's."""
-        return make_lens(self.lens_model, self.distortion)
+        if not self.distortion:
+            return None
+        return (_Fisheye if self.lens_model == "fisheye" else _RadialTangential)(self.distortion)
 
     @property
     def matrix(self) -> Array:
@@ -289,15 +205,9 @@ class Camera:
 
     def project_recorded(self, points: Array) -> Array:
         """Pixels (n, 2), in the image as recorded, of points (n, 3) in the camera frame; NaN where unseen."""
-        if self.lens is None:
+        if self._lens is None:
             return self.project(points)
-        return self._pixels(self.lens.image(points))
-
-    def recorded_jacobian(self, points: Array) -> Array:
-        """Derivative (n, 2, 3) of `project_recorded` with respect to the points, pixels per metre."""
-        if self.lens is None:
-            return self.projection_jacobian(points)
-        return self.lens.image_jacobian(points) * np.array([[self.fx], [self.fy]])
+        return self._pixels(self._lens.image(points))
 
     def distort_pixels(self, pixels: Array) -> Array:
         """Pixels (n, 2), in the image as recorded, of the same points in the undistorted image."""
@@ -309,25 +219,31 @@ class Camera:
         NaN where the lens images nothing that a pinhole could see.
         """
         pixels = np.asarray(pixels, dtype=float)
-        if self.lens is None:
+        if self._lens is None:
             return pixels
-        return self._pixels(self.lens.ideal(self.rays(pixels)[:, :2]))
+        return self._pixels(self._lens.ideal(self.rays(pixels)[:, :2]))
 
     def _pixels(self, image_points: Array) -> Array:
         """Pixels (n, 2) of image points (n, 2) at unit focal length."""
         return image_points * np.array([self.fx, self.fy]) + np.array([self.cx, self.cy])
 
-    def undistortion_maps(self) -> tuple[NDArray, NDArray] | None:
+    def undistortion_maps(self) -> Maps | None:
         """Maps for `cv2.remap` that undistort an image, or None when there is nothing to undistort.
 
         The undistorted image has the size and the intrinsics of the recorded one.
         """
-        if self.lens is None:
-            return None
+        return None if self._lens is None else self.maps_of(self.pixel_rays)
+
+    @property
+    def pixel_rays(self) -> Array:
+        """Directions (h * w, 3) with z = 1 of all pixels of the undistorted image, row by row."""
         rows, columns = np.mgrid[: self.height, : self.width]
-        pixels = self.distort_pixels(np.column_stack([columns.ravel(), rows.ravel()]))
-        maps = pixels.astype(np.float32).reshape(self.height, self.width, 2)
-        return cv2.convertMaps(maps, None, cv2.CV_16SC2)  # type: ignore[call-overload]
+        return self.rays(np.column_stack([columns.ravel(), rows.ravel()]).astype(float))
+
+    def maps_of(self, rays: Array) -> Maps:
+        """Maps that take each pixel from where the camera records its ray (h * w, 3)."""
+        pixels = self.project_recorded(rays).astype(np.float32).reshape(self.height, self.width, 2)
+        return cv2.convertMaps(pixels, None, cv2.CV_16SC2)  # type: ignore[call-overload]
 
     def check_image(self, image: NDArray, where: str) -> None:
         """Raise CameraError unless ``image`` (height, width, ...) has the calibrated size."""
@@ -337,32 +253,6 @@ class Camera:
                 f"{where} is {width}x{height} pixels but the camera file is for {self.width}x{self.height}: "
                 "use the calibration of this camera at this size, or resize the images"
             )
-
-
-# Stereo pairs: two cameras that are fixed to each other, and the images that share their rows.
-
-
-@dataclass(frozen=True)
-class RectifiedPair:
-    """Images in which a point has the same row, and disparity tells its depth.
-
-    Attributes
-    ----------
-    camera : the ideal pinhole of both images. baseline : distance of the cameras, metres.
-    rectified_from_left : rotation (3, 3) from the left camera's frame to the rectified one.
-    left_maps, right_maps : for `cv2.remap`, from recorded images to rectified ones.
-    """
-
-    camera: Camera
-    baseline: float
-    rectified_from_left: Array
-    left_maps: tuple[NDArray, NDArray]
-    right_maps: tuple[NDArray, NDArray]
-
-    def depth(self, disparity: Array) -> Array:
-        """Depth, metres, of disparities, left minus right column, pixels; infinite where not positive."""
-        positive = np.where(disparity > 0.0, disparity, np.nan)
-        return np.where(disparity > 0.0, self.camera.fx * self.baseline / positive, np.inf)
 
 
 @dataclass(frozen=True)
@@ -378,8 +268,12 @@ class StereoCamera:
         """Distance between the centres of the cameras, metres."""
         return float(np.linalg.norm(self.right_from_left.translation))
 
-    def rectify(self) -> RectifiedPair:
+    def rectify(self) -> tuple[Camera, Maps, Maps]:
         """Turn both cameras until their rows coincide, by the smallest turns (Fusiello et al. 2000).
+
+        Returns
+        -------
+        The ideal pinhole of both rectified images, and the maps for `cv2.remap` from the left and the right image.
 
         Raises
         ------
@@ -396,10 +290,8 @@ class StereoCamera:
         focal = float(np.mean([*left.intrinsics[:2], *right.intrinsics[:2]]))
         centre = 0.5 * (left.intrinsics[2:] + right.intrinsics[2:])
         camera = Camera(left.width, left.height, focal, focal, float(centre[0]), float(centre[1]))
-        rays = camera.rays(_pixel_grid(camera))
-        left_rays = rays @ rotation
-        right_rays = left_rays @ self.right_from_left.rotation.T
-        return RectifiedPair(camera, self.baseline, rotation, _maps(left, left_rays), _maps(right, right_rays))
+        left_rays = camera.pixel_rays @ rotation
+        return camera, left.maps_of(left_rays), right.maps_of(left_rays @ self.right_from_left.rotation.T)
 
     def _rectified_from_left(self) -> Array:
         """The rotation whose x axis points to the right camera and whose z axis is between both cameras'."""
@@ -416,14 +308,3 @@ class StereoCamera:
         y = np.cross(z, x)
         y /= np.linalg.norm(y)
         return np.stack([x, y, np.cross(x, y)])
-
-
-def _pixel_grid(camera: Camera) -> Array:
-    rows, columns = np.mgrid[: camera.height, : camera.width]
-    return np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
-
-
-def _maps(camera: Camera, rays: Array) -> tuple[NDArray, NDArray]:
-    """Maps for `cv2.remap` that take each pixel from where the camera recorded its ray."""
-    pixels = camera.project_recorded(rays).astype(np.float32).reshape(camera.height, camera.width, 2)
-    return cv2.convertMaps(pixels, None, cv2.CV_16SC2)  # type: ignore[call-overload]

@@ -10,7 +10,7 @@ import pytest
 from morph_dslam.cli.app import main
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.io.tables import Landmarks, save_landmarks
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.model import load_model
 from morph_dslam.sources import open_source
 from morph_dslam.tracking.multi_camera import RigTracker

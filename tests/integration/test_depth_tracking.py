@@ -7,7 +7,7 @@ import pytest
 from morph_dslam.cli.app import main
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.io.camera_files import save_camera
-from morph_dslam.io.tables import Landmarks, save_landmarks
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.model import save_model
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_depth, sheet_state

@@ -12,7 +12,7 @@ from morph_dslam.errors import RegistrationError, TrackingError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_exp
 from morph_dslam.io.camera_files import save_camera
-from morph_dslam.io.tables import Landmarks, save_landmarks
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.model import SurfacePoints, save_model
 from morph_dslam.registration.board import BoardStart, FiducialBoard, load_board, locate_board
 from morph_dslam.registration.guess import GuessFile, GuessStart, PictureStart, load_picture

@@ -9,7 +9,7 @@ from morph_dslam.cli.app import main
 from morph_dslam.errors import RegistrationError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.io.tables import Landmarks, save_landmarks
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.model import save_model
 from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.multi_camera import RigCamera, RigTracker

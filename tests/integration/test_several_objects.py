@@ -8,7 +8,7 @@ from morph_dslam.cli.app import main
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.camera_files import save_camera
-from morph_dslam.io.tables import Landmarks, save_landmarks
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.model import save_model
 from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.estimator import State

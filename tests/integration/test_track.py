@@ -12,7 +12,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import CameraError, RegistrationError, SourceError, TrackingError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.io.camera_files import save_camera
-from morph_dslam.io.tables import Landmarks, save_landmarks
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.model import save_model
 from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.track import TrackOptions, track

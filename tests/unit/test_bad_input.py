@@ -14,7 +14,7 @@ from morph_dslam.errors import EvaluationError, MorphError, RegistrationError, T
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.evaluation.run_report import write_run_report
 from morph_dslam.io.camera_files import load_camera
-from morph_dslam.io.tables import load_landmarks
+from morph_dslam.io.landmarks import load_landmarks
 from morph_dslam.io.trajectory import load_trajectory
 from morph_dslam.model import save_model
 from morph_dslam.registration.board import load_board

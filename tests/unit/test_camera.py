@@ -1,13 +1,15 @@
-"""The pinhole camera against OpenCV and finite differences."""
+"""Cameras, lenses and stereo pairs against OpenCV, finite differences and closed forms."""
 
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from morph_dslam.camera import Camera
+from morph_dslam.camera import Camera, StereoCamera
 from morph_dslam.errors import CameraError
+from morph_dslam.geometry import RigidTransform
 
 PLAIN = Camera(640, 480, 528.0, 531.0, 318.5, 241.2)
 BARREL = Camera(640, 480, 528.0, 531.0, 318.5, 241.2, (-0.28, 0.09, 1e-3, -5e-4, 0.02))
@@ -74,23 +76,12 @@ def test_recorded_projection_is_opencvs(camera):
     np.testing.assert_allclose(camera.undistort_pixels(camera.distort_pixels(ideal)), ideal, atol=1e-5)
 
 
-@pytest.mark.parametrize("camera", [PLAIN, BARREL, RATIONAL, FISHEYE])
-def test_recorded_jacobian_by_central_differences(camera):
-    points, step = points_in_view(20), 1e-6
-    jacobian = camera.recorded_jacobian(points)
-    for axis in range(3):
-        offset = step * np.eye(3)[axis]
-        difference = (camera.project_recorded(points + offset) - camera.project_recorded(points - offset)) / (2 * step)
-        np.testing.assert_allclose(jacobian[:, :, axis], difference, rtol=1e-5, atol=1e-4)
-
-
 def test_a_fisheye_sees_more_than_a_pinhole_does():
     # Equidistant with k = 0: the image radius is the angle itself, here 120 degrees to the right.
     lens = Camera(640, 480, 100.0, 100.0, 320.0, 240.0, (0.0, 0.0, 0.0, 0.0), "fisheye")
     aside = np.array([[np.sin(2.0 * np.pi / 3.0), 0.0, np.cos(2.0 * np.pi / 3.0)], [0.0, 0.0, 1.0]])
     expected = [[320.0 + 100.0 * 2.0 * np.pi / 3.0, 240.0], [320.0, 240.0]]
     np.testing.assert_allclose(lens.project_recorded(aside), expected, atol=1e-9)
-    np.testing.assert_allclose(lens.recorded_jacobian(aside)[1], [[100, 0, 0], [0, 100, 0]], atol=1e-9)
     assert np.isnan(lens.undistort_pixels(np.array(expected))[0]).all()
     np.testing.assert_allclose(lens.undistort_pixels(np.array(expected))[1], [320.0, 240.0])
 
@@ -122,20 +113,53 @@ def test_wrong_lenses_are_refused():
         Camera(640, 480, 500.0, 500.0, 320.0, 240.0, (), "fisheye")
 
 
-def test_undistortion_maps_bring_a_distorted_dot_to_its_ideal_pixel():
-    point = np.array([[0.25, -0.15, 1.0]])
-    dot, ideal = opencv_pixels(BARREL, point)[0], BARREL.project(point)[0]
-    v, u = np.mgrid[0:480, 0:640]
-    image = np.exp(-((u - dot[0]) ** 2 + (v - dot[1]) ** 2) / (2 * 4.0**2)).astype(np.float32)
-    maps = BARREL.undistortion_maps()
-    assert maps is not None
-    undistorted = cv2.remap(image, *maps, cv2.INTER_LINEAR)
-    found = np.unravel_index(undistorted.argmax(), undistorted.shape)[::-1]
-    assert np.abs(np.array(found) - ideal).max() <= 1.5
-    assert PLAIN.undistortion_maps() is None
-
-
 def test_images_of_another_size_are_refused_by_name():
     PLAIN.check_image(np.zeros((480, 640, 3), np.uint8), "frame 7")
     with pytest.raises(CameraError, match="frame 7 is 480x640 pixels but the camera file is for 640x480"):
         PLAIN.check_image(np.zeros((640, 480), np.uint8), "frame 7")
+
+
+LEFT = Camera(320, 240, 210.0, 212.0, 161.0, 118.0, (-0.28, 0.07, 2e-4, 2e-5))
+RIGHT = Camera(320, 240, 205.0, 204.0, 157.0, 121.0, (0.01, -0.02, 0.003, 0.0), "fisheye")
+# The right camera is 11 cm to the right, a little higher, and turned.
+RIGHT_IN_LEFT = RigidTransform(
+    Rotation.from_euler("xyz", [1.0, -2.0, 0.5], degrees=True).as_matrix(), np.array([0.11, -0.002, 0.001])
+)
+PAIR = StereoCamera(LEFT, RIGHT, RIGHT_IN_LEFT.inverse)
+
+
+def dot_image(camera, point):
+    """A picture of a bright dot at a point (3,) in the camera's frame."""
+    u, v = camera.project_recorded(point[None])[0]
+    rows, columns = np.mgrid[: camera.height, : camera.width]
+    return np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / (2 * 2.0**2)).astype(np.float32)
+
+
+def centre(image):
+    rows, columns = np.mgrid[: image.shape[0], : image.shape[1]]
+    weights = np.where(image > 0.05 * image.max(), image, 0.0)
+    return np.array([(columns * weights).sum(), (rows * weights).sum()]) / weights.sum()
+
+
+@pytest.mark.parametrize("point", [[0.05, 0.0, 1.0], [-0.2, 0.15, 0.8], [0.5, -0.4, 2.0]])
+def test_rectified_images_share_rows_and_disparity_gives_the_point(point):
+    camera, left_maps, right_maps = PAIR.rectify()
+    right_point = PAIR.right_from_left.apply(np.array(point))
+    left = centre(cv2.remap(dot_image(LEFT, np.array(point)), *left_maps, cv2.INTER_LINEAR))
+    right = centre(cv2.remap(dot_image(RIGHT, right_point), *right_maps, cv2.INTER_LINEAR))
+    assert right[1] == pytest.approx(left[1], abs=0.1)
+    # The rectified frame is the left one turned: distances from both centres stay.
+    found = camera.rays(left[None])[0] * camera.fx * PAIR.baseline / (left[0] - right[0])
+    assert np.linalg.norm(found) == pytest.approx(np.linalg.norm(point), rel=0.01)
+    beside = found - [PAIR.baseline, 0.0, 0.0]
+    assert np.linalg.norm(beside) == pytest.approx(np.linalg.norm(right_point), rel=0.01)
+
+
+def test_pairs_that_cannot_be_rectified():
+    with pytest.raises(CameraError, match="is not to the right of the first"):
+        StereoCamera(LEFT, RIGHT, RIGHT_IN_LEFT).rectify()
+    with pytest.raises(CameraError, match="in one place"):
+        StereoCamera(LEFT, RIGHT, RigidTransform.identity()).rectify()
+    small = Camera(160, 120, 100.0, 100.0, 80.0, 60.0)
+    with pytest.raises(CameraError, match="320x240 pixels, the right one 160x120"):
+        StereoCamera(LEFT, small, PAIR.right_from_left).rectify()

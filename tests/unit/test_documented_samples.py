@@ -13,7 +13,7 @@ from morph_dslam import make_study
 from morph_dslam.errors import StudyError
 from morph_dslam.export import StateChoice
 from morph_dslam.io.camera_files import load_camera
-from morph_dslam.io.tables import load_landmarks
+from morph_dslam.io.landmarks import load_landmarks
 from morph_dslam.mechanics.materials.user import UserMaterial
 from morph_dslam.model import Parameter, load_model, save_model
 from morph_dslam.model.inner_structure import save_inner_structure

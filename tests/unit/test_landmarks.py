@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import RegistrationError
-from morph_dslam.io.tables import Landmarks, load_landmarks, save_landmarks
+from morph_dslam.io.landmarks import Landmarks, load_landmarks, save_landmarks
 
 HEADER = "x_mm,y_mm,z_mm,u_px,v_px\n"
 

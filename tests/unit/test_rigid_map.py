@@ -3,8 +3,8 @@
 import meshio
 import numpy as np
 
-from morph_dslam.io.tables import save_ply
 from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, REMOVED, Followed, Keyframe, RigidMap
+from morph_dslam.slam.run import save_ply
 from morph_dslam.slam.tracking import FewTemplates
 
 

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.calibration.board import Board, find_corners, parse_board
+from morph_dslam.calibration.board import Board, View, find_corners, parse_board, select_by_coverage
 from morph_dslam.calibration.calibrate import calibrate
-from morph_dslam.calibration.solve import View, select_by_coverage, solve_intrinsics
+from morph_dslam.calibration.solve import solve_intrinsics
 from morph_dslam.camera import Camera
 from morph_dslam.cli import app as cli
 from morph_dslam.errors import CameraError

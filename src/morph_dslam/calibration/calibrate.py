@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from morph_dslam.calibration.board import Board
-from morph_dslam.calibration.solve import Solution, Views, collect_views, solve_intrinsics
+from morph_dslam.calibration.board import Board, Views, collect_views
+from morph_dslam.calibration.solve import Solution, solve_intrinsics
 from morph_dslam.camera import LensModel
 from morph_dslam.errors import CameraError
 from morph_dslam.io.camera_files import save_camera

@@ -1,6 +1,6 @@
 """Landmarks, and registration of a model in a map with its run folder."""
 
-from morph_dslam.io.tables import Landmarks, load_landmarks
+from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.registration.run import registration_line, run_registration
 from morph_dslam.registration.start import InitializerFiles
 

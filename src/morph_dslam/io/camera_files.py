@@ -1,4 +1,9 @@
-"""YAML files that users bring, OpenCV's dialect included."""
+"""Camera files: a small YAML of intrinsics, and the calibrations of other programs.
+
+The keys of our own are width, height, fx, fy, cx, cy, optionally distortion ([k1, k2, p1, p2, k3], OpenCV's order) and
+lens (radial-tangential, or fisheye with k1, k2, k3, k4). Formats of other programs are recognised by the keys that only
+they have, and translated to these.
+"""
 
 from __future__ import annotations
 
@@ -8,66 +13,37 @@ from typing import Any, cast
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from morph_dslam.camera import Camera, LensModel, StereoCamera
 from morph_dslam.errors import CameraError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.colmap import read_cameras
+from morph_dslam.io.text import read_text
 
-
-class _Loader(yaml.SafeLoader):
-    """A safe loader that reads `!!opencv-matrix` as the mapping it holds."""
-
-
-def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> dict:
-    assert isinstance(node, yaml.MappingNode)
-    return loader.construct_mapping(node, deep=True)
-
-
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
-
-
-def read_opencv_yaml(path: Path) -> object:
-    """The content of a YAML file, which may have OpenCV's header `%YAML:1.0` and its matrices.
-
-    Raises
-    ------
-    CameraError
-        If the file cannot be read or is not YAML.
-    """
-    try:
-        text = path.read_text()
-    except OSError as error:
-        raise CameraError(f"cannot read the camera file {path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise CameraError(f"{path} is not a YAML file: {error}") from error
-    lines = text.splitlines()
-    if lines and lines[0].startswith("%YAML:"):
-        # YAML writes this directive with a space, and a document that follows one begins with ---.
-        lines = lines[1:]
-    try:
-        return yaml.load("\n".join(lines), Loader=_Loader)
-    except yaml.YAMLError as error:
-        raise CameraError(f"{path} is not a YAML file: {' '.join(str(error).split())}") from error
-
-
-# Camera files: a small YAML of intrinsics, and the calibrations of other programs.
-# width: 640
-# height: 480
-# fx: 528.0
-# fy: 528.0
-# cx: 320.0
-# cy: 240.0
-# distortion: [k1, k2, p1, p2, k3]   # optional, OpenCV's order
-# lens: radial-tangential            # optional; fisheye for OpenCV's fisheye, with k1, k2, k3, k4
-
+Mapping = dict[str, Any]
 
 #: No focal length or principal point is meant by what is larger, pixels.
 LARGEST_PX = 1e7
+
 #: Image sides of more pixels are refused before memory is asked for them.
 LARGEST_SIDE_PX = 65_535
+
+#: Names of distortion models in ROS, Kalibr and EuRoC files. A name with None stands for no distortion.
+DISTORTION_MODELS = {
+    "plumb_bob": "radial-tangential",
+    "rational_polynomial": "radial-tangential",
+    "radial-tangential": "radial-tangential",
+    "radtan": "radial-tangential",
+    "equidistant": "fisheye",
+    "fisheye": "fisheye",
+    "none": None,
+    "": None,
+}
+
+_MATRIX_NAMES = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "k", "M1")
+
+_DISTORTION_NAMES = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D", "d", "D1")
 
 
 class _CameraFile(BaseModel):
@@ -82,12 +58,24 @@ class _CameraFile(BaseModel):
     lens: str = "radial-tangential"
 
 
+class _Loader(yaml.SafeLoader):
+    """A safe loader that reads `!!opencv-matrix` as the mapping it holds."""
+
+
+def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> dict:
+    assert isinstance(node, yaml.MappingNode)
+    return loader.construct_mapping(node, deep=True)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
+
+
 def load_camera(path: str | Path) -> Camera:
     """Read a camera file, or a calibration by OpenCV, ROS, ORB-SLAM, Kalibr, EuRoC or COLMAP (cameras.txt).
 
     Parameters
     ----------
-    path : the file. In one with several cameras, `file#name` chooses: `camchain.yaml#cam1`, `cameras.txt#2`.
+    path : the file; in one with several cameras, `file#name` chooses: `camchain.yaml#cam1`, `cameras.txt#2`
 
     Raises
     ------
@@ -99,37 +87,52 @@ def load_camera(path: str | Path) -> Camera:
     where = str(path) if name is None else f"{path}#{name}"
     if path.suffix == ".txt":
         return parse_camera(_choose(read_cameras(path), name, path), where)
-    content = read_opencv_yaml(path)
+    content = _read_yaml(path)
     chain = _camera_chain(content)
     if chain:
         content = _choose(chain, name, path)
     elif name is not None:
         raise CameraError(f"{path} holds one camera only: leave out #{name}")
-    translate = translator_of(content) if isinstance(content, dict) else None
+    translate = _translator_of(content) if isinstance(content, dict) else None
     return parse_camera(content if translate is None else translate(cast(dict, content), where), where)
 
 
-def _split_name(path: Path) -> tuple[Path, str | None]:
-    """The file and the name of the camera in it, None where none is given."""
-    if path.exists() or "#" not in path.name:
-        return path, None
-    stem, _, name = path.name.rpartition("#")
-    return path.with_name(stem), name
+def load_camera_or_pair(path: str | Path) -> Camera | StereoCamera:
+    """Read a camera, or a stereo pair.
+
+    A pair is a Kalibr camchain with cam0, to the left, and cam1, or EuRoC's `mav0` folder, or the folder that holds
+    it. A camchain of which one camera is chosen, `camchain.yaml#cam0`, is that camera alone.
+
+    Raises
+    ------
+    CameraError
+        As of `load_camera`, or if a pair's file does not say where the cameras are.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return _pair_of_euroc(path)
+    if path.is_file() and path.suffix in (".yaml", ".yml"):
+        content = _read_yaml(path)
+        if isinstance(content, dict) and all(isinstance(content.get(c), dict) for c in ("cam0", "cam1")):
+            (left, _), (right, right_from_left) = _cameras_of_kalibr(path, content, 2)
+            return StereoCamera(left, right, right_from_left)
+    return load_camera(path)
 
 
-def _camera_chain(content: object) -> dict[str, dict]:
-    """The cameras of a Kalibr camchain by name, none where the content is another's."""
-    entries = content.items() if isinstance(content, dict) else ()
-    return {str(name): value for name, value in entries if isinstance(value, dict) and "camera_model" in value}
+def load_rig(path: str | Path) -> list[tuple[Camera, RigidTransform]]:
+    """Read all cameras of a Kalibr camchain, cam0 first, each with camera_from_cam0, metres.
 
-
-def _choose(cameras: dict[str, dict], name: str | None, path: Path) -> dict:
-    if name is None and len(cameras) == 1:
-        return next(iter(cameras.values()))
-    if name not in cameras:
-        names = ", ".join(cameras)
-        raise CameraError(f"{path} holds the cameras {names}: choose one, {path}#{next(iter(cameras))} say")
-    return cameras[name]
+    Raises
+    ------
+    CameraError
+        If the file is missing or malformed, has fewer than two cameras, or does not say where one is.
+    """
+    chain = _read_yaml(Path(path))
+    chain = chain if isinstance(chain, dict) else {}
+    count = sum(str(name).startswith("cam") for name in chain)
+    if count < 2 or not all(isinstance(chain.get(f"cam{n}"), dict) for n in range(count)):
+        raise CameraError(f"{path} is no rig: a Kalibr camchain of several cameras has cam0, cam1 and so on")
+    return _cameras_of_kalibr(Path(path), chain, count)
 
 
 def parse_camera(content: object, where: str) -> Camera:
@@ -164,34 +167,151 @@ def save_camera(path: Path, camera: Camera) -> None:
     path.write_text(yaml.safe_dump(content, sort_keys=False))
 
 
-# Camera calibrations of other programs, translated to the keys of this project's camera files.
-# Each format is recognised by the keys that only it has. What a translator returns is checked by
-# `morph_dslam.io.camera_files.parse_camera` like a camera file of our own.
+def _read_yaml(path: Path) -> object:
+    """The content of a YAML file, which may have OpenCV's header `%YAML:1.0` and its matrices."""
+    lines = read_text(path, "camera file", CameraError).splitlines()
+    if lines and lines[0].startswith("%YAML:"):
+        # YAML writes this directive with a space, and a document that follows one begins with ---.
+        lines = lines[1:]
+    try:
+        return yaml.load("\n".join(lines), Loader=_Loader)
+    except yaml.YAMLError as error:
+        raise CameraError(f"{path} is not a YAML file: {' '.join(str(error).split())}") from error
 
 
-Mapping = dict[str, Any]
-
-#: Names of distortion models in ROS, Kalibr and EuRoC files. A name with None stands for no distortion.
-DISTORTION_MODELS = {
-    "plumb_bob": "radial-tangential",
-    "rational_polynomial": "radial-tangential",
-    "radial-tangential": "radial-tangential",
-    "radtan": "radial-tangential",
-    "equidistant": "fisheye",
-    "fisheye": "fisheye",
-    "none": None,
-    "": None,
-}
+def _split_name(path: Path) -> tuple[Path, str | None]:
+    """The file and the name of the camera in it, None where none is given."""
+    if path.exists() or "#" not in path.name:
+        return path, None
+    stem, _, name = path.name.rpartition("#")
+    return path.with_name(stem), name
 
 
-def numbers(value: object, count: int | None, what: str) -> list[float]:
-    """A list of numbers, given as one, as rows, or as a matrix mapping with ``data``.
+def _camera_chain(content: object) -> dict[str, dict]:
+    """The cameras of a Kalibr camchain by name, none where the content is another's."""
+    entries = content.items() if isinstance(content, dict) else ()
+    return {str(name): value for name, value in entries if isinstance(value, dict) and "camera_model" in value}
 
-    Raises
-    ------
-    CameraError
-        If it is none of these, or has another ``count``.
-    """
+
+def _choose(cameras: dict[str, dict], name: str | None, path: Path) -> dict:
+    if name is None and len(cameras) == 1:
+        return next(iter(cameras.values()))
+    if name not in cameras:
+        names = ", ".join(cameras)
+        raise CameraError(f"{path} holds the cameras {names}: choose one, {path}#{next(iter(cameras))} say")
+    return cameras[name]
+
+
+def _cameras_of_kalibr(path: Path, chain: Mapping, count: int) -> list[tuple[Camera, RigidTransform]]:
+    """Cameras of a camchain, each with camera_from_cam0."""
+    cameras, pose = [], RigidTransform.identity()
+    for number in range(count):
+        where, entry = f"{path}#cam{number}", chain[f"cam{number}"]
+        if number:
+            pose = _transform(entry.get("T_cn_cnm1"), f"{where}: T_cn_cnm1") @ pose
+        cameras.append((parse_camera(_from_kalibr(entry, where), where), pose))
+    return cameras
+
+
+def _pair_of_euroc(folder: Path) -> StereoCamera:
+    base = folder / "mav0" if (folder / "mav0").is_dir() else folder
+    cameras, poses = [], []
+    for name in ("cam0", "cam1"):
+        file = base / name / "sensor.yaml"
+        content = _read_yaml(file)
+        if not isinstance(content, dict):
+            raise CameraError(f"{file} holds no camera")
+        cameras.append(parse_camera(_from_kalibr(content, str(file)), str(file)))
+        poses.append(_transform(content.get("T_BS"), f"{file}: T_BS"))
+    return StereoCamera(cameras[0], cameras[1], poses[1].inverse @ poses[0])
+
+
+def _transform(value: object, what: str) -> RigidTransform:
+    """A rigid transform of sixteen numbers, row by row."""
+    matrix = np.array(_numbers(value, 16, what)).reshape(4, 4)
+    if not np.isfinite(matrix).all():
+        raise CameraError(f"{what} holds a value that is not finite")
+    u, singular, vt = np.linalg.svd(matrix[:3, :3])
+    if np.abs(singular - 1.0).max() > 1e-3 or np.linalg.det(u @ vt) < 0.0:
+        raise CameraError(f"{what} is not a rotation and a translation")
+    return RigidTransform(u @ vt, matrix[:3, 3])
+
+
+def _translator_of(content: Mapping) -> Callable[[Mapping, str], Mapping] | None:
+    """The translator for a file with these keys, None for a camera file of our own."""
+    keys = content.keys()
+    if any(str(key).startswith(("Camera.", "Camera1.")) for key in keys):
+        return _from_orb_slam
+    if "camera_model" in keys or "intrinsics" in keys:
+        return _from_kalibr
+    if any(name in keys for name in _MATRIX_NAMES):
+        return _from_opencv_or_ros
+    return None
+
+
+def _from_opencv_or_ros(content: Mapping, where: str) -> Mapping:
+    """OpenCV's calibration YAML and ROS's camera_info, which share their names."""
+    if "M2" in content or "K2" in content:
+        raise CameraError(
+            f"{where} is a stereo calibration without single cameras: give the file of one camera, with "
+            "image_width, image_height, camera_matrix and distortion_coefficients"
+        )
+    matrix = _numbers(_first(content, _MATRIX_NAMES), 9, f"{where}: camera matrix")
+    if any(matrix[i] != 0.0 for i in (1, 3, 6, 7)) or matrix[8] != 1.0:
+        raise CameraError(f"{where}: the camera matrix is not [fx 0 cx; 0 fy cy; 0 0 1]: skew is not modelled")
+    values = _first(content, _DISTORTION_NAMES)
+    coefficients = [] if values is None else _numbers(values, None, f"{where}: distortion coefficients")
+    model = content.get("distortion_model")
+    if model is None:
+        model = "fisheye" if content.get("fisheye_model") in (1, True) else "plumb_bob"
+    width = _first(content, ("image_width", "image_Width", "width"))
+    height = _first(content, ("image_height", "image_Height", "height"))
+    if content.get("image_size") is not None:
+        width, height = _numbers(content["image_size"], 2, f"{where}: image_size")
+    _check_size(width, height, where, "image_width: and image_height:")
+    intrinsics = {"fx": matrix[0], "fy": matrix[4], "cx": matrix[2], "cy": matrix[5]}
+    return {"width": width, "height": height, **intrinsics, **_lens_keys(model, coefficients, where)}
+
+
+def _from_orb_slam(content: Mapping, where: str) -> Mapping:
+    """The settings files of ORB-SLAM: `Camera.fx` in versions 1 and 2, `Camera1.fx` in version 3."""
+    prefix = "Camera1" if "Camera1.fx" in content else "Camera"
+    if f"{prefix}.fx" not in content:
+        raise CameraError(f"{where}: {prefix}.fx is missing")
+    width, height = (_first(content, (f"Camera.{name}", f"{prefix}.{name}")) for name in ("width", "height"))
+    _check_size(width, height, where, "Camera.width: and Camera.height:")
+    kind = str(content.get("Camera.type", "PinHole"))
+    kinds = {"PinHole": "plumb_bob", "Pinhole": "plumb_bob", "Rectified": "none", "KannalaBrandt8": "fisheye"}
+    if kind not in kinds:
+        raise CameraError(f"{where}: unknown Camera.type '{kind}'; known are {', '.join(kinds)}")
+    names = ("k1", "k2", "k3", "k4") if kind == "KannalaBrandt8" else ("k1", "k2", "p1", "p2", "k3")
+    given = [content.get(f"{prefix}.{name}", 0.0) for name in names]
+    coefficients = [] if kind == "Rectified" else _numbers(given, len(names), f"{where}: {prefix}.k1 ...")
+    values = {name: content.get(f"{prefix}.{name}") for name in ("fx", "fy", "cx", "cy")}
+    values = {name: value for name, value in values.items() if value is not None}
+    return {"width": width, "height": height, **values, **_lens_keys(kinds[kind], coefficients, where)}
+
+
+def _from_kalibr(content: Mapping, where: str) -> Mapping:
+    """One camera of a Kalibr camchain, or a EuRoC sensor.yaml, which has the same entries."""
+    model = content.get("camera_model")
+    if model != "pinhole":
+        raise CameraError(f"{where}: unknown camera model '{model}'; calibrate with pinhole-radtan or pinhole-equi")
+    fx, fy, cx, cy = _numbers(content.get("intrinsics"), 4, f"{where}: intrinsics")
+    width, height = _numbers(content.get("resolution"), 2, f"{where}: resolution")
+    values = _first(content, ("distortion_coeffs", "distortion_coefficients"))
+    coefficients = [] if values is None else _numbers(values, None, f"{where}: distortion coefficients")
+    lens = _lens_keys(content.get("distortion_model"), coefficients, where)
+    return {"width": int(width), "height": int(height), "fx": fx, "fy": fy, "cx": cx, "cy": cy, **lens}
+
+
+def _check_size(width: object, height: object, where: str, lines: str) -> None:
+    if width is None or height is None:
+        raise CameraError(f"{where} does not say for what image size it is: add the lines {lines}")
+
+
+def _numbers(value: object, count: int | None, what: str) -> list[float]:
+    """A list of numbers, given as one, as rows, or as a matrix mapping with ``data``; CameraError if it is none."""
     if isinstance(value, dict):
         value = value.get("data")
     if isinstance(value, list) and value and all(isinstance(row, list) for row in value):
@@ -206,7 +326,11 @@ def numbers(value: object, count: int | None, what: str) -> list[float]:
     return values
 
 
-def lens_keys(model: object, coefficients: list[float], what: str) -> Mapping:
+def _first(content: Mapping, names: tuple[str, ...]) -> Any:
+    return next((content[name] for name in names if name in content), None)
+
+
+def _lens_keys(model: object, coefficients: list[float], what: str) -> Mapping:
     """The keys of a camera file for a named distortion model; raises CameraError if it is unknown."""
     name = str(model if model is not None else "").lower()
     if name not in DISTORTION_MODELS:
@@ -218,201 +342,7 @@ def lens_keys(model: object, coefficients: list[float], what: str) -> Mapping:
     if lens is None or (lens == "radial-tangential" and not any(coefficients)):
         return {}
     if lens == "radial-tangential":
-        coefficients = _without_zero_tail(coefficients)
+        # Lists padded with zeros: the shortest form that OpenCV knows.
+        counts = (count for count in (4, 5, 8) if len(coefficients) >= count and not any(coefficients[count:]))
+        coefficients = coefficients[: next(counts, None)]
     return {"lens": lens, "distortion": coefficients}
-
-
-def _without_zero_tail(coefficients: list[float]) -> list[float]:
-    """The shortest form that OpenCV knows, 4, 5 or 8 coefficients, of a list padded with zeros."""
-    for count in (4, 5, 8):
-        if len(coefficients) >= count and not any(coefficients[count:]):
-            return coefficients[:count]
-    return coefficients
-
-
-def _from_matrix(matrix: list[float], where: str) -> Mapping:
-    """fx, fy, cx, cy of a row-major intrinsic matrix of nine numbers."""
-    if any(matrix[i] != 0.0 for i in (1, 3, 6, 7)) or matrix[8] != 1.0:
-        raise CameraError(f"{where}: the camera matrix is not [fx 0 cx; 0 fy cy; 0 0 1]: skew is not modelled")
-    return {"fx": matrix[0], "fy": matrix[4], "cx": matrix[2], "cy": matrix[5]}
-
-
-def _first(content: Mapping, names: tuple[str, ...]) -> Any:
-    return next((content[name] for name in names if name in content), None)
-
-
-_MATRIX_NAMES = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "k", "M1")
-_DISTORTION_NAMES = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D", "d", "D1")
-
-
-def _size(content: Mapping, where: str) -> Mapping:
-    width = _first(content, ("image_width", "image_Width", "width"))
-    height = _first(content, ("image_height", "image_Height", "height"))
-    size = content.get("image_size")
-    if size is not None:
-        width, height = numbers(size, 2, f"{where}: image_size")
-    if width is None or height is None:
-        raise CameraError(
-            f"{where} does not say for what image size it is: add the lines image_width: and image_height:"
-        )
-    return {"width": width, "height": height}
-
-
-def from_opencv_or_ros(content: Mapping, where: str) -> Mapping:
-    """OpenCV's calibration YAML and ROS's camera_info, which share their names."""
-    if "M2" in content or "K2" in content:
-        raise CameraError(
-            f"{where} is a stereo calibration without single cameras: give the file of one camera, with "
-            "image_width, image_height, camera_matrix and distortion_coefficients"
-        )
-    matrix = numbers(_first(content, _MATRIX_NAMES), 9, f"{where}: camera matrix")
-    values = _first(content, _DISTORTION_NAMES)
-    coefficients = [] if values is None else numbers(values, None, f"{where}: distortion coefficients")
-    model = content.get("distortion_model")
-    if model is None:
-        model = "fisheye" if content.get("fisheye_model") in (1, True) else "plumb_bob"
-    return {**_size(content, where), **_from_matrix(matrix, where), **lens_keys(model, coefficients, where)}
-
-
-def from_orb_slam(content: Mapping, where: str) -> Mapping:
-    """The settings files of ORB-SLAM: `Camera.fx` in versions 1 and 2, `Camera1.fx` in version 3."""
-    prefix = "Camera1" if "Camera1.fx" in content else "Camera"
-    if f"{prefix}.fx" not in content:
-        raise CameraError(f"{where}: {prefix}.fx is missing")
-    size = [_first(content, (f"Camera.{name}", f"{prefix}.{name}")) for name in ("width", "height")]
-    if None in size:
-        raise CameraError(
-            f"{where} does not say for what image size it is: add the lines Camera.width: and Camera.height:"
-        )
-    kind = str(content.get("Camera.type", "PinHole"))
-    kinds = {"PinHole": "plumb_bob", "Pinhole": "plumb_bob", "Rectified": "none", "KannalaBrandt8": "fisheye"}
-    if kind not in kinds:
-        raise CameraError(f"{where}: unknown Camera.type '{kind}'; known are {', '.join(kinds)}")
-    names = ("k1", "k2", "k3", "k4") if kind == "KannalaBrandt8" else ("k1", "k2", "p1", "p2", "k3")
-    given = [content.get(f"{prefix}.{name}", 0.0) for name in names]
-    coefficients = [] if kind == "Rectified" else numbers(given, len(names), f"{where}: {prefix}.k1 ...")
-    values = {name: content.get(f"{prefix}.{name}") for name in ("fx", "fy", "cx", "cy")}
-    values = {name: value for name, value in values.items() if value is not None}
-    return {"width": size[0], "height": size[1], **values, **lens_keys(kinds[kind], coefficients, where)}
-
-
-def from_kalibr(content: Mapping, where: str) -> Mapping:
-    """One camera of a Kalibr camchain, or a EuRoC sensor.yaml, which has the same entries."""
-    model = content.get("camera_model")
-    if model != "pinhole":
-        raise CameraError(f"{where}: unknown camera model '{model}'; calibrate with pinhole-radtan or pinhole-equi")
-    fx, fy, cx, cy = numbers(content.get("intrinsics"), 4, f"{where}: intrinsics")
-    width, height = numbers(content.get("resolution"), 2, f"{where}: resolution")
-    values = _first(content, ("distortion_coeffs", "distortion_coefficients"))
-    coefficients = [] if values is None else numbers(values, None, f"{where}: distortion coefficients")
-    lens = lens_keys(content.get("distortion_model"), coefficients, where)
-    return {"width": int(width), "height": int(height), "fx": fx, "fy": fy, "cx": cx, "cy": cy, **lens}
-
-
-def translator_of(content: Mapping) -> Callable[[Mapping, str], Mapping] | None:
-    """The translator for a file with these keys, None for a camera file of our own."""
-    keys = content.keys()
-    if any(str(key).startswith(("Camera.", "Camera1.")) for key in keys):
-        return from_orb_slam
-    if "camera_model" in keys or "intrinsics" in keys:
-        return from_kalibr
-    if any(name in keys for name in _MATRIX_NAMES):
-        return from_opencv_or_ros
-    return None
-
-
-# Calibrations of stereo pairs: Kalibr camchains, and EuRoC's folders of two cameras.
-
-
-Array = NDArray[np.float64]
-
-
-def load_stereo(path: Path) -> StereoCamera:
-    """Read a stereo pair, cam0 to the left.
-
-    Parameters
-    ----------
-    path : a Kalibr camchain with cam0 and cam1, or EuRoC's `mav0` folder, or the folder that holds it.
-
-    Raises
-    ------
-    CameraError
-        If a file is missing or malformed, or does not say where the cameras are.
-    """
-    path = Path(path)
-    return _from_euroc(path) if path.is_dir() else _from_kalibr(path)
-
-
-def load_camera_or_pair(path: Path) -> Camera | StereoCamera:
-    """Read what `load_stereo` reads as a pair, anything else as `load_camera` does.
-
-    A camchain of which one camera is chosen, `camchain.yaml#cam0`, is that camera alone.
-
-    Raises
-    ------
-    CameraError
-        As both do.
-    """
-    path = Path(path)
-    if path.is_dir():
-        return _from_euroc(path)
-    if path.is_file() and path.suffix in (".yaml", ".yml"):
-        content = read_opencv_yaml(path)
-        if isinstance(content, dict) and all(isinstance(content.get(c), dict) for c in ("cam0", "cam1")):
-            return _from_kalibr(path)
-    return load_camera(path)
-
-
-def load_rig(path: Path) -> list[tuple[Camera, RigidTransform]]:
-    """Read all cameras of a Kalibr camchain, cam0 first, each with camera_from_cam0, metres.
-
-    Raises
-    ------
-    CameraError
-        If the file is missing or malformed, has fewer than two cameras, or does not say where one is.
-    """
-    chain = read_opencv_yaml(Path(path))
-    chain = chain if isinstance(chain, dict) else {}
-    count = sum(str(name).startswith("cam") for name in chain)
-    if count < 2 or not all(isinstance(chain.get(f"cam{n}"), dict) for n in range(count)):
-        raise CameraError(f"{path} is no rig: a Kalibr camchain of several cameras has cam0, cam1 and so on")
-    cameras, pose = [], RigidTransform.identity()
-    for number in range(count):
-        what, entry = f"{path}#cam{number}", chain[f"cam{number}"]
-        if number:
-            pose = _transform(entry.get("T_cn_cnm1"), f"{what}: T_cn_cnm1") @ pose
-        cameras.append((parse_camera(from_kalibr(entry, what), what), pose))
-    return cameras
-
-
-def _from_kalibr(path: Path) -> StereoCamera:
-    chain = read_opencv_yaml(path)
-    if not isinstance(chain, dict) or not all(isinstance(chain.get(c), dict) for c in ("cam0", "cam1")):
-        raise CameraError(f"{path} holds no stereo pair: a Kalibr camchain has cam0 and cam1")
-    left, right = (parse_camera(from_kalibr(chain[c], f"{path}#{c}"), f"{path}#{c}") for c in ("cam0", "cam1"))
-    pose = _transform(chain["cam1"].get("T_cn_cnm1"), f"{path}#cam1: T_cn_cnm1")
-    return StereoCamera(left, right, pose)
-
-
-def _from_euroc(folder: Path) -> StereoCamera:
-    base = folder / "mav0" if (folder / "mav0").is_dir() else folder
-    cameras, poses = [], []
-    for name in ("cam0", "cam1"):
-        file = base / name / "sensor.yaml"
-        content = read_opencv_yaml(file)
-        if not isinstance(content, dict):
-            raise CameraError(f"{file} holds no camera")
-        cameras.append(parse_camera(from_kalibr(content, str(file)), str(file)))
-        poses.append(_transform(content.get("T_BS"), f"{file}: T_BS"))
-    return StereoCamera(cameras[0], cameras[1], poses[1].inverse @ poses[0])
-
-
-def _transform(value: object, what: str) -> RigidTransform:
-    """A rigid transform of sixteen numbers, row by row."""
-    matrix = np.array(numbers(value, 16, what)).reshape(4, 4)
-    if not np.isfinite(matrix).all():
-        raise CameraError(f"{what} holds a value that is not finite")
-    u, singular, vt = np.linalg.svd(matrix[:3, :3])
-    if np.abs(singular - 1.0).max() > 1e-3 or np.linalg.det(u @ vt) < 0.0:
-        raise CameraError(f"{what} is not a rotation and a translation")
-    return RigidTransform(u @ vt, matrix[:3, 3])

@@ -1,4 +1,7 @@
-"""COLMAP's text model: its cameras. (Its images, as a trajectory, are read by `io.trajectory`.)"""
+"""COLMAP text models: cameras.txt, images.txt, points3D.txt (colmap.github.io/format.html).
+
+Images as a trajectory are read by `io.trajectory`.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import CameraError, MapError
+from morph_dslam.io.text import read_text
+
+Array = NDArray[np.float64]
 
 #: Where each of COLMAP's models keeps its values; fx and fy are one value in those that begin with f.
 MODELS: dict[str, tuple[str, ...]] = {
@@ -39,14 +45,8 @@ def read_cameras(path: Path) -> dict[str, dict]:
     CameraError
         If the file cannot be read, has no camera, or one of an unknown model or with wrong values.
     """
-    try:
-        lines = path.read_text().splitlines()
-    except OSError as error:
-        raise CameraError(f"cannot read the camera file {path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise CameraError(f"{path} is not a text file: save the COLMAP model as text") from error
     cameras = {}
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(read_text(path, "camera file", CameraError).splitlines(), start=1):
         if line.strip() and not line.startswith("#"):
             words = line.split()
             cameras[words[0]] = _camera(words, f"{path}, line {number}")
@@ -67,16 +67,10 @@ def _camera(words: list[str], where: str) -> dict:
         values = dict(zip(names, [float(word) for word in words[4:]], strict=True))
     except ValueError as error:
         raise CameraError(f"{where}: {model} has width, height, then {', '.join(names)}, all numbers") from error
-    focal = values.get("f")
-    camera = {
-        "width": width,
-        "height": height,
-        "fx": focal if focal is not None else values["fx"],
-        "fy": focal if focal is not None else values["fy"],
-        "cx": values["cx"] - PIXEL_CENTRE,
-        "cy": values["cy"] - PIXEL_CENTRE,
-    }
-    return camera | _lens(model, values)
+    focal = values["f"] if "f" in values else values["fx"]
+    camera = {"width": width, "height": height, "fx": focal, "fy": values.get("fy", focal)}
+    centre = {name: values[name] - PIXEL_CENTRE for name in ("cx", "cy")}
+    return camera | centre | _lens(model, values)
 
 
 def _lens(model: str, values: dict[str, float]) -> dict:
@@ -89,20 +83,16 @@ def _lens(model: str, values: dict[str, float]) -> dict:
     return {"distortion": coefficients if model == "FULL_OPENCV" else coefficients[:4]}
 
 
-# COLMAP text models: cameras.txt, images.txt, points3D.txt (colmap.github.io/format.html).
-
-
-Array = NDArray[np.float64]
-
-
 @dataclass(frozen=True)
 class ColmapImage:
     """An image of a model.
 
     Attributes
     ----------
-    name : its file, the number in which is the frame's. camera_from_world : (4, 4).
-    point_ids : (k,) points seen, by their rows in the model. pixels : (k, 2) where, in the undistorted image.
+    name : its file, the number in which is the frame's
+    camera_from_world : (4, 4)
+    point_ids : (k,) points seen, by their rows in the model
+    pixels : (k, 2) where, in the undistorted image
     """
 
     name: str
@@ -112,13 +102,7 @@ class ColmapImage:
 
     @property
     def number(self) -> int:
-        """The last number in the file's name.
-
-        Raises
-        ------
-        ValueError
-            If there is none.
-        """
+        """The last number in the file's name."""
         digits = re.findall(r"\d+", Path(self.name).stem)
         if not digits:
             raise ValueError(f"{self.name} has no number, which says which frame it is")

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.errors import TrajectoryError
 from morph_dslam.geometry import RigidTransform
+from morph_dslam.io.text import read_text
 
 Array = NDArray[np.float64]
 #: Larger values are not meant: timestamps in nanoseconds are smaller.
@@ -68,7 +69,7 @@ def load_trajectory(path: Path) -> Trajectory:
     ----------
     path : a TUM file (timestamp tx ty tz qx qy qz qw), a KITTI file (twelve numbers a line, stamped with the
         line's number from 0), COLMAP's images.txt (stamped with the last number in each image's name), or a
-        folder of 7-Scenes with `frame-000000.pose.txt` (stamped with the frame's number / 30).
+        folder of 7-Scenes with `frame-000000.pose.txt` (stamped with the frame's number / 30)
 
     Raises
     ------
@@ -78,13 +79,7 @@ def load_trajectory(path: Path) -> Trajectory:
     path = Path(path)
     if path.is_dir():
         return _make(path, _seven_scenes_rows(path))
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise TrajectoryError(f"cannot read the trajectory {path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise TrajectoryError(f"{path} is not a text file of camera poses") from error
-    lines = text.splitlines()
+    lines = read_text(path, "trajectory", TrajectoryError).splitlines()
     if path.name == "images.txt" or any(line.startswith("# Image list") for line in lines[:5]):
         return _make(path, _colmap_rows(path, lines))
     return _make(path, _table_rows(path, lines))

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.io.tables import Landmarks, read_toml
+from morph_dslam.io.landmarks import Landmarks
+from morph_dslam.io.text import read_toml
 from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.registration.landmarks import shape_starts
 from morph_dslam.registration.registration import Registration, register_by_landmarks

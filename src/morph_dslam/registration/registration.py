@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, cross_matrix, rotation_log
-from morph_dslam.io.tables import Landmarks
+from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.revolution import with_revolution_angle

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError,
 from scipy.interpolate import CubicSpline
 
 from morph_dslam.errors import SceneError
-from morph_dslam.io.tables import read_toml
+from morph_dslam.io.text import read_toml
 
 Array = NDArray[np.float64]
 

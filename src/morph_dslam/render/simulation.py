@@ -20,7 +20,7 @@ from tqdm import tqdm
 from morph_dslam.camera import Camera
 from morph_dslam.errors import SceneError
 from morph_dslam.io.camera_files import load_camera, parse_camera, save_camera
-from morph_dslam.io.tables import Landmarks, save_landmarks
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
 from morph_dslam.model import ReducedModel, SurfacePoints, load_model
 from morph_dslam.model.reduced_model import spread_over

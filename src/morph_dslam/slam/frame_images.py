@@ -176,9 +176,8 @@ class FrameImages:
         if isinstance(camera, StereoCamera):
             if with_depth:
                 raise CameraError("a stereo pair measures depth itself: give one camera for depth images")
-            pair = camera.rectify()
-            self.camera, self._maps, self._right_maps = pair.camera, pair.left_maps, pair.right_maps
-            self.baseline_px = pair.camera.fx * pair.baseline
+            self.camera, self._maps, self._right_maps = camera.rectify()
+            self.baseline_px = self.camera.fx * camera.baseline
         else:
             self.camera, self._maps, self._right_maps = camera, camera.undistortion_maps(), None
             self.baseline_px = camera.fx * VIRTUAL_BASELINE if with_depth else 0.0

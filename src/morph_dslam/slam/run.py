@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 from morph_dslam.errors import MapError
 from morph_dslam.io.camera_files import load_camera_or_pair
 from morph_dslam.io.colmap import ColmapImage, ColmapModel, read_colmap_model, write_colmap_model
-from morph_dslam.io.tables import save_ply
 from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.slam.frame_images import FrameImages
@@ -238,3 +237,15 @@ def draw_frame(image: NDArray[np.uint8], frame: SlamFrame) -> NDArray[np.uint8]:
         width = round(thickness * size)
         cv2.putText(drawn, text, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.45 * size, (grey, grey, grey), width, cv2.LINE_AA)
     return drawn
+
+
+def save_ply(path: Path, points: NDArray[np.float64]) -> None:
+    """Write points (n, 3) as a binary little-endian PLY file."""
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(points)}",
+        *(f"property float {axis}" for axis in "xyz"),
+        "end_header",
+    ]
+    path.write_bytes("\n".join(header).encode() + b"\n" + points.astype("<f4").tobytes())

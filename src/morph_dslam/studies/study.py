@@ -14,7 +14,7 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 
 from morph_dslam.errors import StudyError
-from morph_dslam.io.tables import read_toml
+from morph_dslam.io.text import read_toml
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.sheet_study import SheetStudy
 from morph_dslam.studies.solid_study import SolidStudy

@@ -18,7 +18,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import MapError, RegistrationError, TrackingError
 from morph_dslam.geometry import RigidTransform, rotation_log
 from morph_dslam.io.camera_files import load_camera
-from morph_dslam.io.tables import Landmarks, load_landmarks
+from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.inner_structure import CarriedStructure, InnerStructure, load_inner_structure
 from morph_dslam.registration.landmarks import CLICK_PX

@@ -1,4 +1,4 @@
-"""Calibrations of other programs: the numbers read, and what is refused.
+"""Camera files and calibrations of other programs: the numbers read, and what is refused.
 
 Files are written as those programs write them; OpenCV's by OpenCV itself.
 """
@@ -6,12 +6,16 @@ Files are written as those programs write them; OpenCV's by OpenCV itself.
 import cv2
 import numpy as np
 import pytest
+import yaml
+from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import CameraError
-from morph_dslam.io.camera_files import load_camera, save_camera
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.io.camera_files import load_camera, load_camera_or_pair, save_camera
 from tests.support.real_data import real_data
 
+GOOD = "width: 640\nheight: 480\nfx: 528.0\nfy: 527.5\ncx: 320\ncy: 239.5\n"
 ROS = """image_width: 640
 image_height: 480
 camera_name: narrow_stereo
@@ -101,6 +105,11 @@ distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
 BROWN = (-0.28, 0.07, 0.0002, 1.76e-05)
 
 
+def test_a_handwritten_file_is_read(tmp_path):
+    (tmp_path / "camera.yaml").write_text(GOOD)
+    assert load_camera(tmp_path / "camera.yaml") == Camera(640, 480, 528.0, 527.5, 320.0, 239.5)
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -187,6 +196,17 @@ def test_a_camera_chosen_from_a_colmap_model(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("", "holds no camera"),
+        ("- 1\n- 2\n", "holds no camera"),
+        ("width: [640\n", "not a YAML file"),
+        (GOOD.replace("fx: 528.0\n", ""), "fx: Field required"),
+        (GOOD + "focal: 3\n", "focal: Extra inputs"),
+        (GOOD.replace("528.0", "wide"), "fx: Input should be a valid number"),
+        (GOOD.replace("528.0", ".nan"), "fx: Input should be"),
+        (GOOD.replace("528.0", "-528"), "fx: Input should be greater than 0"),
+        (GOOD.replace("640", "0"), "width: Input should be greater than 0"),
+        (GOOD + "distortion: [0.1, 0.2]\n", "distortion has 2 values"),
+        (GOOD + "distortion: [0.1, .nan, 0, 0]\n", "distortion"),
         (ROS.replace("plumb_bob", "omni"), "unknown distortion model 'omni'; known are plumb_bob"),
         (ROS.replace("image_width: 640\n", ""), "does not say for what image size"),
         (ROS.replace("458.654, 0, 367", "458.654, 3, 367"), "skew is not modelled"),
@@ -231,9 +251,16 @@ def test_colmap_cameras_that_are_refused(tmp_path, text, message):
         load_camera(path)
 
 
-def test_a_name_where_there_is_one_camera(tmp_path):
-    (tmp_path / "camera.yaml").write_text(ROS)
-    with pytest.raises(CameraError, match="holds one camera only: leave out #cam1"):
+def test_missing_binary_and_folder_are_refused(tmp_path):
+    with pytest.raises(CameraError, match=r"cannot read the camera file .*absent\.yaml"):
+        load_camera(tmp_path / "absent.yaml")
+    with pytest.raises(CameraError, match="cannot read"):
+        load_camera(tmp_path)
+    (tmp_path / "image.yaml").write_bytes(bytes(range(128, 256)))
+    with pytest.raises(CameraError, match="not a text file"):
+        load_camera(tmp_path / "image.yaml")
+    (tmp_path / "camera.yaml").write_text(GOOD)
+    with pytest.raises(CameraError, match="one camera only"):
         load_camera(tmp_path / "camera.yaml#cam1")
 
 
@@ -242,3 +269,59 @@ def test_the_published_calibration_of_opencvs_samples():
     assert camera.fx == pytest.approx(535.91573396163199, rel=1e-15)
     assert camera.distortion[0] == pytest.approx(-0.26637260909660682, rel=1e-15)
     assert (camera.width, camera.height) == (640, 480)
+
+
+LEFT = Camera(320, 240, 210.0, 212.0, 161.0, 118.0, (-0.28, 0.07, 2e-4, 2e-5))
+RIGHT = Camera(320, 240, 205.0, 204.0, 157.0, 121.0, (0.01, -0.02, 0.003, 0.0), "fisheye")
+RIGHT_IN_LEFT = RigidTransform(
+    Rotation.from_euler("xyz", [1.0, -2.0, 0.5], degrees=True).as_matrix(), np.array([0.11, -0.002, 0.001])
+)
+
+
+def sensor(camera, distortion_key="distortion_coefficients", **more):
+    model = "equidistant" if camera.lens_model == "fisheye" else "radial-tangential"
+    return {
+        "camera_model": "pinhole",
+        "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+        "resolution": [camera.width, camera.height],
+        "distortion_model": model,
+        distortion_key: list(camera.distortion),
+        **more,
+    }
+
+
+def test_a_kalibr_chain(tmp_path):
+    path = tmp_path / "camchain.yaml"
+    chain = {
+        "cam0": sensor(LEFT, "distortion_coeffs"),
+        "cam1": sensor(RIGHT, "distortion_coeffs", T_cn_cnm1=RIGHT_IN_LEFT.inverse.matrix.tolist()),
+    }
+    path.write_text(yaml.safe_dump(chain))
+    pair = load_camera_or_pair(path)
+    assert (pair.left, pair.right) == (LEFT, RIGHT)
+    np.testing.assert_allclose(pair.right_from_left.matrix, RIGHT_IN_LEFT.inverse.matrix, atol=1e-12)
+    del chain["cam1"]["T_cn_cnm1"]
+    path.write_text(yaml.safe_dump(chain))
+    with pytest.raises(CameraError, match="cam1: T_cn_cnm1 is not a list of numbers"):
+        load_camera_or_pair(path)
+    chain["cam1"]["T_cn_cnm1"] = (2.0 * np.eye(4)).tolist()
+    path.write_text(yaml.safe_dump(chain))
+    with pytest.raises(CameraError, match="is not a rotation and a translation"):
+        load_camera_or_pair(path)
+
+
+def test_euroc_gives_both_poses_in_the_body(tmp_path):
+    body_from_left = RigidTransform(Rotation.from_euler("zyx", [80, 3, -2], degrees=True).as_matrix(), np.ones(3))
+    body_from_right = body_from_left @ RIGHT_IN_LEFT
+    for name, camera, pose in (("cam0", LEFT, body_from_left), ("cam1", RIGHT, body_from_right)):
+        folder = tmp_path / "mav0" / name
+        folder.mkdir(parents=True)
+        matrix = {"rows": 4, "cols": 4, "data": pose.matrix.ravel().tolist()}
+        (folder / "sensor.yaml").write_text("%YAML:1.0\n" + yaml.safe_dump(sensor(camera, T_BS=matrix)))
+    for given in (tmp_path, tmp_path / "mav0"):
+        pair = load_camera_or_pair(given)
+        assert (pair.left, pair.right) == (LEFT, RIGHT)
+        np.testing.assert_allclose(pair.right_from_left.matrix, RIGHT_IN_LEFT.inverse.matrix, atol=1e-12)
+    (tmp_path / "mav0" / "cam1" / "sensor.yaml").unlink()
+    with pytest.raises(CameraError, match=r"cannot read the camera file .*cam1"):
+        load_camera_or_pair(tmp_path)

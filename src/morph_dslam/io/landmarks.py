@@ -1,0 +1,73 @@
+"""Landmark files: points of the undeformed object and where they are seen in the reference frame.
+
+Such a file is CSV, in millimetres and pixels: a first line ``x_mm,y_mm,z_mm,u_px,v_px``, then a line for each point.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import RegistrationError
+from morph_dslam.io.text import read_text
+
+#: No millimetres or pixels are meant by what is larger.
+LARGEST = 1e7
+
+HEADER = ("x_mm", "y_mm", "z_mm", "u_px", "v_px")
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """Points of an object and their pixels.
+
+    Attributes
+    ----------
+    points : (k, 3) on the undeformed object in its frame, metres
+    pixels : (k, 2) in the image as recorded
+    """
+
+    points: NDArray[np.float64]
+    pixels: NDArray[np.float64]
+
+
+def load_landmarks(path: Path) -> Landmarks:
+    """Read a landmark file.
+
+    Raises
+    ------
+    RegistrationError
+        If the file is missing, has another header, or a value is no number, or one that cannot be meant.
+    """
+    lines = read_text(path, "landmarks", RegistrationError).splitlines()
+    rows = [row for row in csv.reader(lines) if any(cell.strip() for cell in row)]
+    if not rows or tuple(cell.strip() for cell in rows[0]) != HEADER:
+        raise RegistrationError(f"{path}: the first line of a landmark file is {','.join(HEADER)}")
+    values = np.array([_values(path, number, row) for number, row in enumerate(rows[1:], start=1)])
+    values = values.reshape(-1, len(HEADER))
+    return Landmarks(1e-3 * values[:, :3], np.ascontiguousarray(values[:, 3:]))
+
+
+def _values(path: Path, number: int, row: list[str]) -> list[float]:
+    try:
+        values = [float(cell) for cell in row]
+    except ValueError:
+        values = []
+    if len(values) != len(HEADER) or not (np.abs(values) < LARGEST).all():
+        raise RegistrationError(
+            f"{path}: landmark {number} is '{','.join(row)}'; give {len(HEADER)} numbers: {','.join(HEADER)}"
+        )
+    return values
+
+
+def save_landmarks(path: Path, landmarks: Landmarks) -> None:
+    """Write a landmark file that `load_landmarks` reads."""
+    lines = [
+        ",".join([*(f"{1e3 * x:.6g}" for x in point), *(f"{x:.4f}" for x in pixel)])
+        for point, pixel in zip(landmarks.points, landmarks.pixels, strict=True)
+    ]
+    path.write_text("\n".join([",".join(HEADER), *lines]) + "\n")

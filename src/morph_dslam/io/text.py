@@ -1,0 +1,34 @@
+"""Text files that users write, with the errors that reading one can meet."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from morph_dslam.errors import MorphError
+
+
+def read_text(path: Path, what: str, error_class: type[MorphError]) -> str:
+    """The text of a file in UTF-8, with or without a byte order mark.
+
+    Parameters
+    ----------
+    path : the file
+    what : what the file is, for the message: "study file" say
+    error_class : what is raised if it cannot be read or is no text
+    """
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise error_class(f"cannot read the {what} {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise error_class(f"{path} is not a text file, so no {what}: {error}") from error
+
+
+def read_toml(path: Path, what: str, error_class: type[MorphError]) -> dict[str, Any]:
+    """The content of a TOML file; parameters as of `read_text`."""
+    try:
+        return tomllib.loads(read_text(path, what, error_class))
+    except tomllib.TOMLDecodeError as error:
+        raise error_class(f"{path} is not a TOML file: {error}") from error
