@@ -190,25 +190,6 @@ def test_vtk_prisms_of_15_nodes_which_meshio_cannot_read_are_refused(tmp_path):
         load_mesh(tmp_path / "cell.vtk", "mm")
 
 
-def test_cells_that_meshio_would_leave_out_in_silence_are_refused(tmp_path):
-    def array(kind, name, components, values):
-        text = " ".join(map(str, values))
-        head = f'type="{kind}" Name="{name}" NumberOfComponents="{components}" format="ascii"'
-        return f"<DataArray {head}>{text}</DataArray>"
-
-    places = block((1.0, 1.0, 1.0), (1, 1, 1), "hex8").nodes.ravel()
-    (tmp_path / "cells.vtu").write_text(
-        '<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian"><UnstructuredGrid>'
-        '<Piece NumberOfPoints="8" NumberOfCells="2">'
-        f"<Points>{array('Float64', 'Points', 3, places)}</Points>"
-        f"<Cells>{array('Int64', 'connectivity', 1, [0, 1, 2, 4, *range(8)])}"
-        f"{array('Int64', 'offsets', 1, [4, 12])}{array('UInt8', 'types', 1, [10, 11])}</Cells>"
-        "</Piece></UnstructuredGrid></VTKFile>"
-    )
-    with pytest.raises(StudyError, match="cells that are not known; use tetra, "):
-        load_mesh(tmp_path / "cells.vtu", "mm")
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
