@@ -26,6 +26,7 @@ def quantity(kind: str) -> BeforeValidator:
         except StudyError as error:
             raise ValueError(str(error)) from error
 
+    setattr(read, "quantity", kind)  # noqa: B010, for the reference of keys
     return BeforeValidator(read)
 
 

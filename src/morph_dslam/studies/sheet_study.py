@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -36,8 +37,6 @@ from morph_dslam.studies.snapshots import SOLVER_VERSION
 
 Array = NDArray[np.float64]
 
-FACES = ("top", "bottom")
-
 #: Signs that the coordinates take when the sheet is mirrored in its own plane, in x = 0 and in y = 0.
 MIRROR_Z = np.array([-1.0, 1.0, -1.0, 1.0])
 
@@ -59,7 +58,10 @@ def take_snapshot(problem: GrippedSheet, state: EquilibriumState, points: Array,
 
     Parameters
     ----------
-    points : (n, 2) material points. thickness_ratio : the sheet's thickness over that of ``problem``.
+    problem : the sheet.
+    state : solved.
+    points : (n, 2) material points.
+    thickness_ratio : the sheet's thickness over that of ``problem``.
     """
     dof_slopes, _ = problem.sensitivities(state)
     fields = _fields(problem, state.dofs, points, thickness_ratio)
@@ -80,75 +82,57 @@ def _fields(problem: GrippedSheet, dofs: Array, points: Array, ratio: float) -> 
     return {"displacement": displacement, "stress_top": membrane - bending, "stress_bottom": membrane + bending}
 
 
-def mirrored(snapshot: Snapshot) -> Snapshot:
-    """The mirror image z -> -z: another state of the same sheet, with its faces swapped."""
-    flip, z = MIRROR_Z[:, None, None], np.array([1.0, 1.0, -1.0])
+def _image(
+    snapshot: Snapshot, signs: Array, vector: list[float], motion: Array, columns: int = 0, axis: int | None = None
+) -> Snapshot:
+    """A mirror image of a snapshot.
 
-    def image(fields: dict[str, Array], sign: Array | float) -> dict[str, Array]:
+    Parameters
+    ----------
+    snapshot : to be mirrored.
+    signs : (4,) of the coordinates.
+    vector : signs of the displacement's components.
+    motion : (5,) of the grips in the image.
+    columns : points along x of the output grid.
+    axis : of the grid that is reversed, -2 for x and -3 for y; None where the faces are swapped instead.
+    """
+    tensor = [1.0, 1.0, 1.0 if axis is None else -1.0]
+
+    def moved(field: Array) -> Array:
+        if axis is None:
+            return field
+        grid = field.reshape(*field.shape[:-2], -1, columns, 3)
+        return np.flip(grid, axis).reshape(field.shape)
+
+    def image(fields: Mapping[str, Array], sign: Array | float) -> dict[str, Array]:
+        top, bottom = ("stress_bottom", "stress_top") if axis is None else ("stress_top", "stress_bottom")
         return {
-            "displacement": fields["displacement"] * z * sign,
-            "stress_top": fields["stress_bottom"] * sign,
-            "stress_bottom": fields["stress_top"] * sign,
+            "displacement": moved(fields["displacement"]) * np.array(vector) * sign,
+            "stress_top": moved(fields[top]) * np.array(tensor) * sign,
+            "stress_bottom": moved(fields[bottom]) * np.array(tensor) * sign,
         }
 
-    return Snapshot(
-        snapshot.coordinates * MIRROR_Z,
-        image(snapshot.fields, 1.0),
-        image(snapshot.sensitivities, flip),
-        {"motion": snapshot.outputs["motion"] * np.array([-1.0, -1.0, -1.0, 1.0, 1.0])},
-    )
+    slopes = image(snapshot.sensitivities, signs[:, None, None])
+    return Snapshot(snapshot.coordinates * signs, image(snapshot.fields, 1.0), slopes, {"motion": motion})
+
+
+def mirrored(snapshot: Snapshot) -> Snapshot:
+    """The mirror image z -> -z: another state of the same sheet, with its faces swapped."""
+    motion = snapshot.outputs["motion"] * np.array([-1.0, -1.0, -1.0, 1.0, 1.0])
+    return _image(snapshot, MIRROR_Z, [1.0, 1.0, -1.0], motion)
 
 
 def reversed_ends(snapshot: Snapshot, columns: int) -> Snapshot:
-    """The mirror image x -> -x: another state of the same sheet if its grips are at the same height.
-
-    Parameters
-    ----------
-    columns : points along x of the output grid.
-    """
-    flip, x, shear = MIRROR_X[:, None, None], np.array([-1.0, 1.0, 1.0]), np.array([1.0, 1.0, -1.0])
-
-    def turned(field: Array) -> Array:
-        grid = field.reshape(*field.shape[:-2], -1, columns, 3)
-        return grid[..., ::-1, :].reshape(field.shape)
-
-    def image(fields: dict[str, Array], sign: Array | float) -> dict[str, Array]:
-        return {name: turned(field) * (x if name == "displacement" else shear) * sign for name, field in fields.items()}
-
+    """The mirror image x -> -x: another state of the same sheet if its grips are at the same height."""
     left, right, twist, approach, turn = snapshot.outputs["motion"]
-    return Snapshot(
-        snapshot.coordinates * MIRROR_X,
-        image(snapshot.fields, 1.0),
-        image(snapshot.sensitivities, flip),
-        {"motion": np.array([right, left, -twist, approach, -turn])},
-    )
+    motion = np.array([right, left, -twist, approach, -turn])
+    return _image(snapshot, MIRROR_X, [-1.0, 1.0, 1.0], motion, columns, -2)
 
 
 def upside_down(snapshot: Snapshot, columns: int) -> Snapshot:
-    """The mirror image y -> -y: another state of the same sheet if its grips are at the middle of its edges.
-
-    Parameters
-    ----------
-    columns : points along x of the output grid.
-    """
-    flip, y, shear = MIRROR_Y[:, None, None], np.array([1.0, -1.0, 1.0]), np.array([1.0, 1.0, -1.0])
-
-    def turned(field: Array) -> Array:
-        grid = field.reshape(*field.shape[:-2], -1, columns, 3)
-        return grid[..., ::-1, :, :].reshape(field.shape)
-
-    def image(fields: dict[str, Array], sign: Array | float) -> dict[str, Array]:
-        return {name: turned(field) * (y if name == "displacement" else shear) * sign for name, field in fields.items()}
-
-    return Snapshot(
-        snapshot.coordinates * MIRROR_Y,
-        image(snapshot.fields, 1.0),
-        image(snapshot.sensitivities, flip),
-        {"motion": snapshot.outputs["motion"] * np.array([1.0, 1.0, -1.0, 1.0, -1.0])},
-    )
-
-
-# The study of a thin elastic sheet held by two rigid grips.
+    """The mirror image y -> -y: another state of the same sheet if its grips are at the middle of its edges."""
+    motion = snapshot.outputs["motion"] * np.array([1.0, 1.0, -1.0, 1.0, -1.0])
+    return _image(snapshot, MIRROR_Y, [1.0, -1.0, 1.0], motion, columns, -3)
 
 
 #: Cells along a side of a sheet: more than these are a mistake.
@@ -388,7 +372,9 @@ class GrippedSheetSweep:
 
     Attributes
     ----------
-    points : (n, 2) output grid. thickness_ratio : the sheet's thickness over the one it is solved at.
+    sheet : the discrete problem.
+    points : (n, 2) output grid.
+    thickness_ratio : the sheet's thickness over the one it is solved at.
     root : (4,) coordinates of the first state.
     """
 

@@ -84,12 +84,12 @@ def _without_tags(section: type[BaseModel], location: tuple[int | str, ...]) -> 
             continue
         keys.append(part)
         if isinstance(part, str) and part in section.model_fields and position < len(location) - 1:
-            kinds = _kinds(section.model_fields[part].annotation)
+            kinds = sections_of(section.model_fields[part].annotation)
             section = next(iter(kinds.values()), section)
     return keys, section
 
 
-def _kinds(annotation: Any) -> dict[str, type[BaseModel]]:
+def sections_of(annotation: Any) -> dict[str, type[BaseModel]]:
     """The sections that an annotation allows, by the tag of their kind."""
     found: dict[str, type[BaseModel]] = {}
     pending = [annotation]
