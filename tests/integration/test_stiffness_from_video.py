@@ -111,7 +111,7 @@ def test_a_stiffness_ratio_is_estimated_over_a_sequence_with_an_interval_that_ho
     assert summary["n_tracked"] == 24
     (ratio,) = summary["one_over_the_sequence"]
     low, high = ratio["interval_95"]
-    assert ratio["told_by_the_images"]
+    assert ratio["observable"]
     assert low < RATIO < high
     assert high - low < 0.25 * RATIO
 
@@ -119,8 +119,8 @@ def test_a_stiffness_ratio_is_estimated_over_a_sequence_with_an_interval_that_ho
 def test_a_stiffness_ratio_of_a_bar_that_is_not_bent_is_said_not_to_be_told(folder):
     summary = film_and_track(folder, "straight", lift=0.0, frames=4)
     (ratio,) = summary["one_over_the_sequence"]
-    assert not ratio["told_by_the_images"]
-    assert any("'ratio' cannot be told from the images" in flag for flag in summary["flags"])
+    assert not ratio["observable"]
+    assert any("'ratio' is unobservable" in flag for flag in summary["flags"])
 
 
 def test_the_ratio_changes_the_bars_shape(folder):

@@ -85,4 +85,4 @@ def test_what_is_held_leaves_the_others_as_if_it_were_known():
     expected = np.linalg.inv(np.delete(np.delete(linear.hessian, TURN, 0), TURN, 1))
     held = linear.holding(np.array([TURN]))
     np.testing.assert_allclose(held.inverse[np.ix_(others, others)], expected, rtol=1e-6)
-    assert not held.scores[:, :, TURN].any()
+    assert not held.weighted_jacobian[:, :, TURN].any()

@@ -1,4 +1,4 @@
-"""What the images do not tell, on models whose blind combinations are known."""
+"""What unobservable, on models whose blind combinations are known."""
 
 import numpy as np
 import pytest
@@ -75,8 +75,8 @@ def run_of(per_sequence, frames=3):
 
 def test_parameters_without_effect_and_those_that_act_alike_are_named():
     told = summarise(run_of(()))["flags"]
-    assert told[0] == "parameter 'colour' cannot be told from the images in 3 frames"
-    assert told[1].startswith("parameters 'load' and 'stiffness' cannot be told apart from the images in 3 frames")
+    assert told[0] == "parameter 'colour' is unobservable in 3 frames"
+    assert told[1].startswith("only a combination of parameters 'load' and 'stiffness' is observable in 3 frames")
     # 2 stiffness - load stays the same: twice as much of the load as of the stiffness, both in shares of 2.
     assert "'load' is 0.179 larger and 'stiffness' is 0.0894 larger" in told[1]
     assert len(told) == 2
@@ -88,12 +88,12 @@ def test_values_over_the_sequence_have_an_interval_and_say_when_nothing_tells():
     low, high = shear["interval_95"]
     assert low < 0.2 < high
     assert high - low < 0.05
-    assert shear["told_by_the_images"]
-    assert not stiffness["told_by_the_images"]
-    assert not colour["told_by_the_images"]
-    assert any("'colour' cannot be told from the images of the whole sequence" in t for t in summary["flags"])
+    assert shear["observable"]
+    assert not stiffness["observable"]
+    assert not colour["observable"]
+    assert any("'colour' is unobservable over the whole sequence" in t for t in summary["flags"])
     assert value_line(shear).startswith("shear = 0.")
-    assert value_line(colour).endswith("the images do not tell")
+    assert value_line(colour).endswith("unobservable")
 
 
 def test_interval_is_in_the_parameters_unit():
@@ -113,7 +113,7 @@ def test_combinations_that_share_a_parameter_come_together():
     np.testing.assert_allclose(part.directions @ seen, 0.0, atol=1e-6)
     names = [Parameter(name, "angle", "deg", -1.0, 1.0, 0.0) for name in "abc"]
     assert statement(names, part, "in 5 frames") == (
-        "parameters 'a', 'b' and 'c' cannot be told apart from the images in 5 frames"
+        "only a combination of parameters 'a', 'b' and 'c' is observable in 5 frames"
     )
 
 

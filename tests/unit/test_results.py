@@ -62,7 +62,7 @@ def test_summary_counts_and_flags():
     told = flags(run)
     assert "1 of 3 frames were lost" in told[0]
     assert "'arch' is at the upper bound of its range (60 mm) in 1 frames: the object may be outside" in told[1]
-    assert "'skew' cannot be told from the images in 1 frames" in told[2]
+    assert "'skew' is unobservable in 1 frames" in told[2]
     assert len(told) == 3
 
 

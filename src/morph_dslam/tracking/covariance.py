@@ -40,14 +40,6 @@ def error_factors_of(covariance: Array | None, scale: Array) -> Array | None:
     return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64)
 
 
-# Errors that points have in common: how alike in each two of them, and what residuals show of them.
-# A model's errors are alike over parts of the surface much wider than the windows that are compared. Their
-# covariance is taken to fall with the points' distance as a Gaussian does; so smooth a covariance has few
-# directions, and a pivoted Cholesky factor of as many columns holds it (Harbrecht, Peters & Schneider 2012).
-# What residuals have in common is measured over pairs of points that lie near each other, but so far apart
-# that their windows do not overlap; of many points some hundreds tell it as well as all.
-
-
 #: Over these shares of the points' spread a model's errors are taken to be alike, and are pairs compared.
 ALIKE_SHARE, PAIR_SHARE = 0.75, 0.5
 
@@ -94,13 +86,13 @@ class SharedErrors:
         found = np.tensordot(some, beside, axes=([0, 1], [0, 1])) / max(2.0 * n_pairs, 1.0)
         return np.asarray(found, dtype=np.float64)
 
-    def gradients(self, scores: Array) -> Array:
-        """Gradients (2 r, n) by each direction of an error of one pixel, of scores (p, 2, n).
+    def gradients(self, weighted_jacobian: Array) -> Array:
+        """Gradients (2 r, n) by each direction of an error of one pixel, by J' W (p, 2, n).
 
         Their products are the gradient's covariance, each coordinate for itself.
         """
-        n = scores.shape[2]
-        found = self.factor.T @ scores.reshape(len(scores), -1)
+        n = weighted_jacobian.shape[2]
+        found = self.factor.T @ weighted_jacobian.reshape(len(weighted_jacobian), -1)
         return np.asarray(found.reshape(-1, n), dtype=np.float64)
 
     def share_left(self, used: NDArray[np.bool_], jacobian: Array, gradients: Array, gain: Array) -> float:
@@ -139,9 +131,6 @@ def gaussian_factor(places: Array, length: float) -> Array:
         columns = np.vstack([columns, column])
         left = left - column**2
     return np.ascontiguousarray(columns.T)
-
-
-# Covariance of an estimate with Huber weights.
 
 
 #: Eigenvalue floor, relative to the best-seen direction.

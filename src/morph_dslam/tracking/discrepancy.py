@@ -210,14 +210,6 @@ def _neighbour_lines(points: Array, count: int) -> NDArray[np.int64]:
     return np.unique(np.sort(pairs, axis=1), axis=0)
 
 
-# The discrepancy in the reference view, from a whole sequence.
-# Every followed point is bound to the mesh by the pixel in which the reference view shows it. Where the
-# object departs from the model there, the points are bound beside their places, and no shape of another frame
-# explains all of them. So the discrepancies of the reference view and of keyframes are sought together (a
-# bundle adjustment of a surface that hardly stretches): that of the reference moves the points along the
-# surface until they are in their pixels again. Those of the keyframes are eliminated by Schur complements.
-
-
 #: Gauss-Newton steps: after five the displacements change by less than a tenth of a millimetre.
 STEPS = 5
 
@@ -248,6 +240,10 @@ def refine_discrepancy(
     outline: Outline | None = None,
 ) -> Discrepancy:
     """The discrepancy in the reference view that explains landmarks and keyframes best.
+
+    Where the object departs from the model in the reference view, points are bound beside their places, and
+    no shape of another frame explains all of them. So the discrepancies of the reference view and of the
+    keyframes are sought together; those of the keyframes are eliminated by Schur complements.
 
     Parameters
     ----------

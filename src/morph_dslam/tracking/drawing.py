@@ -161,9 +161,6 @@ def _edges(cells: NDArray[np.int64], pairs: list[tuple[int, int]]) -> NDArray[np
     return np.stack([cells[:, list(pair)] for pair in pairs], axis=1)
 
 
-# The augmented view: the deformed object over a frame, coloured by a field, cut open or seen through.
-
-
 Shown = Literal["stress", "strain", "displacement"]
 
 #: Opacity of the object's surface, of one that shows what it has inside, and of one that is cut open.
@@ -372,9 +369,6 @@ def _drawn_mesh(model: ReducedModel, section: SectionPlane | None) -> tuple[Mate
         np.concatenate([left.corners, inside.corners]), np.concatenate([left.weights, inside.weights])
     )
     return points, np.concatenate([triangles, cut_open + len(left)])
-
-
-# The augmented video of a run: every frame with the object over it, in one range of colours.
 
 
 #: At most so many states are looked at for the range of colours.

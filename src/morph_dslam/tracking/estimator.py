@@ -147,9 +147,6 @@ def project_with_jacobian(functions, rotation, translation, rest, modes, intrins
     return pixels, jacobian
 
 
-# A cost about its minimum: how errors of measurements enter the estimate.
-
-
 Array = NDArray[np.float64]
 
 
@@ -159,12 +156,12 @@ class LinearCost:
 
     Attributes
     ----------
-    scores : (p, 2, n) by which an error of a pixel enters the gradient, in units of what a point of weight 1
+    weighted_jacobian : (p, 2, n) by which an error of a pixel enters the gradient, in units of what a point of weight 1
         is off by. of_depths : (n, n), covariance of the gradient from errors of depths. hessian : (n, n).
     scale : (n,) of the unknowns.
     """
 
-    scores: Array
+    weighted_jacobian: Array
     of_depths: Array
     hessian: Array
     scale: Array
@@ -187,34 +184,34 @@ class LinearCost:
         jacobian[~used] = 0.0
         factor = np.minimum(1.0, huber_px / np.maximum(np.where(used, length, 0.0), 1e-300))
         exactness = np.sqrt(measured.weights)[:, None, None]
-        scores = exactness * factor[:, None, None] * jacobian
-        hessian = np.tensordot(scores, exactness * jacobian, axes=([0, 1], [0, 1]))
+        weighted_jacobian = exactness * factor[:, None, None] * jacobian
+        hessian = np.tensordot(weighted_jacobian, exactness * jacobian, axes=([0, 1], [0, 1]))
         of_depths = np.zeros_like(hessian)
         if measured.depths is not None:
             _, part, _, far = measured.depths.terms(points, state)
             hessian, of_depths = hessian + part, measured.depths.variance_px(far) * part
-        return cls(scores, of_depths, hessian, scale)
+        return cls(weighted_jacobian, of_depths, hessian, scale)
 
     def in_unknowns(self, chain: Array) -> LinearCost:
         """The same cost of other unknowns, whose increments ``chain`` (n, m) turns into these."""
         hessian, of_depths = (chain.T @ matrix @ chain for matrix in (self.hessian, self.of_depths))
-        return LinearCost(self.scores @ chain, of_depths, hessian, self.scale)
+        return LinearCost(self.weighted_jacobian @ chain, of_depths, hessian, self.scale)
 
     def holding(self, indices: NDArray[np.int64]) -> LinearCost:
         """The same cost with the unknowns at ``indices`` (k,) known: how well the others are then."""
-        scores, of_depths, hessian = self.scores.copy(), self.of_depths.copy(), self.hessian.copy()
+        rows, of_depths, hessian = self.weighted_jacobian.copy(), self.of_depths.copy(), self.hessian.copy()
         largest = float(np.max(np.diag(hessian) * self.scale**2))
-        scores[:, :, indices] = 0.0
+        rows[:, :, indices] = 0.0
         for matrix in (of_depths, hessian):
             matrix[indices], matrix[:, indices] = 0.0, 0.0
         hessian[indices, indices] = max(largest, 1e-30) / self.scale[indices] ** 2
-        return LinearCost(scores, of_depths, hessian, self.scale)
+        return LinearCost(rows, of_depths, hessian, self.scale)
 
     @staticmethod
     def joined(costs: Sequence[LinearCost]) -> LinearCost:
         """The sum of costs of the same unknowns, their points one after the other."""
         return LinearCost(
-            np.concatenate([cost.scores for cost in costs]),
+            np.concatenate([cost.weighted_jacobian for cost in costs]),
             np.sum([cost.of_depths for cost in costs], axis=0),
             np.sum([cost.hessian for cost in costs], axis=0),
             costs[0].scale,
@@ -237,9 +234,6 @@ class LinearCost:
         """The part (n, n) of `inverse` that is not seen at all."""
         values, vectors, floor = self._spectrum
         return (vectors * np.where(values > floor, 0.0, 1.0 / floor)) @ vectors.T
-
-
-# Parameters and pose from pixels: Levenberg-Marquardt with Huber weights inside the parameter box.
 
 
 __all__ = ["BoundPoints", "Estimate", "EstimationOptions", "Estimator", "Prior", "State", "moved"]

@@ -57,13 +57,6 @@ def bounded_step(hessian, gradient, lower, upper):
     return step
 
 
-# Levenberg-Marquardt over parameters inside their box and a pose.
-# The steps are taken in scaled unknowns (half a parameter range, one radian, the object's size), so that the
-# damping treats them alike. Directions that the cost does not see get no step: the damping has a floor
-# relative to the best-seen direction, and the iteration ends when the model predicts no worthwhile decrease.
-# Bounds are kept by an active set (Nocedal & Wright, Numerical Optimization, ch. 16.7).
-
-
 #: Largest step of one iteration in scaled unknowns: keeps an unseen direction from crossing the box at once.
 LARGEST_STEP = 1.0
 

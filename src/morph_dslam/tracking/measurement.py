@@ -97,11 +97,6 @@ class ReferenceAppearance:
         return Rendering(image, depth)
 
 
-# Drawing a textured surface in one pass over its triangles: image and depth only, for every frame.
-# The same picture as `rasterise` followed by `render_textured`, at half the time: which triangle a pixel sees
-# and where on it need not be kept.
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def _draw_triangle(area, u, v, q, x, y, texture, image, depth):
     """Draw one triangle: twice its area, and its corners' pixels u, v, inverse depths q and texture
@@ -149,9 +144,6 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
         for corner in range(3):
             x[corner], y[corner] = coordinates[t, corner, 0], coordinates[t, corner, 1]
         _draw_triangle(area, u, v, q, x, y, texture, image, depth)
-
-
-# Where the object's bound points are seen in a frame, and which of these measurements to believe.
 
 
 #: Pyramid levels that reach as far as a correction may: a quarter of the size, with windows of 17 pixels.
@@ -231,9 +223,6 @@ def compare_with_rendering(
     spread = np.full(len(predicted), np.inf)
     pixels[rows], valid[rows], spread[rows] = found, ok, exactness
     return Measurement(pixels, valid, visible, spread, rendering.depth)
-
-
-# Which of several pictures gives each part of the surface its texture.
 
 
 #: Another picture takes a triangle over from the first where it shows that much more area: seams are few, and

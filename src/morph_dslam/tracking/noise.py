@@ -144,16 +144,6 @@ class PixelNoise:
         self.frame = float(total - self.common)
 
 
-# How exactly each point is measured in a frame, and what it counts by that.
-# What patches of the rendered view and of the frame differ by, tells how exactly a point was found: something
-# else may be in a part of its window, or the surface may be seen much broader than in the reference view.
-# Apart from that, a model that is a little off leaves residuals that all points have alike. A residual's
-# variance is so taken to be f s² + t, with s what the patches tell; f and t are learnt from the residuals of
-# the frames. Where the model leaves nothing, points whose patches differ more err by more than in proportion,
-# because a part of a window that is covered moves what is found as a whole. The variance is then taken to be
-# f s^2p, and the power p >= 1 is learnt.
-
-
 #: Nothing is known better than by this, pixels, whatever the patches say.
 LEAST_SPREAD_PX = 0.01
 
@@ -172,7 +162,13 @@ MEDIAN_OF_PAIR = 1.1774
 
 
 class PointNoise:
-    """Weights of points; all the same until frames were learnt from."""
+    """Weights of points; all the same until frames were learnt from.
+
+    What the patches of a point differ by says how exactly it was found, s; a model that is a little off
+    leaves residuals that all points have alike. A residual's variance is f s² + t, and where the model leaves
+    nothing f s^2p, because a part of a window that is covered moves what is found as a whole; f, t and the
+    power p are learnt from the residuals of the frames.
+    """
 
     def __init__(self) -> None:
         self._moments: Array | None = None

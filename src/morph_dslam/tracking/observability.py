@@ -1,7 +1,8 @@
-"""Which parameters the images tell, and how well: from the covariance without any prior on the parameters.
+"""Which parameters are observable, and how well: from the covariance without any prior on the parameters.
 
-A parameter, or a combination of several, is not told where the 95 % interval is as wide as its range: then
-the start, a bound or a prior decides on its value, not the images.
+A parameter, or a combination of several, is unobservable where the 95 % interval is as wide as its range: then
+the start, a bound or a prior decides on its value, not the images. A field F(X, mu) has to first order the
+covariance S C S' at each point, with its sensitivities S = dF/dmu and the parameters' covariance C.
 """
 
 from __future__ import annotations
@@ -32,12 +33,12 @@ INTERVAL_95 = 1.96
 
 @dataclass(frozen=True)
 class Unobservable:
-    """Parameters that the images do not tell, or not apart.
+    """Unobservable parameters, or an unobservable combination of several.
 
     Attributes
     ----------
-    indices : of the parameters. directions : (k, d) combinations of them that are not told, of length one in
-        shares of the ranges.
+    indices : of the parameters. directions : (k, d) unobservable combinations of them, of length one in shares
+        of the ranges.
     """
 
     indices: tuple[int, ...]
@@ -84,10 +85,10 @@ def covariance_of_parameters(estimate: Estimate) -> Array:
     return (estimate.covariance if measured is None else measured)[:d, :d]
 
 
-def untold_in_run(
+def unobservable_in_run(
     parameters: Sequence[Parameter], estimates: Sequence[Estimate]
 ) -> dict[tuple[int, ...], tuple[int, Unobservable]]:
-    """What is not told in the frames of a run: by the parameters' indices in how many, and the last of it."""
+    """What is unobservable in the frames of a run: by the parameters' indices in how many, and the last of it."""
     ranges = np.array([p.upper - p.lower for p in parameters])
     found: dict[tuple[int, ...], tuple[int, Unobservable]] = {}
     for estimate in estimates:
@@ -97,16 +98,16 @@ def untold_in_run(
 
 
 def statement(parameters: Sequence[Parameter], part: Unobservable, where: str) -> str:
-    """A sentence on what is not told ``where``."""
+    """A sentence on what is unobservable ``where``."""
     names = [f"'{parameters[k].name}'" for k in part.indices]
     if len(names) == 1:
-        return f"parameter {names[0]} cannot be told from the images {where}"
-    text = f"parameters {', '.join(names[:-1])} and {names[-1]} cannot be told apart from the images {where}"
+        return f"parameter {names[0]} is unobservable {where}"
+    text = f"only a combination of parameters {', '.join(names[:-1])} and {names[-1]} is observable {where}"
     if len(part.directions) > 1:
         return text
     along = part.directions[0] * np.sign(part.directions[0][part.indices[0]])
     changes = [_change(parameters[k], along[k]) for k in part.indices]
-    return f"{text}: they stay the same when {' and '.join(changes)}"
+    return f"{text}: the images stay the same when {' and '.join(changes)}"
 
 
 def _change(parameter: Parameter, share: float) -> str:
@@ -124,7 +125,7 @@ def one_value(parameter: Parameter, value: float, deviation: float) -> dict[str,
         "value": parameter.display(value),
         "standard_deviation": parameter.display(deviation),
         "interval_95": [parameter.display(low), parameter.display(high)],
-        "told_by_the_images": bool(deviation < UNOBSERVABLE_SHARE * (parameter.upper - parameter.lower)),
+        "observable": bool(deviation < UNOBSERVABLE_SHARE * (parameter.upper - parameter.lower)),
     }
 
 
@@ -133,14 +134,9 @@ def value_line(figures: dict) -> str:
     unit = "" if figures["unit"] == "1" else f" {figures['unit']}"
     low, high = figures["interval_95"]
     text = f"{figures['name']} = {figures['value']:.4g}{unit} over the sequence"
-    if not figures["told_by_the_images"]:
-        return f"{text}, but the images do not tell"
+    if not figures["observable"]:
+        return f"{text}, but it is unobservable"
     return f"{text}, 95 % interval {low:.4g} to {high:.4g}{unit}"
-
-
-# How well an estimate tells displacements and stresses: the parameters' covariance through the modes.
-# A field F(X, mu) has to first order the covariance S C S' at each point, with its sensitivities S = dF/dmu
-# and the parameters' covariance C. It is what the images leave open; the model's own error comes on top.
 
 
 #: Von Mises stress is sqrt(s' Q s), of three plane or of six components of the stress.

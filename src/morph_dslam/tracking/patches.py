@@ -209,11 +209,6 @@ def compare_patches(first, second, first_points, second_points, half):
     return places, correlation, spread
 
 
-# Image motion: contrast-normalized images and pyramidal Lucas-Kanade.
-# Tracking works on contrast-normalized images (each pixel minus its neighbourhood's mean), so that shading, which
-# changes as the surface bends, does not count as motion.
-
-
 #: Grey level of a pixel that equals its neighbourhood's mean.
 NEUTRAL = 128
 
@@ -257,9 +252,6 @@ def follow(
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
     return found.reshape(-1, 2).astype(float), status.ravel() == 1
-
-
-# Feature points of the reference view: evenly spread corners to follow, and descriptors to find it again.
 
 
 def interior(covered: NDArray[np.bool_], margin: int) -> NDArray[np.uint8]:

@@ -145,11 +145,6 @@ def _frame_residuals(
     return scaled.ravel()
 
 
-# The reference state refined by a depth image: landmarks of one view hardly tell how far the object is.
-# As in iterative closest points, surface points are paired with what the depth camera measured along their
-# own sight lines, and the pairs are made anew after each estimate.
-
-
 #: Points that are paired, how often, and how many are needed.
 POINTS, ROUNDS, LEAST = 600, 5, 30
 
@@ -169,7 +164,7 @@ def refine_by_depth(
     image: NDArray[np.float32],
     sigma_at_1m: float = SIGMA_AT_1M,
 ) -> Estimate:
-    """The state of an object from landmarks and a depth image of the same view.
+    """The state of an object from landmarks and a depth image of the same view, as in iterative closest points.
 
     Parameters
     ----------

@@ -26,7 +26,7 @@ from morph_dslam.tracking.observability import (
     largest_von_mises,
     one_value,
     statement,
-    untold_in_run,
+    unobservable_in_run,
 )
 from morph_dslam.tracking.outcomes import ModelDoesNotExplain, ObjectMoved, Status
 from morph_dslam.tracking.result import STAGES, FrameResult
@@ -391,7 +391,7 @@ def flags(run: RunResults) -> list[str]:
             "are that much wider; check the landmarks and whether the object has the model's dimensions"
         )
     found += _at_bound(run)
-    return found + _untold(run)
+    return found + _unobservable(run)
 
 
 def _at_bound(run: RunResults) -> list[str]:
@@ -419,18 +419,18 @@ def _shown(parameter: Parameter, value: float) -> str:
     return f"{parameter.display(value):.4g}{unit}"
 
 
-def _untold(run: RunResults) -> list[str]:
-    """What the images do not tell; of what is one per sequence, only after the last frame."""
+def _unobservable(run: RunResults) -> list[str]:
+    """Unobservable parameters; of those that are one per sequence, only after the last frame."""
     parameters, estimates = run.model.parameters, [r.estimate for r in run.results if r.estimate]
     constant = {k for k, p in enumerate(parameters) if p.name in run.per_sequence}
     found = [
         statement(parameters, part, f"in {count} frames")
-        for indices, (count, part) in untold_in_run(parameters, estimates).items()
+        for indices, (count, part) in unobservable_in_run(parameters, estimates).items()
         if not constant.issuperset(indices)
     ]
-    for indices, (_, part) in untold_in_run(parameters, estimates[-1:]).items():
+    for indices, (_, part) in unobservable_in_run(parameters, estimates[-1:]).items():
         if constant.issuperset(indices):
-            found.append(statement(parameters, part, "of the whole sequence"))
+            found.append(statement(parameters, part, "over the whole sequence"))
     return found
 
 

@@ -1,4 +1,11 @@
-"""What the sequence filter keeps from frame to frame, and how it goes over to the points of another view."""
+"""Fuses the frames of a sequence: parameters that are one per sequence, or walk, and all covariances.
+
+A point's measurement error has two parts. One stays with the point, because its place was read off the
+reference view once; it is alike for points whose windows overlap there. The other is new in every frame, and
+only that averages out. The past is a prior of the next frame, as in any Kalman filter in the information form.
+Beside it goes, for every point, how its own error has entered the estimate: these errors are "considered" but
+not estimated, as in Schmidt's filter (Jazwinski, Stochastic Processes and Filtering Theory, 1970, ch. 8.4).
+"""
 
 from __future__ import annotations
 
@@ -58,7 +65,7 @@ class Errors:
     ----------
     by_point : (p, 2, n) derivative by the part that stays with a point, in its standard deviations.
     by_frames : (n, n) covariance from what is new in each frame.
-    by_cause : (c, n) derivative by what is the same in all frames of a known pose; see `Prior.lasting`.
+    by_factor : (c, n) derivative by what is the same in all frames of a known pose; see `Prior.lasting`.
     unseen : (n, n) covariance of what nothing tells of. covariance : (n, n) from all of it.
     inverse : (n, n) of the cost's Hessian.
     by_views : (k, n) by the number of a view that was left: derivative by what its points had put into the
@@ -67,7 +74,7 @@ class Errors:
 
     by_point: Array
     by_frames: Array
-    by_cause: Array
+    by_factor: Array
     unseen: Array
     covariance: Array
     inverse: Array
@@ -80,7 +87,7 @@ class Past:
 
     Attributes
     ----------
-    mean : (k,), SI. covariance : (k, k). by_point, by_frames, by_cause, unseen, by_views : as in `Errors`,
+    mean : (k,), SI. covariance : (k, k). by_point, by_frames, by_factor, unseen, by_views : as in `Errors`,
         (p, 2, k), (k, k), (c, k), (k, k) and (k, k) each.
     left : the views of ``by_views``, by number.
     """
@@ -89,7 +96,7 @@ class Past:
     covariance: Array
     by_point: Array
     by_frames: Array
-    by_cause: Array
+    by_factor: Array
     unseen: Array
     by_views: dict[int, Array] = field(default_factory=dict)
     left: dict[int, LeftPoints] = field(default_factory=dict)
@@ -121,20 +128,11 @@ class Past:
         )
 
 
-def quadratic(scores: Array, correlation: Correlation, others: Array | None = None) -> Array:
-    """sum_ij K_ij W_i' V_j (n, n) of scores (p, 2, n), twice the same or two, and correlation K (p, p)."""
-    others = scores if others is None else others
+def quadratic(rows: Array, correlation: Correlation, others: Array | None = None) -> Array:
+    """sum_ij K_ij W_i' V_j (n, n) of W and V (p, 2, n), W itself by default, with correlation K (p, p)."""
+    others = rows if others is None else others
     spread = np.asarray(correlation @ others.reshape(len(others), -1)).reshape(others.shape)
-    return np.tensordot(scores, spread, axes=([0, 1], [0, 1]))
-
-
-# Whether a frame can tell of a parameter at all: whether the parameter's effect is clearly there.
-# Some parameters act only while others do, as the side from which a lever is turned. While it is not, errors
-# of the lever's angle turn it, to a side of their own, and the curvature of the cost, which a covariance is
-# made from, takes this for a measured side. The error of the direction of a vector with independent errors is
-# about one over its length in standard deviations only where that length is some of them; below, the
-# direction may be any. So an effect counts only where it is so many times what the other parameters' errors
-# make it differ by.
+    return np.tensordot(rows, spread, axes=([0, 1], [0, 1]))
 
 
 #: Of a plane vector that is at least so many standard deviations long, the direction's error is that of the
@@ -152,33 +150,25 @@ def without_clear_effect(
 ) -> NDArray[np.bool_]:
     """Which of some parameters (k,) may have no effect on what was measured.
 
+    Some parameters act only while others do, as the side from which a lever is turned. While it is not,
+    errors of the lever's angle turn it to a side of their own, and the curvature of the cost takes this for a
+    measured side. So an effect counts only where it is `CLEARLY` times what the others' errors make it differ.
+
     Parameters
     ----------
     linear : the cost of what was measured, about the ``state`` that was estimated. linear_at : about another.
     spread : (d,) standard deviations of the parameters were those at ``indices`` (k,) known, SI.
     """
-    effects = linear.scores[:, :, indices]
+    effects = linear.weighted_jacobian[:, :, indices]
     changes = np.zeros(len(indices))
     half_ranges = 0.5 * (model.upper - model.lower)
     for other in np.setdiff1d(np.arange(len(spread)), indices):
         parameters = state.parameters.copy()
         step = min(float(spread[other]), float(half_ranges[other]))
         parameters[other] += step if parameters[other] + step <= model.upper[other] else -step
-        there = linear_at(replace(state, parameters=parameters)).scores[:, :, indices]
+        there = linear_at(replace(state, parameters=parameters)).weighted_jacobian[:, :, indices]
         changes += np.sum((there - effects) ** 2, axis=(0, 1))
     return np.sum(effects**2, axis=(0, 1)) <= CLEARLY**2 * changes
-
-
-# Parameters that are one over the whole sequence, and how sure an estimate is.
-# What a point's measurement is off by has two parts. One belongs to the point: its place was read off the
-# reference view once, and every frame is compared with that view. It is the same in all frames, and alike for
-# points whose windows overlap there. The other is new in every frame. Only the second averages out.
-# The filter keeps the estimate of the parameters that are one per sequence, from all frames so far, with its
-# covariance; in the next frame it is a prior, as in any Kalman filter in the information form. Parameters may
-# also walk: their variance then grows by that of a step from frame to frame. Beside it goes,
-# for every point, how its own error has entered the estimate. So the covariance holds the points' errors in
-# full, however many frames there are: they are "considered" but not estimated, as in Schmidt's filter
-# (Jazwinski, Stochastic Processes and Filtering Theory, 1970, ch. 8.4).
 
 
 #: The weight of the past in the mean of past and frame stays below this.
@@ -236,7 +226,7 @@ class SequenceFilter(Generic[Frame]):
         self._unknowns = len(estimator.model.parameters) + 6
         self._noise = PixelNoise(MEMORY)
         self._past: Past | None = None
-        self._untold = np.zeros(len(self._constant))
+        self._unobservable_variance = np.zeros(len(self._constant))
         self._conflicts = 0
         self.past_information, self.keeps = np.zeros((self._unknowns,) * 2), True
 
@@ -257,7 +247,7 @@ class SequenceFilter(Generic[Frame]):
         self.past_information, self.keeps = np.zeros((self._unknowns,) * 2), True
         linear = self._estimator.linear(measured, alone)
         self._noise.add(alone.residuals, measured, _taken(measured, linear, alone.state, known))
-        self._untold = self._without_effect(measured, linear, alone, known)
+        self._unobservable_variance = self._without_effect(measured, linear, alone, known)
         errors = self._errors(measured, linear, alone.state, known)
         by_itself = self._with_covariance(alone, measured, linear, errors, known)
         if not len(self._kept):
@@ -289,7 +279,7 @@ class SequenceFilter(Generic[Frame]):
         nothing = np.zeros(len(constant))
         if not 0 < len(constant) < d:
             return nothing
-        self._untold = nothing
+        self._unobservable_variance = nothing
         held = self._errors(measured, linear.holding(constant), alone.state, known).covariance
         absent = without_clear_effect(
             model,
@@ -338,7 +328,7 @@ class SequenceFilter(Generic[Frame]):
             grown * self._of_kept(errors.covariance) + self._step,
             np.sqrt(grown) * errors.by_point[:, :, self._kept],
             grown * self._of_kept(errors.by_frames) + self._step,
-            np.sqrt(grown) * errors.by_cause[:, self._kept],
+            np.sqrt(grown) * errors.by_factor[:, self._kept],
             grown * self._of_kept(errors.unseen),
             {view: np.sqrt(grown) * rows[:, self._kept] for view, rows in errors.by_views.items()},
             {} if self._past is None else self._past.left,
@@ -362,8 +352,8 @@ class SequenceFilter(Generic[Frame]):
         squared_px = np.trace(np.linalg.solve(self._of_kept(errors.inverse), own)) / len(self._kept)
         p, basis = scipy.linalg.eigh(past.covariance, own)
         shared = quadratic(past.by_point, measured.correlation, errors.by_point[:, :, self._kept])
-        error_factors = min(len(past.by_cause), len(errors.by_cause))
-        shared += past.by_cause[:error_factors].T @ errors.by_cause[:error_factors, self._kept]
+        error_factors = min(len(past.by_factor), len(errors.by_factor))
+        shared += past.by_factor[:error_factors].T @ errors.by_factor[:error_factors, self._kept]
         c = np.einsum("ik,ij,jk->k", basis, shared, basis)
         weight = np.clip((1.0 - c) / np.maximum(1.0 + p - 2.0 * c, 1e-12), 0.0, LARGEST_WEIGHT)
         root = basis * np.sqrt(squared_px * weight / (1.0 - weight))
@@ -389,36 +379,36 @@ class SequenceFilter(Generic[Frame]):
         """How the measurements' errors, and those of what is known otherwise, enter the estimate."""
         d, kept = self._unknowns - 6, self._kept
         common, frame = self._noise.common, self._noise.frame
-        by_point = np.sqrt(common) * linear.scores
-        by_frames = frame * quadratic(linear.scores, measured.correlation) + linear.of_depths
-        by_cause, unseen = np.zeros((0, self._unknowns)), np.zeros_like(linear.hessian)
+        by_point = np.sqrt(common) * linear.weighted_jacobian
+        by_frames = frame * quadratic(linear.weighted_jacobian, measured.correlation) + linear.of_depths
+        by_factor, unseen = np.zeros((0, self._unknowns)), np.zeros_like(linear.hessian)
         by_views: dict[int, Array] = {}
         hessian = linear.hessian.copy()
         if known is not None:
-            information, by_cause = known.terms(state)[1], known.lasting_scores
+            information, by_factor = known.terms(state)[1], known.lasting_push
             hessian += information
-            by_frames += known.squared_px * information - by_cause.T @ by_cause
+            by_frames += known.squared_px * information - by_factor.T @ by_factor
         # What a frame does not tell is no better known by many: one more cause that stays the same.
-        by_cause = np.vstack([np.sqrt(self._untold)[:, None] * hessian[self._constant], by_cause])
+        by_factor = np.vstack([np.sqrt(self._unobservable_variance)[:, None] * hessian[self._constant], by_factor])
         if past is not None and self._past is not None:
             hessian[:d, :d] += past.information
             weight = self._of_kept(past.information)
             by_point[:, :, kept] += self._past.by_point @ weight
             by_frames[np.ix_(kept, kept)] += weight @ self._past.by_frames @ weight
-            by_cause = _longer(by_cause, len(self._past.by_cause))
-            by_cause[: len(self._past.by_cause), kept] += self._past.by_cause @ weight
+            by_factor = _longer(by_factor, len(self._past.by_factor))
+            by_factor[: len(self._past.by_factor), kept] += self._past.by_factor @ weight
             unseen[np.ix_(kept, kept)] += weight @ self._past.unseen @ weight
             by_views = {view: rows @ weight for view, rows in self._past.by_views.items()}
         linear = replace(linear, hessian=hessian)
         inverse = linear.inverse
-        by_point, by_frames, by_cause = by_point @ inverse, inverse @ by_frames @ inverse, by_cause @ inverse
+        by_point, by_frames, by_factor = by_point @ inverse, inverse @ by_frames @ inverse, by_factor @ inverse
         unseen = inverse @ unseen @ inverse + (common + frame) * linear.unseen
-        covariance = quadratic(by_point, measured.correlation) + by_frames + by_cause.T @ by_cause + unseen
+        covariance = quadratic(by_point, measured.correlation) + by_frames + by_factor.T @ by_factor + unseen
         if past is not None and self._past is not None:
             by_views = {view: rows @ inverse[kept] for view, rows in by_views.items()}
             for view, rows in by_views.items():
                 covariance += rows.T @ self._past.left[view].covariance @ rows
-        return Errors(by_point, by_frames, by_cause, unseen, covariance, inverse, by_views)
+        return Errors(by_point, by_frames, by_factor, unseen, covariance, inverse, by_views)
 
 
 def _taken(measured: Observations | RigObservations, linear: LinearCost, state: State, known: Prior | None) -> float:
@@ -428,7 +418,7 @@ def _taken(measured: Observations | RigObservations, linear: LinearCost, state: 
     independent, and more where neighbours err alike.
     """
     hessian = linear.hessian if known is None else linear.hessian + known.terms(state)[1]
-    spread = quadratic(linear.scores, measured.correlation)
+    spread = quadratic(linear.weighted_jacobian, measured.correlation)
     return float(np.trace(replace(linear, hessian=hessian).inverse @ spread))
 
 

@@ -68,9 +68,6 @@ def moved(state: State, step: Array) -> State:
     return State(state.parameters + step[:d], RigidTransform(rotation, pose.translation + step[d + 3 :]))
 
 
-# What is known of a state beforehand.
-
-
 @dataclass(frozen=True)
 class Prior:
     """What is known of the parameters, and of the pose, beforehand, as one more term of the cost.
@@ -117,7 +114,7 @@ class Prior:
         return state if self.pose is None else replace(state, camera_from_object=self.pose)
 
     @property
-    def lasting_scores(self) -> Array:
+    def lasting_push(self) -> Array:
         """How the lasting errors enter the gradient (k, d + 6)."""
         d = len(self.mean)
         if self.lasting is None or self.pose_information is None:
