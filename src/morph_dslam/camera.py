@@ -27,7 +27,6 @@ Maps = tuple[NDArray, NDArray]
 
 #: Newton stops when the image point is met to this distance at unit focal length, 1e-7 px at 1000 px.
 TOLERANCE = 1e-10
-
 MOST_ITERATIONS = 50
 
 #: Numbers of coefficients of each lens model.
@@ -141,10 +140,7 @@ class Camera:
         fisheye
     lens_model : "radial-tangential", or "fisheye" for the equidistant model
 
-    Raises
-    ------
-    CameraError
-        If the lens model is unknown or takes another number of coefficients.
+    Raises CameraError if the lens model is unknown or takes another number of coefficients.
     """
 
     width: int
@@ -275,10 +271,8 @@ class StereoCamera:
         -------
         The ideal pinhole of both rectified images, and the maps for `cv2.remap` from the left and the right image.
 
-        Raises
-        ------
-        CameraError
-            If the cameras differ in image size, stand in one place, or the right one is not to the right.
+        Raises CameraError if the cameras differ in image size, stand in one place, or the right one is not to the
+        right.
         """
         left, right = self.left, self.right
         if (left.width, left.height) != (right.width, right.height):

@@ -1,4 +1,4 @@
-"""Rotations and rigid transforms, named target_from_source: ``a_from_b @ p_b`` is in frame a."""
+"""Rotations, rigid and similarity transforms, named target_from_source: ``a_from_b @ p_b`` is in frame a."""
 
 from __future__ import annotations
 
@@ -114,9 +114,6 @@ class RigidTransform:
         return points @ self.rotation.T + self.translation
 
 
-# Similarity transforms, Sim(3): a scale, a rotation, and a translation; and the best fit to points.
-
-
 @dataclass(frozen=True)
 class SimilarityTransform:
     """A point is scaled, rotated by ``rotation`` (3, 3), and moved by ``translation`` (3,), target's unit."""
@@ -163,10 +160,7 @@ def fit_similarity(source: Array, target: Array, with_scale: bool = True) -> Sim
     Minimises the sum of squared distances over rotations, translations and, ``with_scale``, scales. The
     rotation of points on one line is not unique; one of the best is returned.
 
-    Raises
-    ------
-    ValueError
-        If there is no point, or with a scale, the source points coincide.
+    Raises ValueError if there is no point, or with a scale, the source points coincide.
     """
     if not len(source):
         raise ValueError("a similarity cannot be fitted to no points")

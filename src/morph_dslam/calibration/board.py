@@ -26,7 +26,6 @@ REFINEMENT_WINDOW = 0.35
 
 #: So many frames of a video are searched for the board, evenly spread over it.
 MOST_SEARCHED = 120
-
 #: So many of those where it is found are used: more add time and no accuracy.
 MOST_FRAMES = 30
 
@@ -54,10 +53,7 @@ class Board:
 def parse_board(text: str, square: str) -> Board:
     """The board of "9x6" inner corners and squares of "25 mm".
 
-    Raises
-    ------
-    CameraError
-        If one of them is not of that form, or the board is too small to be recognised.
+    Raises CameraError if one of them is not of that form, or the board is too small to be recognised.
     """
     size = re.fullmatch(r"(\d+)\s*[xX×]\s*(\d+)", text.strip())
     if size is None:
@@ -140,12 +136,8 @@ def collect_views(sources: Sequence[Path], board: Board, ignored: Path | None = 
     Of a recording with many views, those are kept that cover positions, distances and tilts best. The image
     ``ignored`` is passed over: a picture that an earlier calibration left in the folder.
 
-    Raises
-    ------
-    CameraError
-        If the board is found nowhere, or the images differ in size.
-    SourceError
-        If an image or a video cannot be read.
+    Raises CameraError if the board is found nowhere, or the images differ in size. Raises SourceError if an image or a
+    video cannot be read.
     """
     files = [path for path in _image_files(sources) if ignored is None or path.resolve() != ignored.resolve()]
     images, total = (_read(files), len(files)) if files else _sampled(sources)

@@ -1,4 +1,4 @@
-"""A picture of a calibration: what of the image the board covered, and the residuals."""
+"""The calibration of a camera from a board: a camera file, a picture of the residuals, and a report."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from morph_dslam.errors import CameraError
 from morph_dslam.io.camera_files import save_camera
 
 DPI = 110
-
 #: Residuals are drawn this many times their length.
 MAGNIFIED = 100.0
 
@@ -71,17 +70,11 @@ def _draw_views(axes: Axes, solution: Solution) -> None:
     axes.set_title("rms [px] of each view, and its tilt", fontsize=10)
 
 
-# The calibration of a camera from a board: a camera file, a picture, and a report.
-
-
 #: The image is divided into so many cells each way to see how much of it the corners cover.
 CELLS = 10
-
 LEAST_COVERAGE = 0.5
-
 #: A larger residual than this, pixels, says that something is wrong.
 LARGE_RMS = 0.7
-
 #: A board bent by more than this part of its length is worth a remark.
 BENT = 0.005
 
@@ -146,13 +139,8 @@ def calibrate(
     ----------
     sources : images, one folder of images, or one video or other recording. output : the camera file.
 
-    Raises
-    ------
-    CameraError
-        If the board is found in too few images, images differ in size, the views do not determine the focal
-        length, or the camera file cannot be written.
-    SourceError
-        If an image or a video cannot be read.
+    Raises CameraError if the board is found in too few images, images differ in size, the views do not determine the
+    focal length, or the camera file cannot be written. Raises SourceError if an image or a video cannot be read.
     """
     output = Path(output)
     if output.suffix not in (".yaml", ".yml"):

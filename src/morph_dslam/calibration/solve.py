@@ -23,21 +23,16 @@ Array = NDArray[np.float64]
 
 #: Three views determine the intrinsics; five let a bad one show.
 FEWEST_VIEWS = 5
-
 #: From so many views on the shape of the board is solved for; OpenCV does so for radial-tangential lenses.
 FEWEST_FOR_SHAPE = 8
-
 #: A view whose residual is this many times the median one is left out, unless it is below `HARMLESS` pixels.
 OUTLIER_RATIO = 3.0
-
 HARMLESS = 0.3
-
 #: Without a view in which the board is tilted this much, focal length and distance are ambiguous.
 LEAST_TILT = np.deg2rad(10.0)
 
 #: A focal length known less well than this, as standard deviation over value, is refused.
 MOST_UNCERTAIN = 0.01
-
 #: Fisheyes are solved for from these angles across the width of the image, radians, until one fits.
 FISHEYE_ANGLES = (1.5, 2.0, 2.5, 3.1, 4.0)
 
@@ -94,10 +89,7 @@ def solve_intrinsics(
 ) -> Solution:
     """Calibrate from views of the board, leaving out those that do not fit the others.
 
-    Raises
-    ------
-    CameraError
-        If there are too few views, or they do not determine the focal length.
+    Raises CameraError if there are too few views, or they do not determine the focal length.
     """
     solve = _solve_fisheye if lens_model == "fisheye" else _solve_radial_tangential
     kept, left_out = list(views), []

@@ -25,10 +25,8 @@ Mapping = dict[str, Any]
 
 #: No focal length or principal point is meant by what is larger, pixels.
 LARGEST_PX = 1e7
-
 #: Image sides of more pixels are refused before memory is asked for them.
 LARGEST_SIDE_PX = 65_535
-
 #: Names of distortion models in ROS, Kalibr and EuRoC files. A name with None stands for no distortion.
 DISTORTION_MODELS = {
     "plumb_bob": "radial-tangential",
@@ -77,11 +75,8 @@ def load_camera(path: str | Path) -> Camera:
     ----------
     path : the file; in one with several cameras, `file#name` chooses: `camchain.yaml#cam1`, `cameras.txt#2`
 
-    Raises
-    ------
-    CameraError
-        If the file is missing or malformed, lacks or misnames a value, has a camera or distortion model that
-        is not known, does not say its image size, or holds several cameras of which none is chosen.
+    Raises CameraError if the file is missing or malformed, lacks or misnames a value, has a camera or distortion model
+    that is not known, does not say its image size, or holds several cameras of which none is chosen.
     """
     path, name = _split_name(Path(path))
     where = str(path) if name is None else f"{path}#{name}"
@@ -103,10 +98,7 @@ def load_camera_or_pair(path: str | Path) -> Camera | StereoCamera:
     A pair is a Kalibr camchain with cam0, to the left, and cam1, or EuRoC's `mav0` folder, or the folder that holds
     it. A camchain of which one camera is chosen, `camchain.yaml#cam0`, is that camera alone.
 
-    Raises
-    ------
-    CameraError
-        As of `load_camera`, or if a pair's file does not say where the cameras are.
+    Raises CameraError as of `load_camera`, or if a pair's file does not say where the cameras are.
     """
     path = Path(path)
     if path.is_dir():
@@ -122,10 +114,7 @@ def load_camera_or_pair(path: str | Path) -> Camera | StereoCamera:
 def load_rig(path: str | Path) -> list[tuple[Camera, RigidTransform]]:
     """Read all cameras of a Kalibr camchain, cam0 first, each with camera_from_cam0, metres.
 
-    Raises
-    ------
-    CameraError
-        If the file is missing or malformed, has fewer than two cameras, or does not say where one is.
+    Raises CameraError if the file is missing or malformed, has fewer than two cameras, or does not say where one is.
     """
     chain = _read_yaml(Path(path))
     chain = chain if isinstance(chain, dict) else {}

@@ -40,10 +40,7 @@ PIXEL_CENTRE = 0.5
 def read_cameras(path: Path) -> dict[str, dict]:
     """The cameras of a cameras.txt by their ids, as the keys of our camera files.
 
-    Raises
-    ------
-    CameraError
-        If the file cannot be read, has no camera, or one of an unknown model or with wrong values.
+    Raises CameraError if the file cannot be read, has no camera, or one of an unknown model or with wrong values.
     """
     cameras = {}
     for number, line in enumerate(read_text(path, "camera file", CameraError).splitlines(), start=1):
@@ -148,10 +145,7 @@ class ColmapModel:
 def read_colmap_model(folder: Path) -> ColmapModel:
     """Read images and points of a model; pixels are those of the images as recorded.
 
-    Raises
-    ------
-    MapError
-        If files are missing or damaged, or hold no image or point.
+    Raises MapError if files are missing or damaged, or hold no image or point.
     """
     for name in ("images.txt", "points3D.txt"):
         if not (folder / name).is_file():

@@ -137,9 +137,6 @@ def read_cards(path: Path) -> list[Card]:
     return cards
 
 
-# Named sets of labels in an input file: lists, GENERATE ranges, and sets within sets.
-
-
 Labels = NDArray[np.int64]
 
 

@@ -17,7 +17,6 @@ from morph_dslam.io.text import read_text
 
 #: No millimetres or pixels are meant by what is larger.
 LARGEST = 1e7
-
 HEADER = ("x_mm", "y_mm", "z_mm", "u_px", "v_px")
 
 
@@ -38,10 +37,8 @@ class Landmarks:
 def load_landmarks(path: Path) -> Landmarks:
     """Read a landmark file.
 
-    Raises
-    ------
-    RegistrationError
-        If the file is missing, has another header, or a value is no number, or one that cannot be meant.
+    Raises RegistrationError if the file is missing, has another header, or a value is no number, or one that cannot be
+    meant.
     """
     lines = read_text(path, "landmarks", RegistrationError).splitlines()
     rows = [row for row in csv.reader(lines) if any(cell.strip() for cell in row)]

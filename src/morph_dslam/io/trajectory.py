@@ -71,10 +71,7 @@ def load_trajectory(path: Path) -> Trajectory:
         line's number from 0), COLMAP's images.txt (stamped with the last number in each image's name), or a
         folder of 7-Scenes with `frame-000000.pose.txt` (stamped with the frame's number / 30)
 
-    Raises
-    ------
-    TrajectoryError
-        If it is missing, empty, or of none of these kinds, or a line is no pose.
+    Raises TrajectoryError if it is missing, empty, or of none of these kinds, or a line is no pose.
     """
     path = Path(path)
     if path.is_dir():

@@ -1,7 +1,9 @@
-"""Small linear algebra in compiled loops: symmetric positive definite systems, and steps of a pose.
+"""Bundle adjustment: camera poses and map points together, from their pixels, in compiled loops.
 
-numba's `np.linalg` takes many seconds to compile; these few lines take one, and for the sizes of a local
-bundle adjustment (some dozens of unknowns) run as fast.
+Levenberg-Marquardt on the Huber cost of reprojection errors; points are eliminated by the Schur complement (Triggs et
+al., Bundle Adjustment - A Modern Synthesis, 2000, section 6). Where a camera measures depth, the column of the point in
+a right image at a known baseline is a third residual (Mur-Artal and Tardós, ORB-SLAM2, 2017). No interpreter lock is
+held. numba's `np.linalg` takes many seconds to compile; the linear algebra here takes one, and runs as fast.
 """
 
 from __future__ import annotations
@@ -82,31 +84,19 @@ def orthonormal(poses):
     return result
 
 
-# Bundle adjustment: camera poses and map points together, from their pixels.
-# Levenberg-Marquardt on the Huber cost of reprojection errors. Points are eliminated by the Schur complement
-# (Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, section 6), so that the linear system has six
-# unknowns for each free camera. Where a camera measures depth (stereo, RGB-D), the column of the point in a
-# right image at a known baseline is a third residual (Mur-Artal and Tardós, ORB-SLAM2, 2017).
-# The compiled part holds no interpreter lock: a mapper can adjust while a tracker runs. Its plain twin is
-# scipy's least squares, with which the tests compare it.
-
-
 Array = NDArray[np.float64]
-
 Indices = NDArray[np.int64]
 
 #: Damping of the first iteration, as a part of the diagonal, and its bounds.
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-9, 1e8
-
 #: A point's block is kept invertible by this much: a point seen once has no depth of its own, px^2/m^2.
 POINT_RIDGE = 1e-9
-
 #: Points nearer to the camera plane than this part of a unit depth do not count.
 LEAST_DEPTH = 1e-6
 
 
 @njit(cache=True, nogil=True)
-def _local(poses, c, points, p):
+def in_camera(poses, c, points, p):
     """A point in the axes of a camera, three numbers."""
     x = poses[c, 0, 0] * points[p, 0] + poses[c, 0, 1] * points[p, 1] + poses[c, 0, 2] * points[p, 2]
     y = poses[c, 1, 0] * points[p, 0] + poses[c, 1, 1] * points[p, 1] + poses[c, 1, 2] * points[p, 2]
@@ -115,7 +105,7 @@ def _local(poses, c, points, p):
 
 
 @njit(cache=True, nogil=True)
-def _residual(x, y, z, pixels, o, camera):
+def residual(x, y, z, pixels, o, camera):
     """Reprojection error of a point before the camera: column, row, right column (0 if not measured)."""
     u = camera[0] * x / z + camera[2]
     in_right = 0.0 if np.isnan(pixels[o, 2]) else u - camera[4] / z - pixels[o, 2]
@@ -123,8 +113,8 @@ def _residual(x, y, z, pixels, o, camera):
 
 
 @njit(cache=True, nogil=True)
-def _jacobians(x, y, z, poses, c, camera, by_pose, by_point):
-    """Derivatives of `_residual` by the pose's twist (rotation, translation; from the left) and the point."""
+def jacobians(x, y, z, poses, c, camera, by_pose, by_point):
+    """Derivatives of `residual` by the pose's twist (rotation, translation; from the left) and the point."""
     for row in range(3):
         gx, gy = (0.0, camera[1] / z) if row == 1 else (camera[0] / z, 0.0)
         gz = -(gx * x + gy * y) / z + (camera[4] / (z * z) if row == 2 else 0.0)
@@ -137,7 +127,7 @@ def _jacobians(x, y, z, poses, c, camera, by_pose, by_point):
 
 
 @njit(cache=True, nogil=True)
-def _huber(error, width):
+def huber(error, width):
     """Cost and weight of an error's length."""
     if error <= width:
         return 0.5 * error * error, 1.0
@@ -149,12 +139,12 @@ def total_cost(poses, points, camera_idx, point_idx, pixels, camera, width):
     """Huber cost of all observations; one that falls behind its camera costs as much as a miss of 1000 px."""
     cost = 0.0
     for o in range(len(pixels)):
-        x, y, z = _local(poses, camera_idx[o], points, point_idx[o])
+        x, y, z = in_camera(poses, camera_idx[o], points, point_idx[o])
         error = 1000.0
         if z >= LEAST_DEPTH:
-            first, second, third = _residual(x, y, z, pixels, o, camera)
+            first, second, third = residual(x, y, z, pixels, o, camera)
             error = np.sqrt(first * first + second * second + third * third)
-        cost += _huber(error, width)[0]
+        cost += huber(error, width)[0]
     return cost
 
 
@@ -168,28 +158,28 @@ def _normal_equations(poses, points, slot, camera_idx, point_idx, pixels, camera
     pose_block, pose_right = np.zeros((n_free, 6, 6)), np.zeros((n_free, 6))
     point_block, point_right = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
     cross = np.zeros((len(pixels), 3, 6))
-    residual, by_pose, by_point = np.zeros(3), np.zeros((3, 6)), np.zeros((3, 3))
+    misses, by_pose, by_point = np.zeros(3), np.zeros((3, 6)), np.zeros((3, 3))
     for o in range(len(pixels)):
         c, p = camera_idx[o], point_idx[o]
-        x, y, z = _local(poses, c, points, p)
+        x, y, z = in_camera(poses, c, points, p)
         if z < LEAST_DEPTH:
             continue
-        residual[0], residual[1], residual[2] = _residual(x, y, z, pixels, o, camera)
-        square = residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2
-        weight = _huber(np.sqrt(square), width)[1]
-        _jacobians(x, y, z, poses, c, camera, by_pose, by_point)
+        misses[0], misses[1], misses[2] = residual(x, y, z, pixels, o, camera)
+        square = misses[0] ** 2 + misses[1] ** 2 + misses[2] ** 2
+        weight = huber(np.sqrt(square), width)[1]
+        jacobians(x, y, z, poses, c, camera, by_pose, by_point)
         free = slot[c]
         for row in range(2 if np.isnan(pixels[o, 2]) else 3):
             for i in range(3):
                 weighted = weight * by_point[row, i]
-                point_right[p, i] -= weighted * residual[row]
+                point_right[p, i] -= weighted * misses[row]
                 for j in range(i, 3):
                     point_block[p, i, j] += weighted * by_point[row, j]
             if free < 0:
                 continue
             for i in range(6):
                 weighted = weight * by_pose[row, i]
-                pose_right[free, i] -= weighted * residual[row]
+                pose_right[free, i] -= weighted * misses[row]
                 for j in range(i + 1):
                     pose_block[free, i, j] += weighted * by_pose[row, j]
                 for j in range(3):

@@ -18,29 +18,22 @@ from morph_dslam.slam.result import NoPose, SlamReason
 from morph_dslam.slam.rigid_map import Followed, RigidMap
 
 Array = NDArray[np.float64]
-
 Mask = NDArray[np.bool_]
 
 #: Errors beyond these multiples of the usual one count linearly, and not at all; within bounds, in pixels.
 #: With wider ones a near object that moves draws the pose along: a turn and a move of the camera nearly
 #: explain it.
 HUBER_RATIO, MOST_HUBER_PX = 1.5, 1.5
-
 INLIER_RATIO, LEAST_INLIER_PX = 4.0, 1.5
-
 #: For the same reason points do not count at first that miss the prediction by this multiple of the median.
 TRUSTED_RATIO = 3.0
-
 #: A point fits as well as usual within this multiple of the usual error, at least in so many pixels. A misfit
 #: (`misfit`) above this calls for another pose, which has to lower it to this part.
 CORE_RATIO, LEAST_CORE_PX = 2.0, 0.6
-
 MOST_MISFIT, CLEARLY_BETTER = 0.35, 0.85
-
 #: Points first seen so many keyframes ago decide between two poses, if there are enough: points that came
 #: with an object while it moved along with the camera must not outvote them.
 SENIOR_AGE, LEAST_SENIORS = 3, 30
-
 #: Points that leave together, by a motion of their own, and are as many as this part of those that stay: then
 #: which of them stands still is ambiguous.
 RIVAL_SHARE = 0.6

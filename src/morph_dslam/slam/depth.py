@@ -18,21 +18,16 @@ from morph_dslam.slam.options import LEAST_CORRELATION, PATCH_HALF
 from morph_dslam.tracking.patches import follow, patch_correlation
 
 Array = NDArray[np.float64]
-
 Image = NDArray[np.uint8]
 
 #: Largest disparity of stereo pairs, pixels; nearer points have no depth from one frame.
 MOST_DISPARITY_PX = 128
-
 #: Disparities of neighbouring pixels of a depth image that differ by more are an edge, pixels.
 MOST_STEP = 1.5
-
 #: How far a measured column may be from the expected one, pixels.
 SEARCH_PX = 6
-
 #: Half width of the patches compared along a row, and how much worse the second best place has to be.
 ROW_HALF, ROW_CLEARNESS = 5, 1.25
-
 #: A point's rows in both rectified images differ by less than this, pixels.
 MOST_ROW_ERROR = 0.75
 

@@ -20,7 +20,6 @@ FACTORS = np.exp(np.linspace(np.log(0.7), np.log(1.43), 9))
 
 #: Keyframes that are adjusted, and the fewest that say anything.
 MOST_KEYFRAMES, LEAST_KEYFRAMES = 12, 5
-
 #: The cost with the best factor has to be this part of the given one's, and the factor this far from 1.
 MOST_COST, LEAST_DEVIATION = 0.7, 0.04
 

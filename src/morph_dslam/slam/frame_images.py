@@ -1,8 +1,8 @@
-"""ORB descriptors at given points, and matching points that have several of them.
+"""From a frame as recorded to what tracking and mapping work on, and the description of its points.
 
-Descriptors are turned upright by each patch's intensity centroid (Rublee et al. 2011) and computed at several
-scales, since the points did not come from ORB's detector. The image is the grey one: contrast normalization, by a
-window of fixed size, makes the same surface look different from nearer or farther.
+ORB descriptors are turned upright by each patch's intensity centroid (Rublee et al. 2011) and computed at several
+scales, since the points did not come from ORB's detector, in the grey image: contrast normalization, by a window of
+fixed size, makes the same surface look different from nearer or farther.
 """
 
 from __future__ import annotations
@@ -22,18 +22,13 @@ from morph_dslam.slam.pose import inside
 from morph_dslam.tracking.patches import normalize_contrast
 
 Array = NDArray[np.float64]
-
 Indices = NDArray[np.int64]
-
 Image = NDArray[np.uint8]
-
 Descriptors = NDArray[np.uint8]
 
 #: ORB's patch radius in pixels, and what it needs around a keypoint at the first scale.
 PATCH_RADIUS, BORDER = 15, 32
-
 SCALE_STEP = 1.2
-
 #: Octaves that points are described at, for changes of scale between 0.6 and 1.6.
 OCTAVES = (0, 2, 4)
 
@@ -136,9 +131,6 @@ def match_points(distances: NDArray[np.uint16], ratio: float, most: int) -> tupl
     return rows[kept], columns[kept]
 
 
-# From a frame as recorded to what tracking and mapping work on: undistorted, contrast-normalized, and depth.
-
-
 #: Baseline, metres, that depth images are taken to have: structured light's noise is then half a pixel.
 VIRTUAL_BASELINE = 0.08
 
@@ -166,10 +158,7 @@ class FrameImages:
     ----------
     camera : of the undistorted images. baseline_px : of the depth (`RigidMap`), 0 without depth.
 
-    Raises
-    ------
-    CameraError
-        If a stereo pair is to have depth images too, or cannot be rectified.
+    Raises CameraError if a stereo pair is to have depth images too, or cannot be rectified.
     """
 
     def __init__(self, camera: Camera | StereoCamera, with_depth: bool = False) -> None:
@@ -196,10 +185,7 @@ class FrameImages:
     ) -> FrameView:
         """The view of a frame; depth or right images that the camera does not use are left aside.
 
-        Raises
-        ------
-        CameraError
-            If an image has not the camera's size.
+        Raises CameraError if an image has not the camera's size.
         """
         grey = self._grey(image, f"frame {index}", self._maps)
         normalized = self._normalized(grey)

@@ -21,27 +21,20 @@ from morph_dslam.slam.result import NoPose, SlamReason
 from morph_dslam.tracking.patches import FLOW_WINDOW, follow, patch_correlation, spread_corners
 
 Array = NDArray[np.float64]
-
 Mask = NDArray[np.bool_]
 
 #: Corners that are followed from the first view.
 START_CORNERS = 500
-
 #: Median angle between the first two views' rays, degrees.
 START_PARALLAX_DEG = 1.2
-
 #: Error in pixels, and share of the points that must fit, in three views.
 START_RMS_PX, START_SHARE = 1.0, 0.9
-
 #: How much larger a rejected hypothesis' squared error must be than the accepted one's.
 START_CLEARNESS = 1.5
-
 #: Squared error at which an observation stops to count more, px^2.
 MOST_SQUARED = 16.0
-
 #: Two hypotheses are the same if their second cameras differ by less than this after adjustment.
 SAME_DEG = 1.0
-
 #: Third views that may leave the choice open before the second view is chosen anew.
 MOST_OPEN_VIEWS = 8
 

@@ -1,4 +1,7 @@
-"""Points of a new keyframe: corners to follow, depth from a frame or from two views, points mapped twice."""
+"""Points of a new keyframe, and bundle adjustment of the part of the map around it.
+
+The adjustment is gathered from the map, solved apart from it, and put back; a tracker may go on in between.
+"""
 
 from __future__ import annotations
 
@@ -19,19 +22,14 @@ Array = NDArray[np.float64]
 #: Disparity from which the depth of a point in one frame makes it a map point, pixels; the baseline of depth images
 #: counts as 8 cm.
 LEAST_DISPARITY_PX = 10.0
-
 #: Points and candidates that a keyframe is filled up to, and how far new corners keep from followed points, pixels.
 MAP_CORNERS, CORNER_DISTANCE_PX = 450, 9
-
 #: Angle between rays from which a candidate becomes a map point.
 TRIANGULATION_DEG = 1.2
-
 #: Points that miss a view by more than this multiple of the usual error are at no place; bounds in pixels.
 NEW_POINT_MISS_RATIO, NEW_POINT_LEAST_MISS_PX, NEW_POINT_MOST_MISS_PX = 4.0, 1.5, 4.0
-
 #: Points of one place: this near in the image, pixels, and their depths alike to this part.
 SAME_PIXEL, SAME_DEPTH = 2.0, 0.1
-
 #: Fewer missing corners than this are not worth a search.
 LEAST_MISSING = 10
 
@@ -142,19 +140,12 @@ class PointMaker:
                 rigid_map.merge(int(older), int(newer))
 
 
-# Bundle adjustment of a part of the map: gathered from it, solved apart from it, and put back.
-# In between, a tracker may go on with the map as it was: only putting back changes it.
-
-
 #: Observations that miss by more than this multiple of the median error after adjustment are taken out, and
 #: those beyond a smaller multiple before it count linearly; within bounds, in pixels. With bounds alone a few
 #: wrong points would bend an otherwise exact map.
 MISS_RATIO, LEAST_MISS_PX, MOST_MISS_PX = 6.0, 1.5, 4.0
-
 HUBER_RATIO, LEAST_HUBER_PX, MOST_HUBER_PX = 2.0, 0.2, 1.5
-
 TOLERANCE = 1e-4
-
 #: Keyframes that local bundle adjustment moves, and those that hold it.
 WINDOW, FIXED_WINDOW = 8, 6
 

@@ -1,7 +1,9 @@
-"""Pose graph optimisation: keyframes as similarity transforms that relative measurements hold together.
+"""Closing loops: the camera is back where it was, but what drifted in between says that it is elsewhere.
 
-Each keyframe has a scale besides its pose, since the scale of a map made by one camera drifts (Strasdat,
-Montiel and Davison, Scale Drift-Aware Large Scale Monocular SLAM, 2010). Gauss-Newton with a sparse solver.
+A new keyframe that resembles old ones, which share none of its points, is located by their points alone. The drift is
+spread over all keyframes by a pose graph of similarity transforms, since the scale of a map made by one camera drifts
+too (Strasdat, Montiel and Davison, Scale Drift-Aware Large Scale Monocular SLAM, 2010); points that were mapped twice
+are made one, and the whole map is adjusted.
 """
 
 from __future__ import annotations
@@ -24,7 +26,6 @@ from morph_dslam.slam.rigid_map import GOOD, Followed, RigidMap
 from morph_dslam.slam.tracking import Tracker
 
 Array = NDArray[np.float64]
-
 Indices = NDArray[np.int64]
 
 #: Step of the numerical derivatives, and the step at which iterations end.
@@ -133,21 +134,12 @@ def _jacobian(
     return sparse.csr_array(entries, shape=shape)
 
 
-# Closing loops: the camera is back where it was, but what drifted in between says that it is elsewhere.
-# A new keyframe that resembles old ones, which share none of its points, is located by their points alone. If
-# it is found, the drift is known: it is spread over all keyframes (`pose_graph`), points that were mapped
-# twice are made one, and the whole map is adjusted.
-
-
 #: Old keyframes are at least so many keyframes older, and share fewer points with the new one.
 LEAST_AGE, MOST_SHARED = 8, 15
-
 #: An old keyframe has to resemble the new one this much as the best of its neighbours does.
 LEAST_LIKENESS = 0.6
-
 #: Old points found in the new view, and of them those that are new points as well, within so many pixels.
 LEAST_FOUND, LEAST_PAIRS, PAIR_PX = 40, 12, 3.0
-
 #: Keyframes that share so many points hold each other in the pose graph.
 LEAST_COVISIBLE = 40
 

@@ -1,4 +1,4 @@
-"""A map from frames whose poses are known, by whatever program: only its points have to be found."""
+"""Maps in files, and maps made from frames whose poses another program found."""
 
 from __future__ import annotations
 
@@ -25,10 +25,8 @@ Array = NDArray[np.float64]
 
 #: Frames and poses belong together if they are at most this far apart in time, seconds.
 MOST_TIME_DIFFERENCE = 0.01
-
 #: Depth of points of which nothing is known, in lengths of the path: images then move by rotation alone.
 FAR = 100.0
-
 #: Points are found again where the poses have them in at least this share of frames: 0.9 with exact
 #: poses, 0.15 with poses that are a tenth of a second late.
 LEAST_FOUND = 0.4
@@ -39,10 +37,7 @@ def map_from_trajectory(trajectory: Trajectory, source: FrameSource, images: Fra
 
     Lengths are the trajectory's.
 
-    Raises
-    ------
-    MapError
-        If fewer than three frames have a pose, or too few points obey the poses.
+    Raises MapError if fewer than three frames have a pose, or too few points obey the poses.
     """
     rigid_map, intrinsics = RigidMap(), np.asarray(images.camera.intrinsics)
     mapper = Mapper(rigid_map, intrinsics, hold_poses=True, unknown_depth=FAR * trajectory.length)
@@ -104,11 +99,7 @@ class _PosedTracker(Tracker):
         return result
 
 
-# Saving a map of the rigid scene, and loading it for another run with the same camera.
-
-
 FORMAT, VERSION = "morph-dslam map", 3
-
 KEYFRAME_ARRAYS = ("normalized", "camera_from_world", "point_ids", "pixels", "right", "described_ids", "descriptors")
 
 TRAJECTORY_ARRAYS = ("timestamps", "world_from_camera", "indices")
@@ -145,10 +136,7 @@ def load_map(path: Path, camera: Camera) -> RigidMap:
 def load_map_and_trajectory(path: Path, camera: Camera) -> tuple[RigidMap, Trajectory]:
     """Read a map and the path of the run that made it, which is empty where the file holds none.
 
-    Raises
-    ------
-    MapError
-        If it is missing, damaged, empty, of another version, or of a camera with other intrinsics.
+    Raises MapError if it is missing, damaged, empty, of another version, or of a camera with other intrinsics.
     """
     if not path.is_file():
         raise MapError(f"there is no map {path}")
@@ -187,9 +175,6 @@ def _read(path: Path, file: h5py.File, camera: Camera) -> RigidMap:
     return rigid_map
 
 
-# A map from a COLMAP model and the images that it was made from.
-
-
 #: Observations that miss their points by more are left out; if half of them do, the cameras differ.
 MOST_ERROR_PX = 4.0
 
@@ -199,10 +184,7 @@ def map_from_colmap(model: ColmapModel, source: FrameSource, images: FrameImages
 
     A frame is an image if its number is the last one in the image's name. Lengths are the model's.
 
-    Raises
-    ------
-    MapError
-        If none of the frames is an image of the model, or its points are not where the camera has them.
+    Raises MapError if none of the frames is an image of the model, or its points are not where the camera has them.
     """
     wanted = {image.number: image for image in model.images}
     rigid_map, errors, numbers = RigidMap(), [], []

@@ -1,4 +1,9 @@
-"""Which views the map keeps."""
+"""Building the map: which views it keeps, their points, culling, local bundle adjustment; in steps.
+
+Work is a generator that pauses where what follows can wait for another frame. In step with the frames, one step a frame
+changes the map itself, so that the same frames give the same map. Beside them, a thread does each step on a copy of the
+map, which replaces the map when the step has ended: frames wait for none.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +30,11 @@ Array = NDArray[np.float64]
 #: A keyframe is due when fewer than this share of the last one's points are left, when points have moved this far
 #: since it (median), or when the camera has moved this part of the median depth.
 KEYFRAME_SHARE, KEYFRAME_MOTION_PX, KEYFRAME_BASELINE = 0.75, 30.0, 0.06
-
 #: Where keyframes can wait, they wait for frames in which the image moves less than this, pixels: fast motion blurs,
 #: and most cameras read their rows one after the other, which bends what they see.
 QUIET_PX = 5.0
-
 #: They cannot wait when fewer than this share of the last one's points are left.
 URGENT_SHARE = 0.6
-
 LEAST_FRAMES_BETWEEN = 3
 
 
@@ -84,21 +86,12 @@ class KeyframeChoice:
         return bool(np.median(motion) > KEYFRAME_MOTION_PX or baseline / depth > KEYFRAME_BASELINE)
 
 
-# Taking out keyframes that show hardly anything that others do not show.
-# Where the camera comes back to places that are mapped, it adds keyframes there as it does elsewhere. Those
-# whose points are seen often enough without them go (Mur-Artal, Montiel and Tardós, ORB-SLAM, 2015), so that
-# a map grows with the scene and not with time. Small maps are left whole.
-
-
 #: Maps of at most so many keyframes are left whole.
 ENOUGH_KEYFRAMES = 40
-
 #: A keyframe can go if at least this share of its points is seen by so many others.
 REDUNDANT_SHARE, ENOUGH_OTHERS = 0.9, 3
-
 #: The newest keyframes stay: what they show has not been seen often yet.
 RECENT = 8
-
 #: Keyframes that go at once: more than come, so that a map that has become too large shrinks again.
 MOST_AT_ONCE = 2
 
@@ -137,13 +130,8 @@ def _good(rigid_map: RigidMap, number: int) -> Indices:
     return ids[rigid_map.state[ids] == GOOD]
 
 
-# Building the map: a kept view's new points, culling, fusion, local bundle adjustment.
-# A view is worked in by steps, between which tracking goes on (`mapping_work`).
-
-
 #: Map points that are found in a smaller share of the frames that should show them are taken out.
 LEAST_FOUND = 0.1
-
 #: Iterations of local bundle adjustment.
 LOCAL_ITERATIONS = 10
 
@@ -251,13 +239,6 @@ def _keyframe(view: FrameView, pose: Array, seen: Followed) -> Keyframe:
 def pose_in_keyframe(camera_from_world: Array, keyframe: Keyframe) -> Array:
     """The camera in a keyframe's frame (4, 4), which later adjustments of the keyframe carry along."""
     return camera_from_world @ inverse(keyframe.camera_from_world)
-
-
-# The mapper's work as steps, between which tracking goes on.
-# Work is a generator that pauses where what follows can wait for another frame. In step with the frames each
-# step changes the map itself, one step a frame, so that the same frames give the same map. Beside them, a
-# thread does each step on a copy of the map, which replaces the map when the step has ended: frames wait for
-# none.
 
 
 Work = Generator[None, None, None]

@@ -6,13 +6,10 @@ from dataclasses import dataclass
 
 #: Half width, pixels, of patches that must agree, and how well: their correlation.
 PATCH_HALF, LEAST_CORRELATION = 6, 0.6
-
 #: Points that miss by more, pixels, do not belong to the rigid scene.
 INLIER_PX = 4.0
-
 #: A pose from fewer points counts as lost.
 LEAST_INLIERS = 20
-
 #: Fewest points that a map begins with.
 LEAST_START_POINTS = 80
 

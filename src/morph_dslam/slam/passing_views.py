@@ -15,17 +15,13 @@ from numpy.typing import NDArray
 from morph_dslam.slam.pose import inverse, reprojection_errors
 
 Array = NDArray[np.float64]
-
 Indices = NDArray[np.int64]
-
 Mask = NDArray[np.bool_]
 
 #: A frame is kept when the points have moved this far since the last one kept (median), pixels.
 LEAST_MOTION_PX = 2.0
-
 #: Frames kept at most; then every other one is left out.
 MOST_VIEWS = 16
-
 #: A point has to fit this share of the frames that it was followed in.
 LEAST_SHARE = 0.75
 

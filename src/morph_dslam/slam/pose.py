@@ -1,4 +1,10 @@
-"""Map points in a camera, as arrays."""
+"""Projection of map points, the pose of a camera from them, and the motion between two views.
+
+Poses are refined by Huber-weighted Gauss-Newton, or found by P3P in RANSAC without a start. Between two views the
+choice of essential matrix or homography follows ORB-SLAM (Mur-Artal et al. 2015, IV-B): where a homography explains the
+matches about as well, the scene is plane or the camera has only turned, and the motion is taken from its decomposition
+(Malis and Vargas 2007). A plane leaves two solutions; both are returned, and a third view decides.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +16,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.geometry import rotation_exp
-from morph_dslam.slam.bundle_adjustment import cholesky_solve, orthonormal, turned_and_shifted
+from morph_dslam.slam.bundle_adjustment import (
+    LEAST_DEPTH,
+    cholesky_solve,
+    huber,
+    in_camera,
+    jacobians,
+    orthonormal,
+    residual,
+    turned_and_shifted,
+)
 
 Array = NDArray[np.float64]
 
@@ -53,14 +68,6 @@ def inside(pixels: Array, shape: tuple[int, ...], margin: float) -> NDArray[np.b
         )
 
 
-# The pose of one camera from known points: Huber-weighted Gauss-Newton, and RANSAC without a start.
-# Where depth was measured, the point's column in a right image is a third residual, as in
-# `bundle_adjustment`.
-
-
-#: Points nearer than this to the camera plane do not count.
-LEAST_DEPTH = 1e-6
-
 #: Points that miss by more than this multiple of the inliers' median do not count in the next round: without
 #: this a few points that move draw the pose along for as long as they stay below ``inlier_px``. Pixels below
 #: which all count.
@@ -71,46 +78,22 @@ CORE_RATIO, LEAST_CORE_PX = 3.0, 0.6
 def _normal_equations(pose, points, pixels, camera, width):
     """Huber cost, J'WJ (6, 6) and -J'Wr (6,) by the pose's twist from the left (rotation, translation)."""
     matrix, right, cost = np.zeros((6, 6)), np.zeros(6), 0.0
-    rows = np.zeros((3, 6))
+    poses, rows, by_point, misses = pose.reshape(1, 4, 4), np.zeros((3, 6)), np.zeros((3, 3)), np.zeros(3)
     for i in range(len(points)):
-        x = pose[0, 0] * points[i, 0] + pose[0, 1] * points[i, 1] + pose[0, 2] * points[i, 2] + pose[0, 3]
-        y = pose[1, 0] * points[i, 0] + pose[1, 1] * points[i, 1] + pose[1, 2] * points[i, 2] + pose[1, 3]
-        z = pose[2, 0] * points[i, 0] + pose[2, 1] * points[i, 1] + pose[2, 2] * points[i, 2] + pose[2, 3]
+        x, y, z = in_camera(poses, 0, points, i)
         if z < LEAST_DEPTH:
             cost += width * 1000.0
             continue
-        ru = camera[0] * x / z + camera[2] - pixels[i, 0]
-        rv = camera[1] * y / z + camera[3] - pixels[i, 1]
-        square = ru * ru + rv * rv
-        has_depth, rd = not np.isnan(pixels[i, 2]), 0.0
-        if has_depth:
-            rd = ru + pixels[i, 0] - camera[4] / z - pixels[i, 2]
-            square += rd * rd
-        error = np.sqrt(square)
-        weight = 1.0 if error <= width else width / error
-        cost += 0.5 * error * error if error <= width else width * (error - 0.5 * width)
-        fx, fy = camera[0] / z, camera[1] / z
-        rows[0, 0], rows[0, 1], rows[0, 2] = -fx * x * y / z, fx * (z + x * x / z), -fx * y
-        rows[0, 3], rows[0, 4], rows[0, 5] = fx, 0.0, -fx * x / z
-        rows[1, 0], rows[1, 1], rows[1, 2] = -fy * (z + y * y / z), fy * x * y / z, fy * x
-        rows[1, 3], rows[1, 4], rows[1, 5] = 0.0, fy, -fy * y / z
-        for j in range(6):
-            right[j] -= weight * (rows[0, j] * ru + rows[1, j] * rv)
-            for k in range(6):
-                matrix[j, k] += weight * (rows[0, j] * rows[0, k] + rows[1, j] * rows[1, k])
-        if not has_depth:
-            continue
-        # The column in the right image moves as the one in the left, and with the disparity.
-        by_depth = camera[4] / (z * z)
-        for j in range(6):
-            rows[2, j] = rows[0, j]
-        rows[2, 0] += by_depth * y
-        rows[2, 1] -= by_depth * x
-        rows[2, 5] += by_depth
-        for j in range(6):
-            right[j] -= weight * rows[2, j] * rd
-            for k in range(6):
-                matrix[j, k] += weight * rows[2, j] * rows[2, k]
+        misses[0], misses[1], misses[2] = residual(x, y, z, pixels, i, camera)
+        term, weight = huber(np.sqrt(misses[0] ** 2 + misses[1] ** 2 + misses[2] ** 2), width)
+        cost += term
+        jacobians(x, y, z, poses, 0, camera, rows, by_point)
+        for row in range(2 if np.isnan(pixels[i, 2]) else 3):
+            for j in range(6):
+                weighted = weight * rows[row, j]
+                right[j] -= weighted * misses[row]
+                for k in range(6):
+                    matrix[j, k] += weighted * rows[row, k]
     return cost, matrix, right
 
 
@@ -242,13 +225,6 @@ def find_pose(
     used[used] = estimate.inliers
     estimate = replace(estimate, inliers=used)
     return estimate if estimate.inliers.sum() >= least else None
-
-
-# Structure from two views: essential matrix or homography, whichever explains the motion, and triangulation.
-# The choice follows ORB-SLAM (Mur-Artal et al. 2015, IV-B): where a homography explains the matches about as
-# well as an essential matrix does, the scene is plane or the camera has only turned, and the motion is taken
-# from the homography's decomposition (Malis and Vargas 2007). A plane leaves two solutions; both are
-# returned, and a third view decides.
 
 
 #: Share of homography score above which the homography is believed (ORB-SLAM's value).

@@ -1,8 +1,9 @@
-"""Which keyframes show the place that an image shows: a bag of binary words, trained from the map itself.
+"""Finding the camera again: which keyframes look alike, and where their points are now.
 
-Descriptors are assigned to the nearest of some hundred words, and images are compared by how often each word
-occurs in them, rare words counting more (Sivic and Zisserman 2003; binary words as in Gálvez-López and Tardós
-2012). The words are cluster centres by k-majority (Grana et al. 2013): bits that most members have.
+Keyframes are ranked by a bag of binary words, trained from the map itself (Sivic and Zisserman 2003; binary words as in
+Gálvez-López and Tardós 2012; clusters by k-majority, Grana et al. 2013). The points of the likeliest one and of those
+that share most points with it are matched with the image's corners; P3P in RANSAC gives a rough pose, which is believed
+only if the points are found where it has them. Before that the place is tried at which the camera was lost.
 """
 
 from __future__ import annotations
@@ -33,10 +34,8 @@ from morph_dslam.tracking.patches import spread_corners
 Array = NDArray[np.float64]
 
 N_WORDS = 400
-
 #: Descriptors that words are trained from, and rounds of clustering.
 N_TRAINING, ROUNDS = 6000, 6
-
 #: Words are trained anew when there are this many times the keyframes that they were trained from.
 RETRAIN_AT = 1.5
 
@@ -119,29 +118,18 @@ class PlaceIndex:
         return common / np.maximum(np.maximum(known.sum(axis=1), seen.sum()), 1e-12)
 
 
-# Finding the camera again after it was lost: which keyframes look alike, and where their points are now.
-# Keyframes are ranked by `place_recognition`. The points of the likeliest one and of those that share most
-# points with it are matched with the image's corners; P3P in RANSAC gives a rough pose, which is believed
-# only if the points are found where it has them. Before that the place is tried at which the camera was lost.
-
-
 Image = NDArray[np.uint8]
 
 #: Corners of the image that are described.
 N_CORNERS = 600
-
 #: Keyframes tried in one frame: the one that looks most alike, and one more in turn of those that follow.
 N_IN_TURN = 10
-
 #: Keyframes whose points are matched together, and the fewest points that they share.
 GROUP, LEAST_SHARED = 4, 20
-
 #: Matches are nearer than this many bits, and clearly nearer than the second best.
 MOST_BITS, RATIO = 80, 0.95
-
 #: Matches that agree on a rough pose, within so many pixels.
 ROUGH_INLIERS, ROUGH_PX = 12, 6.0
-
 #: A pose is believed if this share of the group's points in view are found where it has them, most of these
 #: fit it, and their error is at most so many times the usual one, or this: repeated texture fits badly
 #: somewhere else, but beside all keyframes the map's own errors show.

@@ -16,11 +16,9 @@ from numpy.typing import NDArray
 from morph_dslam.slam.passing_views import PassingViews
 
 Array = NDArray[np.float64]
-
 Indices = NDArray[np.int64]
 
 CANDIDATE, GOOD, REMOVED = 0, 1, 2
-
 #: Arrays of a map with one row a point.
 POINT_ARRAYS = (
     "positions",

@@ -33,9 +33,7 @@ from morph_dslam.tracking.run_folder import check_run_folder
 Array = NDArray[np.float64]
 
 DPI = 110
-
 PATH_COLOUR, POINT_COLOUR = "#b4530a", "#8fb3d9"
-
 #: Blue, green, red of what the video shows.
 INLIER, CANDIDATE, DISAGREEING = (80, 200, 60), (200, 150, 40), (40, 40, 230)
 
@@ -78,11 +76,8 @@ def run_slam(
     -------
     The content of ``summary.json``.
 
-    Raises
-    ------
-    MorphError
-        If an input cannot be used (CameraError, SourceError, MapError) or the run folder holds a run
-        (TrackingError).
+    Raises MorphError if an input cannot be used (CameraError, SourceError, MapError) or the run folder holds a run
+    (TrackingError).
     """
     options, is_model = options or SlamOptions(), map_path is not None and map_path.is_dir()
     if options.extend and map_path is None and trajectory is None:

@@ -91,10 +91,7 @@ class Scene:
 def load_scene(path: str | Path, camera: Camera) -> Scene:
     """Read a scene that `Scene.save` or `morph slam` wrote (``map.h5``).
 
-    Raises
-    ------
-    MapError
-        If the file is missing, damaged, empty, of another version, or of a camera with other intrinsics.
+    Raises MapError if the file is missing, damaged, empty, of another version, or of a camera with other intrinsics.
     """
     return Scene(camera, *load_map_and_trajectory(Path(path), camera))
 
@@ -123,10 +120,8 @@ def map_scene(
     images : recording that poses or model are of; the source by default
     watch : called with each undistorted image and what it gave, with its points
 
-    Raises
-    ------
-    MorphError
-        If an input cannot be used: SourceError, CameraError, or MapError if map, poses or model do not fit.
+    Raises MorphError if an input cannot be used: SourceError, CameraError, or MapError if map, poses or model do not
+    fit.
     """
     opened = open_stream(source) if isinstance(source, str | Path) else source
     is_live = isinstance(opened, LiveStream)

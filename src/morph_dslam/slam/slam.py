@@ -31,7 +31,6 @@ Array = NDArray[np.float64]
 
 #: Frames that a relocalised pose has to be tracked for before the map grows again.
 HELD_FRAMES = 3
-
 #: The scene deforms when more than this share of its points disagree with a rigid one in so many frames on end.
 DEFORMING_SHARE, DEFORMING_FRAMES = 0.12, 5
 
@@ -76,10 +75,7 @@ class Slam:
 
         Frames are lost until the camera is found in it. It is kept as it is unless the options let it grow.
 
-        Raises
-        ------
-        MapError
-            If the map is to grow, but its depth comes from another kind of camera.
+        Raises MapError if the map is to grow, but its depth comes from another kind of camera.
         """
         if rigid_map.baseline_px != self.frame_images.baseline_px:
             if self.options.extend:
@@ -134,10 +130,7 @@ class Slam:
         depth : (h, w) metres, NaN where not measured
         right : (h, w[, 3]) the right image of a stereo pair
 
-        Raises
-        ------
-        CameraError
-            If an image has not the camera's size.
+        Raises CameraError if an image has not the camera's size.
         """
         if self.options.freeze_at is not None and index >= self.options.freeze_at and not self.is_frozen:
             self.freeze()

@@ -1,7 +1,10 @@
-"""From which keyframes to look for points, where any that saw them will do.
+"""Following the map from frame to frame: where its points are now, and from them the camera's pose.
 
-Each keyframe costs as much as some hundred points: its image pyramid is built anew. In a map that grows the
-newest keyframe is the template of nearly all points in view; in one that is complete they come from many.
+Each point is followed from a keyframe that saw it, not from the previous frame, so that errors do not add up; the
+previous frame only says where to begin. Where the view has changed much, the keyframe is first warped as if its scene
+were a plane at the points' median depth (Klein and Murray 2007 warp each patch by itself). Points lost from sight are
+looked for again where the pose says they are. Points that leave the place where a rigid scene has them do not count for
+the pose, but are followed on.
 """
 
 from __future__ import annotations
@@ -78,17 +81,10 @@ class FewTemplates:
         return views, pixels
 
 
-# A keyframe's image as it would look from elsewhere, so that patches of it can be found there.
-# Lucas-Kanade follows shifts: between views that are turned about the optical axis, or nearer or farther, the
-# keyframe is first warped as if its scene were a plane at the points' median depth. What is left of parallax
-# is small within a patch (Klein and Murray 2007 warp each patch by itself).
-
-
 Image = NDArray[np.uint8]
 
 #: Patches that are turned by less and scaled by less, along either axis, are followed as they are.
 MOST_TURN_DEG, MOST_STRETCH = 14.0, 1.25
-
 #: A warped view is used again while what it lacks is this part of those.
 REUSE = 0.5
 
@@ -158,36 +154,22 @@ class WarpedViews:
         return self._views[number][1], now
 
 
-# Following the map from frame to frame: where its points are now, and from them the camera's pose.
-# Each point is followed from the keyframe that last saw it, not from the previous frame, so that errors do
-# not add up between keyframes; the previous frame only says where to begin. Points lost from sight are looked
-# for again where the pose says they are. Points that leave the place where a rigid scene has them do not
-# count for the pose, but are followed on.
-
-
 Mask = NDArray[np.bool_]
 
 #: Points are looked for from a keyframe only if they are seen from there at about this angle and distance.
 MOST_VIEW_ANGLE_DEG = 35.0
-
 MOST_SCALE_CHANGE = 1.6
-
 #: A point not found in this share of the frames in which it was looked for is looked for after all others.
 DOUBTFUL_SHARE = 0.25
-
 #: Points that disagree have moved if they did so in the frame before, too, or if all at once they are more
 #: than this share of the points that agree.
 MOST_LEAVING = 0.1
-
 #: Lost points looked for in a frame, from at most so many keyframes.
 SEARCH_POINTS, SEARCH_KEYFRAMES = 80, 3
-
 #: In a frozen map lost points are looked for while fewer than this are followed.
 ENOUGH_POINTS = 340
-
 #: How far from its predicted pixel a lost point may be found.
 SEARCH_RADIUS_PX = 5.0
-
 #: Weight of the newest frame in the usual error.
 USUAL_RATE = 0.1
 

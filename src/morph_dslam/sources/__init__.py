@@ -46,10 +46,7 @@ def open_stream(source: str | Path, first: int | None = None, last: int | None =
 
     A recording gives every frame, however long each takes; a webcam gives the newest and drops the others.
 
-    Raises
-    ------
-    SourceError
-        If the source is missing or cannot be opened, or the range is not in it.
+    Raises SourceError if the source is missing or cannot be opened, or the range is not in it.
     """
     path = Path(source)
     if first is not None and last is not None and last < first:
@@ -70,11 +67,8 @@ def open_source(path: str | Path, first: int | None = None, last: int | None = N
         bag, with `#topic` after its name where it holds several, whose frames are numbered from 0
     first, last : range of frame numbers, both included; open ends by default
 
-    Raises
-    ------
-    SourceError
-        If the path is missing, holds no frames, or does not reach ``first`` or ``last``. While iterating:
-        if a frame cannot be decoded, changes size, or the video ends early; all frames before it come first.
+    Raises SourceError if the path is missing, holds no frames, or does not reach ``first`` or ``last``. While
+    iterating: if a frame cannot be decoded, changes size, or the video ends early; all frames before it come first.
     """
     stream = open_stream(path, first, last)
     if isinstance(stream, LiveStream):

@@ -16,7 +16,6 @@ from morph_dslam.errors import SourceError
 
 #: Frames per second where a recording does not tell it.
 ASSUMED_FPS = 30.0
-
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 
 #: The bytes with which a complete file of this kind ends; the decoder itself fills what is missing with grey.
@@ -74,10 +73,7 @@ def has_registered_depth(source: FrameStream) -> bool:
 def check_range(where: Path, available: range, first: int | None, last: int | None) -> tuple[int, int]:
     """The wanted range with its open ends filled in.
 
-    Raises
-    ------
-    SourceError
-        If ``where``, whose frame numbers span ``available``, does not hold both ends.
+    Raises SourceError if ``where``, whose frame numbers span ``available``, does not hold both ends.
     """
     low, high = available[0], available[-1]
     for wanted in (first, last):
@@ -113,10 +109,7 @@ class DepthScale:
 def read_image(path: Path, what: str) -> NDArray[np.uint8]:
     """Read an image (h, w, 3) uint8 as blue, green, red.
 
-    Raises
-    ------
-    SourceError
-        If the file is missing, cut short or not an image; the message begins with ``what``.
+    Raises SourceError if the file is missing, cut short or not an image; the message begins with ``what``.
     """
     return np.asarray(_decode(path, what, cv2.IMREAD_COLOR), dtype=np.uint8)
 

@@ -25,12 +25,10 @@ TUM_DEPTH = DepthScale(values_per_metre=5000.0)
 
 #: Colour and depth are not taken at the same instant; these belong together, seconds.
 MOST_TIME_DIFFERENCE = 0.02
-
 SEVEN_SCENES_DEPTH = DepthScale(values_per_metre=1000.0, unknown=(0, 65535), registered=False)
 
 #: 7-Scenes carry no timestamps.
 SEVEN_SCENES_FPS = 30.0
-
 _COLOUR = re.compile(r"frame-(\d+)\.color\.(png|jpg)")
 
 
@@ -113,10 +111,7 @@ def _usual_rate(timestamps: list[float]) -> float:
 def numbered_images(folder: Path) -> dict[int, Path]:
     """The images of a folder by the last number in their names, in its order.
 
-    Raises
-    ------
-    SourceError
-        If a name has no number, two have the same, or there is no image.
+    Raises SourceError if a name has no number, two have the same, or there is no image.
     """
     images: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
