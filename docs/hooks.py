@@ -136,7 +136,10 @@ def resolve(dotted: str) -> object:
 
 def _canonical(dotted: str) -> str:
     """Where an object is defined, or the name itself where that is not known."""
-    found = resolve(dotted)
+    try:
+        found = resolve(dotted)
+    except (AttributeError, ModuleNotFoundError):
+        return dotted  # mkdocstrings says that it is missing
     module, name = getattr(found, "__module__", None), getattr(found, "__qualname__", None)
     return f"{module}.{name}" if module and name and module.startswith("morph_dslam") else dotted
 
@@ -171,7 +174,7 @@ def extend_page() -> str:
 
 def subcommands() -> dict[str, argparse.ArgumentParser]:
     """The parser of each command."""
-    parser = importlib.import_module("morph_dslam.cli.app")._parser()
+    parser = importlib.import_module("morph_dslam.cli.app").new_parser()
     (action,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
     return dict(action.choices)
 

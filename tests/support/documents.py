@@ -4,7 +4,9 @@ import re
 from pathlib import Path
 
 PROJECT = Path(__file__).parents[2]
-PAGES = {path.stem: path.read_text() for path in [*(PROJECT / "docs").glob("*.md"), PROJECT / "README.md"]}
+_FILES = [*(PROJECT / "docs").rglob("*.md"), PROJECT / "README.md"]
+#: By name, with the folder of those that are in one: `cameras`, `how/camera`.
+PAGES = {str(path.relative_to(PROJECT).with_suffix("")).removeprefix("docs/"): path.read_text() for path in _FILES}
 
 
 def samples(page: str, language: str) -> list[str]:

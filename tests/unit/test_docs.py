@@ -19,7 +19,7 @@ from tests.support.function_formats import FORMATS
 from tests.support.small_models import block_model
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGES = [*DOCS.glob("*.md"), *(DOCS.parent / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG"))]
+PAGES = [*DOCS.rglob("*.md"), *(DOCS.parent / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG"))]
 
 
 def documented_readers():
@@ -109,8 +109,9 @@ def anchor(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
 
 
-def test_links_between_documents_lead_somewhere():
-    for page in PAGES:
+def test_links_of_pages_outside_the_site_lead_somewhere():
+    """Those within the site are checked by `make docs`."""
+    for page in PAGES[-3:]:
         for name, fragment in re.findall(r"\]\(([\w./-]*)(?:#([\w-]+))?\)", page.read_text()):
             target = page.parent / name if name else page
             assert target.exists(), f"{page.name}: {name}"

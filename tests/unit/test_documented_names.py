@@ -1,8 +1,9 @@
 """What the program accepts, writes and flags is documented, and what the documentation names exists."""
 
 import argparse
-import importlib
+import importlib.util
 import re
+import sys
 from types import GenericAlias
 from typing import get_args
 
@@ -24,6 +25,7 @@ from morph_dslam.slam.slam import Slam
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.sheet_study import SheetStudy
 from morph_dslam.studies.solid_study import SolidStudy
+from morph_dslam.tracking.outcomes import Status, TrackingWarning
 from morph_dslam.tracking.run_folder import RunResults, summarise, write_csv, write_hdf5
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.documents import PAGES, PROJECT, code_words
@@ -161,13 +163,18 @@ def exists(dotted: str) -> bool:
     return False
 
 
-def test_flags_in_the_table_are_those_of_the_program():
-    """Every phrase in the table stands in the source, across the lines that a text is broken into."""
-    source = " ".join(path.read_text() for path in (PROJECT / "src/morph_dslam").rglob("*.py"))
-    source = re.sub(r'"\s*\n\s*f?"', "", source)
-    source = re.sub(r"\{HAS_MOVED\}|\{MAY_BE_ANOTHER\}|\{REFERENCE_WORSE\}|\{UN\w+\}", "", source)
-    table = PAGES["run-folder"].partition("### Flags")[2].partition("\n\n[")[0]
-    phrases = re.findall(r"`([^`]+)`", " ".join(row.split("|")[1] for row in table.splitlines() if row))
-    assert len(phrases) > 20
-    for phrase in phrases:
-        assert phrase in source, phrase
+def test_every_status_and_warning_of_a_frame_is_documented():
+    kinds = {kind.__name__ for kind in TrackingWarning.__subclasses__()}
+    assert len(kinds) > 5
+    assert (kinds | {status.value for status in Status}) - code_words("run-folder") == set()
+
+
+def test_results_are_those_that_were_kept():
+    """`docs/results.md` and the table in README.md are written by a program, not by hand."""
+    spec = importlib.util.spec_from_file_location("results", PROJECT / "benchmarks/results.py")
+    results = importlib.util.module_from_spec(spec)
+    sys.modules["results"] = results
+    spec.loader.exec_module(results)
+    del sys.modules["results"]
+    assert PAGES["results"] == results.page()
+    assert results.readme_table() in PAGES["README"]

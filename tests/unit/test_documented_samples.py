@@ -1,7 +1,6 @@
 """Sample files and programs in the documentation are what the program accepts."""
 
 import tomllib
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,25 +14,23 @@ from morph_dslam.export import StateChoice
 from morph_dslam.io.camera_files import load_camera
 from morph_dslam.io.landmarks import load_landmarks
 from morph_dslam.mechanics.materials.user import UserMaterial
-from morph_dslam.model import Parameter, load_model, save_model
-from morph_dslam.model.inner_structure import save_inner_structure
+from morph_dslam.model import Parameter, save_model
 from morph_dslam.reduction.report_pictures import read_reference_curve
 from morph_dslam.registration.board import load_board
 from morph_dslam.registration.guess import load_guess, load_picture
 from morph_dslam.render.scene_file import load_scene_file
 from morph_dslam.studies.affine import read_affine
 from morph_dslam.studies.external import ExternalStudy, read_table
-from morph_dslam.studies.inner_structures import place_inner_structure
 from morph_dslam.studies.sheet_study import SheetStudy
 from morph_dslam.studies.solid_study import SolidStudy
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.documents import PAGES, samples
-from tests.support.small_models import block_model
 
 
 def test_every_sample_file_is_read_by_a_test_here():
     """A new sample needs a line here, and a test."""
-    counts = {(page, kind): len(samples(page, kind)) for page in PAGES for kind in ("toml", "yaml", "csv")}
+    pages = [page for page in PAGES if "tutorials" not in page]
+    counts = {(page, kind): len(samples(page, kind)) for page in pages for kind in ("toml", "yaml", "csv")}
     assert {key: count for key, count in counts.items() if count} == {
         ("cameras", "yaml"): 1,
         ("certificate", "csv"): 1,
@@ -160,8 +157,10 @@ def run_sample(page: str, number: int = 0) -> dict:
 
 
 def test_every_program_is_run_by_a_test():
-    """Those of model-file and solid-study in `test_docs`, that of slam in `test_slam`."""
-    counts = {page: len(samples(page, "python")) for page in PAGES}
+    """Those of model-file and solid-study in `test_docs`, of slam in `test_slam`, the others in tests/tutorials."""
+    run_elsewhere = {"README", "quick-start", "extending"}
+    pages = [page for page in PAGES if "tutorials" not in page and page not in run_elsewhere]
+    counts = {page: len(samples(page, "python")) for page in pages}
     assert {page: count for page, count in counts.items() if count} == {
         "certificate": 1,
         "materials": 1,
@@ -169,7 +168,6 @@ def test_every_program_is_run_by_a_test():
         "model-file": 2,
         "slam": 2,
         "solid-study": 2,
-        "tracking": 1,
     }
 
 
@@ -200,18 +198,6 @@ def test_law_of_ones_own():
     np.testing.assert_allclose(stiffness[3, 3], 2.5e5, rtol=1e-10)
     np.testing.assert_allclose(stiffness[0, 0], 5e6 + 4.0 / 3.0 * 2.5e5, rtol=1e-10)
     assert law.function(ngs.Id(3), 2.0).dim == 1
-
-
-def test_inner_structure(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    save_model(Path("liver.morph"), block_model("polynomial"))
-    nodes = np.array([[0.02, 0.03, 0.04], [0.06, 0.03, 0.04], [0.03, 0.07, 0.05], [0.04, 0.05, 0.08]])
-    triangles = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
-    model = load_model(Path("liver.morph"))
-    save_inner_structure(Path("tumour.h5"), place_inner_structure(model, "tumour", nodes, triangles))
-    names = run_sample("tracking")
-    rest = replace(names["tumour"]).nodes(names["model"].default)
-    assert rest.shape == (4, 3)
 
 
 def test_report_from_the_model_alone(tmp_path, monkeypatch):

@@ -1,0 +1,333 @@
+"""Run benchmarks and examples, keep what they print last, and write the page of results from it.
+
+    python benchmarks/results.py run NAME...     # run these, and keep their last lines in benchmarks/results
+    python benchmarks/results.py keep NAME LOG   # the same from the output of a run, kept in a file
+    python benchmarks/results.py page            # write docs/results.md and the table in README.md
+
+Figures stand nowhere else in the documentation, so each is what a command has printed, with its date.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import re
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass
+from datetime import date, datetime
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+KEPT = ROOT / "benchmarks" / "results"
+BEGIN, END = "<!-- results: written by benchmarks/results.py -->", "<!-- end of results -->"
+
+#: Where the truth of figures comes from.
+SAME_MODEL = "simulated: rendered from the same reduced model, so the error of that model is not contained"
+MEASURED = "measured"
+SOLVED = "finite element solutions that the reduction has not seen"
+#: Noise of simulated recordings.
+NOISE = "grey values with 2 levels of noise, blur 0.5 to 0.6 px"
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A command whose last lines are kept.
+
+    Attributes
+    ----------
+    section : heading in the page. title : what it is. command : as typed in the project's folder.
+    truth : where the truth comes from. lines : how many of the last lines are kept. about : sentences.
+    """
+
+    section: str
+    title: str
+    command: str
+    truth: str
+    noise: str = ""
+    lines: int = 1
+    about: str = ""
+
+
+BENCHMARKS = {
+    "demo": Benchmark("Tracking", "A rubber mat", "python examples/demo/run.py", SAME_MODEL, NOISE),
+    "kinect_paper": Benchmark(
+        "Tracking",
+        "A real sheet of paper",
+        "python examples/kinect_paper/run.py --data DIR",
+        "measured: 301 points of a depth camera in 12 frames (Varol et al., CVPR 2012)",
+        "a real camera with published intrinsics",
+        2,
+        "The line before the last is the error after one rigid motion of all measured points, and after one in each "
+        "frame. Most of the difference is a tilt between the estimate and the measured points; whose error it is, is "
+        "not known. The landmarks of the first frame were set by hand.",
+    ),
+    "boot_seal_track": Benchmark(
+        "Tracking",
+        "The boot seal in a scanned scene",
+        "python examples/boot_seal/track.py",
+        SAME_MODEL,
+        f"{NOISE}; the depth sensor 1.4 mm at 1 m",
+        2,
+        "The first line is the distance of a simulated depth sensor's points from the estimated surface, as the paper "
+        "measures it (the paper: 1.49 mm mean, 1.33 mm median, with a real seal and a real sensor); `base_mean_mm` is "
+        "that of the undeformed frame. The second is the distance of all nodes of the solid from the truth.",
+    ),
+    "paper_sheet_track": Benchmark(
+        "Tracking",
+        "The paper's sheet as a free object",
+        "python examples/paper_sheet/track.py",
+        SAME_MODEL,
+        f"{NOISE}; the depth sensor 1.4 mm at 1 m",
+        2,
+        "The paper: 3.98 mm mean, with a real sheet and a depth camera whose own error is 1.2 mm.",
+    ),
+    "liver": Benchmark(
+        "Tracking",
+        "A tumour inside a deforming liver",
+        "python examples/liver/run.py --data DIR",
+        SAME_MODEL,
+        NOISE,
+        2,
+        "The line before the last says how far off the tumour would be if the liver were taken as rigid.",
+    ),
+    "tracked_seeds": Benchmark(
+        "Tracking",
+        "The boot seal in five other recordings",
+        "python benchmarks/tracked_seeds.py",
+        SAME_MODEL,
+        "other in each recording",
+        6,
+        "`sigma95` is the number of stated standard deviations below which 95 % of the errors lie; 1.96 would be "
+        "exact.",
+    ),
+    "live": Benchmark(
+        "Tracking",
+        "Live tracking of the boot seal",
+        "python benchmarks/live.py --minutes 1",
+        "none: frame rate, latency and memory only",
+    ),
+    "alternatives": Benchmark(
+        "Tracking", "The tracker beside plain alternatives", "python benchmarks/alternatives.py", SAME_MODEL, NOISE, 20
+    ),
+    "registration_seeds": Benchmark(
+        "Registration",
+        "The boot seal in five scans",
+        "python benchmarks/registration_seeds.py --seeds 5",
+        "simulated: exact pose and scale",
+        "other in each scan",
+    ),
+    "slam_7scenes": Benchmark(
+        "Camera tracking",
+        "A real recording: 7-Scenes, red kitchen, 250 frames",
+        "python benchmarks/slam_7scenes.py --data DIR",
+        "measured: the recording's own camera path, accurate to about a centimetre",
+    ),
+    "slam_rendered": Benchmark(
+        "Camera tracking",
+        "Rendered scenes",
+        "python benchmarks/slam_rendered.py --seeds 5",
+        "simulated: exact camera path",
+        "2 grey levels",
+        10,
+    ),
+    "slam_long": Benchmark(
+        "Camera tracking",
+        "Long recordings",
+        "python benchmarks/slam_long.py --minutes 3 --noise-frames 20",
+        "simulated: exact camera path",
+        lines=4,
+    ),
+    "boot_seal_solve": Benchmark(
+        "Mechanics",
+        "The boot seal: 104 positions of its lever",
+        "python examples/boot_seal/run.py",
+        SOLVED,
+        lines=2,
+        about="The mesh of the paper: 25 795 nodes, 18 403 linear hexahedra.",
+    ),
+    "boot_seal_felupe": Benchmark(
+        "Mechanics",
+        "The solver beside felupe",
+        "python benchmarks/boot_seal.py",
+        "the same problem, solved by felupe with the same linear solver",
+        lines=4,
+    ),
+    "paper_sheet_solve": Benchmark(
+        "Mechanics", "The paper's sheet beyond buckling", "python examples/paper_sheet/run.py", SOLVED, lines=2
+    ),
+    "silicone": Benchmark(
+        "Mechanics",
+        "A real silicone bar under its own weight",
+        "python examples/diffcal_silicone/run.py --data DIR",
+        "measured: a depth image of the bar",
+    ),
+    "silicone_estimate": Benchmark(
+        "Mechanics",
+        "Its stiffness from its images",
+        "python examples/diffcal_silicone/estimate.py --data DIR",
+        "published shear modulus 50.1 kPa, identified with linear tetrahedra, which are too stiff in bending",
+        lines=12,
+    ),
+    "vhb": Benchmark(
+        "Mechanics",
+        "A viscoelastic elastomer",
+        "python examples/vhb_viscoelastic/run.py --data DIR",
+        "measured: tension tests that the fit has not seen",
+        lines=2,
+    ),
+    "cantilever_pgd": Benchmark(
+        "Reduction", "The paper's cantilever by PGD", "python examples/cantilever_pgd/run.py", "direct solves", lines=12
+    ),
+    "reduction_boot_seal": Benchmark(
+        "Reduction",
+        "The boot seal: error against number of modes",
+        "python benchmarks/reduction_boot_seal.py",
+        SOLVED,
+        lines=16,
+    ),
+    "reduction_formats": Benchmark(
+        "Reduction", "Formats of one field", "python benchmarks/reduction_formats.py", "direct solves", lines=18
+    ),
+    "reduction_creep": Benchmark(
+        "Reduction", "Time as a parameter", "python benchmarks/reduction_creep.py", SOLVED, lines=4
+    ),
+    "reduction_growth": Benchmark(
+        "Reduction", "One to six parameters", "python benchmarks/reduction_growth.py", SOLVED, lines=24
+    ),
+    "reduction_peers": Benchmark(
+        "Reduction", "Beside pyMOR and tensorly", "python benchmarks/reduction_peers.py", SOLVED, lines=20
+    ),
+}
+
+INTRODUCTION = """\
+# Results
+
+The command beside each figure printed it. `python benchmarks/results.py` runs the commands and writes this page. Errors
+are distances of material points in the camera frame, without alignment, unless stated otherwise. Times are those of a
+shared machine and vary between runs. *Truth* is what the result was compared with, *noise* what the images contain.
+
+A simulated recording measures the error of images, map and estimation. It does not contain the error of a model of a
+real object: wrong material constants, supports or dimensions. Only results whose truth is *measured* do.
+"""
+
+#: What README.md shows of each: its title, and the figures by key of the last line.
+SHOWN = {
+    "demo": ("mean_mm", "p95_mm", "tracked"),
+    "kinect_paper": ("mean_mm", "p95_mm", "tracked"),
+    "boot_seal_track": ("mean_mm", "p95_mm", "tracked"),
+    "paper_sheet_track": ("mean_mm", "p95_mm", "tracked"),
+}
+
+
+def machine() -> str:
+    """This machine in words."""
+    cores = len(os.sched_getaffinity(0))
+    return f"{cores} core{'s' * (cores > 1)} of a shared {platform.machine()} machine, no GPU"
+
+
+def keep(name: str, output: str, day: str, command: str | None = None) -> None:
+    """Keep the last lines of an output, without progress bars and lines that only name a file."""
+    lines = [line.rpartition("\r")[2].rstrip() for line in output.split("\n")]
+    lines = [line for line in lines if line and not re.search(r"\d+%\||^\w+ +/\S+$", line)]
+    kept = [re.sub(r"/\S*/(?=(?:examples|benchmarks|demo)/)", "", line) for line in lines[-BENCHMARKS[name].lines :]]
+    content = {"date": day, "command": command or BENCHMARKS[name].command, "machine": machine(), "output": kept}
+    KEPT.mkdir(exist_ok=True)
+    (KEPT / f"{name}.json").write_text(json.dumps(content, indent=2) + "\n")
+
+
+def run(names: list[str], data: Path | None) -> int:
+    """Run benchmarks one after the other and keep what they print; the number that failed."""
+    failed = 0
+    for name in names:
+        words = [sys.executable if word == "python" else word for word in shlex.split(BENCHMARKS[name].command)]
+        if words[-1] == "DIR":
+            words[-2:] = ["--data", str(data)] if data is not None else []
+        print(f"== {name}: {shlex.join(words)}", flush=True)
+        done = subprocess.run(words, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        print(done.stdout)
+        if done.returncode:
+            failed += 1
+        else:
+            keep(name, done.stdout, date.today().isoformat())
+    return failed
+
+
+def kept() -> dict[str, dict]:
+    """What was kept, by name, in the order of the page."""
+    return {name: json.loads(path.read_text()) for name in BENCHMARKS if (path := KEPT / f"{name}.json").exists()}
+
+
+def page() -> str:
+    """The page of results."""
+    found = kept()
+    parts = [INTRODUCTION]
+    for section in dict.fromkeys(benchmark.section for benchmark in BENCHMARKS.values()):
+        names = [name for name in found if BENCHMARKS[name].section == section]
+        if names:
+            parts.append(f"## {section}\n")
+            parts += [_entry(BENCHMARKS[name], found[name]) for name in names]
+    missing = [b for name, b in BENCHMARKS.items() if name not in found]
+    if missing:
+        parts.append("## Not run for this version\n")
+        parts.append("\n".join(f"- {b.title}: `{b.command}`" for b in missing) + "\n")
+    return "\n".join(parts)
+
+
+def _entry(benchmark: Benchmark, content: dict) -> str:
+    rows = [("command", f"`{content['command']}`"), ("date", content["date"]), ("machine", content["machine"])]
+    rows += [("truth", benchmark.truth)] + [("noise", benchmark.noise)] * bool(benchmark.noise)
+    table = "\n".join(["| | |", "|---|---|", *(f"| {key} | {value} |" for key, value in rows)])
+    about = f"{benchmark.about}\n\n" if benchmark.about else ""
+    output = "\n".join(content["output"])
+    return f"### {benchmark.title}\n\n{about}{table}\n\n```text\n{output}\n```\n"
+
+
+def readme_table() -> str:
+    """The table in README.md."""
+    rows = ["| | mean error | 95 % | frames tracked | truth |", "|---|---|---|---|---|"]
+    for name, content in kept().items():
+        if name in SHOWN:
+            figures = dict(re.findall(r"(\w+)=(\S+)", content["output"][-1]))
+            mean, largest, tracked = (figures[key] for key in SHOWN[name])
+            kind = BENCHMARKS[name].truth.split(":")[0]
+            tracked = tracked.replace("/", " of ")
+            rows.append(f"| {BENCHMARKS[name].title} | {mean} mm | {largest} mm | {tracked} | {kind} |")
+    return "\n".join(rows)
+
+
+def write_pages() -> None:
+    """Write docs/results.md, and the table between its marks in README.md."""
+    (ROOT / "docs" / "results.md").write_text(page())
+    path = ROOT / "README.md"
+    text = path.read_text()
+    start, stop = text.index(BEGIN) + len(BEGIN), text.index(END)
+    path.write_text(f"{text[:start]}\n\n{readme_table()}\n\n{text[stop:]}")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    running = commands.add_parser("run", help="run benchmarks and keep their last lines")
+    running.add_argument("names", nargs="+", choices=BENCHMARKS, metavar="NAME")
+    running.add_argument("--data", type=Path, help="folder of recordings that must be obtained separately")
+    keeping = commands.add_parser("keep", help="keep the last lines of an output that is in a file")
+    keeping.add_argument("name", choices=BENCHMARKS, metavar="NAME")
+    keeping.add_argument("log", type=Path)
+    commands.add_parser("page", help="write docs/results.md and the table in README.md")
+    arguments = parser.parse_args()
+    if arguments.command == "run":
+        return run(arguments.names, arguments.data)
+    if arguments.command == "keep":
+        day = datetime.fromtimestamp(arguments.log.stat().st_mtime).date().isoformat()
+        keep(arguments.name, arguments.log.read_text(), day)
+    else:
+        write_pages()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
