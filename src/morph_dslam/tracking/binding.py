@@ -23,7 +23,8 @@ class View:
 
     Attributes
     ----------
-    nodes : (n, 3) in the camera frame, metres. pixels : (n, 2), NaN behind the camera.
+    nodes : (n, 3) in the camera frame, metres
+    pixels : (n, 2), NaN behind the camera.
     """
 
     nodes: Array
@@ -126,7 +127,9 @@ def nearest_surface_points(nodes: Array, triangles: NDArray[np.int64], positions
 
     Parameters
     ----------
-    nodes : (n, 3). triangles : (m, 3) node indices. positions : (k, 3), same unit.
+    nodes : (n, 3)
+    triangles : (m, 3) node indices
+    positions : (k, 3), same unit.
 
     Returns
     -------

@@ -19,7 +19,8 @@ class BoundPart:
 
     Attributes
     ----------
-    rows : of the points. state : of the object in the picture.
+    rows : of the points
+    state : of the object in the picture.
     error_factors : (d + 6, c) how ``state`` is off by c error factors, the same for all parts, in their
         standard deviations; None where nothing is known of its error.
     """
@@ -42,13 +43,10 @@ def error_factors_of(covariance: Array | None, scale: Array) -> Array | None:
 
 #: Over these shares of the points' spread a model's errors are taken to be alike, and are pairs compared.
 ALIKE_SHARE, PAIR_SHARE = 0.75, 0.5
-
 #: The factor leaves no more than this of any point's variance.
 FACTOR_TOLERANCE = 0.01
-
 #: Pairs are made of no more points than these.
 MOST_COMPARED = 256
-
 #: An estimate that takes up more of the model's error leaves too little to tell how large it is.
 LEAST_LEFT = 0.02
 
@@ -58,7 +56,8 @@ class SharedErrors:
 
     Parameters
     ----------
-    places : (p, 3) of the points, pixels. window : side of the square that is compared around each, pixels.
+    places : (p, 3) of the points, pixels
+    window : side of the square that is compared around each, pixels.
     """
 
     def __init__(self, places: Array, window: int) -> None:
@@ -103,7 +102,9 @@ class SharedErrors:
 
         Parameters
         ----------
-        used : (p,). jacobian : (p, 2, n), zero if unused. gradients : (2 r, n) as of `gradients`.
+        used : (p,)
+        jacobian : (p, 2, n), zero if unused
+        gradients : (2 r, n) as of `gradients`.
         gain : (n, n) H^-1.
         """
         some, jacobian, factor = used[self._compared], jacobian[self._compared], self.factor[self._compared]
@@ -146,16 +147,18 @@ def huber_covariance(hessian, residuals, weights, numbers, huber_px, scale):
 
     Parameters
     ----------
-    hessian : (k, k) of the Huber cost. residuals : (p, 2), pixels. weights : (p,), positive,
-        inverse variances up to a factor.
+    hessian : (k, k) of the Huber cost
+    residuals : (p, 2), pixels
+    weights : (p,), positive, inverse variances up to a factor.
     numbers : (p,) how many numbers each point gives: 1 along an outline's normal, else 2.
     huber_px : residual length where the cost turns linear.
     scale : (k,) of the unknowns: directions are compared in unknowns divided by it.
 
     Returns
     -------
-    sigma_px : robust standard deviation of a coordinate of a point of weight 1. covariance : (k, k); infinite
-        where there are no more numbers than unknowns, very large in directions that the residuals do not see.
+    sigma_px : robust standard deviation of a coordinate of a point of weight 1
+    covariance : (k, k); infinite where there are no more numbers than unknowns, very large in directions that
+        the residuals do not see.
     """
     size, count = len(hessian), numbers.sum()
     freedom = count - size

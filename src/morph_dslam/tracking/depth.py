@@ -26,13 +26,10 @@ SIGMA_AT_1M = 2.0e-3
 
 #: Neighbours nearer than this, pixels, have the same error, as those of structured light have.
 ALIKE_PX = 3
-
 #: Side of the square of pixels through which a plane is laid.
 DEPTH_WINDOW = 5
-
 #: Depths in the square that differ by more than this share of the depth are of two surfaces.
 LARGEST_STEP = 0.03
-
 #: Residual in standard deviations where Huber's cost turns linear.
 HUBER_SIGMAS = 2.0
 
@@ -45,7 +42,8 @@ class PointDepths:
     ----------
     depths : (p,) along the optical axis, metres; of any value where the weight is 0.
     weights : (p,) pixels per metre, 0 where there is none.
-    squared_px : variance of a residual in pixels. huber_px : residual where the cost turns linear.
+    squared_px : variance of a residual in pixels
+    huber_px : residual where the cost turns linear.
     """
 
     depths: Array
@@ -67,8 +65,9 @@ class PointDepths:
 
         Parameters
         ----------
-        image : (h, w) as recorded, metres, NaN where unknown. pixels : (p, 2) of the points in the
-            undistorted image. used : (p,) which of them count.
+        image : (h, w) as recorded, metres, NaN where unknown
+        pixels : (p, 2) of the points in the undistorted image
+        used : (p,) which of them count.
         squared_px : variance of an image coordinate in the estimator's cost, against which depth is weighed.
         """
         depths = np.full(len(pixels), np.nan)
@@ -151,7 +150,8 @@ def linearise_depths(functions, rotation, translation, rest, modes, depths, weig
     Returns
     -------
     cost : sum of rho(weight * (depth of the point - measured depth)).
-    hessian, gradient : (d + 6, d + 6) and (d + 6,). residuals : (p,) pixels, 0 without weight.
+    hessian, gradient : (d + 6, d + 6) and (d + 6,)
+    residuals : (p,) pixels, 0 without weight.
     """
     n_points, d = rest.shape[0], functions.shape[0] - 1
     fields = combine_modes(functions, modes.reshape(modes.shape[0], 3 * n_points)).reshape(1 + d, n_points, 3)

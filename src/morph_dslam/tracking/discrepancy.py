@@ -44,7 +44,8 @@ class DiscrepancyOptions:
     centres : points at which it is given.
     samples, neighbours : points of the surface between which the strain is looked at, and lines from each.
     point_px, outline_px : standard deviation of a point's pixels, neighbours of which have much in common,
-        and of the distance of the outline. huber_px : residual where the cost turns linear.
+        and of the distance of the outline
+    huber_px : residual where the cost turns linear.
     steps : Gauss-Newton steps in a frame; one will do from the discrepancy of the frame before.
     """
 
@@ -61,22 +62,23 @@ class DiscrepancyOptions:
 
 
 @dataclass(frozen=True)
-class Quadratic:
+class _Quadratic:
     """The cost of a step of the centres' displacements (m, 3), its numbers component by component.
 
     Attributes
     ----------
-    hessian : (3 m, 3 m). gradient : (3 m,).
+    hessian : (3 m, 3 m)
+    gradient : (3 m,).
     """
 
     hessian: Array
     gradient: Array
 
-    def __add__(self, other: Quadratic) -> Quadratic:
-        return Quadratic(self.hessian + other.hessian, self.gradient + other.gradient)
+    def __add__(self, other: _Quadratic) -> _Quadratic:
+        return _Quadratic(self.hessian + other.hessian, self.gradient + other.gradient)
 
     @classmethod
-    def of_rows(cls, weights: Array, forces: Array, influence: Array) -> Quadratic:
+    def of_rows(cls, weights: Array, forces: Array, influence: Array) -> _Quadratic:
         """By the second derivatives (p, 3, 3) and the gradient (p, 3) by the displacements of p points.
 
         ``influence`` (p, m) is the centres' on them.
@@ -84,7 +86,7 @@ class Quadratic:
         return cls(weighted_gram(weights, influence), (influence.T @ forces).T.ravel())
 
     @classmethod
-    def of_residuals(cls, rows: Array, residuals: Array, weights: Array, influence: Array) -> Quadratic:
+    def of_residuals(cls, rows: Array, residuals: Array, weights: Array, influence: Array) -> _Quadratic:
         """By residuals (p, k) with ``weights`` (p,) and their derivatives (p, k, 3) by p displacements."""
         curvature = np.einsum("p,pka,pkb->pab", weights, rows, rows)
         forces = np.einsum("p,pka,pk->pa", weights, rows, residuals)
@@ -151,7 +153,7 @@ class DiscrepancyFit:
         for _ in range(self.options.steps if last is None else 1):
             there = positions + influence @ values @ rotation.T
             derivatives, residuals, weights = self.seen(measured, there)
-            data = Quadratic.of_residuals(derivatives @ rotation, residuals, weights, influence)
+            data = _Quadratic.of_residuals(derivatives @ rotation, residuals, weights, influence)
             values = values + (self.prior(shape, rotation, values) + data).minimum()
         return Discrepancy(self.basis, values)
 
@@ -161,7 +163,8 @@ class DiscrepancyFit:
         Returns
         -------
         derivatives : (p, 2, 3) of pixels by the position, or of the distance from the outline and 0.
-        residuals : (p, 2) pixels. weights : (p,) inverse variances with Huber's factor.
+        residuals : (p, 2) pixels
+        weights : (p,) inverse variances with Huber's factor.
         """
         options, normals = self.options, measured.normals
         derivatives = self.camera.projection_jacobian(positions)
@@ -183,7 +186,7 @@ class DiscrepancyFit:
         """The samples (s, 3) of the surface in the camera frame, in a state of the model, metres."""
         return self._samples.in_camera(state)
 
-    def prior(self, shape: Array, rotation: Array, values: Array) -> Quadratic:
+    def prior(self, shape: Array, rotation: Array, values: Array) -> _Quadratic:
         """The cost of the process and of the strain beyond the model's at ``values`` (m, 3).
 
         Parameters
@@ -191,7 +194,7 @@ class DiscrepancyFit:
         shape : (s, 3) samples of the surface in the model's state, as `shape` has them.
         rotation : (3, 3) of that state's pose.
         """
-        process = Quadratic(self._precision, self._precision @ values.T.ravel())
+        process = _Quadratic(self._precision, self._precision @ values.T.ravel())
         start, end = self._lines.T
         model = (shape[start] - shape[end]) @ rotation
         now = model + self._stretching @ values
@@ -200,7 +203,7 @@ class DiscrepancyFit:
         gradient = now / (length * self._lengths)[:, None]
         share = STRAINS_A_SAMPLE * len(shape) / len(strain) / self.options.strain**2
         outer = share * gradient[:, :, None] * gradient[:, None, :]
-        return process + Quadratic.of_rows(outer, share * strain[:, None] * gradient, self._stretching)
+        return process + _Quadratic.of_rows(outer, share * strain[:, None] * gradient, self._stretching)
 
 
 def _neighbour_lines(points: Array, count: int) -> NDArray[np.int64]:
@@ -220,7 +223,8 @@ class Reference:
 
     Attributes
     ----------
-    state : of the model in it. pixels : (p, 2) of the followed points.
+    state : of the model in it
+    pixels : (p, 2) of the followed points.
     landmarks, landmark_pixels : (k) points and where they are seen (k, 2), undistorted.
     landmark_px : their standard deviation.
     """
@@ -247,7 +251,8 @@ def refine_discrepancy(
 
     Parameters
     ----------
-    fit : of the same model. outline : of the object, if the keyframes saw it.
+    fit : of the same model
+    outline : of the object, if the keyframes saw it.
     """
     adjustment = _Adjustment(fit, estimator, reference, keyframes, outline)
     for _ in range(STEPS):
@@ -261,10 +266,13 @@ class _Frame:
 
     Attributes
     ----------
-    measured : in it. state : of the model. positions : (p, 3) of the points and shape : (s, 3) of the samples
-        of the surface in that state, camera frame.
+    measured : in it
+    state : of the model
+    positions : (p, 3) of the points and shape : (s, 3) of the samples of the surface in that state, camera
+        frame.
     sliding : (p, 3, 3) how the points move as the reference's discrepancy slides them along the surface.
-    influence : (p, m) of the centres on the points. values : (m, 3) the discrepancy.
+    influence : (p, m) of the centres on the points
+    values : (m, 3) the discrepancy.
     """
 
     measured: Observations
@@ -326,8 +334,8 @@ class _Adjustment:
         for frame in self._frames:
             own, shared, coupling = self._costs(frame)
             solved = cho_solve(cho_factor(own.hessian), np.column_stack([coupling, own.gradient]))
-            schur = Quadratic(coupling.T @ solved[:, :-1], coupling.T @ solved[:, -1])
-            total = Quadratic(
+            schur = _Quadratic(coupling.T @ solved[:, :-1], coupling.T @ solved[:, -1])
+            total = _Quadratic(
                 total.hessian + shared.hessian - schur.hessian, total.gradient + shared.gradient - schur.gradient
             )
             frames.append(solved)
@@ -336,13 +344,13 @@ class _Adjustment:
         for frame, solved in zip(self._frames, frames, strict=True):
             frame.values = frame.values - as_displacements(solved[:, -1] + solved[:, :-1] @ step)
 
-    def _of_reference(self) -> Quadratic:
+    def _of_reference(self) -> _Quadratic:
         """What is known of the reference view's discrepancy by itself: the prior and the landmarks."""
         state, known, camera = self._reference.state, self._reference, self._estimator.camera
         rotation = state.camera_from_object.rotation
         influence = self._fit.basis.influence(known.landmarks.rest)
         there = known.landmarks.in_camera(state) + influence @ self.values @ rotation.T
-        landmarks = Quadratic.of_residuals(
+        landmarks = _Quadratic.of_residuals(
             camera.projection_jacobian(there) @ rotation,
             camera.project(there) - known.landmark_pixels,
             np.full(len(there), known.landmark_px**-2),
@@ -350,7 +358,7 @@ class _Adjustment:
         )
         return landmarks + self._fit.prior(self._fit.shape(state), rotation, self.values)
 
-    def _costs(self, frame: _Frame) -> tuple[Quadratic, Quadratic, Array]:
+    def _costs(self, frame: _Frame) -> tuple[_Quadratic, _Quadratic, Array]:
         """A keyframe's cost by its own discrepancy and by the reference's, and the mixed derivatives."""
         rotation, influence = frame.state.camera_from_object.rotation, frame.influence
         slid = np.einsum("pxa,pa->px", frame.sliding, influence @ self.values)
@@ -359,5 +367,5 @@ class _Adjustment:
         own, shared = derivatives @ rotation, derivatives @ frame.sliding
         prior = self._fit.prior(frame.shape, rotation, frame.values)
         coupling = weighted_gram(np.einsum("p,pka,pkb->pab", weights, own, shared), influence)
-        by_own, by_shared = (Quadratic.of_residuals(rows, residuals, weights, influence) for rows in (own, shared))
+        by_own, by_shared = (_Quadratic.of_residuals(rows, residuals, weights, influence) for rows in (own, shared))
         return by_own + prior, by_shared, coupling

@@ -32,10 +32,8 @@ Array = NDArray[np.float64]
 
 #: A hexahedron as six tetrahedra around its diagonal 0-6, corners in VTK's order.
 _HEX = np.array([[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]])
-
 #: A prism as three tetrahedra.
 _PRISM = np.array([[0, 1, 2, 5], [0, 1, 5, 4], [0, 4, 5, 3]])
-
 _FORM = re.compile(r"([+-]?)([xyz])=(-?[0-9]*\.?[0-9]+)")
 
 
@@ -45,7 +43,8 @@ class SectionPlane:
 
     Attributes
     ----------
-    normal : (3,) unit vector, object frame. offset : metres.
+    normal : (3,) unit vector, object frame
+    offset : metres.
     """
 
     normal: Array
@@ -165,16 +164,12 @@ Shown = Literal["stress", "strain", "displacement"]
 
 #: Opacity of the object's surface, of one that shows what it has inside, and of one that is cut open.
 OPACITY, SEE_THROUGH, CUT_OPEN = 0.65, 0.4, 0.9
-
 #: Colours of inner structures in turn: violet, yellow, green, blue.
 INNER_COLOURS = ((235, 60, 235), (60, 220, 255), (90, 235, 90), (255, 190, 60))
-
 #: Direction to the light, camera frame, and what it leaves in the shade.
 LIGHT, AMBIENT = np.array([0.3, -0.4, -1.0]), 0.55
-
 #: Colours end at this percentile of the field: stress has narrow peaks.
 PERCENTILE = 99.5
-
 #: States of the parameter box from which the range of colours is taken (a power of two).
 SAMPLES = 32
 
@@ -186,7 +181,8 @@ class DrawOptions:
     Attributes
     ----------
     show : "stress" (von Mises), "strain" (equivalent) or "displacement"; None for stress where the model has
-        one, else the displacement. section : a plane that cuts the object open; None for none.
+        one, else the displacement
+    section : a plane that cuts the object open; None for none.
     """
 
     show: Shown | None = None

@@ -26,7 +26,6 @@ from morph_dslam.tracking.state import BoundPoints, Prior, State, moved
 
 #: Points nearer to the camera plane than this, in metres, or behind it cannot be seen.
 MINIMUM_DEPTH = 1e-3
-
 #: Cost of a point that the state places behind the camera; large, so that such a step is refused.
 UNSEEN_COST = 1e9
 
@@ -156,8 +155,10 @@ class LinearCost:
 
     Attributes
     ----------
-    weighted_jacobian : (p, 2, n) by which an error of a pixel enters the gradient, in units of what a point of weight 1
-        is off by. of_depths : (n, n), covariance of the gradient from errors of depths. hessian : (n, n).
+    weighted_jacobian : (p, 2, n) by which an error of a pixel enters the gradient, in units of what a point
+        of weight 1 is off by
+    of_depths : (n, n), covariance of the gradient from errors of depths
+    hessian : (n, n).
     scale : (n,) of the unknowns.
     """
 
@@ -323,7 +324,9 @@ class Estimator:
 
         Parameters
         ----------
-        points : p of them. pixels : (p, 2). weights : (p,).
+        points : p of them
+        pixels : (p, 2)
+        weights : (p,).
         normals : (p, 2), zero but for points on an outline.
 
         Returns

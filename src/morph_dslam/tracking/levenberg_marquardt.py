@@ -24,7 +24,8 @@ def bounded_step(hessian, gradient, lower, upper):
 
     Parameters
     ----------
-    hessian, gradient : (n, n), positive definite, and (n,). lower, upper : (n,) of the step.
+    hessian, gradient : (n, n), positive definite, and (n,)
+    lower, upper : (n,) of the step.
 
     Returns
     -------
@@ -59,10 +60,8 @@ def bounded_step(hessian, gradient, lower, upper):
 
 #: Largest step of one iteration in scaled unknowns: keeps an unseen direction from crossing the box at once.
 LARGEST_STEP = 1.0
-
 #: Damping floor, relative to the best-seen direction.
 DAMPING_FLOOR = 1e-6
-
 #: At a state: cost, Gauss-Newton Hessian (d + 6, d + 6), gradient (d + 6,), and residuals of any shape.
 Evaluate = Callable[[State], tuple[float, Array, Array, Array]]
 
@@ -73,7 +72,8 @@ class Box:
 
     Attributes
     ----------
-    lower, upper : (d,), SI. scale : (d + 6,) half a parameter range, one radian, the object's size.
+    lower, upper : (d,), SI
+    scale : (d + 6,) half a parameter range, one radian, the object's size.
     """
 
     lower: Array
@@ -138,8 +138,11 @@ def damped_step(hessian, gradient, parameters, lowest, highest, scale, damping):
 
     Parameters
     ----------
-    hessian, gradient : (n, n) and (n,) of the cost, SI. parameters : (d,), the first of the unknowns.
-    lowest, highest : (d,) their box. scale : (n,) of the unknowns. damping : relative to the diagonal.
+    hessian, gradient : (n, n) and (n,) of the cost, SI
+    parameters : (d,), the first of the unknowns.
+    lowest, highest : (d,) their box
+    scale : (n,) of the unknowns
+    damping : relative to the diagonal.
     """
     n, d = len(gradient), len(parameters)
     scaled, slope = np.empty((n, n)), gradient * scale

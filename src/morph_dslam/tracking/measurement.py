@@ -48,7 +48,8 @@ class ReferenceAppearance:
 
     Parameters
     ----------
-    normalized_images : (h, w) each, the contrast-normalized pictures. views : the mesh in each of them.
+    normalized_images : (h, w) each, the contrast-normalized pictures
+    views : the mesh in each of them.
     sources : (m,) the picture that gives each triangle its texture; the first by default.
     closed : see `rasterise`.
 
@@ -133,7 +134,8 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
     Parameters
     ----------
     pixels, depths, triangles, closed : see `rasterise`. coordinates : (m, 3, 2) column and row of each
-        triangle's corners in the texture, texture pixels; outside it is its border. texture : (H, W) uint8.
+        triangle's corners in the texture, texture pixels; outside it is its border
+    texture : (H, W) uint8.
     image, depth : (h, w) uint8 and float32, the unit of ``depths``; changed where the surface is nearest.
     """
     u, v, q, x, y = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -148,17 +150,13 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
 
 #: Pyramid levels that reach as far as a correction may: a quarter of the size, with windows of 17 pixels.
 CORRECTION_LEVELS = 2
-
 #: Patches compared are (2 PATCH_HALF + 1) pixels wide.
 PATCH_HALF = 7
 PATCH_WINDOW = 2 * PATCH_HALF + 1
-
 #: Patches of the rendering and of the frame that agree less are rejected.
 LEAST_CORRELATION = 0.6
-
 #: A point found farther from where the rendering shows it, pixels, is rejected.
 LARGEST_CORRECTION_PX = 12.0
-
 #: A point this share of the object's depth behind the z-buffer counts as hidden.
 DEPTH_TOLERANCE = 0.01
 
@@ -169,7 +167,8 @@ class Measurement:
 
     Attributes
     ----------
-    pixels : (p, 2) where they were found. valid : (p,) which to believe.
+    pixels : (p, 2) where they were found
+    valid : (p,) which to believe.
     visible : (p,) which no other part of the object hides.
     spread : (p,) how exactly by what the patches differ, pixels, up to a factor; see `compare_patches`.
     depth : (h, w) metres, of the object as it was drawn for the comparison; None where it was not.
@@ -195,7 +194,8 @@ def visible_surface(
 
     Parameters
     ----------
-    positions : (p, 3) of the points in the camera frame. pixels : (p, 2) of them.
+    positions : (p, 3) of the points in the camera frame
+    pixels : (p, 2) of them.
     """
     same_side = facing(view, triangles[points.triangles]) == appearance.facing[points.triangles]
     depths = positions[:, 2]
@@ -210,7 +210,8 @@ def compare_with_rendering(
 
     Parameters
     ----------
-    frame : (h, w) the contrast-normalized frame. predicted : (p, 2) where the rendering shows the points.
+    frame : (h, w) the contrast-normalized frame
+    predicted : (p, 2) where the rendering shows the points.
     guesses : (p, 2) where to start looking for them in the frame.
     """
     rows = np.flatnonzero(visible)
@@ -235,7 +236,8 @@ def shown_areas(view: View, triangles: NDArray[np.int64], depth: NDArray[np.floa
 
     Parameters
     ----------
-    depth : (h, w) of the object in ``view``, metres. closed : whether only outer sides can be seen.
+    depth : (h, w) of the object in ``view``, metres
+    closed : whether only outer sides can be seen.
     """
     areas = signed_areas(view.pixels[triangles])
     tolerance = DEPTH_TOLERANCE * float(np.nanmedian(view.nodes[:, 2]))

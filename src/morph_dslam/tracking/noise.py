@@ -25,9 +25,12 @@ class Observations:
 
     Attributes
     ----------
-    points : p of them. pixels : (p, 2) as measured. weights : (p,), inverse variances up to a factor.
+    points : p of them
+    pixels : (p, 2) as measured
+    weights : (p,), inverse variances up to a factor.
     normals : (p, 2), zero for points that count in both directions; see `reprojection.linearise`.
-    correlation : (p, p) of the errors of the points' measurements. depths : where a depth camera saw them.
+    correlation : (p, p) of the errors of the points' measurements
+    depths : where a depth camera saw them.
     """
 
     points: BoundPoints
@@ -146,17 +149,13 @@ class PixelNoise:
 
 #: Nothing is known better than by this, pixels, whatever the patches say.
 LEAST_SPREAD_PX = 0.01
-
 #: With differences that are independent from pixel to pixel f is 1; blur makes neighbours alike, so that they
 #: count as fewer. A larger f is no noise of the patches but what the model leaves, where it moves them most.
 LARGEST_FACTOR = 4.0
-
 #: Larger powers of what the patches tell would leave few points to decide.
 LARGEST_POWER = 1.5
-
 #: Share of the latest frame in what is learnt, and points that it must have to tell.
 LEARNING_RATE, LEAST_POINTS = 0.05, 20
-
 #: The length of a Gaussian pair has this median, in standard deviations of a coordinate (Rayleigh).
 MEDIAN_OF_PAIR = 1.1774
 

@@ -23,10 +23,8 @@ Array = NDArray[np.float64]
 
 #: A standard deviation of this share of a parameter's range makes the 95 % interval as wide as the range.
 UNOBSERVABLE_SHARE = 0.25
-
 #: A parameter takes part in a combination when its share of the direction is larger.
 PART = 0.2
-
 #: Half the width of a 95 % interval in standard deviations of a Gaussian.
 INTERVAL_95 = 1.96
 
@@ -37,8 +35,8 @@ class Unobservable:
 
     Attributes
     ----------
-    indices : of the parameters. directions : (k, d) unobservable combinations of them, of length one in shares
-        of the ranges.
+    indices : of the parameters
+    directions : (k, d) unobservable combinations of them, of length one in shares of the ranges.
     """
 
     indices: tuple[int, ...]
@@ -141,7 +139,6 @@ def value_line(figures: dict) -> str:
 
 #: Von Mises stress is sqrt(s' Q s), of three plane or of six components of the stress.
 _PLANE = np.array([[1.0, -0.5, 0.0], [-0.5, 1.0, 0.0], [0.0, 0.0, 3.0]])
-
 _SOLID = np.zeros((6, 6))
 
 

@@ -21,20 +21,15 @@ Array = NDArray[np.float64]
 
 #: Points on the rim, evenly spread.
 N_POINTS = 120
-
 #: How far the outline is searched for to either side of where the estimate shows it, pixels.
 REACH_PX = 14
-
 #: Pixels averaged on each side of a candidate.
 SIDE_PX = 4
-
 #: Grey levels by which the two sides must differ.
 LEAST_CONTRAST = 10.0
-
 #: Largest difference of the inner side from its brightness in the reference view, relative to that; shading
 #: changes it as the surface bends.
 BRIGHTNESS_TOLERANCE = 0.35
-
 #: Weight of an outline point relative to a texture point: it gives one number, not two, and stands for all of
 #: the bare margin behind it.
 OUTLINE_WEIGHT = 2.0
@@ -46,7 +41,8 @@ class OutlineMeasurement:
 
     Attributes
     ----------
-    pixels : (p, 2) on the outline, each on the normal of its point. normals : (p, 2) outwards.
+    pixels : (p, 2) on the outline, each on the normal of its point
+    normals : (p, 2) outwards.
     valid : (p,) which were found.
     """
 
@@ -67,7 +63,8 @@ class Outline:
 
     Parameters
     ----------
-    grey : (h, w) undistorted reference image. state : the object in it.
+    grey : (h, w) undistorted reference image
+    state : the object in it.
     """
 
     def __init__(self, model: ReducedModel, camera: Camera, grey: NDArray[np.uint8], state: State) -> None:
@@ -97,7 +94,8 @@ class Outline:
 
         Parameters
         ----------
-        grey : (h, w) undistorted image. reach : how far to search to either side, pixels.
+        grey : (h, w) undistorted image
+        reach : how far to search to either side, pixels.
         """
         pixels, normals = self._predict(state)
         offsets = search_outline(

@@ -18,7 +18,6 @@ Array = NDArray[np.float64]
 
 #: A step longer than this, pixels, is no correction.
 LONGEST_STEP = 1.0
-
 #: Sums may be taken in any order: half the time.
 FAST = {"reassoc", "contract", "nsz"}
 
@@ -72,7 +71,8 @@ def patch_correlation(first, second, first_points, second_points, half):
 
     Parameters
     ----------
-    first, second : (h, w) uint8. first_points, second_points : (p, 2) patch centres in each.
+    first, second : (h, w) uint8
+    first_points, second_points : (p, 2) patch centres in each.
     half : the patches are (2 half + 1) pixels wide.
 
     Returns
@@ -184,12 +184,15 @@ def compare_patches(first, second, first_points, second_points, half):
 
     Parameters
     ----------
-    first, second : (h, w) uint8. first_points : (p, 2) patch centres in the first image.
-    second_points : (p, 2) in the second, by motion alone. half : the patches are (2 half + 1) pixels wide.
+    first, second : (h, w) uint8
+    first_points : (p, 2) patch centres in the first image.
+    second_points : (p, 2) in the second, by motion alone
+    half : the patches are (2 half + 1) pixels wide.
 
     Returns
     -------
-    places : (p, 2) in the second image. correlation : (p,) as of `patch_correlation`.
+    places : (p, 2) in the second image
+    correlation : (p,) as of `patch_correlation`.
     spread : (p,) standard deviation of a coordinate, pixels; infinite where it is not determined.
     """
     count, size = len(first_points), 2 * half + 1
@@ -215,7 +218,6 @@ NEUTRAL = 128
 
 #: Lucas-Kanade's window, pixels, and pyramid levels above the image itself.
 FLOW_WINDOW, LEVELS = 17, 3
-
 #: Side of the square over whose mean contrast is normalized, pixels.
 CONTRAST_WINDOW = 31
 
@@ -233,7 +235,8 @@ def follow(
 
     Parameters
     ----------
-    points : (p, 2) in the source image, pixels. guesses : (p, 2) where to start in the target.
+    points : (p, 2) in the source image, pixels
+    guesses : (p, 2) where to start in the target.
 
     Returns
     -------

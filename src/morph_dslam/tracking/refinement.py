@@ -31,7 +31,9 @@ class Keyframe:
 
     Attributes
     ----------
-    pixels : (p, 2). weights : (p,), 0 for points that were not seen. state : estimated there.
+    pixels : (p, 2)
+    weights : (p,), 0 for points that were not seen
+    state : estimated there.
     sigma_px : robust standard deviation of the residuals in it.
     outline : where the outline was seen, if it was looked for: it ties the texture to the object's edges.
     """
@@ -49,7 +51,10 @@ class Keyframe:
 
         Returns
         -------
-        points : p of them. pixels : (p, 2). weights : (p,). normals : (p, 2), zero but on the outline.
+        points : p of them
+        pixels : (p, 2)
+        weights : (p,)
+        normals : (p, 2), zero but on the outline.
         """
         pixels, weights = self.pixels[met], self.weights[met].astype(np.float64)
         normals = np.zeros_like(pixels)
@@ -65,13 +70,10 @@ class Keyframe:
 #: How many independent points a keyframe counts for: its residuals are mostly the model's, which are alike
 #: over wide parts of the surface.
 EFFECTIVE_POINTS = 30.0
-
 #: Residuals smaller than this, pixels, say no more.
 LEAST_SIGMA_PX = 0.3
-
 #: Keyframes used, spread over the sequence.
 N_KEYFRAMES = 25
-
 #: Standard deviation of a landmark, pixels, where the registration does not say it.
 LANDMARK_PX = 0.5
 
@@ -98,7 +100,8 @@ def refine_reference(
     ----------
     landmarks, landmark_pixels : (k) as registered; pixels (k, 2) undistorted.
     reference_pixels : (p, 2) of the followed points in the reference view.
-    start : the registered state. outline : of the object, if the keyframes saw it.
+    start : the registered state
+    outline : of the object, if the keyframes saw it.
     """
     model, camera = estimator.model, estimator.camera
     inner = Estimator(model, camera, EstimationOptions(max_iterations=8, tolerance=1e-5))
@@ -147,10 +150,8 @@ def _frame_residuals(
 
 #: Points that are paired, how often, and how many are needed.
 POINTS, ROUNDS, LEAST = 600, 5, 30
-
 #: Depths farther from the surface than this share of the object's size are of something else.
 LARGEST_DISTANCE = 0.05
-
 #: Depth within this many pixels of the object's rim may belong to what is behind it.
 RIM_PX = 4
 
@@ -168,8 +169,10 @@ def refine_by_depth(
 
     Parameters
     ----------
-    landmarks : p of them, bound. pixels : (p, 2) of them in the undistorted image.
-    state : as the landmarks have it. sigma_px : how exactly they were set.
+    landmarks : p of them, bound
+    pixels : (p, 2) of them in the undistorted image.
+    state : as the landmarks have it
+    sigma_px : how exactly they were set.
     image : (h, w) as recorded, metres, NaN where unknown.
 
     Raises

@@ -30,8 +30,10 @@ class PointChange:
 
     Attributes
     ----------
-    left, taken : numbers of the view so far and of the next one. correlation : (p, p) of the points so far.
-    n_points : of the next view, with those of the outline. kept : numbers of the views that can come back.
+    left, taken : numbers of the view so far and of the next one
+    correlation : (p, p) of the points so far.
+    n_points : of the next view, with those of the outline
+    kept : numbers of the views that can come back.
     besides : (n, n) covariance of the state so far from errors that the filter does not know of; zero where
         no frame was taken in since the last change.
     """
@@ -45,12 +47,12 @@ class PointChange:
 
 
 @dataclass(frozen=True)
-class LeftPoints:
+class _LeftPoints:
     """How the lasting errors of a view's points had entered the past when the view was left.
 
     Attributes
     ----------
-    by_point : (p, 2, k), as in `Errors`. covariance : (k, k) from it.
+    by_point : (p, 2, k), as in `_Errors`. covariance : (k, k) from it.
     """
 
     by_point: Array
@@ -58,7 +60,7 @@ class LeftPoints:
 
 
 @dataclass(frozen=True)
-class Errors:
+class _Errors:
     """How errors enter an estimate.
 
     Attributes
@@ -66,7 +68,8 @@ class Errors:
     by_point : (p, 2, n) derivative by the part that stays with a point, in its standard deviations.
     by_frames : (n, n) covariance from what is new in each frame.
     by_factor : (c, n) derivative by what is the same in all frames of a known pose; see `Prior.lasting`.
-    unseen : (n, n) covariance of what nothing tells of. covariance : (n, n) from all of it.
+    unseen : (n, n) covariance of what nothing tells of
+    covariance : (n, n) from all of it.
     inverse : (n, n) of the cost's Hessian.
     by_views : (k, n) by the number of a view that was left: derivative by what its points had put into the
         k parameters then.
@@ -82,13 +85,15 @@ class Errors:
 
 
 @dataclass(frozen=True)
-class Past:
+class _Past:
     """What the frames so far said of the k parameters that are one per sequence.
 
     Attributes
     ----------
-    mean : (k,), SI. covariance : (k, k). by_point, by_frames, by_factor, unseen, by_views : as in `Errors`,
-        (p, 2, k), (k, k), (c, k), (k, k) and (k, k) each.
+    mean : (k,), SI
+    covariance : (k, k)
+    by_point, by_frames, by_factor, unseen, by_views : as in `_Errors`, (p, 2, k), (k, k), (c, k), (k, k) and
+        (k, k) each.
     left : the views of ``by_views``, by number.
     """
 
@@ -99,9 +104,9 @@ class Past:
     by_factor: Array
     unseen: Array
     by_views: dict[int, Array] = field(default_factory=dict)
-    left: dict[int, LeftPoints] = field(default_factory=dict)
+    left: dict[int, _LeftPoints] = field(default_factory=dict)
 
-    def with_points(self, change: PointChange, kept: NDArray[np.int64]) -> Past:
+    def with_points(self, change: PointChange, kept: NDArray[np.int64]) -> _Past:
         """The same past, for measurements of another view's points.
 
         What the points so far have put into it is kept apart, so that their errors are known as the same when
@@ -114,7 +119,7 @@ class Past:
         """
         besides = change.besides[np.ix_(kept, kept)]
         covariance = quadratic(self.by_point, change.correlation)
-        left = self.left | {change.left: LeftPoints(self.by_point, covariance)}
+        left = self.left | {change.left: _LeftPoints(self.by_point, covariance)}
         by_views = self.by_views | {change.left: np.eye(len(kept))}
         by_point, unseen = np.zeros((change.n_points, 2, len(kept))), self.unseen + besides
         if change.taken in left:
@@ -156,7 +161,8 @@ def without_clear_effect(
 
     Parameters
     ----------
-    linear : the cost of what was measured, about the ``state`` that was estimated. linear_at : about another.
+    linear : the cost of what was measured, about the ``state`` that was estimated
+    linear_at : about another.
     spread : (d,) standard deviations of the parameters were those at ``indices`` (k,) known, SI.
     """
     effects = linear.weighted_jacobian[:, :, indices]
@@ -173,17 +179,13 @@ def without_clear_effect(
 
 #: The weight of the past in the mean of past and frame stays below this.
 LARGEST_WEIGHT = 0.999
-
 #: Frames over which the past fades, by a factor e.
 MEMORY = 600.0
-
 #: A frame whose own estimate is so many standard deviations off the past's changes nothing of it; it stands
 #: by itself, unless the past is far surer of what does not change. After so many in a row the past is forgotten.
 GATE, PATIENCE = 5.0, 3
-
 #: A past with this part of a frame's standard deviation is believed against it.
 FAR_SURER = 0.2
-
 #: What was measured in a frame.
 Frame = TypeVar("Frame", Observations, RigObservations)
 
@@ -225,7 +227,7 @@ class SequenceFilter(Generic[Frame]):
         self._walks = bool(walking)
         self._unknowns = len(estimator.model.parameters) + 6
         self._noise = PixelNoise(MEMORY)
-        self._past: Past | None = None
+        self._past: _Past | None = None
         self._unobservable_variance = np.zeros(len(self._constant))
         self._conflicts = 0
         self.past_information, self.keeps = np.zeros((self._unknowns,) * 2), True
@@ -297,7 +299,7 @@ class SequenceFilter(Generic[Frame]):
         estimate: Estimate,
         measured: Frame,
         linear: LinearCost,
-        errors: Errors,
+        errors: _Errors,
         known: Prior | None,
         past: Prior | None = None,
     ) -> Estimate:
@@ -320,10 +322,10 @@ class SequenceFilter(Generic[Frame]):
     def _of_kept(self, matrix: Array) -> Array:
         return matrix[np.ix_(self._kept, self._kept)]
 
-    def _keep(self, estimate: Estimate, errors: Errors) -> None:
+    def _keep(self, estimate: Estimate, errors: _Errors) -> None:
         """Make the estimate's parameters that are one per sequence the past of the next frame."""
         grown = np.exp(1.0 / MEMORY)
-        self._past = Past(
+        self._past = _Past(
             estimate.state.parameters[self._kept],
             grown * self._of_kept(errors.covariance) + self._step,
             np.sqrt(grown) * errors.by_point[:, :, self._kept],
@@ -342,7 +344,7 @@ class SequenceFilter(Generic[Frame]):
         parameters[self._kept[surer]] = self._past.mean[surer]
         return replace(alone.state, parameters=parameters)
 
-    def _prior(self, past: Past, measured: Frame, errors: Errors) -> Prior:
+    def _prior(self, past: _Past, measured: Frame, errors: _Errors) -> Prior:
         """The past as a term of the frame's cost, of the weight that makes the variance of both least.
 
         In the basis in which the frame's covariance is 1 and the past's p, with the covariance c of both, the
@@ -362,20 +364,20 @@ class SequenceFilter(Generic[Frame]):
         information[np.ix_(self._kept, self._kept)] = root @ root.T
         return Prior(mean, information)
 
-    def _contradicts(self, past: Past, estimate: Estimate) -> bool:
+    def _contradicts(self, past: _Past, estimate: Estimate) -> bool:
         """Whether a frame by itself says something else than all those before."""
         apart = estimate.state.parameters[self._kept] - past.mean
         spread = self._of_kept(estimate.covariance) + past.covariance
         return float(apart @ np.linalg.solve(spread, apart)) > GATE**2
 
-    def _is_far_surer(self, past: Past, estimate: Estimate) -> bool:
+    def _is_far_surer(self, past: _Past, estimate: Estimate) -> bool:
         """Whether the past knows far better than a frame by itself whatever both tell of."""
         shares = scipy.linalg.eigvalsh(past.covariance, self._of_kept(estimate.covariance))
         return float(shares.max()) < FAR_SURER**2
 
     def _errors(
         self, measured: Frame, linear: LinearCost, state: State, known: Prior | None, past: Prior | None = None
-    ) -> Errors:
+    ) -> _Errors:
         """How the measurements' errors, and those of what is known otherwise, enter the estimate."""
         d, kept = self._unknowns - 6, self._kept
         common, frame = self._noise.common, self._noise.frame
@@ -408,7 +410,7 @@ class SequenceFilter(Generic[Frame]):
             by_views = {view: rows @ inverse[kept] for view, rows in by_views.items()}
             for view, rows in by_views.items():
                 covariance += rows.T @ self._past.left[view].covariance @ rows
-        return Errors(by_point, by_frames, by_factor, unseen, covariance, inverse, by_views)
+        return _Errors(by_point, by_frames, by_factor, unseen, covariance, inverse, by_views)
 
 
 def _taken(measured: Observations | RigObservations, linear: LinearCost, state: State, known: Prior | None) -> float:

@@ -74,8 +74,9 @@ class Prior:
 
     Attributes
     ----------
-    mean : (d,), SI. information : (d, d), the Hessian of the cost (mu - mean)' I (mu - mean) / 2, in squared
-        pixels as the cost; zero for parameters of which nothing is known.
+    mean : (d,), SI
+    information : (d, d), the Hessian of the cost (mu - mean)' I (mu - mean) / 2, in squared pixels as the
+        cost; zero for parameters of which nothing is known.
     pose : camera_from_object as known beforehand; None if nothing is.
     pose_information : (6, 6) in the same unit, of the increment (rotation vector, translation) that `moved`
         applies to ``pose``; None if nothing is known.

@@ -35,16 +35,12 @@ Array = NDArray[np.float64]
 
 #: More than this, pixels, and more than half of the residuals' variance, counts as the model's failure.
 UNEXPLAINED_PX = 0.5
-
 #: What comparing windows leaves in neighbours alike, pixels: an expectation well below says nothing.
 FLOOR_PX = 0.05
-
 #: Frames over which what was learnt of the reference fades, by a factor e.
 MEMORY = 600.0
-
 #: More than so many times the stated deviation of the reference is a warning.
 CLEARLY_WORSE = 2.0
-
 #: A triangle seen so much flatter in the reference view than in another says nothing of the motion there.
 LARGEST_STRETCH = 5.0
 
