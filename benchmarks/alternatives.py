@@ -29,12 +29,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alternative_functions import Differenced, Hats, Linearised
-from morph_dslam import Camera, MorphError, ReducedModel, Registration, Tracker, load_camera, load_model, open_source
+from morph_dslam import (
+    Camera,
+    MorphError,
+    ReducedModel,
+    Registration,
+    Tracker,
+    load_camera,
+    load_model,
+    open_source,
+    register_landmarks,
+)
 from morph_dslam.extend import one_thread_for_algebra
 from morph_dslam.extend.geometry import RigidTransform
 from morph_dslam.extend.registration import Landmarks
 from morph_dslam.extend.tracking import BoundPoints, Estimate, Estimator, State, moved
-from morph_dslam.registration.registration import register_by_landmarks
 
 Array = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parents[1]
@@ -166,12 +175,12 @@ def follow(model: ReducedModel, kind: type[Counted], recording: Recording, exact
         for frame in open_source(recording.folder / "frames", recording.first, last):
             if tracker is None:
                 try:
-                    placed = register_by_landmarks(model, camera, landmarks)
+                    placed = register_landmarks(model, camera, landmarks)
                 except MorphError as error:
                     return Row([], [], [], last + 1 - recording.first, str(error))
-                tracker = Tracker(model, camera, Registration.at(model, placed.state), reference=frame.image)
+                tracker = Tracker(model, camera, Registration(model, placed.state), reference=frame.image)
                 tracker.track(frame.image)  # compiles
-                tracker = Tracker(model, camera, Registration.at(model, placed.state), reference=frame.image)
+                tracker = Tracker(model, camera, Registration(model, placed.state), reference=frame.image)
             Counted.iterations, Counted.seconds = 0, 0.0
             estimate = tracker.track(frame.image).estimate
             if estimate is None:

@@ -21,7 +21,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
 
@@ -29,7 +28,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam import MorphError, load_camera
+from morph_dslam import MorphError, Registration, load_camera
 from morph_dslam.extend.geometry import RigidTransform, cross_matrix, fit_similarity
 from morph_dslam.extend.registration import run_registration
 from morph_dslam.extend.slam import run_slam
@@ -151,22 +150,23 @@ class Outcome:
         return abs(self.scale) <= SCALE_LIMIT and 1e3 * self.places.mean() <= PLACE_LIMIT and not self.ambiguous
 
 
-def outcome(content: dict[str, Any], rigid_map: RigidMap, true_poses: Array) -> Outcome:
-    """Compare the content of a registration.json with the truth, poses (T, 4, 4) of all frames."""
-    middle = np.array(content["mean_node_m"])
-    keyframes = content["keyframes"]
-    truth = [RigidTransform.from_matrix(true_poses[entry["frame"]]) for entry in keyframes]
-    found = [RigidTransform.from_matrix(np.array(entry["camera_from_object"])) for entry in keyframes]
+def outcome(registration: Registration, rigid_map: RigidMap, true_poses: Array) -> Outcome:
+    """Compare a registration with the truth, poses (T, 4, 4) of all frames."""
+    in_scene, keyframes = registration.map_registration, registration.keyframes
+    assert in_scene is not None
+    middle, covariance = in_scene.centre, in_scene.covariance
+    assert covariance is not None
+    truth = [RigidTransform.from_matrix(true_poses[keyframe.frame]) for keyframe in keyframes]
+    found = [keyframe.pose for keyframe in keyframes]
     in_map = [RigidTransform.from_matrix(keyframe.camera_from_world) for keyframe in rigid_map.keyframes]
     true_scale = fit_similarity(_centres(truth), _centres(in_map)).scale
-    scale = float(np.log(content["map_units_per_metre"] / true_scale))
+    scale = float(np.log(in_scene.world_from_object.scale / true_scale))
     misses = np.array([a.apply(middle) - b.apply(middle) for a, b in zip(found, truth, strict=True)])
     places = np.sqrt((misses**2).sum(axis=1))
     tilts = [np.linalg.norm(a.rotation[:, 2] - b.rotation[:, 2]) for a, b in zip(found, truth, strict=True)]
-    covariance = np.array(content["covariance"])
     normalised = [scale / np.sqrt(covariance[0, 0])]
-    normalised.extend(_normalised_pose(found[-1], truth[-1], np.array(keyframes[-1]["covariance"]), middle))
-    return Outcome(scale, places, float(np.mean(tilts)), np.array(normalised), content["ambiguous"])
+    normalised.extend(_normalised_pose(found[-1], truth[-1], keyframes[-1].covariance, middle))
+    return Outcome(scale, places, float(np.mean(tilts)), np.array(normalised), registration.ambiguous)
 
 
 def _centres(poses: list[RigidTransform]) -> Array:
@@ -222,12 +222,12 @@ def main() -> int:
         mapped(folder, arguments.again == "maps")
         map_path, camera = folder / "scan" / "map.h5", folder / "recording" / "camera.yaml"
         try:
-            content = run_registration(map_path, MODEL, camera, folder / "registration")
+            registration = run_registration(map_path, MODEL, camera, folder / "registration")
         except MorphError as error:
             print(f"seed={seed} not registered: {error}", flush=True)
             continue
         truth = np.load(folder / "recording" / "truth.npz")["camera_from_object"]
-        found.append(outcome(content, load_map(map_path, load_camera(camera)), truth))
+        found.append(outcome(registration, load_map(map_path, load_camera(camera)), truth))
         print(line(seed, found[-1]), flush=True)
     print(last_line(found, arguments.seeds))
     return 0

@@ -41,10 +41,10 @@ from tests.support.shown_frames import (
 from tests.support.staged_scenes import SCENES, Scene, drawn_out
 from tests.support.stated_cases import InMap, Outcome, Shown, in_unit, landmarks, placed_by_landmarks, run_case, stated
 
-from morph_dslam import Registration
+from morph_dslam import register_landmarks
 from morph_dslam.extend import one_thread_for_algebra
 from morph_dslam.extend.geometry import SimilarityTransform
-from morph_dslam.registration.landmarks import register
+from morph_dslam.extend.registration import Landmarks
 from morph_dslam.registration.mesh import register_mesh
 
 Case = tuple[str, Callable[[], Outcome]]
@@ -116,9 +116,8 @@ def _in_unit(scene: Scene, factor: float) -> Outcome:
     """Landmarks in their own unit, the mesh in another."""
     points, pixels = landmarks(scene, scene.model)
     model = in_unit(scene.model, factor)
-    found = register(model, scene.stage.camera, points, pixels)
-    placed = Registration(model, None, found.state, {}, found.flags, covariance=found.covariance)
-    return run_case(scene, placed, moving(scene, 5))
+    found = register_landmarks(model, scene.stage.camera, Landmarks(points, pixels))
+    return run_case(scene, found, moving(scene, 5))
 
 
 def anchored_cases(scene: Scene, seed: int) -> Iterator[Case]:

@@ -128,7 +128,7 @@ def new_tracker(model: ReducedModel, film: Film, plain: bool) -> Tracker:
 
     def begin() -> Tracker:
         with patch.object(DrawnSurface, "of", whole if plain else DrawnSurface.of):
-            return Tracker(model, CAMERA, Registration.at(model, film.states[0]), reference=film.images[0])
+            return Tracker(model, CAMERA, Registration(model, film.states[0]), reference=film.images[0])
 
     begin().track(film.images[0])
     return begin()

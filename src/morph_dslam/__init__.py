@@ -42,6 +42,9 @@ __all__ = [
     "map_scene",
     "open_live",
     "open_source",
+    "register",
+    "register_board",
+    "register_landmarks",
     "save_model",
     "simulate",
     "track",
@@ -80,6 +83,9 @@ _MODULES = {
     "map_scene": "slam.scene",
     "open_live": "sources",
     "open_source": "sources",
+    "register": "registration.register",
+    "register_board": "registration.board_registration",
+    "register_landmarks": "registration.landmarks",
     "save_model": "model",
     "simulate": "render.simulation",
     "track": "tracking.track",
@@ -97,6 +103,9 @@ if TYPE_CHECKING:  # the same for editors and type checkers
     from morph_dslam.mechanics.solid import SolidProblem
     from morph_dslam.model import Parameter, ReducedModel, load_model, save_model
     from morph_dslam.reduction.report import write_build_report
+    from morph_dslam.registration.board_registration import register_board
+    from morph_dslam.registration.landmarks import register_landmarks
+    from morph_dslam.registration.register import register
     from morph_dslam.registration.registration import Registration, load_registration
     from morph_dslam.render.simulation import simulate
     from morph_dslam.slam.options import SlamOptions

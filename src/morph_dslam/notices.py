@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 
 @dataclass(frozen=True)
@@ -12,8 +12,14 @@ class Notice:
     """A warning about a result, with the numbers that it rests on as fields.
 
     Each kind of warning is a small frozen dataclass. Programs test the class, or its `kind`, and read the
-    fields; the text is only shown. One module of each part of the program writes all texts of that part.
+    fields; the text is only shown.
+
+    Attributes
+    ----------
+    template : the text, with the fields' names in braces.
     """
+
+    template: ClassVar[str] = ""
 
     @property
     def kind(self) -> str:
@@ -22,12 +28,22 @@ class Notice:
 
     @property
     def text(self) -> str:
-        """The warning in words."""
-        raise NotImplementedError
+        """For people."""
+        return self.template.format(**vars(self))
 
     def content(self) -> dict[str, Any]:
         """The kind, the fields and the text, for a JSON file."""
         return {"kind": self.kind, **asdict(self), "text": self.text}
 
-    def __str__(self) -> str:
-        return self.text
+
+@dataclass(frozen=True)
+class Remark(Notice):
+    """A warning of which programs need no more than the text.
+
+    Attributes
+    ----------
+    message : the text.
+    """
+
+    template: ClassVar[str] = "{message}"
+    message: str

@@ -28,7 +28,7 @@ def covered_run():
     """Mean errors by frame, mm, errors of the parameters over their deviations, and points that agreed."""
     model = bent_sheet_model(43, 31)
     film = SheetFilm(model)
-    tracker = Tracker(model, CAMERA, Registration.at(model, sheet_state(0.0)), reference=film.frame(sheet_state(0.0)))
+    tracker = Tracker(model, CAMERA, Registration(model, sheet_state(0.0)), reference=film.frame(sheet_state(0.0)))
     errors, normalised, counts = [], [], []
     for step, time in enumerate(TIMES):
         truth = sheet_state(time)

@@ -92,7 +92,7 @@ def test_the_block_is_followed_all_around_without_a_view_that_is_made(film, view
     turns = np.radians(np.linspace(4, 160, 40))
     truths = [block_state(turn, (k + 1) / 40) for k, turn in enumerate(turns)]
     tracker = Tracker(
-        film.model, CAMERA, Registration.at(film.model, start), OPTIONS, reference=views[0].picture, keyframes=further
+        film.model, CAMERA, Registration(film.model, start), OPTIONS, reference=views[0].picture, keyframes=further
     )
     results = [tracker.track(film.frame(truth)) for truth in truths]
     assert not any(result.made_view for result in results)
@@ -128,7 +128,7 @@ def test_the_error_that_all_views_have_in_common_is_stated(film, estimator):
     for _ in range(6):
         views = known_views(film, deviations * rng.standard_normal(6), deviations)
         further = KeyframeViews(views[0].error_factors, (views[3], views[5]))
-        start = Registration.at(film.model, views[0].state)
+        start = Registration(film.model, views[0].state)
         tracker = Tracker(film.model, CAMERA, start, OPTIONS, reference=views[0].picture, keyframes=further)
         for turn in np.radians([10, 25, 40]):
             truth = block_state(turn, 0.25)

@@ -30,7 +30,7 @@ def tracked(truths=TRUTHS, step=None, covariance=None, **options):
     tracker = Tracker(
         film.model,
         CAMERA,
-        Registration.at(film.model, state, covariance),
+        Registration(film.model, state, covariance),
         TrackerOptions(**options),
         reference=film.frame(start),
     )

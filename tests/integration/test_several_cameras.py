@@ -47,7 +47,7 @@ def images(films, time, **changes):
 def test_two_cameras_are_nearer_to_the_truth_than_one(model, films):
     """Something hides most of the object from the first camera, and some of it from the second."""
     first = images(films, 0.0)
-    alone = Tracker(model, FRONT.camera, Registration.at(model, sheet_state(0.0)), reference=first[0])
+    alone = Tracker(model, FRONT.camera, Registration(model, sheet_state(0.0)), reference=first[0])
     rig = RigTracker(model, RIG, first, sheet_state(0.0))
     errors, deviations = {"alone": [], "rig": []}, {"alone": [], "rig": []}
     for time in TIMES:

@@ -51,7 +51,7 @@ def frame(model, films, time):
 
 def new_trackers(model, films):
     first = frame(model, films, 0.0)
-    return {name: Tracker(model, CAMERA, Registration.at(model, states(0.0)[name]), reference=first) for name in films}
+    return {name: Tracker(model, CAMERA, Registration(model, states(0.0)[name]), reference=first) for name in films}
 
 
 def test_object_that_passes_before_another_one_costs_it_no_accuracy(model, films):

@@ -1,24 +1,16 @@
 """What is not as it should be leads to a stated status, never to a confident wrong answer."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from morph_dslam.cli.app import main
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import SimilarityTransform
-from morph_dslam.io.camera_files import save_camera
-from morph_dslam.model import save_model
-from morph_dslam.registration.landmarks import register
-from morph_dslam.registration.mesh import register_in_unit, register_mesh
-from morph_dslam.registration.scene import scene_of_map
-from morph_dslam.slam.map_files import save_map
-from morph_dslam.slam.rigid_map import GOOD, Keyframe, RigidMap
+from morph_dslam.io.landmarks import Landmarks
+from morph_dslam.registration.landmarks import register_landmarks
+from morph_dslam.registration.messages import UnusualSize, WrongUnit
 from morph_dslam.tracking.outcomes import ModelDoesNotExplain, OtherReferenceView
-from tests.support.rendered_object import CAMERA, scanned, wedge
 from tests.support.shown_frames import behind_a_thing, covered, exchanged, moving, passing
-from tests.support.staged_scenes import SCENES, bending_wedge, drawn_out, is_beyond, is_doubted, mean_error
+from tests.support.staged_scenes import SCENES, drawn_out, is_beyond, is_doubted, mean_error
 from tests.support.stated_cases import Shown, in_unit, landmarks, placed_by_landmarks, run_case, stated
 
 WORLD = SimilarityTransform(1.0, np.eye(3), np.array([0.1, -0.2, 0.3]))
@@ -73,70 +65,28 @@ def test_a_sheet_of_another_format_is_mostly_not_sure_of_itself(factors):
 def test_a_mesh_in_another_unit_than_the_landmarks_is_named(name, factor):
     scene = SCENES[name](0)
     points, pixels = landmarks(scene, scene.model)
-    with pytest.raises(RegistrationError, match=f"multiplied by {1 / factor:.4g}: one in"):
-        register(in_unit(scene.model, factor), scene.stage.camera, points, pixels)
+    with pytest.raises(RegistrationError, match=f"multiplied by {1 / factor:.4g}"):
+        register_landmarks(in_unit(scene.model, factor), scene.stage.camera, Landmarks(points, pixels))
 
 
 def test_landmarks_all_over_a_sheet_are_named_where_its_mesh_is_in_a_unit_somewhat_too_large(sheet):
     """They lie on a part of the larger sheet, and fit by a bend of it, so that nothing else would say so."""
-    points, pixels = landmarks(sheet, sheet.model)
-    found = register(in_unit(sheet.model, 2.54), sheet.stage.camera, points, pixels)
-    assert any("they fit if its mesh is multiplied by 0.3937: one in centimetres" in f for f in found.flags)
-    assert not any("multiplied" in f for f in register(sheet.model, sheet.stage.camera, points, pixels).flags)
+    given = Landmarks(*landmarks(sheet, sheet.model))
+    found = register_landmarks(in_unit(sheet.model, 2.54), sheet.stage.camera, given)
+    (unit,) = (warning for warning in found.warnings if isinstance(warning, WrongUnit))
+    assert (unit.meant, unit.taken, unit.factor) == ("centimetres", "inches", pytest.approx(1 / 2.54))
+    right = register_landmarks(sheet.model, sheet.stage.camera, given)
+    assert not any(isinstance(warning, WrongUnit) for warning in right.warnings)
 
 
 def test_one_camera_cannot_tell_the_size_but_an_absurd_one_is_flagged(sheet):
     """Mesh and landmarks in the same wrong unit fit perfectly, at a distance as wrong as the size."""
     points, pixels = landmarks(sheet, sheet.model, click_px=0.0)
     model = in_unit(sheet.model, 1000.0)
-    found = register(model, sheet.stage.camera, 1000.0 * points, pixels)
-    assert any("the model is 514 m across" in flag for flag in found.flags)
+    found = register_landmarks(model, sheet.stage.camera, Landmarks(1000.0 * points, pixels))
+    assert UnusualSize(pytest.approx(514.0, abs=1.0)) in found.warnings
     depth = found.state.camera_from_object.translation[2]
     assert depth == pytest.approx(1000.0 * sheet.state(0.0).camera_from_object.translation[2], rel=1e-3)
-
-
-def map_with(objects, metric=True):
-    points, views = scanned(WORLD, objects, with_images=True)
-    rigid_map = RigidMap(baseline_px=40.0 if metric else 0.0)
-    rigid_map.add_points(points.positions, np.zeros((len(points), 2)), 0, GOOD)
-    for view in views:
-        pose = view.camera_from_world.matrix
-        keyframe = Keyframe(view.frame, view.frame / 30.0, view.normalized, pose, view.point_ids, view.pixels)
-        rigid_map.add_keyframe(keyframe)
-    return rigid_map
-
-
-@pytest.mark.slow
-def test_the_unit_of_a_metric_map_tells_that_of_the_mesh():
-    nodes, triangles, _ = wedge()
-    points, views = scene_of_map(map_with((np.zeros(3),)))
-    with pytest.raises(RegistrationError, match=r"one of its shape that is 0\.039\d* times as large"):
-        register_in_unit(25.4 * nodes, triangles, points, views, CAMERA, metric=True)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("stretch", [1.0, 1.1])
-def test_a_mesh_that_is_drawn_out_is_accused_by_its_outline(stretch):
-    """Its faces lie on those of the object in another size, where the images of them agree."""
-    nodes, triangles, _ = wedge()
-    points, views = scanned(replace(WORLD, scale=3.7), with_images=True)
-    found = register_mesh(nodes * [stretch, 1.0, 1.0], triangles, points, views, CAMERA)
-    right = abs(found.world_from_object.scale / 3.7 - 1.0) < 0.01
-    assert right == (stretch == 1.0)
-    assert found.outline.contradicts == (not right)
-    assert found.ambiguous == (not right)
-
-
-@pytest.mark.slow
-def test_an_object_that_the_map_does_not_hold_ends_the_registration(tmp_path, capsys):
-    save_map(tmp_path / "map.h5", map_with((), metric=False), CAMERA)
-    save_camera(tmp_path / "camera.yaml", CAMERA)
-    save_model(tmp_path / "wedge.morph", bending_wedge())
-    files = [str(tmp_path / name) for name in ("map.h5", "wedge.morph", "camera.yaml", "place")]
-    status = main(["register", files[0], "--model", files[1], "--camera", files[2], "-o", files[3]])
-    assert status == 2
-    assert "the object was not found in the map" in capsys.readouterr().err
-    assert not (tmp_path / "place" / "registration.json").exists()
 
 
 @pytest.mark.parametrize("name", ["sheet", "wedge in the hand"])

@@ -28,7 +28,7 @@ def film(model):
 
 
 def start(model, film):
-    return Tracker(model, CAMERA, Registration.at(model, sheet_state(0.0)), reference=film.frame(sheet_state(0.0)))
+    return Tracker(model, CAMERA, Registration(model, sheet_state(0.0)), reference=film.frame(sheet_state(0.0)))
 
 
 def test_moving_bending_sheet_is_followed_within_a_fraction_of_a_millimetre(model, film):
@@ -95,7 +95,7 @@ def test_lens_distortion_is_undone(model):
     def recorded(state):
         return cv2.remap(film.frame(state, noise=0.0), maps[..., 0], maps[..., 1], cv2.INTER_CUBIC)
 
-    tracker = Tracker(model, lens, Registration.at(model, sheet_state(0.0)), reference=recorded(sheet_state(0.0)))
+    tracker = Tracker(model, lens, Registration(model, sheet_state(0.0)), reference=recorded(sheet_state(0.0)))
     for time in (0.03, 0.06, 0.09):
         result = tracker.track(recorded(sheet_state(time)))
         assert result.status == "tracked"
@@ -104,7 +104,7 @@ def test_lens_distortion_is_undone(model):
 
 def test_sequence_that_does_not_begin_at_the_reference_is_entered(model, film):
     reference = film.frame(sheet_state(0.0))
-    tracker = Tracker(model, CAMERA, Registration.at(model, sheet_state(0.0)), reference=reference, in_sequence=False)
+    tracker = Tracker(model, CAMERA, Registration(model, sheet_state(0.0)), reference=reference, in_sequence=False)
     truth = sheet_state(0.5)
     result = tracker.track(film.frame(truth))
     assert result.status == "tracked", result.reason
@@ -113,7 +113,7 @@ def test_sequence_that_does_not_begin_at_the_reference_is_entered(model, film):
 
 def test_object_without_texture_is_refused_with_advice(model, film):
     with pytest.raises(RegistrationError, match="printed texture"):
-        Tracker(model, CAMERA, Registration.at(model, sheet_state(0.0)), reference=film.blank(noise=0.0))
+        Tracker(model, CAMERA, Registration(model, sheet_state(0.0)), reference=film.blank(noise=0.0))
 
 
 def test_same_frames_give_the_same_states(model):
@@ -160,7 +160,7 @@ def test_covered_object_is_lost_and_never_put_elsewhere(model, film):
 def test_object_absent_from_the_beginning_is_waited_for(model, film):
     """Another print on a sheet of the same shape is not the object either."""
     truth = sheet_state(0.1)
-    start = Registration.at(model, sheet_state(0.0))
+    start = Registration(model, sheet_state(0.0))
     tracker = Tracker(model, CAMERA, start, reference=film.frame(sheet_state(0.0)), in_sequence=False)
     for frame in (film.blank(), SheetFilm(model, seed=9).frame(truth), film.blank()):
         result = tracker.track(frame)
@@ -175,7 +175,7 @@ def test_second_identical_object_is_not_taken_for_the_first(model, film):
     """Followed, the object stays what it is; after a loss two that look the same cannot be told apart."""
     here = aside(sheet_state(0.0), -0.16, 0.0, 0.55)
     there = aside(here, 0.42, 0.08)
-    tracker = Tracker(model, CAMERA, Registration.at(model, here), reference=film.frame(here))
+    tracker = Tracker(model, CAMERA, Registration(model, here), reference=film.frame(here))
 
     def both(first, second):
         image, other = film.frame(first), film.frame(second)

@@ -5,13 +5,13 @@ The place comes from the truth and the camera's path in the map, not from `morph
 
 from __future__ import annotations
 
-import json
-
 import cv2
 import numpy as np
 
 from morph_dslam.geometry import fit_similarity
 from morph_dslam.io.camera_files import load_camera
+from morph_dslam.model import load_model
+from morph_dslam.registration.registration import KeyframePose, MapRegistration, registration_in_map
 from morph_dslam.render.simulation import simulate
 from morph_dslam.slam.map_files import save_map
 from morph_dslam.slam.scene import trajectory_of
@@ -81,35 +81,22 @@ def make_anchored_recording(folder):
     ]
     slam.refine_map()
     save_map(folder / "map.h5", slam.map, camera)
-    write_registration(folder / "registration.json", slam, frames, truth)
+    write_registration(folder / "registration.json", load_model(folder / "sheet.morph"), slam, frames, truth)
 
 
-def write_registration(path, slam, frames, truth, centre=(0.0, 0.0, 0.0), names=None):
+def write_registration(path, model, slam, frames, truth, centre=(0.0, 0.0, 0.0), **files):
     """A registration that is as good as the camera's path in the map."""
     path_in_map = trajectory_of(slam, frames)
     seen = [frame.index for frame in frames if frame.pose is not None]
     placed = _similarity(path_in_map.world_from_camera, truth["camera_from_object"][seen], np.array(centre))
     size = 0.5 * placed.scale
     spread = np.array([1e-3, *[1e-3] * 3, *[1e-3 * size] * 3])
-    content = {
-        "world_from_object": placed.matrix.tolist(),
-        "map_units_per_metre": placed.scale,
-        "mean_node_m": list(centre),
-        "covariance": np.diag(spread**2).tolist(),
-        "score": 100.0,
-        "runner_up_score": 10.0,
-        "rms_px": 0.1,
-        "ambiguous": False,
-        "axis_of_revolution": None,
-        "keyframes": [],
-    }
-    for keyframe in slam.map.keyframes:
-        pose = np.eye(4)
-        pose[:3, :3] = keyframe.camera_from_world[:3, :3] @ placed.rotation
-        moved = keyframe.camera_from_world[:3, :3] @ placed.translation + keyframe.camera_from_world[:3, 3]
-        pose[:3, 3] = moved / placed.scale
-        content["keyframes"].append({"frame": keyframe.index, "camera_from_object": pose.tolist()})
-    path.write_text(json.dumps(content | (names or {})))
+    in_map = MapRegistration(placed, np.array(centre), np.diag(spread**2))
+    keyframes = [
+        KeyframePose(keyframe.index, in_map.pose_in(keyframe.camera_from_world)) for keyframe in slam.map.keyframes
+    ]
+    facts = {"from": "map", "score": 100.0, "runner_up_score": 10.0, "rms_px": 0.1}
+    registration_in_map(model, in_map, keyframes, facts).save(path, **files)
 
 
 def _similarity(map_from_camera, camera_from_object, centre):

@@ -282,8 +282,8 @@ def _scan(folder, models, truth):
     for name, model in models.items():
         (folder / name).mkdir()
         path = folder / name / "registration.json"
-        names = {"map": "../map.h5", "model": f"../{name}.morph"}
-        write_registration(path, slam, frames, truth[name], model.nodes.mean(axis=0), names)
+        files = {"map_path": folder / "map.h5", "model_path": folder / f"{name}.morph"}
+        write_registration(path, model, slam, frames, truth[name], model.nodes.mean(axis=0), **files)
         _write_adjusted(path, truth[name], model.nodes.mean(axis=0))
 
 

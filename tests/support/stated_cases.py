@@ -10,8 +10,10 @@ import numpy as np
 
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.model import ReducedModel
-from morph_dslam.registration.landmarks import register
+from morph_dslam.registration.landmarks import register_landmarks
+from morph_dslam.registration.messages import Ambiguous, AtBound, OutlineElsewhere, PoorFit, Underdetermined, WrongUnit
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.run_folder import RunResults, flags
@@ -20,8 +22,8 @@ from tests.support.staged_scenes import Scene, is_beyond, is_doubted, mean_error
 
 #: Frames of a recording at 30 a second that show one unit of a scene's time.
 FRAMES = 120
-#: Flags of a registration that say it may be wrong.
-DOUBTFUL = ("ambiguous", "poor", "doubtful", "underdetermined", "at a bound")
+#: Warnings of a registration that say it may be wrong.
+DOUBTFUL = (Ambiguous, PoorFit, WrongUnit, OutlineElsewhere, Underdetermined, AtBound)
 #: Errors of a pose in a map: of the registration, which last, and of the camera; rad and metres.
 LASTING, FROM_CAMERA = np.repeat([8e-4, 3e-4], 3), np.repeat([3e-4, 1e-4], 3)
 
@@ -89,9 +91,8 @@ def _seen(scene: Scene, positions, pixels):
 
 
 def placed_by_landmarks(scene: Scene, model: ReducedModel, seed: int) -> Registration:
-    """As `register_by_landmarks` does it, in the scene's first frame."""
-    found = register(model, scene.stage.camera, *landmarks(scene, model, seed=seed))
-    return Registration(model, None, found.state, {}, found.flags, covariance=found.covariance)
+    """In the scene's first frame."""
+    return register_landmarks(model, scene.stage.camera, Landmarks(*landmarks(scene, model, seed=seed)))
 
 
 class InMap:
@@ -112,7 +113,7 @@ class InMap:
         covariance = np.zeros((len(model.parameters) + 6,) * 2)
         covariance[-6:, -6:] = np.diag(LASTING**2)
         state = State(model.default, _off_by(truth, self._off))
-        return Registration(model, None, state, {}, (), covariance=covariance)
+        return Registration(model, state, covariance)
 
     def known(self, place: RigidTransform) -> PosePrior:
         """Where the map has the object in a frame whose camera sees it at ``place``."""
@@ -137,7 +138,7 @@ def run_case(
     tracker = Tracker(registration.model, scene.stage.camera, registration, reference=reference, **options)
     run, errors, back = RunResults(registration.model, 0), [np.nan], None
     wrong_model = registration.model is not scene.model
-    doubtful = wrong_model and any(word in flag for flag in registration.flags for word in DOUBTFUL)
+    doubtful = wrong_model and any(isinstance(warning, DOUBTFUL) for warning in registration.warnings)
     beyond = wrong = 0
     for number, view in enumerate(shown):
         states = [*view.others, *([] if view.state is None else [view.state])]
@@ -157,7 +158,7 @@ def run_case(
             back = number - back_at
     reasons = Counter(_gist(r.reason) for r in run.results if r.status != "tracked")
     return Outcome(
-        (*registration.flags, *flags(run), *reasons),
+        (*(warning.text for warning in registration.warnings), *flags(run), *reasons),
         len(run),
         int(run.tracked.sum()),
         int((~run.tracked).sum()),

@@ -1,6 +1,5 @@
 """What a user gets wrong at the command line: one message that says what to mend, and status 2."""
 
-import json
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -18,8 +17,7 @@ from morph_dslam.io.landmarks import load_landmarks
 from morph_dslam.io.trajectory import load_trajectory
 from morph_dslam.model import save_model
 from morph_dslam.registration.board import load_board
-from morph_dslam.registration.registration import load_registration
-from morph_dslam.tracking.run_folder import check_run_folder, write_registration
+from morph_dslam.tracking.run_folder import check_run_folder
 from morph_dslam.tracking.setup import Reregistration
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.block_study import write_study
@@ -182,55 +180,6 @@ def test_a_damaged_summary_is_named(tmp_path):
             write_run_report(run, {})
 
 
-REGISTRATION = {
-    "world_from_object": np.eye(4).tolist(),
-    "map_units_per_metre": 1.0,
-    "mean_node_m": [0.0, 0.0, 0.0],
-    "score": 1.0,
-    "runner_up_score": 0.0,
-    "ambiguous": False,
-    "rms_px": 0.1,
-    "covariance": np.eye(7).tolist(),
-    "axis_of_revolution": None,
-    "keyframes": [{"frame": 3, "camera_from_object": np.eye(4).tolist(), "covariance": None}],
-}
-
-
-def test_a_registration_with_parts_of_another_shape(tmp_path):
-    path, model = tmp_path / "registration.json", bent_sheet_model(7, 5)
-    path.write_text(json.dumps(REGISTRATION))
-    assert load_registration(path, model).frame == 3
-    keyframe = REGISTRATION["keyframes"][0]
-    for wrong in (
-        {"world_from_object": [1, 2]},
-        {"world_from_object": np.diag([1.0, 1.0, 1.1, 1.0]).tolist()},
-        {"world_from_object": np.diag([1e300, 1.0, 1.0, 1.0]).tolist()},
-        {"map_units_per_metre": 0.0},
-        {"mean_node_m": [1, 2]},
-        {"mean_node_m": -3},
-        {"covariance": np.eye(6).tolist()},
-        {"covariance": (np.eye(7) * np.nan).tolist()},
-        {"axis_of_revolution": "z"},
-        {"axis_of_revolution": {"direction": [0, 1]}},
-        {"keyframes": []},
-        {"keyframes": [keyframe | {"camera_from_object": [[1.0]]}]},
-        {"keyframes": [keyframe | {"covariance": [[1.0]]}]},
-    ):
-        path.write_text(json.dumps(REGISTRATION | wrong))
-        with pytest.raises(RegistrationError, match="is not a registration"):
-            load_registration(path, model)
-
-
-def test_a_registration_of_another_object(tmp_path):
-    path, model = tmp_path / "registration.json", bent_sheet_model(7, 5)
-    size = np.linalg.norm(np.ptp(model.nodes, axis=0))
-    path.write_text(json.dumps(REGISTRATION | {"mean_node_m": [0.08 * size, 0.0, 0.0]}))
-    assert load_registration(path, model).frame == 3
-    path.write_text(json.dumps(REGISTRATION | {"mean_node_m": [0.0, 0.2 * size, 0.0]}))
-    with pytest.raises(RegistrationError, match=rf"places another object .* are {200 * size:.1f} mm apart"):
-        load_registration(path, model)
-
-
 def test_a_folder_that_holds_a_run_or_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("")
     check_run_folder(tmp_path / "a" / "run", overwrite=False)
@@ -245,20 +194,10 @@ def test_a_folder_that_holds_a_run_or_cannot_be_made(tmp_path):
             check_run_folder(tmp_path / name, overwrite=True)
 
 
-def test_a_registration_names_its_files_relative_to_itself(tmp_path):
-    (tmp_path / "place").mkdir()
-    files = tmp_path / "scan" / "map.h5", tmp_path / "seal.morph"
-    written = write_registration(tmp_path / "place", {"score": 1.0}, *files)
-    assert written == {"score": 1.0, "map": "../scan/map.h5", "model": "../seal.morph"}
-    assert json.loads((tmp_path / "place" / "registration.json").read_text()) == written
-    with pytest.raises(RegistrationError, match="cannot write the registration"):
-        write_registration(tmp_path / "absent", {}, *files)
-
-
-@pytest.mark.parametrize("aid", ["board", "picture", "guess"])
-def test_a_reference_that_is_to_be_refined_without_landmarks(tmp_path, capsys, aid):
+@pytest.mark.parametrize("start", ["board", "picture", "guess"])
+def test_a_reference_that_is_to_be_refined_without_landmarks(tmp_path, capsys, start):
     """It would be tracked as it is, and the option have no effect."""
-    arguments = ("track", "film", "--model", "m.morph", "--camera", "c.yaml", f"--{aid}", "aid.toml")
+    arguments = ("track", "film", "--model", "m.morph", "--camera", "c.yaml", f"--{start}", "start.toml")
     assert "start from landmarks, or leave out --refine" in message_of(
         capsys, *arguments, "--refine", "-o", tmp_path / "run"
     )

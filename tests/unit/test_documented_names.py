@@ -17,7 +17,8 @@ from morph_dslam.cli import app as cli
 from morph_dslam.io.camera_files import _CameraFile
 from morph_dslam.mechanics.materials.library import constant_quantities, laws
 from morph_dslam.registration.board import BoardFile
-from morph_dslam.registration.guess import GuessFile, PictureFile
+from morph_dslam.registration.guess import GuessFile
+from morph_dslam.registration.picture import PictureFile
 from morph_dslam.render.scene_file import Scene
 from morph_dslam.slam.run import write_run as write_slam_run
 from morph_dslam.slam.scene import finish_scene

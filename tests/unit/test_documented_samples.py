@@ -17,7 +17,8 @@ from morph_dslam.mechanics.materials.user import UserMaterial
 from morph_dslam.model import Parameter, save_model
 from morph_dslam.reduction.report_pictures import read_reference_curve
 from morph_dslam.registration.board import load_board
-from morph_dslam.registration.guess import load_guess, load_picture
+from morph_dslam.registration.guess import load_guess
+from morph_dslam.registration.picture import load_picture
 from morph_dslam.render.scene_file import load_scene_file
 from morph_dslam.studies.affine import read_affine
 from morph_dslam.studies.external import ExternalStudy, read_table

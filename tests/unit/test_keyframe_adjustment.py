@@ -1,4 +1,4 @@
-"""Keyframes adjusted about an object: from a path that is off to known poses, with honest deviations."""
+"""Keyframes compared on an object and adjusted about it: known displacements, poses and deviations."""
 
 from dataclasses import replace
 
@@ -7,11 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_log
-from morph_dslam.registration.icp import Axis
+from morph_dslam.registration.increments import moved_pose, moved_similarity, pose_jacobian, similarity_jacobian
 from morph_dslam.registration.keyframe_adjustment import AdjustedKeyframes, KeyframeAdjustment, similarity_of_path
+from morph_dslam.registration.registration import Axis
 from morph_dslam.registration.scene import camera_from_object
-from morph_dslam.registration.texture import moved_pose, pose_jacobian
-from morph_dslam.registration.texture_alignment import moved_similarity, similarity_jacobian
+from morph_dslam.registration.texture import align_patches, carry
+from morph_dslam.render.rasteriser import rasterise
 from tests.support.rendered_object import CAMERA, cameras, scanned, wedge
 
 WORLD = SimilarityTransform(3.7, Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix(), np.array([0.5, -1.2, 2.0]))
@@ -140,3 +141,65 @@ def test_causes_of_a_body_of_revolution_hold_nothing_of_its_turn():
     assert np.abs(error_factors[:, 2]).max() < 1e-6
     for k in range(4):
         np.testing.assert_allclose(error_factors[k] @ error_factors[k].T, adjusted.covariance_of(k), atol=1e-6)
+
+
+def pattern(x, y):
+    """A smooth texture between 0 and 255."""
+    return 128.0 + 40.0 * np.sin(0.31 * x + 0.17 * y) + 35.0 * np.cos(0.23 * y - 0.11 * x) + 20.0 * np.sin(0.4 * y)
+
+
+ROWS, COLUMNS = np.mgrid[0:120, 0:160].astype(float)
+CENTRES = np.array([[40.2, 50.7], [80.0, 60.4], [100.6, 30.1], [120.3, 90.9]])
+
+
+def test_a_known_displacement_is_measured_whatever_the_contrast():
+    carried = pattern(COLUMNS, ROWS).astype(np.float32)
+    image = np.rint(20.0 + 0.7 * pattern(COLUMNS - 0.37, ROWS + 0.61)).astype(np.uint8)
+    moves, alike = align_patches(carried, np.ones(carried.shape, dtype=bool), image, CENTRES, 8)
+    np.testing.assert_allclose(moves, np.tile([0.37, -0.61], (4, 1)), atol=0.03)
+    assert (alike > 0.99).all()
+
+
+def test_pixels_that_are_not_shown_do_not_count():
+    rng = np.random.default_rng(0)
+    carried = pattern(COLUMNS, ROWS).astype(np.float32)
+    image = np.rint(pattern(COLUMNS - 0.4, ROWS)).astype(np.uint8)
+    shown = COLUMNS + 0.3 * ROWS < 100.0
+    carried[~shown], image[~shown] = 0.0, rng.integers(0, 255, (~shown).sum())
+    # The edge runs through the patch; the pixel beside it takes part in the interpolation of the image.
+    moves, alike = align_patches(carried, shown, image, np.array([[80.0, 60.0]]), 8)
+    np.testing.assert_allclose(moves[0], [0.4, 0.0], atol=0.1)
+    assert alike[0] > 0.95
+    _, nothing = align_patches(carried, shown, image, np.array([[140.0, 60.0]]), 8)
+    assert nothing[0] == -1.0
+
+
+@pytest.fixture(scope="module")
+def two_views():
+    nodes, triangles, _ = wedge()
+    _, views = scanned(WORLD, with_images=True)
+    drawn = []
+    for pose in (cameras()[1], cameras()[4]):
+        local = pose.apply(nodes)
+        pixels = CAMERA.project(local)
+        drawn.append((pixels, local[:, 2], rasterise(pixels, local[:, 2], triangles, CAMERA.height, CAMERA.width)))
+    return triangles, drawn, views[1].normalized, views[4].normalized
+
+
+def test_a_carried_texture_is_what_the_other_view_shows(two_views):
+    triangles, ((pixels, depths, first), (_, _, second)), normalized, other = two_views
+    carried, shown = np.zeros(normalized.shape, np.float32), np.zeros(normalized.shape, dtype=bool)
+    carry(second.triangle_ids, second.weights, triangles, pixels, depths, first.depth, normalized, carried, shown)
+    assert shown.sum() > 5000
+    assert np.corrcoef(carried[shown], other[shown].astype(float))[0, 1] > 0.75
+    # What the first view cannot see, at least a face of the wedge, is not carried.
+    assert (second.covered & ~shown).sum() > 500
+
+
+def test_a_texture_carried_into_its_own_view_stays(two_views):
+    triangles, ((pixels, depths, first), _), normalized, _ = two_views
+    carried, shown = np.zeros(normalized.shape, np.float32), np.zeros(normalized.shape, dtype=bool)
+    carry(first.triangle_ids, first.weights, triangles, pixels, depths, first.depth, normalized, carried, shown)
+    assert shown.sum() > 5000
+    # Weights are those in space: within a triangle of 8 mm the image's would be a little others.
+    assert np.abs(carried[shown] - normalized[shown].astype(float)).mean() < 1.0

@@ -1,10 +1,121 @@
-"""Landmark files."""
+"""Registration by landmarks: exact recovery, every way in which it can be wrong, and the files of landmarks."""
 
 import numpy as np
 import pytest
 
-from morph_dslam.errors import RegistrationError
+from morph_dslam.camera import Camera
+from morph_dslam.errors import RegistrationError, RegistrationFailure
+from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.landmarks import Landmarks, load_landmarks, save_landmarks
+from morph_dslam.model import SurfacePoints
+from morph_dslam.registration.landmarks import register_landmarks, shape_starts, solve_pnp
+from morph_dslam.registration.messages import Ambiguity, Ambiguous, AtBound, Underdetermined
+from morph_dslam.tracking.estimator import BoundPoints, State
+from tests.support.bent_sheet import bent_sheet_model
+
+CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
+POSE = RigidTransform(
+    rotation_exp(np.array([0.25, -0.3, 0.1])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.02, -0.01, 0.6])
+)
+BENT = State(np.array([0.040, 0.25, -0.12]), POSE)
+MODEL = bent_sheet_model(22, 16)
+
+
+def landmarks(state=BENT, count=14, noise=0.0):
+    """Object points at mesh nodes and their pixels in ``state``."""
+    nodes = np.random.default_rng(1).choice(len(MODEL.nodes), count, replace=False)
+    pixels = CAMERA.project(state.camera_from_object.apply(MODEL.positions(state.parameters))[nodes])
+    return Landmarks(MODEL.nodes[nodes], pixels + noise * np.random.default_rng(0).standard_normal(pixels.shape))
+
+
+def test_bent_object_is_found_exactly_without_a_start():
+    found = register_landmarks(MODEL, CAMERA, landmarks())
+    np.testing.assert_allclose(found.state.parameters, BENT.parameters, atol=1e-6)
+    np.testing.assert_allclose(found.state.camera_from_object.matrix, POSE.matrix, atol=1e-6)
+    assert found.facts["residual_rms_px"] < 1e-4
+    assert found.warnings == ()
+
+
+def test_bend_the_other_way_is_distinguished():
+    other = State(BENT.parameters * [-1, 1, 1], POSE)
+    found = register_landmarks(MODEL, CAMERA, landmarks(other, noise=0.3))
+    assert found.state.parameters[0] == pytest.approx(-0.040, abs=3e-3)
+
+
+def test_distorted_pixels_are_undistorted():
+    lens = Camera(640, 480, 528.0, 528.0, 320.0, 240.0, (-0.2, 0.05, 0.0, 0.0))
+    exact = landmarks()
+    x, y = ((exact.pixels - [320.0, 240.0]) / 528.0).T
+    r2 = x**2 + y**2
+    bent = 1 - 0.2 * r2 + 0.05 * r2**2
+    recorded = np.column_stack([x * bent, y * bent]) * 528.0 + [320.0, 240.0]
+    found = register_landmarks(MODEL, lens, Landmarks(exact.points, recorded))
+    np.testing.assert_allclose(found.state.parameters, BENT.parameters, atol=1e-4)
+
+
+def test_landmarks_that_cannot_be_right_are_named():
+    points, pixels = landmarks().points.copy(), landmarks().pixels.copy()
+    points[4, 2] += 0.020
+    with pytest.raises(RegistrationError, match=r"landmark 5 at .* is 20.0 mm off"):
+        register_landmarks(MODEL, CAMERA, Landmarks(points, pixels))
+    pixels[2] = [700.0, 100.0]
+    with pytest.raises(RegistrationError, match=r"landmark 3 has the pixel \(700, 100\)"):
+        register_landmarks(MODEL, CAMERA, Landmarks(landmarks().points, pixels))
+    with pytest.raises(RegistrationError, match="3 landmarks"):
+        register_landmarks(MODEL, CAMERA, Landmarks(points[:3], pixels[:3]))
+
+
+def test_landmarks_in_the_wrong_order_do_not_fit():
+    with pytest.raises(RegistrationError) as caught:
+        register_landmarks(MODEL, CAMERA, Landmarks(landmarks().points, landmarks().pixels[::-1]))
+    assert caught.value.reason is RegistrationFailure.LANDMARKS_DO_NOT_FIT
+
+
+def test_barely_enough_landmarks_are_flagged():
+    found = register_landmarks(MODEL, CAMERA, Landmarks(landmarks().points[:4], landmarks().pixels[:4]))
+    assert found.warnings == (Underdetermined(numbers=8, unknowns=9, enough=7),)
+    assert found.facts["residual_rms_px"] < 0.1
+
+
+def test_shape_beyond_the_range_is_flagged():
+    found = register_landmarks(MODEL, CAMERA, landmarks(State(np.array([0.068, 0.25, -0.12]), POSE)))
+    assert AtBound("arch") in found.warnings
+
+
+def test_bend_that_landmarks_cannot_decide_is_ambiguous():
+    """A long way off the image of a shallow arch is nearly the same for both signs of a mirrored pose."""
+    far = Camera(640, 480, 9000.0, 9000.0, 320.0, 240.0)
+    positions = RigidTransform(POSE.rotation, np.array([0.0, 0.0, 12.0])).apply(
+        MODEL.positions(np.array([0.02, 0.0, 0.0]))
+    )
+    nodes = np.random.default_rng(1).choice(len(MODEL.nodes), 9, replace=False)
+    found = register_landmarks(MODEL, far, Landmarks(MODEL.nodes[nodes], far.project(positions[nodes])))
+    assert Ambiguous(Ambiguity.SHAPES, found.facts["n_alternatives"] + 1) in found.warnings
+    assert found.ambiguous
+
+
+def test_start_shapes_cover_the_box():
+    shapes = np.array(shape_starts(MODEL))
+    assert len(shapes) == 1 + 3**3
+    np.testing.assert_allclose(shapes[0], MODEL.default)
+    np.testing.assert_allclose(shapes.min(axis=0), MODEL.lower + (MODEL.upper - MODEL.lower) / 6)
+    assert len(shape_starts(MODEL, largest=5)) == 1 + 2 * 3
+
+
+def test_pnp_returns_the_pose_of_a_flat_and_of_a_bent_shape():
+    for parameters in (np.zeros(3), BENT.parameters):
+        points = MODEL.positions(parameters)[np.random.default_rng(1).choice(len(MODEL.nodes), 8, replace=False)]
+        poses = solve_pnp(points, CAMERA.project(POSE.apply(points)), CAMERA)
+        assert min(np.abs(pose.matrix - POSE.matrix).max() for pose in poses) < 1e-4
+
+
+def test_landmarks_between_nodes_are_bound_to_their_triangle():
+    rng = np.random.default_rng(2)
+    surface = SurfacePoints(rng.integers(0, len(MODEL.triangles), 12), rng.dirichlet(np.ones(3), 12))
+    bound = BoundPoints.from_surface(MODEL, surface)
+    found = register_landmarks(MODEL, CAMERA, Landmarks(bound.rest, CAMERA.project(bound.in_camera(BENT))))
+    np.testing.assert_allclose(found.state.parameters, BENT.parameters, atol=1e-6)
+
 
 HEADER = "x_mm,y_mm,z_mm,u_px,v_px\n"
 
@@ -25,22 +136,19 @@ def test_spreadsheet_habits_are_accepted(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("content", "named"),
     [
-        ("a,b\n1,2\n", "first line of a landmark file is x_mm"),
-        ("", "first line"),
-        (HEADER + "1,2,3,4\n", "landmark 1 is '1,2,3,4'; give 5 numbers"),
-        (HEADER + "1,2,3,4,5\n1,2,x,4,5\n", "landmark 2 is"),
-        (HEADER + "1,2,nan,4,5\n", "landmark 1 is"),
+        ("a,b\n1,2\n", "x_mm"),
+        ("", "x_mm"),
+        (HEADER + "1,2,3,4\n", "landmark 1 is '1,2,3,4'"),
+        (HEADER + "1,2,3,4,5\n1,2,x,4,5\n", "landmark 2"),
+        (HEADER + "1,2,nan,4,5\n", "landmark 1"),
+        (None, r"landmarks\.csv"),
     ],
 )
-def test_wrong_files_are_refused(tmp_path, content, message):
+def test_wrong_files_are_refused(tmp_path, content, named):
     path = tmp_path / "landmarks.csv"
-    path.write_text(content)
-    with pytest.raises(RegistrationError, match=message):
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(RegistrationError, match=named):
         load_landmarks(path)
-
-
-def test_missing_file_is_named(tmp_path):
-    with pytest.raises(RegistrationError, match=r"nothing\.csv"):
-        load_landmarks(tmp_path / "nothing.csv")

@@ -1,4 +1,4 @@
-"""Registration of a mesh to a map: known places, in every unit; none, two, and turns that cannot be told."""
+"""Registration of a mesh in a map: known places, in every unit; none, two, turns, and where the search starts."""
 
 from dataclasses import replace
 
@@ -6,14 +6,22 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.errors import RegistrationError
+from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import SimilarityTransform
+from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.meshing.generators import tube
-from morph_dslam.registration.icp import Surface, fit_surface, normal_equations, normal_equations_numpy
-from morph_dslam.registration.mesh import register_mesh
+from morph_dslam.registration.icp import Surface, fit_surface
+from morph_dslam.registration.mesh import register_in_unit, register_mesh
+from morph_dslam.registration.messages import Ambiguity, Ambiguous, OutlineElsewhere, TooLittleTexture
+from morph_dslam.registration.register import register
+from morph_dslam.registration.registration import Axis
 from morph_dslam.registration.scene import MapPoints
-from morph_dslam.registration.texture_alignment import TextureAlignment
-from tests.support.rendered_object import CAMERA, scanned, wedge
+from morph_dslam.registration.search_space import TURNS, attitudes, find_planes
+from morph_dslam.registration.texture import TextureComparison
+from morph_dslam.slam.rigid_map import GOOD, Keyframe, RigidMap
+from morph_dslam.slam.scene import Scene
+from tests.support.rendered_object import CAMERA, cameras, scanned, wedge
+from tests.support.staged_scenes import bending_wedge
 
 WORLD = SimilarityTransform(3.7, Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix(), np.array([0.5, -1.2, 2.0]))
 #: The same in a map whose unit is the metre.
@@ -36,6 +44,7 @@ def test_a_wedge_on_a_table_is_found_in_a_map_of_unknown_scale():
     assert found.rms_px is None  # the views have no images here
 
 
+@pytest.mark.slow
 def test_a_place_that_no_image_confirms_is_doubted():
     """The same map, with images that show something beside the object, and nothing on it."""
     nodes, triangles, _ = wedge()
@@ -43,9 +52,8 @@ def test_a_place_that_no_image_confirms_is_doubted():
     rim = np.full_like(views[0].normalized, 128)
     rim[:4] = np.arange(rim.shape[1]) % 251
     found = register_mesh(nodes, triangles, points, [replace(view, normalized=rim) for view in views], CAMERA)
-    assert found.rms_px is None
     assert found.runner_up < 0.8 * found.score
-    assert found.ambiguous
+    assert found.warnings == (Ambiguous(Ambiguity.UNCONFIRMED), TooLittleTexture())
 
 
 def test_images_refine_what_the_points_leave_open():
@@ -53,33 +61,65 @@ def test_images_refine_what_the_points_leave_open():
     _, views = scanned(WORLD, with_images=True)
     # 2 % of scale, a degree and a millimetre off
     off = SimilarityTransform(1.02, Rotation.from_rotvec([0.0, 0.018, 0.0]).as_matrix(), np.array([1e-3, 0.0, -5e-4]))
-    result = TextureAlignment(nodes, triangles, CAMERA, views).refine(WORLD @ off)
-    assert result is not None
-    assert result.world_from_object.scale == pytest.approx(WORLD.scale, rel=1e-3)
-    assert apart(result.world_from_object, WORLD, nodes) < 2e-4
-    assert result.rms_px < 0.2
+    found, rms = TextureComparison(nodes, triangles, CAMERA).refine(WORLD @ off, views)
+    assert found.scale == pytest.approx(WORLD.scale, rel=1e-3)
+    assert apart(found, WORLD, nodes) < 2e-4
+    assert rms < 0.2
 
 
-def test_a_metric_map_keeps_its_scale():
-    nodes, triangles, _ = wedge()
+def test_a_model_in_a_metric_scene_keeps_its_scale():
     points, views = scanned(METRIC, with_images=True)
-    found = register_mesh(nodes, triangles, points, views, CAMERA, metric=True)
-    assert found.world_from_object.scale == 1.0
-    assert apart(found.world_from_object, METRIC, nodes) < 5e-4
+    rigid_map = RigidMap(baseline_px=40.0)
+    rigid_map.add_points(points.positions, np.zeros((len(points), 2)), 0, GOOD)
+    for view in views:
+        pose = view.camera_from_world.matrix
+        rigid_map.add_keyframe(Keyframe(view.frame, 0.0, view.normalized, pose, view.point_ids, view.pixels))
+    model = bending_wedge()
+    found = register(Scene(CAMERA, rigid_map, Trajectory(np.zeros(0), np.zeros((0, 4, 4)))), model)
+    assert found.map_registration.world_from_object.scale == 1.0
+    assert apart(found.map_registration.world_from_object, METRIC, model.nodes) < 5e-4
+    assert found.warnings == ()
+    assert [view.frame for view in found.keyframes] == [view.frame for view in views]
+    assert len(found.views) == len(views)
+    off = found.state.camera_from_object.apply(model.nodes) - cameras()[-1].apply(model.nodes)
+    assert np.linalg.norm(off, axis=1).max() < 5e-4
 
 
+@pytest.mark.slow
+def test_the_unit_of_a_metric_map_gives_that_of_the_mesh():
+    nodes, triangles, _ = wedge()
+    with pytest.raises(RegistrationError, match=r"0\.039\d*") as caught:
+        register_in_unit(25.4 * nodes, triangles, *scanned(METRIC, with_images=True), CAMERA, metric=True)
+    assert caught.value.reason is RegistrationFailure.WRONG_SIZE
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stretch", [1.0, 1.1])
+def test_a_mesh_that_is_drawn_out_is_accused_by_its_outline(stretch):
+    """Its faces lie on those of the object in another size, where the images of them agree."""
+    nodes, triangles, _ = wedge()
+    points, views = scanned(WORLD, with_images=True)
+    found = register_mesh(nodes * [stretch, 1.0, 1.0], triangles, points, views, CAMERA)
+    right = abs(found.world_from_object.scale / 3.7 - 1.0) < 0.01
+    assert right == (stretch == 1.0)
+    assert any(isinstance(warning, OutlineElsewhere) for warning in found.warnings) == (not right)
+
+
+@pytest.mark.slow
 def test_two_of_a_kind_are_ambiguous():
     nodes, triangles, _ = wedge()
     points, views = scanned(METRIC, objects=(np.array([-0.08, 0.0, 0.0]), np.array([0.08, 0.03, 0.0])))
     # Of a metric map one size is searched, not three: that takes a third of the time.
-    assert register_mesh(nodes, triangles, points, views, CAMERA, metric=True).ambiguous
+    found = register_mesh(nodes, triangles, points, views, CAMERA, metric=True)
+    assert found.warnings == (Ambiguous(Ambiguity.SECOND_PLACE, found.runner_up / found.score), TooLittleTexture())
 
 
 def test_an_absent_object_is_not_found():
     nodes, triangles, _ = wedge()
     points, views = scanned(WORLD, objects=())
-    with pytest.raises(RegistrationError, match="not found in the map"):
+    with pytest.raises(RegistrationError) as caught:
         register_mesh(nodes, triangles, points, views, CAMERA)
+    assert caught.value.reason is RegistrationFailure.NOT_FOUND
 
 
 def test_a_tube_may_be_turned_about_its_axis_and_a_wedge_may_not():
@@ -93,17 +133,6 @@ def test_a_tube_may_be_turned_about_its_axis_and_a_wedge_may_not():
     assert Surface.of_mesh(nodes, triangles).axis_of_revolution is None
 
 
-@pytest.mark.parametrize("to_planes", [True, False])
-def test_compiled_and_plain_normal_equations_agree(to_planes):
-    rng = np.random.default_rng(2)
-    gaps, arms, normals = rng.normal(size=(3, 200, 3))
-    found = normal_equations(gaps, arms, normals, 1.5, to_planes)
-    plain = normal_equations_numpy(gaps, arms, normals, 1.5, to_planes)
-    assert 20 < np.count_nonzero(plain[2]) < 180
-    for a, b in zip(found, plain, strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
-
-
 def test_exact_points_lead_back_from_a_disturbed_place():
     nodes, triangles, _ = wedge()
     surface = Surface.of_mesh(nodes, triangles)
@@ -112,6 +141,52 @@ def test_exact_points_lead_back_from_a_disturbed_place():
     points = MapPoints(WORLD.apply(some), WORLD.apply(outside))
     start = WORLD @ SimilarityTransform(0.95, Rotation.from_rotvec([0.1, 0.05, -0.08]).as_matrix(), np.full(3, 2e-3))
     widths = WORLD.scale * surface.size * np.array([0.2] * 5 + [0.1] * 10 + [0.03] * 15)
-    fit = fit_surface(points, surface, start, widths)
-    assert apart(fit.world_from_object, WORLD, nodes) < 1e-6
-    np.testing.assert_allclose(fit.weights, 1.0, atol=1e-6)
+    found, weights = fit_surface(points, surface, start, widths)
+    assert apart(found, WORLD, nodes) < 1e-6
+    np.testing.assert_allclose(weights, 1.0, atol=1e-6)
+
+
+NORMAL = np.array([2.0, -3.0, 6.0]) / 7.0
+
+
+def test_body_stands_on_each_of_its_six_sides_in_all_turns():
+    rotations = attitudes(None, NORMAL)
+    for side in (*np.eye(3), *-np.eye(3)):
+        upright = [rotation for rotation in rotations if np.allclose(rotation @ side, NORMAL, atol=1e-9)]
+        assert len(upright) >= TURNS
+        relative = [np.trace(upright[0].T @ other) for other in upright[:TURNS]]
+        turns = 1.0 + 2.0 * np.cos(2.0 * np.pi * np.arange(TURNS) / TURNS)
+        np.testing.assert_allclose(np.sort(relative), np.sort(turns), atol=1e-9)
+    for rotation in rotations:
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(rotation) == pytest.approx(1.0)
+
+
+def test_axis_of_revolution_stands_upright_either_way_and_points_everywhere_once():
+    axis = Axis(np.zeros(3), np.array([0.0, 0.6, 0.8]))
+    directions = np.array([rotation @ axis.direction for rotation in attitudes(axis, NORMAL)])
+    for sign in (1.0, -1.0):
+        assert np.linalg.norm(directions - sign * NORMAL, axis=1).min() < 1e-9
+    between = np.linalg.norm(directions[:, None] - directions[None], axis=2)
+    assert between[~np.eye(len(between), dtype=bool)].min() > 0.09
+    everywhere = np.random.default_rng(0).normal(size=(500, 3))
+    everywhere /= np.linalg.norm(everywhere, axis=1)[:, None]
+    nearest = np.linalg.norm(everywhere[:, None] - directions[None], axis=2).min(axis=1)
+    assert np.degrees(2.0 * np.arcsin(nearest.max() / 2.0)) < 40.0
+
+
+def test_largest_plane_is_found_among_clutter_and_none_where_there_is_none():
+    rng = np.random.default_rng(1)
+    basis = np.linalg.svd(NORMAL[None])[2][1:]
+    table = rng.uniform(-1.0, 1.0, (400, 2)) @ basis + 0.002 * rng.normal(size=(400, 1)) * NORMAL
+    clutter = rng.uniform(-1.0, 1.0, (150, 3))
+    points = np.concatenate([table, clutter])
+    planes = find_planes(points)
+    found = planes.largest_normal(points)
+    assert found is not None
+    assert abs(found @ NORMAL) > np.cos(np.radians(1.0))
+    # What is taken out is the table, and of the clutter only what lies in it.
+    assert np.mean(np.isin(np.arange(400), planes.taken_out[0])) > 0.95
+    assert np.all(np.abs(points[planes.taken_out[0]] @ NORMAL) < 0.05)
+    cloud = rng.normal(size=(400, 3))
+    assert find_planes(cloud).largest_normal(cloud) is None

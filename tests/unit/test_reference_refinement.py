@@ -4,8 +4,9 @@ import numpy as np
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.model import SurfacePoints
-from morph_dslam.registration.landmarks import register
+from morph_dslam.registration.landmarks import register_landmarks
 from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
 from morph_dslam.tracking.refinement import Keyframe, choose_keyframes, refine_reference
@@ -31,7 +32,7 @@ def test_other_frames_correct_a_reference_that_bad_landmarks_spoiled():
     object_points = model.nodes[rng.choice(len(model.nodes), 10, replace=False)]
     landmarks = BoundPoints.from_surface(model, nearest_surface_points(model.nodes, model.triangles, object_points)[0])
     clicked = CAMERA.project(landmarks.in_camera(truth)) + 1.5 * rng.standard_normal((10, 2))
-    registered = register(model, CAMERA, object_points, clicked).state
+    registered = register_landmarks(model, CAMERA, Landmarks(object_points, clicked)).state
     refined = refine_reference(
         Estimator(model, CAMERA),
         landmarks,

@@ -1,18 +1,15 @@
 """Bodies of revolution loaded from an unknown side, and products of functions: closed forms."""
 
-import json
-
 import numpy as np
 import pytest
 
-from morph_dslam.errors import ModelFileError, RegistrationError
+from morph_dslam.errors import ModelFileError
 from morph_dslam.evaluation.model_summary import summarise_model
 from morph_dslam.meshing.generators import block
 from morph_dslam.model import load_model, save_model
 from morph_dslam.model.basis_functions import chebyshev_basis, fourier_basis
 from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.model.tensor_functions import CPFunctions, ProductFunctions
-from morph_dslam.registration.registration import load_registration
 from tests.support.bent_tube import AXIS, bent_tube, polynomial
 from tests.support.numpy_twins.fields import evaluate, partial
 
@@ -97,35 +94,3 @@ def test_products_are_those_of_their_factors():
     np.testing.assert_allclose(evaluate(product.mixed(matrix), [x, a])[1], (rows @ matrix)[1:], atol=1e-12)
     with pytest.raises(ValueError, match="mixed by a matrix"):
         ProductFunctions(first, CPFunctions((chebyshev_basis(0.0, 1.0, 2),), (unit,), unit), np.eye(4))
-
-
-def test_a_registration_places_the_object_in_its_last_keyframe(tmp_path):
-    pose = np.eye(4)
-    pose[:3, 3] = [0.1, 0.2, 0.5]
-    content = {
-        "score": 50.0,
-        "runner_up_score": 45.0,
-        "rms_px": 0.1,
-        "map_units_per_metre": 2.0,
-        "world_from_object": np.diag([2.0, 2.0, 2.0, 1.0]).tolist(),
-        "mean_node_m": [0.0, 0.0, 0.05],
-        "covariance": None,
-        "ambiguous": True,
-        "axis_of_revolution": {"point_m": [0.0, 0.0, 0.05], "direction": [0.0, 0.0, 1.0]},
-        "keyframes": [
-            {"frame": 7, "camera_from_object": pose.tolist()},
-            {"frame": 3, "camera_from_object": np.eye(4).tolist()},
-        ],
-    }
-    path = tmp_path / "registration.json"
-    path.write_text(json.dumps(content))
-    registration = load_registration(path, bent_tube())
-    assert registration.frame == 7
-    np.testing.assert_allclose(registration.state.camera_from_object.matrix, pose)
-    assert registration.model.parameters[-1].name == "turn"
-    assert any("ambiguous" in flag for flag in registration.flags)
-    path.write_text("{}")
-    with pytest.raises(RegistrationError, match=r"not a registration\.json"):
-        load_registration(path, bent_tube())
-    with pytest.raises(RegistrationError, match="cannot read"):
-        load_registration(tmp_path / "none.json", bent_tube())

@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from morph_dslam.errors import RegistrationError
-
 HELP = "find an undeformed object in the map of a scene, and the size of the map's unit"
 KEPT = "nothing was written"
 
@@ -21,7 +19,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--board",
         type=Path,
         metavar="TOML",
-        help="place the object, and find the map's unit, by a board that stands in the scene",
+        help="register the object, and find the map's unit, by a board that stands in the scene",
     )
     command.add_argument(
         "--beside",
@@ -35,17 +33,13 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Register the object and print how well it fits."""
-    from morph_dslam.registration.board_in_map import register_by_board
-    from morph_dslam.registration.run import registration_line, remarks, run_registration
+    from morph_dslam.extend.registration import registration_line, run_registration
 
-    inputs = (arguments.map, arguments.model, arguments.camera)
-    if arguments.board is not None:
-        if arguments.beside:
-            raise RegistrationError("a board says where the object is: leave out --beside")
-        content, picture = register_by_board(*inputs, arguments.board, arguments.output), ""
-    else:
-        content, picture = run_registration(*inputs, arguments.output, arguments.beside), " and registration.jpg"
-        for remark in remarks(content):
-            print(f"note: {remark}")
+    registration = run_registration(
+        arguments.map, arguments.model, arguments.camera, arguments.output, arguments.beside, arguments.board
+    )
+    for warning in registration.warnings:
+        print(f"note: {warning.text}")
+    picture = "" if arguments.board else " and registration.jpg"
     print(f"wrote {arguments.output / 'registration.json'}{picture}")
-    print(registration_line(content))
+    print(registration_line(registration))

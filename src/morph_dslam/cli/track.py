@@ -104,7 +104,7 @@ def print_summary(folder: Path, summary: dict[str, Any]) -> None:
 
 def object_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
     """What `add_tracking_arguments` asked for, by the names of `ObjectOptions`."""
-    from morph_dslam.registration.start import InitializerFiles
+    from morph_dslam.registration.initialization import InitializerFiles
     from morph_dslam.tracking.options import TrackerOptions
 
     return {

@@ -1,7 +1,15 @@
-"""Landmarks, and registration of a model in a map with its run folder."""
+"""Registration from files to files, landmarks, and other ways to find an object in a frame."""
 
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
-from morph_dslam.registration.run import registration_line, run_registration
-from morph_dslam.registration.start import InitializerFiles
+from morph_dslam.registration.initialization import InitializerFiles, register_by_initializer
+from morph_dslam.registration.register import draw_registration, registration_line, run_registration
 
-__all__ = ["InitializerFiles", "Landmarks", "load_landmarks", "registration_line", "run_registration"]
+__all__ = [
+    "InitializerFiles",
+    "Landmarks",
+    "draw_registration",
+    "load_landmarks",
+    "register_by_initializer",
+    "registration_line",
+    "run_registration",
+]

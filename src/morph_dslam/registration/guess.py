@@ -1,229 +1,36 @@
-"""TOML files that help to place an object: what they have in common, and what is said of a mistake in one."""
+"""Registration by a guess: refined until its outline parts the object from what is around it, or refused.
+
+Brightness inside of the guessed outline and around it says how likely each pixel belongs to the object
+(Prisacariu & Reid 2012), so that edges of a print do not count. The outline is laid where this falls, searched
+along its normals, and at last, from nearby, where the brightness itself changes most. At the right pose it falls
+everywhere; elsewhere only by chance, and how often that is the image itself says.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic import Field, FiniteFloat
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import RegistrationError
+from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.io.landmarks import Landmarks
-from morph_dslam.io.text import read_toml
 from morph_dslam.model import ReducedModel, SurfacePoints
-from morph_dslam.registration.landmarks import shape_starts
-from morph_dslam.registration.registration import Registration, register_by_landmarks
-from morph_dslam.render.rasteriser import rasterise
-from morph_dslam.sources.frames import read_image
-from morph_dslam.tracking.binding import DrawnSurface, draw_view, nearest_surface_points, view_of
+from morph_dslam.registration.initialization import Section, Vector, read_file
+from morph_dslam.registration.messages import OutlineOnly
+from morph_dslam.registration.registration import Registration
+from morph_dslam.tracking.binding import DrawnSurface, draw_view, view_of
 from morph_dslam.tracking.estimator import Estimate, EstimationOptions, Estimator
-from morph_dslam.tracking.relocalization import state_from_matches
 from morph_dslam.tracking.state import BoundPoints, Prior, State
-
-#: A coordinate or an angle. None is meant by what is larger: in millimetres it would be ten kilometres.
-Number = Annotated[float, Field(ge=-1e7, le=1e7)]
-
-Vector = tuple[Number, Number, Number]
-
-
-class Section(BaseModel):
-    """A part of such a file; unknown keys are mistakes."""
-
-    model_config = ConfigDict(extra="forbid")
-
-
-AnySection = TypeVar("AnySection", bound=Section)
-
-
-def read_aid(path: Path, what: str, kind: type[AnySection]) -> AnySection:
-    """Read a file and check it.
-
-    Parameters
-    ----------
-    what : the file is, for the message. kind : its content.
-
-    Raises
-    ------
-    RegistrationError
-        If it is missing, no TOML, or says something impossible.
-    """
-    content = read_toml(path, what, RegistrationError)
-    try:
-        return kind.model_validate(content)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        message = first["msg"].removeprefix("Value error, ")
-        raise RegistrationError(f"{path}: {where}: {message}" if where else f"{path}: {message}") from error
-
-
-# Placing an object by a picture of its print: features of the picture are found in the reference frame.
-
 
 Array = NDArray[np.float64]
 
 Image = NDArray[np.uint8]
-
-N_FEATURES, RATIO = 3000, 0.8
-
-MATCH_PX, LEAST_MATCHES = 6.0, 15
-
-#: Shapes tried for a first pose, landmarks made of the matches, and the standard deviation of one, pixels.
-N_SHAPES, N_LANDMARKS, LANDMARK_PX = 9, 60, 0.3
-
-#: A second place with so many of the matches of the first one is another object like it.
-AMBIGUOUS = 0.5
-
-
-class Rectangle(Section):
-    """Where the picture is on the undeformed object: its upper left corner, and its whole edges."""
-
-    corner_mm: Vector
-    right_mm: Vector
-    down_mm: Vector
-
-
-class PictureFile(Section):
-    """A picture file: an image, and a rectangle of the object, or ``coordinates``: an .npy array (n, 2) with
-    the picture's pixel of each node of the model, NaN where it has none."""
-
-    image: str
-    rectangle: Rectangle | None = None
-    coordinates: str | None = None
-
-    @model_validator(mode="after")
-    def _lies_somewhere(self) -> PictureFile:
-        if (self.rectangle is None) == (self.coordinates is None):
-            raise ValueError("say where the picture is on the object: either rectangle, or coordinates")
-        return self
-
-
-@dataclass(frozen=True)
-class PictureStart:
-    """Places the object by the picture ``image`` (h, w) of its print.
-
-    Attributes
-    ----------
-    rectangle : corner, right and down (3, 3), metres, on the undeformed object; or coordinates : (n, 2).
-    """
-
-    image: Image
-    rectangle: Array | None
-    coordinates: Array | None
-
-    def register(self, model: ReducedModel, camera: Camera, grey: Image) -> Registration:
-        """The object in an undistorted image (h, w).
-
-        Raises
-        ------
-        RegistrationError
-            If the print is not found there.
-        """
-        mine, theirs = _matches(self.image, grey)
-        points, on_object = self._points(model, mine)
-        points, pixels = points[on_object], theirs[on_object]
-        agreeing = _agreeing(model, camera, points, pixels)
-        if not agreeing.any():
-            raise RegistrationError(
-                f"the picture's print is not found in the reference frame: of {len(points)} matches too "
-                "few agree on a place; choose a frame that shows it larger and sharper, and check where the "
-                "picture is on the object"
-            )
-        rest = ~agreeing
-        second = _agreeing(model, camera, points[rest], pixels[rest]) if rest.any() else rest
-        rows = np.flatnonzero(agreeing)
-        chosen = rows[np.unique(np.linspace(0, len(rows) - 1, N_LANDMARKS).round().astype(int))]
-        landmarks = Landmarks(points[chosen], camera.distort_pixels(pixels[chosen]))
-        placed = register_by_landmarks(model, camera, landmarks, LANDMARK_PX)
-        flags = placed.flags
-        if second.sum() >= AMBIGUOUS * agreeing.sum():
-            counts = f"{int(agreeing.sum())} and {int(second.sum())} features agree"
-            flags = (*flags, f"registration ambiguous: the print is in two places, where {counts}")
-        facts = {**placed.facts, "from": "picture", "n_matches": len(points), "n_agreeing": len(rows)}
-        return replace(placed, facts=facts, flags=flags)
-
-    def _points(self, model: ReducedModel, pixels: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Points (k, 3) of the undeformed object at pixels (k, 2) of the picture; and which are on it."""
-        if self.rectangle is not None:
-            height, width = self.image.shape
-            corner, right, down = self.rectangle
-            a, b = ((pixels + 0.5) / [width, height]).T
-            return corner + a[:, None] * right + b[:, None] * down, np.ones(len(pixels), dtype=bool)
-        coordinates = np.asarray(self.coordinates)
-        height, width = self.image.shape
-        drawn = rasterise(coordinates, np.ones(len(coordinates)), model.triangles, height, width)
-        columns, rows = np.clip(np.rint(pixels).astype(int), 0, [width - 1, height - 1]).T
-        triangles, weights = drawn.triangle_ids[rows, columns], drawn.weights[rows, columns]
-        points = np.einsum("kc,kcx->kx", weights, model.nodes[model.triangles[triangles]])
-        return points, triangles >= 0
-
-
-def load_picture(path: Path) -> PictureStart:
-    """Read a picture file and its image.
-
-    Raises
-    ------
-    RegistrationError, SourceError
-        If one of them is missing or malformed.
-    """
-    described = read_aid(path, "picture file", PictureFile)
-    image = read_image(path.parent / described.image, "picture of the print")
-    grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
-    if described.rectangle is not None:
-        r = described.rectangle
-        return PictureStart(grey, 1e-3 * np.array([r.corner_mm, r.right_mm, r.down_mm]), None)
-    try:
-        coordinates = np.load(path.parent / str(described.coordinates), allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise RegistrationError(f"{path}: cannot read the coordinates {described.coordinates}: {error}") from error
-    if coordinates.ndim != 2 or coordinates.shape[1] != 2:
-        raise RegistrationError(f"{path}: {described.coordinates} is no array of two columns")
-    return PictureStart(grey, None, np.asarray(coordinates, dtype=np.float64))
-
-
-def _matches(picture: Image, grey: Image) -> tuple[Array, Array]:
-    """Pixels (k, 2) of features that look alike, in the picture and in the frame (SIFT; Lowe 2004)."""
-    detector = cv2.SIFT_create(nfeatures=N_FEATURES)  # type: ignore[attr-defined]
-    ours, first = detector.detectAndCompute(picture, None)
-    theirs, second = detector.detectAndCompute(grey, None)
-    if first is None or second is None or len(first) < 2 or len(second) < 2:
-        return np.empty((0, 2)), np.empty((0, 2))
-    # From the frame to the picture: a second object like it finds the same features again.
-    pairs = [
-        (best.trainIdx, best.queryIdx)
-        for best, runner_up in cv2.BFMatcher(cv2.NORM_L2).knnMatch(second, first, k=2)
-        if best.distance < RATIO * runner_up.distance
-    ]
-    mine = np.array([ours[a].pt for a, _ in pairs], dtype=np.float64).reshape(-1, 2)
-    return mine, np.array([theirs[b].pt for _, b in pairs], dtype=np.float64).reshape(-1, 2)
-
-
-def _agreeing(model: ReducedModel, camera: Camera, points: Array, pixels: Array) -> NDArray[np.bool_]:
-    """Which matches (k,) agree on one state of the object; none if they are too few."""
-    none = np.zeros(len(points), dtype=bool)
-    if len(points) < LEAST_MATCHES:
-        return none
-    surface, _ = nearest_surface_points(model.nodes, model.triangles, points)
-    bound = BoundPoints.from_surface(model, surface)
-    shapes = shape_starts(model)
-    some = shapes[:: max(1, len(shapes) // N_SHAPES)]
-    state, agreeing = state_from_matches(Estimator(model, camera), bound, pixels, some, MATCH_PX, LEAST_MATCHES)
-    return none if state is None else agreeing
-
-
-# Placing an object by a guess: refined until its outline parts it from what is around it, or refused.
-# Brightness inside of the guessed outline and around it tells how likely each pixel belongs to the object
-# (Prisacariu & Reid 2012), so that edges of a print do not count. The outline is laid where this falls,
-# searched along its normals, and at last, from nearby, where the brightness itself changes most. In the right
-# place it falls everywhere; elsewhere only by chance, and how often that is the image itself tells.
-
 
 #: Points of the outline, and how far to either side of it edges are searched in turn, pixels.
 N_POINTS, REACHES, LAST_REACHES = 160, (24, 16, 12, 8, 6, 4), (3, 2, 2)
@@ -241,7 +48,7 @@ LEAST_SHARE = 0.8
 #: Errors are alike along each side of an outline: its points count as so many independent ones.
 N_INDEPENDENT = 6
 
-#: How sure the guessed parameters are, over their range: an outline tells little of the shape.
+#: How sure the guessed parameters are, over their range: an outline says little of the shape.
 GUESS_SHARE = 0.05
 
 
@@ -260,8 +67,8 @@ class GuessFile(Section):
 
 
 @dataclass(frozen=True)
-class GuessStart:
-    """Places the object near a guess."""
+class GuessInitializer:
+    """Finds the object near a guess."""
 
     guess: GuessFile
 
@@ -293,18 +100,17 @@ class GuessStart:
             raise RegistrationError(
                 f"the image contradicts the guess: {100 * on_edges:.0f} % of the outline lie on edges, by "
                 f"chance it would be {100 * by_chance:.0f} %; give a closer guess (the outline within about "
-                f"{REACHES[0]} pixels), or landmarks"
+                f"{REACHES[0]} pixels), or landmarks",
+                RegistrationFailure.GUESS_CONTRADICTED,
             )
         facts = {"from": "guess", "outline_on_edges": on_edges, "by_chance": by_chance}
-        flags = ("placed by a guess: its outline agrees with the image, which tells little of the shape",)
-        return Registration(
-            model, None, estimate.state, facts, flags, covariance=N_POINTS / N_INDEPENDENT * estimate.covariance
-        )
+        covariance = N_POINTS / N_INDEPENDENT * estimate.covariance
+        return Registration(model, estimate.state, covariance, facts=facts, warnings=(OutlineOnly(),))
 
 
-def load_guess(path: Path) -> GuessStart:
+def load_guess(path: Path) -> GuessInitializer:
     """Read a guess; raises RegistrationError if the file is missing or malformed."""
-    return GuessStart(read_aid(path, "guess", GuessFile))
+    return GuessInitializer(read_file(path, "guess", GuessFile))
 
 
 class _OutlineSearch:
@@ -371,7 +177,10 @@ class _OutlineSearch:
         rim[[0, 1, -2, -1]], rim[:, [0, 1, -2, -1]] = False, False
         rows, columns = np.nonzero(rim)
         if len(rows) < 30:
-            raise RegistrationError("the guess puts the object out of the image, or so far away that it is a dot")
+            raise RegistrationError(
+                "the guess puts the object out of the image, or so far away that it is a dot",
+                RegistrationFailure.GUESS_CONTRADICTED,
+            )
         chosen = np.unique(np.linspace(0, len(rows) - 1, N_POINTS).round().astype(int))
         rows, columns = rows[chosen], columns[chosen]
         smooth = cv2.GaussianBlur(covered.astype(np.float32), (0, 0), 2.0)

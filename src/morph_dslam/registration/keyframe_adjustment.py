@@ -6,7 +6,7 @@ agree on the mesh, and with which the map's points, which stand still beside it,
 adjustment in which the object's points lie on its surface and the others are free.
 
 The covariance is a sandwich (Huber & Ronchetti, Robust Statistics, 6.3): neighbouring measurements share
-their errors, and so do all pairs of views that show one patch of the surface. So the scores are summed by
+their errors, and so do all pairs of views that show one patch of the surface. So the gradients are summed by
 patches, and by points, before their squares are.
 """
 
@@ -20,18 +20,10 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, cross_matrix, rotation_log
-from morph_dslam.registration.icp import Axis
-from morph_dslam.registration.scene import (
-    MapPoints,
-    PoseScores,
-    StaticPoints,
-    View,
-    camera_from_object,
-    huber_weights,
-    views_of,
-)
-from morph_dslam.registration.texture import WINDOW, PairDisplacements, TextureComparison, moved_pose
-from morph_dslam.registration.texture_alignment import moved_similarity, similarity_jacobian
+from morph_dslam.registration.increments import moved_pose, moved_similarity, pose_jacobian, similarity_jacobian
+from morph_dslam.registration.registration import Axis
+from morph_dslam.registration.scene import MapPoints, View, camera_from_object, views_of
+from morph_dslam.registration.texture import WINDOW, PairDisplacements, TextureComparison
 
 Array = NDArray[np.float64]
 
@@ -54,11 +46,20 @@ ACROSS_PATCHES = 9.0 / 4.0
 #: ten rendered scans with known truth (benchmarks/registration_seeds.py, the first ten seeds).
 IN_COMMON = 16.0 / 9.0
 
+#: At most so many points, those that most views saw.
+MOST_STATIC = 2000
+
+#: Iterations for the points' places, and how far a point's block is from singular at the least.
+POINT_ITERATIONS, RIDGE = 3, 1e-6
+
+#: Points nearer than this part of the usual depth do not count.
+LEAST_DEPTH = 0.05
+
 #: Directions that are seen worse than this, over the best one, stay as they are.
 LEAST_SEEN = 1e-9
 
 #: Errors of all poses together are given by so many error factors: the registration's seven, and one more.
-N_CAUSES = 8
+N_FACTORS = 8
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,8 @@ class AdjustedKeyframes:
 
     Attributes
     ----------
-    views : those adjusted. poses : camera_from_object of each, metres.
+    views : those adjusted.
+    poses : camera_from_object of each, metres.
     covariance : (6 K, 6 K) of all poses together, in the increments of `pose_jacobian`. The turn about an
         axis of revolution is not in it.
     rms_px : how far the images agree.
@@ -92,14 +94,14 @@ class AdjustedKeyframes:
         size = len(self.covariance)
         scale = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
         values, vectors = np.linalg.eigh(self.covariance / np.outer(scale, scale))
-        leading = np.arange(size) >= size - N_CAUSES
+        leading = np.arange(size) >= size - N_FACTORS
         roots = vectors[:, leading] * np.sqrt(np.maximum(values[leading], 0.0))
         error_factors = (scale[:, None] * roots).reshape(-1, 6, roots.shape[1])
         return np.stack([_filled_up(part, self.covariance_of(view)) for view, part in enumerate(error_factors)])
 
 
 def _filled_up(error_factors: Array, covariance: Array) -> Array:
-    """Causes (6, c), c >= 6, changed as little as can be so that they make up a covariance (6, 6)."""
+    """Error factors (6, c), c >= 6, changed as little as can be so that they make up a covariance (6, 6)."""
     values, vectors = np.linalg.eigh(covariance)
     roots = np.sqrt(np.maximum(values, 0.0))
     # Nothing is known of the turn about an axis, and nothing of it is in either.
@@ -108,13 +110,131 @@ def _filled_up(error_factors: Array, covariance: Array) -> Array:
     return np.asarray((vectors * roots) @ left @ right, dtype=np.float64)
 
 
+@dataclass(frozen=True)
+class _PoseTerms:
+    """What measurements add to the normal equations of the poses of K views.
+
+    Attributes
+    ----------
+    information : (6 K, 6 K).
+    gradients : (c, 6 K) by independent groups of measurements, which add up to the right-hand side.
+    sigma_px : standard deviation of a pixel coordinate.
+    """
+
+    information: Array
+    gradients: Array
+    sigma_px: float
+
+
+class _StaticPoints:
+    """Points of the map that at least two of the views saw, free in the object's frame.
+
+    What their pixels say about the poses when every point may be where it fits best is the Schur complement of
+    the points (Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, section 6).
+
+    Parameters
+    ----------
+    positions : (n, 3) of all points, object frame, metres.
+    views : with ``point_ids`` among these.
+    camera : of the views, without distortion.
+    """
+
+    def __init__(self, positions: Array, views: Sequence[View], camera: Camera) -> None:
+        self._camera = camera
+        counts = np.bincount(np.concatenate([view.point_ids for view in views]), minlength=len(positions))
+        chosen = np.argsort(-counts, kind="stable")[:MOST_STATIC]
+        chosen = np.sort(chosen[counts[chosen] >= 2])
+        row = np.full(len(positions), -1)
+        row[chosen] = np.arange(len(chosen))
+        rows = [row[view.point_ids] for view in views]
+        self._view = np.concatenate([np.full((r >= 0).sum(), k) for k, r in enumerate(rows)])
+        self._point = np.concatenate([r[r >= 0] for r in rows])
+        self._pixels = np.concatenate([v.pixels[r >= 0] for v, r in zip(views, rows, strict=True)])
+        self._positions = positions[chosen]
+
+    def __len__(self) -> int:
+        return len(self._positions)
+
+    def linearise(self, poses: Sequence[RigidTransform]) -> _PoseTerms:
+        """Moves the points to where they fit these poses best, and says where the poses should go."""
+        for _ in range(POINT_ITERATIONS):
+            residuals, by_point, _ = self._residuals(poses)
+            weights, _ = self._weights(residuals)
+            blocks, right = self._point_system(residuals, by_point, weights)
+            self._positions = self._positions + np.linalg.solve(blocks, right[:, :, None])[:, :, 0]
+        residuals, by_point, by_pose = self._residuals(poses)
+        weights, sigma = self._weights(residuals)
+        weights = weights / sigma**2
+        blocks, right = self._point_system(residuals, by_point, weights)
+        n, k = len(self), len(poses)
+        weighted = by_pose * weights[:, None, None]
+        cross, gradient = np.zeros((n, k, 6, 3)), np.zeros((n, k, 6))
+        np.add.at(cross, (self._point, self._view), np.einsum("oij,oik->ojk", weighted, by_point))
+        np.add.at(gradient, (self._point, self._view), np.einsum("oij,oi->oj", weighted, residuals))
+        own = np.zeros((k, 6, 6))
+        np.add.at(own, self._view, np.einsum("oij,oik->ojk", weighted, by_pose))
+        cross = cross.reshape(n, 6 * k, 3)
+        half = np.linalg.solve(np.linalg.cholesky(blocks), cross.transpose(0, 2, 1)).reshape(3 * n, 6 * k)
+        information = -half.T @ half
+        for view in range(k):
+            part = slice(6 * view, 6 * view + 6)
+            information[part, part] += own[view]
+        away = np.linalg.solve(blocks, right[:, :, None])
+        return _PoseTerms(information, gradient.reshape(n, 6 * k) - (cross @ away)[:, :, 0], sigma)
+
+    def _residuals(self, poses: Sequence[RigidTransform]) -> tuple[Array, Array, Array]:
+        """Residuals (o, 2), seen minus expected, and derivatives of the expected pixels by point and pose."""
+        rotations = np.array([pose.rotation for pose in poses])[self._view]
+        shifts = np.array([pose.translation for pose in poses])[self._view]
+        local = np.einsum("oij,oj->oi", rotations, self._positions[self._point]) + shifts
+        near = local[:, 2] < LEAST_DEPTH * float(np.median(local[:, 2]))
+        local[near] = [0.0, 0.0, float(np.median(local[:, 2]))]
+        residuals = self._pixels - self._camera.project(local)
+        slopes = self._camera.projection_jacobian(local)
+        residuals[near], slopes[near] = 0.0, 0.0
+        by_pose = np.empty((len(local), 2, 6))
+        for view, pose in enumerate(poses):
+            mine = self._view == view
+            by_pose[mine] = slopes[mine] @ pose_jacobian(local[mine], pose)
+        return residuals, slopes @ rotations, by_pose
+
+    def _weights(self, residuals: Array) -> tuple[Array, float]:
+        """Huber weights (o,), and the robust standard deviation of a coordinate."""
+        freedom = max(2 * len(residuals) - 3 * len(self), 1) / max(2 * len(residuals), 1)
+        return huber_weights(residuals, freedom)
+
+    def _point_system(self, residuals: Array, by_point: Array, weights: Array) -> tuple[Array, Array]:
+        """Blocks (n, 3, 3), kept invertible, and right-hand sides (n, 3)."""
+        blocks, right = np.zeros((len(self), 3, 3)), np.zeros((len(self), 3))
+        weighted = by_point * weights[:, None, None]
+        np.add.at(blocks, self._point, np.einsum("oij,oik->ojk", weighted, by_point))
+        np.add.at(right, self._point, np.einsum("oij,oi->oj", weighted, residuals))
+        ridge = RIDGE * np.trace(blocks, axis1=1, axis2=2) + 1e-12
+        return blocks + ridge[:, None, None] * np.eye(3), right
+
+
+def huber_weights(residuals: Array, freedom: float = 1.0) -> tuple[Array, float]:
+    """Weights (p,) of residuals (p, 2), which fall beyond two standard deviations, and the latter.
+
+    The length of a Gaussian pair has the median 1.1774 sigma (Rayleigh). ``freedom`` is the share of the
+    numbers that no unknown takes up.
+    """
+    lengths = np.linalg.norm(residuals, axis=1)
+    sigma = max(float(np.median(lengths)) / 1.1774 / np.sqrt(freedom), 1e-3)
+    return 2.0 * sigma / np.maximum(lengths, 2.0 * sigma), sigma
+
+
 class KeyframeAdjustment:
     """Adjusts the keyframes of a map about an object.
 
     Parameters
     ----------
-    nodes : (n, 3) of the undeformed mesh, metres. triangles : (m, 3). camera : without distortion.
-    points, views : of the map. axis : about which the object may be turned without a difference.
+    nodes : (n, 3) of the undeformed mesh, metres.
+    triangles : (m, 3) node indices.
+    camera : of the views, without distortion.
+    points : of the map.
+    views : keyframes of the map.
+    axis : about which the object may be turned without a difference; None if there is none.
     """
 
     def __init__(
@@ -136,20 +256,20 @@ class KeyframeAdjustment:
         if len(views) < 2:
             return None
         poses = [camera_from_object(view, placed) for view in views]
-        static = StaticPoints(placed.inverse.apply(self._points.positions), views, self._camera)
+        static = _StaticPoints(placed.inverse.apply(self._points.positions), views, self._camera)
         images, units = [view.normalized for view in views], self._units(len(views))
         mixing = _Mixing()
         for _ in range(ITERATIONS):
             measured = self._comparison.measure(images, poses)
             if sum(len(pair.offsets) for pair in measured) < FEWEST * len(views):
                 return None
-            on_mesh, beside = self._mesh_scores(measured, poses), static.linearise(poses)
+            on_mesh, beside = self._mesh_terms(measured, poses), static.linearise(poses)
             step, covariance = self._solved(on_mesh, beside, poses)
             step = units * mixing.mixed(step / units)
             poses = [moved_pose(pose, part) for pose, part in zip(poses, step.reshape(-1, 6), strict=True)]
         return AdjustedKeyframes(views, poses, covariance, on_mesh.sigma_px)
 
-    def _mesh_scores(self, measured: list[PairDisplacements], poses: list[RigidTransform]) -> PoseScores:
+    def _mesh_terms(self, measured: list[PairDisplacements], poses: list[RigidTransform]) -> _PoseTerms:
         """What the displacements on the mesh say, by patches of the surface as large as a window."""
         offsets = np.concatenate([pair.offsets for pair in measured])
         places = np.concatenate([pair.places for pair in measured])
@@ -164,7 +284,7 @@ class KeyframeAdjustment:
         independent = len(np.unique(np.column_stack([views, cell]), axis=0)) / len(offsets)
         weights = weights * independent / sigma**2
         n = len(poses)
-        information, scores = np.zeros((6 * n, 6 * n)), np.zeros((cell.max() + 1, n, 6))
+        information, gradients = np.zeros((6 * n, 6 * n)), np.zeros((cell.max() + 1, n, 6))
         row = 0
         for pair in measured:
             rows = slice(row, row + len(pair.offsets))
@@ -172,11 +292,11 @@ class KeyframeAdjustment:
             slopes = {pair.first: pair.by_first, pair.second: pair.by_second}
             for i, by_i in slopes.items():
                 weighted = by_i * weights[rows, None, None]
-                np.add.at(scores[:, i], cell[rows], np.einsum("pij,pi->pj", weighted, pair.offsets))
+                np.add.at(gradients[:, i], cell[rows], np.einsum("pij,pi->pj", weighted, pair.offsets))
                 for j, by_j in slopes.items():
                     block = np.einsum("pij,pik->jk", weighted, by_j)
                     information[6 * i : 6 * i + 6, 6 * j : 6 * j + 6] += block
-        return PoseScores(information, scores.reshape(-1, 6 * n), sigma)
+        return _PoseTerms(information, gradients.reshape(-1, 6 * n), sigma)
 
     def _pixel_size(self, poses: list[RigidTransform]) -> float:
         """What a pixel covers on the object, metres."""
@@ -184,15 +304,15 @@ class KeyframeAdjustment:
         depth = float(np.median([pose.apply(middle)[2] for pose in poses]))
         return depth / max(self._camera.fx, self._camera.fy)
 
-    def _solved(self, on_mesh: PoseScores, beside: PoseScores, poses: list[RigidTransform]) -> tuple[Array, Array]:
+    def _solved(self, on_mesh: _PoseTerms, beside: _PoseTerms, poses: list[RigidTransform]) -> tuple[Array, Array]:
         """The step (6 K,) of all poses, and their covariance (6 K, 6 K)."""
-        scores = np.concatenate([np.sqrt(ACROSS_PATCHES) * on_mesh.scores, beside.scores])
-        right = on_mesh.scores.sum(axis=0) + beside.scores.sum(axis=0)
+        gradients = np.concatenate([np.sqrt(ACROSS_PATCHES) * on_mesh.gradients, beside.gradients])
+        right = on_mesh.gradients.sum(axis=0) + beside.gradients.sum(axis=0)
         units = self._units(len(poses))
         information = (on_mesh.information + beside.information) * np.outer(units, units)
         inverse = _inverse(information, self._turn(poses) / units)
         step = inverse @ (right * units)
-        half = (scores * units) @ inverse
+        half = (gradients * units) @ inverse
         return step * units, IN_COMMON * half.T @ half * np.outer(units, units)
 
     def _units(self, count: int) -> Array:
@@ -242,9 +362,6 @@ def _inverse(information: Array, fixed: Array) -> Array:
     return keep @ inverse @ keep
 
 
-# The similarity between an object's frame and a map, from the keyframes' poses in both.
-
-
 PATH_ITERATIONS = 5
 
 
@@ -258,7 +375,10 @@ def similarity_of_path(
 
     Parameters
     ----------
-    start : near it. centre : (3,) the mean node, object frame. metric : keep the scale.
+    adjusted : the keyframes about the object.
+    start : near the similarity.
+    centre : (3,) the mean node, object frame, metres.
+    metric : keep the scale.
 
     Returns
     -------
@@ -285,9 +405,9 @@ def similarity_of_path(
         step = np.zeros(7)
         step[free] = solution * units
         left = np.concatenate(misses) - stacked @ solution
-        scores = np.einsum("kij,ki->kj", stacked.reshape(count, 6, -1), left.reshape(count, 6))
+        gradients = np.einsum("kij,ki->kj", stacked.reshape(count, 6, -1), left.reshape(count, 6))
         gain = np.concatenate([row.T @ m for row, m in zip(rows, metrics, strict=True)], axis=1)
-        meat = scores.T @ scores + gain @ adjusted.covariance @ gain.T
+        meat = gradients.T @ gradients + gain @ adjusted.covariance @ gain.T
         covariance[free, free] = inverse @ meat @ inverse * np.outer(units, units)
         transform = moved_similarity(transform, step, centre)
     covariance[1:, 1:] += _scatter(adjusted, transform, centre)

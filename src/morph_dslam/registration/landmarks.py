@@ -1,23 +1,58 @@
-"""Whether landmarks would fit an object if its mesh had been read in another unit."""
+"""Registration by landmarks: the object's pose and parameters in one frame, and how well they are known.
+
+The shape is not assumed. PnP is solved for shapes spread over the parameter box, each is refined over pose and
+parameters together, and the minima are compared, so that an ambiguity (a bend towards the camera that looks
+like one away from it) is reported and not chosen by accident.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import permutations, product
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import RegistrationError
+from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel
+from morph_dslam.registration.messages import (
+    Ambiguity,
+    Ambiguous,
+    AtBound,
+    PoorFit,
+    RegistrationWarning,
+    Underdetermined,
+    UnusualSize,
+    WrongUnit,
+)
+from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.binding import nearest_surface_points
+from morph_dslam.tracking.depth import SIGMA_AT_1M
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOptions, Estimator, State
+from morph_dslam.tracking.refinement import refine_by_depth
 
 Array = NDArray[np.float64]
+
+#: Standard deviation of a carefully set landmark, pixels. Those that fit so many times worse are flagged.
+CLICK_PX, POOR_FIT = 0.5, 2.0
+
+#: Standard deviation of landmarks' pixels where they are too few to show it, and the least that is believed.
+UNKNOWN_PX, LEAST_PX = 2.0, 0.1
+
+#: Shares of the object's size: least extent of the landmarks, how far one may lie off the undeformed surface,
+#: and how far apart different minima are (mean over the mesh, in the camera frame).
+SPREAD_SHARE, SURFACE_SHARE, DISTINCT_SHARE = 0.12, 0.01, 0.02
+
+#: Largest residual (root mean square) as a share of the image's diagonal.
+RESIDUAL_SHARE = 0.005
+
+#: Objects of another size, metres, are flagged: a mesh in millimetres that was taken for metres is such.
+SIZES = (0.005, 10.0)
 
 #: Units that meshes come in, metres.
 UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 1e-3, "inches": 0.0254}
@@ -30,111 +65,25 @@ LEAST_SPREAD = 0.2
 PART_OF_IT, MOST_OF_IT = 0.5, 0.6
 
 
-def unit_hint(model: ReducedModel, points: Array, surface_share: float, least: float = LEAST_SPREAD) -> str:
-    """What to say where the landmarks (k, 3) would lie on the object if its mesh were in another unit.
+def register_landmarks(
+    model: ReducedModel,
+    camera: Camera,
+    landmarks: Landmarks | str | Path,
+    click_px: float = CLICK_PX,
+    depth: NDArray[np.float32] | None = None,
+    depth_sigma: float = SIGMA_AT_1M,
+) -> Registration:
+    """The object in the frame in which the landmarks were set.
 
     Parameters
     ----------
-    surface_share : how far they may lie off it, and ``least`` : how far they must be spread, as shares of the
-        object's size.
-    """
-    size, hint = extent(model.nodes), ""
-    best = least * size
-    for (meant, a), (taken, b) in permutations(UNITS.items(), 2):
-        scaled = points * (b / a)
-        _, distances = nearest_surface_points(model.nodes, model.triangles, scaled)
-        if distances.max() <= surface_share * size and extent(scaled) > best:
-            best = extent(scaled)
-            hint = (
-                f"; they fit if its mesh is multiplied by {a / b:.4g}: one in {meant} was taken for one in "
-                f"{taken}, perhaps, so mend its unit in the study"
-            )
-    return hint
-
-
-def flag_of_unit(model: ReducedModel, points: Array, surface_share: float) -> tuple[str, ...]:
-    """A flag where landmarks (k, 3) lie on a part of the object, and all over it in another unit."""
-    size, spread = extent(model.nodes), extent(points)
-    hint = unit_hint(model, points, surface_share, MOST_OF_IT) if spread < PART_OF_IT * size else ""
-    if not hint:
-        return ()
-    apart = f"{1e3 * spread:.4g} mm apart on an object of {1e3 * size:.4g} mm"
-    return (f"registration doubtful: the landmarks are {apart}{hint}",)
-
-
-def extent(points: Array) -> float:
-    """Length of the diagonal of the box around points (n, 3)."""
-    return float(np.linalg.norm(np.ptp(points, axis=0)))
-
-
-# Registration: the object's pose and parameters in the reference frame, from landmarks.
-# The shape is not assumed: PnP is solved for shapes spread over the parameter box, each is refined over pose
-# and parameters together, and the minima found are compared, so that an ambiguity (a bend towards the camera
-# that looks like one away from it) is reported and not chosen by accident.
-
-
-#: Landmarks that fit so many times worse than careful ones do are flagged.
-POOR_FIT = 2.0
-
-#: Objects of another size, metres, are flagged: a mesh in millimetres that was taken for metres is such.
-SIZES = (0.005, 10.0)
-
-
-#: Standard deviation of a carefully set landmark, pixels.
-CLICK_PX = 0.5
-
-#: Shares of the object's size: least extent of the landmarks, how far one may lie off the undeformed surface,
-#: and how far apart different minima are (mean over the mesh, in the camera frame).
-SPREAD_SHARE, SURFACE_SHARE, DISTINCT_SHARE = 0.12, 0.01, 0.02
-
-#: Largest residual (root mean square) as a share of the image's diagonal.
-RESIDUAL_SHARE = 0.005
-
-
-@dataclass(frozen=True)
-class LandmarkFit:
-    """The object in the reference frame.
-
-    Attributes
-    ----------
-    estimate : pose, parameters and their uncertainty.
-    alternatives : other states that fit the landmarks about as well, best first.
-    residual_rms_px : root mean square of the landmarks' residuals.
-    flags : what could be wrong with it, in words.
-    click_px : standard deviation that a landmark has at the least.
-    """
-
-    estimate: Estimate
-    alternatives: tuple[State, ...]
-    residual_rms_px: float
-    flags: tuple[str, ...]
-    click_px: float = 0.0
-
-    @property
-    def state(self) -> State:
-        return self.estimate.state
-
-    @property
-    def covariance(self) -> Array:
-        """That of the state (d + 6, d + 6), with landmarks taken to be no better than ``click_px``.
-
-        A few landmarks that happen to fit well, or that a wrong model fits, do not say that they are exact.
-        """
-        sigma = self.estimate.sigma_px
-        return self.estimate.covariance * max(1.0, (self.click_px / max(sigma, 1e-12)) ** 2)
-
-
-def register(
-    model: ReducedModel, camera: Camera, points: Array, pixels: Array, click_px: float = CLICK_PX
-) -> LandmarkFit:
-    """Place the object in the reference frame.
-
-    Parameters
-    ----------
-    points : (k, 3) landmarks on the undeformed object, object frame, metres.
-    pixels : (k, 2) where they are seen in the image as recorded, with its distortion.
+    model : of the object.
+    camera : that took the frame.
+    landmarks : points of the undeformed object and their pixels in the frame, or the file that has them.
     click_px : standard deviation of a carefully set landmark; minima that fit equally well within it are
         ambiguous.
+    depth : (h, w) of the frame, metres, NaN where unknown; None without a depth camera.
+    depth_sigma : standard deviation of a pixel's depth at 1 m, metres.
 
     Raises
     ------
@@ -142,34 +91,48 @@ def register(
         If there are fewer than 4 landmarks, one lies off the object or outside the image, or no pose and
         parameters explain them.
     """
-    bound = bind_landmarks(model, points)
-    _check_pixels(camera, pixels)
-    undistorted = np.ascontiguousarray(camera.undistort_pixels(pixels))
+    if not isinstance(landmarks, Landmarks):
+        landmarks = load_landmarks(Path(landmarks))
+    bound = bind_landmarks(model, landmarks.points)
+    _check_pixels(camera, landmarks.pixels)
+    pixels = np.ascontiguousarray(camera.undistort_pixels(landmarks.pixels))
     estimator = Estimator(model, camera, EstimationOptions(huber_px=3.0, max_iterations=60))
-    starts = list(_starts(model, camera, bound, undistorted))
-    found = estimator.estimate_from(bound, undistorted, np.ones(len(bound)), starts)
+    found = estimator.estimate_from(bound, pixels, np.ones(len(bound)), list(_starts(model, camera, bound, pixels)))
     found = [estimate for estimate in found if np.isfinite(estimate.residuals).all()]
     if not found:
         raise RegistrationError(
-            "no pose of the object explains the landmarks: check that points and pixels belong together"
+            "no pose of the object explains the landmarks: check that points and pixels belong together",
+            RegistrationFailure.LANDMARKS_DO_NOT_FIT,
         )
-    best, alternatives = _distinct_minima(model, found, click_px)
+    best, n_alternatives = _distinct_minima(model, found, click_px)
     rms = float(np.sqrt(np.mean(np.sum(best.residuals**2, axis=1))))
     _check_residual(best, rms, RESIDUAL_SHARE * float(np.hypot(camera.width, camera.height)))
-    states = tuple(estimate.state for estimate in alternatives)
-    flags = _flags(model, best, alternatives, len(bound), click_px)
-    flags += flag_of_unit(model, points, SURFACE_SHARE)
-    return LandmarkFit(best, states, rms, flags, click_px)
+    facts = {
+        "from": "landmarks",
+        "residual_rms_px": rms,
+        "sigma_px": best.sigma_px,
+        "n_landmarks": len(best.residuals),
+        "n_alternatives": n_alternatives,
+    }
+    warnings = _warnings(model, best, n_alternatives, landmarks.points, click_px)
+    # A few landmarks that happen to fit well, or that a wrong model fits, are not exact for that.
+    covariance = best.covariance * max(1.0, (click_px / max(best.sigma_px, 1e-12)) ** 2)
+    if depth is not None:
+        # How well the landmarks fit shows how carefully they were set, where they are enough to show it.
+        sigma = max(best.sigma_px, LEAST_PX) if np.isfinite(best.sigma_px) else UNKNOWN_PX
+        best = refine_by_depth(Estimator(model, camera), bound, pixels, best.state, sigma, depth, depth_sigma)
+        facts["along_the_sight_line"], covariance = "by depth", best.covariance
+    return Registration(model, best.state, covariance, facts=facts, warnings=warnings)
 
 
 def bind_landmarks(model: ReducedModel, points: Array) -> BoundPoints:
-    """Bind landmarks to the nearest points of the undeformed surface; see `register`."""
+    """Bind landmarks (k, 3) to the nearest points of the undeformed surface; see `register_landmarks`."""
     if len(points) < 4:
         raise RegistrationError(
-            f"{len(points)} landmarks are too few to place the object: give at least 4, better "
+            f"{len(points)} landmarks are too few to register the object: give at least 4, better "
             f"{(len(model.parameters) + 6) // 2 + 3} or more spread over it"
         )
-    size, spread = extent(model.nodes), extent(points)
+    size, spread = _extent(model.nodes), _extent(points)
     surface, distances = nearest_surface_points(model.nodes, model.triangles, points)
     limit = SURFACE_SHARE * size
     worst = int(distances.argmax())
@@ -180,14 +143,37 @@ def bind_landmarks(model: ReducedModel, points: Array) -> BoundPoints:
         raise RegistrationError(
             f"landmark {worst + 1} at ({x:g}, {y:g}, {z:g}) mm is {1e3 * distances[worst]:.1f} mm off the "
             f"object, at most {1e3 * limit:.1f} mm are allowed: landmarks are points of the "
-            f"undeformed object ({ranges} mm){unit_hint(model, points, SURFACE_SHARE)}"
+            f"undeformed object ({ranges} mm){_unit_hint(model, points)}"
         )
     if spread < SPREAD_SHARE * size:
         raise RegistrationError(
             f"the landmarks are {1e3 * spread:.3g} mm apart on an object of {1e3 * size:.3g} mm: spread them "
-            f"over all that is seen of it{unit_hint(model, points, SURFACE_SHARE)}"
+            f"over all that is seen of it{_unit_hint(model, points)}"
         )
     return BoundPoints.from_surface(model, surface)
+
+
+def _other_unit(model: ReducedModel, points: Array, least: float) -> WrongUnit | None:
+    """In which unit of the mesh landmarks (k, 3) would lie on the object, spread over this share of it."""
+    size, found = _extent(model.nodes), None
+    best = least * size
+    for (meant, a), (taken, b) in permutations(UNITS.items(), 2):
+        scaled = points * (b / a)
+        _, distances = nearest_surface_points(model.nodes, model.triangles, scaled)
+        if distances.max() <= SURFACE_SHARE * size and _extent(scaled) > best:
+            best = _extent(scaled)
+            found = WrongUnit(_extent(points), size, a / b, meant, taken)
+    return found
+
+
+def _unit_hint(model: ReducedModel, points: Array) -> str:
+    found = _other_unit(model, points, LEAST_SPREAD)
+    return "" if found is None else found.hint
+
+
+def _extent(points: Array) -> float:
+    """Length of the diagonal of the box around points (n, 3)."""
+    return float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
 def _check_pixels(camera: Camera, pixels: Array) -> None:
@@ -256,24 +242,20 @@ def solve_pnp(points: Array, pixels: Array, camera: Camera) -> list[RigidTransfo
     return poses
 
 
-def _distinct_minima(
-    model: ReducedModel, found: list[Estimate], click_px: float
-) -> tuple[Estimate, tuple[Estimate, ...]]:
-    """The best minimum and the different ones that landmarks of the stated accuracy cannot exclude."""
-    limit = DISTINCT_SHARE * extent(model.nodes)
+def _distinct_minima(model: ReducedModel, found: list[Estimate], click_px: float) -> tuple[Estimate, int]:
+    """The best minimum, and how many different ones landmarks of the stated accuracy cannot exclude."""
+    limit = DISTINCT_SHARE * _extent(model.nodes)
     best = found[0]
     freedom = max(2 * len(best.residuals) - len(best.covariance), 1)
     variance = max(click_px**2, 2.0 * best.cost / freedom)
     # Twice the log-likelihood ratio of two minima; 9 is the three-sigma level.
     plausible = [e for e in found if 2.0 * (e.cost - best.cost) < 9.0 * variance]
     shapes = [_mesh_in_camera(model, best.state)]
-    alternatives: list[Estimate] = []
     for estimate in plausible:
         shape = _mesh_in_camera(model, estimate.state)
         if all(np.linalg.norm(shape - other, axis=1).mean() > limit for other in shapes):
-            alternatives.append(estimate)
             shapes.append(shape)
-    return best, tuple(alternatives)
+    return best, len(shapes) - 1
 
 
 def _mesh_in_camera(model: ReducedModel, state: State) -> Array:
@@ -287,39 +269,27 @@ def _check_residual(best: Estimate, rms: float, limit: float) -> None:
         raise RegistrationError(
             f"the landmarks do not fit the object: their residual is {rms:.1f} px (root mean square, at most "
             f"{limit:.1f} px), the worst is landmark {worst + 1} with {lengths[worst]:.1f} px; check "
-            "its pixel, the order of the landmarks, the camera file, and that the model reaches this shape"
+            "its pixel, the order of the landmarks, the camera file, and that the model reaches this shape",
+            RegistrationFailure.LANDMARKS_DO_NOT_FIT,
         )
 
 
-def _flags(
-    model: ReducedModel, best: Estimate, alternatives: tuple[Estimate, ...], count: int, click_px: float
-) -> tuple[str, ...]:
-    flags = []
-    unknowns = len(model.parameters) + 6
-    if 2 * count <= unknowns:
-        flags.append(
-            f"registration underdetermined: {count} landmarks give {2 * count} numbers for {unknowns} "
-            f"unknowns, so the shape stays near its default; add landmarks ({unknowns // 2 + 3} or more)"
-        )
+def _warnings(
+    model: ReducedModel, best: Estimate, n_alternatives: int, points: Array, click_px: float
+) -> tuple[RegistrationWarning, ...]:
+    warnings: list[RegistrationWarning] = []
+    numbers, unknowns, size = 2 * len(points), len(model.parameters) + 6, _extent(model.nodes)
+    if numbers <= unknowns:
+        warnings.append(Underdetermined(numbers, unknowns, unknowns // 2 + 3))
     elif best.sigma_px > POOR_FIT * click_px:
-        flags.append(
-            f"registration poor: the landmarks fit to {best.sigma_px:.1f} px, carefully set ones to "
-            f"{click_px:g} px; check them, the camera file, and whether this is the model of this object"
-        )
-    size = extent(model.nodes)
+        warnings.append(PoorFit(best.sigma_px, click_px))
     if not SIZES[0] < size < SIZES[1]:
-        flags.append(
-            f"the model is {size:.3g} m across: if that is not so, the unit of its mesh is wrong; one camera "
-            "cannot tell, because an object twice as large at twice the distance looks the same"
-        )
-    if alternatives:
-        flags.append(
-            f"registration ambiguous: {len(alternatives) + 1} different shapes fit the landmarks equally "
-            "well; add landmarks away from the object's outline, or take a reference frame that shows it bent"
-        )
-    # An undetermined parameter may lie anywhere; only a determined one tells of a limit.
-    determined = best.parameter_std < model.upper - model.lower
-    for parameter, at_bound in zip(model.parameters, best.at_bound & determined, strict=True):
-        if at_bound:
-            flags.append(f"registration: parameter '{parameter.name}' is at a bound of the model's range")
-    return tuple(flags)
+        warnings.append(UnusualSize(size))
+    if n_alternatives:
+        warnings.append(Ambiguous(Ambiguity.SHAPES, n_alternatives + 1))
+    # An unobservable parameter may lie anywhere; only an observable one says that the range ends too early.
+    observable = best.parameter_std < model.upper - model.lower
+    at_bound = zip(model.parameters, best.at_bound & observable, strict=True)
+    warnings += [AtBound(parameter.name) for parameter, is_at_bound in at_bound if is_at_bound]
+    other = _other_unit(model, points, MOST_OF_IT) if _extent(points) < PART_OF_IT * size else None
+    return tuple(warnings if other is None else [*warnings, other])

@@ -1,4 +1,10 @@
-"""What keyframes say for and against an object in a place: points it explains, and points it would hide."""
+"""Registration of a mesh in a sparse map: where the object is, how large the map's unit is, and how sure that is.
+
+Regions of the map that stand out of its planes are tried in turn. In each the surface starts in many attitudes and
+sizes, is laid through the points by scaled robust ICP, and every result is scored by the keyframes: points that it
+explains count for it, points that it would occlude against it. The best and the best other one are kept, and the
+best is refined by comparing the keyframes' images on it. Last, these are asked whether they show its outline there.
+"""
 
 from __future__ import annotations
 
@@ -8,152 +14,34 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import RegistrationError
+from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import SimilarityTransform
-from morph_dslam.registration.icp import Axis, Fit, Surface, candidate_regions, find_planes, fit_surface, plane_points
+from morph_dslam.registration.icp import Surface, fit_surface
 from morph_dslam.registration.keyframe_adjustment import AdjustedKeyframes, KeyframeAdjustment, similarity_of_path
+from morph_dslam.registration.messages import (
+    Ambiguity,
+    Ambiguous,
+    OutlineElsewhere,
+    RegistrationWarning,
+    TooLittleTexture,
+)
 from morph_dslam.registration.outline_fit import OutlineFit, outline_fit
+from morph_dslam.registration.registration import Axis
 from morph_dslam.registration.scene import MapPoints, View, spread_views
-from morph_dslam.registration.texture_alignment import TextureAlignment
+from morph_dslam.registration.search_space import attitudes, candidate_regions, find_planes, plane_points
+from morph_dslam.registration.texture import TextureComparison
 from morph_dslam.render.rasteriser import rasterise
 
 Array = NDArray[np.float64]
 
-#: A point that the object would hide counts against it as much as so many that it explains.
+#: A point that the object would occlude counts against it as much as so many that it explains.
 VIOLATION = 2.0
 
 #: The views are drawn this much smaller.
 SHRINK = 4
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What speaks for a place.
-
-    Attributes
-    ----------
-    explained : (n,) points that lie on the visible side of the object. hidden : (n,) those it would hide.
-    solid : (n,) points explained without those of the one plane that holds most of them. Any flat face fits
-        on any table or wall, in any size.
-    """
-
-    explained: NDArray[np.bool_]
-    hidden: NDArray[np.bool_]
-    solid: NDArray[np.bool_]
-
-    @property
-    def score(self) -> float:
-        """Points explained, but for one plane, less those hidden, these `VIOLATION` times."""
-        return float(self.solid.sum() - VIOLATION * self.hidden.sum())
-
-
-def gather_evidence(
-    world_from_object: SimilarityTransform,
-    nodes: Array,
-    triangles: NDArray[np.int64],
-    positions: Array,
-    views: Sequence[View],
-    camera: Camera,
-    tolerance: float,
-) -> Evidence:
-    """Draw the object into every view and compare its depth with that of the points seen there.
-
-    Parameters
-    ----------
-    nodes : (n, 3) of the mesh, object frame. positions : (p, 3) of all map points, world.
-    tolerance : how far from the surface a point may lie that it explains, world unit.
-    """
-    votes = np.zeros((2, len(positions)), dtype=np.int64)
-    small = _shrunk(camera)
-    world = world_from_object.apply(nodes)
-    for view in views:
-        local = view.camera_from_world.apply(world)
-        buffers = rasterise(small.project(local), local[:, 2], triangles, small.height, small.width)
-        depth = view.camera_from_world.apply(positions[view.point_ids])[:, 2]
-        columns, rows = np.rint((view.pixels + 0.5) / SHRINK - 0.5).astype(np.int64).T
-        inside = (columns >= 0) & (columns < small.width) & (rows >= 0) & (rows < small.height)
-        drawn = np.full(len(depth), np.inf)
-        drawn[inside] = buffers.depth[rows[inside], columns[inside]]
-        # A grazing surface changes its depth within a pixel: what is hidden must be so by more.
-        votes[0, view.point_ids] += np.abs(depth - drawn) <= 2.0 * tolerance
-        votes[1, view.point_ids] += drawn < depth - 4.0 * tolerance
-    explained, hidden = votes[0] > votes[1], votes[1] > votes[0]
-    solid = explained.copy()
-    found = np.flatnonzero(explained)
-    if len(found) >= 3:
-        solid[found] = ~plane_points(positions[found], tolerance, np.random.default_rng(0))
-    return Evidence(explained, hidden, solid)
-
-
-def _shrunk(camera: Camera) -> Camera:
-    return Camera(
-        camera.width // SHRINK,
-        camera.height // SHRINK,
-        camera.fx / SHRINK,
-        camera.fy / SHRINK,
-        (camera.cx + 0.5) / SHRINK - 0.5,
-        (camera.cy + 0.5) / SHRINK - 0.5,
-    )
-
-
-# Attitudes in which a surface starts when it is looked for in a map.
-
-
-#: Turns about the normal of a plane that a body may stand on.
-TURNS = 8
-
-#: Directions of an axis nearer to each other than this (rad) are one.
-ALIKE = 0.1
-
-
-def attitudes(axis: Axis | None, normal: Array | None) -> list[Array]:
-    """Rotations (3, 3), world from object: some spread over all, and those in which the body stands upright.
-
-    Spread over all are those of the icosahedron. A body stands on the plane when one of the six directions of
-    its frame's axes is along the plane's normal. Of a body of revolution only the direction of its axis
-    counts.
-
-    Parameters
-    ----------
-    axis : of a body of revolution. normal : (3,) of the plane that holds most of the map, if there is one.
-    """
-    rotations = list(Rotation.create_group("I").as_matrix())
-    if normal is not None:
-        rotations = [*_standing(normal, axis), *rotations]
-    if axis is None:
-        return rotations
-    kept: list[Array] = []
-    for rotation in rotations:
-        if all(np.linalg.norm((rotation - other) @ axis.direction) > ALIKE for other in kept):
-            kept.append(rotation)
-    return kept
-
-
-def _standing(normal: Array, axis: Axis | None) -> list[Array]:
-    """Rotations that lay a direction of the object along a plane's normal, either side up."""
-    if axis is not None:
-        return [_onto(axis.direction, sign * normal) for sign in (1.0, -1.0)]
-    turns = [Rotation.from_rotvec(2.0 * np.pi * k / TURNS * normal).as_matrix() for k in range(TURNS)]
-    upright = [_onto(direction, normal) for direction in (*np.eye(3), *-np.eye(3))]
-    return [turn @ rotation for rotation in upright for turn in turns]
-
-
-def _onto(direction: Array, target: Array) -> Array:
-    """A rotation that takes one direction to another; both of unit length."""
-    return Rotation.align_vectors(target[None], direction[None])[0].as_matrix()
-
-
-# Registration of a mesh to a sparse map: where the object is, how large the map's unit is, and how sure.
-# Regions of the map that stand out of its planes are tried in turn. In each the surface starts in many
-# attitudes and sizes, is laid through the points by scaled robust ICP, and every result is scored by the
-# keyframes: points that it explains count for it, points that it would hide against it. The best and the best
-# other one are kept, and the best is refined by comparing the keyframes' images on it. Last, these are asked
-# whether they show its outline there.
-
 
 #: Sizes at which the surface starts, over that of the region.
 START_SIZES = (0.85, 1.1, 1.45)
@@ -184,7 +72,7 @@ FEWEST_EXPLAINED = 20
 #: Two places are one if the surfaces are this near to each other, over their size.
 SAME_PLACE = 0.05
 
-#: The runner-up's score over the best's above which the two cannot be told apart.
+#: The runner-up's score over the best's above which they are ambiguous.
 AMBIGUOUS = 0.8
 
 #: So many of the best places are compared by the images on them, if they score at least this part of the
@@ -194,14 +82,84 @@ N_COMPARED, WORTH_COMPARING, POOR_AGREEMENT_PX, MUCH_WORSE = 4, 0.5, 0.35, 2.0
 
 
 @dataclass(frozen=True)
+class _Evidence:
+    """What speaks for a place.
+
+    Attributes
+    ----------
+    explained : (n,) points that lie on the visible side of the object.
+    occluded : (n,) points that it would occlude.
+    solid : (n,) points explained without those of the one plane that holds most of them. Any flat face fits
+        on any table or wall, in any size.
+    """
+
+    explained: NDArray[np.bool_]
+    occluded: NDArray[np.bool_]
+    solid: NDArray[np.bool_]
+
+    @property
+    def score(self) -> float:
+        """Points explained, but for one plane, less those occluded, these `VIOLATION` times."""
+        return float(self.solid.sum() - VIOLATION * self.occluded.sum())
+
+
+def _gather_evidence(
+    world_from_object: SimilarityTransform,
+    nodes: Array,
+    triangles: NDArray[np.int64],
+    positions: Array,
+    views: Sequence[View],
+    camera: Camera,
+    tolerance: float,
+) -> _Evidence:
+    """Draw the object into every view and compare its depth with that of the points (p, 3) seen there.
+
+    ``tolerance`` is how far from the surface a point may lie that it explains, world unit.
+    """
+    votes = np.zeros((2, len(positions)), dtype=np.int64)
+    small = _shrunk(camera)
+    world = world_from_object.apply(nodes)
+    for view in views:
+        local = view.camera_from_world.apply(world)
+        buffers = rasterise(small.project(local), local[:, 2], triangles, small.height, small.width)
+        depth = view.camera_from_world.apply(positions[view.point_ids])[:, 2]
+        columns, rows = np.rint((view.pixels + 0.5) / SHRINK - 0.5).astype(np.int64).T
+        inside = (columns >= 0) & (columns < small.width) & (rows >= 0) & (rows < small.height)
+        drawn = np.full(len(depth), np.inf)
+        drawn[inside] = buffers.depth[rows[inside], columns[inside]]
+        # A grazing surface changes its depth within a pixel: what is occluded must be so by more.
+        votes[0, view.point_ids] += np.abs(depth - drawn) <= 2.0 * tolerance
+        votes[1, view.point_ids] += drawn < depth - 4.0 * tolerance
+    explained, occluded = votes[0] > votes[1], votes[1] > votes[0]
+    solid = explained.copy()
+    found = np.flatnonzero(explained)
+    if len(found) >= 3:
+        solid[found] = ~plane_points(positions[found], tolerance, np.random.default_rng(0))
+    return _Evidence(explained, occluded, solid)
+
+
+def _shrunk(camera: Camera) -> Camera:
+    return Camera(
+        camera.width // SHRINK,
+        camera.height // SHRINK,
+        camera.fx / SHRINK,
+        camera.fy / SHRINK,
+        (camera.cx + 0.5) / SHRINK - 0.5,
+        (camera.cy + 0.5) / SHRINK - 0.5,
+    )
+
+
+@dataclass(frozen=True)
 class MeshRegistration:
     """An object found in a map.
 
     Attributes
     ----------
     world_from_object : metres to the map's unit.
-    covariance : (7, 7) of log scale, rotation vector and translation about the mean node, world.
-    score, runner_up : of `Evidence`, for this place and for the next best.
+    covariance : (7, 7) of log scale, rotation vector and translation about the mean node, world; None if there
+        was too little to compare.
+    score : points explained outside of one plane, less twice those it would occlude.
+    runner_up : the score of the next best place.
     n_explained : points on the surface.
     rms_px : how far the keyframes' images of the surface agree; None if there was too little to compare.
     axis : about which the surface can be turned without a difference, so that this angle is not known.
@@ -223,17 +181,31 @@ class MeshRegistration:
     unconfirmed: bool = False
 
     @property
+    def warnings(self) -> tuple[RegistrationWarning, ...]:
+        """What a reader must know."""
+        warnings: list[RegistrationWarning] = []
+        if self.outline.contradicts:
+            warnings.append(OutlineElsewhere(self.outline.share))
+        elif self.unconfirmed:
+            warnings.append(Ambiguous(Ambiguity.UNCONFIRMED))
+        elif self.rms_px is not None and self.rms_px > POOR_AGREEMENT_PX:
+            warnings.append(Ambiguous(Ambiguity.IMAGES_DIFFER, self.rms_px))
+        elif self.runner_up > AMBIGUOUS * self.score:
+            warnings.append(Ambiguous(Ambiguity.SECOND_PLACE, self.runner_up / self.score))
+        if self.rms_px is None:
+            warnings.append(TooLittleTexture())
+        return tuple(warnings)
+
+    @property
     def ambiguous(self) -> bool:
-        """Whether another place is nearly as good, or the images contradict this one or tell nothing."""
-        contradicted = self.rms_px is not None and self.rms_px > POOR_AGREEMENT_PX
-        contradicted |= self.outline.contradicts
-        return self.unconfirmed or contradicted or self.runner_up > AMBIGUOUS * self.score
+        """Whether another place is nearly as good, or the images contradict this one or do not confirm it."""
+        return any(isinstance(warning, Ambiguous | OutlineElsewhere) for warning in self.warnings)
 
 
 @dataclass(frozen=True)
 class _Place:
     transform: SimilarityTransform
-    evidence: Evidence
+    evidence: _Evidence
 
 
 def register_mesh(
@@ -249,9 +221,13 @@ def register_mesh(
 
     Parameters
     ----------
-    nodes : (n, 3) metres. triangles : (m, 3), outwards if the surface is closed.
-    points : of the map. views : its keyframes, whose ``point_ids`` are rows of ``points``.
-    camera : of the views, without distortion. metric : the map's unit is the metre.
+    nodes : (n, 3) metres.
+    triangles : (m, 3) node indices, outwards if the surface is closed.
+    points : of the map.
+    views : keyframes of the map, whose ``point_ids`` are rows of ``points``.
+    camera : of the views, without distortion.
+    metric : whether the map's unit is the metre.
+    progress : whether to show a progress bar.
 
     Raises
     ------
@@ -264,7 +240,7 @@ def register_mesh(
 
     def judged(place: SimilarityTransform, asked: Sequence[View]) -> _Place:
         tolerance = TOLERANCE * surface.size * place.scale
-        return _Place(place, gather_evidence(place, nodes, triangles, points.positions, asked, camera, tolerance))
+        return _Place(place, _gather_evidence(place, nodes, triangles, points.positions, asked, camera, tolerance))
 
     places: list[_Place] = []
     few, more = spread_views(views, FIRST_ASKED), spread_views(views, MOST_ASKED)
@@ -275,8 +251,9 @@ def register_mesh(
         for start in sorted(starts, key=lambda place: -place.evidence.score)[:N_REFINED]:
             places.append(judged(_refined(start.transform, points, surface, metric), more))
     candidates = _distinct(places, len(points), surface)
-    aligner = TextureAlignment(nodes, triangles, camera, views, metric)
-    found = _chosen(candidates, aligner, surface)
+    comparison = TextureComparison(nodes, triangles, camera)
+    aligned = [comparison.refine(place.transform, views, metric) for place in _worth_comparing(candidates)]
+    found = _chosen(candidates, aligned, surface)
     if found.rms_px is not None:
         adjustment = KeyframeAdjustment(nodes, triangles, camera, points, views, surface.axis_of_revolution)
         found = _adjusted(found, adjustment, nodes.mean(axis=0), metric)
@@ -300,7 +277,7 @@ def _refined(start: SimilarityTransform, points: MapPoints, surface: Surface, me
     """The place near ``start`` that fits all points around it."""
     size = surface.size * start.scale
     near = np.linalg.norm(points.positions - start.apply(surface.centre), axis=1) < size
-    return fit_surface(points[near], surface, start, FINE * size, metric).world_from_object
+    return fit_surface(points[near], surface, start, FINE * size, metric)[0]
 
 
 def _searched(points: MapPoints, surface: Surface, starts_in: list[Array], metric: bool) -> list[SimilarityTransform]:
@@ -317,19 +294,18 @@ def _searched(points: MapPoints, surface: Surface, starts_in: list[Array], metri
             start = SimilarityTransform(scale, rotation, place)
             starts.append(fit_surface(some, surface, start, COARSE * surface.size * scale, metric, False))
     fits = []
-    for rough in _by_weight(starts)[:N_FOLLOWED]:
-        begun = rough.world_from_object
+    for begun in _by_weight(starts)[:N_FOLLOWED]:
         fits.append(fit_surface(some, surface, begun, MIDDLE * surface.size * begun.scale, metric, False))
     chosen: list[SimilarityTransform] = []
-    for fit in _by_weight(fits):
-        place = fit.world_from_object
+    for place in _by_weight(fits):
         if len(chosen) < N_SCORED and all(not _same_place(place, other, surface) for other in chosen):
             chosen.append(place)
     return chosen
 
 
-def _by_weight(fits: list[Fit]) -> list[Fit]:
-    return sorted(fits, key=lambda fit: -float(fit.weights.sum()))
+def _by_weight(fits: list[tuple[SimilarityTransform, Array]]) -> list[SimilarityTransform]:
+    """The fits without their weights, those of most weight first."""
+    return [transform for transform, _ in sorted(fits, key=lambda fit: -float(fit[1].sum()))]
 
 
 def _same_place(a: SimilarityTransform, b: SimilarityTransform, surface: Surface) -> bool:
@@ -347,7 +323,8 @@ def _distinct(places: list[_Place], n_points: int, surface: Surface) -> list[_Pl
     if not places or places[0].evidence.score < FEWEST_EXPLAINED:
         raise RegistrationError(
             f"the object was not found in the map of {n_points} points: {_best_of(places)}. Film the "
-            "undeformed object closer and from more sides, and check the unit of its mesh"
+            "undeformed object closer and from more sides, and check the unit of its mesh",
+            RegistrationFailure.NOT_FOUND,
         )
     kept: list[_Place] = []
     for place in places:
@@ -360,42 +337,42 @@ def _best_of(places: list[_Place]) -> str:
     """What speaks for the best of the places (by score, the best first), none of which is good enough."""
     if not places:
         return "no region of it has enough points"
-    explained, solid, hidden = (
-        int(kind.sum()) for kind in (places[0].evidence.explained, places[0].evidence.solid, places[0].evidence.hidden)
-    )
+    best = places[0].evidence
     return (
-        f"the best place explains {explained} of them, but only {solid} outside of a single plane (a flat "
-        f"face fits anywhere), and would hide {hidden} that were seen; {FEWEST_EXPLAINED} outside of it are "
-        "needed, and two more for each that is hidden"
+        f"the best place explains {best.explained.sum()} of them, but only {best.solid.sum()} outside of a single "
+        f"plane (a flat face fits anywhere), and would occlude {best.occluded.sum()} that were seen; "
+        f"{FEWEST_EXPLAINED} outside of it are needed, and two more for each that is occluded"
     )
 
 
-def _chosen(candidates: list[_Place], aligner: TextureAlignment, surface: Surface) -> MeshRegistration:
-    """The candidate on which the images agree best, of those that score well."""
+def _worth_comparing(candidates: list[_Place]) -> list[_Place]:
+    """Of the candidates, the best first, those that score well."""
     least = WORTH_COMPARING * candidates[0].evidence.score
-    compared = [place for place in candidates[:N_COMPARED] if place.evidence.score >= least]
-    aligned = [aligner.refine(place.transform) for place in compared]
-    misfits = np.array([np.inf if found is None else found.rms_px for found in aligned])
+    return [place for place in candidates[:N_COMPARED] if place.evidence.score >= least]
+
+
+def _chosen(
+    candidates: list[_Place], aligned: list[tuple[SimilarityTransform, float] | None], surface: Surface
+) -> MeshRegistration:
+    """The candidate on which the images agree best; ``aligned`` are the first ones, refined by images."""
+    compared = candidates[: len(aligned)]
+    moved = [place.transform if found is None else found[0] for place, found in zip(compared, aligned, strict=True)]
+    misfits = np.array([np.inf if found is None else found[1] for found in aligned])
     row = int(np.argmin(misfits))  # the first where no images can be compared
-    best, alignment = compared[row], aligned[row]
-    place = best.transform if alignment is None else alignment.world_from_object
+    best, place = compared[row].evidence, moved[row]
     others = [other.evidence.score for other in candidates[len(compared) :]]
-    for other, found, misfit in zip(compared, aligned, misfits, strict=True):
-        moved = other.transform if found is None else found.world_from_object
-        if misfit <= MUCH_WORSE * misfits[row] and not _same_place(moved, place, surface):
+    for other, there, misfit in zip(compared, moved, misfits, strict=True):
+        if misfit <= MUCH_WORSE * misfits[row] and not _same_place(there, place, surface):
             others.append(other.evidence.score)
     return MeshRegistration(
         place,
         None,
-        best.evidence.score,
+        best.score,
         max([0.0, *others]),
-        int(best.evidence.explained.sum()),
-        None if alignment is None else alignment.rms_px,
+        int(best.explained.sum()),
+        float(misfits[row]) if np.isfinite(misfits[row]) else None,
         surface.axis_of_revolution,
     )
-
-
-# Whether an object that is not found in a metric map would be if its mesh were in another unit.
 
 
 def register_in_unit(
@@ -409,8 +386,7 @@ def register_in_unit(
 ) -> MeshRegistration:
     """As `register_mesh`; an object that a metric map does not hold is looked for in other sizes.
 
-    A monocular map has no unit: there an object of another size is found, with another map_units_per_metre,
-    and nobody can tell.
+    A monocular map has no unit: there an object of another size is found, with another map_units_per_metre.
 
     Raises
     ------
@@ -430,6 +406,7 @@ def register_in_unit(
             raise
         raise RegistrationError(
             "the object was not found in its size, but one of its shape that is "
-            f"{found.world_from_object.scale:.4g} times as large is there, and the map is metric: mend the "
-            "unit of the study's mesh"
+            f"{found.world_from_object.scale:.4g} times as large is there, and the map is metric: correct the "
+            "unit of the study's mesh",
+            RegistrationFailure.WRONG_SIZE,
         ) from None

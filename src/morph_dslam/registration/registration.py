@@ -1,35 +1,39 @@
-"""The object's pose as it is known beforehand in a frame, from a camera that was found in the scene's map."""
+"""Where an object is: in a reference frame, and in the map of a scene."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
-from morph_dslam.geometry import RigidTransform, SimilarityTransform, cross_matrix, rotation_log
-from morph_dslam.io.landmarks import Landmarks
-from morph_dslam.model import ReducedModel
+from morph_dslam.geometry import RigidTransform, SimilarityTransform, cross_matrix, rotation_exp, rotation_log
+from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.revolution import with_revolution_angle
-from morph_dslam.registration.landmarks import CLICK_PX, bind_landmarks, register
+from morph_dslam.notices import Notice
+from morph_dslam.registration.messages import Ambiguous, AngleOpen, OutlineElsewhere, read_warning
 from morph_dslam.slam.pose import PoseEstimate
-from morph_dslam.tracking.depth import SIGMA_AT_1M
-from morph_dslam.tracking.estimator import Estimator, State
-from morph_dslam.tracking.refinement import refine_by_depth
-from morph_dslam.tracking.state import Prior
+from morph_dslam.tracking.state import Prior, State
 
 Array = NDArray[np.float64]
+
+#: No number of a registration is meant to be larger.
+LARGEST = 1e20
+
+#: Mean nodes that are farther apart than this share of the size belong to different objects.
+OTHER_OBJECT = 0.1
 
 
 @dataclass(frozen=True)
 class PosePrior:
-    """An object's pose in one frame.
+    """An object's pose in one frame, as the map gives it.
 
     Attributes
     ----------
@@ -50,11 +54,14 @@ class PosePrior:
         return self.from_camera + self.lasting @ self.lasting.T
 
     def prior(self, d: int, squared_px: float, firmness: float = 1.0) -> Prior:
-        """As a term of the estimator's cost, which knows nothing of the ``d`` parameters.
+        """As a term of the estimator's cost, which says nothing of the ``d`` parameters.
 
-        ``squared_px`` is the variance of an image coordinate: it makes a covariance a weight in that cost.
-        ``firmness`` multiplies the weight, but makes the pose no better known: its errors stay in what is
-        stated of the estimate.
+        Parameters
+        ----------
+        d : number of parameters.
+        squared_px : variance of an image coordinate: it makes a covariance a weight in that cost.
+        firmness : multiplies the weight, but makes the pose no better known: its errors stay in what is
+            stated of the estimate.
         """
         squared_px = firmness * squared_px
         information = np.asarray(squared_px * np.linalg.inv(self.covariance), dtype=np.float64)
@@ -67,59 +74,21 @@ class PosePrior:
         return np.concatenate([turn, pose.translation - self.pose.translation])
 
 
-# Where a registered object is in a map, and from there in a camera that was found in the map.
-
-
-#: No number of a registration is meant to be larger.
-LARGEST = 1e20
-
-#: Mean nodes that are farther apart than this share of the size belong to different objects.
-OTHER_OBJECT = 0.1
-
-
 @dataclass(frozen=True)
 class MapRegistration:
     """Where an undeformed object is in a map.
 
     Attributes
     ----------
-    world_from_object : metres to the map's unit. centre : (3,) the mean node, object frame, metres.
+    world_from_object : metres to the map's unit.
+    centre : (3,) the mean node, object frame, metres.
     covariance : (7, 7) of log scale, rotation vector and translation about ``centre``, in the map; None where
-        nobody knows.
+        it is not known.
     """
 
     world_from_object: SimilarityTransform
     centre: Array
     covariance: Array | None
-
-    @classmethod
-    def from_content(cls, content: dict[str, Any]) -> MapRegistration:
-        """From the content of a registration.json; raises KeyError, TypeError or ValueError if it is none."""
-        matrix = numbers_of(content["world_from_object"], (4, 4))
-        scale, covariance = float(content["map_units_per_metre"]), content["covariance"]
-        if not scale > 0.0 or not np.allclose(matrix[:3, :3] @ matrix[:3, :3].T / scale**2, np.eye(3)):
-            raise ValueError("world_from_object is no rotation scaled by map_units_per_metre")
-        return cls(
-            SimilarityTransform(scale, matrix[:3, :3] / scale, matrix[:3, 3]),
-            numbers_of(content["mean_node_m"], (3,)),
-            None if covariance is None else numbers_of(covariance, (7, 7)),
-        )
-
-    def check_model(self, model: ReducedModel, path: Path) -> None:
-        """Refuse a registration of another object; one of a finer mesh of the same object will do.
-
-        Raises
-        ------
-        RegistrationError
-            If the mean nodes of the two are farther apart than `OTHER_OBJECT` of the object's size.
-        """
-        nodes = model.positions(model.default)
-        apart = np.linalg.norm(nodes.mean(axis=0) - self.centre)
-        if apart > OTHER_OBJECT * np.linalg.norm(np.ptp(nodes, axis=0)):
-            raise RegistrationError(
-                f"{path} places another object than '{model.name}': their mean nodes are {1e3 * apart:.1f} "
-                "mm apart; give the model that was registered, or register this one"
-            )
 
     def slopes(self, pose: RigidTransform) -> Array:
         """How the increment (6,) of the object's ``pose`` in a camera depends on the registration: (6, 7).
@@ -138,7 +107,7 @@ class MapRegistration:
         return result
 
     def pose_covariance(self, pose: RigidTransform) -> Array | None:
-        """(6, 6) of the object's ``pose`` in an exactly known camera; None where nobody knows."""
+        """(6, 6) of the object's ``pose`` in an exactly known camera; None where it is not known."""
         if self.covariance is None:
             return None
         slopes = self.slopes(pose)
@@ -153,7 +122,7 @@ class MapRegistration:
     def pose_prior(self, camera: PoseEstimate) -> PosePrior:
         """The object's pose in a camera found in the map, metres; ValueError without a covariance."""
         if self.covariance is None:
-            raise ValueError("the place has no covariance")
+            raise ValueError("the registration has no covariance")
         pose = self.pose_in(camera.camera_from_world)
         # The camera's twist turns everything about the camera, and shifts it in the map's unit.
         by_camera = np.eye(6)
@@ -164,34 +133,41 @@ class MapRegistration:
         return PosePrior(pose, by_camera @ camera.covariance @ by_camera.T, self.slopes(pose) @ root)
 
 
-def numbers_of(values: Any, shape: tuple[int, ...]) -> Array:
-    """An array of a registration.json; raises ValueError if its shape is another, or a number absurd."""
-    array = np.array(values, dtype=np.float64)
-    if array.shape != shape or not (np.abs(array) < LARGEST).all():
-        raise ValueError(f"an array of shape {shape} was expected")
-    return array
-
-
-# Where tracking starts: from landmarks in a reference frame, or from a registration in a map.
-
-
-#: Standard deviation of landmarks' pixels where they are too few to tell, and the least that is believed.
-LANDMARK_PX, LEAST_LANDMARK_PX = 2.0, 0.1
-
-
 @dataclass(frozen=True)
 class KeyframePose:
     """The undeformed object in a keyframe of the map.
 
     Attributes
     ----------
-    frame : number of the keyframe. error_factors : (6, c) how ``pose`` is off by c error factors, the same
-        for all keyframes, in their standard deviations.
+    frame : number of the keyframe.
+    pose : camera_from_object, metres.
+    covariance : (6, 6) of ``pose``; None unless the keyframe was adjusted by itself.
+    error_factors : (6, c) how ``pose`` is off by c error factors, the same for all keyframes, in their
+        standard deviations; None as ``covariance``.
     """
 
     frame: int
     pose: RigidTransform
-    error_factors: Array
+    covariance: Array | None = None
+    error_factors: Array | None = None
+
+
+@dataclass(frozen=True)
+class Axis:
+    """An axis of revolution, object frame, metres.
+
+    Attributes
+    ----------
+    point : (3,) on it.
+    direction : (3,) of unit length.
+    """
+
+    point: Array
+    direction: Array
+
+    def turned(self, points: Array, angle: float) -> Array:
+        """Points (..., 3) turned about the axis by ``angle`` (rad)."""
+        return (points - self.point) @ rotation_exp(angle * self.direction).T + self.point
 
 
 @dataclass(frozen=True)
@@ -200,140 +176,242 @@ class Registration:
 
     Attributes
     ----------
-    model : the model to track with; with the angle about its axis as a parameter where that is not known.
-    frame : number of the reference frame; None for the first one tracked.
-    state : of the object there. facts : for the summary. flags : what a reader must know.
-    per_sequence : names of the parameters that the registration leaves open and that do not change: the angle
-        about an axis.
+    model : to track with; it has the angle about the object's axis as a parameter where that is open.
+    state : parameters and pose of the object in the reference frame.
     covariance : (d + 6, d + 6) of ``state``; None where it is not known.
+    frame : number of the reference frame, a keyframe of the map; None for the first frame that is tracked.
+    facts : figures for the summary; ``from`` says what the object was registered by.
+    warnings : what a reader must know.
+    per_sequence : names of the parameters that the registration leaves open and that do not change.
     map_registration : where the object is in the map of the scene; None where there is none.
+    keyframes : of the map, with the object's pose in each.
+    axis : of revolution; None if the object has none.
     discrepancy : what the object's shape has beyond the model's in the frame; None where it is not known.
-    views : keyframes that show the object, that of ``frame`` first; none where their errors are not known.
     """
 
     model: ReducedModel
-    frame: int | None
     state: State
-    facts: dict[str, Any]
-    flags: tuple[str, ...]
-    per_sequence: tuple[str, ...] = ()
     covariance: Array | None = None
+    frame: int | None = None
+    facts: dict[str, Any] = field(default_factory=dict)
+    warnings: tuple[Notice, ...] = ()
+    per_sequence: tuple[str, ...] = ()
     map_registration: MapRegistration | None = None
+    keyframes: tuple[KeyframePose, ...] = ()
+    axis: Axis | None = None
     discrepancy: Discrepancy | None = None
-    views: tuple[KeyframePose, ...] = ()
 
-    @classmethod
-    def at(cls, model: ReducedModel, state: State, covariance: Array | None = None) -> Registration:
-        """An object whose state in the reference frame is known from elsewhere, with this covariance."""
-        return cls(model, None, state, {}, (), covariance=covariance)
+    @property
+    def ambiguous(self) -> bool:
+        """Whether another registration is nearly as good, or the images do not confirm this one."""
+        return any(isinstance(warning, Ambiguous | OutlineElsewhere) for warning in self.warnings)
+
+    @property
+    def views(self) -> tuple[KeyframePose, ...]:
+        """Keyframes with error factors, that of ``frame`` first.
+
+        None if that one has no covariance of its own: then its error has none of these factors.
+        """
+        if not any(view.frame == self.frame and view.covariance is not None for view in self.keyframes):
+            return ()
+        known = [view for view in self.keyframes if view.error_factors is not None]
+        return tuple(sorted(known, key=lambda view: view.frame != self.frame))
+
+    def content(self) -> dict[str, Any]:
+        """All but model and discrepancy as plain JSON: what `save` writes."""
+        content = {**self.facts, "ambiguous": self.ambiguous}
+        content["warnings"] = [warning.content() for warning in self.warnings]
+        if self.map_registration is None:
+            return content | {
+                "parameters": self.state.parameters.tolist(),
+                "camera_from_object": self.state.camera_from_object.matrix.tolist(),
+                "state_covariance": _list(self.covariance),
+            }
+        placed, axis = self.map_registration.world_from_object, self.axis
+        return content | {
+            "world_from_object": placed.matrix.tolist(),
+            "map_units_per_metre": placed.scale,
+            "mean_node_m": self.map_registration.centre.tolist(),
+            "covariance": _list(self.map_registration.covariance),
+            "axis_of_revolution": axis and {"point_m": axis.point.tolist(), "direction": axis.direction.tolist()},
+            "keyframes": [
+                {
+                    "frame": view.frame,
+                    "camera_from_object": view.pose.matrix.tolist(),
+                    "covariance": _list(view.covariance),
+                    "error_factors": _list(view.error_factors),
+                }
+                for view in self.keyframes
+            ],
+        }
+
+    def save(self, path: str | Path, map_path: str | Path | None = None, model_path: str | Path | None = None) -> None:
+        """Write a file that `load_registration` reads.
+
+        Parameters
+        ----------
+        path : of the file, ``registration.json``.
+        map_path : of the map, which the file names relative to itself.
+        model_path : of the model, likewise.
+
+        Raises
+        ------
+        RegistrationError
+            If it cannot be written.
+        """
+        path = Path(path)
+        named = {"map": map_path, "model": model_path}
+        files = {key: None if file is None else os.path.relpath(file, path.parent) for key, file in named.items()}
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(json.dumps(self.content() | files, indent=2) + "\n")
+        except OSError as error:
+            raise RegistrationError(f"cannot write the registration to {path}: {error.strerror}") from error
 
 
-def load_registration(path: str | Path, model: ReducedModel) -> Registration:
-    """The object as `morph register` placed it, undeformed, in the last keyframe of the map.
-
-    Raises
-    ------
-    RegistrationError
-        If the file is missing, not one of `morph register`, or places another object.
-    """
-    path = Path(path)
-    try:
-        content = json.loads(path.read_text())
-        keyframe = max(content["keyframes"], key=lambda entry: entry["frame"])
-        pose = RigidTransform.from_matrix(numbers_of(keyframe["camera_from_object"], (4, 4)))
-        own = keyframe.get("covariance")  # of a keyframe whose pose was adjusted by itself
-        own = None if own is None else numbers_of(own, (6, 6))
-        views = _views(content["keyframes"])
-        frame, axis = int(keyframe["frame"]), content["axis_of_revolution"]
-        axis = None if axis is None else numbers_of(axis["direction"], (3,))
-        facts = {key: content[key] for key in ("score", "runner_up_score", "rms_px", "map_units_per_metre")}
-        ambiguous, outline_fits = bool(content["ambiguous"]), bool(content.get("outline_fits", True))
-        place = MapRegistration.from_content(content)
-    except OSError as error:
-        raise RegistrationError(f"cannot read the registration {path}: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError, IndexError) as error:
-        raise RegistrationError(f"{path} is not a registration.json of `morph register` ({error})") from error
-    place.check_model(model, path)
+def registration_in_map(
+    model: ReducedModel,
+    map_registration: MapRegistration,
+    keyframes: Sequence[KeyframePose],
+    facts: dict[str, Any],
+    warnings: Sequence[Notice] = (),
+    axis: Axis | None = None,
+) -> Registration:
+    """The undeformed object in the last of the map's keyframes; of the arguments see `Registration`."""
+    last = max(keyframes, key=lambda view: view.frame)
     open_angles: tuple[str, ...] = ()
-    flags = []
-    if not outline_fits:
-        flags.append("registration doubtful: the keyframes show the object's outline elsewhere")
-    elif ambiguous:
-        flags.append("registration ambiguous: another place is nearly as good, or no image confirms this one")
     if axis is not None:
-        model = with_revolution_angle(model, axis)
+        model = with_revolution_angle(model, axis.direction)
         open_angles = (model.parameters[-1].name,)
-        flags.append(
-            f"the angle about the object's axis cannot be seen before it deforms: it is the parameter "
-            f"'{open_angles[0]}'"
-        )
-    state = State(model.default, pose)
-    of_pose = place.pose_covariance(pose) if own is None else own
-    covariance = None if of_pose is None else _of_state(of_pose, len(model.parameters))
-    facts = {"from": "map", **facts}
-    # Without an estimate of its own the pose of the reference frame has none of the others' error factors.
-    views = tuple(sorted(views, key=lambda view: view.frame != frame)) if own is not None else ()
-    return Registration(model, frame, state, facts, tuple(flags), open_angles, covariance, place, views=views)
+        warnings = [*(w for w in warnings if not isinstance(w, AngleOpen)), AngleOpen(*open_angles)]
+    of_pose = map_registration.pose_covariance(last.pose) if last.covariance is None else last.covariance
+    return Registration(
+        model,
+        State(model.default, last.pose),
+        None if of_pose is None else state_covariance(of_pose, len(model.parameters)),
+        last.frame,
+        facts,
+        tuple(warnings),
+        open_angles,
+        map_registration,
+        tuple(keyframes),
+        axis,
+    )
 
 
-def _views(keyframes: list[dict[str, Any]]) -> list[KeyframePose]:
-    """The keyframes whose poses were adjusted together; raises ValueError as `numbers_of` does."""
-    views = []
-    for entry in keyframes:
-        if entry.get("error_factors") is None:
-            continue
-        error_factors = np.array(entry["error_factors"], dtype=np.float64)
-        error_factors = numbers_of(error_factors, (6, error_factors.size // 6))
-        pose = RigidTransform.from_matrix(numbers_of(entry["camera_from_object"], (4, 4)))
-        views.append(KeyframePose(int(entry["frame"]), pose, error_factors))
-    if len({view.error_factors.shape for view in views}) > 1:
-        raise ValueError("the keyframes' errors have different numbers of error_factors")
-    return views
-
-
-def _of_state(of_pose: Array, n_parameters: int) -> Array:
-    """The covariance of parameters that are known exactly, and of a pose."""
+def state_covariance(of_pose: Array, n_parameters: int) -> Array:
+    """The covariance of a state whose parameters are known exactly, from that of its pose (6, 6)."""
     covariance = np.zeros((n_parameters + 6, n_parameters + 6))
     covariance[n_parameters:, n_parameters:] = of_pose
     return covariance
 
 
-def register_by_landmarks(
-    model: ReducedModel,
-    camera: Camera,
-    landmarks: Landmarks,
-    click_px: float = CLICK_PX,
-    depth: NDArray[np.float32] | None = None,
-    depth_sigma: float = SIGMA_AT_1M,
-) -> Registration:
-    """The object in the frame of the landmarks; raises RegistrationError as `register` does.
+#: What is no figure for the summary in the file of a registration.
+_NO_FACTS = {"ambiguous", "warnings", "parameters", "camera_from_object", "state_covariance", "world_from_object"}
+_NO_FACTS |= {"mean_node_m", "covariance", "axis_of_revolution", "keyframes", "map", "model"}
+
+
+def load_registration(path: str | Path, model: ReducedModel | None = None) -> Registration:
+    """Read what `Registration.save` or `morph register` wrote.
 
     Parameters
     ----------
-    depth : (h, w) of that frame, metres, NaN where unknown; None without a depth camera.
-    depth_sigma : standard deviation of a pixel's depth at 1 m, metres.
+    path : of the file, ``registration.json``.
+    model : that was registered; the one that the file names by default.
+
+    Raises
+    ------
+    RegistrationError
+        If the file is missing, damaged, or of another object.
+    ModelFileError
+        If the model that it names cannot be read.
     """
-    registration = register(model, camera, landmarks.points, landmarks.pixels, click_px)
-    facts = {
-        "from": "landmarks",
-        "residual_rms_px": registration.residual_rms_px,
-        "sigma_px": registration.estimate.sigma_px,
-        "n_landmarks": len(registration.estimate.residuals),
-        "n_alternatives": len(registration.alternatives),
-    }
-    placed, covariance = registration.estimate, registration.covariance
-    if depth is not None:
-        bound = bind_landmarks(model, landmarks.points)
-        # How well the landmarks fit tells how carefully they were set, where they are enough to tell.
-        sigma = max(placed.sigma_px, LEAST_LANDMARK_PX) if np.isfinite(placed.sigma_px) else LANDMARK_PX
-        placed = refine_by_depth(
-            Estimator(model, camera),
-            bound,
-            camera.undistort_pixels(landmarks.pixels),
-            placed.state,
-            sigma,
-            depth,
-            depth_sigma,
+    path = Path(path)
+    content = read_content(path)
+    try:
+        if model is None:
+            model = load_model(path.parent / content["model"])
+        registration = _from_content(content, model)
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        raise RegistrationError(f"{path} is not a registration.json of `morph register` ({error})") from error
+    if registration.map_registration is not None:
+        _check_model(registration.map_registration, model, path)
+    return registration
+
+
+def read_content(path: Path) -> dict[str, Any]:
+    """The content of a file of `Registration.save`; raises RegistrationError if it cannot be read."""
+    try:
+        content = json.loads(path.read_text())
+    except OSError as error:
+        raise RegistrationError(f"cannot read the registration {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise RegistrationError(f"{path} is not a registration.json of `morph register` ({error})") from error
+    if not isinstance(content, dict):
+        raise RegistrationError(f"{path} is not a registration.json of `morph register`")
+    return content
+
+
+def _from_content(content: dict[str, Any], model: ReducedModel) -> Registration:
+    """From `Registration.content`; raises KeyError, TypeError, ValueError or IndexError if it is none."""
+    facts = {key: value for key, value in content.items() if key not in _NO_FACTS}
+    warnings = tuple(read_warning(warning) for warning in content["warnings"])
+    if "world_from_object" not in content:
+        d = len(model.parameters)
+        pose = RigidTransform.from_matrix(_numbers(content["camera_from_object"], (4, 4)))
+        state = State(_numbers(content["parameters"], (d,)), pose)
+        covariance = content["state_covariance"]
+        covariance = covariance and np.array(covariance, dtype=np.float64).reshape(d + 6, d + 6)
+        return Registration(model, state, covariance, facts=facts, warnings=warnings)
+    matrix, scale = _numbers(content["world_from_object"], (4, 4)), float(content["map_units_per_metre"])
+    if not scale > 0.0 or not np.allclose(matrix[:3, :3] @ matrix[:3, :3].T / scale**2, np.eye(3)):
+        raise ValueError("world_from_object is no rotation scaled by map_units_per_metre")
+    placed = SimilarityTransform(scale, matrix[:3, :3] / scale, matrix[:3, 3])
+    found = MapRegistration(placed, _numbers(content["mean_node_m"], (3,)), _optional(content["covariance"], (7, 7)))
+    axis = content["axis_of_revolution"]
+    axis = axis and Axis(_numbers(axis["point_m"], (3,)), _numbers(axis["direction"], (3,)))
+    return registration_in_map(model, found, _keyframes(content["keyframes"]), facts, warnings, axis)
+
+
+def _keyframes(entries: list[dict[str, Any]]) -> list[KeyframePose]:
+    keyframes = []
+    for entry in entries:
+        factors = entry["error_factors"]
+        keyframes.append(
+            KeyframePose(
+                int(entry["frame"]),
+                RigidTransform.from_matrix(_numbers(entry["camera_from_object"], (4, 4))),
+                _optional(entry["covariance"], (6, 6)),
+                factors and _numbers(factors, (6, np.size(factors) // 6)),
+            )
         )
-        facts["along_the_sight_line"], covariance = "by depth", placed.covariance
-    return Registration(model, None, placed.state, facts, registration.flags, covariance=covariance)
+    if len({k.error_factors.shape for k in keyframes if k.error_factors is not None}) > 1:
+        raise ValueError("the keyframes' errors have different numbers of error_factors")
+    return keyframes
+
+
+def _check_model(found: MapRegistration, model: ReducedModel, path: Path) -> None:
+    """Refuse a registration of another object; one of a finer mesh of the same object will do."""
+    nodes = model.positions(model.default)
+    apart = np.linalg.norm(nodes.mean(axis=0) - found.centre)
+    if apart > OTHER_OBJECT * np.linalg.norm(np.ptp(nodes, axis=0)):
+        raise RegistrationError(
+            f"{path} is of another object than '{model.name}': their mean nodes are {1e3 * apart:.1f} mm apart; "
+            "give the model that was registered, or register this one"
+        )
+
+
+def _numbers(values: Any, shape: tuple[int, ...]) -> Array:
+    """An array of a registration's file; raises ValueError if its shape is another, or a number absurd."""
+    array = np.array(values, dtype=np.float64)
+    if array.shape != shape or not (np.abs(array) < LARGEST).all():
+        raise ValueError(f"an array of shape {shape} was expected")
+    return array
+
+
+def _optional(values: Any, shape: tuple[int, ...]) -> Array | None:
+    return None if values is None else _numbers(values, shape)
+
+
+def _list(array: Array | None) -> list | None:
+    return None if array is None else array.tolist()

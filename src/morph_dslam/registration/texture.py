@@ -1,9 +1,12 @@
-"""Comparing keyframes on a mesh: what one image shows on the surface, the others must show there too.
+"""Keyframes compared on a mesh: what one image shows on the surface, the others must show there too.
 
 A keyframe's image is laid on the mesh and rendered into another view. Where surface and cameras are not where
 they should be, the rendering is displaced; Lucas-Kanade measures by how much, to a fraction of a pixel, at
 hundreds of points of each pair of views. Each displacement depends on the two poses alone, because a point is
 where the first view's ray meets the mesh.
+
+The displacements say how far the surface has to move, the cameras being where the map has them: the linear
+equations of point-to-plane ICP, from thousands of pixels in place of the map's few points.
 """
 
 from __future__ import annotations
@@ -18,7 +21,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.geometry import RigidTransform, SimilarityTransform
+from morph_dslam.registration.increments import moved_similarity, pose_jacobian, similarity_jacobian
+from morph_dslam.registration.scene import View, camera_from_object, views_of
 from morph_dslam.render.rasteriser import Buffers, rasterise
 
 Array = NDArray[np.float64]
@@ -34,6 +39,15 @@ N_CORNERS, LEAST_COSINE = 150, 0.3
 #: Side of the patches compared, pixels, and their least correlation.
 WINDOW, LEAST_CORRELATION = 17, 0.8
 
+#: Iterations of a refinement, and keyframes used, spread over all that see the object.
+REFINEMENTS, MOST_VIEWS = 6, 8
+
+#: Displacements that differ more from the fit count less (Huber), pixels.
+HUBER_PX = 0.5
+
+#: Fewer measurements are no evidence.
+FEWEST = 60
+
 
 @dataclass(frozen=True)
 class PairDisplacements:
@@ -41,9 +55,12 @@ class PairDisplacements:
 
     Attributes
     ----------
-    first, second : numbers of the views. places : (p, 3) points on the surface, object frame, metres.
+    first : number of the view whose image is carried.
+    second : number of the view that it is compared with.
+    places : (p, 3) points on the surface, object frame, metres.
     offsets : (p, 2) from where the second view should show the points to where it does, pixels.
-    by_first, by_second : (p, 2, 6) how the expected pixel moves with each pose (`pose_jacobian`).
+    by_first : (p, 2, 6) how the expected pixel moves with the first pose (`pose_jacobian`).
+    by_second : (p, 2, 6) likewise with the second one.
     """
 
     first: int
@@ -56,7 +73,7 @@ class PairDisplacements:
 
 @dataclass(frozen=True)
 class _Drawn:
-    """The mesh in one view: projected nodes (n, 2), depths (n,), all pixels, and corners (c, 2) on it."""
+    """The mesh in one view: projected nodes (n, 2), depths (n,), buffers of all pixels, and corners (c, 2)."""
 
     normalized: Image
     pose: RigidTransform
@@ -66,47 +83,82 @@ class _Drawn:
     corners: Array
 
 
-def pose_jacobian(points: Array, pose: RigidTransform) -> Array:
-    """How points (p, 3) in the camera frame move with the pose, (p, 3, 6).
-
-    The pose's increment is that of `online.state.moved`: a rotation vector, by which the object turns about
-    its origin as the camera's axes stand, and a difference of translation.
-    """
-    x, y, z = (points - pose.translation).T
-    zero, one = np.zeros(len(points)), np.ones(len(points))
-    return np.stack(
-        [
-            np.column_stack([zero, z, -y, one, zero, zero]),
-            np.column_stack([-z, zero, x, zero, one, zero]),
-            np.column_stack([y, -x, zero, zero, zero, one]),
-        ],
-        axis=1,
-    )
-
-
-def moved_pose(pose: RigidTransform, step: Array) -> RigidTransform:
-    """The pose after such an increment (6,)."""
-    return RigidTransform(rotation_exp(step[:3]) @ pose.rotation, pose.translation + step[3:])
-
-
 class TextureComparison:
     """Compares images of one mesh.
 
     Parameters
     ----------
-    nodes : (n, 3) of the undeformed mesh, metres. triangles : (m, 3). camera : without distortion.
+    nodes : (n, 3) of the undeformed mesh, metres.
+    triangles : (m, 3) node indices.
+    camera : of the views, without distortion.
     """
 
     def __init__(self, nodes: Array, triangles: NDArray[np.int64], camera: Camera) -> None:
         self._nodes, self._triangles, self._camera = nodes, triangles, camera
         self._centre = nodes.mean(axis=0)
 
+    def refine(
+        self, start: SimilarityTransform, views: Sequence[View], metric: bool = False
+    ) -> tuple[SimilarityTransform, float] | None:
+        """The world_from_object near ``start`` with which all views agree.
+
+        Parameters
+        ----------
+        start : metres to the map's unit.
+        views : keyframes of the map.
+        metric : keep the scale.
+
+        Returns
+        -------
+        The similarity and the root mean square misfit of a pixel coordinate; None where too little can be
+        compared.
+        """
+        views = views_of(self._nodes, start, views, self._camera, MOST_VIEWS)
+        images, transform, rms = [view.normalized for view in views], start, 0.0
+        for _ in range(REFINEMENTS):
+            poses = [camera_from_object(view, transform) for view in views]
+            measured = self.measure(images, poses)
+            if sum(len(pair.offsets) for pair in measured) < FEWEST:
+                return None
+            step, rms = self._step(measured, poses, transform, metric)
+            transform = moved_similarity(transform, step, self._centre)
+        return transform, rms
+
+    def _step(
+        self,
+        measured: list[PairDisplacements],
+        poses: list[RigidTransform],
+        transform: SimilarityTransform,
+        metric: bool,
+    ) -> tuple[Array, float]:
+        """The step (7,) of the similarity, and the root mean square misfit in pixels."""
+        slopes = [similarity_jacobian(pose, transform, self._centre) for pose in poses]
+        rows = np.concatenate(
+            [pair.by_first @ slopes[pair.first] + pair.by_second @ slopes[pair.second] for pair in measured]
+        )
+        offsets = np.concatenate([pair.offsets for pair in measured])
+        # Unknowns in comparable units, of which those that the images leave open stay as they are.
+        size = transform.scale * float(np.sqrt(np.mean(np.sum((self._nodes - self._centre) ** 2, axis=1))))
+        units, free = np.array([1.0 / size] * 4 + [1.0] * 3), slice(1 if metric else 0, 7)
+        rows = rows * units
+        step, misfit, weights = np.zeros(7), offsets, np.ones(len(rows))
+        for _ in range(10):
+            weights = HUBER_PX / np.maximum(np.linalg.norm(misfit, axis=1), HUBER_PX)
+            matrix = np.einsum("pij,p,pik->jk", rows, weights, rows, optimize=True)
+            right = np.einsum("pij,p,pi->j", rows, weights, offsets, optimize=True)
+            inverse = np.linalg.pinv(matrix[free, free], rcond=1e-5, hermitian=True)
+            step[free] = inverse @ right[free]
+            misfit = offsets - rows @ step
+        mean_square = np.average(np.mean(misfit**2, axis=1), weights=weights)
+        return step * units, float(np.sqrt(mean_square))
+
     def measure(self, images: Sequence[Image], poses: Sequence[RigidTransform]) -> list[PairDisplacements]:
         """Displacements between all views from not too different sides.
 
         Parameters
         ----------
-        images : (h, w) contrast-normalized. poses : camera_from_object of each, metres.
+        images : (h, w) contrast-normalized, of each view.
+        poses : camera_from_object of each, metres.
         """
         drawn = [self._draw(image, pose) for image, pose in zip(images, poses, strict=True)]
         sights = [self._centre - pose.inverse.translation for pose in poses]
@@ -166,7 +218,7 @@ class TextureComparison:
         return far[:, None] * rays, rays, normals, along
 
     def _visible(self, drawn: _Drawn, pixels: Array, depths: Array) -> NDArray[np.bool_]:
-        """Which points, at pixels (p, 2) and depths (p,), nothing hides in a view."""
+        """Which points, at pixels (p, 2) and depths (p,), are not occluded in a view."""
         columns, rows = np.rint(np.nan_to_num(pixels, nan=-1.0)).astype(int).T
         inside = (columns >= 0) & (columns < self._camera.width) & (rows >= 0) & (rows < self._camera.height)
         result = np.zeros(len(pixels), dtype=bool)
@@ -200,9 +252,8 @@ def _corners(normalized: Image, buffers: Buffers) -> Array:
     return np.empty((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
 
 
-# One view's texture carried by the mesh into another view, and how far patches of it are displaced there.
-# Pixels that the first view does not show, behind a fold of the object or beyond its rim, take no part. So a
-# patch at a fold or at the rim is measured by what both views show of it, whatever is in front or behind.
+# One view's texture carried by the mesh into another view, and how far patches of it are displaced there. Pixels
+# that the first view does not show, behind a fold or beyond the rim, take no part.
 
 
 #: A pixel is hidden in the first view if it lies behind what is seen there by this part of its depth.
@@ -240,26 +291,21 @@ def _sample(image, x, y, across, along):
     return value
 
 
-def _sample_numpy(image, x, y):
-    """The plain twin of `_sample`, for places (p,)."""
-    x0, y0 = x.astype(int), y.astype(int)
-    across, along = np.empty((4, len(x))), np.empty((4, len(x)))
-    _cubic.py_func(x - x0, across)
-    _cubic.py_func(y - y0, along)
-    grey = image.astype(float)
-    around = [[grey[y0 + j - 1, x0 + i - 1] for i in range(4)] for j in range(4)]
-    return np.einsum("jp,ip,jip->p", along, across, np.array(around))
-
-
 @njit(cache=True, nogil=True)
 def carry(triangle_ids, weights, triangles, coordinates, depths, depth, image, carried, shown):
     """Fill ``carried`` (h, w), and ``shown`` where the second view's pixels are seen in the first.
 
     Parameters
     ----------
-    triangle_ids, weights : (h, w), (h, w, 3) of the second view's buffers. triangles : (m, 3).
-    coordinates, depths : (n, 2), (n,) the nodes in the first view. depth, image : (h, w) of the first view.
-    carried : (h, w) float32. shown : (h, w) bool.
+    triangle_ids : (h, w) of the second view's buffers.
+    weights : (h, w, 3) likewise.
+    triangles : (m, 3) node indices.
+    coordinates : (n, 2) pixels of the nodes in the first view.
+    depths : (n,) of the nodes there.
+    depth : (h, w) of the first view.
+    image : (h, w) of the first view.
+    carried : (h, w) float32.
+    shown : (h, w) bool.
     """
     height, width = triangle_ids.shape
     across, along = np.empty(4), np.empty(4)
@@ -283,25 +329,6 @@ def carry(triangle_ids, weights, triangles, coordinates, depths, depth, image, c
                 continue
             carried[row, column] = _sample(image, x, y, across, along)
             shown[row, column] = True
-
-
-def carry_numpy(triangle_ids, weights, triangles, coordinates, depths, depth, image, carried, shown):
-    """The plain twin of `carry`."""
-    from scipy.ndimage import maximum_filter, minimum_filter
-
-    rows, columns = np.nonzero(triangle_ids >= 0)
-    corners, shares = triangles[triangle_ids[rows, columns]], weights[rows, columns]
-    x, y = np.einsum("pc,pci->ip", shares, coordinates[corners])
-    z = np.einsum("pc,pc->p", shares, depths[corners])
-    x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
-    kept = (x0 >= 1) & (y0 >= 1) & (x0 + 2 < image.shape[1]) & (y0 + 2 < image.shape[0])
-    rows, columns, x, y, z, x0, y0 = (part[kept] for part in (rows, columns, x, y, z, x0, y0))
-    nearest = minimum_filter(depth, size=2, origin=-1)[y0, x0] * (1.0 + HIDDEN_BY)
-    farthest = maximum_filter(depth, size=2, origin=-1)[y0, x0] * (1.0 - HIDDEN_BY)
-    seen = (z <= nearest) & (z >= farthest)
-    shown[:] = False
-    shown[rows[seen], columns[seen]] = True
-    carried[rows[seen], columns[seen]] = _sample_numpy(image, x[seen], y[seen])
 
 
 @njit(cache=True, nogil=True)
@@ -380,7 +407,10 @@ def align_patches(carried, shown, image, centres, half):
 
     Parameters
     ----------
-    carried, shown : (h, w) of `carry`. image : (h, w) the second view. centres : (p, 2) pixels.
+    carried : (h, w) of `carry`.
+    shown : (h, w) of `carry`.
+    image : (h, w) the second view.
+    centres : (p, 2) pixels.
     half : patches are 2 half + 1 pixels wide.
 
     Returns
@@ -400,33 +430,4 @@ def align_patches(carried, shown, image, centres, half):
         slopes[:count, 0] -= slopes[:count, 0].mean()
         slopes[:count, 1] -= slopes[:count, 1].mean()
         moves[p, 0], moves[p, 1], alike[p] = _align(image, xs, ys, values, slopes, count, seen)
-    return moves, alike
-
-
-def align_patches_numpy(carried, shown, image, centres, half):
-    """The plain twin of `align_patches`."""
-    from scipy.ndimage import binary_erosion, generate_binary_structure
-
-    inner = binary_erosion(shown, generate_binary_structure(2, 1))
-    down, right = np.gradient(carried.astype(float))
-    moves, alike = np.zeros((len(centres), 2)), np.full(len(centres), -1.0)
-    for p, centre in enumerate(np.rint(centres).astype(int)):
-        rows, columns = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1) + centre[::-1, None]
-        inside = (rows >= 0) & (columns >= 0) & (rows < image.shape[0]) & (columns < image.shape[1])
-        rows, columns = rows[inside], columns[inside]
-        rows, columns = rows[inner[rows, columns]], columns[inner[rows, columns]]
-        if len(rows) < LEAST_SHARE * (2 * half + 1) ** 2:
-            continue
-        values = carried[rows, columns] - carried[rows, columns].mean()
-        slopes = np.column_stack([right[rows, columns], down[rows, columns]])
-        slopes = slopes - slopes.mean(axis=0)
-        for _ in range(ITERATIONS):
-            seen = _sample_numpy(image, columns + moves[p, 0], rows + moves[p, 1])
-            seen = seen - seen.mean()
-            left = values - values @ values / (values @ seen) * seen
-            step = np.linalg.solve(slopes.T @ slopes, slopes.T @ left)
-            moves[p] += step
-            if np.abs(step).max() < LAST_STEP:
-                alike[p] = values @ seen / np.sqrt((values @ values) * (seen @ seen))
-                break
     return moves, alike

@@ -411,7 +411,7 @@ class RigTracker:
         # The joint estimate ties lasting errors to the points of one view a camera, so that none is made.
         single = replace(self.options, per_sequence=(), random_walk=(), new_views=False)
         try:
-            registration = Registration.at(self.model, state)
+            registration = Registration(self.model, state)
             return Tracker(
                 self.model,
                 part.camera,

@@ -20,8 +20,8 @@ from tqdm import tqdm
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import TrackingError
+from morph_dslam.registration.initialization import InitializerFiles
 from morph_dslam.registration.registration import PosePrior, Registration
-from morph_dslam.registration.start import InitializerFiles
 from morph_dslam.sources import Frame, FrameSource
 from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.tracking.anchoring import Anchor

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,7 +13,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.errors import MorphError, RegistrationError, TrackingError
+from morph_dslam.errors import MorphError, TrackingError
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.model.discrepancy import Discrepancy, largest_deformation, save_discrepancies
 from morph_dslam.model.inner_structure import CarriedStructure
@@ -68,26 +67,6 @@ def check_run_folder(folder: Path, overwrite: bool, sign: str = "result.h5") -> 
             f"{folder} holds a run already: choose another folder, or allow it to be overwritten (`--overwrite`)"
         )
     make_folder(folder, "the run", TrackingError)
-
-
-def write_registration(folder: Path, content: dict[str, Any], map_path: Path, model_path: Path) -> dict[str, Any]:
-    """Write ``registration.json``, which names map and model relative to it, into a folder that is there.
-
-    Returns
-    -------
-    What was written: ``content``, and the names.
-
-    Raises
-    ------
-    RegistrationError
-        If it cannot be written.
-    """
-    content = content | {"map": os.path.relpath(map_path, folder), "model": os.path.relpath(model_path, folder)}
-    try:
-        (folder / "registration.json").write_text(json.dumps(content, indent=2) + "\n")
-    except OSError as error:
-        raise RegistrationError(f"cannot write the registration to {folder}: {error.strerror}") from error
-    return content
 
 
 # Where inner structures are in every frame of a run, and how well that is known.

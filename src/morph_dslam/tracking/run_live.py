@@ -12,6 +12,7 @@ from typing import Any
 
 from morph_dslam.errors import SourceError, TrackingError
 from morph_dslam.io.video import VideoWriter
+from morph_dslam.notices import Remark
 from morph_dslam.sources import open_live, open_stream
 from morph_dslam.sources.live import LiveCamera, LiveStream
 from morph_dslam.threads import one_thread_for_algebra
@@ -217,7 +218,7 @@ def _write(part: _Object, notes: Sequence[str], times: LiveTimes, options: LiveO
     """Write all files of an object's run folder but the video, which was written on the way."""
     setup, run, of_object = part.start.setup, part.run, part.start.setup.options
     registration = part.start.registration
-    registration = replace(registration, flags=(*registration.flags, *notes))
+    registration = replace(registration, warnings=(*registration.warnings, *map(Remark, notes)))
     named = {"source": options.source}
     named |= {name: str(path) for name, path in vars(of_object.initializer).items() if path is not None}
     for name, path in (("landmarks", of_object.landmarks), ("registration", of_object.registration)):

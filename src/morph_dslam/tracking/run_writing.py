@@ -74,7 +74,7 @@ def write_run(
             "frames_compared_with_them": sum(result.view > 0 for result in run.results),
         },
         "registration": registration.facts,
-        "flags": list(registration.flags),
+        "flags": [warning.text for warning in registration.warnings],
         "inputs": given,
         "versions": _versions(),
     }

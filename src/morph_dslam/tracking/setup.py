@@ -21,9 +21,10 @@ from morph_dslam.io.camera_files import load_camera
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.inner_structure import CarriedStructure, InnerStructure, load_inner_structure
-from morph_dslam.registration.landmarks import CLICK_PX
-from morph_dslam.registration.registration import Registration, load_registration, register_by_landmarks
-from morph_dslam.registration.start import Initializer, InitializerFiles, register_by_initializer
+from morph_dslam.notices import Remark
+from morph_dslam.registration.initialization import Initializer, InitializerFiles, register_by_initializer
+from morph_dslam.registration.landmarks import CLICK_PX, register_landmarks
+from morph_dslam.registration.registration import Registration, load_registration
 from morph_dslam.slam.map_files import load_map
 from morph_dslam.sources import Frame
 from morph_dslam.tracking.anchoring import Anchor
@@ -215,7 +216,7 @@ class Setup:
         return [self.registration.frame, *(frame for frame in others if frame is not None)]
 
     def placed(self, image: NDArray[np.uint8] | Image, depth: NDArray[np.float32] | None = None) -> Registration:
-        """The registration; raises RegistrationError as `register_by_landmarks` and `Initializer.register` do.
+        """The registration; raises RegistrationError as `register_landmarks` and `Initializer.register` do.
 
         Parameters
         ----------
@@ -228,7 +229,7 @@ class Setup:
             return register_by_initializer(self.initializer, self.model, self.camera, image)
         assert self.landmarks is not None
         options = self.options
-        return register_by_landmarks(
+        return register_landmarks(
             self.model, self.camera, self.landmarks, options.click_px, depth, options.tracker.depth_sigma
         )
 
@@ -336,7 +337,7 @@ def load_setup(options: ObjectOptions) -> Setup:
     free = options.pose == "free"
     if path is None and not free:
         note = "no map was given or found beside the registration: the object is tracked as a free one"
-        registration = replace(registration, flags=(*registration.flags, note))
+        registration = replace(registration, warnings=(*registration.warnings, Remark(note)))
     keyframes: dict[int, KeyframeImage] = {}
     if path is not None and not options.use_outline:
         keyframes = pictures_of(path, camera, registration)
@@ -399,7 +400,7 @@ class Reregistration:
             if due:
                 self._notes.append(f"not placed anew in frame {frame.index}: {error}")
             return chain
-        self._notes += [f"placed anew in frame {frame.index}", *placed.flags]
+        self._notes += [f"placed anew in frame {frame.index}", *(warning.text for warning in placed.warnings)]
         self._n_lost = 0
         tracker.anchor = chain.anchor
         return tracker
@@ -417,7 +418,7 @@ class Reregistration:
         """The object in the frame, with the model and what else the run began with."""
         model, camera, options = self._registration.model, self._setup.camera, self._setup.options
         if landmarks is not None:
-            found = register_by_landmarks(model, camera, landmarks, options.click_px)
+            found = register_landmarks(model, camera, landmarks, options.click_px)
         else:
             assert self._setup.initializer is not None
             image = np.asarray(frame.image, dtype=np.uint8)

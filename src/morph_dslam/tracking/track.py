@@ -11,6 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from morph_dslam.errors import SourceError, TrackingError
+from morph_dslam.notices import Remark
 from morph_dslam.registration.landmarks import bind_landmarks
 from morph_dslam.registration.registration import Registration
 from morph_dslam.sources import Frame, FrameSource, open_source
@@ -90,7 +91,7 @@ def track(options: TrackOptions) -> dict[str, Any]:
             run = replace(run, refined=True, frames=[], timestamps=[], results=[])
             _follow(source, setup, registration, begin, False, run)
     finally:
-        registration = replace(registration, flags=(*registration.flags, *again.notes))
+        registration = replace(registration, warnings=(*registration.warnings, *map(Remark, again.notes)))
         summary = write_results(setup, registration, source, options, run) if len(run) else {}
     return summary
 

@@ -16,6 +16,7 @@ from tqdm import tqdm
 from morph_dslam.camera import Camera
 from morph_dslam.errors import CameraError, RegistrationError, SourceError, TrackingError
 from morph_dslam.io.camera_files import load_rig
+from morph_dslam.notices import Remark
 from morph_dslam.slam.frame_images import FrameImages
 from morph_dslam.sources import Frame, FrameSource, open_source
 from morph_dslam.threads import one_thread_for_algebra
@@ -84,7 +85,9 @@ def track_rig(options: TrackOptions, others: Sequence[Path]) -> dict[str, Any]:
     try:
         _follow(sources, first, tracker, run)
     finally:
-        registration = replace(registration, flags=(*registration.flags, *_unequal(sources, len(run))))
+        registration = replace(
+            registration, warnings=(*registration.warnings, *map(Remark, _unequal(sources, len(run))))
+        )
         summary = write_results(setup, registration, sources[0], options, run) if len(run) else {}
     return summary
 

@@ -1,0 +1,292 @@
+"""Registration by a printed board that is fixed to the object, in one image, or to the scene, in its map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from morph_dslam.camera import Camera
+from morph_dslam.errors import RegistrationError, RegistrationFailure
+from morph_dslam.geometry import RigidTransform, SimilarityTransform, cross_matrix
+from morph_dslam.model import ReducedModel
+from morph_dslam.registration.board import FEWEST_CORNERS, FiducialBoard, load_board
+from morph_dslam.registration.landmarks import solve_pnp
+from morph_dslam.registration.messages import Ambiguity, Ambiguous, AssumedUndeformed, RegistrationWarning
+from morph_dslam.registration.registration import (
+    KeyframePose,
+    MapRegistration,
+    Registration,
+    registration_in_map,
+    state_covariance,
+)
+from morph_dslam.registration.scene import View, camera_from_object, points_and_views
+from morph_dslam.registration.texture import moved_similarity, pose_jacobian
+from morph_dslam.slam.scene import Scene
+from morph_dslam.tracking.state import State, moved
+
+Array = NDArray[np.float64]
+
+#: Standard deviation of a corner at the least, and residuals that speak against board or camera, pixels.
+LEAST_CORNER_PX, LARGEST_RESIDUAL_PX = 0.1, 2.0
+
+#: Another pose whose squared residuals are at most so many times as large is ambiguous with the best.
+AMBIGUOUS = 4.0
+
+#: By how much a board's size may differ from that in a metric map.
+METRIC_SHARE = 0.03
+
+
+@dataclass(frozen=True)
+class BoardPose:
+    """A board in an image.
+
+    Attributes
+    ----------
+    camera_from_board : metres.
+    covariance : (6, 6) of its increment, see `state.moved`.
+    n_corners : number of corners found.
+    rms_px : root mean square of their residuals' lengths, pixels.
+    ambiguous : whether another tilt fits nearly as well.
+    """
+
+    camera_from_board: RigidTransform
+    covariance: Array
+    n_corners: int
+    rms_px: float
+    ambiguous: bool
+
+    def of_object(self, board_from_object: RigidTransform) -> tuple[RigidTransform, Array]:
+        """camera_from_object, and the covariance (6, 6) of its increment."""
+        arm = self.camera_from_board.rotation @ board_from_object.translation
+        slopes = np.eye(6)
+        slopes[3:, :3] = -cross_matrix(arm)
+        return self.camera_from_board @ board_from_object, slopes @ self.covariance @ slopes.T
+
+
+def locate_board(board: FiducialBoard, camera: Camera, grey: NDArray[np.uint8]) -> BoardPose | None:
+    """The board in an undistorted image (h, w); None where too little of it is seen.
+
+    Raises
+    ------
+    RegistrationError
+        If its corners do not lie as on this board.
+    """
+    points, pixels = board.find(grey)
+    if len(points) < FEWEST_CORNERS:
+        return None
+    fits = sorted(
+        (_refined(start, points, pixels, camera) for start in solve_pnp(points, pixels, camera)), key=lambda fit: fit[1]
+    )
+    if not fits:
+        return None
+    pose, cost, information = fits[0]
+    rms = float(np.sqrt(cost / len(points)))
+    if rms > LARGEST_RESIDUAL_PX:
+        raise RegistrationError(
+            f"the corners of the board do not lie as they should: they are {rms:.1f} px off; check the board "
+            "file (sizes, columns and rows), that the print is flat, and the camera file",
+            RegistrationFailure.BOARD_DOES_NOT_FIT,
+        )
+    variance = max(cost / max(2 * len(points) - 6, 1), LEAST_CORNER_PX**2)
+    ambiguous = any(_angle(pose, other) > 0.05 and c < AMBIGUOUS * cost + 1.0 for other, c, _ in fits[1:])
+    covariance = np.asarray(variance * np.linalg.pinv(information), dtype=np.float64)
+    return BoardPose(pose, covariance, len(points), rms, ambiguous)
+
+
+def _refined(
+    start: RigidTransform, points: Array, pixels: Array, camera: Camera
+) -> tuple[RigidTransform, float, Array]:
+    """The pose of least squared residuals near ``start``, their sum, and the information (6, 6)."""
+    state = State(np.empty(0), start)
+    for _ in range(10):
+        residuals, jacobian = _linear(state.camera_from_object, points, pixels, camera)
+        step, *_ = np.linalg.lstsq(jacobian, -residuals, rcond=None)
+        state = moved(state, np.asarray(step, dtype=np.float64))
+    residuals, jacobian = _linear(state.camera_from_object, points, pixels, camera)
+    return state.camera_from_object, float(residuals @ residuals), jacobian.T @ jacobian
+
+
+def _linear(pose: RigidTransform, points: Array, pixels: Array, camera: Camera) -> tuple[Array, Array]:
+    """Residuals (2 k,) and their derivatives (2 k, 6) by the pose's increment."""
+    local = pose.apply(points)
+    jacobian = camera.projection_jacobian(local) @ pose_jacobian(local, pose)
+    return (camera.project(local) - pixels).ravel(), jacobian.reshape(-1, 6)
+
+
+def _angle(one: RigidTransform, other: RigidTransform) -> float:
+    """Between two rotations, radians."""
+    return float(np.arccos(np.clip(0.5 * (np.trace(one.rotation.T @ other.rotation) - 1.0), -1.0, 1.0)))
+
+
+def _on_board(board: FiducialBoard) -> RigidTransform:
+    if board.board_from_object is None:
+        raise RegistrationError("the board file does not say where the object is: give it a section [object]")
+    return board.board_from_object
+
+
+@dataclass(frozen=True)
+class BoardInitializer:
+    """Finds the undeformed object by the board that it is fixed to.
+
+    Attributes
+    ----------
+    board : with the object's place on it.
+    """
+
+    board: FiducialBoard
+
+    def register(self, model: ReducedModel, camera: Camera, grey: NDArray[np.uint8]) -> Registration:
+        """The object in an undistorted image (h, w).
+
+        Raises
+        ------
+        RegistrationError
+            If the board is not seen, or its file does not say where the object is on it.
+        """
+        on_board = _on_board(self.board)
+        found = locate_board(self.board, camera, grey)
+        if found is None:
+            raise RegistrationError(
+                "the board is not seen in the reference frame: choose one that shows it sharp and with its "
+                "white margin, and check its dictionary",
+                RegistrationFailure.BOARD_NOT_SEEN,
+            )
+        pose, of_pose = found.of_object(on_board)
+        covariance = state_covariance(of_pose, len(model.parameters))
+        warnings: list[RegistrationWarning] = [AssumedUndeformed()]
+        if found.ambiguous:
+            warnings.append(Ambiguous(Ambiguity.BOARD_TILT))
+        facts = {"from": "board", "n_corners": found.n_corners, "residual_rms_px": found.rms_px}
+        return Registration(model, State(model.default, pose), covariance, facts=facts, warnings=tuple(warnings))
+
+
+@dataclass(frozen=True)
+class _BoardInMap:
+    """A board found in a map.
+
+    Attributes
+    ----------
+    world_from_board : metres to the map's unit.
+    covariance : (7, 7) of log scale, rotation vector and translation about ``centre``, world.
+    centre : (3,) of the board, metres.
+    n_views : number of keyframes that show it.
+    rms_px : root mean square of its corners' residuals, pixels.
+    """
+
+    world_from_board: SimilarityTransform
+    covariance: Array
+    centre: Array
+    n_views: int
+    rms_px: float
+
+
+def register_board(scene: Scene, model: ReducedModel, board: FiducialBoard | str | Path) -> Registration:
+    """The undeformed object in a map, and the map's unit, by a board that stands in the scene.
+
+    Parameters
+    ----------
+    scene : with the map.
+    model : of the object.
+    board : with the object's place on it, or the file that describes it.
+
+    Raises
+    ------
+    RegistrationError
+        If fewer than two keyframes show the board, from too near to one another, or they do not agree; or if
+        the board does not say where the object is.
+    """
+    board = board if isinstance(board, FiducialBoard) else load_board(Path(board))
+    on_board = _on_board(board)
+    views = points_and_views(scene)[1]
+    found = _find_in_map(board, views, scene.camera)
+    if scene.is_metric and abs(found.world_from_board.scale - 1.0) > METRIC_SHARE:
+        raise RegistrationError(
+            f"the map is metric, but a metre of the board is {found.world_from_board.scale:.3g} m in it: "
+            "measure the print, and correct the board file or the depth camera's calibration",
+            RegistrationFailure.WRONG_SIZE,
+        )
+    placed = found.world_from_board @ SimilarityTransform(1.0, on_board.rotation, on_board.translation)
+    mean_node = model.positions(model.default).mean(axis=0)
+    arm = placed.apply(mean_node) - found.world_from_board.apply(found.centre)
+    facts = {
+        "from": "board",
+        "score": float(found.n_views),
+        "runner_up_score": 0.0,
+        "n_explained": found.n_views,
+        "rms_px": found.rms_px,
+        "map_units_per_metre": placed.scale,
+        "outline_share": None,
+    }
+    keyframes = [KeyframePose(view.frame, camera_from_object(view, placed)) for view in views]
+    return registration_in_map(
+        model, MapRegistration(placed, mean_node, _about(found.covariance, arm)), keyframes, facts
+    )
+
+
+def _find_in_map(board: FiducialBoard, views: Sequence[View], camera: Camera) -> _BoardInMap:
+    """The similarity with which all keyframes see the board's corners where they are."""
+    seen, poses = [], []
+    for view in views:
+        points, pixels = board.find(view.normalized)
+        pose = locate_board(board, camera, view.normalized) if len(points) >= FEWEST_CORNERS else None
+        if pose is not None:
+            seen.append((view, points, pixels))
+            poses.append(pose.camera_from_board)
+    if len(seen) < 2:
+        raise RegistrationError(
+            f"the board is seen in {len(seen)} keyframes of the map, two at least are needed: film it from "
+            "several sides, sharp and with its white margin",
+            RegistrationFailure.BOARD_NOT_SEEN,
+        )
+    centre = np.array([*board.size, 0.0]) / 2.0
+    start = _start([view for view, _, _ in seen], poses, centre)
+    units = np.array([1.0] * 4 + [start.scale] * 3)
+
+    def residuals(step: Array) -> Array:
+        world = moved_similarity(start, step * units, centre)
+        parts = [
+            camera.project(view.camera_from_world.apply(world.apply(points))) - pixels for view, points, pixels in seen
+        ]
+        return np.nan_to_num(np.concatenate(parts), nan=1e3).ravel()
+
+    found = least_squares(residuals, np.zeros(7), loss="huber", f_scale=1.0)
+    misfit = residuals(found.x)
+    rms = float(np.sqrt(np.mean(misfit.reshape(-1, 2) ** 2) * 2.0))
+    if rms > LARGEST_RESIDUAL_PX:
+        raise RegistrationError(
+            f"the board does not stand still in the map, or its file is wrong: corners are {rms:.1f} px off",
+            RegistrationFailure.BOARD_DOES_NOT_FIT,
+        )
+    variance = max(float(misfit @ misfit) / max(len(misfit) - 7, 1), LEAST_CORNER_PX**2)
+    covariance = variance * np.linalg.pinv(found.jac.T @ found.jac) * np.outer(units, units)
+    return _BoardInMap(moved_similarity(start, found.x * units, centre), covariance, centre, len(seen), rms)
+
+
+def _start(views: Sequence[View], poses: Sequence[RigidTransform], centre: Array) -> SimilarityTransform:
+    """Mean rotation; then, by linear least squares, the scale and place that suit all keyframes."""
+    turns = [v.camera_from_world.rotation.T @ p.rotation for v, p in zip(views, poses, strict=True)]
+    rotation = Rotation.from_matrix(np.array(turns)).mean().as_matrix()
+    rows, right = [], []
+    for view, pose in zip(views, poses, strict=True):
+        # R_cw X + t_cw = s (centre in the camera, metres)
+        rows.append(np.column_stack([view.camera_from_world.rotation, -pose.apply(centre)]))
+        right.append(-view.camera_from_world.translation)
+    solution, *_ = np.linalg.lstsq(np.vstack(rows), np.concatenate(right), rcond=None)
+    scale = float(solution[3])
+    if not scale > 0.0:
+        raise RegistrationError("the keyframes that show the board are too near to one another to give its size")
+    return SimilarityTransform(scale, rotation, solution[:3] - scale * rotation @ centre)
+
+
+def _about(covariance: Array, arm: Array) -> Array:
+    """The covariance (7, 7) about another point, ``arm`` (3,) from the first one, world."""
+    slopes = np.eye(7)
+    slopes[4:, 0] = arm
+    slopes[4:, 1:4] = -cross_matrix(arm)
+    return slopes @ covariance @ slopes.T

@@ -1,0 +1,108 @@
+"""Other ways to find the object in a frame than landmarks: a board, a picture of its print, or a guess."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Protocol, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from morph_dslam.camera import Camera
+from morph_dslam.errors import RegistrationError, TrackingError
+from morph_dslam.io.text import read_toml
+from morph_dslam.model import ReducedModel
+from morph_dslam.registration.registration import Registration
+
+Image = NDArray[np.uint8]
+
+#: A coordinate or an angle. None is meant by what is larger: in millimetres it would be ten kilometres.
+Number = Annotated[float, Field(ge=-1e7, le=1e7)]
+
+Vector = tuple[Number, Number, Number]
+
+
+class Section(BaseModel):
+    """A part of a file; unknown keys are mistakes."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+AnySection = TypeVar("AnySection", bound=Section)
+
+
+def read_file(path: Path, what: str, kind: type[AnySection]) -> AnySection:
+    """Read a TOML file and check it.
+
+    Parameters
+    ----------
+    path : of the file.
+    what : the file is, for the message.
+    kind : its content.
+
+    Raises
+    ------
+    RegistrationError
+        If it is missing, no TOML, or says something impossible.
+    """
+    content = read_toml(path, what, RegistrationError)
+    try:
+        return kind.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        message = first["msg"].removeprefix("Value error, ")
+        raise RegistrationError(f"{path}: {where}: {message}" if where else f"{path}: {message}") from error
+
+
+class Initializer(Protocol):
+    """Finds an object in one image."""
+
+    def register(self, model: ReducedModel, camera: Camera, grey: Image) -> Registration:
+        """The object in an undistorted image (h, w); raises RegistrationError if it is not found."""
+        ...
+
+
+@dataclass(frozen=True)
+class InitializerFiles:
+    """Files of which at most one is given (docs/registration-aids.md).
+
+    Attributes
+    ----------
+    board : a board file.
+    picture : a picture file.
+    guess : a guess.
+    """
+
+    board: Path | None = None
+    picture: Path | None = None
+    guess: Path | None = None
+
+    def load(self) -> Initializer | None:
+        """The initializer, None if there is none; raises TrackingError, RegistrationError or SourceError."""
+        from morph_dslam.registration.board import load_board
+        from morph_dslam.registration.board_registration import BoardInitializer
+        from morph_dslam.registration.guess import load_guess
+        from morph_dslam.registration.picture import load_picture
+
+        if sum(path is not None for path in (self.board, self.picture, self.guess)) > 1:
+            raise TrackingError("say in one way where the object is: by a board, a picture, or a guess")
+        if self.board is not None:
+            return BoardInitializer(load_board(self.board))
+        if self.picture is not None:
+            return load_picture(self.picture)
+        return None if self.guess is None else load_guess(self.guess)
+
+
+def register_by_initializer(
+    initializer: Initializer, model: ReducedModel, camera: Camera, image: Image
+) -> Registration:
+    """The object in a frame (h, w, 3) as recorded; raises RegistrationError if it is not found."""
+    grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+    maps = camera.undistortion_maps()
+    if maps is not None:
+        grey = np.asarray(cv2.remap(grey, *maps, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+    return initializer.register(model, camera, grey)

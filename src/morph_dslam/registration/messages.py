@@ -1,0 +1,219 @@
+"""Warnings about a registration, and their texts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from enum import StrEnum
+from typing import Any, ClassVar
+
+from morph_dslam.notices import Notice
+
+
+@dataclass(frozen=True)
+class RegistrationWarning(Notice):
+    """Something that a reader of a registration must know; each kind is a class of its own."""
+
+
+class Ambiguity(StrEnum):
+    """What makes a registration ambiguous."""
+
+    SHAPES = "shapes"
+    BOARD_TILT = "board_tilt"
+    TWO_PRINTS = "two_prints"
+    SECOND_PLACE = "second_place"
+    UNCONFIRMED = "unconfirmed"
+    IMAGES_DIFFER = "images_differ"
+
+
+_AMBIGUITIES = {
+    Ambiguity.SHAPES: "{value:.0f} different shapes fit the landmarks equally well; add landmarks away from the "
+    "object's outline, or take a reference frame that shows it bent",
+    Ambiguity.BOARD_TILT: "the board can be tilted the other way; show it larger or aslant",
+    Ambiguity.TWO_PRINTS: "the print is in two places; the second one has {value:.0%} of the first one's features",
+    Ambiguity.SECOND_PLACE: "another place in the map scores {value:.0%} of this one; look at registration.jpg, "
+    "and give landmarks if it is wrong",
+    Ambiguity.UNCONFIRMED: "no image confirms this place, and scenery that has the object's shape in another size "
+    "would do; look at registration.jpg, and give landmarks if it is wrong",
+    Ambiguity.IMAGES_DIFFER: "the keyframes' images differ by {value:.2f} px on the object; look at "
+    "registration.jpg, and give landmarks if it is wrong",
+}
+
+
+@dataclass(frozen=True)
+class Ambiguous(RegistrationWarning):
+    """Another registration is nearly as good, or nothing confirms this one.
+
+    Attributes
+    ----------
+    why : what makes it so.
+    value : the number of shapes, the share of the second place or print, or the difference in pixels.
+    """
+
+    why: Ambiguity
+    value: float = 0.0
+
+    @property
+    def text(self) -> str:
+        """For people."""
+        return "registration ambiguous: " + _AMBIGUITIES[Ambiguity(self.why)].format(value=self.value)
+
+
+@dataclass(frozen=True)
+class Underdetermined(RegistrationWarning):
+    """The landmarks give no more numbers than there are unknowns.
+
+    Attributes
+    ----------
+    numbers : two for each landmark.
+    unknowns : parameters and pose.
+    enough : number of landmarks that would be.
+    """
+
+    template: ClassVar[str] = (
+        "registration underdetermined: the landmarks give {numbers} numbers for {unknowns} unknowns, so the shape "
+        "stays near its default; give {enough} landmarks or more"
+    )
+    numbers: int
+    unknowns: int
+    enough: int
+
+
+@dataclass(frozen=True)
+class PoorFit(RegistrationWarning):
+    """The landmarks fit worse than carefully set ones do.
+
+    Attributes
+    ----------
+    sigma_px : standard deviation of their pixels by the fit.
+    expected_px : that of carefully set ones.
+    """
+
+    template: ClassVar[str] = (
+        "registration poor: the landmarks fit to {sigma_px:.1f} px, carefully set ones to {expected_px:g} px; check "
+        "them, the camera file, and whether this is the model of this object"
+    )
+    sigma_px: float
+    expected_px: float
+
+
+@dataclass(frozen=True)
+class AtBound(RegistrationWarning):
+    """A parameter ends at a bound of its range.
+
+    Attributes
+    ----------
+    parameter : its name.
+    """
+
+    template: ClassVar[str] = "registration: parameter '{parameter}' is at a bound of the model's range"
+    parameter: str
+
+
+@dataclass(frozen=True)
+class UnusualSize(RegistrationWarning):
+    """The model is so small or large that its unit may be wrong.
+
+    Attributes
+    ----------
+    size : of the model, metres.
+    """
+
+    template: ClassVar[str] = (
+        "the model is {size:.3g} m across: if that is not so, the unit of its mesh is wrong; one camera cannot see "
+        "that, because an object twice as large at twice the distance looks the same"
+    )
+    size: float
+
+
+@dataclass(frozen=True)
+class WrongUnit(RegistrationWarning):
+    """The landmarks lie on a part of the object, and would lie all over it in another unit.
+
+    Attributes
+    ----------
+    spread : of the landmarks, metres.
+    size : of the object, metres.
+    factor : by which the mesh would have to be multiplied.
+    meant : the unit of the mesh, if so.
+    taken : the unit in which it was read.
+    """
+
+    spread: float
+    size: float
+    factor: float
+    meant: str
+    taken: str
+
+    @property
+    def text(self) -> str:
+        """For people."""
+        apart = f"{1e3 * self.spread:.4g} mm apart on an object of {1e3 * self.size:.4g} mm"
+        return f"registration doubtful: the landmarks are {apart}{self.hint}"
+
+    @property
+    def hint(self) -> str:
+        """What to do, for the end of a sentence."""
+        return (
+            f"; they fit if its mesh is multiplied by {self.factor:.4g}: one in {self.meant} was taken for one in "
+            f"{self.taken}, perhaps, so correct its unit in the study"
+        )
+
+
+@dataclass(frozen=True)
+class AssumedUndeformed(RegistrationWarning):
+    """A board says where the object is, not how it is deformed."""
+
+    template: ClassVar[str] = "registered by a board: the object is taken to be undeformed in the reference frame"
+
+
+@dataclass(frozen=True)
+class OutlineOnly(RegistrationWarning):
+    """A guess was refined by the outline, which says little of the shape."""
+
+    template: ClassVar[str] = "registered by a guess: its outline agrees with the image, which says little of the shape"
+
+
+@dataclass(frozen=True)
+class OutlineElsewhere(RegistrationWarning):
+    """The keyframes show the object's outline elsewhere.
+
+    Attributes
+    ----------
+    share : of the outline that is where the registration has it.
+    """
+
+    template: ClassVar[str] = (
+        "registration doubtful: the keyframes show only {share:.0%} of the object's outline where it is; it may be "
+        "the mesh of another object, and the size of the map's unit wrong; look at registration.jpg"
+    )
+    share: float
+
+
+@dataclass(frozen=True)
+class AngleOpen(RegistrationWarning):
+    """The undeformed object can be turned about its axis without a difference.
+
+    Attributes
+    ----------
+    parameter : name of the parameter that is the angle.
+    """
+
+    template: ClassVar[str] = (
+        "the angle about the object's axis is unobservable before it deforms: it is the parameter '{parameter}'"
+    )
+    parameter: str
+
+
+@dataclass(frozen=True)
+class TooLittleTexture(RegistrationWarning):
+    """The keyframes could not be compared on the object, so that they did not refine its place."""
+
+    template: ClassVar[str] = "the keyframes show too little texture on the object to refine its place"
+
+
+def read_warning(content: Mapping[str, Any]) -> RegistrationWarning:
+    """A warning from what `Notice.content` gave; raises KeyError or TypeError if it is none."""
+    kinds = {kind.__name__: kind for kind in RegistrationWarning.__subclasses__()}
+    kind = kinds["".join(part.capitalize() for part in content["kind"].split("_"))]
+    return kind(**{field.name: content[field.name] for field in fields(kind)})

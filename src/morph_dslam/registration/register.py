@@ -1,0 +1,187 @@
+"""Registration of a model's undeformed object in the map of a scene: what `morph register` does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import RegistrationError
+from morph_dslam.io.camera_files import load_camera
+from morph_dslam.model import ReducedModel, load_model
+from morph_dslam.registration.board_registration import register_board
+from morph_dslam.registration.mesh import MeshRegistration, register_in_unit
+from morph_dslam.registration.registration import (
+    KeyframePose,
+    MapRegistration,
+    Registration,
+    load_registration,
+    read_content,
+    registration_in_map,
+)
+from morph_dslam.registration.scene import MapPoints, View, camera_from_object, points_and_views, spread_views
+from morph_dslam.render.overlay import draw_overlay
+from morph_dslam.render.shading import lambert, vertex_normals
+from morph_dslam.slam.scene import Scene, load_scene
+from morph_dslam.tracking.anchoring import points_on_object
+
+#: Keyframes in the picture of a registration.
+N_PICTURES = 3
+
+
+def register(
+    scene: Scene, model: ReducedModel, beside: Sequence[Registration] = (), progress: bool = False
+) -> Registration:
+    """Find a model's undeformed object in a mapped scene by its shape and its texture.
+
+    Parameters
+    ----------
+    scene : with the map.
+    model : of the object.
+    beside : other objects in this map, to which the points on them are left.
+    progress : whether to show a progress bar.
+
+    Raises
+    ------
+    RegistrationError
+        If the object is not found.
+    """
+    points, views = without_points_on(beside, *points_and_views(scene))
+    nodes = model.positions(model.default)
+    found = register_in_unit(nodes, model.triangles, points, views, scene.camera, scene.is_metric, progress)
+    facts = {
+        "from": "map",
+        "score": found.score,
+        "runner_up_score": found.runner_up,
+        "n_explained": found.n_explained,
+        "rms_px": found.rms_px,
+        "map_units_per_metre": found.world_from_object.scale,
+        "outline_share": found.outline.share if found.outline.count else None,
+    }
+    in_map = MapRegistration(found.world_from_object, nodes.mean(axis=0), found.covariance)
+    return registration_in_map(model, in_map, _keyframes(found, views), facts, found.warnings, found.axis)
+
+
+def without_points_on(
+    others: Sequence[Registration], points: MapPoints, views: Sequence[View]
+) -> tuple[MapPoints, list[View]]:
+    """The points and views of a map without the points on objects that are registered in it."""
+    left = np.ones(len(points), dtype=bool)
+    for other in others:
+        if other.map_registration is None:
+            raise RegistrationError(f"'{other.model.name}' is not registered in a map: leave it out of beside")
+        left &= ~points_on_object(points.positions, other.map_registration, other.model)[0]
+    rows = np.cumsum(left) - 1
+    seen = [left[view.point_ids] for view in views]
+    return points[left], [
+        replace(view, point_ids=rows[view.point_ids[kept]], pixels=view.pixels[kept])
+        for view, kept in zip(views, seen, strict=True)
+    ]
+
+
+def _keyframes(found: MeshRegistration, views: Sequence[View]) -> list[KeyframePose]:
+    """The object's pose in every keyframe, with its covariance and error factors where it was adjusted."""
+    adjusted = found.keyframes
+    if adjusted is None:
+        return [KeyframePose(view.frame, camera_from_object(view, found.world_from_object)) for view in views]
+    factors, row = adjusted.error_factors(), {view.frame: k for k, view in enumerate(adjusted.views)}
+    poses = []
+    for view in views:
+        k = row.get(view.frame)
+        if k is None:
+            poses.append(KeyframePose(view.frame, camera_from_object(view, found.world_from_object)))
+        else:
+            poses.append(KeyframePose(view.frame, adjusted.poses[k], adjusted.covariance_of(k), factors[k]))
+    return poses
+
+
+def run_registration(
+    map_path: Path,
+    model_path: Path,
+    camera_path: Path,
+    output: Path,
+    beside: Sequence[Path] = (),
+    board: Path | None = None,
+) -> Registration:
+    """Register an object from files to files: ``registration.json``, and ``registration.jpg`` without a board.
+
+    Parameters
+    ----------
+    map_path : the map.h5 of `morph slam`.
+    model_path : a model file.
+    camera_path : the camera file of the map.
+    output : the folder to write.
+    beside : files of registrations of other objects in this map, to which the points on them are left.
+    board : file of a board that stands in the scene, to register by; by the mesh if None.
+
+    Raises
+    ------
+    RegistrationError
+        If the object is not found, a file of ``beside`` is not one of this map, or the folder cannot be
+        written.
+    MapError, ModelFileError, CameraError
+        If an input cannot be read.
+    """
+    if board is not None and beside:
+        raise RegistrationError("a board says where the object is: leave out --beside")
+    camera, model = load_camera(camera_path), load_model(model_path)
+    others = [_load_beside(path, map_path) for path in beside]
+    scene = load_scene(map_path, camera)
+    if board is not None:
+        registration = register_board(scene, model, board)
+    else:
+        registration = register(scene, model, others, progress=True)
+    registration.save(output / "registration.json", map_path, model_path)
+    if board is None:
+        cv2.imwrite(str(output / "registration.jpg"), draw_registration(registration, scene))
+    return registration
+
+
+def _load_beside(path: Path, map_path: Path) -> Registration:
+    """The registration of another object; raises RegistrationError if it is of another map."""
+    registration, own_map = load_registration(path), read_content(path)["map"]
+    if own_map is None or (path.parent / own_map).resolve() != map_path.resolve():
+        raise RegistrationError(f"{path} is of another map, {own_map}: register both objects in one map")
+    return registration
+
+
+def registration_line(registration: Registration) -> str:
+    """The line that sums up a registration in a map."""
+    facts: dict[str, Any] = registration.facts
+    agreement = "none" if facts["rms_px"] is None else f"{facts['rms_px']:.3f}"
+    return (
+        f"map_units_per_metre={facts['map_units_per_metre']:.6g} score={facts['score']:.0f} "
+        f"runner_up={facts['runner_up_score']:.0f} explained={facts['n_explained']} rms_px={agreement} "
+        f"ambiguous={'yes' if registration.ambiguous else 'no'}"
+    )
+
+
+def draw_registration(registration: Registration, scene: Scene) -> NDArray[np.uint8]:
+    """Keyframes of the scene side by side, the object drawn over the lower row, coloured by its height."""
+    assert registration.map_registration is not None
+    model = registration.model
+    nodes = model.positions(model.default)
+    world = registration.map_registration.world_from_object.apply(nodes)
+    height = 1e3 * (nodes[:, 2] - nodes[:, 2].min())
+    columns = []
+    for view in spread_views(points_and_views(scene)[1], N_PICTURES):
+        local = view.camera_from_world.apply(world)
+        image = np.asarray(cv2.cvtColor(view.normalized, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+        drawn = draw_overlay(
+            image,
+            scene.camera.project(local),
+            local[:, 2],
+            model.triangles,
+            height,
+            (0.0, float(height.max())),
+            label="z on the object [mm]",
+            alpha=0.5,
+            brightness=lambert(vertex_normals(local, model.triangles), np.array([-0.4, -0.6, -1.0]), 0.4),
+        )
+        columns.append(np.vstack([image, drawn]))
+    return np.hstack(columns)
