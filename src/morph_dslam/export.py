@@ -1,7 +1,7 @@
-"""The states of an export: parameter values along a path or on a grid, and their table.
+"""`morph export`: states of a model as a series for ParaView (VTU or XDMF) or as a glTF animation.
 
-Users give values in each parameter's own unit (that of `morph info`); arrays here are SI, (s, d) for s states
-of d parameters.
+States are parameter values along a path or on a grid. Users give values in each parameter's own unit (that of
+`morph info`); arrays here are SI, (s, d) for s states of d parameters.
 """
 
 from __future__ import annotations
@@ -178,11 +178,8 @@ def write_table(path: Path, model: ReducedModel, states: Array, places: Sequence
             writer.writerow([*place.values(), *values])
 
 
-# Binary glTF 2.0 (.glb): the visible surface, its modes as morph targets, the functions as an animation.
-# A separated displacement is what glTF calls morph targets: position = rest + sum_i weight_i target_i, with
-# the modes F_i as targets and the functions H_i(mu) as weights. Normals are left out on purpose: a viewer
-# then has to use those of the deformed triangles, where morphed normals would be wrong.
-# Source: Khronos Group, glTF 2.0 Specification, sections 3.7.2 (morph targets), 3.11 (animations), 4 (GLB).
+# Binary glTF 2.0 (Khronos specification, sections 3.7.2, 3.11 and 4): the modes are morph targets, the functions their
+# weights. Normals are left out: a viewer then uses those of the deformed triangles.
 
 
 FRAMES_PER_SECOND = 12.0
@@ -278,10 +275,8 @@ def write_glb(path: Path, model: ReducedModel, states: Array) -> None:
         file.write(struct.pack("<I4s", len(binary), b"BIN\0") + binary)
 
 
-# Series of VTU or XDMF files for ParaView, through meshio.
-# Points are the undeformed nodes; "Warp By Vector" with ``displacement`` draws the deformed shape. All values
-# are SI: metres and pascals. Tensors are written with nine components row by row, because VTK and XDMF order
-# six of them differently.
+# ParaView: points are the undeformed nodes, values are SI, and tensors have nine components row by row, because VTK and
+# XDMF order six of them differently.
 
 
 #: meshio's name and number of nodes of each cell type; meshio has no prisms of 15 nodes: their corners stand.
@@ -362,9 +357,6 @@ def write_xdmf_series(folder: Path, stem: str, model: ReducedModel, states: Arra
     places = [{"file": series.name, "step": i} for i in range(len(states))]
     write_table(folder / "states.csv", model, states, places)
     return series
-
-
-# `morph export`: choose the states, write them in one format.
 
 
 FORMATS = ("xdmf", "vtu", "gltf")

@@ -1,4 +1,4 @@
-"""What the page draws: a model's visible surface, moved and coloured for given parameters."""
+"""`morph explore`: a web server on this computer only, which answers with a model's surface, moved and coloured."""
 
 from __future__ import annotations
 
@@ -119,9 +119,6 @@ class ModelSurface:
             "fields": [asdict(field) for field in self.fields],
             "colours": np.asarray(colours).tolist(),
         }
-
-
-# `morph explore`: a small web server on this computer only, which answers with shapes and states.
 
 
 HOST = "127.0.0.1"

@@ -1,4 +1,9 @@
-"""Whether the parts of a reduced model fit together; asked before a model is written and after it is read."""
+"""The `.morph` file: HDF5, versioned, without pickles, and checked in full when loaded (docs/model-file.md).
+
+It begins with a block that HDF5 leaves to its user: a line of text and the SHA-256 of the rest. That is compared
+before the HDF5 library sees the file, which damaged structures can lead astray; then every array is checked by
+itself (`field_storage`) and against the others, so that a file of a faulty writer is refused as well.
+"""
 
 from __future__ import annotations
 
@@ -81,12 +86,6 @@ def _check_field(
         raise ValueError(f"field '{name}' holds values that are not finite")
 
 
-# A checksum of all that follows, in the block that HDF5 leaves to its user.
-# HDF5 files may begin with a block of any content (HDF5 File Format Specification, "user block"). Ours holds
-# a line of text and the SHA-256 of the rest of the file. It is compared before the HDF5 library sees the
-# file, for that library can be led astray by damaged structures: endless allocations, and worse.
-
-
 #: Length of the block in bytes; HDF5 asks for a power of two from 512.
 BLOCK = 512
 
@@ -120,12 +119,6 @@ def check_checksum(path: Path) -> None:
         raise ValueError("it does not begin as a model file")
     if found != _block(path):
         raise ValueError("its content does not match its checksum")
-
-
-# The `.morph` file: HDF5, versioned, without pickles, and checked in full when loaded.
-# The layout is documented in docs/model-file.md. A checksum over all bytes is compared before HDF5
-# opens the file; then every array is checked by itself (`field_storage`) and against the others, so that a
-# file of a faulty writer is refused as well.
 
 
 FORMAT = "morph-dslam reduced model"

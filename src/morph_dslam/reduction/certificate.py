@@ -1,9 +1,12 @@
-"""Stability of a sweep's solutions, and the bifurcations that it may have passed.
+"""The certificate: what a reduced model gets wrong on held-out solutions, and how stable the solutions are.
 
-An equilibrium is stable under its prescribed supports where the tangent on the free degrees of freedom is
-positive definite; Sylvester's law of inertia counts its negative eigenvalues from the factorisation. Where
-the count differs between two neighbours of the sweep, a critical point lies between them: a limit point, or
-a bifurcation from which a branch leaves that the sweep has not followed.
+Every figure is measured on held-out solves, which the reduction never uses (docs/certificate.md). Nodes count
+alike, as in the paper's "Cartesian mean error"; a value's size is the Euclidean norm of a vector and the Frobenius
+norm of a tensor, neither of which depends on the axes.
+
+An equilibrium is stable under its prescribed supports where the tangent on the free degrees of freedom is positive
+definite; Sylvester's law of inertia counts its negative eigenvalues from the factorisation. Where the count differs
+between two neighbours of the sweep, a critical point lies between them: a limit point, or a bifurcation.
 """
 
 from __future__ import annotations
@@ -82,12 +85,6 @@ def _statement(solved: int, known: int, unstable: int, passed: int) -> str:
     places = f"in {passed} places" if passed > 1 else "in one place"
     branches = f"; bifurcations may have been passed {places}" if passed else ""
     return f"{unstable} of {solved} solutions are unstable{branches}{told}"
-
-
-# The certificate: what a reduced model gets wrong on solutions that it has not seen.
-# Every figure is measured on held-out solves, which the reduction never sees (docs/certificate.md). Nodes
-# count alike, as in the paper's "Cartesian mean error"; a value's size is the Euclidean norm of a vector and
-# the Frobenius norm of a tensor, neither of which depends on the axes.
 
 
 CONFIDENCE = 0.95

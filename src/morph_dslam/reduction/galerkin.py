@@ -97,10 +97,6 @@ class GalerkinEquations:
         """Full solution (n,) of coefficients ``y`` (k,) at parameters ``mu`` (d,)."""
         return self.full.prescribed(mu) + y @ self.modes
 
-    def lift_slopes(self, slopes: Array, mu: Array) -> Array:
-        """Derivatives (d, n) of the full solution from those of the coefficients (d, k)."""
-        return self.full.prescribed_slopes(mu) + slopes @ self.modes
-
     def coefficients(self, x: Array, weights: Array | None = None) -> Array:
         """Coefficients (k,) of a full solution (n,): its projection, for modes orthonormal in ``weights``."""
         return self.modes @ (x if weights is None else weights * x)
@@ -133,15 +129,6 @@ def newton_correction(equations: Equations, x: Array, mu: Array) -> Array:
     """
     linearisation: Linearisation = equations.linearise(x, mu)
     return -linearisation.solve(linearisation.residual)
-
-
-# Galerkin solutions at any parameters, predicted from full solutions and corrected by quasi-Newton steps.
-# A prediction is polynomial regression of the full solutions and their sensitivities, later of all reduced
-# solutions, shifted by what it missed at the nearest solution known. Corrections start with the inverse of
-# the projected tangent there and update it by Broyden's method (Kelley, Iterative Methods for Linear and
-# Nonlinear Equations, 1995, chapter 7), so that each costs one residual in place of a tangent, which is made
-# anew where they converge slowly; the updated inverse is kept with the new solution. Where they do not
-# converge, Newton's method does, or follows the path from the nearest full solution.
 
 
 #: Modes are kept until so little of the states is left out, as a part of the tolerance of the reduction ...
@@ -199,6 +186,11 @@ def solid_equations(sweep: SweepProblem | None) -> SolidProblem:
 
 class ReducedSolver:
     """Solves equations projected on the modes of some of their solutions.
+
+    A prediction is polynomial regression of the full solutions and their sensitivities, later of all reduced
+    solutions, shifted by what it missed at the nearest solution known. Broyden's method corrects it (Kelley,
+    Iterative Methods for Linear and Nonlinear Equations, 1995, chapter 7) with the inverse of the projected tangent
+    there, made anew where it converges slowly; else Newton's method, or the path from the nearest full solution.
 
     Parameters
     ----------

@@ -1,4 +1,9 @@
-"""Recognising samples that are all points of a full, evenly spaced grid."""
+"""Functions of the parameters through values on a full grid.
+
+Along lines through the middle and towards the corners of the box the sought functions are sampled finely; each
+parameter gets as many nodes as interpolation along its lines needs. The values on the grid of these nodes are then
+decomposed (`tensor_formats`). `EvenGrid` recognises samples that are all points of an evenly spaced grid.
+"""
 
 from __future__ import annotations
 
@@ -60,12 +65,6 @@ class EvenGrid:
     def tensor(self, values: Array) -> Array:
         """Values (n, m) at the samples as a tensor (m, n_1, ..., n_d) over the grid."""
         return np.moveaxis(values[self.order].reshape(*self.counts, -1), -1, 0)
-
-
-# Functions of the parameters through values on a full grid, whose size along each parameter lines decide.
-# Along lines through the middle and towards the corners of the box the sought functions are sampled finely;
-# each parameter gets as many nodes as interpolation along its lines needs. The values on the grid of these
-# nodes are then decomposed (`tensor_formats`).
 
 
 #: Nodes along the lines that decide the size of a grid, and how far from the middle lines run.

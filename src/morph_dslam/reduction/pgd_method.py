@@ -124,11 +124,6 @@ class PgdFields:
         return reaction_names(probes, self.solid.problem.length)
 
 
-# The method "pgd": a linear solid solved for all parameters at once, without any snapshot.
-# The separated stiffness and load of the finite elements (`linear_solid`) go to a-priori PGD, and its modes
-# give strains, stresses and reactions (`pgd_fields`).
-
-
 #: Numbers of functions of one parameter that are tried.
 SIZES = (5, 9, 17, 33, 65, 129)
 

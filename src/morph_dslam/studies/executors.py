@@ -112,11 +112,6 @@ def default_executor(workers: int | None) -> Iterator[Executor]:
     executor.shutdown()
 
 
-# A Dask cluster to solve on, by the address of its scheduler.
-# Starts are sent to its workers and snapshots come back, so they need no folder in common with the build. A
-# worker that is lost is no harm: the scheduler gives its samples to others.
-
-
 #: Seconds to wait for a scheduler to answer.
 PATIENCE = 10.0
 

@@ -145,9 +145,6 @@ def bounds(study: ParametricStudy) -> Array:
     return np.array([[parameter.lower, parameter.upper] for parameter in study.model_parameters()])
 
 
-# What a build is doing, for whoever waits: one line for each phase, between the progress bars.
-
-
 def announce(phase: str) -> None:
     """Print the name of the phase that begins, on the stream of the progress bars and above them."""
     tqdm.write(phase, file=sys.stderr)

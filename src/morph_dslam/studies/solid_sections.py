@@ -1,4 +1,8 @@
-"""The [mesh] section of a study: a file, or a structured generator and its arguments."""
+"""The [mesh], [[shape]], [[supports]] and [[loads]] sections of a solid's study.
+
+A value is a number with its unit, the name of a parameter, or a linear expression of parameters
+(`morph_dslam.studies.affine`). ``make`` turns a section into what the solver understands.
+"""
 
 from __future__ import annotations
 
@@ -185,11 +189,6 @@ def mesh_fingerprint(mesh: Mesh) -> str:
     return digest.hexdigest()
 
 
-# The [[shape]] sections of a solid's study: how its undeformed shape varies from the mesh.
-# Each moves the mesh's nodes by an amplitude, a length that may name parameters, along a field of
-# `morph_dslam.mechanics.morphing`. Sections add up.
-
-
 Array = NDArray[np.float64]
 
 
@@ -258,11 +257,6 @@ def _check_ends(
                 if used
             )
             raise StudyError(f"the shape at {where or 'its amplitude'}: {error}") from error
-
-
-# The [[supports]] and [[loads]] of a solid's study: each names a set of the mesh and what acts there.
-# A value is a number with its unit, the name of a parameter, or a linear expression of parameters
-# (`morph_dslam.studies.affine`). ``make`` turns a section into what the solver understands.
 
 
 #: A quantity in a study file.
