@@ -2,7 +2,7 @@
 SHELL := bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DELETE_ON_ERROR:
-.PHONY: demo test test-all test-lowest bench lint docs clean
+.PHONY: demo test test-all test-lowest bench lint docs quick-start clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -57,6 +57,15 @@ lint: $(INSTALLED)
 docs: $(INSTALLED)
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "the documentation is in build/site/index.html"
+
+# The wheel, installed in an environment of its own, runs the quick start outside of this folder.
+quick-start:
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer, with its venv module, is needed"; exit 1; }
+	@rm -rf build/wheel && mkdir -p build/wheel/run
+	@$(PYTHON) -m venv build/wheel/venv
+	@build/wheel/venv/bin/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir build/wheel .
+	@build/wheel/venv/bin/pip install --quiet --disable-pip-version-check "$$(ls build/wheel/*.whl)[demo]"
+	@cd build/wheel/run && MORPH=../venv/bin/morph ../venv/bin/python ../../../docs/run_quick_start.py
 
 clean:
 	rm -rf demo examples/*/output build dist .pytest_cache .ruff_cache .import_linter_cache

@@ -56,6 +56,13 @@ COMMANDS_INTRODUCTION = """\
 Nothing prompts, and nothing needs a display.
 """
 
+STUDY_KEYS_INTRODUCTION = """\
+# Study keys
+
+All keys with their defaults. [Study of a solid](../solid-study.md) and [study of a sheet](../study-file.md) explain them.
+
+"""
+
 #: What the pages have documented so far: public names, and what pages of "How it works" refer to.
 _documented: set[str] = set()
 
@@ -70,6 +77,7 @@ def on_files(files, config):
         "reference/api.md": api_page(),
         "reference/extend.md": extend_page(),
         "reference/commands.md": commands_page(),
+        "reference/study-keys.md": study_keys_page(),
         "changelog.md": _from_root("CHANGELOG.md"),
         "contributing.md": _from_root("CONTRIBUTING.md"),
     }
@@ -192,6 +200,11 @@ def commands_page() -> str:
                 rows.append(f"| {_spelling(action)} | {_meaning(action, one_of, parser.prog)} |")
         parts.append("\n".join(rows) + "\n")
     return "\n".join(parts)
+
+
+def study_keys_page() -> str:
+    """All keys of studies, from the models that read them."""
+    return STUDY_KEYS_INTRODUCTION + importlib.import_module("morph_dslam.studies.reference").study_reference()
 
 
 def _spelling(action: argparse.Action) -> str:
