@@ -149,10 +149,6 @@ class SimilarityTransform:
         """Move points (..., 3)."""
         return self.scale * (points @ self.rotation.T) + self.translation
 
-    def apply_to_pose(self, pose: RigidTransform) -> RigidTransform:
-        """The pose of the same camera in the target: target_from_source applied to source_from_camera."""
-        return RigidTransform(self.rotation @ pose.rotation, self.apply(pose.translation))
-
 
 def fit_similarity(source: Array, target: Array, with_scale: bool = True) -> SimilarityTransform:
     """The transform target_from_source that moves points (n, 3) closest to others (n, 3) (Umeyama 1991).

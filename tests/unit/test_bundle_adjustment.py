@@ -100,7 +100,6 @@ def test_fixed_cameras_stay_and_the_cost_is_the_sum_of_huber_terms():
     )
     expected = np.where(errors <= 2.0, errors**2 / 2.0, 2.0 * (errors - 1.0)).sum()
     assert found.cost == pytest.approx(expected, rel=1e-9)
-    assert found.cost < 0.1 * found.initial_cost
 
 
 def test_a_point_behind_its_camera_counts_as_a_miss():

@@ -1,10 +1,8 @@
-"""The map's book-keeping and the point cloud file."""
+"""The map's book-keeping."""
 
-import meshio
 import numpy as np
 
 from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, REMOVED, Followed, Keyframe, RigidMap
-from morph_dslam.slam.run import save_ply
 from morph_dslam.slam.tracking import FewTemplates
 
 
@@ -69,12 +67,6 @@ def test_new_corners_join_the_keyframe_that_found_them():
     rigid_map.extend_keyframe(1, Followed(ids, np.ones((2, 2))))
     assert rigid_map.keyframes[1].point_ids.tolist() == [1, 3, 4, 5]
     assert rigid_map.good.tolist() == [0, 1, 2, 3]
-
-
-def test_the_point_cloud_is_read_by_another_program(tmp_path):
-    points = np.random.default_rng(0).normal(size=(7, 3))
-    save_ply(tmp_path / "map.ply", points)
-    assert np.allclose(meshio.read(tmp_path / "map.ply").points, points, atol=1e-6)
 
 
 def test_few_keyframes_are_chosen_that_show_most_points():

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.slam.depth import DepthImage, StereoImages, depth_of
+from morph_dslam.slam.frame_images import DepthImage, StereoImages, depth_of
 from morph_dslam.slam.pose import refine_pose
 from tests.support.rendered_sequence import printed_texture
 

@@ -313,11 +313,10 @@ class Observations:
 
 @dataclass(frozen=True)
 class Adjustment:
-    """Adjusted ``camera_from_world`` (c, 4, 4) and ``points`` (p, 3), Huber costs in px^2, iterations."""
+    """Adjusted ``camera_from_world`` (c, 4, 4) and ``points`` (p, 3), Huber cost in px^2, iterations."""
 
     camera_from_world: Array
     points: Array
-    initial_cost: float
     cost: float
     iterations: int
 
@@ -353,9 +352,8 @@ def adjust(
     camera = np.append(np.asarray(intrinsics, dtype=np.float64), baseline_px)
     poses = np.ascontiguousarray(camera_from_world, dtype=np.float64)
     points = np.ascontiguousarray(points, dtype=np.float64)
-    before = total_cost(poses, points, camera_idx, point_idx, pixels, camera, huber_px)
     poses, points, cost, done = _adjust(
         poses, points, slot, camera_idx, point_idx, start, pixels, camera, huber_px, iterations, tolerance
     )
     poses[~fixed] = orthonormal(poses[~fixed])
-    return Adjustment(poses, points, float(before), float(cost), int(done))
+    return Adjustment(poses, points, float(cost), int(done))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.slam.bundle_adjustment import Adjustment, Observations, adjust
-from morph_dslam.slam.depth import FrameDepth, depth_of
+from morph_dslam.slam.frame_images import FrameDepth, depth_of
 from morph_dslam.slam.pose import check_points, project, rays, reprojection_errors, triangulate, world_points
 from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, Followed, Indices, Keyframe, RigidMap
 from morph_dslam.tracking.patches import FLOW_WINDOW, spread_corners

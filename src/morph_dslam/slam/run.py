@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import meshio
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -116,7 +117,7 @@ def run_slam(
 def write_run(folder: Path, scene: Scene, more: dict[str, Any]) -> dict[str, Any]:
     """Write all files but the video; returns the content of ``summary.json``, of which ``more`` is a part."""
     save_trajectory(folder / "trajectory.txt", scene.trajectory)
-    save_ply(folder / "map.ply", scene.points)
+    meshio.Mesh(scene.points, []).write(folder / "map.ply")
     scene.save(folder / "map.h5")
     _write_colmap(folder / "colmap", scene)
     _write_csv(folder / "frames.csv", scene)
@@ -232,15 +233,3 @@ def draw_frame(image: NDArray[np.uint8], frame: SlamFrame) -> NDArray[np.uint8]:
         width = round(thickness * size)
         cv2.putText(drawn, text, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.45 * size, (grey, grey, grey), width, cv2.LINE_AA)
     return drawn
-
-
-def save_ply(path: Path, points: NDArray[np.float64]) -> None:
-    """Write points (n, 3) as a binary little-endian PLY file."""
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(points)}",
-        *(f"property float {axis}" for axis in "xyz"),
-        "end_header",
-    ]
-    path.write_bytes("\n".join(header).encode() + b"\n" + points.astype("<f4").tobytes())

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.slam.consensus import Sight
-from morph_dslam.slam.depth import FrameDepth
+from morph_dslam.slam.frame_images import FrameDepth
 from morph_dslam.slam.options import INLIER_PX, LEAST_CORRELATION, PATCH_HALF
 from morph_dslam.slam.pose import (
     LEAST_DEPTH,
