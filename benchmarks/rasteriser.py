@@ -1,8 +1,7 @@
-"""The rasteriser's speed against two plain ways of drawing the same mesh, in the same run, on one thread.
+"""The rasteriser's speed against the painter's algorithm on the same mesh, in the same run, on one thread.
 
-The mesh is a bent sheet of 5 000 triangles over a third of a 640x480 image. The baselines are the numpy twin,
-which draws the same buffers, and the painter's algorithm on OpenCV's polygons, which knows neither depth nor
-weights. Run: python benchmarks/rasteriser.py
+The mesh is a bent sheet of 5 000 triangles over a third of a 640x480 image. The painter's algorithm draws OpenCV's
+polygons and gives neither depth nor weights. Run: python benchmarks/rasteriser.py
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 
 from morph_dslam import Camera
 from morph_dslam.extend.rendering import draw_overlay, rasterise, render_textured
-from morph_dslam.render.rasteriser import rasterise_numpy
 
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 COLUMNS, ROWS = 59, 44
@@ -67,7 +65,6 @@ def main() -> None:
     overlay = median_ms(
         lambda: draw_overlay(image, pixels, depths, triangles, values, (0, 1), label="von Mises stress [MPa]"), 30
     )
-    twin = median_ms(lambda: rasterise_numpy(pixels, depths, triangles, *size), 2)
     painter = median_ms(lambda: paint(pixels, depths, triangles), 5)
     agreement = (paint(pixels, depths, triangles) >= 0) == buffers.covered
 
@@ -75,7 +72,6 @@ def main() -> None:
     print(f"rasterise                 {own:8.2f}")
     print(f"render_textured           {textured:8.2f}")
     print(f"draw_overlay (all of it)  {overlay:8.2f}")
-    print(f"numpy twin                {twin:8.2f}   {twin / own:6.1f} x rasterise")
     print(f"painter, fillConvexPoly   {painter:8.2f}   {painter / own:6.1f} x rasterise")
     print(f"the painter covers the same pixels but for {1 - agreement.mean():.2%}")
 

@@ -10,14 +10,14 @@ import pytest
 from morph_dslam.cli.app import main
 from morph_dslam.evaluation.depth import RIM_PX, depth_error
 from morph_dslam.evaluation.run_folder import load_run
-from morph_dslam.render.rasteriser import rasterise_numpy
+from tests.support.numpy_twins import rendering
 from tests.support.run_folders import CAMERA, write_run
 
 
 def surface_depth(run, row):
     """Exact depth (h, w) of the estimated surface, 0 beside it, drawn by the plain rasteriser."""
     nodes = run.camera_points(row)
-    drawn = rasterise_numpy(CAMERA.project(nodes), nodes[:, 2], run.model.triangles, 480, 640).depth
+    drawn = rendering.rasterise(CAMERA.project(nodes), nodes[:, 2], run.model.triangles, 480, 640).depth
     return np.where(np.isfinite(drawn), drawn, 0.0)
 
 

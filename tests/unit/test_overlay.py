@@ -4,10 +4,11 @@ import matplotlib
 import numpy as np
 import pytest
 
-from morph_dslam.render.overlay import blend_surface, blend_surface_numpy, draw_overlay, paint_surface
+from morph_dslam.render.overlay import blend_surface, draw_overlay, paint_surface
 from morph_dslam.render.rasteriser import rasterise
-from morph_dslam.render.shading import colour_bar, colour_table, lambert, vertex_normals, vertex_normals_numpy
+from morph_dslam.render.shading import colour_bar, colour_table, lambert, vertex_normals
 from tests.support.bent_sheet import LENGTH, bent_sheet_model
+from tests.support.numpy_twins import rendering
 
 PIXELS = np.array([[20.0, 40.0], [119.0, 40.0], [119.0, 139.0], [20.0, 139.0]])
 TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
@@ -52,7 +53,7 @@ def test_blending_agrees_with_its_plain_twin():
     buffers = rasterise(PIXELS, np.array([1.0, 1.2, 1.5, 0.9]), TRIANGLES, 240, 320)
     start = rng.integers(0, 256, (240, 320, 3), dtype=np.uint8)
     images = []
-    for blend in (blend_surface, blend_surface_numpy):
+    for blend in (blend_surface, rendering.blend_surface):
         image = start.copy()
         levels, brightness = np.array([-40.0, 120.0, 300.0, 80.0]), np.array([0.4, 1.0, 1.3, 0.8])
         table = colour_table("turbo")
@@ -96,7 +97,7 @@ def test_normals_of_an_arch_are_those_of_its_surface():
     inner = np.abs(x) < 0.49 * LENGTH
     found = vertex_normals(points, model.triangles)
     np.testing.assert_allclose(found[inner], expected[inner], atol=2e-3)
-    np.testing.assert_allclose(found, vertex_normals_numpy(points, model.triangles), atol=1e-12)
+    np.testing.assert_allclose(found, rendering.vertex_normals(points, model.triangles), atol=1e-12)
 
 
 def test_only_the_part_of_the_image_with_the_surface_is_painted():

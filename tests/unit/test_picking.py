@@ -6,8 +6,9 @@ import pytest
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.render.picking import nearest_on_outline, pick_surface, pick_surface_numpy
+from morph_dslam.render.picking import nearest_on_outline, pick_surface
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.numpy_twins import rendering
 
 CAMERA = Camera(640, 480, 528.0, 527.0, 320.3, 239.1)
 POSE = RigidTransform(rotation_exp(np.array([np.pi + 0.2, 0.1, -0.3])), np.array([0.02, -0.01, 0.6]))
@@ -55,7 +56,7 @@ def test_compiled_and_plain_picking_agree_also_on_what_is_behind_and_beside():
     triangles = np.array([rng.choice(300, 3, replace=False) for _ in range(80)])
     rays = rng.normal(size=(400, 3))
     rays[:5] = np.nan
-    found, plain = pick_surface(nodes, triangles, rays), pick_surface_numpy(nodes, triangles, rays)
+    found, plain = pick_surface(nodes, triangles, rays), rendering.pick_surface(nodes, triangles, rays)
     assert np.array_equal(found.triangles, plain.triangles)
     assert 50 < np.count_nonzero(found.triangles >= 0) < 350
     np.testing.assert_allclose(found.weights, plain.weights, atol=1e-9)

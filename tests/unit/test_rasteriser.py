@@ -5,9 +5,10 @@ import pytest
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import rotation_exp
-from morph_dslam.render.rasteriser import rasterise, rasterise_numpy, visible_points
-from morph_dslam.render.texture import render_textured, render_textured_numpy
+from morph_dslam.render.rasteriser import rasterise, visible_points
+from morph_dslam.render.texture import render_textured
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.numpy_twins import rendering
 
 CAMERA = Camera(96, 72, 80.0, 82.0, 47.0, 36.5)
 SIZE = (CAMERA.height, CAMERA.width)
@@ -90,7 +91,7 @@ def test_mesh_is_watertight():
 def test_rasteriser_agrees_with_its_plain_twin(mu):
     model = bent_sheet_model(15, 11)
     points = model.positions(np.array(mu)) @ np.diag([1.0, -1.0, -1.0]) + [0.02, 0.0, 0.4]
-    compiled, plain = (draw(points, model.triangles, function) for function in (rasterise, rasterise_numpy))
+    compiled, plain = (draw(points, model.triangles, function) for function in (rasterise, rendering.rasterise))
     np.testing.assert_array_equal(compiled.triangle_ids, plain.triangle_ids)
     np.testing.assert_allclose(compiled.depth, plain.depth, rtol=1e-6)
     np.testing.assert_allclose(compiled.weights, plain.weights, atol=1e-6)
@@ -117,7 +118,7 @@ def test_texturing_agrees_with_its_plain_twin(channels):
     buffers = draw(points, model.triangles)
     coordinates = (model.nodes[:, :2] + [0.21, 0.1485]) * 200.0
     compiled = render_textured(buffers, model.triangles, coordinates, texture)
-    plain = render_textured_numpy(buffers, model.triangles, coordinates, texture)
+    plain = rendering.render_textured(buffers, model.triangles, coordinates, texture)
     assert compiled.shape == SIZE + texture.shape[2:]
     assert not compiled[~buffers.covered].any()
     assert np.abs(compiled.astype(int) - plain).max() <= 1
@@ -138,7 +139,7 @@ def tetrahedron(turned):
     return 0.2 * points @ rotation_exp(turned).T + np.array([0.0, 0.0, 0.6]), triangles
 
 
-@pytest.mark.parametrize("rasteriser", [rasterise, rasterise_numpy])
+@pytest.mark.parametrize("rasteriser", [rasterise, rendering.rasterise])
 @pytest.mark.parametrize("turned", [(0.3, 0.2, 0.1), (2.0, -0.4, 0.7), (-0.9, 2.5, 0.0)])
 def test_back_faces_of_a_closed_surface_are_left_out_without_a_difference(rasteriser, turned):
     points, triangles = tetrahedron(np.array(turned))

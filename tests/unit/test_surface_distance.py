@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from morph_dslam.evaluation.depth import distances_to_surface, distances_to_surface_numpy
+from morph_dslam.evaluation.depth import distances_to_surface
+from tests.support.numpy_twins import rendering
 
 TRIANGLE = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
 
@@ -29,7 +30,7 @@ def test_compiled_and_plain_distances_agree_on_a_closed_surface():
     triangles = np.array([rng.choice(60, 3, replace=False) for _ in range(90)])
     points = 2.0 * rng.normal(size=(200, 3))
     found = distances_to_surface(points, nodes, triangles)
-    assert np.allclose(found, distances_to_surface_numpy(points, nodes, triangles), atol=1e-12)
+    assert np.allclose(found, rendering.distances_to_surface(points, nodes, triangles), atol=1e-12)
 
 
 def test_distance_to_a_fine_sphere_is_the_difference_of_radii():

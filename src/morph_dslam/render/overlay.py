@@ -43,16 +43,6 @@ def blend_surface(image, triangle_ids, weights, triangles, levels, brightness, t
                 image[row, column, channel] = np.uint8(mixed + 0.5)
 
 
-def blend_surface_numpy(image, triangle_ids, weights, triangles, levels, brightness, table, alpha):
-    """The plain twin of `blend_surface`."""
-    covered = triangle_ids >= 0
-    corners = triangles[triangle_ids[covered]]
-    level, light = (np.einsum("kc,kc->k", weights[covered], field[corners])[:, None] for field in (levels, brightness))
-    entry = (np.clip(level[:, 0], 0.0, 255.0) + 0.5).astype(int)
-    colour = np.minimum(light * table[entry], 255.0)
-    image[covered] = ((1.0 - alpha) * image[covered] + alpha * colour + 0.5).astype(np.uint8)
-
-
 @dataclass(frozen=True)
 class Painted:
     """Where a surface was painted: ``covered`` (h, w) of the part of the image that begins at ``corner``.

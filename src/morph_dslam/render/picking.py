@@ -120,25 +120,6 @@ def _nearest(nodes, triangles, rays, order, starts, corner, size):
     return found, weights
 
 
-def pick_surface_numpy(camera_points: Array, triangles: NDArray[np.int64], rays: Array) -> SurfacePoints:
-    """The plain twin of `pick_surface`: every ray with every triangle."""
-    occluder_depth = np.flatnonzero((camera_points[triangles, 2] > 0.0).all(axis=1))
-    a, b, c = camera_points[triangles[occluder_depth]].transpose(1, 0, 2)
-    volume = np.einsum("mx,mx->m", a, np.cross(b, c))
-    volume[volume == 0.0] = np.nan  # seen edge-on: NaN weights, which no comparison accepts
-    dual = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)]) / volume[:, None]
-    scaled = np.einsum("px,cmx->cpm", rays, dual)
-    inverse_range = scaled.sum(axis=0)
-    hit = (scaled >= -EDGE_TOLERANCE * np.abs(inverse_range)).all(axis=0) & (inverse_range > 0.0)
-    nearest = np.where(hit, inverse_range, -np.inf).argmax(axis=1)
-    rows = np.arange(len(rays))
-    met = hit[rows, nearest]
-    inside = np.clip(scaled[:, rows[met], nearest[met]].T, 0.0, None)
-    weights = np.full((len(rays), 3), np.nan)
-    weights[met] = inside / inside.sum(axis=1, keepdims=True)
-    return SurfacePoints(np.where(met, occluder_depth[nearest], -1), weights)
-
-
 def nearest_on_outline(
     camera_points: Array, node_pixels: Array, triangles: NDArray[np.int64], pixels: Array
 ) -> tuple[SurfacePoints, Array]:

@@ -32,13 +32,13 @@ def load_triangle(pixels, depths, triangles, t, closed, u, v, inverse_depth):
     Twice its area in the image, squared pixels, negative where the corners run anticlockwise; 0 if it is not
     to be drawn: a corner is not in front of the camera, or it is turned away or degenerate.
     """
-    occluder_depth = True
+    ahead = True
     for corner in range(3):
         node = triangles[t, corner]
-        occluder_depth &= depths[node] > 0.0 and np.isfinite(pixels[node, 0] + pixels[node, 1])
+        ahead &= depths[node] > 0.0 and np.isfinite(pixels[node, 0] + pixels[node, 1])
         u[corner], v[corner] = pixels[node, 0], pixels[node, 1]
     area = (u[1] - u[0]) * (v[2] - v[0]) - (u[2] - u[0]) * (v[1] - v[0])
-    is_drawn = occluder_depth and abs(area) > LEAST_AREA and not (closed and area >= 0.0)
+    is_drawn = ahead and abs(area) > LEAST_AREA and not (closed and area >= 0.0)
     if is_drawn:
         for corner in range(3):
             inverse_depth[corner] = 1.0 / depths[triangles[t, corner]]
@@ -192,38 +192,6 @@ def image_region(pixels: Array, height: int, width: int, margin: int = 0) -> tup
     if left >= right or top >= bottom:
         return None
     return slice(int(top), int(bottom)), slice(int(left), int(right))
-
-
-def rasterise_numpy(
-    pixels: Array, depths: Array, triangles: NDArray, height: int, width: int, closed: bool = False
-) -> Buffers:
-    """The plain twin of `rasterise`: each triangle's weights by solving its 3x3 system over a window."""
-    buffers = _empty_buffers(height, width)
-    for t, nodes in enumerate(triangles):
-        corners, z = pixels[nodes], depths[nodes]
-        if not (np.isfinite(corners).all() and (z > 0.0).all()):
-            continue
-        system = np.vstack([corners.T, np.ones(3)])
-        area = np.linalg.det(system)
-        if not abs(area) > LEAST_AREA or (closed and area >= 0.0):
-            continue
-        low = np.ceil(np.maximum(corners.min(axis=0), 0)).astype(int)
-        high = np.floor(np.minimum(corners.max(axis=0), [width - 1, height - 1])).astype(int)
-        rows, columns = np.mgrid[low[1] : high[1] + 1, low[0] : high[0] + 1]
-        if rows.size == 0:
-            continue
-        window = (slice(low[1], high[1] + 1), slice(low[0], high[0] + 1))
-        image_weights = np.tensordot(
-            np.linalg.inv(system), np.stack([columns, rows, np.ones_like(rows)]).astype(float), axes=1
-        )
-        scaled = image_weights / z[:, None, None]
-        with np.errstate(divide="ignore"):
-            depth = 1.0 / scaled.sum(axis=0)
-        seen = (image_weights >= -EDGE_TOLERANCE).all(axis=0) & (depth < buffers.depth[window])
-        buffers.depth[window][seen] = depth[seen]
-        buffers.triangle_ids[window][seen] = t
-        buffers.weights[window][seen] = (scaled * depth).transpose(1, 2, 0)[seen]
-    return buffers
 
 
 def visible_points(

@@ -45,16 +45,6 @@ def vertex_normals(points: Array, triangles: NDArray) -> Array:
     return normals
 
 
-def vertex_normals_numpy(points: Array, triangles: NDArray) -> Array:
-    """The plain twin of `vertex_normals`."""
-    a, b, c = (points[triangles[:, corner]] for corner in range(3))
-    face_normals = np.cross(b - a, c - a)
-    nodes = triangles.T.ravel()
-    normals = np.column_stack([np.bincount(nodes, np.tile(component, 3), len(points)) for component in face_normals.T])
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return normals / np.where(length > 0.0, length, 1.0)
-
-
 def lambert(normals: Array, to_light: Array, ambient: float) -> Array:
     """Brightness (n,) from ``ambient`` to 1 of a matt surface that looks alike from both sides.
 

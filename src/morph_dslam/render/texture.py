@@ -155,23 +155,6 @@ def interpolate(buffers: Buffers, triangles: NDArray, node_values: NDArray) -> N
     return np.einsum("kc,kc...->k...", buffers.weights[covered], node_values[corners])
 
 
-def render_textured_numpy(
-    buffers: Buffers, triangles: NDArray, texture_coordinates: Array, texture: NDArray[np.uint8]
-) -> NDArray[np.uint8]:
-    """The plain twin of `render_textured`."""
-    last = np.array([texture.shape[1] - 1, texture.shape[0] - 1])
-    place = np.clip(interpolate(buffers, triangles, texture_coordinates), 0, last)
-    x0, y0 = place.astype(int).T
-    x1, y1 = np.minimum(x0 + 1, last[0]), np.minimum(y0 + 1, last[1])
-    shape = (-1,) + (1,) * (texture.ndim - 2)
-    right, down = (place[:, 0] - x0).reshape(shape), (place[:, 1] - y0).reshape(shape)
-    above = (1.0 - right) * texture[y0, x0] + right * texture[y0, x1]
-    below = (1.0 - right) * texture[y1, x0] + right * texture[y1, x1]
-    image = np.zeros(buffers.triangle_ids.shape + texture.shape[2:], dtype=np.uint8)
-    image[buffers.covered] = ((1.0 - down) * above + down * below + 0.5).astype(np.uint8)
-    return image
-
-
 # Points of a sheet by their place in its rest plane: texture coordinates, regular grids, landmarks.
 
 
