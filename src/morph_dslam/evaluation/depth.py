@@ -104,9 +104,6 @@ def distances_to_surface(points: Array, nodes: Array, triangles: NDArray[np.inte
     return _least_distances(points, corners, np.concatenate(near).astype(np.int64), starts)
 
 
-# Depth images by frame number: what the surfaces of a run are measured against.
-
-
 DepthImage = NDArray[np.float32]
 
 
@@ -120,11 +117,6 @@ def read_depths(
     path : a ``depth.h5`` of `morph simulate`; a folder of numbered 16-bit images; or a recording with depth
         of its own, in the layout of TUM RGB-D or 7-Scenes.
     values_per_metre : of the images of a folder, which is taken for a recording without it.
-
-    Raises
-    ------
-    EvaluationError
-        If there is nothing of the kind, it is damaged, or a file is given a unit.
     """
     wanted = sorted(frames)
     try:
@@ -184,19 +176,11 @@ def _from_recording(path: Path, frames: Sequence[int]) -> Iterator[tuple[int, De
         )
 
 
-# Surface error: how far a depth sensor's points are from the estimated surface, as the paper measures it.
-# A depth image shows where the surface is, not which point of the material is where: a shape that slides
-# along itself passes here, and only `material_error` sees it. What the sensor itself gets wrong is measured
-# in a base frame, where the object is not deformed, and stands beside the figures; it is not taken off them.
-
-
 #: Depth within this many pixels of the estimated outline may belong to what is behind the object.
 RIM_PX = 4
-
 #: Sensor points farther from the surface than this part of the object's size are of something else, a hand
 #: before it say; how many they are is reported.
 LARGEST_DISTANCE = 0.1
-
 #: Points compared in a frame, spread evenly over those seen.
 MOST_POINTS = 4000
 
@@ -271,12 +255,6 @@ def depth_error(
     ----------
     path, values_per_metre : see `read_depths`; the depth images are as the run's camera sees them.
     base_frame : a frame in which the object is not deformed.
-
-    Raises
-    ------
-    EvaluationError
-        If no tracked frame has depth on the object, the base frame is not among those that have, or the
-        images are of another size.
     """
     camera, triangles = run.camera, run.model.triangles
     surface_nodes = np.unique(triangles)

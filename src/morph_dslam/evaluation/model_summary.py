@@ -16,10 +16,8 @@ from morph_dslam.model.tensor_functions import CPFunctions, ProductFunctions, Te
 
 #: Endings of certificate keys and the unit they stand for.
 _UNITS = {"_mm": "mm", "_percent": "%", "_MPa": "MPa", "_seconds": "s", "_ms": "ms", "_deg": "°"}
-
 #: Texts longer than this (a study's) are for programs, not for a summary.
 _LONGEST_TEXT = 120
-
 _FORMATS = {
     ParameterFunctions: "polynomials",
     CPFunctions: "CP",
@@ -30,7 +28,6 @@ _FORMATS = {
 
 #: Long lists of the reduction, which the build's report draws.
 _DRAWN = ("singular_values", "cross_validation")
-
 Facts = dict[str, str]
 
 

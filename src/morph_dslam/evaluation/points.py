@@ -18,7 +18,6 @@ from morph_dslam.model import SurfacePoints
 from morph_dslam.render.picking import nearest_on_outline, pick_surface
 
 Array = NDArray[np.float64]
-
 LAYOUT = (
     "frame (t,) whole numbers, points_mm (t, p, 3) in the camera frame, pixels (t, p, 2) and, if known, visible (t, p)"
 )
@@ -83,9 +82,6 @@ def load_truth(path: Path) -> PointTruth:
     return PointTruth(frames.astype(np.int64), points.astype(float) / 1000.0, pixels.astype(float), ~visible)
 
 
-# Names of a model file's fields in words.
-
-
 _TITLES = {
     "displacement": "displacement",
     "stress_top": "stress, top face",
@@ -103,11 +99,6 @@ def field_title(name: str) -> str:
         if name.startswith(start):
             return words + name.removeprefix(start)
     return _TITLES.get(name, name)
-
-
-# Material error: how far material points are from where the run says they are, without any alignment.
-# Each truth point is bound to the mesh by its pixel in one frame, then followed on the estimated surface
-# through the other frames: a shape that is right but slides along itself does not pass.
 
 
 #: A truth point whose pixel misses the estimated surface by no more than this is bound to its outline.
@@ -187,13 +178,7 @@ class MaterialError:
 
 
 def bind_truth(run: Run, truth: PointTruth, frame: int) -> Binding:
-    """Bind truth points to the mesh by their pixels in ``frame``, in the state estimated there.
-
-    Raises
-    ------
-    EvaluationError
-        If the truth or the run has no such frame, it was not tracked, or no pixel falls on the mesh.
-    """
+    """Bind truth points to the mesh by their pixels in ``frame``, in the state estimated there."""
     in_truth = np.flatnonzero(truth.frames == frame)
     if not in_truth.size:
         known = ", ".join(str(number) for number in truth.frames)
@@ -226,13 +211,7 @@ def bind_truth(run: Run, truth: PointTruth, frame: int) -> Binding:
 
 
 def material_error(run: Run, truth: PointTruth, bind_frame: int) -> MaterialError:
-    """Compare every truth frame except the binding one with the run.
-
-    Raises
-    ------
-    EvaluationError
-        As `bind_truth`, or if no other truth frame was tracked.
-    """
+    """Compare every truth frame except the binding one with the run."""
     binding = bind_truth(run, truth, bind_frame)
     corners, weights = run.model.triangles[binding.points.triangles], binding.points.weights
     frames, vectors, truths, sight, untracked, outside = [], [], [], [], [], []
@@ -305,18 +284,11 @@ def summarise(error: MaterialError) -> dict[str, Any]:
     }
 
 
-# Tables of a certificate's errors, from certificates of any version of the model file.
-
-
 #: Endings of a certificate's keys and the unit in which their values are.
 _UNITS = {"_mm": "mm", "_MPa": "MPa", "_Nmm": "N mm", "_N": "N"}
-
 _ABSOLUTE = ("mean", "max", "worst_sample_mean", "largest")
-
 _HEADER = ("field", "mean", "largest", "worst mean", "largest value", "unit", "mean / largest", "relative L2")
-
 _SENSITIVITY_HEADER = ("parameter", "mean / largest", "relative L2")
-
 _UNKNOWN = "–"
 
 

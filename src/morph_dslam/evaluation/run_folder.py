@@ -19,9 +19,7 @@ from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.discrepancy import Discrepancy, load_discrepancies
 
 Array = NDArray[np.float64]
-
 FORMAT = "morph-dslam run"
-
 VERSION = 1
 
 
@@ -124,9 +122,6 @@ def load_run(folder: Path) -> Run:
     if not len(run.frames):
         raise EvaluationError(f"{path} holds no frames: track again")
     return run
-
-
-# The figures of an evaluation in words.
 
 
 def remarks(figures: Mapping[str, Any]) -> list[str]:

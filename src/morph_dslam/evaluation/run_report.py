@@ -24,9 +24,7 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.sources.frames import open_capture
 
 DPI = 110
-
 MEDIAN, MEAN = "#b4530a", "#1b1f24"
-
 #: More frames than this are drawn as bands.
 MOST_BOXES = 30
 
@@ -150,16 +148,10 @@ def _plot_map(path: Path, rest: NDArray, mean: NDArray, model: ReducedModel, lab
     figure.savefig(path, dpi=DPI)
 
 
-# The report of a run: figures, plots, a few augmented frames, and the model it used.
-
-
 VIDEO = "augmented.mp4"
-
 N_FRAMES_SHOWN = 4
-
 #: Keys of ``summary.json`` that the figures of the evaluation repeat.
 _SHOWN_ABOVE = ("model", "n_frames", "n_tracked", "median_ms", "p95_ms")
-
 _CAPTIONS = {
     "evaluation.png": "Material error over the points of each frame with truth.",
     "error_map.png": "Mean material error where each point lies on the undeformed object.",
@@ -245,13 +237,7 @@ def _tracking_sections(run: Run) -> list[Section]:
 
 
 def write_run_report(run: Run, figures: Mapping[str, Any]) -> Path:
-    """Write ``report.html`` into a run folder; ``figures`` are those of ``evaluation.json``.
-
-    Raises
-    ------
-    EvaluationError
-        If the run's summary is damaged.
-    """
+    """Write ``report.html`` into a run folder; ``figures`` are those of ``evaluation.json``."""
     tracking, settings = _tracking_sections(run)
     sections = [
         _error_section(run, figures),

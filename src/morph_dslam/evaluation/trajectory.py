@@ -65,9 +65,6 @@ def summarise_alignment(error: MaterialError) -> dict[str, Any]:
     }
 
 
-# Errors of a camera trajectory against the truth (Sturm et al. 2012): absolute and relative.
-
-
 #: Poses of estimate and truth belong together if they are at most this far apart in time, seconds.
 MOST_TIME_DIFFERENCE = 0.01
 
@@ -146,13 +143,7 @@ def associate(first: Array, second: Array, most: float = MOST_TIME_DIFFERENCE) -
 
 
 def match(estimate: Trajectory, truth: Trajectory, most: float = MOST_TIME_DIFFERENCE) -> tuple[Trajectory, Trajectory]:
-    """The poses of both trajectories (n each) that belong together in time.
-
-    Raises
-    ------
-    EvaluationError
-        If there are fewer than three.
-    """
+    """The poses of both trajectories (n each) that belong together in time."""
     pairs = associate(estimate.timestamps, truth.timestamps, most)
     if len(pairs) < 3:
         spans = [f"{t.timestamps[0]:.3f} to {t.timestamps[-1]:.3f} s" for t in (estimate, truth)]
@@ -168,13 +159,7 @@ def match(estimate: Trajectory, truth: Trajectory, most: float = MOST_TIME_DIFFE
 
 
 def absolute_error(estimate: Trajectory, truth: Trajectory, with_scale: bool) -> AbsoluteError:
-    """The absolute trajectory error of matched trajectories after SE(3), or ``with_scale`` Sim(3), alignment.
-
-    Raises
-    ------
-    EvaluationError
-        If the estimated centres coincide, so that no scale fits.
-    """
+    """The absolute trajectory error of matched trajectories after SE(3), or ``with_scale`` Sim(3), alignment."""
     try:
         alignment = fit_similarity(estimate.positions, truth.positions, with_scale)
     except ValueError as error:
@@ -192,11 +177,6 @@ def relative_error(estimate: Trajectory, truth: Trajectory, interval: float, sca
     ----------
     interval : seconds (frames where trajectories are stamped with frame numbers).
     scale : of the truth over the estimate; multiplies the estimate's translations.
-
-    Raises
-    ------
-    EvaluationError
-        If no motion is that long.
     """
     times = estimate.timestamps
     ends = np.searchsorted(times, times + interval)
@@ -223,14 +203,9 @@ def _angles(rotations: Array) -> Array:
     return np.arctan2(sine, 0.5 * (np.trace(rotations, axis1=1, axis2=2) - 1.0))
 
 
-# The evaluation of a trajectory: figures and a picture, written beside it.
-
-
 #: The relative error is taken over motions this long, seconds, where the trajectory allows it.
 INTERVAL = 1.0
-
 DPI = 110
-
 TRUTH, ESTIMATE = "#1b1f24", "#b4530a"
 
 

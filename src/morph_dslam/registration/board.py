@@ -22,11 +22,9 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.registration.initialization import Section, Vector, read_file
 
 Array = NDArray[np.float64]
-
 #: Places on an edge, the part of it they spread over, and how far across it its brightness is looked at, as a
 #: share of its length and pixels.
 N_PLACES, INNER, REACH_SHARE, REACHES_PX = 15, (0.12, 0.88), 0.08, (1.5, 4.0)
-
 ITERATIONS = 3
 
 
@@ -80,7 +78,6 @@ def _from_edges(image: NDArray[np.float32], corners: Array) -> Array:
 
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-
 #: Names of the dictionaries of markers, as in OpenCV without its prefix, in lower case.
 DICTIONARIES = tuple(
     sorted({name[5:].lower() for name in dir(cv2.aruco) if name.startswith("DICT_")})  # type: ignore[attr-defined]
@@ -88,9 +85,7 @@ DICTIONARIES = tuple(
 
 #: Fewer corners are not believed: one marker has four.
 FEWEST_CORNERS = 4
-
 DOTS_PER_INCH = 300
-
 #: A side of a print is at most so long, metres: beyond it the unit was mistaken.
 LARGEST_SIDE = 10.0
 
@@ -203,13 +198,7 @@ class FiducialBoard:
 
 
 def load_board(path: Path) -> FiducialBoard:
-    """Read a board file.
-
-    Raises
-    ------
-    RegistrationError
-        If it is missing, no TOML, or says something impossible.
-    """
+    """Read a board file."""
     description = read_file(path, "board file", BoardFile)
     board = FiducialBoard(description)
     try:
@@ -223,13 +212,7 @@ def load_board(path: Path) -> FiducialBoard:
 
 
 def print_board(board: FiducialBoard, path: Path) -> None:
-    """Write the board in its true size as a PNG or PDF file, with a white margin and a line to measure.
-
-    Raises
-    ------
-    RegistrationError
-        If the file cannot be written.
-    """
+    """Write the board in its true size as a PNG or PDF file, with a white margin and a line to measure."""
     from matplotlib.figure import Figure
 
     inch, margin = 0.0254, 0.015

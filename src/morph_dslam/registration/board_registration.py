@@ -31,13 +31,10 @@ from morph_dslam.slam.scene import Scene
 from morph_dslam.tracking.state import State, moved
 
 Array = NDArray[np.float64]
-
 #: Standard deviation of a corner at the least, and residuals that speak against board or camera, pixels.
 LEAST_CORNER_PX, LARGEST_RESIDUAL_PX = 0.1, 2.0
-
 #: Another pose whose squared residuals are at most so many times as large is ambiguous with the best.
 AMBIGUOUS = 4.0
-
 #: By how much a board's size may differ from that in a metric map.
 METRIC_SHARE = 0.03
 
@@ -70,13 +67,7 @@ class BoardPose:
 
 
 def locate_board(board: FiducialBoard, camera: Camera, grey: NDArray[np.uint8]) -> BoardPose | None:
-    """The board in an undistorted image (h, w); None where too little of it is seen.
-
-    Raises
-    ------
-    RegistrationError
-        If its corners do not lie as on this board.
-    """
+    """The board in an undistorted image (h, w); None where too little of it is seen."""
     points, pixels = board.find(grey)
     if len(points) < FEWEST_CORNERS:
         return None

@@ -29,25 +29,18 @@ from morph_dslam.tracking.estimator import Estimate, EstimationOptions, Estimato
 from morph_dslam.tracking.state import BoundPoints, Prior, State
 
 Array = NDArray[np.float64]
-
 Image = NDArray[np.uint8]
-
 #: Points of the outline, and how far to either side of it edges are searched in turn, pixels.
 N_POINTS, REACHES, LAST_REACHES = 160, (24, 16, 12, 8, 6, 4), (3, 2, 2)
-
 #: Fall in a pixel that is an edge, of the likelihood and of brightness over its range, and how near to the
 #: outline it must be in the end, pixels.
 LEAST_EDGE, NEAR_PX = 0.04, 1.5
-
 #: Side of the median filter that takes out the strokes of a print, grey levels in a bin of the histograms.
 MEDIAN, BIN = 9, 8
-
 #: Of what chance does not put on edges, so much must be.
 LEAST_SHARE = 0.8
-
 #: Errors are alike along each side of an outline: its points count as so many independent ones.
 N_INDEPENDENT = 6
-
 #: How sure the guessed parameters are, over their range: an outline says little of the shape.
 GUESS_SHARE = 0.05
 

@@ -16,16 +16,12 @@ from morph_dslam.registration.registration import Axis
 from morph_dslam.registration.scene import MapPoints
 
 Array = NDArray[np.float64]
-
 #: Points spread over the surface.
 N_SAMPLES = 12000
-
 #: A surface turned about its axis of revolution stays where it was, up to this part of its size.
 SYMMETRY_TOLERANCE = 0.01
-
 #: Weight of staying in directions that the points leave open, over the weight of all points.
 PRIOR = 1e-4
-
 #: A wall of a hollow body, whose other side may be nearer to a point, is at most so thick over its size.
 WALL = 0.02
 

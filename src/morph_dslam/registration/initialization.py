@@ -18,10 +18,8 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.registration.registration import Registration
 
 Image = NDArray[np.uint8]
-
 #: A coordinate or an angle. None is meant by what is larger: in millimetres it would be ten kilometres.
 Number = Annotated[float, Field(ge=-1e7, le=1e7)]
-
 Vector = tuple[Number, Number, Number]
 
 
@@ -42,11 +40,6 @@ def read_file(path: Path, what: str, kind: type[AnySection]) -> AnySection:
     path : of the file.
     what : the file is, for the message.
     kind : its content.
-
-    Raises
-    ------
-    RegistrationError
-        If it is missing, no TOML, or says something impossible.
     """
     content = read_toml(path, what, RegistrationError)
     try:

@@ -26,38 +26,27 @@ from morph_dslam.registration.scene import MapPoints, View, camera_from_object, 
 from morph_dslam.registration.texture import WINDOW, PairDisplacements, TextureComparison
 
 Array = NDArray[np.float64]
-
 ITERATIONS = 8
-
 #: Steps are prolonged by at most so many times.
 MOST_EXTRAPOLATED = 4.0
-
 #: Keyframes adjusted, spread over all that see the object.
 MOST_VIEWS = 24
-
 #: Fewer measurements for each view are no evidence.
 FEWEST = 30
-
 #: Windows as large as the patches reach into the next ones: the sum over a patch holds only (2 / 3)^2 of what
 #: they have in common.
 ACROSS_PATCHES = 9.0 / 4.0
-
 #: What else neighbouring patches and points have in common, in variance: so much larger were the errors in
 #: ten rendered scans with known truth (benchmarks/registration_seeds.py, the first ten seeds).
 IN_COMMON = 16.0 / 9.0
-
 #: At most so many points, those that most views saw.
 MOST_STATIC = 2000
-
 #: Iterations for the points' places, and how far a point's block is from singular at the least.
 POINT_ITERATIONS, RIDGE = 3, 1e-6
-
 #: Points nearer than this part of the usual depth do not count.
 LEAST_DEPTH = 0.05
-
 #: Directions that are seen worse than this, over the best one, stay as they are.
 LEAST_SEEN = 1e-9
-
 #: Errors of all poses together are given by so many error factors: the registration's seven, and one more.
 N_FACTORS = 8
 

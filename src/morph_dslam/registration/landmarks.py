@@ -37,29 +37,21 @@ from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOpti
 from morph_dslam.tracking.refinement import refine_by_depth
 
 Array = NDArray[np.float64]
-
 #: Standard deviation of a carefully set landmark, pixels. Those that fit so many times worse are flagged.
 CLICK_PX, POOR_FIT = 0.5, 2.0
-
 #: Standard deviation of landmarks' pixels where they are too few to show it, and the least that is believed.
 UNKNOWN_PX, LEAST_PX = 2.0, 0.1
-
 #: Shares of the object's size: least extent of the landmarks, how far one may lie off the undeformed surface,
 #: and how far apart different minima are (mean over the mesh, in the camera frame).
 SPREAD_SHARE, SURFACE_SHARE, DISTINCT_SHARE = 0.12, 0.01, 0.02
-
 #: Largest residual (root mean square) as a share of the image's diagonal.
 RESIDUAL_SHARE = 0.005
-
 #: Objects of another size, metres, are flagged: a mesh in millimetres that was taken for metres is such.
 SIZES = (0.005, 10.0)
-
 #: Units that meshes come in, metres.
 UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 1e-3, "inches": 0.0254}
-
 #: Landmarks in another unit must be spread over this share of the object: on a point they lie anywhere.
 LEAST_SPREAD = 0.2
-
 #: On a sheet landmarks lie in any smaller unit: those spread over less than the first share of it, which
 #: would be spread over more than the second in another one, are flagged.
 PART_OF_IT, MOST_OF_IT = 0.5, 0.6

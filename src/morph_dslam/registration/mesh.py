@@ -36,45 +36,31 @@ from morph_dslam.registration.texture import TextureComparison
 from morph_dslam.render.rasteriser import rasterise
 
 Array = NDArray[np.float64]
-
 #: A point that the object would occlude counts against it as much as so many that it explains.
 VIOLATION = 2.0
-
 #: The views are drawn this much smaller.
 SHRINK = 4
-
 #: Sizes at which the surface starts, over that of the region.
 START_SIZES = (0.85, 1.1, 1.45)
-
 #: How far its middle starts behind that of the points, which lie on the filmed side; over their spread.
 START_BEHIND = (0.0, 0.6)
-
 #: Points used while searching; starts of a region that are followed to their end, scored by few keyframes,
 #: and refined and scored by more.
 MOST_POINTS, N_FOLLOWED, N_SCORED, N_REFINED = 120, 120, 40, 5
-
 #: Samples of the surface while searching, and keyframes asked for evidence, first and then.
 ROUGH_SAMPLES, FIRST_ASKED, MOST_ASKED = 3000, 3, 10
-
 #: Widths of the robust weights over the surface's size: for all starts, for the better ones, to refine these.
 COARSE = np.array([0.3, 0.25, 0.2, 0.15])
-
 MIDDLE = np.array([0.15, 0.12, 0.1, 0.08, 0.07, 0.06, 0.05])
-
 FINE = np.array([0.05, 0.04, 0.04, 0.03, 0.03, 0.025, 0.025, 0.02, 0.02, 0.02])
-
 #: A point explained lies this near to the surface, over its size.
 TOLERANCE = 0.015
-
 #: A lower score is no evidence.
 FEWEST_EXPLAINED = 20
-
 #: Two places are one if the surfaces are this near to each other, over their size.
 SAME_PLACE = 0.05
-
 #: The runner-up's score over the best's above which they are ambiguous.
 AMBIGUOUS = 0.8
-
 #: So many of the best places are compared by the images on them, if they score at least this part of the
 #: best. Images that differ by more than this, pixels, or so many times as much as on another place, speak
 #: against a place.
@@ -228,11 +214,6 @@ def register_mesh(
     camera : of the views, without distortion.
     metric : whether the map's unit is the metre.
     progress : whether to show a progress bar.
-
-    Raises
-    ------
-    RegistrationError
-        If no place in the map explains enough points.
     """
     rough, surface = Surface.of_mesh(nodes, triangles, ROUGH_SAMPLES), Surface.of_mesh(nodes, triangles)
     planes = find_planes(points.positions)
@@ -387,11 +368,6 @@ def register_in_unit(
     """As `register_mesh`; an object that a metric map does not hold is looked for in other sizes.
 
     A monocular map has no unit: there an object of another size is found, with another map_units_per_metre.
-
-    Raises
-    ------
-    RegistrationError
-        If the object is not found; the message says in which size it would have been.
     """
     try:
         return register_mesh(nodes, triangles, points, views, camera, metric, progress)

@@ -25,22 +25,16 @@ from morph_dslam.registration.scene import View
 from morph_dslam.render.rasteriser import rasterise
 
 Array = NDArray[np.float64]
-
 #: Directions around the object's middle into which its outline in a view is cut; pixels of a stretch.
 N_STRETCHES, FEWEST_PIXELS = 24, 8
-
 #: How far, pixels, to look to either side, half the width of an edge, and the least length of either part.
 REACH, EDGE, PART = 16, 1, 4
-
 #: An outline that lies where it is drawn is found between these, pixels outwards: blur carries texture out.
 FOUND = (-2, 3)
-
 #: Gradients, grey levels a pixel, that are noise; log likelihood by which a cut must be better than none.
 NOISE, CLEAR_CUT = 0.3, 2.0
-
 #: Share of the clear stretches that is enough: a quarter is found by chance.
 FITTING = 0.4
-
 #: Neighbours agree on an outline elsewhere to so many pixels; this share of so many pairs is no chance.
 ALIKE, AGREED, FEWEST_PAIRS = 2, 0.6, 40
 

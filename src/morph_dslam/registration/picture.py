@@ -26,16 +26,11 @@ from morph_dslam.tracking.relocalization import state_from_matches
 from morph_dslam.tracking.state import BoundPoints
 
 Array = NDArray[np.float64]
-
 Image = NDArray[np.uint8]
-
 N_FEATURES, RATIO = 3000, 0.8
-
 MATCH_PX, LEAST_MATCHES = 6.0, 15
-
 #: Shapes tried for a first pose, landmarks made of the matches, and the standard deviation of one, pixels.
 N_SHAPES, N_LANDMARKS, LANDMARK_PX = 9, 60, 0.3
-
 #: A second place with so many of the matches of the first one is another object like it.
 AMBIGUOUS = 0.5
 

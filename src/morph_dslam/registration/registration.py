@@ -23,10 +23,8 @@ from morph_dslam.slam.pose import PoseEstimate
 from morph_dslam.tracking.state import Prior, State
 
 Array = NDArray[np.float64]
-
 #: No number of a registration is meant to be larger.
 LARGEST = 1e20
-
 #: Mean nodes that are farther apart than this share of the size belong to different objects.
 OTHER_OBJECT = 0.1
 

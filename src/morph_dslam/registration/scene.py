@@ -14,7 +14,6 @@ from morph_dslam.slam.rigid_map import GOOD
 from morph_dslam.slam.scene import Scene
 
 Array = NDArray[np.float64]
-
 #: A view sees an object of which at least this part projects into its image.
 SEEN_SHARE = 0.5
 

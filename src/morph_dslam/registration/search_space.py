@@ -13,25 +13,18 @@ from scipy.spatial.transform import Rotation
 from morph_dslam.registration.registration import Axis
 
 Array = NDArray[np.float64]
-
 #: A plane holds at least this part of the map; at most so many are taken out.
 PLANE_SHARE, MOST_PLANES = 0.12, 4
-
 #: Planes are this thick, in units of the map's usual spacing between points.
 PLANE_THICKNESS = 0.15
-
 #: Points of one piece are joined over so many times the usual spacing, each in turn.
 JOINED_OVER = (0.6, 0.9, 1.3, 2.0, 3.0)
-
 #: A piece has at least so many points.
 FEWEST_POINTS = 25
-
 #: Trials of RANSAC for one plane, and how many times farther than usual a stray's neighbours are.
 TRIALS, STRAY = 400, 4.0
-
 #: Turns about the normal of a plane that a body may stand on.
 TURNS = 8
-
 #: Directions of an axis nearer to each other than this (rad) are one.
 ALIKE = 0.1
 

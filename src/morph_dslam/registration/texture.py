@@ -27,24 +27,17 @@ from morph_dslam.registration.scene import View, camera_from_object, views_of
 from morph_dslam.render.rasteriser import Buffers, rasterise
 
 Array = NDArray[np.float64]
-
 Image = NDArray[np.uint8]
-
 #: Views between which the object turns by more than this are not compared.
 LARGEST_TURN = np.radians(35.0)
-
 #: Points of each view, and the least cosine between the surface's normal and the sight lines.
 N_CORNERS, LEAST_COSINE = 150, 0.3
-
 #: Side of the patches compared, pixels, and their least correlation.
 WINDOW, LEAST_CORRELATION = 17, 0.8
-
 #: Iterations of a refinement, and keyframes used, spread over all that see the object.
 REFINEMENTS, MOST_VIEWS = 6, 8
-
 #: Displacements that differ more from the fit count less (Huber), pixels.
 HUBER_PX = 0.5
-
 #: Fewer measurements are no evidence.
 FEWEST = 60
 
@@ -252,16 +245,10 @@ def _corners(normalized: Image, buffers: Buffers) -> Array:
     return np.empty((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
 
 
-# One view's texture carried by the mesh into another view, and how far patches of it are displaced there. Pixels
-# that the first view does not show, behind a fold or beyond the rim, take no part.
-
-
 #: A pixel is hidden in the first view if it lies behind what is seen there by this part of its depth.
 HIDDEN_BY = 0.01
-
 #: Iterations of an alignment, the step at which it ends, and the farthest that a patch may go, pixels.
 ITERATIONS, LAST_STEP, FARTHEST = 25, 2e-3, 8.0
-
 #: At least this part of a patch must be seen in both views, and the gradients must be so different (the
 #: determinant of their squares over the trace's square).
 LEAST_SHARE, LEAST_STRUCTURE = 0.4, 1e-3

@@ -32,21 +32,15 @@ from morph_dslam.render.texture import load_photograph, render_textured, resize_
 from morph_dslam.units import to_si
 
 Array = NDArray[np.float64]
-
 Image = NDArray[np.uint8]
-
 #: Triangles that reach behind the camera are not drawn, so rectangles are cut into cells of at most this
 #: side, metres.
 CELL = 0.08
-
 MOST_CELLS = 60
-
 #: A texture has at most so many pixels along a side.
 LARGEST_TEXTURE = 3000
-
 #: A rectangle with a shorter edge is none, metres.
 SHORTEST_EDGE = 1e-6
-
 #: The faces of a box: a corner, then the directions along its rows and columns, in halves of the size.
 _BOX_FACES = (
     ((-1, -1, 1), (2, 0, 0), (0, 0, -2)),
@@ -91,13 +85,7 @@ class Face:
 
 
 def environment_faces(environment: Environment) -> list[Face]:
-    """All rectangles, those of the boxes among them.
-
-    Raises
-    ------
-    SceneError
-        If the edges of a rectangle are not perpendicular.
-    """
+    """All rectangles, those of the boxes among them."""
     faces = []
     for number, section in enumerate(environment.rectangles):
         centre, right, down = (
@@ -127,11 +115,6 @@ class StaticScene:
     camera : whose pictures are drawn. positions : (T, 3) where the camera is, world, metres; textures are
         made as fine as they can be seen from there.
     light : (3,) direction towards a distant light, world. ambient : its ambient part.
-
-    Raises
-    ------
-    SceneError
-        If a photograph is missing or a rectangle is none.
     """
 
     def __init__(
@@ -179,9 +162,6 @@ def _face_texture(face: Face, folder: Path, pixels_per_metre: float) -> Image:
     return resize_to_fill(load_photograph(face.texture, folder), int(width), int(height))
 
 
-# A simulated depth camera: exact depth made noisy, coarse and incomplete, as structured light gives it.
-
-
 #: 16-bit depth images hold this many values a metre, as those of the TUM RGB-D benchmark do.
 VALUES_PER_METRE = 5000.0
 
@@ -210,9 +190,6 @@ def _rim(depth: NDArray[np.float32], sensor: DepthSensor) -> NDArray[np.bool_]:
     jump = cv2.dilate(filled, square) - cv2.erode(filled, square) > 0.03 * filled
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * sensor.rim_px + 1,) * 2)
     return cv2.dilate(jump.astype(np.uint8), disc).astype(bool)
-
-
-# The motion that a scene file prescribes: parameters, pose and occluder in every frame, checked.
 
 
 _AT_ORIGIN = PoseKeyFrame(frame=0, position_mm=(0.0, 0.0, 0.0))
@@ -290,13 +267,7 @@ def _pose_track(keys: list[PoseKeyFrame], frames: NDArray, upright: Vector) -> l
 
 
 def _camera_track(keys: list[CameraKeyFrame], frames: NDArray) -> list[RigidTransform]:
-    """Poses camera_from_world of a camera that looks at its target with the world's z axis up.
-
-    Raises
-    ------
-    SceneError
-        If it looks straight up or down, or stands in its target.
-    """
+    """Poses camera_from_world of a camera that looks at its target with the world's z axis up."""
     numbers = [key.frame for key in keys]
     positions = interpolate_key_frames(numbers, np.array([key.position_mm for key in keys]) * 1e-3, frames)
     targets = interpolate_key_frames(numbers, np.array([key.target_mm for key in keys]) * 1e-3, frames)
@@ -321,13 +292,7 @@ def _occluder_track(occluder: Occluder | None, frames: NDArray) -> Array | None:
 
 
 def plan_motion(scene: Scene, model: ReducedModel) -> Motion:
-    """The motion of every frame.
-
-    Raises
-    ------
-    SceneError
-        If a parameter is unknown to the model, or leaves its range at or between key frames.
-    """
+    """The motion of every frame."""
     frames = np.arange(scene.frames)
     if scene.camera_path:
         in_world = _pose_track(scene.pose or [_AT_ORIGIN], frames, (0.0, 0.0, 0.0))

@@ -16,15 +16,11 @@ from morph_dslam.render.overlay import draw_overlay, paint_surface
 from morph_dslam.render.shading import lambert, vertex_normals
 
 Array = NDArray[np.float64]
-
 VIEW_BACKGROUND = 245
-
 #: Size of the object over that of the picture, and its distance from the camera over its size.
 FILLING, DISTANCE = 0.8, 4.0
-
 #: Size of what is drawn without letters over that of the picture.
 FILLED = 0.92
-
 #: Direction to the light, camera frame.
 LIGHT = np.array([-0.4, -0.6, -1.0])
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from morph_dslam.model import SurfacePoints
 
 Array = NDArray[np.float64]
-
 #: Barycentric slack, so that a ray through a shared edge meets at least one of its triangles.
 EDGE_TOLERANCE = 1e-9
 #: Cells along each side of the grid in which rays are looked up.

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 #: Barycentric slack that keeps a pixel centre lying on a shared edge from falling between both triangles.
 EDGE_TOLERANCE = 1e-9
-
 #: A triangle of at most this area in the image, squared pixels, covers nothing.
 LEAST_AREA = 1e-12
 
@@ -74,13 +73,6 @@ def weight_steps(v, area):
 def is_inside(b0, b1, b2):
     """Whether a pixel with these weights is covered."""
     return b0 >= -EDGE_TOLERANCE and b1 >= -EDGE_TOLERANCE and b2 >= -EDGE_TOLERANCE
-
-
-# The rasteriser: a z-buffer that says which triangle each pixel sees, where on it, and how far away.
-# Inverse depth is linear in the image, so it both decides visibility and turns image-plane weights into
-# perspective-correct barycentric weights. Pixel (0, 0) is the centre of the first pixel. Both faces of a
-# triangle are drawn, unless the surface is said to be closed: of a closed surface nothing but the faces
-# turned to the camera can be seen from outside.
 
 
 Array = NDArray[np.float64]

@@ -37,9 +37,6 @@ def interpolate_key_frames(frames: Sequence[int] | NDArray, values: Array, wante
     return spline(np.clip(wanted, frames[0], frames[-1]))
 
 
-# The scene file of a simulation: what moves how, how it looks, and what camera sees it.
-
-
 Colour = tuple[
     Annotated[int, Field(ge=0, le=255)], Annotated[int, Field(ge=0, le=255)], Annotated[int, Field(ge=0, le=255)]
 ]
@@ -47,15 +44,10 @@ Colour = tuple[
 #: No number of a scene is meant where it is larger: a kilometre in millimetres, degrees, pixels, frames. What
 #: is computed with those below cannot overflow.
 LARGEST = 1_000_000
-
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
-
 Vector = tuple[Number, Number, Number]
-
 FrameNumber = Annotated[int, Field(ge=0, le=LARGEST)]
-
 Side = Annotated[float, Field(ge=1e-3, le=LARGEST)]
-
 #: Standard deviation of a blur: OpenCV filters with a kernel some eight times as wide.
 Blur = Annotated[float, Field(ge=0.0, le=100.0)]
 

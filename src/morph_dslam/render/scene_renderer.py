@@ -31,9 +31,7 @@ from morph_dslam.render.texture import (
 )
 
 Array = NDArray[np.float64]
-
 Image = NDArray[np.uint8]
-
 #: An object's print has at most so many pixels along its longer side.
 LARGEST_PRINT = 8000
 
@@ -135,11 +133,6 @@ class SceneRenderer:
     folder : what paths in the scene are relative to.
     nearest_depth : metres; the print is made as fine as it can be seen from there.
     surroundings : what stands around the object, for `supersampled` pictures, or None.
-
-    Raises
-    ------
-    SceneError
-        If a photograph is missing or unreadable.
     """
 
     def __init__(

@@ -58,11 +58,7 @@ def lambert(normals: Array, to_light: Array, ambient: float) -> Array:
     return ambient + (1.0 - ambient) * cosine
 
 
-# Colour maps as lookup tables, and the colour bar that explains them.
-
-
 FONT = cv2.FONT_HERSHEY_SIMPLEX
-
 #: Grey level of the panels behind text, dark enough for white letters on any video.
 BACKGROUND = 38
 

@@ -31,11 +31,8 @@ from morph_dslam.render.scene_renderer import SceneRenderer, in_disc, pixel_axes
 from morph_dslam.render.texture import is_sheet, landmark_nodes, regular_points, spread_nodes
 
 Array = NDArray[np.float64]
-
 N_TRUTH_POINTS = 300
-
 MIN_LANDMARKS = 8
-
 #: A point so far behind the depth buffer is hidden; less may be the surface's own slope within a pixel.
 HIDDEN_BY = 3e-3
 

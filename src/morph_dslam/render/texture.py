@@ -31,11 +31,6 @@ def find_photograph(name: str, folder: Path) -> Path:
     ----------
     name : a path relative to ``folder``, or the bare name of a photograph packaged with scikit-image, such
         as "coffee". A name with a suffix or a folder is always a path.
-
-    Raises
-    ------
-    SceneError
-        If there is no such file, or a packaged photograph is wanted and scikit-image is not installed.
     """
     path = folder / name
     if path.is_file():
@@ -83,9 +78,6 @@ def load_photograph(name: str, folder: Path) -> NDArray[np.uint8]:
         return read_image(path, f"photograph '{name}'")
     except SourceError as error:
         raise SceneError(str(error)) from error
-
-
-# Texturing: the colour each rasterised pixel takes from a texture image, sampled bilinearly.
 
 
 Array = NDArray[np.float64]
@@ -153,9 +145,6 @@ def interpolate(buffers: Buffers, triangles: NDArray, node_values: NDArray) -> N
     covered = buffers.covered
     corners = triangles[buffers.triangle_ids[covered]]
     return np.einsum("kc,kc...->k...", buffers.weights[covered], node_values[corners])
-
-
-# Points of a sheet by their place in its rest plane: texture coordinates, regular grids, landmarks.
 
 
 #: A model whose rest shape is deeper than this fraction of its smaller side is no sheet.
@@ -229,11 +218,6 @@ def landmark_nodes(model: ReducedModel) -> NDArray[np.int64]:
         distance = np.linalg.norm(model.nodes[candidates, :2] - place, axis=1)
         nodes.append(candidates[distance.argmin()])
     return np.array(list(dict.fromkeys(nodes)), dtype=np.int64)
-
-
-# Texture and landmarks of a solid's surface: where a sheet has one rest plane, a solid has three.
-# The print is laid on by box projection: each triangle takes the texture as seen along the axis that its rest
-# normal is nearest to. Nodes where triangles of different axes meet are used once for each.
 
 
 #: Landmarks of a solid, spread over all of its surface: about half of them face the camera.
