@@ -206,17 +206,9 @@ def test_uniaxial_stretch_reaches_the_closed_form_through_the_whole_chain(tmp_pa
 MISTAKES = {
     "unknown set": ('on = "z_min"', 'on = "floor"', r"no node set or surface 'floor'; it has: .*z_max"),
     "unit slip": ('["40 mm", "40 mm", "80 mm"]', '["40 m", "40 m", "80 m"]', r"measures 40 x 40 x 80 m"),
-    "no unit": ('young = "3 MPa"', "young = 3.0", r"materials\.rubber: young: write 3\.0 with its unit"),
-    "other unit": ('young = "3 MPa"', 'young = "3 mm"', r"'mm' is not a unit of stress; use one of Pa"),
-    "unstable": ("poisson = 0.45", "poisson = 0.55", r"poisson = 0\.55 must lie between"),
-    "negative modulus": ('young = "3 MPa"', 'young = "-3 MPa"', r"young = -3e\+06 must be positive"),
     "unknown law": ('"neo_hookean"', '"neo_hooke"', r"not a known material law; known are neo_hookean"),
-    "unknown constant": ("poisson = 0.45", 'poisson = 0.45\nshear = "1 MPa"', r"has no constant 'shear'"),
     "unknown key": ("[solver]", "[solver]\nspeed = 3", r"unknown key solver\.speed; known here: workers, thr"),
-    "unknown mesh key": ("divisions =", "division =", r"unknown key mesh\.division; known here: generator, size"),
-    "unknown support": ('kind = "rotation"', 'kind = "spin"', r"supports\.1.*'spin'"),
     "unknown parameter": ('angle = "bend"', 'angle = "bent"', r"names 'bent', which is no parameter; the par"),
-    "parameter of another quantity": ('angle = "bend"', 'angle = "squash"', r"squash is of length, and angle"),
     "falling range": ('["0 mm", "8 mm"]', '["8 mm", "0 mm"]', r"range must rise"),
 }
 

@@ -122,7 +122,6 @@ class ModelSurface:
 
 
 HOST = "127.0.0.1"
-
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",

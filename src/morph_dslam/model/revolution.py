@@ -32,7 +32,6 @@ NODE_TOLERANCE = 1e-5
 
 #: Harmonics of the angle are kept until they leave out less than this part of a mode.
 HARMONICS_LEFT_OUT = 1e-3
-
 MOST_HARMONICS = 12
 
 

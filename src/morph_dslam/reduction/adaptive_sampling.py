@@ -56,7 +56,8 @@ def sample_adaptively(
         solver = ReducedSolver(equations, solutions, bounds(study), study.reduction.tolerance)
         candidates = candidate_samples(study, len(estimates))
         room = study.sampling.training - len(samples)
-        count = min(_samples_of_a_round(study, len(samples)), max(room, 1))
+        greedy = reduction_method(study.reduction.method or "").greedy
+        count = min(1 if greedy else max(LEAST, int(GROWTH * len(samples))), max(room, 1))
         worst, estimates = _worst(solver, candidates, estimates, count)
         largest = float(estimates[worst[0]])
         rounds.append({"solves": len(samples), "largest_estimate": largest})
@@ -65,10 +66,6 @@ def sample_adaptively(
         estimates[worst] = -np.inf
         estimates = np.append(estimates, np.full(len(worst), np.inf))
         samples = np.vstack([samples, candidates[worst]])
-
-
-def _samples_of_a_round(study: ParametricStudy, known: int) -> int:
-    return 1 if reduction_method(study.reduction.method or "").greedy else max(LEAST, int(GROWTH * known))
 
 
 def _worst(solver: ReducedSolver, candidates: Array, earlier: Array, count: int) -> tuple[NDArray[np.int64], Array]:

@@ -139,7 +139,6 @@ SOLVER_TOLERANCE = 1e-2
 
 #: Most modes that equilibrium is projected on; more cost little, for assembly takes nearly all of the time.
 MOST_MODES = 60
-
 MOST_CORRECTIONS = 20
 
 #: After so many corrections the last must be so small a part of the first, or the tangent is made anew.

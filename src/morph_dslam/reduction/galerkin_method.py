@@ -150,7 +150,8 @@ def reduce_by_galerkin(task: ReductionTask) -> ReducedModel:
     spread = np.diff(box, axis=1)[:, 0]
     modes = {name: field_modes(task, name, spread, tolerance) for name in task.field_names}
     sampled = SampledFields(solver, problem, modes, SHARE * tolerance)
-    dense = _on_grid(task, sampled) if _grid_is_used(task) else _scattered(task, sampled)
+    on_grid = len(task.parameters) <= MOST_GRID_PARAMETERS and task.options.format != "polynomial"
+    dense = _on_grid(task, sampled) if on_grid else _scattered(task, sampled)
     fields, summaries = {}, {}
     for name, part in sampled.parts.items():
         flat = dense.coefficients[part].reshape(part.stop - part.start, -1)
@@ -169,10 +170,6 @@ def reduce_by_galerkin(task: ReductionTask) -> ReducedModel:
         **summaries["displacement"],
     }
     return task.model(fields, summary)
-
-
-def _grid_is_used(task: ReductionTask) -> bool:
-    return len(task.parameters) <= MOST_GRID_PARAMETERS and task.options.format != "polynomial"
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from morph_dslam.mechanics.loads import FORCE, MOMENT, REACTION, reaction_names
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.model.basis_functions import Basis, chebyshev_basis
 from morph_dslam.reduction.linear_solid import LinearSolid, linear_solid
-from morph_dslam.reduction.pgd import PgdSolution, solve_pgd
+from morph_dslam.reduction.pgd import solve_pgd
 from morph_dslam.reduction.registry import register_reduction
 from morph_dslam.reduction.separated_terms import Terms, multiplied, spline_terms
 from morph_dslam.reduction.separation import VectorFunction, fibre_series, generic_points, separate
@@ -147,7 +147,10 @@ def reduce_by_pgd(task: ReductionTask) -> ReducedModel:
     name = options.basis or "cubic_spline"
     bases, notes = suited_bases(solid, name, SHARE * options.tolerance)
     solution = solve_pgd(solid.separable(bases), options.max_modes, options.tolerance)
-    fields = PgdFields(solid, _all_dofs(solid, solution, bases), task.mesh.weights, SHARE * options.tolerance)
+    vectors = np.zeros((solid.problem.n_dofs, len(solution.modes)))
+    vectors[solid.free] = solution.modes.T
+    dofs = spline_terms(solid.prescribed, bases) + Terms(vectors, solution.functions.factors, bases)
+    fields = PgdFields(solid, dofs, task.mesh.weights, SHARE * options.tolerance)
     displacement, singular_values = fields.displacement()
     summary: dict[str, Any] = {
         "method": "pgd",
@@ -165,13 +168,6 @@ def reduce_by_pgd(task: ReductionTask) -> ReducedModel:
         summary["warnings"] = notes
     others = {"stress_solid": fields.stress(), "strain": fields.strain(), **fields.reactions()}
     return task.model({"displacement": displacement, **others}, summary)
-
-
-def _all_dofs(solid: LinearSolid, solution: PgdSolution, bases: tuple[Basis, ...]) -> Terms:
-    """Displacements of all dofs: the prescribed ones and what PGD has found."""
-    vectors = np.zeros((solid.problem.n_dofs, len(solution.modes)))
-    vectors[solid.free] = solution.modes.T
-    return spline_terms(solid.prescribed, bases) + Terms(vectors, solution.functions.factors, bases)
 
 
 def suited_bases(solid: LinearSolid, name: BasisName, tolerance: float) -> tuple[tuple[Basis, ...], list[str]]:

@@ -132,7 +132,7 @@ def expansion_train(
     ----------
     indices : (n_terms, d), distinct. coefficients : (n_terms, n_functions).
     """
-    norms = [_norms(basis) for basis in bases]
+    norms = [np.where((np.arange(b.size) > 0) & (b.kind == "chebyshev"), np.sqrt(0.5), 1.0) for b in bases]
     scale = np.prod([n[indices[:, k]] for k, n in enumerate(norms)], axis=0)
     rest, remaining = coefficients.T * scale, indices
     allowed = tolerance * float(np.linalg.norm(rest)) / np.sqrt(len(bases))
@@ -151,10 +151,3 @@ def expansion_train(
         rest, remaining = values[:rank, None] * right[:rank], tails
     cores = [np.ascontiguousarray(core / n[None, :, None]) for core, n in zip(cores, norms, strict=True)]
     return TensorTrainFunctions(bases, tuple(cores))
-
-
-def _norms(basis: Basis) -> Array:
-    norms = np.ones(basis.size)
-    if basis.kind == "chebyshev":
-        norms[1:] = np.sqrt(0.5)
-    return norms

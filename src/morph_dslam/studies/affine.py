@@ -23,7 +23,6 @@ Array = NDArray[np.float64]
 
 #: No number of a study is meant where it is larger, in whatever unit: what follows from it could overflow.
 LARGEST = 1e30
-
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 
 _WORD = r"[A-Za-z_][\w./]*"
@@ -136,7 +135,8 @@ def _read_term(
     number = 1.0 if term["number"] is None else possible(float(term["number"]), text)
     name = term["factor"] or term["name"]
     if name is not None and name not in known:
-        raise StudyError(f"'{text}' names '{name}', which is no parameter; {_listed(known)}")
+        listed = f"the parameters are {', '.join(known)}" if known else "the study has no parameters"
+        raise StudyError(f"'{text}' names '{name}', which is no parameter; {listed}")
     measured = "ratio" if name is None else parameters[known[name]].quantity
     share = 1.0
     if term["divisor"] is not None:
@@ -165,7 +165,3 @@ def _share(term: re.Match, text: str, measured: str, name: str | None) -> float:
     if name is None or not divisor:
         raise StudyError(f"'{text}': only a parameter can be divided, and not by zero")
     return 1.0 / to_si(divisor, term["divisor_unit"], measured)
-
-
-def _listed(names: Mapping[str, int]) -> str:
-    return f"the parameters are {', '.join(names)}" if names else "the study has no parameters"

@@ -206,16 +206,13 @@ def _connected(client_type: type[Client], address: str) -> Iterator[Client]:
             get_address_host(address)  # a client that cannot be made for it would not be closed cleanly
             client = client_type(address, timeout=PATIENCE, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
+            reason = (str(error) or type(error).__name__).splitlines()[0]
             raise WorkerError(
-                f"no Dask scheduler answers at {address} ({_first_line(error)}): start one with "
+                f"no Dask scheduler answers at {address} ({reason}): start one with "
                 "`dask scheduler`, which prints its address, and workers with `dask worker ADDRESS`"
             ) from error
     with client:
         yield client
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0]
 
 
 def _check_workers(client: Client, address: str) -> None:

@@ -48,7 +48,6 @@ _VOIGT = {6: [0, 1, 2, 4, 5, 3], 9: [0, 4, 8, 5, 2, 1]}
 
 #: Nodes may differ by so much of the mesh's size from file to file, which is written in single precision.
 _SAME = 1e-5
-
 _COLUMN = re.compile(r"\s*(?P<name>\w+)\s*(?:\[(?P<unit>[^\]]+)\])?\s*")
 
 

@@ -73,15 +73,11 @@ def locking_warnings(study: Study) -> list[str]:
 
     materials = {f"'{name}'": section.make(read) for name, section in study.materials.items()}
     mixed = study.solver.formulation == "mixed"
+    advice = "give it a law with a volumetric part, which mixed elements need"
+    advice = advice if mixed else 'set solver.formulation = "mixed"'
     return [
         f"the material {name} is nearly incompressible (Poisson's ratio {law.equivalent_poisson:.4f}) in "
-        f"displacement elements, which lock: {_advice(mixed)}"
+        f"displacement elements, which lock: {advice}"
         for name, law in materials.items()
         if not (mixed and law.volumetric_modulus is not None) and law.equivalent_poisson >= NEARLY_INCOMPRESSIBLE
     ]
-
-
-def _advice(mixed: bool) -> str:
-    if mixed:
-        return "give it a law with a volumetric part, which mixed elements need"
-    return 'set solver.formulation = "mixed"'

@@ -29,7 +29,8 @@ def training_samples(study: ParametricStudy) -> Array:
     if sampling.scheme == "even":
         return study.admissible(_even(study, sampling.training))
     if sampling.scheme == "grid":
-        return study.admissible(_grid(study))
+        axes = grid_axes(study)  # the last parameter runs fastest
+        return study.admissible(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes)))
     count = sampling.first if sampling.scheme == "adaptive" else sampling.training
     return sample_box(study, count, sampling.seed, TRAINING_TOWARDS_EDGES)
 
@@ -72,12 +73,6 @@ def _even(study: ParametricStudy, count: int) -> Array:
             f'sampling.scheme = "even" is for one parameter, and this study has {len(box)}: use "grid" or "sobol"'
         )
     return np.linspace(box[0, 0], box[0, 1], count)[:, None]
-
-
-def _grid(study: ParametricStudy) -> Array:
-    """The full grid (n, d), evenly spaced along each parameter, the last parameter running fastest."""
-    axes = grid_axes(study)
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
 
 
 def grid_axes(study: ParametricStudy) -> list[Array]:
