@@ -31,8 +31,7 @@ from tqdm import tqdm
 from morph_dslam import Camera, Frame, MorphError, open_source
 from morph_dslam.evaluation.trajectory import absolute_error, match
 from morph_dslam.extend import threads_side_by_side
-from morph_dslam.extend.slam import Slam, SlamFrame, trajectory_of, warm_up
-from morph_dslam.io.trajectory import load_trajectory
+from morph_dslam.extend.slam import Slam, SlamFrame, load_trajectory, trajectory_of, warm_up
 
 ROOT = Path(__file__).parents[2]
 FPS = 30.0
