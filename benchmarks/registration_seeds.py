@@ -28,12 +28,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam import MorphError, Registration, load_camera
+from morph_dslam import MorphError, Registration, Scene, load_camera, load_scene
 from morph_dslam.extend.geometry import RigidTransform, cross_matrix, fit_similarity
 from morph_dslam.extend.registration import run_registration
 from morph_dslam.extend.slam import run_slam
-from morph_dslam.slam.map_files import load_map
-from morph_dslam.slam.rigid_map import RigidMap
 from support import keep_sequence
 
 Array = NDArray[np.float64]
@@ -150,7 +148,7 @@ class Outcome:
         return abs(self.scale) <= SCALE_LIMIT and 1e3 * self.places.mean() <= PLACE_LIMIT and not self.ambiguous
 
 
-def outcome(registration: Registration, rigid_map: RigidMap, true_poses: Array) -> Outcome:
+def outcome(registration: Registration, scene: Scene, true_poses: Array) -> Outcome:
     """Compare a registration with the truth, poses (T, 4, 4) of all frames."""
     in_scene, keyframes = registration.map_registration, registration.keyframes
     assert in_scene is not None
@@ -158,7 +156,7 @@ def outcome(registration: Registration, rigid_map: RigidMap, true_poses: Array) 
     assert covariance is not None
     truth = [RigidTransform.from_matrix(true_poses[keyframe.frame]) for keyframe in keyframes]
     found = [keyframe.pose for keyframe in keyframes]
-    in_map = [RigidTransform.from_matrix(keyframe.camera_from_world) for keyframe in rigid_map.keyframes]
+    in_map = [RigidTransform.from_matrix(keyframe.camera_from_world) for keyframe in scene.map.keyframes]
     true_scale = fit_similarity(_centres(truth), _centres(in_map)).scale
     scale = float(np.log(in_scene.world_from_object.scale / true_scale))
     misses = np.array([a.apply(middle) - b.apply(middle) for a, b in zip(found, truth, strict=True)])
@@ -227,7 +225,7 @@ def main() -> int:
             print(f"seed={seed} not registered: {error}", flush=True)
             continue
         truth = np.load(folder / "recording" / "truth.npz")["camera_from_object"]
-        found.append(outcome(registration, load_map(map_path, load_camera(camera)), truth))
+        found.append(outcome(registration, load_scene(map_path, load_camera(camera)), truth))
         print(line(seed, found[-1]), flush=True)
     print(last_line(found, arguments.seeds))
     return 0

@@ -30,7 +30,6 @@ from morph_dslam.extend.rendering import rasterise, render_textured
 from morph_dslam.extend.tracking import BoundPoints, Estimator, State, moved
 from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.tracking.binding import DrawnSurface
-from morph_dslam.tracking.result import STAGES
 
 Array = NDArray[np.float64]
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
@@ -162,7 +161,7 @@ def compare(model: ReducedModel, distance: float, frames: int) -> None:
     print(f"{'':<12}{'frame [ms]':>11}{'ratio':>8}{'error [mm]':>12}{'tracked':>9}   stages [ms, wall]")
     base = float(np.median(times["tracker"]))
     for name, found in results.items():
-        stages = {stage: np.median([result.timings_ms[stage] for result in found]) for stage in STAGES}
+        stages = {stage: np.median([result.timings_ms[stage] for result in found]) for stage in found[0].timings_ms}
         errors = [error_mm(model, r, s) for r, s in zip(found, film.states[1:], strict=True)]
         shares = ", ".join(f"{stage} {value:.1f}" for stage, value in stages.items() if value > 0.05)
         tracked = sum(result.estimate is not None for result in found)
