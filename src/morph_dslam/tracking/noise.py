@@ -177,19 +177,19 @@ class PointNoise:
         """t / f in squared pixels; infinite where the patches do not tell how exact a point is."""
         if self._moments is None:
             return np.inf
-        told, squared = self._moments.T
-        factor = min((squared[1] - squared[0]) / max(told[1] - told[0], 1e-300), LARGEST_FACTOR)
+        expected, squared = self._moments.T
+        factor = min((squared[1] - squared[0]) / max(expected[1] - expected[0], 1e-300), LARGEST_FACTOR)
         if factor <= 0.0:
             return np.inf
-        return max(float(squared.mean() / factor - told.mean()), LEAST_SPREAD_PX**2)
+        return max(float(squared.mean() / factor - expected.mean()), LEAST_SPREAD_PX**2)
 
     @property
     def power(self) -> float:
         """p; 1 where the patches tell too little, or the model leaves something."""
         if self._moments is None or self.common > LEAST_SPREAD_PX**2:
             return 1.0
-        told, squared = np.log(np.maximum(self._moments.T, 1e-300))
-        return float(np.clip((squared[1] - squared[0]) / (told[1] - told[0]), 1.0, LARGEST_POWER))
+        expected, squared = np.log(np.maximum(self._moments.T, 1e-300))
+        return float(np.clip((squared[1] - squared[0]) / (expected[1] - expected[0]), 1.0, LARGEST_POWER))
 
     def weights(self, spread: Array, used: NDArray[np.bool_]) -> Array:
         """Inverse variances (p,), in that of a typical point; zero for points that are not ``used`` (p,).

@@ -109,36 +109,21 @@ def _normal_equations(a, b, half, sums, products):
     """
     sums[:] = 0.0
     products[:] = 0.0
+    signals = np.empty(4)
     for row in range(1, 2 * half + 2):
         y = float(row - half - 1)
         for column in range(1, 2 * half + 2):
             x = float(column - half - 1)
-            right = 0.25 * (a[row, column + 1] - a[row, column - 1] + b[row, column + 1] - b[row, column - 1])
-            down = 0.25 * (a[row + 1, column] - a[row - 1, column] + b[row + 1, column] - b[row - 1, column])
-            level = a[row, column] - 128.0
-            change = b[row, column] - a[row, column]
-            sums[0, 0] += right
-            sums[0, 1] += right * x
-            sums[0, 2] += right * y
-            sums[1, 0] += down
-            sums[1, 1] += down * x
-            sums[1, 2] += down * y
-            sums[2, 0] += level
-            sums[2, 1] += level * x
-            sums[2, 2] += level * y
-            sums[3, 0] += change
-            sums[3, 1] += change * x
-            sums[3, 2] += change * y
-            products[0, 0] += right * right
-            products[0, 1] += right * down
-            products[0, 2] += right * level
-            products[0, 3] += right * change
-            products[1, 1] += down * down
-            products[1, 2] += down * level
-            products[1, 3] += down * change
-            products[2, 2] += level * level
-            products[2, 3] += level * change
-            products[3, 3] += change * change
+            signals[0] = 0.25 * (a[row, column + 1] - a[row, column - 1] + b[row, column + 1] - b[row, column - 1])
+            signals[1] = 0.25 * (a[row + 1, column] - a[row - 1, column] + b[row + 1, column] - b[row - 1, column])
+            signals[2] = a[row, column] - 128.0
+            signals[3] = b[row, column] - a[row, column]
+            for i in range(4):
+                sums[i, 0] += signals[i]
+                sums[i, 1] += signals[i] * x
+                sums[i, 2] += signals[i] * y
+                for j in range(i, 4):
+                    products[i, j] += signals[i] * signals[j]
 
 
 @njit(cache=True, nogil=True)

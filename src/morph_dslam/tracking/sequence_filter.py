@@ -276,7 +276,7 @@ class SequenceFilter(Generic[Frame]):
         return self._without_walk(fused, by_itself) if self._walks else fused
 
     def _without_effect(self, measured: Frame, linear: LinearCost, alone: Estimate, known: Prior | None) -> Array:
-        """Variances (k,) of what is one per sequence where a frame tells nothing of it, else zero."""
+        """Variances (k,) of shared parameters that are unobservable in a frame, zero for the others."""
         model, d, constant = self._estimator.model, self._unknowns - 6, self._constant
         nothing = np.zeros(len(constant))
         if not 0 < len(constant) < d:
@@ -304,11 +304,11 @@ class SequenceFilter(Generic[Frame]):
         past: Prior | None = None,
     ) -> Estimate:
         """The estimate with its covariance, and what it would be without a prior on the parameters."""
-        told = None
+        by_images = None
         if known is not None and known.information.any():
             of_pose = replace(known, information=np.zeros_like(known.information))
-            told = self._errors(measured, linear, estimate.state, of_pose, past).covariance
-        return replace(estimate, covariance=errors.covariance, measured_covariance=told)
+            by_images = self._errors(measured, linear, estimate.state, of_pose, past).covariance
+        return replace(estimate, covariance=errors.covariance, measured_covariance=by_images)
 
     def _without_walk(self, fused: Estimate, by_itself: Estimate) -> Estimate:
         """The estimate with the covariance that its frame alone gives what walks, and all frames the rest."""
