@@ -85,16 +85,6 @@ def test_the_faces_of_a_sheet_have_a_von_mises_stress_each():
     ]
 
 
-def test_certificates_of_older_files_are_shown_as_far_as_they_go():
-    old = {"displacement": {"mean_mm": 0.21}, "stress_solid": 0.004, "sensitivity": {"lever": 6.8e-4}}
-    assert error_table(old).rows == [
-        ["displacement", "0.210", "–", "–", "–", "mm", "–", "–"],
-        ["Cauchy stress", "–", "–", "–", "–", "–", "–", "4.00e-03"],
-    ]
-    assert sensitivity_table(old).rows == [["lever", "–", "6.80e-04"]]
-    assert sensitivity_table({}).rows == []
-
-
 def test_info_prints_the_whole_certificate(tmp_path, capsys):
     model = replace(stretched_block_model(), certificate=CERTIFICATE, provenance=PROVENANCE)
     save_model(tmp_path / "block.morph", model)

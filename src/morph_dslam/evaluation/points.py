@@ -298,22 +298,17 @@ def error_table(certificate: Mapping[str, Any]) -> Table:
     for name, entry in certificate.items():
         if name not in ("displacement", "strain") and not name.startswith(("stress_", "reaction_")):
             continue
-        errors = entry if isinstance(entry, Mapping) else {"relative_l2": entry}
-        rows.append(_row(field_title(name), errors))
-        if "von_mises" in errors:
+        rows.append(_row(field_title(name), entry))
+        if "von_mises" in entry:
             place = field_title(name).partition(", ")[2]
-            rows.append(_row(f"von Mises stress, {place}".removesuffix(", "), errors["von_mises"]))
+            rows.append(_row(f"von Mises stress, {place}".removesuffix(", "), entry["von_mises"]))
     return Table(rows, _HEADER)
 
 
 def sensitivity_table(certificate: Mapping[str, Any]) -> Table:
     """One row for each parameter with both measures of its sensitivity's error."""
     entries = certificate.get("sensitivity", {})
-    rows = []
-    for name, entry in entries.items():
-        errors = entry if isinstance(entry, Mapping) else {"relative_l2": entry}
-        rows.append([name, *_relative(errors)])
-    return Table(rows, _SENSITIVITY_HEADER)
+    return Table([[name, *_relative(errors)] for name, errors in entries.items()], _SENSITIVITY_HEADER)
 
 
 def _row(title: str, errors: Mapping[str, Any]) -> list[str]:
