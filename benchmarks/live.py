@@ -17,7 +17,9 @@ import resource
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 # As `morph live` does it; only before numpy is loaded has it an effect.
@@ -28,17 +30,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam import Frame, MorphError, open_source
+from morph_dslam import Frame, FrameResult, MorphError, TrackOptions, open_source
 from morph_dslam.extend import run_and_report_errors
 from morph_dslam.extend.registration import run_registration
 from morph_dslam.extend.slam import run_slam
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.sources.live import PacedRecording
 from morph_dslam.tracking.drawing import AugmentedView
-from morph_dslam.tracking.live import LivePicture, LiveSession, OneObject, VideoSink
-from morph_dslam.tracking.result import STAGES
-from morph_dslam.tracking.run_folder import RunResults
-from morph_dslam.tracking.setup import ObjectOptions, load_setup
+from morph_dslam.tracking.sinks import LivePicture, LiveTimes, VideoSink
+from morph_dslam.tracking.track import new_session, prepare, warm_up
 from support import keep, keep_sequence
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -62,12 +62,11 @@ class BackAndForth:
 
 
 class Timed:
-    """Processor time that calls of a method take, by the thread they run in."""
+    """Processor time that calls of a function take in the thread that they run in."""
 
-    def __init__(self, target: object, method: str) -> None:
+    def __init__(self, call: Callable) -> None:
         self.milliseconds: list[float] = []
-        self._call = getattr(target, method)
-        setattr(target, method, self)
+        self._call = call
 
     def __call__(self, *arguments):
         begin = time.thread_time()
@@ -131,51 +130,48 @@ def run(arguments: argparse.Namespace) -> None:
     place = folder / "registration" / "registration.json"
     if not place.is_file():
         raise MorphError(f"there is no {place}: make it with examples/boot_seal/track.py first")
-    setup = load_setup(
-        ObjectOptions(
-            model=model,
-            camera=folder / "recording" / "camera.yaml",
-            registration=place,
-            map_path=folder / "scan" / "map.h5",
-        )
+    recording = folder / "recording"
+    options = TrackOptions(
+        frames=recording / "frames",
+        model=model,
+        camera=recording / "camera.yaml",
+        registration=place,
+        map_path=folder / "scan" / "map.h5",
+        output=folder,
     )
-    registration, reference = setup.registration, setup.reference
-    assert registration is not None
-    assert reference is not None
-    images = [frame.image for frame in open_source(folder / "recording" / "frames", registration.frame)]
-    setup.warm_up(registration, reference)
-    chain = setup.new_tracker(registration, reference, in_sequence=False)
-    picture = LivePicture(setup.camera, {"seal": AugmentedView(registration.model, setup.camera)})
-    picture_time, locate, track = Timed(picture, "draw"), Timed(chain, "locate"), Timed(chain, "track")
-    results = RunResults(registration.model, registration.frame or 0)
-    stream = PacedRecording(BackAndForth(images, arguments.minutes))
-    with tempfile.TemporaryDirectory() as temporary:
-        size = (setup.camera.width, setup.camera.height)
-        with VideoWriter(Path(temporary) / "augmented.mp4", FPS, size) as writer:
-            sink = VideoSink(writer, FPS)
-            record = Timed(sink, "show")
-            session = LiveSession(stream, OneObject("seal", chain), picture, {"seal": results}, [sink])
-            begin = time.process_time()
-            session.run()
-            spent = 1e3 * (time.process_time() - begin)
-    report(session, spent, {"locate": locate, "track": track, "draw": picture_time, "record": record})
+    with ExitStack() as stack:
+        placed = prepare(options, stack)[2]
+        (seal,) = placed
+        images = [frame.image for frame in open_source(recording / "frames", seal.frame)]
+        warm_up(placed)
+        stream = PacedRecording(BackAndForth(images, arguments.minutes))
+        video = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "augmented.mp4"
+        writer = stack.enter_context(VideoWriter(video, FPS, (seal.camera.width, seal.camera.height)))
+        record, times, results = Timed(VideoSink(writer, FPS)), LiveTimes(), []
+        picture = LivePicture(seal.camera, {seal.name: AugmentedView(seal.model, seal.camera)})
+        sinks = [times, record, lambda tracked: results.append(tracked.results[seal.name])]
+        session = new_session(placed, stream, sinks, picture=picture)
+        picture.draw, session.locate, session.track = map(Timed, (picture.draw, session.locate, session.track))
+        begin = time.process_time()
+        session.run()
+        spent = 1e3 * (time.process_time() - begin)
+    timed = {"locate": session.locate, "track": session.track, "draw": picture.draw, "record": record}
+    report(results, times, session.n_dropped, spent, timed)
 
 
-def report(session: LiveSession, spent: float, timed: dict[str, Timed]) -> None:
+def report(results: list[FrameResult], times: LiveTimes, n_dropped: int, spent: float, timed: dict[str, Timed]) -> None:
     """Print processor time by thread and by stage, how it went, and the result line."""
-    times, results = session.times, session.runs["seal"].results
     print(f"\n{'processor time [ms]':<22}{'median':>8}{'p95':>8}")
     for name, one in timed.items():
         print(f"{name:<22}{np.median(one.milliseconds):>8.1f}{np.percentile(one.milliseconds, 95):>8.1f}")
     print(f"{'all, a drawn frame':<22}{spent / max(len(times.frames), 1):>8.1f}")
-    stages = {stage: np.median([result.timings_ms[stage] for result in results]) for stage in STAGES}
+    stages = {stage: np.median([result.timings_ms[stage] for result in results]) for stage in results[0].timings_ms}
     print("wall time by stage [ms]: " + ", ".join(f"{k} {v:.1f}" for k, v in stages.items() if v > 0.05))
-    statuses = {result.status for result in results}
-    counts = {status: sum(result.status == status for result in results) for status in sorted(statuses)}
-    print(f"drawn frames: {len(results)}, {counts}")
+    counts = Counter(str(result.status) for result in results)
+    print(f"drawn frames: {len(results)}, {dict(counts)}")
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
     print(
-        f"fps={times.fps:.2f} dropped={times.n_dropped} latency_median_ms={times.latency_ms(50):.1f} "
+        f"fps={times.fps:.2f} dropped={n_dropped} latency_median_ms={times.latency_ms(50):.1f} "
         f"latency_p95_ms={times.latency_ms(95):.1f} memory_MB={memory:.0f}"
     )
 

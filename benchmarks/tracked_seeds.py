@@ -74,7 +74,7 @@ def tracked(seed: int, pose: str) -> NDArray[np.float64]:
             registration=registration / "registration.json",
             pose=pose,  # type: ignore[arg-type]
             output=folder / "run",
-            overlay=False,
+            video=False,
             overwrite=True,
         )
     )

@@ -135,8 +135,7 @@ def track_and_evaluate(recording: Recording, model: Path, run: Path) -> dict[str
             last=last,
             reference_frame=recording.reference_frame,
             refine_reference=recording.refine_reference,
-            use_outline=recording.use_outline,
-            use_discrepancy=recording.use_discrepancy,
+            tracker=md.TrackerOptions(use_outline=recording.use_outline, use_discrepancy=recording.use_discrepancy),
             overwrite=True,
         )
     )

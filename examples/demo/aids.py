@@ -57,10 +57,10 @@ def run(_: argparse.Namespace) -> None:
                 frames=sequence / "frames",
                 model=DEMO / "sheet.morph",
                 camera=sequence / "camera.yaml",
-                aids=InitializerFiles(**{aid: FOLDER / f"{aid}.toml"}),
+                initializer=InitializerFiles(**{aid: FOLDER / f"{aid}.toml"}),
                 output=folder,
                 last=29,
-                overlay=False,
+                video=False,
                 overwrite=True,
             )
         )

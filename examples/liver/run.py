@@ -84,7 +84,7 @@ def track_from_landmarks(folder: Path) -> dict:
             landmarks=SEQUENCE / "landmarks.csv",
             inner=(TUMOUR,),
             output=folder,
-            overlay=False,
+            video=False,
             overwrite=True,
         )
     )

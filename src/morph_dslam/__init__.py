@@ -21,6 +21,7 @@ __all__ = [
     "ReducedModel",
     "Registration",
     "Scene",
+    "Session",
     "SlamOptions",
     "SolidProblem",
     "Status",
@@ -62,10 +63,11 @@ _MODULES = {
     "ReducedModel": "model",
     "Registration": "registration.registration",
     "Scene": "slam.scene",
+    "Session": "tracking.session",
     "SlamOptions": "slam.options",
     "SolidProblem": "mechanics.solid",
     "Status": "tracking.outcomes",
-    "TrackOptions": "tracking.track",
+    "TrackOptions": "tracking.run_options",
     "Tracker": "tracking.tracker",
     "TrackerOptions": "tracking.options",
     "TrackingWarning": "tracking.outcomes",
@@ -117,7 +119,9 @@ if TYPE_CHECKING:  # the same for editors and type checkers
     from morph_dslam.tracking.options import TrackerOptions
     from morph_dslam.tracking.outcomes import Status, TrackingWarning
     from morph_dslam.tracking.result import FrameResult
-    from morph_dslam.tracking.track import TrackOptions, track
+    from morph_dslam.tracking.run_options import TrackOptions
+    from morph_dslam.tracking.session import Session
+    from morph_dslam.tracking.track import track
     from morph_dslam.tracking.tracker import Tracker
 
 

@@ -3,6 +3,7 @@
 import _thread
 import json
 import signal
+from contextlib import ExitStack
 from dataclasses import replace
 
 import cv2
@@ -10,17 +11,17 @@ import h5py
 import numpy as np
 import pytest
 
+import morph_dslam as md
 from morph_dslam.cli.app import main
 from morph_dslam.errors import MapError, TrackingError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.registration.registration import PosePrior
 from morph_dslam.sources import open_source
-from morph_dslam.tracking.live import VideoSink
 from morph_dslam.tracking.outcomes import CameraLost, ObjectMoved
-from morph_dslam.tracking.run_live import LiveOptions, run_live
-from morph_dslam.tracking.setup import ObjectOptions, load_setup
-from morph_dslam.tracking.track import TrackOptions, track
+from morph_dslam.tracking.placement import new_anchor
+from morph_dslam.tracking.sinks import VideoSink
+from morph_dslam.tracking.track import new_session, prepare
 from morph_dslam.tracking.tracker import CameraLocalization
 from tests.support.rendered_anchored import SCAN
 
@@ -33,14 +34,28 @@ def recording(anchored_recording):
     return anchored_recording
 
 
-def of_object(folder, **others):
-    known = {"registration": folder / "registration.json", "map_path": folder / "map.h5"} | others
-    return ObjectOptions(folder / "sheet.morph", folder / "sequence" / "camera.yaml", **known)
+def options(folder, output, **others):
+    known = {"registration": folder / "registration.json", "first": SCAN} | others
+    files = {"frames": folder / "sequence" / "frames", "camera": folder / "sequence" / "camera.yaml"}
+    return md.TrackOptions(**files, model=folder / "sheet.morph", output=output, **known)
 
 
-def new_chain(folder, **others):
-    setup = load_setup(of_object(folder, **others))
-    return setup, setup.new_tracker(setup.registration, setup.reference, in_sequence=False)
+class OneObject:
+    """A session of the sheet, frame by frame."""
+
+    def __init__(self, folder, **others):
+        self.placed = prepare(options(folder, folder, **others), ExitStack())[2]
+        self.session = new_session(self.placed, ())
+        (self.model, self.camera), (self.name, self.tracker) = (
+            (self.placed[0].model, self.placed[0].camera),
+            *self.session.trackers.items(),
+        )
+
+    def locate(self, frame):
+        return self.session.locate((frame,)).get(self.name, CameraLocalization())
+
+    def track(self, frame):
+        return self.session.track((frame,), self.session.locate((frame,))).results[self.name]
 
 
 def frames_of(folder, first, last):
@@ -51,29 +66,19 @@ def true_pose(truth, frame):
     return RigidTransform.from_matrix(truth["camera_from_object"][frame])
 
 
-def pixels_of(setup, truth, frame):
-    nodes = setup.model.positions(truth["parameters"][frame])
-    return setup.camera.project(true_pose(truth, frame).apply(nodes))
+def pixels_of(sheet, truth, frame):
+    nodes = sheet.model.positions(truth["parameters"][frame])
+    return sheet.camera.project(true_pose(truth, frame).apply(nodes))
 
 
-def test_a_recording_is_tracked_with_the_camera_in_the_map(recording):
+def test_a_recording_is_tracked_with_the_camera_in_the_map(recording, tmp_path):
     folder, truth = recording
-    summary = track(
-        TrackOptions(
-            frames=folder / "sequence" / "frames",
-            model=folder / "sheet.morph",
-            camera=folder / "sequence" / "camera.yaml",
-            registration=folder / "registration.json",
-            output=folder / "run",
-            first=SCAN,
-            overlay=False,
-        )
-    )
+    summary = md.track(options(folder, tmp_path / "run", video=False))
     # The map is the one beside the registration.
     assert summary["inputs"]["map"] == str(folder / "map.h5")
     assert (summary["pose"], summary["n_tracked"], summary["n_hidden"]) == ("map", 20, 0)
-    run = load_run(folder / "run")
-    with h5py.File(folder / "run" / "result.h5") as file:
+    run = load_run(tmp_path / "run")
+    with h5py.File(tmp_path / "run" / "result.h5") as file:
         assert set(file["pose_from"].asstr()[()]) == {"points and map"}
         assert (file["pose_std"][:] > 0.0).all()
     expected = truth["parameters"][run.frames]
@@ -84,20 +89,20 @@ def test_a_recording_is_tracked_with_the_camera_in_the_map(recording):
 
 def test_a_covered_object_is_hidden_in_its_place_and_few_points_tell_its_shape(recording):
     folder, truth = recording
-    setup, chain = new_chain(folder)
+    sheet = OneObject(folder)
     rng = np.random.default_rng(2)
     seen = {}
     for frame in frames_of(folder, 44, 57):
         image = frame.image.copy()
-        left, top = np.floor(pixels_of(setup, truth, frame.index).min(axis=0)).astype(int) - 12
-        right, bottom = np.ceil(pixels_of(setup, truth, frame.index).max(axis=0)).astype(int) + 12
+        left, top = np.floor(pixels_of(sheet, truth, frame.index).min(axis=0)).astype(int) - 12
+        right, bottom = np.ceil(pixels_of(sheet, truth, frame.index).max(axis=0)).astype(int) + 12
         if 48 <= frame.index < 52:  # a cloth with a pattern of its own over all of it
             cloth = rng.integers(30, 220, (60, 80, 3), dtype=np.uint8)
             cloth = cv2.resize(cloth, (right - left, bottom - top), interpolation=cv2.INTER_CUBIC)
             image[top:bottom, left:right] = cloth
         if frame.index >= 54:  # and over most of it
             image[top:bottom, left : left + round(0.86 * (right - left))] = 120
-        seen[frame.index] = chain.track(replace(frame, image=image))
+        seen[frame.index] = sheet.track(replace(frame, image=image))
     for index in range(48, 52):
         result = seen[index]
         assert (result.status, result.pose_from, result.estimate) == ("hidden", "map", None)
@@ -116,14 +121,14 @@ def test_a_covered_object_is_hidden_in_its_place_and_few_points_tell_its_shape(r
 
 def test_where_the_camera_is_lost_the_points_alone_tell_the_pose(recording):
     folder, truth = recording
-    setup, chain = new_chain(folder)
+    sheet = OneObject(folder)
     for frame in frames_of(folder, 44, 51):
         image = frame.image
         if frame.index >= 47:
-            outline = cv2.convexHull(np.rint(pixels_of(setup, truth, frame.index)).astype(np.int32))
-            sheet = cv2.fillConvexPoly(np.zeros(image.shape[:2], dtype=np.uint8), outline, 1)
-            image = np.where(sheet[:, :, None] > 0, image, np.uint8(110))
-        result = chain.track(replace(frame, image=image))
+            outline = cv2.convexHull(np.rint(pixels_of(sheet, truth, frame.index)).astype(np.int32))
+            mask = cv2.fillConvexPoly(np.zeros(image.shape[:2], dtype=np.uint8), outline, 1)
+            image = np.where(mask[:, :, None] > 0, image, np.uint8(110))
+        result = sheet.track(replace(frame, image=image))
         assert result.status == "tracked", result.reason
         assert abs(result.estimate.state.parameters[0] - truth["parameters"][frame.index, 0]) < 1e-3
     assert result.pose_from == "points"
@@ -133,16 +138,16 @@ def test_where_the_camera_is_lost_the_points_alone_tell_the_pose(recording):
 def test_an_object_that_was_moved_is_said_to_be_and_is_followed_by_its_points(recording):
     """The map's pose is shifted, as if the object had been pushed by 15 mm, and later back."""
     folder, truth = recording
-    _, chain = new_chain(folder)
+    sheet = OneObject(folder)
     push = np.array([0.015, 0.0, 0.0])
     moved, sources = {}, {}
     for frame in frames_of(folder, 40, 55):
-        known = chain.locate(frame).pose_prior
+        known = sheet.locate(frame).pose_prior
         if 44 <= frame.index < 50:
             pose = known.pose
             there = RigidTransform(pose.rotation, pose.translation + pose.rotation @ push)
             known = PosePrior(there, known.from_camera, known.lasting)
-        result = chain.track(frame.image, CameraLocalization(known))
+        result = sheet.tracker.track(frame.image, CameraLocalization(known))
         assert result.status == "tracked", result.reason
         apart = result.pose.translation - truth["camera_from_object"][frame.index][:3, 3]
         assert np.linalg.norm(apart) < MAP_ERROR
@@ -156,10 +161,10 @@ def test_an_object_that_was_moved_is_said_to_be_and_is_followed_by_its_points(re
 
 def test_a_pose_that_is_held_is_the_maps(recording):
     folder, _ = recording
-    _, chain = new_chain(folder, pose="fixed")
+    sheet = OneObject(folder, pose="fixed")
     for frame in frames_of(folder, 44, 46):
-        located = chain.locate(frame)
-        result = chain.track(frame, located)
+        located = sheet.locate(frame)
+        result = sheet.tracker.track(frame, located)
         np.testing.assert_allclose(result.pose.matrix, located.pose_prior.pose.matrix, atol=1e-5)
         assert result.pose_from == "points and map"
 
@@ -167,87 +172,75 @@ def test_a_pose_that_is_held_is_the_maps(recording):
 def test_a_free_object_is_known_by_the_maps_pictures_wherever_it_is(recording):
     """The camera stands on its head, where the map would not have the object."""
     folder, truth = recording
-    setup, chain = new_chain(folder, pose="free")
-    assert (setup.map_path, chain.anchor) == (None, None)
-    registration = setup.registration
+    sheet = OneObject(folder, pose="free")
+    assert new_anchor(sheet.placed) is None
     half_turn = RigidTransform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
-    width, height = setup.camera.width, setup.camera.height
-    middle = np.array([2.0 * setup.camera.cx, 2.0 * setup.camera.cy])
+    width, height = sheet.camera.width, sheet.camera.height
+    middle = np.array([2.0 * sheet.camera.cx, 2.0 * sheet.camera.cy])
     moves = np.array([[-1.0, 0.0, middle[0]], [0.0, -1.0, middle[1]]])
     for frame in frames_of(folder, 40, 52):
         image = cv2.warpAffine(frame.image, moves, (width, height), borderMode=cv2.BORDER_REFLECT)
-        result = chain.track(replace(frame, image=np.asarray(image, dtype=np.uint8)))
+        result = sheet.track(replace(frame, image=np.asarray(image, dtype=np.uint8)))
     assert (result.status, result.pose_from) == ("tracked", "points"), result.reason
     assert result.estimate.state.parameters[0] == pytest.approx(truth["parameters"][52, 0], abs=1e-3)
     found, true = result.estimate.state.camera_from_object, half_turn @ true_pose(truth, 52)
-    apart = (found.apply(registration.model.nodes) - true.apply(registration.model.nodes)).mean(axis=0)
+    apart = (found.apply(sheet.model.nodes) - true.apply(sheet.model.nodes)).mean(axis=0)
     assert np.linalg.norm(apart) < 2.0 * MAP_ERROR
 
 
-def test_a_live_run_keeps_the_pace_and_everything_it_found(recording):
+def test_a_live_run_keeps_the_pace_and_everything_it_found(recording, tmp_path):
     folder, truth = recording
-    options = LiveOptions(str(folder / "sequence" / "frames"), folder / "live", of_object(folder), first=30, serve=0)
-    summary = run_live(options)
+    summary = md.track(options(folder, tmp_path / "live", first=30, live=True, serve=0))
     drawn, dropped = summary["n_frames"], summary["live"]["n_dropped"]
     assert drawn + dropped == 30
     assert summary["live"]["latency_p95_ms"] >= summary["live"]["latency_median_ms"] > 0.0
-    run = load_run(folder / "live")
+    run = load_run(tmp_path / "live")
     assert (np.diff(run.frames) > 0).all()
-    assert run.frames[-1] == 59
-    assert run.status[-1] == "tracked"
+    assert (run.frames[-1], run.status[-1]) == (59, "tracked")
     assert run.parameters[-1, 0] == pytest.approx(truth["parameters"][59, 0], abs=1e-3)
-    rows = (folder / "live" / "latency.csv").read_text().splitlines()
+    rows = (tmp_path / "live" / "latency.csv").read_text().splitlines()
     assert rows[0] == "frame,captured_s,latency_ms"
     assert len(rows) == 1 + drawn
     # Where frames were dropped the video stands still.
-    capture = cv2.VideoCapture(str(folder / "live" / "augmented.mp4"))
+    capture = cv2.VideoCapture(str(tmp_path / "live" / "augmented.mp4"))
     assert int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) == run.frames[-1] - run.frames[0] + 1
     capture.release()
 
 
-def test_a_free_object_starts_live_from_landmarks_in_the_first_frame(recording):
+def test_a_free_object_starts_live_from_landmarks_in_the_first_frame(recording, tmp_path):
     folder, truth = recording
-    landmarks = folder / "sequence" / "landmarks.csv"
-    summary = run_live(
-        LiveOptions(
-            str(folder / "sequence" / "frames"),
-            folder / "free",
-            of_object(folder, landmarks=landmarks, registration=None, map_path=None),
-            record=False,
-            last=20,
-        )
-    )
+    start = {"landmarks": folder / "sequence" / "landmarks.csv", "registration": None}
+    summary = md.track(options(folder, tmp_path, **start, first=None, last=20, live=True, video=False))
     assert (summary["pose"], summary["reference_frame"]) == ("free", 0)
-    run = load_run(folder / "free")
-    assert run.frames[-1] == 20
-    assert run.status[-1] == "tracked"
+    run = load_run(tmp_path)
+    assert (run.frames[-1], run.status[-1]) == (20, "tracked")
     apart = run.camera_from_object[-1][:3, 3] - truth["camera_from_object"][20][:3, 3]
     assert np.linalg.norm(apart) < 3e-3
-    assert not (folder / "free" / "augmented.mp4").exists()
+    assert not (tmp_path / "augmented.mp4").exists()
 
 
-def test_an_interrupt_keeps_a_live_run(recording, monkeypatch, capsys):
+def test_an_interrupt_keeps_a_live_run(recording, monkeypatch, capsys, tmp_path):
     folder, _ = recording
-    show, shown = VideoSink.show, []
+    show, shown = VideoSink.__call__, []
 
-    def interrupted(self, frame, picture):
-        show(self, frame, picture)
-        shown.append(frame.index)
+    def interrupted(self, tracked):
+        show(self, tracked)
+        shown.append(tracked.frame.index)
         if len(shown) == 1:  # many more are to come, also where the machine is slow
             _thread.interrupt_main(signal.SIGTERM)  # shells make background jobs deaf to SIGINT
 
-    monkeypatch.setattr(VideoSink, "show", interrupted)
+    monkeypatch.setattr(VideoSink, "__call__", interrupted)
     command = ["live", str(folder / "sequence" / "frames"), "--model", str(folder / "sheet.morph")]
     command += ["--camera", str(folder / "sequence" / "camera.yaml"), "--show", "displacement"]
-    command += ["--registration", str(folder / "registration.json"), "-o", str(folder / "stopped")]
+    command += ["--registration", str(folder / "registration.json"), "-o", str(tmp_path)]
     assert main(command) == 130
     said = capsys.readouterr()
     assert "everything until then is kept" in said.err
-    frames = load_run(folder / "stopped").frames.tolist()
+    frames = load_run(tmp_path).frames.tolist()
     assert f"tracked={len(frames)}/{len(frames)} fps=" in said.out  # as at any other end
     assert frames == shown
     assert 1 <= len(frames) < 39
-    assert (folder / "stopped" / "augmented.mp4").is_file()
+    assert (tmp_path / "augmented.mp4").is_file()
 
 
 def test_inputs_that_do_not_fit_are_refused(recording, tmp_path):
@@ -256,14 +249,12 @@ def test_inputs_that_do_not_fit_are_refused(recording, tmp_path):
     (tmp_path / "registration.json").write_text(
         json.dumps(content | {"keyframes": [content["keyframes"][0] | {"frame": 1234}]})
     )
-    with pytest.raises(MapError, match="is not the map of the registration: it has no keyframe 1234"):
-        load_setup(of_object(folder, registration=tmp_path / "registration.json"))
-    alone = load_setup(of_object(folder, registration=tmp_path / "registration.json", map_path=None))
-    assert alone.map_path is None
-    assert "no map" in alone.registration.warnings[-1].text
-    with pytest.raises(TrackingError, match="a registration needs the map that it was made in"):
-        run_live(
-            LiveOptions(str(folder / "sequence" / "frames"), tmp_path / "run", replace(alone.options, pose="free"))
-        )
-    with pytest.raises(TrackingError, match="a map needs the object's place in it"):
-        load_setup(of_object(folder, registration=None, landmarks=tmp_path / "landmarks.csv"))
+    moved = {"registration": tmp_path / "registration.json"}
+    with pytest.raises(MapError, match="it has no keyframe 1234"):
+        OneObject(folder, **moved, map_path=folder / "map.h5")
+    with pytest.raises(TrackingError, match="a registration needs the map"):
+        md.track(options(folder, tmp_path / "run", **moved, pose="free", live=True))
+    (tmp_path / "registration.json").write_text(json.dumps(content))
+    alone = OneObject(folder, **moved)
+    assert new_anchor(alone.placed) is None
+    assert "no map" in alone.placed[0].registration.warnings[-1].text

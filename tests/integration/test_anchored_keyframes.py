@@ -11,12 +11,11 @@ from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.model import load_model
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.tracking.estimator import Estimator
-from morph_dslam.tracking.multi_camera import keyframe_views_of_rig, pictures_from
-from morph_dslam.tracking.multi_object import Known, seen_parts
+from morph_dslam.tracking.placement import images_from, seen_part
 from morph_dslam.tracking.reference import SurfaceSamples
-from morph_dslam.tracking.setup import ObjectOptions, load_setup
+from morph_dslam.tracking.run_options import ObjectOptions
 from tests.support.rendered_anchored_rig import FIRST_BESIDE, LEFT_FRAMES, MIRRORED_RIG, RIG, SCAN
-from tests.support.tracked_rig import column, errors, exact_nodes
+from tests.support.tracked_rig import column, errors, exact_nodes, placed_objects
 
 NAMES = ("sheet", "wedge")
 CAMERA = RIG[0].camera
@@ -43,15 +42,14 @@ def test_objects_are_known_by_what_other_keyframes_show_of_them(left_recording, 
     assert mean["several"][1] < min(1.0e-3, 0.5 * mean["one"][1])
 
 
-def setups_of(folder):
-    return {
-        name: load_setup(
-            ObjectOptions(
-                folder / f"{name}.morph", folder / "camera.yaml", registration=folder / name / "adjusted.json"
-            )
-        )
-        for name in NAMES
-    }
+def placed_in(folder, names=NAMES, **more):
+    """The objects by name, with all keyframes."""
+    first, *others = (
+        {"model": folder / f"{name}.morph", "registration": folder / name / "adjusted.json"} for name in names
+    )
+    files = {"frames": folder / "front", "camera": folder / "camera.yaml"} | more
+    also = tuple((name, ObjectOptions(**part)) for name, part in zip(names[1:], others, strict=True))
+    return dict(zip(names, placed_objects(**first, others=also, **files), strict=True))
 
 
 def exact_depth(folder, truth, name, frame):
@@ -63,41 +61,38 @@ def wedge_before_sheet(folder, truth, frame):
     return exact_depth(folder, truth, "wedge", frame) < exact_depth(folder, truth, "sheet", frame)
 
 
-def bound_points(setup):
+def bound_points(placed):
     """The points bound in all keyframes, and in each their pixels (p, 2)."""
-    registration = setup.registration
-    seen = setup.seen.get(registration.frame)
-    reference = setup.new_tracker(registration, setup.reference, False, seen).reference
+    reference = placed.new_tracker().reference
     places = [CAMERA.project(reference.points.in_camera(part.state)[part.rows]) for part in reference.parts]
     pixels = [np.rint(own).astype(int) for own in places]
-    return reference, dict(zip(setup.reference_keyframes, pixels, strict=True))
+    return reference, dict(zip(placed.reference_keyframes, pixels, strict=True))
 
 
 @pytest.fixture(scope="module")
 def sheets(rig_recording):
-    """The sheet, with and without what the wedge hides of it in each keyframe."""
-    setups = setups_of(rig_recording[0])
-    known = [Known(setups[name], setups[name].registration, setups[name].registration.frame) for name in NAMES]
-    of_sheet, of_wedge = seen_parts(known)
-    # The sheet lies behind the wedge everywhere.
-    assert not of_wedge
-    return {"aware": replace(setups["sheet"], seen=of_sheet), "unaware": setups["sheet"]}
+    """The sheet, with and without what the wedge occludes of it in each keyframe; and the wedge."""
+    folder = rig_recording[0]
+    both = placed_in(folder)
+    return {"aware": both["sheet"], "unaware": placed_in(folder, ("sheet",))["sheet"], "wedge": both["wedge"]}
 
 
-def test_what_another_object_hides_in_the_keyframes_is_known(rig_recording, sheets):
+def test_what_another_object_occludes_in_the_keyframes_is_known(rig_recording, sheets):
     folder, truth = rig_recording
-    assert set(sheets["aware"].seen) == set(sheets["aware"].keyframes)
-    for frame, seen in sheets["aware"].seen.items():
-        hidden = wedge_before_sheet(folder, truth, frame)
-        assert not (seen & hidden).any()
-        shown = np.isfinite(exact_depth(folder, truth, "sheet", frame)) & ~hidden
+    sheet, wedge, camera = sheets["aware"], sheets["wedge"], sheets["aware"].cameras[0]
+    for frame in sheet.object.keyframes:
+        # The sheet lies behind the wedge everywhere.
+        assert seen_part(wedge, [sheet], camera, frame) is None
+        seen, occluded = seen_part(sheet, [wedge], camera, frame), wedge_before_sheet(folder, truth, frame)
+        assert not (seen & occluded).any()
+        shown = np.isfinite(exact_depth(folder, truth, "sheet", frame)) & ~occluded
         assert (seen & shown).sum() > 0.9 * shown.sum()
 
 
 def test_nothing_is_bound_where_another_object_is_before_it_in_a_keyframe(rig_recording, sheets):
-    on_wedge = dict.fromkeys(sheets, 0)
-    for name, setup in sheets.items():
-        _, bound = bound_points(setup)
+    on_wedge = dict.fromkeys(("aware", "unaware"), 0)
+    for name in on_wedge:
+        _, bound = bound_points(sheets[name])
         for frame, pixels in bound.items():
             # What is compared of a point reaches beyond its pixel.
             before = wedge_before_sheet(*rig_recording, frame).astype(np.uint8)
@@ -113,14 +108,14 @@ def test_what_is_hidden_in_the_last_keyframe_is_bound_in_another(rig_recording, 
     assert len(bound) > 1
     pixels = np.rint(reference.projected(sheet.registration.state)).astype(int)
     inside = ((pixels >= 0) & (pixels < [CAMERA.width, CAMERA.height])).all(axis=1)
-    hidden, before = (np.zeros(len(pixels), dtype=bool), wedge_before_sheet(*rig_recording, sheet.registration.frame))
+    hidden, before = (np.zeros(len(pixels), dtype=bool), wedge_before_sheet(*rig_recording, sheet.frame))
     hidden[inside] = before[pixels[inside, 1], pixels[inside, 0]]
     assert hidden.sum() > 50
 
 
 def test_what_is_hidden_does_not_count_as_shown_by_the_reference_view(rig_recording, sheets):
-    sheet, last = sheets["aware"], sheets["aware"].registration.frame
-    reference, bound = bound_points(replace(sheet, keyframes={last: sheet.keyframes[last]}))
+    sheet, last = sheets["aware"], sheets["aware"].frame
+    reference, bound = bound_points(replace(sheet, keyframes=None))
     assert list(bound) == [last]
     samples, state = SurfaceSamples(Estimator(sheet.model, CAMERA), reference.surface), sheet.registration.state
     share = np.abs(reference.shown(samples)).sum() / np.abs(samples.seen(state, reference.depth(state))).sum()
@@ -134,14 +129,13 @@ def test_what_is_hidden_does_not_count_as_shown_by_the_reference_view(rig_record
 def test_each_camera_of_a_rig_knows_the_object_by_its_own_pictures_of_the_scan(mirrored_recording, tmp_path):
     """In the last keyframe neither camera shows the side of the wedge that the first one films then."""
     (folder, truth), mean = mirrored_recording, {}
-    setup = setups_of(folder)["wedge"]
-    for further, part in zip(
-        keyframe_views_of_rig(setup, MIRRORED_RIG, [folder / "mirrored"]), MIRRORED_RIG, strict=True
-    ):
+    files = {"frames": folder / "both", "other_cameras": (folder / "mirrored",)}
+    placed = placed_in(folder, ("wedge",), **files, camera=f"{folder}/camchain_mirrored.yaml#cam0")["wedge"]
+    for further, part in zip(placed.keyframes, MIRRORED_RIG, strict=True):
         assert further.views
         for view in further.views:
             exact = part.camera_from_rig.apply(exact_nodes(folder, truth, "wedge", view.frame))
-            nodes = view.state.camera_from_object.apply(setup.model.positions(view.state.parameters))
+            nodes = view.state.camera_from_object.apply(placed.model.positions(view.state.parameters))
             assert np.linalg.norm(nodes - exact, axis=1).max() < 0.4e-3
     arguments = [folder / "both", "--with", folder / "mirrored", "--camera", f"{folder}/camchain_mirrored.yaml#cam0"]
     arguments += ["--model", folder / "wedge.morph", "--registration", folder / "wedge" / "adjusted.json"]
@@ -159,10 +153,10 @@ def test_each_camera_of_a_rig_knows_the_object_by_its_own_pictures_of_the_scan(m
 def test_a_camera_has_those_pictures_of_the_scan_that_it_filmed(rig_recording):
     """The second camera's recording begins in the midst of the scan."""
     folder = rig_recording[0]
-    setup = setups_of(folder)["wedge"]
-    filmed = [number for number in sorted(setup.keyframes) if number >= FIRST_BESIDE]
-    assert 1 < len(filmed) < len(setup.keyframes)
-    assert sorted(pictures_from(folder / "aside", RIG[1].camera, setup.keyframes)) == filmed
-    first, second = keyframe_views_of_rig(setup, RIG, [folder / "aside"])
-    assert first is setup.further
-    assert {view.frame for view in second.views} <= set(filmed)
+    files = {"frames": folder / "front", "other_cameras": (folder / "aside",)}
+    placed = placed_in(folder, ("wedge",), **files, camera=f"{folder}/camchain.yaml#cam0")["wedge"]
+    keyframes = sorted(placed.object.keyframes)
+    filmed = [number for number in keyframes if number >= FIRST_BESIDE]
+    assert 1 < len(filmed) < len(keyframes)
+    assert sorted(images_from(folder / "aside", RIG[1].camera, keyframes)) == filmed
+    assert {view.frame for view in placed.keyframes[1].views} <= set(filmed)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam import MorphError, load_model
+from morph_dslam import MorphError, TrackOptions, load_model, track
 from morph_dslam.evaluation.evaluate import evaluate
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.mechanics.shell import OrthotropicSheet
@@ -21,7 +21,6 @@ from morph_dslam.model import save_model
 from morph_dslam.render.simulation import simulate
 from morph_dslam.studies.problem import Snapshot
 from morph_dslam.studies.snapshots import load_snapshot
-from morph_dslam.tracking.track import TrackOptions, track
 from tests.support.real_data import ROOT
 
 RESULT = r"positions=(\d+) largest_mm=([\d.]+) pcr_path_N=([\d.]+) pcr_eigen_N=([\d.]+) seconds=(\d+)"
@@ -249,7 +248,7 @@ def test_a_flat_sheet_is_followed_to_whichever_side_it_bends(
             camera=sequence / "camera.yaml",
             landmarks=sequence / "landmarks.csv",
             output=run,
-            overlay=False,
+            video=False,
         )
     )
     figures = evaluate(run, sequence / "truth.npz", 0)

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import morph_dslam as md
 from morph_dslam.cli.app import main
-from morph_dslam.errors import RegistrationError, RegistrationFailure, TrackingError
+from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_exp
 from morph_dslam.io.camera_files import save_camera
-from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.model import SurfacePoints, save_model
 from morph_dslam.registration.board import FiducialBoard, load_board
 from morph_dslam.registration.board_registration import BoardInitializer, locate_board
@@ -28,12 +28,9 @@ from morph_dslam.slam.rigid_map import GOOD, Keyframe, RigidMap
 from morph_dslam.tracking.estimator import Estimator
 from morph_dslam.tracking.patches import normalize_contrast
 from morph_dslam.tracking.relocalization import LEAST_MATCHES, state_from_matches
-from morph_dslam.tracking.run_live import LiveOptions, run_live
-from morph_dslam.tracking.setup import ObjectOptions
 from morph_dslam.tracking.state import BoundPoints, State
-from morph_dslam.tracking.track import TrackOptions, track
 from tests.support.bent_sheet import LENGTH, WIDTH
-from tests.support.rendered_sequence import CAMERA
+from tests.support.rendered_sequence import CAMERA, write_landmarks
 from tests.support.staged_scenes import SCENES, aside
 
 GRID = """
@@ -296,60 +293,52 @@ def state_of(scene, number):
 
 def options(recording, output, **changes):
     files = {"frames": "frames", "model": "sheet.morph", "camera": "camera.yaml"}
-    return TrackOptions(
-        **{name: recording / path for name, path in files.items()}, output=output, overlay=False, **changes
+    return md.TrackOptions(
+        **{name: recording / path for name, path in files.items()}, output=output, video=False, **changes
     )
 
 
-def test_a_run_starts_from_a_picture_and_is_placed_anew(recording, scene, tmp_path):
+def frames_of(summary, kind):
+    return [notice["frame"] for notice in summary["notices"] if notice["kind"] == kind]
+
+
+def error_mm(scene, run, row):
+    """Mean distance of the nodes from the truth in one frame."""
+    truth = state_of(scene, run.frames[row])
+    expected = truth.camera_from_object.apply(scene.model.positions(truth.parameters))
+    return 1e3 * np.linalg.norm(run.camera_points(row) - expected, axis=1).mean()
+
+
+def test_a_run_starts_from_a_picture_and_is_registered_anew(recording, scene, tmp_path):
     arguments = ["track", str(recording / "frames"), "--model", str(recording / "sheet.morph")]
     arguments += ["--camera", str(recording / "camera.yaml"), "--picture", str(recording / "picture.toml")]
     arguments += ["--reregister-at", "7", "--reregister-at", "5", "--no-video", "-o", str(tmp_path / "run")]
     assert main(arguments) == 0
     run = load_run(tmp_path / "run")
     assert run.tracked.tolist() == [number not in (4, 5) for number in range(12)]
-    for position in (0, 3, 7, 11):
-        truth = state_of(scene, position)
-        expected = truth.camera_from_object.apply(scene.model.positions(truth.parameters))
-        assert 1e3 * np.linalg.norm(run.camera_points(position) - expected, axis=1).mean() < 4.0
+    assert max(error_mm(scene, run, row) for row in (0, 3, 7, 11)) < 4.0
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["registration"]["from"] == "picture"
-    assert "placed anew in frame 7" in summary["flags"]
-    assert any(flag.startswith("not placed anew in frame 5") for flag in summary["flags"])
+    assert (frames_of(summary, "reregistered"), frames_of(summary, "not_reregistered")) == ([7], [5])
 
 
-def test_a_live_run_is_placed_anew_in_the_frame_or_the_next_that_is_not_dropped(recording, scene, tmp_path):
-    of_object = ObjectOptions(
-        recording / "sheet.morph",
-        recording / "camera.yaml",
-        initializer=InitializerFiles(picture=recording / "picture.toml"),
-    )
-    live = LiveOptions(str(recording / "frames"), tmp_path / "run", of_object, reregister_at=((7, None),), record=False)
-    flags = run_live(live)["flags"]
-    placed = [int(flag.split()[-1]) for flag in flags if flag.startswith("placed anew in frame")]
-    assert len(placed) == 1
-    assert 7 <= placed[0] <= 11
-    run, truth = load_run(tmp_path / "run"), state_of(scene, 11)
+def test_a_live_run_is_registered_anew_in_the_frame_or_the_next_that_is_not_dropped(recording, scene, tmp_path):
+    start = InitializerFiles(picture=recording / "picture.toml")
+    summary = md.track(options(recording, tmp_path, initializer=start, reregister_at=((7, None),), live=True))
+    (frame,) = frames_of(summary, "reregistered")
+    assert 7 <= frame <= 11
+    run = load_run(tmp_path)
     assert (run.frames[-1], run.status[-1]) == (11, "tracked")
-    expected = truth.camera_from_object.apply(scene.model.positions(truth.parameters))
-    assert 1e3 * np.linalg.norm(run.camera_points(len(run.frames) - 1) - expected, axis=1).mean() < 4.0
+    assert error_mm(scene, run, -1) < 4.0
 
 
-def test_landmarks_of_another_frame_place_the_object_anew(recording, scene, tmp_path):
-    nodes = np.random.default_rng(1).choice(len(scene.model.nodes), 16, replace=False)
-    files = []
-    for number in (0, 8):
-        state = state_of(scene, number)
-        seen = CAMERA.project(state.camera_from_object.apply(scene.model.positions(state.parameters)))[nodes]
-        files.append(tmp_path / f"landmarks_{number}.csv")
-        save_landmarks(files[-1], Landmarks(scene.model.nodes[nodes], seen))
-    summary = track(options(recording, tmp_path / "run", landmarks=files[0], reregister_at=((8, files[1]),), last=9))
-    assert "placed anew in frame 8" in summary["flags"]
-    run, truth = load_run(tmp_path / "run"), state_of(scene, 9)
-    expected = truth.camera_from_object.apply(scene.model.positions(truth.parameters))
-    assert 1e3 * np.linalg.norm(run.camera_points(9) - expected, axis=1).mean() < 0.5
-    with pytest.raises(TrackingError, match="give landmarks of that frame"):
-        track(options(recording, tmp_path / "other", landmarks=files[0], reregister_at=((8, None),)))
+def test_landmarks_of_another_frame_register_the_object_anew(recording, scene, tmp_path):
+    files = {number: tmp_path / f"landmarks_{number}.csv" for number in (0, 8)}
+    for number, path in files.items():
+        write_landmarks(path, scene.model, state_of(scene, number), seed=1)
+    run = options(recording, tmp_path / "run", landmarks=files[0], reregister_at=((8, files[8]),), last=9)
+    assert frames_of(md.track(run), "reregistered") == [8]
+    assert error_mm(scene, load_run(tmp_path / "run"), 9) < 0.5
 
 
 def test_matches_of_one_spot_span_no_pose(scene):

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
+from morph_dslam import TrackerOptions, TrackOptions, track
 from morph_dslam.meshing.generators import block
 from morph_dslam.model import load_model
 from morph_dslam.render.simulation import simulate
 from morph_dslam.studies.build import build
 from morph_dslam.studies.study import make_study
-from morph_dslam.tracking.track import TrackOptions, track
 
 SIZE, CELLS = (0.16, 0.05, 0.006), (16, 4, 1)
 RATIO = 2.2
@@ -100,8 +100,8 @@ def film_and_track(folder: Path, name: str, lift: float, frames: int) -> dict:
             camera=sequence / "camera.yaml",
             landmarks=sequence / "landmarks.csv",
             output=folder / f"{name}-run",
-            per_sequence=("ratio",),
-            overlay=False,
+            tracker=TrackerOptions(per_sequence=("ratio",)),
+            video=False,
         )
     )
 

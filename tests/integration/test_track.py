@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
+from morph_dslam import TrackerOptions, TrackOptions, track
 from morph_dslam.camera import Camera
 from morph_dslam.errors import CameraError, RegistrationError, SourceError, TrackingError
 from morph_dslam.evaluation.run_folder import load_run
@@ -15,7 +16,6 @@ from morph_dslam.io.camera_files import save_camera
 from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.model import save_model
 from morph_dslam.tracking.result import STAGES
-from morph_dslam.tracking.track import TrackOptions, track
 from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state
@@ -147,7 +147,7 @@ def test_interrupt_keeps_the_frames_so_far(inputs, tmp_path, monkeypatch):
 
     monkeypatch.setattr(Tracker, "track", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        track(options(inputs, tmp_path / "run", overlay=False))
+        track(options(inputs, tmp_path / "run", video=False))
     assert load_run(tmp_path / "run").frames.tolist() == [20, 21, 22]
     assert not (tmp_path / "run" / "augmented.mp4").exists()
 
@@ -159,7 +159,7 @@ def test_reference_may_lie_inside_the_range(inputs, tmp_path):
     state = sheet_state(TIMES[3])
     seen = CAMERA.project(state.camera_from_object.apply(model.positions(state.parameters)))[nodes]
     save_landmarks(tmp_path / "landmarks.csv", Landmarks(model.nodes[nodes], seen))
-    chosen = options(inputs, tmp_path / "run", first=21, last=23, reference_frame=23, overlay=False)
+    chosen = options(inputs, tmp_path / "run", first=21, last=23, reference_frame=23, video=False)
     summary = track(TrackOptions(**{**vars(chosen), "landmarks": tmp_path / "landmarks.csv"}))
     assert summary["n_tracked"] == 3
     assert summary["reference_frame"] == 23
@@ -193,7 +193,7 @@ def test_broken_frame_ends_the_run_but_keeps_it(inputs, tmp_path):
 
 
 def test_refined_reference_is_named_and_still_right(inputs, tmp_path):
-    summary = track(options(inputs, tmp_path / "run", refine_reference=True, overlay=False))
+    summary = track(options(inputs, tmp_path / "run", refine_reference=True, video=False))
     assert summary["reference_refined_over_the_sequence"]
     run = load_run(tmp_path / "run")
     assert run.tracked.sum() == 6
@@ -213,8 +213,8 @@ def test_run_without_the_object_is_whole_and_says_that_nothing_was_found(inputs,
 
 
 def test_random_walk_and_start_are_named(inputs, tmp_path):
-    walk = {"random_walk": (("twist", 2.0),), "start": "constant-velocity"}
-    summary = track(options(inputs, tmp_path / "run", last=22, overlay=False, **walk))
+    walk = TrackerOptions(random_walk=(("twist", np.radians(2.0)),), start="constant-velocity")
+    summary = track(options(inputs, tmp_path / "run", last=22, video=False, tracker=walk))
     assert "random walk" in summary["temporal_prior"]
     assert "twist by 2 deg" in summary["temporal_prior"]
     assert summary["start_of_each_frame"] == "the state that the last two lead to at constant velocity"
@@ -223,7 +223,9 @@ def test_random_walk_and_start_are_named(inputs, tmp_path):
 
 
 def test_parameter_that_is_one_over_the_sequence_is_named(inputs, finished, tmp_path):
-    summary = track(options(inputs, tmp_path / "run", last=23, per_sequence=("twist",), overlay=False))
+    summary = track(
+        options(inputs, tmp_path / "run", last=23, tracker=TrackerOptions(per_sequence=("twist",)), video=False)
+    )
     assert summary["temporal_prior"] == "one over the sequence, from all frames so far: twist; none on the others"
     (twist,) = summary["one_over_the_sequence"]
     low, high = twist["interval_95"]
@@ -232,4 +234,4 @@ def test_parameter_that_is_one_over_the_sequence_is_named(inputs, finished, tmp_
     assert finished[1]["temporal_prior"] == "none"
     assert finished[1]["one_over_the_sequence"] == []
     with pytest.raises(TrackingError, match="'bend' cannot be one over the sequence"):
-        track(options(inputs, tmp_path / "other", per_sequence=("bend",)))
+        track(options(inputs, tmp_path / "other", tracker=TrackerOptions(per_sequence=("bend",))))

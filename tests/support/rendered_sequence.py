@@ -7,6 +7,9 @@ import numpy as np
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.io.camera_files import save_camera
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
+from morph_dslam.model import save_model
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
 from morph_dslam.tracking.estimator import State
@@ -86,3 +89,20 @@ def mean_error(model, found, truth):
     a = found.camera_from_object.apply(model.positions(found.parameters))
     b = truth.camera_from_object.apply(model.positions(truth.parameters))
     return float(np.linalg.norm(a - b, axis=1).mean())
+
+
+def write_landmarks(path, model, state, camera=CAMERA, count=16, seed=0):
+    """Points of the object and the pixels in which the camera sees them."""
+    nodes = np.random.default_rng(seed).choice(len(model.nodes), count, replace=False)
+    pixels = camera.project(state.camera_from_object.apply(model.positions(state.parameters)))[nodes]
+    inside = ((pixels > 5.0) & (pixels < [camera.width - 5.0, camera.height - 5.0])).all(axis=1)
+    save_landmarks(path, Landmarks(model.nodes[nodes[inside]], pixels[inside]))
+
+
+def write_recording(folder, images, model, camera=CAMERA, name="frames"):
+    """`sheet.morph`, `camera.yaml`, and a folder of images by number."""
+    (folder / name).mkdir()
+    for number, image in images.items():
+        cv2.imwrite(str(folder / name / f"{number:06d}.png"), image)
+    save_model(folder / "sheet.morph", model)
+    save_camera(folder / "camera.yaml", camera)

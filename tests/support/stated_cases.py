@@ -16,7 +16,8 @@ from morph_dslam.registration.landmarks import register_landmarks
 from morph_dslam.registration.messages import Ambiguous, AtBound, OutlineElsewhere, PoorFit, Underdetermined, WrongUnit
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.tracking.estimator import State
-from morph_dslam.tracking.run_folder import RunResults, flags
+from morph_dslam.tracking.run_notices import notices_of
+from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.tracker import CameraLocalization, Tracker
 from tests.support.staged_scenes import Scene, is_beyond, is_doubted, mean_error
 
@@ -158,7 +159,7 @@ def run_case(
             back = number - back_at
     reasons = Counter(_gist(r.reason) for r in run.results if r.status != "tracked")
     return Outcome(
-        (*(warning.text for warning in registration.warnings), *flags(run), *reasons),
+        (*(warning.text for warning in registration.warnings), *(notice.text for notice in notices_of(run)), *reasons),
         len(run),
         int(run.tracked.sum()),
         int((~run.tracked).sum()),

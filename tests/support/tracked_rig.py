@@ -1,11 +1,22 @@
-"""How far what was tracked in the recordings of `rendered_anchored_rig` is from their truth."""
+"""Objects placed as a run places them, and how far what was tracked is from the truth of `rendered_anchored_rig`."""
+
+from contextlib import ExitStack
+from pathlib import Path
 
 import h5py
 import numpy as np
 
+import morph_dslam as md
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import load_model
+from morph_dslam.tracking.track import prepare
+
+
+def placed_objects(**options):
+    """The objects of a run in their reference frames; nothing is written."""
+    with ExitStack() as stack:
+        return prepare(md.TrackOptions(output=Path("run"), **options), stack)[2]
 
 
 def exact_nodes(folder, truth, name, frame):

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,12 +12,11 @@ from morph_dslam.errors import EvaluationError, MorphError, RegistrationError, T
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.evaluation.run_report import write_run_report
 from morph_dslam.io.camera_files import load_camera
+from morph_dslam.io.folders import make_run_folder
 from morph_dslam.io.landmarks import load_landmarks
 from morph_dslam.io.trajectory import load_trajectory
 from morph_dslam.model import save_model
 from morph_dslam.registration.board import load_board
-from morph_dslam.tracking.run_folder import check_run_folder
-from morph_dslam.tracking.setup import Reregistration
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.block_study import write_study
 from tests.support.run_folders import write_run
@@ -134,12 +132,7 @@ def test_nothing_but_our_message_is_printed_of_a_damaged_video(folder):
 
 
 def test_options_without_effect_are_refused(folder, capsys):
-    of_object = ["--model", folder / "sheet.morph", "--camera", folder / "camera.yaml", "--landmarks", "l"]
     output = ["-o", folder / "run"]
-    said = message_of(capsys, "live", "webcam:0", *of_object, *output, "--depth")
-    assert "live tracking takes no depth images" in said
-    said = message_of(capsys, "track", folder, *of_object, *output, "--pose", "fixed")
-    assert "a pose is held fixed by a map" in said
     slam = ["slam", folder, "--camera", folder / "camera.yaml", *output]
     assert "--images says what" in message_of(capsys, *slam, "--images", folder)
     assert "is not a frame number" in refused_by_parser(capsys, *slam, "--freeze-at=-1")
@@ -164,13 +157,6 @@ def test_numbers_that_cannot_be_meant(tmp_path, load, name, text):
         load(tmp_path / name)
 
 
-def test_frames_to_place_the_object_anew_in_that_cannot_be(tmp_path):
-    setup, registration = SimpleNamespace(initializer=object()), SimpleNamespace()
-    with pytest.raises(RegistrationError, match=r"absent\.csv"):
-        Reregistration(setup, registration, [(7, tmp_path / "absent.csv")])
-    assert Reregistration(setup, registration, [(7, None)]).notes == ["not placed anew in frame 7: it was not tracked"]
-
-
 def test_a_damaged_summary_is_named(tmp_path):
     write_run(tmp_path)
     run = load_run(tmp_path)
@@ -182,16 +168,16 @@ def test_a_damaged_summary_is_named(tmp_path):
 
 def test_a_folder_that_holds_a_run_or_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("")
-    check_run_folder(tmp_path / "a" / "run", overwrite=False)
+    make_run_folder(tmp_path / "a" / "run", overwrite=False)
     assert (tmp_path / "a" / "run").is_dir()
     for sign in ("result.h5", "trajectory.txt"):
         (tmp_path / "a" / "run" / sign).write_text("")
         with pytest.raises(TrackingError, match="holds a run already"):
-            check_run_folder(tmp_path / "a" / "run", False, sign)
-        check_run_folder(tmp_path / "a" / "run", True, sign)
+            make_run_folder(tmp_path / "a" / "run", False, sign)
+        make_run_folder(tmp_path / "a" / "run", True, sign)
     for name in ("file", "file/run"):
         with pytest.raises(TrackingError, match="cannot write the run to"):
-            check_run_folder(tmp_path / name, overwrite=True)
+            make_run_folder(tmp_path / name, overwrite=True)
 
 
 @pytest.mark.parametrize("start", ["board", "picture", "guess"])

@@ -27,7 +27,8 @@ from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.sheet_study import SheetStudy
 from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.tracking.outcomes import Status, TrackingWarning
-from morph_dslam.tracking.run_folder import RunResults, summarise, write_csv, write_hdf5
+from morph_dslam.tracking.run_folder import summarise, write_csv, write_hdf5
+from morph_dslam.tracking.run_results import RunResults
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.documents import PAGES, PROJECT, code_words
 from tests.unit.test_results import frame_result

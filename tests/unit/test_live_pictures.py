@@ -9,7 +9,7 @@ import pytest
 
 from morph_dslam.errors import TrackingError
 from morph_dslam.sources import Frame
-from morph_dslam.tracking.live import BrowserSink, LiveTimes, VideoSink
+from morph_dslam.tracking.sinks import BrowserSink, LiveTimes, TrackedFrame, VideoSink
 
 BLUE = np.full((40, 60, 3), (200, 30, 20), dtype=np.uint8)
 
@@ -24,28 +24,28 @@ class Written:
         self.values.append(int(image[0, 0, 0]))
 
 
-def picture(value):
-    return np.full((2, 2, 3), value, dtype=np.uint8)
+def shown(picture, seconds=0.0):
+    return TrackedFrame((Frame(0, seconds, picture),), {}, picture)
 
 
 def test_a_video_stands_still_where_frames_were_dropped_and_leaves_out_long_gaps():
     video = Written()
     sink = VideoSink(video, 10.0)
     for value, seconds in ((1, 5.0), (2, 5.1), (3, 5.4), (4, 5.41), (5, 60.0), (6, 60.2)):
-        sink.show(Frame(0, seconds, picture(0)), picture(value))
+        sink(shown(np.full((2, 2, 3), value, dtype=np.uint8), seconds))
     # The third came 0.3 s after the second; the fourth at once: time goes on from there, as after the gap.
     assert video.values == [1, 2, 3, 3, 3, 4, 5, 6, 6]
 
 
 def test_a_browser_gets_the_newest_picture():
-    frame = Frame(0, 0.0, BLUE)
     with BrowserSink(0) as sink:
-        sink.show(frame, BLUE)  # nobody looks
+        sink(shown(BLUE))  # nobody looks
         with urllib.request.urlopen(sink.address) as page:
             assert b"/stream.mjpg" in page.read()
         with urllib.request.urlopen(sink.address + "stream.mjpg") as stream:
-            sink.wait_for_looker(10.0)
-            sink.show(frame, BLUE)
+            while not sink.is_watched:
+                pass
+            sink(shown(BLUE))
             assert stream.readline() == b"--frame\r\n"
             headers = [stream.readline() for _ in range(3)]
             jpeg = stream.read(int(headers[1].split()[1]))

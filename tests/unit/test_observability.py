@@ -1,4 +1,4 @@
-"""What unobservable, on models whose blind combinations are known."""
+"""What the images do not tell, on models whose blind combinations are known."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,8 @@ from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.observability import one_value, statement, unobservable, value_line
 from morph_dslam.tracking.outcomes import FoundBy, Status
 from morph_dslam.tracking.result import STAGES, FrameResult
-from morph_dslam.tracking.run_folder import RunResults, summarise
+from morph_dslam.tracking.run_folder import summarise
+from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import sheet_mesh
 
@@ -74,12 +75,11 @@ def run_of(per_sequence, frames=3):
 
 
 def test_parameters_without_effect_and_those_that_act_alike_are_named():
-    told = summarise(run_of(()))["flags"]
-    assert told[0] == "parameter 'colour' is unobservable in 3 frames"
-    assert told[1].startswith("only a combination of parameters 'load' and 'stiffness' is observable in 3 frames")
+    colour, both = summarise(run_of(()))["notices"]
+    assert (colour["kind"], colour["parameters"], colour["count"]) == ("unobservable", ["colour"], 3)
+    assert (both["kind"], both["parameters"], both["count"]) == ("unobservable", ["load", "stiffness"], 3)
     # 2 stiffness - load stays the same: twice as much of the load as of the stiffness, both in shares of 2.
-    assert "'load' is 0.179 larger and 'stiffness' is 0.0894 larger" in told[1]
-    assert len(told) == 2
+    assert "'load' is 0.179 larger and 'stiffness' is 0.0894 larger" in both["text"]
 
 
 def test_values_over_the_sequence_have_an_interval_and_say_when_nothing_tells():
@@ -91,7 +91,7 @@ def test_values_over_the_sequence_have_an_interval_and_say_when_nothing_tells():
     assert shear["observable"]
     assert not stiffness["observable"]
     assert not colour["observable"]
-    assert any("'colour' is unobservable over the whole sequence" in t for t in summary["flags"])
+    assert any(notice["parameters"] == ["colour"] for notice in summary["notices"])
     assert value_line(shear).startswith("shear = 0.")
     assert value_line(colour).endswith("unobservable")
 

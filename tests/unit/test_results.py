@@ -15,7 +15,9 @@ from morph_dslam.tracking.estimator import BoundPoints, Estimate, State
 from morph_dslam.tracking.measurement import ReferenceAppearance, visible_surface
 from morph_dslam.tracking.outcomes import FoundBy, Rejection, RejectionReason, Status
 from morph_dslam.tracking.result import STAGES, FrameResult
-from morph_dslam.tracking.run_folder import RunResults, flags, summarise
+from morph_dslam.tracking.run_folder import summarise
+from morph_dslam.tracking.run_notices import RunNotice, RunWarning, notices_of
+from morph_dslam.tracking.run_results import RunResults
 from tests.support.bent_sheet import PARAMETERS, bent_sheet_model
 
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
@@ -59,11 +61,13 @@ def test_summary_counts_and_flags():
     assert (summary["n_frames"], summary["n_tracked"], summary["n_lost"]) == (3, 2, 1)
     assert summary["median_ms"] == pytest.approx(2.0 * len(STAGES) + 0.5)
     assert summary["median_n_inliers"] == 280
-    told = flags(run)
-    assert "1 of 3 frames were lost" in told[0]
-    assert "'arch' is at the upper bound of its range (60 mm) in 1 frames: the object may be outside" in told[1]
-    assert "'skew' is unobservable in 1 frames" in told[2]
-    assert len(told) == 3
+    lost, at_bound, unobservable = notices_of(run)
+    assert lost == RunNotice.of(RunWarning.LOST, count=1, n_frames=3)
+    data = {"parameter": "arch", "side": "upper", "bound": "60 mm", "count": 1}
+    assert at_bound == RunNotice.of(RunWarning.AT_BOUND, **data)
+    assert (unobservable.warning, unobservable.data["parameters"]) == (RunWarning.UNOBSERVABLE, ["skew"])
+    assert summary["flags"] == [lost.text, at_bound.text, unobservable.text]
+    assert summary["notices"][1] == {"kind": "at_bound", **data, "text": at_bound.text}
 
 
 def test_bound_where_the_undeformed_object_rests_is_told_from_one_that_it_reached():
@@ -72,9 +76,9 @@ def test_bound_where_the_undeformed_object_rests_is_told_from_one_that_it_reache
     run = RunResults(replace(model, parameters=(arch, *model.parameters[1:])), reference_frame=0)
     run.add(0, 0.0, frame_result([0.0, 0.1, 0.0], [1e-3, 0.05, 0.01], [True, False, False]))
     run.add(1, 0.1, frame_result([0.06, 0.1, 0.0], [1e-3, 0.05, 0.01], [True, False, False]))
-    resting, reached = flags(run)
-    assert "'arch' is at the lower bound of its range (0 mm) in 1 frames: the object rests there, or is" in resting
-    assert "'arch' is at the upper bound of its range (60 mm) in 1 frames: the object may be" in reached
+    resting, reached = notices_of(run)
+    assert (resting.warning, resting.data["side"]) == (RunWarning.RESTS_AT_BOUND, "lower")
+    assert (reached.warning, reached.data["side"]) == (RunWarning.AT_BOUND, "upper")
 
 
 def test_stress_shown_is_that_of_the_side_turned_to_the_camera():

@@ -77,9 +77,10 @@ def named_value(text: str) -> tuple[str, float]:
     return name, value
 
 
-def frame_and_file(text: str) -> tuple[int, Path | None]:
-    """A frame number, and a file that belongs to it: "120" or "120=landmarks.csv"."""
-    number, equals, name = text.partition("=")
+def frame_and_file(text: str) -> tuple[str, int, Path | None]:
+    """An object's name, a frame number, and a file that belongs to it: "120", "120=landmarks.csv", "lid:120"."""
+    before, equals, name = text.partition("=")
+    of, _, number = before.rpartition(":")
     if not number.isdecimal() or (equals and not name):
         raise argparse.ArgumentTypeError(f"'{text}' is not a frame, or a frame and a file, such as 120=new.csv")
-    return int(number), Path(name) if name else None
+    return of, int(number), Path(name) if name else None

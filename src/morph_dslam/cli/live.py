@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from morph_dslam.cli.arguments import positive_number
-from morph_dslam.cli.track import add_tracking_arguments, drawing, object_arguments, other_objects, print_summary
+from morph_dslam.cli.track import add_tracking_arguments, print_summary, run_options
 
 HELP = "track an object in the frames of a webcam, or of a recording at its own pace, as they come"
 KEPT = "everything until then is kept in the run folder"
@@ -23,24 +23,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Track until the stream ends, and print the figures of each run folder."""
-    from morph_dslam.tracking.run_live import LiveOptions, run_live
-    from morph_dslam.tracking.setup import ObjectOptions
+    from morph_dslam.tracking.track import track
 
-    first, last = arguments.range
-    run_live(
-        LiveOptions(
-            source=arguments.source,
-            output=arguments.output,
-            of_object=ObjectOptions(**object_arguments(arguments)),
-            drawing=drawing(arguments),
-            others=other_objects(arguments),
-            first=first,
-            last=last,
-            reregister_at=tuple(arguments.reregister_at),
-            serve=arguments.serve,
-            record=not arguments.no_video,
-            seconds=arguments.seconds,
-            overwrite=arguments.overwrite,
-        ),
-        print_summary,
+    options = run_options(
+        arguments, frames=arguments.source, live=True, serve=arguments.serve, seconds=arguments.seconds
     )
+    track(options, print_summary)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,8 +11,7 @@ from morph_dslam.cli.arguments import add_range, frame_and_file, named_value
 from morph_dslam.errors import TrackingError
 
 if TYPE_CHECKING:
-    from morph_dslam.tracking.drawing import DrawOptions
-    from morph_dslam.tracking.multi_object import OtherObject
+    from morph_dslam.tracking.run_options import TrackOptions
 
 HELP = "find an object's pose and parameters in every frame, and draw the stress over the video"
 KEPT = "the frames tracked so far are kept in the run folder"
@@ -50,34 +50,16 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Track and print the figures of each run folder."""
-    from morph_dslam.tracking.multi_object import track_objects
-    from morph_dslam.tracking.track import TrackOptions, track
-    from morph_dslam.tracking.track_rig import track_rig
+    from morph_dslam.tracking.track import track
 
-    first, last = arguments.range
-    options = TrackOptions(
+    options = run_options(
+        arguments,
         frames=arguments.frames,
-        output=arguments.output,
-        first=first,
-        last=last,
         reference_frame=arguments.reference_frame,
-        reregister_at=tuple(arguments.reregister_at),
         refine_reference=arguments.refine,
-        overlay=not arguments.no_video,
-        overwrite=arguments.overwrite,
-        drawing=drawing(arguments),
-        **object_arguments(arguments),
+        other_cameras=tuple(arguments.other_cameras),
     )
-    if arguments.other_cameras and arguments.also:
-        raise TrackingError("several objects and several cameras cannot go together: leave out --also or --with")
-    if arguments.other_cameras:
-        print_summary(options.output, track_rig(options, arguments.other_cameras))
-        return
-    if not arguments.also:
-        print_summary(options.output, track(options))
-        return
-    for folder, summary in track_objects(options, other_objects(arguments)).items():
-        print_summary(folder, summary)
+    track(options, print_summary)
 
 
 def print_summary(folder: Path, summary: dict[str, Any]) -> None:
@@ -102,46 +84,79 @@ def print_summary(folder: Path, summary: dict[str, Any]) -> None:
     print(line)
 
 
-def object_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What `add_tracking_arguments` asked for, by the names of `ObjectOptions`."""
+def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
+    """What `add_tracking_arguments` asked for, and more.
+
+    What is asked for of parameters, the outline and inner structures holds for the first object only.
+    """
     from morph_dslam.registration.initialization import InitializerFiles
-    from morph_dslam.tracking.options import TrackerOptions
-
-    return {
-        "model": arguments.model,
-        "camera": arguments.camera,
-        "landmarks": arguments.landmarks,
-        "registration": arguments.registration,
-        "initializer": InitializerFiles(arguments.board, arguments.picture, arguments.guess),
-        "map_path": arguments.map,
-        "pose": arguments.pose,
-        "use_outline": arguments.outline,
-        "use_depth": arguments.depth,
-        "use_discrepancy": arguments.discrepancy,
-        "inner": tuple(arguments.inner),
-        "per_sequence": tuple(arguments.per_sequence),
-        "random_walk": tuple(arguments.random_walk),
-        "start": arguments.start,
-        "tracker": TrackerOptions(new_views=not arguments.one_view, further_views=not arguments.one_view),
-    }
-
-
-def other_objects(arguments: argparse.Namespace) -> tuple[OtherObject, ...]:
-    """The objects beside the first, of ``--also``."""
-    from morph_dslam.tracking.multi_object import OtherObject
-
-    return tuple(OtherObject(name, Path(model), Path(start)) for name, model, start in arguments.also)
-
-
-def drawing(arguments: argparse.Namespace) -> DrawOptions:
-    """What is to be drawn; raises TrackingError if the section is none, or nothing shows it."""
-    is_shown = not arguments.no_video or getattr(arguments, "serve", None) is not None
-    if not is_shown and (arguments.show, arguments.section) != (None, None):
-        raise TrackingError("--show and --section say what the video shows: leave them or --no-video out")
     from morph_dslam.tracking.drawing import DrawOptions, SectionPlane
+    from morph_dslam.tracking.options import TrackerOptions
+    from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
 
+    tracker = TrackerOptions(
+        use_depth=arguments.depth,
+        use_discrepancy=arguments.discrepancy,
+        start=arguments.start,
+        new_views=not arguments.one_view,
+        further_views=not arguments.one_view,
+    )
+
+    def frames_of(name: str) -> tuple[tuple[int, Path | None], ...]:
+        return tuple((frame, path) for of, frame, path in arguments.reregister_at if of == name)
+
+    others = []
+    for name, model, start in arguments.also:
+        is_registered = start.endswith(".json")
+        part = ObjectOptions(
+            model=Path(model),
+            landmarks=None if is_registered else Path(start),
+            registration=Path(start) if is_registered else None,
+            pose=arguments.pose if is_registered else "map",
+            reregister_at=frames_of(name),
+            tracker=tracker,
+        )
+        others.append((name, part))
+    unknown = {of for of, _, _ in arguments.reregister_at} - {"", *(name for name, _ in others)}
+    if unknown:
+        raise TrackingError(f"--reregister-at {min(unknown)}: there is no --also of that name")
+    first, last = arguments.range
     section = None if arguments.section is None else SectionPlane.parse(arguments.section)
-    return DrawOptions(arguments.show, section)
+    return TrackOptions(
+        model=arguments.model,
+        camera=arguments.camera,
+        landmarks=arguments.landmarks,
+        registration=arguments.registration,
+        initializer=InitializerFiles(arguments.board, arguments.picture, arguments.guess),
+        map_path=arguments.map,
+        pose=arguments.pose,
+        inner=tuple(arguments.inner),
+        reregister_at=frames_of(""),
+        tracker=replace(
+            tracker,
+            use_outline=arguments.outline,
+            per_sequence=tuple(arguments.per_sequence),
+            random_walk=_random_walk(arguments),
+        ),
+        others=tuple(others),
+        first=first,
+        last=last,
+        output=arguments.output,
+        overwrite=arguments.overwrite,
+        video=not arguments.no_video,
+        drawing=DrawOptions(arguments.show, section),
+        **more,
+    )
+
+
+def _random_walk(arguments: argparse.Namespace) -> tuple[tuple[str, float], ...]:
+    """Steps in SI of parameters that walk; of a name that is none it stays as it is, to be refused later."""
+    if not arguments.random_walk:
+        return ()
+    from morph_dslam import load_model
+
+    units = {parameter.name: parameter.display(1.0) for parameter in load_model(arguments.model).parameters}
+    return tuple((name, step / units.get(name, 1.0)) for name, step in arguments.random_walk)
 
 
 def add_tracking_arguments(command: argparse.ArgumentParser) -> None:
@@ -228,9 +243,9 @@ def add_tracking_arguments(command: argparse.ArgumentParser) -> None:
         type=frame_and_file,
         action="append",
         default=[],
-        metavar="N[=FILE]",
-        help="place the object anew in frame N, by landmarks there or by the board, picture or guess that "
-        "the run starts from; may be repeated",
+        metavar="[NAME:]N[=FILE]",
+        help="register the object, or that of --also NAME, anew in frame N, by landmarks there or by the board, "
+        "picture or guess that the run starts from; may be repeated",
     )
     command.add_argument(
         "--also",
@@ -239,7 +254,7 @@ def add_tracking_arguments(command: argparse.ArgumentParser) -> None:
         default=[],
         metavar=("NAME", "MODEL", "START"),
         help="another object in the same frames, its results in RUN/NAME; START is its registration.json in "
-        "the same map or, with `morph track`, its file of landmarks; may be repeated",
+        "the same map or its file of landmarks; may be repeated",
     )
     command.add_argument(
         "--show",

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from morph_dslam.errors import MapError
 from morph_dslam.io.camera_files import load_camera_or_pair
 from morph_dslam.io.colmap import ColmapImage, ColmapModel, read_colmap_model, write_colmap_model
+from morph_dslam.io.folders import make_run_folder
 from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.slam.frame_images import FrameImages
@@ -29,7 +30,6 @@ from morph_dslam.slam.rigid_map import GOOD
 from morph_dslam.slam.scene import Scene, finish_scene, load_scene, start_slam, track_frames
 from morph_dslam.sources import open_source, open_stream
 from morph_dslam.sources.live import LiveStream
-from morph_dslam.tracking.run_folder import check_run_folder
 
 Array = NDArray[np.float64]
 
@@ -89,7 +89,7 @@ def run_slam(
         raise MapError("--images says what a COLMAP model (--map MODEL) or poses (--trajectory) are of")
     one_or_two, stream = load_camera_or_pair(camera), open_stream(source, first, last)
     with stream if isinstance(stream, LiveStream) else nullcontext():
-        check_run_folder(output, overwrite, "trajectory.txt")
+        make_run_folder(output, overwrite, "trajectory.txt")
         known: Scene | Trajectory | ColmapModel | None = None
         if trajectory is not None:
             known = load_trajectory(trajectory)

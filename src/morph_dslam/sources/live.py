@@ -6,6 +6,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Generic, Protocol, TypeVar
@@ -193,6 +194,7 @@ class PacedRecording(LiveStream):
     ) -> None:
         super().__init__(source.name, source.fps)
         self._source, self._clock, self._sleep = source, clock, sleep
+        self.has_registered_depth = getattr(source, "has_registered_depth", False)
 
     def read(self) -> Iterator[Frame]:
         first: tuple[float, float] | None = None
@@ -203,7 +205,7 @@ class PacedRecording(LiveStream):
             wait = first[0] + frame.timestamp - first[1] - self._clock()
             if wait > 0.0:
                 self._sleep(wait)
-            yield Frame(frame.index, frame.timestamp, frame.image, captured=self._clock())
+            yield replace(frame, captured=self._clock())
 
     def __iter__(self) -> Iterator[Frame]:
         if self._thread.ident is None:

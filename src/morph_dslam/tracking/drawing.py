@@ -26,7 +26,7 @@ from morph_dslam.render.shading import lambert, text_patch, vertex_normals
 from morph_dslam.sources import FrameSource
 from morph_dslam.tracking.binding import DrawnSurface, View, facing
 from morph_dslam.tracking.estimator import State
-from morph_dslam.tracking.run_folder import RunResults
+from morph_dslam.tracking.run_results import RunResults
 
 Array = NDArray[np.float64]
 
@@ -209,7 +209,7 @@ class AugmentedView:
     ) -> None:
         options = options or DrawOptions()
         self._camera, self._inner, self._model = camera, inner, model
-        self.show = _chosen(model, options.show)
+        self.show = shown_field(model, options.show)
         self._points, self._triangles = _drawn_mesh(model, options.section)
         self._closed = options.section is None and DrawnSurface.of(model).closed
         self._alpha = SEE_THROUGH if inner else OPACITY if options.section is None else CUT_OPEN
@@ -329,7 +329,8 @@ def with_caption(image: NDArray[np.uint8], caption: str) -> NDArray[np.uint8]:
     return result
 
 
-def _chosen(model: ReducedModel, show: Shown | None) -> Shown:
+def shown_field(model: ReducedModel, show: Shown | None) -> Shown:
+    """What colours an object, by default the stress of a model that has it; raises TrackingError if it has it not."""
     has = {"stress": bool(model.stresses), "strain": model.strain is not None, "displacement": True}
     if show is None:
         return "stress" if has["stress"] else "displacement"

@@ -7,9 +7,8 @@ pose is (R w, R v) of the camera's, with R the rotation of camera_from_rig, and 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import scipy.linalg
@@ -20,10 +19,9 @@ from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.registration import PosePrior, Registration
-from morph_dslam.slam.frame_images import FrameImages
-from morph_dslam.sources import open_source
+from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
-from morph_dslam.tracking.anchoring import FIRST_SIGMA_PX, HELD, LEAST_SIGMA_PX
+from morph_dslam.tracking.anchoring import FIRST_SIGMA_PX, HELD, LEAST_SIGMA_PX, Anchor
 from morph_dslam.tracking.covariance import error_factors_of
 from morph_dslam.tracking.estimator import Estimate, EstimationOptions, Estimator, LinearCost, Prior, State
 from morph_dslam.tracking.frame_estimation import new_filter
@@ -43,19 +41,23 @@ from morph_dslam.tracking.outcomes import (
     Status,
     TrackingWarning,
 )
-from morph_dslam.tracking.reference import PosedImage
 from morph_dslam.tracking.result import STAGES, FrameResult
-from morph_dslam.tracking.setup import Setup, views_of
 from morph_dslam.tracking.systematic_errors import SystematicErrors, inverse_of_seen
 from morph_dslam.tracking.tracker import CameraLocalization, Tracker
-from morph_dslam.tracking.views import KeyframeViews, choose_keyframe_views
+from morph_dslam.tracking.views import KeyframeViews
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class RigCamera:
-    """A camera and where it is: ``camera_from_rig``, metres; the first camera's is the identity."""
+    """A camera of a rig.
+
+    Attributes
+    ----------
+    camera : its intrinsics and lens.
+    camera_from_rig : where it is, metres; the identity of the first camera.
+    """
 
     camera: Camera
     camera_from_rig: RigidTransform
@@ -65,7 +67,7 @@ class RigCamera:
         return replace(state, camera_from_object=self.camera_from_rig @ state.camera_from_object)
 
     def seen_pose(self, known: PosePrior) -> PosePrior:
-        """The pose in this camera of what the map tells of that in the rig's; the rig itself is exact."""
+        """The pose in this camera of what the map gives of that in the rig's frame; the rig itself is exact."""
         rotation = self.camera_from_rig.rotation
         turn = np.asarray(scipy.linalg.block_diag(rotation, rotation))
         return PosePrior(self.camera_from_rig @ known.pose, turn @ known.from_camera @ turn.T, turn @ known.lasting)
@@ -85,7 +87,9 @@ class RigEstimator:
 
     Parameters
     ----------
-    cameras : of the rig. What they measured comes in the same order.
+    model : the object.
+    cameras : of the rig; what they measured comes in the same order.
+    options : of the estimator of each.
     """
 
     def __init__(
@@ -143,20 +147,19 @@ class RigEstimator:
         return LinearCost.joined(costs)
 
 
-# What the error of a rig's reference state does to the estimates that all its cameras make together.
-# As for one camera (`systematic_errors`), the points were bound by the reference state, and an error e of it
-# enters each estimate through them. Each camera sees e as C e, with C its chain from increments in the rig's
-# frame to those in its own, so that the sum of C' J' W M J0 C over the cameras pushes the estimate. In
-# further pictures of the undeformed object the same error factors make another e each.
-
-
 class RigReference:
     """Adds to covariances what the reference state is off by.
 
+    As for one camera (`systematic_errors`), an error e of the reference state enters each estimate through the
+    points that were bound by it. Each camera sees e as C e, with C its chain from increments in the rig's frame
+    to those in its own, so that the sum of C' J' W M J0 C over the cameras pushes the estimate. In other
+    reference images of the undeformed object the same error factors make another e each.
+
     Parameters
     ----------
-    trackers : by camera, each at its one reference view, which knows how its pictures are off by the error
-        factors that are the same for all. cameras : of the rig.
+    trackers : by camera, each at its one reference view, which knows how its images are off by the error
+        factors that are the same for all.
+    cameras : of the rig.
     """
 
     def __init__(self, trackers: Sequence[Tracker], cameras: Sequence[RigCamera]) -> None:
@@ -192,161 +195,155 @@ class RigReference:
         return replace(estimate, covariance=estimate.covariance + transfer @ transfer.T)
 
 
-# In which pictures of a scan each camera of a rig has the undeformed object, if the rig filmed the scan.
-# The registration has the object in the first camera's keyframes. What the other cameras filmed in the same
-# instants shows it too, from where the rig has them; each camera chooses among its own pictures.
-
-
-def keyframe_views_of_rig(
-    setup: Setup, cameras: Sequence[RigCamera], others: Sequence[Path]
-) -> list[KeyframeViews] | None:
-    """What each camera has beside the keyframe that the object is placed in; None where nothing is known.
-
-    Parameters
-    ----------
-    setup : of the first camera, whose recording shows the map's keyframes. others : the other recordings.
-    """
-    if setup.further is None or setup.registration is None:
-        return None
-    model, views = setup.registration.model, views_of(setup.registration, setup.keyframes, setup.seen)
-    options, found = setup.tracker_options(setup.registration), [setup.further]
-    for part, path in zip(cameras[1:], others, strict=True):
-        pictures = pictures_from(path, part.camera, [view.frame for view in views if view.frame is not None])
-        own = [
-            _seen_by(part, view, pictures[view.frame], len(model.parameters))
-            for view in views
-            if view.frame in pictures
-        ]
-        found.append(choose_keyframe_views(Estimator(model, part.camera), own[0], own[1:], options))
-    return found
-
-
-def pictures_from(path: Path, camera: Camera, numbers: Collection[int]) -> dict[int, Image]:
-    """Frames of a recording by number, made ready; those that it does not hold are left out.
-
-    Raises
-    ------
-    SourceError
-        If it cannot be read. CameraError if a frame has not the camera's size.
-    """
-    images, pictures = FrameImages(camera), {}
-    for frame in open_source(path):
-        if frame.index in numbers:
-            view = images.prepare(frame.image, frame.index, frame.timestamp)
-            pictures[frame.index] = Image(view.grey, view.normalized)
-        if frame.index >= max(numbers):
-            break
-    return pictures
-
-
-def _seen_by(part: RigCamera, view: PosedImage, picture: Image, n_parameters: int) -> PosedImage:
-    """The first camera's view as another camera has it, in its own picture."""
-    error_factors = None if view.error_factors is None else part.chain(n_parameters) @ view.error_factors
-    return replace(view, picture=picture, state=part.seen(view.state), error_factors=error_factors)
-
-
-# Tracking one object with several synchronised cameras.
-# Each camera follows the object by itself, and one state is estimated from what all of them measured. A
-# camera that has lost the object goes on from what the others know, and finds it again there. Where a map
-# tells the object's pose in the rig, it counts once in the state of all, as it does in each camera's own.
-
-
-#: A camera of which a smaller share of the points agrees with all cameras together says something else.
+#: A camera of which a smaller share of the points agrees with all cameras together contradicts them.
 LEAST_AGREEING = 0.5
 
 
 class RigTracker:
-    """Follows one object from a registered reference view in each camera.
+    """Follows one object through the frames of several cameras.
+
+    Each camera follows it by itself, and one state is estimated from what all of them measured. A camera that
+    has lost the object goes on from what the others know. Where a map gives the object's pose in the rig, it
+    counts once in the common state, as it does in that of each camera. No camera makes reference views: the
+    common estimate ties lasting errors to the points of one view a camera.
 
     Parameters
     ----------
-    cameras : of the rig. references : by camera, the reference frame, of one instant; see `Tracker`.
-    state : of the object in them, its pose in the rig's frame (the first camera's).
-    reference_covariance : (d + 6, d + 6) of ``state``; None where nothing is known of its error.
-    further : by camera, other pictures of the object as it is there, and how it is off in all of them by the
-        same error_factors; these count in place of ``reference_covariance``.
+    model : the object; where the registration leaves the angle about an axis open, ``registration.model``.
+    cameras : of the rig.
+    registration : pose in the rig's frame (the first camera's) and parameters in the reference frames.
+    options : as of `Tracker`.
+    references : by camera, the reference frame (h, w, 3) uint8 of one instant, or made ready.
+    in_sequence : whether the first frames to track are the reference frames or follow them.
+    anchor : the map that the object is anchored in, of the first camera; None for a free object.
+    seen : by camera, where (h, w) the reference frame shows the object; None for all that it covers.
+    keyframes : by camera, other images of the object as it is in the reference frames, with the errors of the
+        registration there.
 
     Raises
     ------
     RegistrationError
-        If the object shows too few corners in a reference frame. TrackingError as `Tracker` does.
+        If the object shows too few corners in a reference frame.
+    TrackingError
+        As `Tracker` does.
     """
 
     def __init__(
         self,
         model: ReducedModel,
         cameras: Sequence[RigCamera],
-        references: Sequence[NDArray[np.uint8] | Image],
-        state: State,
+        registration: Registration,
         options: TrackerOptions | None = None,
+        *,
+        references: Sequence[NDArray[np.uint8] | Image],
         in_sequence: bool = True,
-        reference_covariance: NDArray[np.float64] | None = None,
-        further: Sequence[KeyframeViews] | None = None,
+        anchor: Anchor | None = None,
+        seen: Sequence[NDArray[np.bool_] | None] | None = None,
+        keyframes: Sequence[KeyframeViews] | None = None,
     ) -> None:
-        self.model, self.cameras, self.options = model, tuple(cameras), options or TrackerOptions()
-        self.estimator = RigEstimator(model, self.cameras, self.options.estimation)
-        further = further or self._without_further(reference_covariance)
-        self.trackers = [
-            self._new_tracker(number, image, self.cameras[number].seen(state), in_sequence, others)
-            for number, (image, others) in enumerate(zip(references, further, strict=True))
-        ]
+        self.model = registration.model if registration.per_sequence else model
+        self.cameras, self.options = tuple(cameras), options or TrackerOptions()
+        self.estimator = RigEstimator(self.model, self.cameras, self.options.estimation)
+        error_factors = error_factors_of(registration.covariance, self.estimator.scale)
+        # What earlier frames add, and the discrepancy, are found from all cameras together.
+        single = replace(self.options, per_sequence=(), random_walk=(), use_discrepancy=False, new_views=False)
+        self.trackers: list[Tracker] = []
+        for number, (part, image) in enumerate(zip(self.cameras, references, strict=True)):
+            grey = image.grey if isinstance(image, Image) else image
+            part.camera.check_image(grey, f"the reference frame of camera {number}")
+            in_camera = None if error_factors is None else part.chain(len(self.model.parameters)) @ error_factors
+            try:
+                tracker = Tracker(
+                    self.model,
+                    part.camera,
+                    Registration(self.model, part.seen(registration.state)),
+                    single,
+                    reference=image,
+                    in_sequence=in_sequence,
+                    seen=None if seen is None else seen[number],
+                    keyframes=KeyframeViews(in_camera) if keyframes is None else keyframes[number],
+                )
+            except RegistrationError as error:
+                raise RegistrationError(f"camera {number}: {error}") from error
+            self.trackers.append(tracker)
+        self.trackers[0].anchor = anchor
         self._filter = new_filter(self.estimator, self.options)
         self._reference = RigReference(self.trackers, self.cameras)
         self._sigma_px = FIRST_SIGMA_PX
 
-    def track(self, images: Sequence[NDArray[np.uint8]], localization: CameraLocalization | None = None) -> FrameResult:
-        """Find the object in the next frames (h, w, 3) uint8 of all cameras, in their order.
+    @property
+    def state(self) -> State:
+        """Last known of the object, in the rig's frame."""
+        return self.trackers[0].state
+
+    @property
+    def camera(self) -> Camera:
+        """The first one."""
+        return self.cameras[0].camera
+
+    def locate(self, frame: Frame) -> CameraLocalization:
+        """Find the first camera in the map by its frame; see `Tracker.locate`."""
+        return self.trackers[0].locate(frame)
+
+    def track(
+        self,
+        frames: Sequence[Frame | NDArray[np.uint8]],
+        localization: CameraLocalization | None = None,
+        occluder_depths: Sequence[NDArray[np.float32]] | None = None,
+    ) -> FrameResult:
+        """Find the object in the frames of one instant.
 
         Parameters
         ----------
-        images : one of each camera.
-        localization : an anchored object's pose in the rig's frame by the map; None for a free object.
+        frames : by camera, or their images (h, w, 3) alone.
+        localization : the pose in the rig's frame by the map; None for a free object.
+        occluder_depths : by camera, as in `Tracker.track`.
+
+        Raises
+        ------
+        CameraError
+            If a frame has not its camera's size.
         """
         where = localization or CameraLocalization()
-        known = where.pose_prior
-        results = [
-            tracker.track(image, CameraLocalization(None if known is None else part.seen_pose(known)))
-            for tracker, part, image in zip(self.trackers, self.cameras, images, strict=True)
-        ]
+        known, results = where.pose_prior, []
+        for number, (tracker, part, frame) in enumerate(zip(self.trackers, self.cameras, frames, strict=True)):
+            if isinstance(frame, Frame):
+                part.camera.check_image(frame.image, f"frame {frame.index} of camera {number}")
+            seen = CameraLocalization(None if known is None else part.seen_pose(known))
+            results.append(tracker.track(frame, seen, None if occluder_depths is None else occluder_depths[number]))
         has_moved = any(result.warning(ObjectMoved) is not None for result in results)
         prior = None if known is None or has_moved else self._prior(known, results)
         with frame_clock(STAGES) as clock, stage("fuse"):
             estimate, measured, rejection = self._together(results, prior)
-        times = {name: sum(result.timings_ms[name] for result in results) for name in STAGES}
+        times = {name: sum((result.timings_ms[name] for result in results), 0.0) for name in STAGES}
         times["fuse"] += clock.milliseconds["fuse"]
         times["locate"] = where.milliseconds
-        common = FrameResult(
+        warnings: list[TrackingWarning] = [*_ignored(results, measured), *([ObjectMoved()] if has_moved else [])]
+        if where.why_lost:
+            warnings.append(CameraLost(where.why_lost))
+        is_hidden = estimate is None and known is not None and not has_moved
+        result = FrameResult(
             self.model,
-            Status.LOST,
+            Status.HIDDEN if is_hidden else Status.LOST,
+            rejection=rejection,
+            warnings=tuple(warnings),
+            pose_from=PoseSource.MAP if is_hidden else PoseSource.NONE,
+            pose_prior=known if is_hidden else None,
             n_points=sum(result.n_points for result in results),
             timings_ms=times,
             total_ms=sum(result.total_ms for result in results) + clock.total + where.milliseconds,
         )
-        warnings: list[TrackingWarning] = [*_ignored(results, measured), *([ObjectMoved()] if has_moved else [])]
-        if where.why_lost:
-            warnings.append(CameraLost(where.why_lost))
         if estimate is None:
-            is_hidden = known is not None and not has_moved
-            status, pose_from = (Status.HIDDEN, PoseSource.MAP) if is_hidden else (Status.LOST, PoseSource.NONE)
-            pose_prior = known if is_hidden else None
-            return replace(
-                common,
-                status=status,
-                rejection=rejection,
-                warnings=tuple(warnings),
-                pose_from=pose_from,
-                pose_prior=pose_prior,
-            )
+            return result
         for tracker, part in zip(self.trackers, self.cameras, strict=True):
             tracker.continue_from(part.seen(estimate.state))
         used = measured.weights > 0.0
         recovered = all(result.recovered or result.estimate is None for result in results)
         return replace(
-            common,
+            result,
             status=Status.TRACKED,
             estimate=estimate,
             found_by=FoundBy.LAST_STATE if recovered else FoundBy.FLOW,
-            warnings=tuple(warnings),
             pose_from=PoseSource.POINTS if prior is None else PoseSource.POINTS_AND_MAP,
             n_inliers=int(used.sum()),
             residual_rms_px=float(np.sqrt(np.mean(np.sum(estimate.residuals[used] ** 2, axis=1)))),
@@ -392,37 +389,9 @@ class RigTracker:
             first += len(view.weights)
             if (weights > 0.0).sum() < LEAST_AGREEING * (view.weights > 0.0).sum():
                 weights = np.zeros_like(weights)
-            kept.append(replace(view, weights=weights))
+            depths = view.depths if weights.any() else None
+            kept.append(replace(view, weights=weights, depths=depths))
         return RigObservations(tuple(kept))
-
-    def _without_further(self, covariance: NDArray[np.float64] | None) -> list[KeyframeViews]:
-        """Of each camera no other pictures, but how the reference state is off there."""
-        error_factors = error_factors_of(covariance, self.estimator.scale)
-        chains = [part.chain(len(self.model.parameters)) for part in self.cameras]
-        return [KeyframeViews(None if error_factors is None else chain @ error_factors) for chain in chains]
-
-    def _new_tracker(
-        self, number: int, image: NDArray[np.uint8] | Image, state: State, in_sequence: bool, further: KeyframeViews
-    ) -> Tracker:
-        part = self.cameras[number]
-        picture = image.grey if isinstance(image, Image) else image
-        part.camera.check_image(picture, f"the reference frame of camera {number}")
-        # What is one over the sequence, or walks, is found from all cameras together.
-        # The joint estimate ties lasting errors to the points of one view a camera, so that none is made.
-        single = replace(self.options, per_sequence=(), random_walk=(), new_views=False)
-        try:
-            registration = Registration(self.model, state)
-            return Tracker(
-                self.model,
-                part.camera,
-                registration,
-                single,
-                reference=image,
-                in_sequence=in_sequence,
-                keyframes=further,
-            )
-        except RegistrationError as error:
-            raise RegistrationError(f"camera {number}: {error}") from error
 
 
 def _ignored(results: list[FrameResult], measured: RigObservations) -> list[CameraIgnored]:

@@ -36,7 +36,7 @@ class TrackerOptions:
     use_outline : whether the object's outline counts too; it needs a background that it stands out from.
     use_depth : whether the depth images of frames that have them count too.
     depth_sigma : standard deviation of one pixel's depth at 1 m, metres; it grows with the distance squared.
-    discrepancy : look for what the object's shape has beyond the model's; None for the model alone.
+    use_discrepancy : whether to look for what the object's shape has beyond the model's.
     per_sequence : names of the parameters that are one over the whole sequence.
     random_walk : names of parameters that hardly change from frame to frame, each with the standard deviation
         of the change, SI: a prior on them. None by default.
@@ -65,7 +65,7 @@ class TrackerOptions:
     searches: int = 2
     use_outline: bool = False
     use_depth: bool = False
-    discrepancy: DiscrepancyOptions | None = None
+    use_discrepancy: bool = False
     per_sequence: tuple[str, ...] = ()
     random_walk: tuple[tuple[str, float], ...] = ()
     start: StartFrom = "previous"
@@ -73,4 +73,5 @@ class TrackerOptions:
     max_views: int = 12
     further_views: bool = True
     depth_sigma: float = SIGMA_AT_1M
+    discrepancy: DiscrepancyOptions = field(default_factory=DiscrepancyOptions)
     estimation: EstimationOptions = field(default_factory=EstimationOptions)

@@ -1,238 +1,300 @@
-"""`morph track`: register once, follow through all frames, write the run folder."""
+"""`morph track` and `morph live`: from files to run folders, by a session."""
 
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
-from tqdm import tqdm
 
-from morph_dslam.errors import SourceError, TrackingError
-from morph_dslam.notices import Remark
+from morph_dslam.errors import SourceError
+from morph_dslam.io.landmarks import Landmarks
+from morph_dslam.io.video import VideoWriter
 from morph_dslam.registration.landmarks import bind_landmarks
 from morph_dslam.registration.registration import Registration
-from morph_dslam.sources import Frame, FrameSource, open_source
-from morph_dslam.sources.frames import has_registered_depth
+from morph_dslam.sources import Frame, open_live, open_source, open_stream
+from morph_dslam.sources.frames import FrameSource
+from morph_dslam.sources.live import LiveCamera, LiveStream
 from morph_dslam.threads import one_thread_for_algebra
+from morph_dslam.tracking.combinations import check_depth, check_inputs, check_options
 from morph_dslam.tracking.discrepancy import DiscrepancyFit, Reference, refine_discrepancy
-from morph_dslam.tracking.drawing import AugmentedView, DrawOptions, write_video
+from morph_dslam.tracking.drawing import AugmentedView, write_video
+from morph_dslam.tracking.frame_estimation import temporal_facts
 from morph_dslam.tracking.hypothesis import Image
+from morph_dslam.tracking.placement import (
+    FramesAt,
+    PlacedObject,
+    frame_at,
+    new_anchor,
+    place,
+    place_by_map,
+    with_other_images,
+)
 from morph_dslam.tracking.refinement import LANDMARK_PX, Keyframe, choose_keyframes, refine_reference
-from morph_dslam.tracking.run_folder import RunResults, check_run_folder
-from morph_dslam.tracking.run_writing import RunInputs, write_run
-from morph_dslam.tracking.setup import ObjectOptions, Reregistration, Setup, load_setup
+from morph_dslam.tracking.reregistration import Reregistration
+from morph_dslam.tracking.run_folder import RunFolder
+from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
+from morph_dslam.tracking.run_results import RunResults
+from morph_dslam.tracking.session import Session, SynchronizedFrames
+from morph_dslam.tracking.setup import TrackedObject, load_cameras, load_objects
+from morph_dslam.tracking.sinks import BrowserSink, LivePicture, LiveTimes, Sink, TrackedFrame, VideoSink
+from morph_dslam.tracking.tracker import Tracker
 
-#: Options that name input files.
-_INPUTS = ("frames", "landmarks", "registration")
+Tell = Callable[[Path, dict[str, Any]], object]
 
-
-@dataclass(frozen=True, kw_only=True)
-class TrackOptions(ObjectOptions):
-    """What to track, with what (see `ObjectOptions`), and where the results go.
-
-    Attributes
-    ----------
-    frames : video file or folder of images. output : the run folder.
-    reregister_at : frames in which to place the object anew, with landmarks there, or None for the initializer.
-    first, last : frame numbers to track, both included; all by default.
-    reference_frame : the frame that the landmarks belong to; the first one tracked by default. With
-        ``registration`` it is the map's last keyframe.
-    refine_reference : after tracking, refine the reference state over the whole sequence and track once more.
-    overlay : draw the augmented video, drawing : with what. overwrite : replace a run that is there already.
-    """
-
-    frames: Path
-    output: Path
-    reregister_at: tuple[tuple[int, Path | None], ...] = ()
-    first: int | None = None
-    last: int | None = None
-    reference_frame: int | None = None
-    refine_reference: bool = False
-    overlay: bool = True
-    drawing: DrawOptions = field(default_factory=DrawOptions)
-    overwrite: bool = False
+Source = FrameSource | SynchronizedFrames | LiveStream
 
 
 @one_thread_for_algebra
-def track(options: TrackOptions) -> dict[str, Any]:
-    """Track an object through a sequence and write the run folder.
+def track(run: TrackOptions, tell: Tell = lambda folder, summary: None) -> dict[str, Any]:
+    """Track objects through a recording or a live stream, and write a run folder of each.
 
-    An interrupt, or a video that ends early, keeps what was done: the run folder is completed with the frames
-    so far and the exception goes on.
+    An interrupt, or a recording that breaks off, keeps what was done: the run folders are completed with the
+    frames so far, and the exception goes on.
+
+    Parameters
+    ----------
+    run : what to track, in which frames, and what becomes of the results.
+    tell : called with each run folder and the content of its ``summary.json`` when it is written; with nothing
+        where no frame was tracked.
 
     Returns
     -------
-    The content of ``summary.json``.
+    The content of the first object's ``summary.json``.
 
     Raises
     ------
     MorphError
-        If an input cannot be used (ModelFileError, CameraError, SourceError, RegistrationError, MapError) or
-        the run folder holds a run already (TrackingError).
+        If an input cannot be used (ModelFileError, CameraError, SourceError, RegistrationError, MapError), or
+        options make no sense together or with the inputs, or a run folder holds a run already (TrackingError).
     """
-    _check(options)
-    setup = load_setup(options)
-    options = with_reference(options, setup)
-    if options.overlay:
-        AugmentedView(setup.model, setup.camera, options.drawing)  # says so now if it cannot be drawn
-    source = open_frames(options)
-    begin = find_begin(setup, options)
-    registration = setup.placed(begin.picture, begin.depth)
-    again = Reregistration(setup, registration, options.reregister_at, begin.frame)
-    setup.warm_up(registration, begin.picture)
-    run = RunResults(registration.model, begin.frame, per_sequence=setup.tracker_options(registration).per_sequence)
-    try:
-        keyframes = _follow(source, setup, registration, begin, options.refine_reference, run, again)
-        if options.refine_reference and setup.landmarks is not None:
-            registration = _refined(setup, registration, begin, keyframes, options)
-            run = replace(run, refined=True, frames=[], timestamps=[], results=[])
-            _follow(source, setup, registration, begin, False, run)
-    finally:
-        registration = replace(registration, warnings=(*registration.warnings, *map(Remark, again.notes)))
-        summary = write_results(setup, registration, source, options, run) if len(run) else {}
-    return summary
+    with ExitStack() as stack:
+        run, source, placed = prepare(run, stack)
+        job = _Job(stack, run, source, placed)
+        warm_up(placed)
+        try:
+            job.run()
+        finally:
+            summaries = [job.write(number, tell) for number in range(len(placed))]
+    return summaries[0]
 
 
-def with_reference(options: TrackOptions, setup: Setup) -> TrackOptions:
-    """The options with the reference frame that a registration brings; tracking begins there by default."""
-    if setup.registration is None:
-        return options
-    frame = setup.registration.frame
-    return replace(options, reference_frame=frame, first=frame if options.first is None else options.first)
+def prepare(run: TrackOptions, stack: ExitStack) -> tuple[TrackOptions, Source, list[PlacedObject]]:
+    """Read and check all inputs, open the frames, and place the objects in their reference frames.
+
+    Parameters
+    ----------
+    run : the options.
+    stack : closes what is opened.
+
+    Returns
+    -------
+    run : the options, with the first frame to track.
+    source : of the frames.
+    placed : the objects.
+
+    Raises
+    ------
+    MorphError
+        As `track` does.
+    """
+    check_options(run)
+    cameras = load_cameras(run)
+    objects = load_objects(run, cameras[0].camera)
+    check_inputs(run, objects)
+    if run.reference_frame is not None and run.other_cameras:
+        frame = frame_at(run.frames, run.reference_frame)
+        objects = [place_by_map(part, cameras[0].camera, frame) for part in objects]
+    run = _with_first_frame(run, objects)
+    source, frames_at = _open_live(run, stack) if run.live else _open_recordings(run)
+    check_depth(run, objects, source)
+    placed = [place(part, cameras, frames_at, run) for part in objects]
+    return run, source, with_other_images(placed, run.other_cameras)
 
 
-def open_frames(options: TrackOptions) -> FrameSource:
-    """The frames to track; raises SourceError, or TrackingError if there is no depth that is to be used."""
-    source = open_source(options.frames, options.first, options.last)
-    if options.use_depth and not has_registered_depth(source):
-        raise TrackingError(
-            f"{options.frames} has no depth images that belong to its pixels, as TUM RGB-D recordings have: "
-            "track it without --depth"
-        )
-    return source
+def _with_first_frame(run: TrackOptions, objects: Sequence[TrackedObject]) -> TrackOptions:
+    """A recording is tracked from the frame that an object is registered in, if nothing else is asked for."""
+    frames = [part.start.frame for part in objects if isinstance(part.start, Registration)]
+    return run if run.live or run.first is not None or not frames else replace(run, first=frames[0])
 
 
-@dataclass(frozen=True)
-class Begin:
-    """The reference view: its image, frame, whether the sequence begins with it, and its depth, if used."""
+def _open_recordings(run: TrackOptions) -> tuple[Source, FramesAt]:
+    """The frames to track, and what gives reference frames."""
+    paths = (run.frames, *run.other_cameras)
 
-    picture: np.ndarray | Image
-    frame: int
-    in_sequence: bool
-    depth: np.ndarray | None = None
+    @cache
+    def frames_at(number: int | None) -> tuple[Frame, ...]:
+        return tuple(frame_at(path, run.first if number is None else number) for path in paths)
 
-
-def find_begin(setup: Setup, options: TrackOptions) -> Begin:
-    """The reference view; raises SourceError or CameraError if it is not there, or of another size."""
-    if setup.reference is not None:
-        assert setup.registration is not None
-        assert setup.registration.frame is not None
-        # The frames may be those of another recording: the object is looked for as after a loss.
-        return Begin(setup.reference, setup.registration.frame, False)
-    reference = _reference_frame(options)
-    setup.camera.check_image(reference.image, f"frame {reference.index} of {options.frames}")
-    # A sequence that does not begin with the reference frame is entered as if the object had been lost.
-    depth = reference.depth if options.use_depth else None
-    return Begin(reference.image, reference.index, options.reference_frame in (None, options.first), depth)
+    sources = [open_source(path, run.first, run.last) for path in paths]
+    return (SynchronizedFrames(sources) if run.other_cameras else sources[0]), frames_at
 
 
-def _reference_frame(options: TrackOptions) -> Frame:
-    number = options.reference_frame if options.reference_frame is not None else options.first
-    for frame in open_source(options.frames, number, number):
-        return frame
-    raise SourceError(f"{options.frames} holds no frame {number} to take as the reference")
+def _open_live(run: TrackOptions, stack: ExitStack) -> tuple[Source, FramesAt]:
+    """The stream to track, and what gives its first frame as the reference."""
+    stream = stack.enter_context(open_live(run.frames, run.first, run.last))
+
+    @cache
+    def frames_at(number: int | None) -> tuple[Frame, ...]:
+        # A recording is not begun by that: it would play while everything is made ready.
+        for frame in stream if isinstance(stream, LiveCamera) else open_stream(run.frames, run.first, run.last):
+            return (frame,)
+        raise SourceError(f"{run.frames} ended before the first frame")
+
+    return stream, frames_at
 
 
-def _follow(
-    source: FrameSource,
-    setup: Setup,
-    registration: Registration,
-    begin: Begin,
-    refines: bool,
-    run: RunResults,
-    again: Reregistration | None = None,
-) -> list[Keyframe]:
-    """Track all frames into ``run``; returns where the points were seen if the reference is to be refined."""
-    chain = setup.new_tracker(registration, begin.picture, begin.in_sequence)
-    keyframes = []
-    for frame in tqdm(source, total=len(source), desc="tracking", unit="frame"):
-        chain = chain if again is None else again.chain(frame, chain)
-        result = chain.track(frame)
-        if again is not None:
-            again.take_in(result)
-        run.add(frame.index, frame.timestamp, result)
-        if refines and result.estimate is not None and chain.last_seen is not None:
-            keyframes.append(chain.last_seen)
-    return keyframes
+def new_session(placed: Sequence[PlacedObject], source: Iterable, *arguments: Any, **options: Any) -> Session:
+    """A session of new trackers."""
+    anchor = new_anchor(placed)  # first, because it raises where two objects are in the same place
+    trackers = {part.name: part.new_tracker() for part in placed}
+    return Session(trackers, source, *arguments, anchor=anchor, **options)
 
 
-def _refined(
-    setup: Setup, registration: Registration, begin: Begin, keyframes: list[Keyframe], options: TrackOptions
-) -> Registration:
-    """The registration refined over the sequence; how sure it is then is not known."""
-    print("refining the reference state over the sequence ...", file=sys.stderr)
-    tracker, landmarks = setup.new_tracker(registration, begin.picture, True), setup.landmarks
-    assert landmarks is not None
-    # How well the landmarks fit tells how carefully they were set, where they are enough to tell.
+def warm_up(placed: Sequence[PlacedObject]) -> None:
+    """Compile the inner loops by the reference frame, so that the first frame takes no longer than the others."""
+    print("preparing: compiling the inner loops (half a minute the first time) ...", file=sys.stderr)
+    images = [cv2.cvtColor(i.grey, cv2.COLOR_GRAY2BGR) if isinstance(i, Image) else i for i in placed[0].images]
+    instants = [tuple(Frame(n, float(n), np.asarray(i, dtype=np.uint8)) for i in images) for n in range(2)]
+    for _ in new_session(placed, instants):
+        pass
+
+
+class _Job:
+    """A run: its session, and what becomes of the results.
+
+    Parameters
+    ----------
+    stack : closes what is opened.
+    run : the options.
+    source : of the frames.
+    placed : the objects.
+    """
+
+    def __init__(self, stack: ExitStack, run: TrackOptions, source: Any, placed: list[PlacedObject]) -> None:
+        self._run, self._source, self._placed = run, source, placed
+        self._views = [AugmentedView(part.model, part.camera, run.drawing, part.inner) for part in placed]
+        self._folders = [
+            RunFolder(folder, part.name, part.new_results(), part.camera, part.inner, run.overwrite)
+            for folder, part in zip(run.folders, placed, strict=True)
+        ]
+        self._again = {part.name: Reregistration(part) for part in placed}
+        self._times, self._seen = LiveTimes(), {part.name: [] for part in placed}
+        sinks: list[Sink] = [*self._folders]
+        screens = self._screens(stack) if run.live else []
+        if run.live:
+            sinks += [self._times, *screens]
+        if run.refine_reference:
+            sinks.append(self._keep_seen)
+        views = {part.name: view for part, view in zip(placed, self._views, strict=True)}
+        picture = LivePicture(placed[0].camera, views) if screens else None
+        self._session = new_session(placed, source, sinks, picture=picture, reregistration=self._again)
+
+    def run(self) -> None:
+        """Track, and once more from a refined reference if that is asked for."""
+        run = self._run
+        if run.live:
+            print(f"tracking {self._source.name} (Ctrl-C ends it)", file=sys.stderr)
+        self._session.run(run.seconds, progress=not run.live)
+        if run.refine_reference:
+            print("refining the reference state over the sequence ...", file=sys.stderr)
+            self._placed = [_refined(part, self._seen[part.name]) for part in self._placed]
+            for folder, part in zip(self._folders, self._placed, strict=True):
+                folder.results = part.new_results(refined=isinstance(part.object.start, Landmarks))
+            new_session(self._placed, self._source, self._folders).run(progress=True)
+
+    def write(self, number: int, tell: Tell) -> dict[str, Any]:
+        """Write the run folder of one object, the video last because it takes longest; returns the summary."""
+        run, folder, part = self._run, self._folders[number], self._placed[number]
+        if not len(folder.results):
+            tell(folder.path, {})
+            return {}
+        facts = _facts(run, run.objects[number], part, folder.results)
+        notices = [*part.registration.warnings, *self._again[part.name].notices]
+        if isinstance(self._source, SynchronizedFrames):
+            notices += self._source.notices(len(folder.results))
+        if run.live:
+            facts["live"] = self._times.figures() | {"n_dropped": self._session.n_dropped}
+            self._times.write(folder.path / "latency.csv")
+        summary = folder.write(facts, notices)
+        if run.video and not run.live:
+            first = self._source.sources[0] if isinstance(self._source, SynchronizedFrames) else self._source
+            write_video(folder.path / "augmented.mp4", first, part.camera, folder.results, self._views[number])
+        tell(folder.path, summary)
+        return summary
+
+    def _screens(self, stack: ExitStack) -> list[Sink]:
+        """Where the pictures of a live run go."""
+        screens: list[Sink] = []
+        if self._run.serve is not None:
+            browser = stack.enter_context(BrowserSink(self._run.serve))
+            print(f"shown at {browser.address}", flush=True)
+            screens.append(browser)
+        if self._run.video:
+            camera, fps = self._placed[0].camera, self._source.fps
+            path = self._run.output / "augmented.mp4"
+            writer = stack.enter_context(VideoWriter(path, fps, (camera.width, camera.height)))
+            screens.append(VideoSink(writer, fps))
+        return screens
+
+    def _keep_seen(self, tracked: TrackedFrame) -> None:
+        """Keep where the points of each object were seen, to refine its reference."""
+        for name, tracker in self._session.trackers.items():
+            if tracked.results[name].tracked and isinstance(tracker, Tracker) and tracker.last_seen is not None:
+                self._seen[name].append(tracker.last_seen)
+
+
+def _refined(part: PlacedObject, keyframes: list[Keyframe]) -> PlacedObject:
+    """An object with its reference state refined over the sequence; how well it is known then is not known."""
+    landmarks, registration = part.object.start, part.registration
+    if not isinstance(landmarks, Landmarks):
+        return part
+    tracker = part.new_tracker()
+    assert isinstance(tracker, Tracker)
+    # How well the landmarks fit shows how carefully they were set, where they are enough.
     sigma = registration.facts["sigma_px"]
     landmark_px = max(sigma, 0.1) if np.isfinite(sigma) else LANDMARK_PX
-    bound = bind_landmarks(registration.model, landmarks.points)
-    seen = setup.camera.undistort_pixels(landmarks.pixels)
-    chosen = choose_keyframes(keyframes)
-    pixels, outline, sought = tracker.reference.pixels, tracker.reference.outline, tracker.options.discrepancy
-    if sought is None:
-        start = registration.state
-        state = refine_reference(tracker.estimator, bound, seen, pixels, start, chosen, outline, landmark_px)
-        return replace(registration, state=state, covariance=None)
-    # What the state is wrong by counts with the discrepancy: both at once would be the same twice.
-    known = Reference(registration.state, pixels, bound, seen, landmark_px)
-    fit = DiscrepancyFit(registration.model, setup.camera, sought)
-    found = refine_discrepancy(fit, tracker.estimator, known, chosen, outline)
-    return replace(registration, discrepancy=found, covariance=None)
-
-
-def _check(options: TrackOptions) -> None:
-    if options.reregister_at and options.refine_reference:
-        raise TrackingError(
-            "a reference refined over the whole sequence cannot be changed in mid-sequence: leave out "
-            "--refine or --reregister-at"
+    bound = bind_landmarks(part.model, landmarks.points)
+    seen, pixels = part.camera.undistort_pixels(landmarks.pixels), tracker.reference.pixels
+    chosen, outline = choose_keyframes(keyframes), tracker.reference.outline
+    if not part.options.use_discrepancy:
+        state = refine_reference(
+            tracker.estimator, bound, seen, pixels, registration.state, chosen, outline, landmark_px
         )
-    if options.registration is not None and (options.refine_reference or options.reference_frame is not None):
-        raise TrackingError(
-            "a registration in a map brings its own reference frame, refined already: leave out --refine and "
-            "--reference-frame"
-        )
-    if options.refine_reference and any(path is not None for path in vars(options.initializer).values()):
-        raise TrackingError(
-            "the reference is refined with the landmarks in it: start from landmarks, or leave out --refine"
-        )
-    check_run_folder(options.output, options.overwrite)
+        refined = replace(registration, state=state, covariance=None)
+    else:
+        # What the state is wrong by counts with the discrepancy: both at once would be the same twice.
+        known = Reference(registration.state, pixels, bound, seen, landmark_px)
+        fit = DiscrepancyFit(part.model, part.camera, part.options.discrepancy)
+        found = refine_discrepancy(fit, tracker.estimator, known, chosen, outline)
+        refined = replace(registration, discrepancy=found, covariance=None)
+    return replace(part, registration=refined)
 
 
-def write_results(
-    setup: Setup, registration: Registration, source: FrameSource, options: TrackOptions, run: RunResults
-) -> dict[str, Any]:
-    """Write all files of the run folder; the video last, because it takes longest."""
-    carried = setup.carried(run.model)
-    named = {name: str(getattr(options, name)) for name in _INPUTS if getattr(options, name)}
-    given = {name: str(path) for name, path in vars(options.initializer).items() if path is not None}
-    named |= given | ({} if setup.map_path is None else {"map": str(setup.map_path)})
-    tracker = setup.tracker_options(registration)
-    extra = {
-        "reference_keyframes": setup.reference_keyframes,
-        "reference_refined_over_the_sequence": run.refined,
+def _facts(run: TrackOptions, files: ObjectOptions, part: PlacedObject, results: RunResults) -> dict[str, Any]:
+    """What the summary says of a run beside its results."""
+    named = {"frames": run.frames, "model": files.model, "camera": run.camera, "landmarks": files.landmarks}
+    named |= {"registration": files.registration, **vars(files.initializer), "map": part.object.map_path}
+    options = part.options
+    return temporal_facts(part.model.parameters, options) | {
+        "new_reference_views": {
+            "allowed": options.new_views,
+            "made": sum(result.made_view for result in results.results),
+            "frames_compared_with_them": sum(result.view > 0 for result in results.results),
+        },
+        "registration": part.registration.facts,
+        "inputs": {name: str(path) for name, path in named.items() if path is not None},
+        "reference_keyframes": part.reference_keyframes,
+        "reference_refined_over_the_sequence": results.refined,
         "outline_used": options.use_outline,
         "depth_used": options.use_depth,
         "discrepancy_used": options.use_discrepancy,
-        "pose": options.pose if setup.map_path is not None else "free",
-        "settings": {"click_px": options.click_px, "tracker": asdict(tracker)},
+        "pose": "free" if part.object.map_path is None else files.pose,
+        "settings": {"click_px": run.click_px, "tracker": asdict(options)},
     }
-    inputs = RunInputs(options.model, options.camera, named)
-    summary = write_run(options.output, run, inputs, registration, carried, tracker, extra)
-    if options.overlay:
-        view = AugmentedView(run.model, setup.camera, options.drawing, carried)
-        write_video(options.output / "augmented.mp4", source, setup.camera, run, view)
-    return summary

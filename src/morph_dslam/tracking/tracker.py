@@ -117,8 +117,8 @@ class Tracker:
         self.estimator = Estimator(self.model, camera, self.options.estimation)
         self._undistortion = camera.undistortion_maps()
         self._registration, self._seen, self._keyframes = registration, seen, keyframes
-        sought = self.options.discrepancy
-        self._discrepancy = None if sought is None else DiscrepancyFit(self.model, camera, sought)
+        use, sought = self.options.use_discrepancy, self.options.discrepancy
+        self._discrepancy = DiscrepancyFit(self.model, camera, sought) if use else None
         self._filter = new_filter(self.estimator, self.options)
         self._unfiltered = np.zeros((len(self.model.parameters) + 6,) * 2)
         self._lost, self._n_lost = not in_sequence, 0

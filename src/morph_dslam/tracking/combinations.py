@@ -1,0 +1,144 @@
+"""Which options of a run make no sense together: all refusals are here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+from morph_dslam.errors import TrackingError
+from morph_dslam.registration.registration import Registration
+from morph_dslam.tracking.drawing import shown_field
+from morph_dslam.tracking.outline import rim
+from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
+from morph_dslam.tracking.setup import TrackedObject
+
+
+def _n_starts(part: ObjectOptions) -> int:
+    files = (part.landmarks, part.registration, *vars(part.initializer).values())
+    return sum(path is not None for path in files)
+
+
+def _has_initializer(part: ObjectOptions) -> bool:
+    return any(path is not None for path in vars(part.initializer).values())
+
+
+def _is_no_folder(run: TrackOptions) -> bool:
+    names = [name for name, _ in run.others]
+    return any(names.count(name) > 1 or Path(name).name != name or name in ("", ".", "..", "plots") for name in names)
+
+
+#: Of each object: when to refuse, and what to tell.
+OF_OBJECT: tuple[tuple[Callable[[ObjectOptions], bool], str], ...] = (
+    (
+        lambda part: _n_starts(part) != 1,
+        "say where the object is, in one way: by landmarks, a registration in a map, a board, a picture or a guess",
+    ),
+    (
+        lambda part: part.pose == "fixed" and part.registration is None,
+        "a pose is held fixed by a map: give the object's registration in it, --registration",
+    ),
+    (
+        lambda part: not _has_initializer(part) and any(path is None for _, path in part.reregister_at),
+        "to register the object anew give landmarks of that frame (--reregister-at N=FILE), or start from a board, "
+        "a picture or a guess, which are looked for there again",
+    ),
+)
+
+#: Of the whole run.
+OF_RUN: tuple[tuple[Callable[[TrackOptions], bool], str], ...] = (
+    (
+        lambda run: run.map_path is not None and all(part.registration is None for part in run.objects),
+        "a map needs the object's registration in it: --registration registration.json",
+    ),
+    (_is_no_folder, "the name of another object cannot be that of a folder: give each a different, plain name"),
+    (
+        lambda run: run.live and bool(run.other_cameras),
+        "several cameras are tracked from recordings: leave out --with, or use `morph track`",
+    ),
+    (
+        lambda run: run.live and run.refine_reference,
+        "a reference is refined over a whole recording: leave out --refine, or use `morph track`",
+    ),
+    (
+        lambda run: run.live and run.reference_frame is not None,
+        "the first frame that comes is the reference frame of a live run: leave out --reference-frame",
+    ),
+    (
+        lambda run: not run.live and (run.serve, run.seconds) != (None, None),
+        "--serve and --seconds are for live runs: leave them out, or use `morph live`",
+    ),
+    (
+        lambda run: run.refine_reference and all(part.landmarks is None for part in run.objects),
+        "the reference is refined with the landmarks in it: start from landmarks, or leave out --refine",
+    ),
+    (
+        lambda run: run.refine_reference and any(part.reregister_at for part in run.objects),
+        "a reference refined over the whole sequence cannot be changed in mid-sequence: leave out --refine or "
+        "--reregister-at",
+    ),
+    (
+        lambda run: run.refine_reference and bool(run.other_cameras),
+        "the reference is refined for one camera: leave out --refine or --with",
+    ),
+    (
+        lambda run: (
+            run.reference_frame is not None
+            and not run.other_cameras
+            and all(part.registration is not None for part in run.objects)
+        ),
+        "a registration in a map brings its own reference frame: leave out --reference-frame",
+    ),
+    (
+        lambda run: not run.video and run.serve is None and (run.drawing.show, run.drawing.section) != (None, None),
+        "--show and --section say what the video shows: leave them or --no-video out",
+    ),
+)
+
+
+def check_options(run: TrackOptions) -> None:
+    """Raise TrackingError if options make no sense together."""
+    for part in run.objects:
+        _refuse((message for refuses, message in OF_OBJECT if refuses(part)))
+    _refuse((message for refuses, message in OF_RUN if refuses(run)))
+
+
+def check_inputs(run: TrackOptions, objects: Sequence[TrackedObject]) -> None:
+    """Raise TrackingError if options do not suit the objects."""
+    for part in objects:
+        _refuse(_unsuited(run, part))
+    maps = dict.fromkeys(str(part.map_path.resolve()) for part in objects if part.map_path is not None)
+    if len(maps) > 1:
+        raise TrackingError(
+            f"the objects are anchored in different maps, {' and '.join(maps)}: register them all in one"
+        )
+    if run.live and len({shown_field(part.model, run.drawing.show) for part in objects}) > 1:
+        raise TrackingError("the models hold different fields to colour the objects by: --show displacement")
+
+
+def check_depth(run: TrackOptions, objects: Sequence[TrackedObject], source: object) -> None:
+    """Raise TrackingError if depth images are to be used that the source of frames has not."""
+    if any(part.options.use_depth for part in objects) and not getattr(source, "has_registered_depth", False):
+        raise TrackingError(
+            f"{run.frames} has no depth images that belong to its pixels, as TUM RGB-D recordings have: "
+            "track it without --depth"
+        )
+
+
+def _unsuited(run: TrackOptions, part: TrackedObject) -> Iterable[str]:
+    """What of the options does not suit an object."""
+    if part.options.use_outline and not len(rim(part.model.triangles)):
+        yield f"the surface of '{part.model.name}' is closed and has no rim: track it without the outline"
+    if not isinstance(part.start, Registration):
+        return
+    if run.live and not part.keyframes:
+        yield (
+            "a registration needs the map that it was made in, to know what the object looks like: give --map, and "
+            "leave out --outline"
+        )
+    if run.reference_frame is not None and run.other_cameras and not (part.keyframes and part.map_path):
+        yield "without its map a registration brings its own reference frame: leave out --reference-frame"
+
+
+def _refuse(messages: Iterable[str]) -> None:
+    for message in messages:
+        raise TrackingError(message)

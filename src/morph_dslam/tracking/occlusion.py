@@ -1,0 +1,109 @@
+"""Several objects in the same frames: each is tracked by itself, and occludes what is behind it.
+
+A point that another object's surface occludes does not count. In a frame the objects are drawn, each in the
+state of this frame where it is known already, the nearest one first, and otherwise in that of the frame before,
+moved to where the map has it in this frame if it is anchored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import Camera
+from morph_dslam.model import ReducedModel
+from morph_dslam.sources import Frame
+from morph_dslam.tracking.binding import DrawnSurface, draw_view, view_of
+from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.multi_camera import RigTracker
+from morph_dslam.tracking.outcomes import PoseSource
+from morph_dslam.tracking.result import FrameResult
+from morph_dslam.tracking.tracker import CameraLocalization, Tracker
+
+#: How much wider than drawn an object occludes, pixels: what is compared of a point reaches as far.
+MARGIN_PX = 5
+
+
+def drawn_depth(surface: ReducedModel, camera: Camera, state: State) -> NDArray[np.float32]:
+    """Depth (h, w) of an object in a camera, metres, infinite where it is not."""
+    return draw_view(view_of(surface, camera, state), surface.triangles, camera).depth
+
+
+def widened(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What an object occludes: its depth (h, w), infinite where it is not, and that of a margin around it."""
+    square = np.ones((2 * MARGIN_PX + 1,) * 2, np.uint8)
+    return np.asarray(cv2.erode(depth, square), dtype=np.float32)
+
+
+class MultiObjectTracker:
+    """Follows several objects in the same frames.
+
+    Parameters
+    ----------
+    trackers : by name, each of one object, all of the same camera, or of the same rig.
+    """
+
+    def __init__(self, trackers: Mapping[str, Tracker | RigTracker]) -> None:
+        self.trackers = dict(trackers)
+        self._surfaces = {name: DrawnSurface.of(tracker.model).model for name, tracker in self.trackers.items()}
+        self._last: dict[str, FrameResult] = {}
+
+    def track(
+        self, frames: Sequence[Frame], localizations: Mapping[str, CameraLocalization] | None = None
+    ) -> dict[str, FrameResult]:
+        """Find the objects in the frames of one instant.
+
+        Parameters
+        ----------
+        frames : by camera.
+        localizations : by name, where the map has the anchored objects.
+        """
+        where = {name: (localizations or {}).get(name, CameraLocalization()) for name in self.trackers}
+        if len(where) == 1:
+            ((name, localization),) = where.items()
+            return {name: self._track(name, frames, localization, None)}
+        expected = {name: self._expected(name, where[name]) for name in where}
+        nearest_first = sorted(expected, key=lambda name: self._distance(name, expected[name]))
+        drawn = {name: self._drawn(name, expected[name]) for name in nearest_first}
+        for name in nearest_first:
+            others = [depths for other, depths in drawn.items() if other != name and depths]
+            occluders = [np.minimum.reduce(views) for views in zip(*others, strict=True)] or None
+            self._last[name] = self._track(name, frames, where[name], occluders)
+            drawn[name] = self._drawn(name, self.trackers[name].state)
+        return {name: self._last[name] for name in self.trackers}
+
+    def _track(
+        self,
+        name: str,
+        frames: Sequence[Frame],
+        localization: CameraLocalization,
+        occluders: Sequence[NDArray[np.float32]] | None,
+    ) -> FrameResult:
+        tracker = self.trackers[name]
+        if isinstance(tracker, RigTracker):
+            return tracker.track(frames, localization, occluders)
+        return tracker.track(frames[0], localization, None if occluders is None else occluders[0])
+
+    def _expected(self, name: str, where: CameraLocalization) -> State:
+        """Where an object may be in the next frame: where it was last, or where the map has it."""
+        state, last = self.trackers[name].state, self._last.get(name)
+        if where.pose_prior is None or (last is not None and last.pose_from is PoseSource.POINTS):
+            return state
+        return replace(state, camera_from_object=where.pose_prior.pose)
+
+    def _distance(self, name: str, state: State) -> float:
+        """Mean depth of an object's surface."""
+        return float(state.camera_from_object.apply(self._surfaces[name].positions(state.parameters))[:, 2].mean())
+
+    def _drawn(self, name: str, state: State) -> list[NDArray[np.float32]]:
+        """Depth (h, w) of an object and its margin, by camera; none if it is not known whether it is there."""
+        if name in self._last and self._last[name].estimate is None:
+            return []
+        tracker, surface = self.trackers[name], self._surfaces[name]
+        if isinstance(tracker, RigTracker):
+            return [widened(drawn_depth(surface, part.camera, part.seen(state))) for part in tracker.cameras]
+        return [widened(drawn_depth(surface, tracker.camera, state))]

@@ -1,0 +1,134 @@
+"""What a reader of a run must know, as typed notices; all their texts are here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+
+from morph_dslam.notices import Notice
+from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE, statement, unobservable_in_run
+from morph_dslam.tracking.outcomes import ModelDoesNotExplain, ObjectMoved, Status
+from morph_dslam.tracking.run_results import RunResults
+from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE
+
+
+class RunWarning(StrEnum):
+    """What may be wrong with a run; the texts are filled in by `RunNotice`."""
+
+    LOST = "{count} of {n_frames} frames were lost; their reasons are in frames.csv"
+    HIDDEN = (
+        "the object was hidden in {count} of {n_frames} frames: its pose there is the map's, its parameters are not "
+        "known"
+    )
+    MOVED = (
+        "the object has moved from its place in the map in {count} frames, first in frame {first}: there its points "
+        "alone give its pose; register it again to use the map"
+    )
+    MODEL_FAILS = (
+        "the model does not explain the images in {count} of {n_frames} frames: up to {largest_px:.1f} px are left "
+        "that neighbouring points have in common; it may be a model of something else, or too stiff, or a wrong "
+        "camera file"
+    )
+    REFERENCE_CONTRADICTED = (
+        "the frames contradict the reference state: {factor:.1f} times its stated deviation, and all deviations are "
+        "that much wider; check the landmarks and whether the object has the model's dimensions"
+    )
+    AT_BOUND = (
+        "parameter '{parameter}' is at the {side} bound of its range ({bound}) in {count} frames: the object may be "
+        "outside what the model covers"
+    )
+    RESTS_AT_BOUND = (
+        "parameter '{parameter}' is at the {side} bound of its range ({bound}) in {count} frames: the object rests "
+        "there, or is outside what the model covers"
+    )
+    UNOBSERVABLE = "{statement}"
+    REREGISTERED = "registered anew in frame {frame}"
+    NOT_REREGISTERED = "not registered anew in frame {frame}: {why}"
+    UNEQUAL_RECORDINGS = (
+        "the cameras recorded {counts} frames: {tracked} were tracked, to the end of the shortest recording"
+    )
+
+
+@dataclass(frozen=True)
+class RunNotice(Notice):
+    """A warning about a run.
+
+    Attributes
+    ----------
+    warning : what it is about.
+    data : the figures in it, by name.
+    """
+
+    warning: RunWarning
+    data: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, warning: RunWarning, **data: Any) -> RunNotice:
+        """A notice with these figures."""
+        return cls(warning, data)
+
+    @property
+    def kind(self) -> str:
+        return self.warning.name.lower()
+
+    @property
+    def text(self) -> str:
+        return self.warning.value.format(**self.data)
+
+    def content(self) -> dict[str, Any]:
+        return {"kind": self.kind, **self.data, "text": self.text}
+
+
+def notices_of(run: RunResults) -> list[RunNotice]:
+    """What a reader of the results must know."""
+    found, of, n_frames = [], RunNotice.of, len(run)
+    lost = sum(result.status is Status.LOST for result in run.results)
+    if lost:
+        found.append(of(RunWarning.LOST, count=lost, n_frames=n_frames))
+    if run.hidden.any():
+        found.append(of(RunWarning.HIDDEN, count=int(run.hidden.sum()), n_frames=n_frames))
+    moved = [frame for frame, r in zip(run.frames, run.results, strict=True) if r.warning(ObjectMoved)]
+    if moved:
+        found.append(of(RunWarning.MOVED, count=len(moved), first=moved[0]))
+    failed = sum(result.warning(ModelDoesNotExplain) is not None for result in run.results)
+    if failed:
+        largest = float(np.nanmax(run.unexplained_px()))
+        found.append(of(RunWarning.MODEL_FAILS, count=failed, n_frames=n_frames, largest_px=largest))
+    factor = max((result.reference_factor for result in run.results), default=1.0)
+    if factor > CLEARLY_WORSE:
+        found.append(of(RunWarning.REFERENCE_CONTRADICTED, factor=factor))
+    return [*found, *_at_bound(run), *_unobservable(run)]
+
+
+def _at_bound(run: RunResults) -> list[RunNotice]:
+    """Parameters that the images put to an end of their range."""
+    found = []
+    with np.errstate(invalid="ignore"):
+        determined = run.parameter_std() < UNOBSERVABLE_SHARE * (run.model.upper - run.model.lower)
+    at_bound, values = run.at_bound() & determined, run.parameters()
+    for k, parameter in enumerate(run.model.parameters):
+        upper = values[:, k] > 0.5 * (parameter.lower + parameter.upper)
+        unit = "" if parameter.quantity == "ratio" else f" {parameter.unit}"
+        for bound, side, rows in ((parameter.lower, "lower", ~upper), (parameter.upper, "upper", upper)):
+            count = int((at_bound[:, k] & rows).sum())
+            if count:
+                warning = RunWarning.RESTS_AT_BOUND if bound == parameter.default else RunWarning.AT_BOUND
+                shown = f"{parameter.display(bound):.4g}{unit}"
+                found.append(RunNotice.of(warning, parameter=parameter.name, side=side, bound=shown, count=count))
+    return found
+
+
+def _unobservable(run: RunResults) -> list[RunNotice]:
+    """What the images do not give; of per-sequence parameters only what they do not after the last frame."""
+    parameters, estimates = run.model.parameters, [r.estimate for r in run.results if r.estimate]
+    constant, found = {k for k, p in enumerate(parameters) if p.name in run.per_sequence}, []
+    for part_of_run, is_last in ((estimates, False), (estimates[-1:], True)):
+        for indices, (count, part) in unobservable_in_run(parameters, part_of_run).items():
+            if constant.issuperset(indices) is is_last:
+                text = statement(parameters, part, "over the whole sequence" if is_last else f"in {count} frames")
+                names = [parameters[k].name for k in indices]
+                found.append(RunNotice.of(RunWarning.UNOBSERVABLE, parameters=names, count=count, statement=text))
+    return found

@@ -1,0 +1,97 @@
+"""What a run is asked for: objects, cameras, frames, and what becomes of the results."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from morph_dslam.registration.initialization import InitializerFiles
+from morph_dslam.registration.landmarks import CLICK_PX
+from morph_dslam.tracking.drawing import DrawOptions
+from morph_dslam.tracking.options import TrackerOptions
+
+#: How an object's pose is found: by the map and its points, by the map alone, by its points alone.
+PoseFrom = Literal["map", "fixed", "free"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectOptions:
+    """One object, by files: its model, and where it is at first (one of three).
+
+    Attributes
+    ----------
+    model : model file.
+    landmarks : points of the object and their pixels in the reference frame.
+    registration : registration.json of `morph register`.
+    initializer : a board, a picture of its print or a guess, which find it in the reference frame.
+    pose : of a registered object: "map", the camera is found in the map and the object with it; "fixed", and the
+        map's pose is taken as exact; "free", it may be anywhere.
+    reregister_at : frames in which to register it anew, with landmarks there, or None for the initializer.
+    inner : structures inside of it (`morph inner`), whose positions are written and drawn.
+    tracker : what is measured, and what earlier frames add.
+    """
+
+    model: Path
+    landmarks: Path | None = None
+    registration: Path | None = None
+    initializer: InitializerFiles = field(default_factory=InitializerFiles)
+    pose: PoseFrom = "map"
+    reregister_at: tuple[tuple[int, Path | None], ...] = ()
+    inner: tuple[Path, ...] = ()
+    tracker: TrackerOptions = field(default_factory=TrackerOptions)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackOptions(ObjectOptions):
+    """A run: the first object, and all else.
+
+    Attributes
+    ----------
+    frames : recording of the first camera; live also a webcam, "webcam:0".
+    camera : camera file; of several cameras the first of a Kalibr camchain, "camchain.yaml#cam0".
+    output : run folder of the first object; those of the others are in it.
+    others : more objects, each with the name of its folder.
+    other_cameras : recordings of the other cameras of the camchain, in its order, with the same frame numbers.
+    map_path : map that the objects are registered in; by default the one that each registration names.
+    first : number of the first frame to track; by default that of the recording, or of the registration.
+    last : number of the last frame to track; by default that of the recording.
+    reference_frame : number of the frame that landmarks and initializers belong to, the first one by default;
+        of a registered object before several cameras one in which it is undeformed.
+    click_px : standard deviation of a landmark's pixel.
+    refine_reference : whether to refine the reference state over the whole sequence, and track once more.
+    live : whether frames are dropped that come faster than they are tracked.
+    seconds : after which a live run ends.
+    serve : port at which browsers on this computer see a live run; 0 for any.
+    video : whether to draw the augmented video.
+    drawing : what is drawn.
+    overwrite : whether to replace a run that is in the folder.
+    """
+
+    frames: Path | str
+    camera: Path | str
+    output: Path
+    others: tuple[tuple[str, ObjectOptions], ...] = ()
+    other_cameras: tuple[Path, ...] = ()
+    map_path: Path | None = None
+    first: int | None = None
+    last: int | None = None
+    reference_frame: int | None = None
+    click_px: float = CLICK_PX
+    refine_reference: bool = False
+    live: bool = False
+    seconds: float | None = None
+    serve: int | None = None
+    video: bool = True
+    drawing: DrawOptions = field(default_factory=DrawOptions)
+    overwrite: bool = False
+
+    @property
+    def objects(self) -> tuple[ObjectOptions, ...]:
+        """All of them, the first one first."""
+        return (self, *(part for _, part in self.others))
+
+    @property
+    def folders(self) -> tuple[Path, ...]:
+        """The run folder of each."""
+        return (self.output, *(self.output / name for name, _ in self.others))

@@ -1,0 +1,145 @@
+"""The results of all frames of one object, in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.model import ReducedModel
+from morph_dslam.model.discrepancy import largest_deformation
+from morph_dslam.tracking.binding import DrawnSurface
+from morph_dslam.tracking.estimator import Estimate, State
+from morph_dslam.tracking.observability import largest_displacement, largest_von_mises
+from morph_dslam.tracking.outcomes import Status
+from morph_dslam.tracking.result import STAGES, FrameResult
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class RunResults:
+    """The results of all frames so far, in order.
+
+    Attributes
+    ----------
+    model : that was tracked.
+    reference_frame : number of the frame that the object is known from.
+    refined : whether the reference state was refined over the frames.
+    per_sequence : names of the parameters that are the same in all frames.
+    frames : (f,) numbers.
+    timestamps : (f,) seconds.
+    results : (f,), without the residuals of single points: runs may be long.
+    """
+
+    model: ReducedModel
+    reference_frame: int
+    refined: bool = False
+    per_sequence: tuple[str, ...] = ()
+    frames: list[int] = field(default_factory=list)
+    timestamps: list[float] = field(default_factory=list)
+    results: list[FrameResult] = field(default_factory=list)
+    _largest: list[tuple[float, float]] = field(default_factory=list, repr=False)
+    _stressed: list[tuple[float, float]] = field(default_factory=list, repr=False)
+
+    def add(self, frame: int, timestamp: float, result: FrameResult) -> None:
+        if result.estimate is not None:
+            result = replace(result, estimate=replace(result.estimate, residuals=np.empty((0, 2))))
+        self.frames.append(frame)
+        self.timestamps.append(timestamp)
+        self.results.append(result)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def tracked(self) -> NDArray[np.bool_]:
+        """Frames (f,) that have an estimate."""
+        return np.array([result.tracked for result in self.results], dtype=bool)
+
+    @property
+    def hidden(self) -> NDArray[np.bool_]:
+        """Frames (f,) in which only the pose is known, from the map."""
+        return np.array([result.status is Status.HIDDEN for result in self.results], dtype=bool)
+
+    def states(self) -> list[State | None]:
+        """The state of every frame, None where it was hidden or lost."""
+        return [result.estimate.state if result.estimate else None for result in self.results]
+
+    def poses(self) -> Array:
+        """camera_from_object (f, 4, 4), NaN where lost."""
+        lost = np.full((4, 4), np.nan)
+        return np.array([lost if result.pose is None else result.pose.matrix for result in self.results])
+
+    def pose_std(self) -> Array:
+        """(f, 6) of the rotation vector (rad) and the translation (m) of the pose, NaN where lost."""
+        return np.array([result.pose_std for result in self.results]).reshape(-1, 6)
+
+    def parameters(self) -> Array:
+        """(f, d), SI, NaN where lost."""
+        return self._of_estimates(lambda estimate: estimate.state.parameters, np.nan)
+
+    def parameter_std(self) -> Array:
+        """(f, d), SI, NaN where lost."""
+        return self._of_estimates(lambda estimate: estimate.parameter_std, np.nan)
+
+    def at_bound(self) -> NDArray[np.bool_]:
+        """(f, d), false where lost."""
+        return self._of_estimates(lambda estimate: estimate.at_bound, False)
+
+    def _of_estimates(self, value: Callable[[Estimate], NDArray], lost: float | bool) -> NDArray:
+        """A value of each estimate's parameters (f, d), ``lost`` where there is none."""
+        nothing = np.full(len(self.model.parameters), lost)
+        return np.array([nothing if r.estimate is None else value(r.estimate) for r in self.results])
+
+    def largest_displacements(self) -> Array:
+        """The largest displacement of a node of the surface and its standard deviation (f, 2), metres."""
+        return self._added_to(self._largest, largest_displacement, DrawnSurface.of(self.model).model)
+
+    def largest_stresses(self) -> Array:
+        """The largest von Mises stress of a node of the surface and its standard deviation (f, 2), pascals.
+
+        NaN where lost, and in models without stresses.
+        """
+        used = np.unique(self.model.triangles)
+        stresses = {place: f.with_modes(f.modes[:, used]) for place, f in self.model.stresses.items()}
+        return self._added_to(self._stressed, largest_von_mises, replace(self.model, stresses=stresses))
+
+    def _added_to(
+        self,
+        known: list[tuple[float, float]],
+        largest: Callable[[ReducedModel, Estimate], tuple[float, float]],
+        surface: ReducedModel,
+    ) -> Array:
+        """What is ``known`` of the frames so far (f, 2), added to by what is ``largest`` in those since."""
+        for result in self.results[len(known) :]:
+            found = result.estimate
+            known.append((np.nan, np.nan) if found is None else largest(surface, found))
+        return np.array(known).reshape(-1, 2)
+
+    def timings_ms(self) -> Array:
+        """(f, len(STAGES) + 1): each stage, then the whole frame."""
+        return np.array([[*(r.timings_ms[s] for s in STAGES), r.total_ms] for r in self.results])
+
+    def residuals_px(self) -> Array:
+        """Root mean square residual (f,), NaN where lost."""
+        return np.array([result.residual_rms_px for result in self.results])
+
+    def unexplained_px(self) -> Array:
+        """What the model leaves of the residuals (f,), see `systematic_errors`; NaN where lost."""
+        return np.array([result.unexplained_px for result in self.results])
+
+    def beyond_model(self) -> Array:
+        """Largest displacement (f,) of a node of the surface beyond the model's and a rigid motion, metres.
+
+        NaN where it was not estimated.
+        """
+        nodes = self.model.nodes[np.unique(self.model.triangles)]
+        found = [result.discrepancy for result in self.results]
+        return np.array([np.nan if d is None else largest_deformation(nodes, d) for d in found])
+
+    def counts(self) -> NDArray[np.int64]:
+        """(f, 2): points that could be seen, and those that support the estimate."""
+        return np.array([(r.n_points, r.n_inliers) for r in self.results], dtype=np.int64).reshape(-1, 2)

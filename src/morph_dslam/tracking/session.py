@@ -1,0 +1,177 @@
+"""A session: one or several objects in the frames of one or several cameras, recorded or live."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
+from dataclasses import replace
+
+from tqdm import tqdm
+
+from morph_dslam.errors import SourceError
+from morph_dslam.sources import Frame
+from morph_dslam.sources.frames import FrameSource
+from morph_dslam.sources.live import LiveStream
+from morph_dslam.threads import one_thread_for_algebra
+from morph_dslam.tracking.anchoring import Anchor
+from morph_dslam.tracking.live import LivePipeline
+from morph_dslam.tracking.multi_camera import RigTracker
+from morph_dslam.tracking.occlusion import MultiObjectTracker
+from morph_dslam.tracking.reregistration import Reregistration
+from morph_dslam.tracking.run_notices import RunNotice, RunWarning
+from morph_dslam.tracking.sinks import LivePicture, Sink, TrackedFrame
+from morph_dslam.tracking.tracker import CameraLocalization, Tracker
+
+Localizations = dict[str, CameraLocalization]
+
+
+class Session:
+    """Finds the camera in the map once a frame, and each object in it, and hands the results to sinks.
+
+    A recording is tracked frame by frame. In a live stream one thread finds the camera, one tracks the objects
+    and one draws and hands out; each takes the newest frame, so that some are dropped but none is late.
+
+    Parameters
+    ----------
+    trackers : by name, one of each object; `RigTracker` where several cameras see them.
+    source : of frames, recorded or live; of several cameras a `SynchronizedFrames`.
+    sinks : called with each `TrackedFrame`.
+    anchor : the map that several objects are anchored in, by the same names; None if each tracker has its own
+        or the objects are free.
+    picture : draws each frame; None to draw nothing.
+    reregistration : by object, decides when it is registered anew.
+
+    Attributes
+    ----------
+    n_dropped : number of live frames that came but were not handed out.
+    """
+
+    def __init__(
+        self,
+        trackers: Mapping[str, Tracker | RigTracker],
+        source: Iterable[Frame | tuple[Frame, ...]],
+        sinks: Sequence[Sink] = (),
+        *,
+        anchor: Anchor | None = None,
+        picture: LivePicture | None = None,
+        reregistration: Mapping[str, Reregistration] | None = None,
+    ) -> None:
+        self._objects, self._source, self._sinks = MultiObjectTracker(trackers), source, tuple(sinks)
+        self._anchor, self._picture, self._reregistration = anchor, picture, reregistration or {}
+        self._pipeline: LivePipeline | None = None
+
+    @property
+    def trackers(self) -> dict[str, Tracker | RigTracker]:
+        """By name; another one after an object was registered anew."""
+        return self._objects.trackers
+
+    @property
+    def n_dropped(self) -> int:
+        return 0 if self._pipeline is None else self._pipeline.n_dropped
+
+    def locate(self, frames: Sequence[Frame]) -> Localizations:
+        """Find the first camera of the next frames in the map, and with it each anchored object."""
+        if self._anchor is None:
+            return {name: tracker.locate(frames[0]) for name, tracker in self.trackers.items()}
+        frame, first = frames[0], next(iter(self.trackers.values()))
+        first.camera.check_image(frame.image, f"frame {frame.index}")
+        poses, camera = self._anchor.locate(frame.image, frame.index, frame.timestamp)
+        why = str(camera.reason or "")
+        return {name: CameraLocalization(poses.get(name), why, camera.total_ms) for name in self._anchor.names}
+
+    def track(self, frames: tuple[Frame, ...], localizations: Localizations) -> TrackedFrame:
+        """Find the objects in frames that `locate` has seen."""
+        for name, again in self._reregistration.items():
+            self.trackers[name] = again.tracker(frames, self.trackers[name])
+        results = self._objects.track(frames, localizations)
+        for name, again in self._reregistration.items():
+            again.learn(results[name])
+        return TrackedFrame(frames, results)
+
+    def __iter__(self) -> Iterator[TrackedFrame]:
+        """Track a recording frame by frame, without the sinks."""
+        for item in self._source:
+            frames = item if isinstance(item, tuple) else (item,)
+            yield self._drawn(self.track(frames, self.locate(frames)))
+
+    @one_thread_for_algebra
+    def run(self, seconds: float | None = None, progress: bool = False) -> None:
+        """Track until the source ends, and hand each frame to the sinks.
+
+        Parameters
+        ----------
+        seconds : after which a live session ends; None to go on until the stream ends.
+        progress : whether to show a progress bar, of a recording.
+
+        Raises
+        ------
+        MorphError
+            If a frame cannot be read or has not the camera's size. The sinks have all frames before it.
+        """
+        if isinstance(self._source, LiveStream):
+            self._pipeline = LivePipeline(self._source, (self._locate_live, self._track_live, self._finish_live))
+            self._pipeline.run(seconds)
+            return
+        total = len(self._source) if isinstance(self._source, Sized) else None
+        for tracked in tqdm(self, total=total, desc="tracking", unit="frame", disable=not progress):
+            self._hand_out(tracked)
+
+    def _locate_live(self, frame: Frame) -> tuple[tuple[Frame, ...], Localizations]:
+        return (frame,), self.locate((frame,))
+
+    def _track_live(self, located: tuple[tuple[Frame, ...], Localizations]) -> TrackedFrame:
+        return self.track(*located)
+
+    def _finish_live(self, tracked: TrackedFrame) -> None:
+        tracked = self._drawn(tracked)
+        captured = tracked.frame.captured
+        latency = 0.0 if captured is None else time.monotonic() - captured
+        self._hand_out(replace(tracked, latency_s=latency))
+
+    def _drawn(self, tracked: TrackedFrame) -> TrackedFrame:
+        if self._picture is None:
+            return tracked
+        return replace(tracked, picture=self._picture.draw(tracked.frame, tracked.results))
+
+    def _hand_out(self, tracked: TrackedFrame) -> None:
+        for sink in self._sinks:
+            sink(tracked)
+
+
+class SynchronizedFrames:
+    """What several cameras recorded, the frames of one instant after the other.
+
+    It ends with the shortest recording.
+
+    Parameters
+    ----------
+    sources : by camera, with the same frame numbers.
+    """
+
+    def __init__(self, sources: Sequence[FrameSource]) -> None:
+        self.sources = tuple(sources)
+
+    def notices(self, n_tracked: int) -> list[RunNotice]:
+        """What a reader must know if not all recordings are as long."""
+        counts = [len(source) for source in self.sources]
+        if len(set(counts)) == 1:
+            return []
+        return [RunNotice.of(RunWarning.UNEQUAL_RECORDINGS, counts=", ".join(map(str, counts)), tracked=n_tracked)]
+
+    @property
+    def has_registered_depth(self) -> bool:
+        """Whether the first camera's frames come with depth that belongs to their pixels."""
+        return getattr(self.sources[0], "has_registered_depth", False)
+
+    def __len__(self) -> int:
+        return min(len(source) for source in self.sources)
+
+    def __iter__(self) -> Iterator[tuple[Frame, ...]]:
+        for frames in zip(*self.sources, strict=False):
+            if len({frame.index for frame in frames}) > 1:
+                numbers = ", ".join(str(frame.index) for frame in frames)
+                raise SourceError(
+                    f"the cameras' recordings do not go together: frames {numbers} come at the same time; number "
+                    "what was taken at one instant alike"
+                )
+            yield frames

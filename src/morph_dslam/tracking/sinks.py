@@ -1,0 +1,277 @@
+"""What a session hands to its sinks, and sinks that show pictures: a video, and browsers on this computer."""
+
+from __future__ import annotations
+
+import csv
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from types import TracebackType
+from urllib.parse import urlsplit
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import Camera
+from morph_dslam.errors import TrackingError
+from morph_dslam.io.video import VideoWriter
+from morph_dslam.sources import Frame
+from morph_dslam.tracking.drawing import AugmentedView, with_caption
+from morph_dslam.tracking.result import FrameResult
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """What the sinks of a session get.
+
+    Attributes
+    ----------
+    frames : by camera, of one instant.
+    results : by object.
+    picture : (h, w, 3), the first camera's frame with the objects drawn over it; None if nothing is drawn.
+    latency_s : from the capture of a live frame until its picture was finished, seconds; 0 in a recording.
+    """
+
+    frames: tuple[Frame, ...]
+    results: dict[str, FrameResult]
+    picture: NDArray[np.uint8] | None = None
+    latency_s: float = 0.0
+
+    @property
+    def frame(self) -> Frame:
+        """Of the first camera."""
+        return self.frames[0]
+
+
+#: Takes each tracked frame: a function, a run folder, a video, a browser.
+Sink = Callable[[TrackedFrame], object]
+
+
+@dataclass
+class LiveTimes:
+    """A sink: when frames were captured and how long it took until they were drawn.
+
+    Attributes
+    ----------
+    frames : (f,) numbers.
+    captured : (f,) seconds of `time.monotonic`.
+    latency : (f,) seconds until the picture was finished.
+    """
+
+    frames: list[int] = field(default_factory=list)
+    captured: list[float] = field(default_factory=list)
+    latency: list[float] = field(default_factory=list)
+
+    def __call__(self, tracked: TrackedFrame) -> None:
+        self.frames.append(tracked.frame.index)
+        self.captured.append(tracked.frame.captured or 0.0)
+        self.latency.append(tracked.latency_s)
+
+    @property
+    def fps(self) -> float:
+        """Pictures a second."""
+        if len(self.captured) < 2:
+            return 0.0
+        return (len(self.captured) - 1) / max(self.captured[-1] - self.captured[0], 1e-9)
+
+    def latency_ms(self, percentile: float) -> float:
+        """A percentile of the latency, milliseconds; NaN where nothing was drawn."""
+        return 1e3 * float(np.percentile(self.latency, percentile)) if self.latency else float("nan")
+
+    def figures(self) -> dict[str, float]:
+        """For the summary of a run."""
+        return {"fps": self.fps, "latency_median_ms": self.latency_ms(50), "latency_p95_ms": self.latency_ms(95)}
+
+    def write(self, path: Path) -> None:
+        """Write when each frame was captured, and its latency, as a table."""
+        with path.open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(["frame", "captured_s", "latency_ms"])
+            for frame, captured, latency in zip(self.frames, self.captured, self.latency, strict=True):
+                writer.writerow([frame, f"{captured - self.captured[0]:.6f}", f"{1e3 * latency:.3f}"])
+
+
+class LivePicture:
+    """Draws a tracked frame: undistorted, with the objects over it, or the reason why one is not there.
+
+    Parameters
+    ----------
+    camera : whose frames are drawn.
+    views : by object; all of the same field, with one range of colours.
+    """
+
+    def __init__(self, camera: Camera, views: Mapping[str, AugmentedView]) -> None:
+        ranges = np.array([view.range_of_box() for view in views.values()])
+        self._views, self._limits = dict(views), (float(ranges[:, 0].min()), float(ranges[:, 1].max()))
+        self._maps = camera.undistortion_maps()
+
+    def draw(self, frame: Frame, results: Mapping[str, FrameResult]) -> NDArray[np.uint8]:
+        """The picture, the nearest object over the others."""
+        image, caption = frame.image, f"frame {frame.index}"
+        if self._maps is not None:
+            image = np.asarray(cv2.remap(image, *self._maps, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+        missing = {name: result.reason for name, result in results.items() if result.estimate is None}
+        if missing and len(results) == 1:
+            caption = f"{caption}: {next(iter(missing.values()))}"
+        elif missing:
+            caption = "; ".join([caption, *(f"{name}: {why}" for name, why in missing.items())])
+        if len(missing) == len(results):
+            return with_caption(image, caption)
+        found = [
+            (self._views[name], result.estimate.state, result.discrepancy)
+            for name, result in results.items()
+            if result.estimate is not None
+        ]
+        for view, state, discrepancy in sorted(found, key=lambda one: -one[0].distance(one[1])):
+            image = view.draw(image, state, self._limits, caption, discrepancy)
+        return image
+
+
+HOST = "127.0.0.1"
+
+JPEG_QUALITY = 80
+
+#: A gap in the frames longer than this, seconds, is not filled in the video.
+LONGEST_GAP = 2.0
+
+_PAGE = b"""<!doctype html><title>morph live</title>
+<body style="margin:0;background:#222;text-align:center">
+<img src="/stream.mjpg" style="max-width:100%">
+"""
+
+
+class VideoSink:
+    """Records pictures at a fixed rate; where frames were dropped the last picture stays."""
+
+    def __init__(self, writer: VideoWriter, fps: float) -> None:
+        self._writer, self._fps = writer, fps
+        self._start: float | None = None
+        self._written = 0
+
+    def __call__(self, tracked: TrackedFrame) -> None:
+        """Write the picture as often as its time asks for."""
+        assert tracked.picture is not None
+        seconds = tracked.frame.timestamp
+        self._start = seconds if self._start is None else self._start
+        due = 1 + round((seconds - self._start) * self._fps)
+        missing = due - self._written
+        if not 0 < missing <= LONGEST_GAP * self._fps:
+            # The clock stood still, or there was a long gap: go on from here.
+            self._start, missing = seconds - self._written / self._fps, 1
+        for _ in range(missing):
+            self._writer.write(tracked.picture)
+        self._written += missing
+
+
+class BrowserSink:
+    """Shows pictures to browsers on this computer, as motion JPEG; a context manager.
+
+    Pictures are only encoded while somebody looks at them, and who is slow gets fewer.
+
+    Raises
+    ------
+    TrackingError
+        If the port cannot be taken; 0 takes any free one.
+    """
+
+    def __init__(self, port: int) -> None:
+        self._changed = threading.Condition()
+        self._jpeg, self._number, self._viewers, self._ended = b"", 0, 0, False
+        try:
+            self._server = _Server((HOST, port), partial(_Handler, self))
+        except (OSError, OverflowError) as error:
+            raise TrackingError(
+                f"port {port} cannot be taken ({error}); choose another with --serve; 0 takes any free one"
+            ) from error
+        self.address = f"http://{HOST}:{self._server.server_address[1]}/"
+        self._thread = threading.Thread(target=self._server.serve_forever, name="browser", daemon=True)
+
+    def __enter__(self) -> BrowserSink:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+        self._server.shutdown()
+        self._server.server_close()
+
+    def __call__(self, tracked: TrackedFrame) -> None:
+        """Hand the picture to all who look."""
+        if not self.is_watched or tracked.picture is None:
+            return
+        _, jpeg = cv2.imencode(".jpg", tracked.picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        with self._changed:
+            self._jpeg, self._number = jpeg.tobytes(), self._number + 1
+            self._changed.notify_all()
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether a browser shows the pictures."""
+        return self._viewers > 0
+
+    def watch(self, delta: int) -> None:
+        """Count who looks on."""
+        with self._changed:
+            self._viewers += delta
+            self._changed.notify_all()
+
+    def next_after(self, number: int) -> tuple[int, bytes]:
+        """The number and JPEG of a picture newer than ``number``; waits for it. Empty at the end."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._number > number or self._ended)
+            return (number, b"") if self._ended else (self._number, self._jpeg)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    def __init__(self, sink: BrowserSink, *arguments) -> None:
+        self._sink = sink
+        super().__init__(*arguments)
+
+    def do_GET(self) -> None:
+        # Else a page from elsewhere could look on under a name of its own for this address.
+        if urlsplit(f"//{self.headers.get('Host', '')}").hostname not in (HOST, "localhost"):
+            self.send_error(HTTPStatus.FORBIDDEN)
+        elif self.path == "/":
+            self._begin("text/html; charset=utf-8")
+            self.wfile.write(_PAGE)
+        elif self.path == "/stream.mjpg":
+            self._stream()
+        else:
+            self.send_error(HTTPStatus.NOT_FOUND)
+
+    def _begin(self, content_type: str) -> None:
+        self.send_response(HTTPStatus.OK)
+        self.send_header("Content-Type", content_type)
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.end_headers()
+
+    def _stream(self) -> None:
+        self._begin("multipart/x-mixed-replace; boundary=frame")
+        self._sink.watch(1)
+        try:
+            number, jpeg = self._sink.next_after(0)
+            while jpeg:
+                head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+                self.wfile.write(head.encode() + jpeg + b"\r\n")
+                number, jpeg = self._sink.next_after(number)
+        except ConnectionError:
+            pass  # the page was closed
+        finally:
+            self._sink.watch(-1)
+
+    def log_message(self, format: str, *args) -> None:
+        """Nothing: requests are no news."""
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True

@@ -1,0 +1,289 @@
+"""Several objects, several cameras, and what goes with them, on rendered sheets with known states."""
+
+import numpy as np
+import pytest
+
+import morph_dslam as md
+from morph_dslam.camera import Camera
+from morph_dslam.cli.app import main
+from morph_dslam.errors import RegistrationError
+from morph_dslam.evaluation.run_folder import load_run
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.registration.registration import Registration
+from morph_dslam.sources import Frame
+from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
+from morph_dslam.tracking.occlusion import MultiObjectTracker
+from morph_dslam.tracking.session import SynchronizedFrames
+from morph_dslam.tracking.tracker import Tracker
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.camchain import write_camchain
+from tests.support.rendered_sequence import (
+    CAMERA,
+    UPRIGHT,
+    SheetFilm,
+    mean_error,
+    sheet_depth,
+    sheet_state,
+    write_landmarks,
+    write_recording,
+)
+
+TIMES = np.linspace(0.0, 1.0, 21)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return bent_sheet_model(43, 31)
+
+
+# Several objects: one sheet passes in front of another.
+
+
+@pytest.fixture(scope="module")
+def films(model):
+    return {"behind": SheetFilm(model, seed=1), "before": SheetFilm(model, seed=2)}
+
+
+def states(time):
+    """The sheet behind bends; the one before passes it from right to left."""
+    bend = np.array([0.03 * np.sin(4.0 * time), 0.2, 0.1])
+    behind = RigidTransform(rotation_exp(np.array([0.1, 0.2, 0.1 * time])) @ UPRIGHT, np.array([-0.1, 0.0, 0.9]))
+    before = RigidTransform(
+        rotation_exp(np.array([0.0, -0.3, 0.0])) @ UPRIGHT, np.array([0.33 - 0.35 * time, 0.12, 0.75])
+    )
+    return {"behind": State(bend, behind), "before": State(np.array([0.02, 0.0, 0.05]), before)}
+
+
+def frame(model, films, time):
+    """Both sheets, the nearer one before the other."""
+    images = {name: film.frame(states(time)[name]) for name, film in films.items()}
+    no_noise = np.random.default_rng(0)
+    depths = {name: sheet_depth(model, states(time)[name], no_noise, 0.0, 9.0) for name in films}
+    nearer = depths["before"] < depths["behind"]
+    return np.where(nearer[:, :, None], images["before"], images["behind"])
+
+
+def new_trackers(model, films):
+    first = frame(model, films, 0.0)
+    return {name: Tracker(model, CAMERA, Registration(model, states(0.0)[name]), reference=first) for name in films}
+
+
+def test_a_session_without_files_keeps_what_passes_before_an_object_from_spoiling_it(model, films):
+    recording = [Frame(number, time, frame(model, films, time)) for number, time in enumerate(TIMES[1:])]
+    errors, visible = {name: [] for name in films}, []
+
+    def take(tracked):
+        for name, result in tracked.results.items():
+            assert result.status is md.Status.TRACKED, (name, result.reason)
+            truth = states(tracked.frame.timestamp)[name]
+            errors[name].append(mean_error(model, result.estimate.state, truth))
+        visible.append(tracked.results["behind"].n_points)
+
+    md.Session(new_trackers(model, films), recording, [take]).run()
+    assert len(visible) == len(recording)
+    assert max(errors["before"]) < 0.3e-3
+    # Two thirds of its points are occluded at last.
+    assert min(visible) < 0.4 * visible[0]
+    assert np.mean(errors["behind"]) < 0.3e-3
+    assert max(errors["behind"]) < 1.0e-3
+
+
+def test_occluded_points_are_known_to_be_occluded(model, films):
+    """By themselves, points behind the other sheet count as visible, and have to be thrown out by looks."""
+    aware, unaware = MultiObjectTracker(new_trackers(model, films)), new_trackers(model, films)["behind"]
+    for time in TIMES[1:]:
+        image = frame(model, films, time)
+        counts = aware.track([Frame(0, time, image)])["behind"].n_points, unaware.track(image).n_points
+    positions = aware.trackers["behind"].reference.points.in_camera(states(1.0)["behind"])
+    pixels = np.rint(CAMERA.project(positions)).astype(int)
+    depth = sheet_depth(model, states(1.0)["before"], np.random.default_rng(0), 0.0, 9.0)
+    occluded = depth[pixels[:, 1], pixels[:, 0]] < positions[:, 2]
+    assert occluded.sum() > 60
+    assert counts[0] <= counts[1] - occluded.sum()
+
+
+def test_a_lost_object_occludes_nothing(model, films):
+    objects = MultiObjectTracker(new_trackers(model, films))
+    for time in TIMES[1:14]:
+        before = objects.track([Frame(0, time, frame(model, films, time))])
+    results = objects.track([Frame(0, 0.0, films["behind"].frame(states(TIMES[14])["behind"]))])
+    assert results["before"].status is md.Status.LOST
+    assert results["behind"].n_points > before["behind"].n_points + 80
+
+
+@pytest.fixture(scope="module")
+def two_sheets(model, films, tmp_path_factory):
+    """Frames, model, camera, and landmarks of both sheets in frames 0 and 3."""
+    folder = tmp_path_factory.mktemp("two_sheets")
+    write_recording(folder, {n: frame(model, films, time) for n, time in enumerate(TIMES[:12:2])}, model)
+    for number in (0, 3):
+        for name, state in states(TIMES[2 * number]).items():
+            write_landmarks(folder / f"{name}_{number}.csv", model, state, count=24)
+    return folder
+
+
+def with_two_sheets(folder, output, *more):
+    return [
+        "track", folder / "frames", "--model", folder / "sheet.morph", "--camera", folder / "camera.yaml",
+        "--landmarks", folder / "behind_0.csv", "--also", "before", folder / "sheet.morph", folder / "before_0.csv",
+        "-o", output, "--no-video", *more,
+    ]  # fmt: skip
+
+
+def run_command(arguments):
+    return main([str(word) for word in arguments])
+
+
+@pytest.mark.parametrize("more", ["plain", "refined", "registered anew"])
+def test_each_object_has_a_run_folder_and_all_that_one_object_has(model, two_sheets, tmp_path, capsys, more):
+    options = {
+        "plain": [],
+        "refined": ["--refine"],
+        "registered anew": ["--reregister-at", f"before:3={two_sheets / 'before_3.csv'}"],
+    }[more]
+    assert run_command(with_two_sheets(two_sheets, tmp_path / "run", *options)) == 0
+    said = capsys.readouterr().out
+    assert said.count("tracked=6/6") == 2
+    assert said.count("registered anew in frame 3") == (more == "registered anew")
+    for folder, name in ((tmp_path / "run", "behind"), (tmp_path / "run" / "before", "before")):
+        run = load_run(folder)
+        for row, time in enumerate(TIMES[:12:2]):
+            state = states(time)[name]
+            exact = state.camera_from_object.apply(model.positions(state.parameters))
+            assert np.linalg.norm(run.camera_points(row) - exact, axis=1).mean() < 0.5e-3
+
+
+# Several cameras of wide lenses, so that one by itself tells little along its sight line; 0.4 m apart.
+
+FRONT = RigCamera(Camera(480, 360, 330.0, 330.0, 240.0, 180.0), RigidTransform.identity())
+TURN = rotation_exp(np.array([0.0, 0.5, 0.0]))
+ASIDE = RigCamera(
+    Camera(480, 360, 350.0, 350.0, 235.0, 182.0),
+    RigidTransform(TURN, np.array([0.0, 0.0, 0.62]) - TURN @ np.array([0.0, 0.0, 0.62])),
+)
+RIG = (FRONT, ASIDE)
+RIG_TIMES = np.linspace(0.0, 0.3, 10)[1:]
+
+
+@pytest.fixture
+def rig_films(model):
+    return [SheetFilm(model, part.camera) for part in RIG]
+
+
+def images(films, time):
+    state = sheet_state(time)
+    return [film.frame(part.seen(state), noise=6.0) for film, part in zip(films, RIG, strict=True)]
+
+
+def new_rig(model, references, **options):
+    registration = Registration(model, sheet_state(0.0))
+    return RigTracker(model, RIG, registration, md.TrackerOptions(**options), references=references)
+
+
+def test_two_cameras_are_nearer_to_the_truth_than_one(model, rig_films):
+    """Something covers most of the object in the first camera, and some of it in the second."""
+    first = images(rig_films, 0.0)
+    alone = Tracker(model, FRONT.camera, Registration(model, sheet_state(0.0)), reference=first[0])
+    rig = new_rig(model, first)
+    errors, deviations = {"alone": [], "rig": []}, {"alone": [], "rig": []}
+    for time in RIG_TIMES:
+        seen = images(rig_films, time)
+        seen[0][:, 250:] = 90
+        seen[1][:160] = 90
+        for name, result in (("alone", alone.track(seen[0])), ("rig", rig.track(seen))):
+            assert result.status is md.Status.TRACKED, result.reason
+            errors[name].append(mean_error(model, result.estimate.state, sheet_state(time)))
+            deviations[name].append(result.estimate.pose_std[5])
+    assert np.mean(errors["rig"]) < 0.5 * np.mean(errors["alone"])
+    assert np.mean(deviations["rig"]) < 0.5 * np.mean(deviations["alone"])
+
+
+def test_a_covered_camera_goes_on_from_the_other(model, rig_films):
+    rig = new_rig(model, images(rig_films, 0.0))
+    for number, time in enumerate(RIG_TIMES):
+        seen = images(rig_films, time)
+        if 2 <= number <= 6:
+            seen[1] = rig_films[1].blank()
+        result = rig.track(seen)
+        assert result.status is md.Status.TRACKED, result.reason
+        assert mean_error(model, result.estimate.state, sheet_state(time)) < 0.6e-3
+        assert [warning.camera for warning in result.warnings] == ([1] if 2 <= number <= 6 else [])
+    assert rig.trackers[1].last_measured.weights.sum() > 100
+
+
+def test_an_object_that_no_camera_sees_is_lost(model, rig_films):
+    result = new_rig(model, images(rig_films, 0.0)).track([film.blank() for film in rig_films])
+    assert result.status is md.Status.LOST
+    assert [warning.camera for warning in result.warnings] == [0, 1]
+
+
+def test_a_reference_frame_without_texture_names_its_camera(model, rig_films):
+    first = [images(rig_films, 0.0)[0], np.full((360, 480, 3), 128, np.uint8)]
+    with pytest.raises(RegistrationError, match="camera 1: the object shows only"):
+        new_rig(model, first)
+
+
+def test_depth_images_of_the_first_camera_count(model, rig_films):
+    """The cameras' calibration is off, which the sight line of the first one shows."""
+    rng, shift, sight_line = np.random.default_rng(0), np.array([4e-3, 0.0, 0.0]), {}
+    for use_depth in (False, True):
+        rig = RigTracker(
+            model,
+            [FRONT, RigCamera(ASIDE.camera, RigidTransform(TURN, ASIDE.camera_from_rig.translation + shift))],
+            Registration(model, sheet_state(0.0)),
+            md.TrackerOptions(use_depth=use_depth),
+            references=images(rig_films, 0.0),
+        )
+        found = []
+        for time in RIG_TIMES:
+            front, aside = (Frame(0, time, image) for image in images(rig_films, time))
+            depth = sheet_depth(model, sheet_state(time), rng, camera=FRONT.camera)
+            result = rig.track([Frame(0, time, front.image, depth=depth), aside])
+            away = result.pose.translation - sheet_state(time).camera_from_object.translation
+            found.append(abs(away[2]))
+        sight_line[use_depth] = np.mean(found)
+    assert sight_line[True] < 0.5 * sight_line[False]
+
+
+@pytest.fixture(scope="module")
+def rig_recording_of_sheet(model, tmp_path_factory):
+    """What both cameras recorded, their camchain, the model, and landmarks in the first camera."""
+    folder = tmp_path_factory.mktemp("rig")
+    films = [SheetFilm(model, part.camera) for part in RIG]
+    pairs = {number: images(films, time) for number, time in enumerate([0.0, *RIG_TIMES[:4]])}
+    for k, name in enumerate(("front", "aside")):
+        write_recording(folder, {number: pair[k] for number, pair in pairs.items()}, model, name=name)
+    write_camchain(folder / "camchain.yaml", RIG)
+    write_landmarks(folder / "landmarks.csv", model, sheet_state(0.0), FRONT.camera, count=24)
+    return folder
+
+
+def with_both_cameras(folder, output, *more, camera="camchain.yaml#cam0"):
+    return [
+        "track", folder / "front", "--with", folder / "aside", "--camera", f"{folder}/{camera}",
+        "--model", folder / "sheet.morph", "--landmarks", folder / "landmarks.csv", "-o", output, *more,
+    ]  # fmt: skip
+
+
+def test_the_command_tracks_with_both_cameras(model, rig_recording_of_sheet, tmp_path, capsys):
+    folder = rig_recording_of_sheet
+    assert run_command(with_both_cameras(folder, tmp_path / "run")) == 0
+    assert "tracked=5/5" in capsys.readouterr().out
+    run = load_run(tmp_path / "run")
+    for row, time in enumerate([0.0, *RIG_TIMES[:4]]):
+        state = sheet_state(time)
+        exact = state.camera_from_object.apply(model.positions(state.parameters))
+        assert np.linalg.norm(run.camera_points(row) - exact, axis=1).mean() < 0.4e-3
+    assert run_command(with_both_cameras(folder, tmp_path / "again", "--with", folder / "aside")) == 2
+    assert "has 2 cameras, but there are 3" in capsys.readouterr().err
+    assert run_command(with_both_cameras(folder, tmp_path / "again", camera="camchain.yaml#cam1")) == 2
+    assert "camchain.yaml#cam1" in capsys.readouterr().err
+
+
+def test_frames_of_different_numbers_do_not_go_together(rig_recording_of_sheet):
+    front, aside = (md.open_source(rig_recording_of_sheet / "front", first) for first in (0, 1))
+    both = SynchronizedFrames([front, aside])
+    assert len(both) == 4
+    with pytest.raises(md.MorphError, match="frames 0, 1 come at the same time"):
+        next(iter(both))
