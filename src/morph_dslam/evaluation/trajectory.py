@@ -9,7 +9,7 @@ motion is.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -69,28 +69,10 @@ def summarise_alignment(error: MaterialError) -> dict[str, Any]:
 MOST_TIME_DIFFERENCE = 0.01
 
 
-@dataclass(frozen=True)
-class Statistics:
-    """Statistics of errors, in their unit."""
-
-    rmse: float
-    mean: float
-    median: float
-    std: float
-    min: float
-    max: float
-
-    @classmethod
-    def of(cls, errors: Array) -> Statistics:
-        """Of errors (n,), at least one."""
-        return cls(
-            float(np.sqrt(np.mean(errors**2))),
-            float(errors.mean()),
-            float(np.median(errors)),
-            float(errors.std()),
-            float(errors.min()),
-            float(errors.max()),
-        )
+def statistics(errors: Array) -> dict[str, float]:
+    """Of errors (n,), at least one, in their unit."""
+    figures = {name: float(getattr(np, name)(errors)) for name in ("mean", "median", "std", "min", "max")}
+    return {"rmse": float(np.sqrt(np.mean(errors**2))), **figures}
 
 
 @dataclass(frozen=True)
@@ -249,9 +231,9 @@ def evaluate_trajectory(run: str | Path, truth_path: str | Path) -> dict[str, An
         relative = relative_error(estimate, truth, figures["relative_interval_s"], scale)
         figures[name] = {
             "scale": scale,
-            "absolute_mm": asdict(Statistics.of(1e3 * absolute.distances)),
-            "relative_mm": asdict(Statistics.of(1e3 * relative.translations)),
-            "relative_deg": asdict(Statistics.of(np.rad2deg(relative.rotations))),
+            "absolute_mm": statistics(1e3 * absolute.distances),
+            "relative_mm": statistics(1e3 * relative.translations),
+            "relative_deg": statistics(np.rad2deg(relative.rotations)),
         }
         errors[name] = absolute, relative
     path.with_name(f"{path.stem}_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
@@ -298,7 +280,7 @@ def plot_trajectory(
     right.set_ylabel("error after Sim(3) alignment [mm]")
     right.set_ylim(bottom=0.0)
     right.legend(fontsize=8, frameon=False)
-    rmse = Statistics.of(1e3 * absolute.distances).rmse
+    rmse = statistics(1e3 * absolute.distances)["rmse"]
     scale = absolute.truth_from_estimate.scale
     right.set_title(f"absolute RMSE {rmse:.2f} mm, scale {scale:.4f}, {len(estimate)} poses", fontsize=10)
     figure.savefig(path, dpi=DPI)

@@ -139,7 +139,7 @@ def load_picture(path: Path) -> PictureInitializer:
 
 
 def _matches(picture: Image, grey: Image) -> tuple[Array, Array]:
-    """Pixels (k, 2) of features that look alike, in the picture and in the frame (SIFT; Lowe 2004)."""
+    """Pixels (k, 2) of similar features in the picture and in the frame (SIFT; Lowe 2004)."""
     detector = cv2.SIFT_create(nfeatures=N_FEATURES)  # type: ignore[attr-defined]
     ours, first = detector.detectAndCompute(picture, None)
     theirs, second = detector.detectAndCompute(grey, None)
