@@ -11,14 +11,10 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 
-import morph_dslam as md
 from morph_dslam.cli.app import main
 from tests.support.scenes import MOTION, write_scene
 
 DOCS = Path(__file__).parents[2] / "docs"
-
-
-needs_registration = pytest.mark.skipif(not hasattr(md, "register_landmarks"), reason="not there yet")
 
 
 @pytest.fixture(autouse=True)
@@ -49,7 +45,6 @@ def run_page(page):
     return names
 
 
-@needs_registration
 def test_own_sheet():
     names = run_page("tutorials/sheet.md")
     assert names["figures"]["mean_mm"] < 0.3
@@ -80,7 +75,6 @@ def test_results_in_a_notebook(tmp_path):
     assert {path.name for path in tmp_path.glob("*.png")} >= {"parameters.png", "stress.png", "field.png"}
 
 
-@needs_registration
 def test_the_example_of_the_readme(tmp_path, capsys):
     """With a recording where `make demo` leaves one."""
     (tmp_path / "demo").mkdir()
