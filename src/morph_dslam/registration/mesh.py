@@ -89,7 +89,7 @@ class _Evidence:
         return float(self.solid.sum() - VIOLATION * self.occluded.sum())
 
 
-def _gather_evidence(
+def gather_evidence(
     world_from_object: SimilarityTransform,
     nodes: Array,
     triangles: NDArray[np.int64],
@@ -221,7 +221,7 @@ def register_mesh(
 
     def judged(place: SimilarityTransform, asked: Sequence[View]) -> _Place:
         tolerance = TOLERANCE * surface.size * place.scale
-        return _Place(place, _gather_evidence(place, nodes, triangles, points.positions, asked, camera, tolerance))
+        return _Place(place, gather_evidence(place, nodes, triangles, points.positions, asked, camera, tolerance))
 
     places: list[_Place] = []
     few, more = spread_views(views, FIRST_ASKED), spread_views(views, MOST_ASKED)
