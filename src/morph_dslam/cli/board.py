@@ -10,13 +10,11 @@ KEPT = "nothing was written"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
     command.add_argument("board", type=Path, help="board file (docs/registration-aids.md)")
     command.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="PNG or PDF file to write")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Draw the board."""
     from morph_dslam.registration.board import load_board, print_board
 
     board = load_board(arguments.board)

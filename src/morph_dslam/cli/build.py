@@ -15,7 +15,6 @@ KEPT = "the solutions found so far are kept, and the same command goes on from t
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
     command.add_argument("study", type=Path, help="study file (docs/study-file.md)")
     command.add_argument("-o", "--output", type=Path, required=True, metavar="MODEL", help="model file to write")
     where = command.add_mutually_exclusive_group()

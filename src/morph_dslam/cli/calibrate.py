@@ -10,7 +10,6 @@ KEPT = "nothing was written"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
     command.add_argument(
         "source", type=Path, nargs="+", help="images, a folder of images, or a video (docs/cameras.md)"
     )

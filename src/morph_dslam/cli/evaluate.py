@@ -12,7 +12,6 @@ KEPT = "the run is unchanged"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
     command.add_argument("run_folder", type=Path, metavar="RUN", help="run folder, or a trajectory file")
     truth = command.add_mutually_exclusive_group(required=True)
     truth.add_argument("--points", type=Path, metavar="TRUTH", help="truth file, .npz (docs/run-folder.md)")

@@ -10,7 +10,6 @@ KEPT = "nothing was written"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
     command.add_argument("model", type=Path, help="model file")
     command.add_argument(
         "--port", type=int, default=8765, metavar="N", help="on this computer; 0: any (default: %(default)s)"
@@ -19,7 +18,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Serve the page until it is interrupted."""
     from morph_dslam.explore.server import explore
 
     explore(arguments.model, arguments.port, arguments.open)

@@ -10,7 +10,6 @@ KEPT = "the files written so far are kept"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
     command.add_argument("model", type=Path, help="model file")
     command.add_argument("-o", "--output", type=Path, required=True, metavar="FOLDER", help="folder to write")
     command.add_argument("--format", choices=("xdmf", "vtu", "gltf"), default="xdmf", help="default: %(default)s")
@@ -32,7 +31,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Write the states."""
     from morph_dslam.export import StateChoice, export
 
     choice = StateChoice(arguments.vary, arguments.path, arguments.at)

@@ -10,12 +10,10 @@ KEPT = "nothing was written"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
     command.add_argument("model", type=Path, help="model file")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Print the tables of a model."""
     from morph_dslam import load_model
     from morph_dslam.evaluation.model_summary import summarise_model
 

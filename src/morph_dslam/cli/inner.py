@@ -10,7 +10,6 @@ KEPT = "nothing was written"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
     command.add_argument("surface", type=Path, help=".stl, .obj or .ply file, drawn in the object's frame")
     command.add_argument("--model", type=Path, required=True, help="model file of the solid")
     command.add_argument("--unit", required=True, choices=("m", "cm", "mm"), help="unit of the file's coordinates")
@@ -19,7 +18,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Place the structure."""
     from morph_dslam import load_model
     from morph_dslam.model.inner_structure import save_inner_structure
     from morph_dslam.studies.inner_structures import read_inner_structure

@@ -12,7 +12,6 @@ KEPT = "everything until then is kept in the run folder"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
     command.add_argument("source", metavar="SOURCE", help="webcam:0, or a recording (docs/sources.md)")
     add_tracking_arguments(command)
     command.add_argument(

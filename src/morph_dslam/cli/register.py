@@ -10,7 +10,6 @@ KEPT = "nothing was written"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
     command.add_argument("map", type=Path, help="map.h5 of a run of `morph slam`")
     command.add_argument("--model", type=Path, required=True, help="model file of the object")
     command.add_argument("--camera", type=Path, required=True, help="camera file of the map")

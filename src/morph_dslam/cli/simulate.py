@@ -10,13 +10,11 @@ KEPT = "the frames written so far are kept, without truth"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
     command.add_argument("scene", type=Path, help="scene file (docs/scene-file.md)")
     command.add_argument("-o", "--output", type=Path, required=True, metavar="FOLDER", help="folder to write")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Render the scene."""
     from morph_dslam.render.simulation import simulate
 
     simulate(arguments.scene, arguments.output)

@@ -12,7 +12,6 @@ KEPT = "the frames tracked so far and their map are kept in the run folder"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
     command.add_argument("source", type=Path, help="recording (docs/sources.md), or webcam:0")
     command.add_argument(
         "--camera",

@@ -18,7 +18,6 @@ KEPT = "the frames tracked so far are kept in the run folder"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
     command.add_argument(
         "frames",
         type=Path,

@@ -160,15 +160,7 @@ class PlacedObject:
 
 
 def new_anchor(placed: Sequence[PlacedObject]) -> Anchor | None:
-    """The map with the anchored objects in it; None if all are free.
-
-    Raises
-    ------
-    MapError
-        If the map cannot be read.
-    RegistrationError
-        If two objects are registered in the same place, or it is not known how well one is.
-    """
+    """The map with the anchored objects in it; None if all are free."""
     return _anchor([(part.object, part.registration) for part in placed], placed[0].camera)
 
 
@@ -200,17 +192,6 @@ def place(part: TrackedObject, cameras: Sequence[RigCamera], frames_at: FramesAt
     cameras : that see it.
     frames_at : gives the frames to take as the reference.
     run : the options.
-
-    Raises
-    ------
-    CameraError
-        If the frame has not the camera's size.
-    RegistrationError
-        If the object cannot be registered there.
-    SourceError
-        If the frame is not there.
-    TrackingError
-        If several cameras see it, and the first one's recording does not show the map's keyframe.
     """
     start, camera = part.start, cameras[0].camera
     number = start.frame if isinstance(start, Registration) else run.reference_frame
@@ -228,13 +209,7 @@ def place(part: TrackedObject, cameras: Sequence[RigCamera], frames_at: FramesAt
 
 
 def _beside_keyframe(keyframe: Image, number: int, camera: Camera, frames_at: FramesAt) -> list[NDArray[np.uint8]]:
-    """What the other cameras saw of the undeformed object, in the instant of the map's keyframe.
-
-    Raises
-    ------
-    TrackingError
-        If the first camera's recording does not show the keyframe.
-    """
+    """What the other cameras saw of the undeformed object, in the instant of the map's keyframe."""
     try:
         first, *others = frames_at(number)
         view = FrameImages(camera).prepare(first.image, number, 0.0)
@@ -251,13 +226,7 @@ def _beside_keyframe(keyframe: Image, number: int, camera: Camera, frames_at: Fr
 
 
 def place_by_map(part: TrackedObject, camera: Camera, frame: Frame) -> TrackedObject:
-    """An anchored object that starts from a frame of the recording, in which it is undeformed; others as they are.
-
-    Raises
-    ------
-    RegistrationError
-        If the camera is not found in the map in that frame.
-    """
+    """An anchored object that starts from a frame of the recording, in which it is undeformed; others as they are."""
     registration = part.start
     if not isinstance(registration, Registration):
         return part

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.run_results import RunResults
@@ -34,36 +35,20 @@ def _shade_lost(axes: Axes, run: RunResults) -> None:
 
 def plot_parameters(path: Path, run: RunResults) -> None:
     """Each parameter in its unit with a band of two standard deviations and the ends of its range."""
-    model = run.model
-    figure = Figure(figsize=(9.0, 1.0 + 1.9 * len(model.parameters)), layout="constrained")
-    all_axes = np.atleast_1d(figure.subplots(len(model.parameters), 1, sharex=True))
+    model, frames = run.model, np.array(run.frames)
+    figure, all_axes = _rows(len(model.parameters), 1.9)
     values, deviations, at_bound = run.parameters(), run.parameter_std(), run.at_bound()
-    frames = np.array(run.frames)
     for k, (axes, parameter) in enumerate(zip(all_axes, model.parameters, strict=True)):
-        unit = parameter.display(1.0)
-        value = values[:, k] * unit
-        low, high = parameter.lower * unit, parameter.upper * unit
+        unit, held = parameter.display(1.0), at_bound[:, k]
+        value, low, high = values[:, k] * unit, parameter.lower * unit, parameter.upper * unit
         margin = 0.06 * (high - low)
-        band = np.nan_to_num(2.0 * deviations[:, k] * unit, posinf=high - low)
-        axes.fill_between(
-            frames,
-            np.maximum(value - band, low - margin),
-            np.minimum(value + band, high + margin),
-            color="#4878a8",
-            alpha=0.25,
-            linewidth=0,
-            label="±2 standard deviations",
-        )
-        axes.plot(frames, value, color="#1f4e79", linewidth=1.4)
-        held = at_bound[:, k]
+        deviation = np.nan_to_num(deviations[:, k] * unit, posinf=0.5 * (high - low))
+        _plot_band(axes, run, value, deviation, (low - margin, high + margin))
         axes.plot(frames[held], value[held], "o", color="#d9534f", markersize=3.5, label="at a bound")
         for bound in (low, high):
             axes.axhline(bound, color="#888888", linewidth=0.8, linestyle="--")
-        axes.set_ylim(low - margin, high + margin)
         axes.set_ylabel(f"{parameter.name} [{parameter.unit}]")
-        _shade_lost(axes, run)
     all_axes[0].legend(loc="upper left", fontsize=8)
-    all_axes[-1].set_xlabel("frame")
     figure.savefig(path, dpi=DPI)
 
 
@@ -72,23 +57,30 @@ def plot_confidence(path: Path, run: RunResults) -> None:
     rows = [("largest displacement [mm]", 1e3 * run.largest_displacements())]
     if run.model.stresses:
         rows.append(("largest von Mises stress [MPa]", 1e-6 * run.largest_stresses()))
-    figure = Figure(figsize=(9.0, 1.0 + 2.2 * len(rows)), layout="constrained")
-    all_axes = np.atleast_1d(figure.subplots(len(rows), 1, sharex=True))
-    for axes, (label, (value, deviation)) in zip(all_axes, [(n, v.T) for n, v in rows], strict=True):
-        low, high = value - 2.0 * deviation, value + 2.0 * deviation
+    figure, all_axes = _rows(len(rows), 2.2)
+    for axes, (label, both) in zip(all_axes, rows, strict=True):
         # A frame that tells nothing must not hide what the others tell.
-        top = 1.5 * float(np.nanmax(value, initial=0.0)) or 1.0
-        low, high = np.clip(low, 0.0, top), np.clip(high, 0.0, top)
-        axes.fill_between(
-            run.frames, low, high, color="#4878a8", alpha=0.3, linewidth=0, label="±2 standard deviations"
-        )
-        axes.plot(run.frames, value, color="#1f4e79", linewidth=1.2)
+        top = 1.5 * float(np.nanmax(both[:, 0], initial=0.0)) or 1.0
+        _plot_band(axes, run, *both.T, (0.0, top))
         axes.set_ylabel(label)
-        axes.set_ylim(bottom=0.0)
-        _shade_lost(axes, run)
     all_axes[0].legend(loc="upper left", fontsize=8)
-    all_axes[-1].set_xlabel("frame")
     figure.savefig(path, dpi=DPI)
+
+
+def _rows(count: int, height: float) -> tuple[Figure, NDArray]:
+    figure = Figure(figsize=(9.0, 1.0 + height * count), layout="constrained")
+    all_axes = np.atleast_1d(figure.subplots(count, 1, sharex=True))
+    all_axes[-1].set_xlabel("frame")
+    return figure, all_axes
+
+
+def _plot_band(axes: Axes, run: RunResults, value: NDArray, deviation: NDArray, limits: tuple[float, float]) -> None:
+    low, high = np.clip(value - 2.0 * deviation, *limits), np.clip(value + 2.0 * deviation, *limits)
+    band = {"color": "#4878a8", "alpha": 0.25, "linewidth": 0, "label": "±2 standard deviations"}
+    axes.fill_between(run.frames, low, high, **band)
+    axes.plot(run.frames, value, color="#1f4e79", linewidth=1.4)
+    axes.set_ylim(*limits)
+    _shade_lost(axes, run)
 
 
 def plot_residual(path: Path, run: RunResults) -> None:

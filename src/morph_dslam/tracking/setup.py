@@ -101,13 +101,7 @@ class TrackedObject:
 
 
 def load_cameras(run: TrackOptions) -> tuple[RigCamera, ...]:
-    """The camera, or those of the camchain that the first one was named of, ``camchain.yaml#cam0``.
-
-    Raises
-    ------
-    CameraError
-        If a camera cannot be used, or there is not one for each recording.
-    """
+    """The camera, or those of the camchain that the first one was named of, ``camchain.yaml#cam0``."""
     if not run.other_cameras:
         return (RigCamera(load_camera(Path(run.camera)), RigidTransform.identity()),)
     name, _, chosen = str(run.camera).partition("#")
@@ -129,11 +123,6 @@ def load_objects(run: TrackOptions, camera: Camera) -> list[TrackedObject]:
     ----------
     run : the options.
     camera : the first one.
-
-    Raises
-    ------
-    MorphError
-        If an input cannot be used (ModelFileError, MapError, RegistrationError, TrackingError).
     """
     return [_load_object(str(folder), part, run, camera) for folder, part in zip(run.folders, run.objects, strict=True)]
 
@@ -175,13 +164,7 @@ def map_of(registration: Path, given: Path | None) -> Path | None:
 
 
 def keyframes_of(path: Path, camera: Camera, registration: Registration) -> dict[int, KeyframeImage]:
-    """The keyframes that the registration is for; they have contrast-normalized images only.
-
-    Raises
-    ------
-    MapError
-        If the map cannot be read, or is not that of the registration.
-    """
+    """The keyframes that the registration is for; they have contrast-normalized images only."""
     wanted, keyframes = {registration.frame, *(view.frame for view in registration.views)}, {}
     for keyframe in load_map(path, camera).keyframes:
         if keyframe.index not in wanted:
