@@ -51,7 +51,6 @@ __all__ = [
     "track",
     "write_build_report",
 ]
-
 #: The module of each public name, as in the imports below.
 _MODULES = {
     "Board": "calibration.board",

@@ -19,16 +19,12 @@ from morph_dslam.errors import CameraError
 from morph_dslam.geometry import RigidTransform
 
 Array = NDArray[np.float64]
-
 LensModel = Literal["radial-tangential", "fisheye"]
-
 #: For `cv2.remap`: where each pixel of an image comes from.
 Maps = tuple[NDArray, NDArray]
-
 #: Newton stops when the image point is met to this distance at unit focal length, 1e-7 px at 1000 px.
 TOLERANCE = 1e-10
 MOST_ITERATIONS = 50
-
 #: Numbers of coefficients of each lens model.
 COUNTS: dict[str, tuple[int, ...]] = {"radial-tangential": (4, 5, 8), "fisheye": (4,)}
 

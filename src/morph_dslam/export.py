@@ -31,13 +31,10 @@ from morph_dslam.model.reduced_model import von_mises
 from morph_dslam.units import to_si
 
 Array = NDArray[np.float64]
-
 #: States that one export may have: beyond, a grid was meant to be coarser.
 MOST_STATES = 10_000
-
 #: Values may pass the end of a range by so much of its width: tables round.
 _ROUNDING = 1e-6
-
 #: States of a tour from the default to one end of a range; twice as many cross it.
 _QUARTER = 6
 
@@ -183,11 +180,8 @@ def write_table(path: Path, model: ReducedModel, states: Array, places: Sequence
 
 
 FRAMES_PER_SECOND = 12.0
-
 _FLOAT, _UNSIGNED_INT = 5126, 5125
-
 _VERTICES, _INDICES = 34962, 34963
-
 #: glTF's y points up and its z to the viewer; this turn makes our z point up, and Blender turns it back.
 _Z_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
 
@@ -285,7 +279,6 @@ _MESHIO_CELLS = {
     "tet4": ("tetra", 4), "tet10": ("tetra10", 10),
     "prism6": ("wedge", 6), "prism15": ("wedge", 6), "prism18": ("wedge18", 18),
 }  # fmt: skip
-
 #: Where the nine components of a symmetric tensor stand among xx, yy, zz, yz, xz, xy.
 _FULL_TENSOR = [0, 5, 4, 5, 1, 3, 4, 3, 2]
 

@@ -28,7 +28,6 @@ tolerance = 1e-8
 #: Stress in VTK's order xx, yy, zz, xy, yz, xz and in this program's xx, yy, zz, yz, xz, xy.
 VTK_STRESS = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
 OUR_STRESS = np.array([1.0, 2.0, 3.0, 5.0, 6.0, 4.0])
-
 MESH = block((0.1, 0.02, 0.02), (5, 1, 1), "hex8")
 
 

@@ -22,7 +22,6 @@ BAR = """*NODE
 SQUARE = ((0, 0), (10, 0), (10, 10), (0, 10))
 NODES = [f"{4 * k + i + 1}, {x}, {y}, {10 * k}" for k in range(3) for i, (x, y) in enumerate(SQUARE)]
 BAR = BAR.format(nodes="\n".join(NODES))
-
 STUDY = """
 name = "bar"
 [mesh]

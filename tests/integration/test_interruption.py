@@ -17,7 +17,6 @@ from morph_dslam.studies.snapshots import PARTIAL
 from tests.support.block_study import write_study
 
 N_SAMPLES = 30
-
 #: Stopped while workers send results that are long in the pipe.
 STOPPED_WHILE_SENDING = """
 import time

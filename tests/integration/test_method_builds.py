@@ -34,7 +34,6 @@ BEAM = {
     "sampling": {"held_out": 6},
     "reduction": {"method": "pgd", "tolerance": 1e-3},
 }
-
 BLOCK = {
     "name": "rubber block",
     "mesh": {"generator": "block", "size": ["20 mm", "20 mm", "60 mm"], "divisions": [2, 2, 6], "cells": "hex8"},

@@ -13,7 +13,6 @@ from morph_dslam.sources import open_source
 from tests.support.scenes import write_scene
 
 WALL = 0.9  # how far ahead of the camera the wall is, metres
-
 #: A sheet that lies flat at z = 0, seen obliquely, and a camera that goes round it.
 ROUND = """
 [[camera_path]]

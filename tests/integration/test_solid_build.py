@@ -46,7 +46,6 @@ held_out = 8
 [reduction]
 max_degree = 5
 """
-
 SCENE = """
 model = "block.morph"
 image_format = "png"

@@ -17,7 +17,6 @@ from morph_dslam.model.functions import ParameterFunctions
 
 LENGTH, WIDTH = 0.420, 0.297
 YOUNG_MODULUS, POISSON_RATIO, THICKNESS = 3e9, 0.3, 1e-4
-
 PARAMETERS = (
     Parameter("arch", "length", "mm", -0.060, 0.060, 0.0, "height of the arch"),
     Parameter("skew", "ratio", "1", -0.6, 0.6, 0.0, "lean of the arch towards one end"),

@@ -18,7 +18,6 @@ from morph_dslam.model.tensor_functions import CPFunctions, TensorTrainFunctions
 
 FORMATS = ("polynomial", "cp", "tucker", "tensor_train")
 LOWER, UPPER = np.array([-1.0, 0.0, 0.0]), np.array([1.0, 1.0, 2.0])
-
 #: C1 bases on the box; the last row has those that are not C1 or have no outside.
 SMOOTH = (cubic_spline_basis(np.linspace(-1.0, 1.0, 6)), chebyshev_basis(0.0, 1.0, 4), p_spline_basis(0.0, 2.0, 7))
 OTHERS = (

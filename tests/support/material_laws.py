@@ -59,7 +59,6 @@ _MOONEY = {"c10": 0.3, "c01": 0.12, "bulk": 7.0}
 _YEOH = {"c10": 0.4, "c20": -0.02, "c30": 0.004, "bulk": 7.0}
 _GENT = {"shear": 0.8, "limit": 12.0, "bulk": 7.0}
 _HGO = {"shear": 0.5, "k1": 1.3, "k2": 0.7, "dispersion": 0.1, "bulk": 7.0}
-
 #: name -> (material, closed form P(F)).
 LAWS = {
     "neo_hookean": (NeoHookean(**_HOOKE), partial(exact.neo_hookean, **_HOOKE)),

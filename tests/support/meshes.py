@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from morph_dslam.meshing.meshes import CellBlock, Mesh, jacobian_determinants
 
 Array = NDArray[np.float64]
-
 CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
 SHEET = Mesh(CORNERS, (CellBlock("quad4", np.array([[0, 1, 2, 3]])),), node_sets={"x_min": np.array([0, 3])})
 

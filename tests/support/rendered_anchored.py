@@ -21,7 +21,6 @@ from tests.support.scenes import write_scene
 
 #: Frames of the scan, in which the sheet is flat, and all frames.
 SCAN, FRAMES = 40, 60
-
 _CAMERA = "camera = { width = 480, height = 360, fx = 420.0, fy = 420.0, cx = 239.5, cy = 179.5 }\n"
 _TAIL = """
 [[parameters]]

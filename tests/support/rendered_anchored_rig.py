@@ -38,7 +38,6 @@ LEFT_FRAMES = 10
 KEYFRAME_DEVIATIONS = np.array([5e-4, 5e-4, 5e-4, 2e-4, 2e-4, 2e-4])
 #: The wedge is so much larger than the one on the stage.
 WEDGE_SIZE = 2.0
-
 _CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
 
 
@@ -52,7 +51,6 @@ def _rig(turn: float) -> tuple[RigCamera, RigCamera]:
 
 #: With the second camera to the right of the first, and to the left.
 RIG, MIRRORED_RIG = _rig(0.38), _rig(-0.38)
-
 _HEAD = """
 model = "{name}.morph"
 frames = {frames}

@@ -7,7 +7,6 @@ from morph_dslam.model import save_model
 from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = "camera = { width = 320, height = 240, fx = 260.0, fy = 262.0, cx = 158.0, cy = 121.0 }\n"
-
 MOTION = """
 [[parameters]]
 frame = 0

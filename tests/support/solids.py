@@ -20,7 +20,6 @@ from morph_dslam.meshing.meshes import CellBlock, Mesh
 from morph_dslam.model import Parameter
 
 Array = NDArray[np.float64]
-
 SOLID_CELLS = ("hex8", "hex20", "hex27", "tet4", "tet10", "prism6", "prism15", "prism18")
 FACES = ("x_min", "x_max", "y_min", "y_max", "z_min", "z_max")
 RUBBER = NeoHookean(young=3e6, poisson=0.45)

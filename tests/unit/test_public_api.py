@@ -16,8 +16,6 @@ from tests.support.documents import PROJECT
 
 #: Packages that take long to load.
 HEAVY = ("ngsolve", "cv2", "numba", "numpy", "matplotlib")
-
-
 #: An import of what is not public.
 INNER = re.compile(r"^\s*(?:from|import) morph_dslam\.(?!extend\b)[a-z_.]+.*", re.MULTILINE)
 

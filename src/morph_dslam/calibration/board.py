@@ -18,12 +18,9 @@ from morph_dslam.sources.frames import SUFFIXES, read_image
 from morph_dslam.units import FACTORS
 
 Array = NDArray[np.float64]
-
 #: Half the side of the window in which a corner is refined, of the distance to the next corner in the image.
 #: Larger ones reach the neighbour's edges, smaller ones use less of the corner's own.
 REFINEMENT_WINDOW = 0.35
-
-
 #: So many frames of a video are searched for the board, evenly spread over it.
 MOST_SEARCHED = 120
 #: So many of those where it is found are used: more add time and no accuracy.

@@ -20,7 +20,6 @@ from morph_dslam.errors import CameraError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 
 Array = NDArray[np.float64]
-
 #: Three views determine the intrinsics; five let a bad one show.
 FEWEST_VIEWS = 5
 #: From so many views on the shape of the board is solved for; OpenCV does so for radial-tangential lenses.
@@ -30,12 +29,10 @@ OUTLIER_RATIO = 3.0
 HARMLESS = 0.3
 #: Without a view in which the board is tilted this much, focal length and distance are ambiguous.
 LEAST_TILT = np.deg2rad(10.0)
-
 #: A focal length known less well than this, as standard deviation over value, is refused.
 MOST_UNCERTAIN = 0.01
 #: Fisheyes are solved for from these angles across the width of the image, radians, until one fits.
 FISHEYE_ANGLES = (1.5, 2.0, 2.5, 3.1, 4.0)
-
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
 
 

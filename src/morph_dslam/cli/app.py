@@ -25,11 +25,8 @@ COMMANDS = (
     "build", "info", "simulate", "export", "explore", "track", "live", "evaluate", "slam", "calibrate", "inner",
     "register", "board",
 )  # fmt: skip
-
 USER_ERROR = 2
-
 INTERRUPTED = 130
-
 #: Whoever read the output has stopped, `morph info sheet.morph | head` say: as a shell reports SIGPIPE.
 OUTPUT_CLOSED = 141
 

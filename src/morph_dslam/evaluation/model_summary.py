@@ -25,7 +25,6 @@ _FORMATS = {
     TensorTrainFunctions: "tensor train",
     ProductFunctions: "products",
 }
-
 #: Long lists of the reduction, which the build's report draws.
 _DRAWN = ("singular_values", "cross_validation")
 Facts = dict[str, str]

@@ -89,7 +89,6 @@ _TITLES = {
     "stress_solid": "Cauchy stress",
     "strain": "strain",
 }
-
 _REACTIONS = {"reaction_force_": "force on ", "reaction_moment_": "moment on "}
 
 

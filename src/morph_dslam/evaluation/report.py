@@ -39,7 +39,6 @@ $body
 </body>
 </html>
 """)
-
 _MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".svg": "image/svg+xml"}
 
 

@@ -25,13 +25,10 @@ from morph_dslam.model.reduced_model import von_mises
 from morph_dslam.units import to_si
 
 Array = NDArray[np.float64]
-
 #: Colours end at this percentile of the field over the surface and the box: stress has narrow peaks.
 _PERCENTILE = 99.5
-
 #: States of the box, besides its middle, that the range of colours is taken from (a power of two).
 _SAMPLES = 64
-
 #: Labels of the stresses, in the order in which they are offered.
 _PLACES = {"solid": "von Mises stress", "top": "von Mises stress, top", "bottom": "von Mises stress, bottom"}
 
@@ -127,7 +124,6 @@ _TYPES = {
     ".css": "text/css; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
 }
-
 #: The only files that are served, by the path they are asked for.
 _FILES = {
     "/": "index.html",

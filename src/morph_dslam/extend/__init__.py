@@ -30,7 +30,6 @@ __all__ = [
     "run_and_report_errors",
     "threads_side_by_side",
 ]
-
 #: The module of each name, as in the imports below; imported when it is first used.
 _MODULES = {
     "frame_range": "cli.arguments",

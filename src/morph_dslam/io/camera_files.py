@@ -22,7 +22,6 @@ from morph_dslam.io.colmap import read_cameras
 from morph_dslam.io.text import read_text
 
 Mapping = dict[str, Any]
-
 #: No focal length or principal point is meant by what is larger, pixels.
 LARGEST_PX = 1e7
 #: Image sides of more pixels are refused before memory is asked for them.
@@ -38,9 +37,7 @@ DISTORTION_MODELS = {
     "none": None,
     "": None,
 }
-
 _MATRIX_NAMES = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "k", "M1")
-
 _DISTORTION_NAMES = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D", "d", "D1")
 
 

@@ -19,7 +19,6 @@ from morph_dslam.errors import CameraError, MapError
 from morph_dslam.io.text import read_text
 
 Array = NDArray[np.float64]
-
 #: Where each of COLMAP's models keeps its values; fx and fy are one value in those that begin with f.
 MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -32,7 +31,6 @@ MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
     "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
 }
-
 #: COLMAP puts pixel (0, 0) at the corner of the first pixel, we put it at its centre.
 PIXEL_CENTRE = 0.5
 

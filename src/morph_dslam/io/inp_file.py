@@ -19,7 +19,6 @@ from morph_dslam.errors import StudyError
 from morph_dslam.io.inp_cards import Card, LabelSets, Line, read_cards
 
 Labels = NDArray[np.int64]
-
 #: Cell type and number of nodes by the stem of the element type; the letters after it choose an integration
 #: or a formulation, which a study chooses anew.
 ELEMENTS = {
@@ -27,7 +26,6 @@ ELEMENTS = {
     "C3D15": ("prism15", 15), "C3D20": ("hex20", 20), "C3D27": ("hex27", 27),
     "S3": ("tri3", 3), "S4": ("quad4", 4),
 }  # fmt: skip
-
 _GENERATING = (
     "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "SUBMODEL", "SYMMETRIC MODEL GENERATION",
 )  # fmt: skip

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-
 _CORNERS: dict[str, tuple[tuple[int, ...], ...]] = {
     "tri": ((0, 0), (1, 0), (0, 1)),
     "quad": ((0, 0), (1, 0), (1, 1), (0, 1)),
@@ -27,7 +26,6 @@ _CORNERS: dict[str, tuple[tuple[int, ...], ...]] = {
         (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1),
     ),
 }  # fmt: skip
-
 _EDGES: dict[str, tuple[tuple[int, int], ...]] = {
     "tri": (),
     "quad": (),
@@ -35,7 +33,6 @@ _EDGES: dict[str, tuple[tuple[int, int], ...]] = {
     "prism": ((0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3), (0, 3), (1, 4), (2, 5)),
     "hex": ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)),
 }
-
 _CORNER_FACES: dict[str, tuple[tuple[int, ...], ...]] = {
     "tri": ((0, 1, 2),),
     "quad": ((0, 1, 2, 3),),
@@ -43,7 +40,6 @@ _CORNER_FACES: dict[str, tuple[tuple[int, ...], ...]] = {
     "prism": ((0, 2, 1), (3, 4, 5), (0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)),
     "hex": ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)),
 }
-
 #: Corners around the nodes in the middle of faces, and of the cell, in the order in which VTK numbers them.
 _FACE_CENTRES: dict[str, tuple[tuple[int, ...], ...]] = {
     "prism18": ((0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)),
@@ -52,7 +48,6 @@ _FACE_CENTRES: dict[str, tuple[tuple[int, ...], ...]] = {
         (0, 1, 2, 3, 4, 5, 6, 7),
     ),
 }  # fmt: skip
-
 _SHAPES = {
     "tri3": "tri", "quad4": "quad", "tet4": "tet", "tet10": "tet",
     "prism6": "prism", "prism15": "prism", "prism18": "prism", "hex8": "hex", "hex20": "hex", "hex27": "hex",

@@ -23,7 +23,6 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 #: Solid cell types, all of which the solid generators make.
 SOLIDS = ("hex8", "hex20", "hex27", "tet4", "tet10", "prism6", "prism15", "prism18")
-
 #: How a unit cube, its corners numbered as a hex8's, is cut into cells; cubes side by side match.
 CUTS: dict[str, tuple[tuple[int, ...], ...]] = {
     "hex8": ((0, 1, 2, 3, 4, 5, 6, 7),),

@@ -111,7 +111,6 @@ _CELLS = {
     "wedge": "prism6", "wedge18": "prism18",
     "hexahedron": "hex8", "hexahedron20": "hex20", "hexahedron27": "hex27",
 }  # fmt: skip
-
 #: Dimension of the cells that may only bound others.
 _BOUNDING = {"vertex": 0, "line": 1, "line3": 1, "triangle6": 2, "quad8": 2, "quad9": 2}
 #: Integer data with more values than this number things rather than group them.

@@ -14,7 +14,6 @@ from morph_dslam.studies.problem import ModelMesh
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
 #: Triangles that draw a face of so many nodes (corners, then middle nodes), turning as the face does.
 _FACE_TRIANGLES: dict[int, tuple[tuple[int, int, int], ...]] = {
     3: ((0, 1, 2),),

@@ -12,14 +12,12 @@ from morph_dslam.meshing.cell_types import cell_type
 from morph_dslam.meshing.meshes import CellBlock, Mesh
 
 Indices = NDArray[np.int64]
-
 #: Second-order types by the first-order type that they refine.
 SECOND_ORDER: dict[str, tuple[str, ...]] = {
     "hex8": ("hex20", "hex27"),
     "tet4": ("tet10",),
     "prism6": ("prism15", "prism18"),
 }
-
 FIRST_ORDER = {name: linear for linear, names in SECOND_ORDER.items() for name in names}
 
 

@@ -22,7 +22,6 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 CHEBYSHEV, SPLINE, FOURIER, KRIGING = range(4)
-
 KINDS = {"chebyshev": CHEBYSHEV, "spline": SPLINE, "fourier": FOURIER, "kriging": KRIGING}
 
 

@@ -21,7 +21,6 @@ from morph_dslam.geometry import fit_similarity
 from morph_dslam.model.field_storage import read_array
 
 Array = NDArray[np.float64]
-
 #: For so many arrays of positions a basis keeps its influence: points, drawn nodes and inner structures.
 KEPT = 8
 #: Added to the covariance's diagonal, relative: points that lie close together make it nearly singular.

@@ -14,7 +14,6 @@ from morph_dslam.model.separated import Outside, SeparatedField
 from morph_dslam.units import from_si
 
 Array = NDArray[np.float64]
-
 #: Values of the parameters in SI: all of them in order (d,), or some by name; the others have their defaults.
 ParameterValues = ArrayLike | Mapping[str, float]
 

@@ -26,10 +26,8 @@ from morph_dslam.model.separated import SeparatedField
 from morph_dslam.model.tensor_functions import CPFunctions, ProductFunctions
 
 Array = NDArray[np.float64]
-
 #: Nodes fall on nodes when the mesh is turned on by a cell, up to this part of its size.
 NODE_TOLERANCE = 1e-5
-
 #: Harmonics of the angle are kept until they leave out less than this part of a mode.
 HARMONICS_LEFT_OUT = 1e-3
 MOST_HARMONICS = 12

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from morph_dslam.model.functions import Functions
 
 Array = NDArray[np.float64]
-
 #: What a field is outside the box of its parameters. "bounded": that of the nearest state in the box;
 #: "linear": continued from there by its tangents (C1, linear in each parameter), see `SeparatedField.inside`.
 Outside = Literal["bounded", "linear"]

@@ -89,7 +89,6 @@ def _check_field(
 #: Length of the block in bytes; HDF5 asks for a power of two from 512.
 BLOCK = 512
 _TITLE = b"morph-dslam reduced model\n"
-
 #: How every HDF5 file begins that has no block before it.
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -122,7 +121,6 @@ def check_checksum(path: Path) -> None:
 
 FORMAT = "morph-dslam reduced model"
 VERSION = 3
-
 #: What stays as it is in the name of a field's group; "/" would start another group.
 _PLAIN = " !#$&'()*+,:;=?@[]"
 

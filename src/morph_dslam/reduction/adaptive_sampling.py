@@ -26,13 +26,10 @@ from morph_dslam.studies.sampling import candidate_samples, training_samples
 from morph_dslam.studies.sweep import SweepResult
 
 Array = NDArray[np.float64]
-
 #: Candidates looked at in each round, for each parameter, and at most.
 CANDIDATES, MOST_CANDIDATES = 16, 64
-
 #: New samples of a round, as a part of those so far, and at least.
 GROWTH, LEAST = 0.25, 4
-
 #: Part of the tolerance that the estimate must reach: the rest is left to the functions of the parameters.
 SHARE = 0.5
 

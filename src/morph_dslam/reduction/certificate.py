@@ -88,14 +88,10 @@ def _statement(solved: int, known: int, unstable: int, passed: int) -> str:
 
 
 CONFIDENCE = 0.95
-
 #: Squared components in a value's squared norm; of a symmetric tensor the shears stand for two components.
 _NORM_WEIGHTS = {1: [1.0], 3: [1.0, 1.0, 1.0], 6: [1.0, 1.0, 1.0, 2.0, 2.0, 2.0]}
-
 _PLANE_TENSOR = [1.0, 1.0, 2.0]
-
 _STRESS = "stress_"
-
 #: Unit in which a field's errors are stated, as the ending of its keys, and what it is in SI.
 _UNITS = {
     "displacement": ("_mm", 1e-3),

@@ -133,21 +133,16 @@ def newton_correction(equations: Equations, x: Array, mu: Array) -> Array:
 
 #: Modes are kept until so little of the states is left out, as a part of the tolerance of the reduction ...
 MODE_TOLERANCE = 0.02
-
 #: ... and the last correction is so small a part of it.
 SOLVER_TOLERANCE = 1e-2
-
 #: Most modes that equilibrium is projected on; more cost little, for assembly takes nearly all of the time.
 MOST_MODES = 60
 MOST_CORRECTIONS = 20
-
 #: After so many corrections the last must be so small a part of the first, or the tangent is made anew.
 PATIENCE, SLOW = 3, 0.05
-
 #: The prediction is fitted anew, with this highest degree, at so many times as many solutions as a cubic has
 #: terms, and whenever their number has doubled since.
 REFIT, REFIT_DEGREE = 4, 5
-
 #: A correction larger than this part of the largest solution is not trusted.
 TOO_LARGE = 2.0
 

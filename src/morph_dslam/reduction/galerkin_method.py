@@ -36,10 +36,8 @@ from morph_dslam.reduction.truncation import truncate
 from morph_dslam.studies.solid_sweep import solid_snapshot
 
 Array = NDArray[np.float64]
-
 #: Error allowed in all fields but the displacement, as a multiple of the tolerance.
 OTHER_FIELDS = 40.0
-
 #: Modes of a field are kept until so little is left out, as a part of the tolerance, and at most so many.
 MODE_TOLERANCE, MOST_MODES = 0.1, 80
 
@@ -137,7 +135,6 @@ class SampledFields:
 
 #: A full grid is sampled up to so many parameters.
 MOST_GRID_PARAMETERS = 4
-
 #: Part of the tolerance that interpolation and the separated form may each use.
 SHARE = 0.5
 

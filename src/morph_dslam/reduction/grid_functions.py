@@ -29,7 +29,6 @@ from morph_dslam.reduction.tensor_formats import (
 from morph_dslam.studies.sections import BasisName, FormatName
 
 Array = NDArray[np.float64]
-
 #: Least points along a parameter that cubic splines can interpolate.
 LEAST = 4
 
@@ -69,13 +68,10 @@ class EvenGrid:
 
 #: Nodes along the lines that decide the size of a grid, and how far from the middle lines run.
 FINEST, OFF_CENTRE = 17, 0.7
-
 #: Most nodes of a grid.
 MOST_NODES = 1000
-
 #: Error of a derivative along a line that is good enough, relative to the largest on the parameter's lines.
 SLOPE_ERROR = 2e-2
-
 #: Most terms of a CP form.
 MOST_TERMS = 60
 

@@ -29,7 +29,6 @@ from morph_dslam.studies.problem import SweepProblem
 from morph_dslam.studies.solid_sweep import SolidSweep
 
 Array = NDArray[np.float64]
-
 #: Size of the displacements over the body's extent with which linearity is tried, and what may be left over.
 PROBE, LINEAR = 1e-2, 1e-9
 

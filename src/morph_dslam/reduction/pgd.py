@@ -23,7 +23,6 @@ from morph_dslam.model.tensor_functions import CPFunctions
 from morph_dslam.reduction.separable_problem import DualResidual, SeparableProblem, SeparatedSystem
 
 Array = NDArray[np.float64]
-
 #: All modes and all their functions are refitted after so many enrichments, and at the end.
 REFIT_EVERY = 5
 

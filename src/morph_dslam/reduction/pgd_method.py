@@ -28,7 +28,6 @@ from morph_dslam.studies.problem import Snapshot
 from morph_dslam.studies.sections import BasisName
 
 Array = NDArray[np.float64]
-
 #: Points of the box at which it is seen which reactions are more than rounding.
 N_PROBES = 8
 
@@ -126,7 +125,6 @@ class PgdFields:
 
 #: Numbers of functions of one parameter that are tried.
 SIZES = (5, 9, 17, 33, 65, 129)
-
 #: Part of the reduction's tolerance that the functions of a parameter and the compression may each leave out.
 SHARE = 0.1
 

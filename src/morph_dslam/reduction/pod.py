@@ -12,16 +12,12 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-
 #: Weights (n,) of the unknowns (a lumped mass matrix), or a sparse symmetric positive definite matrix (n, n).
 InnerProduct = Array | scipy.sparse.sparray | scipy.sparse.spmatrix
-
 #: Bytes that a decomposition may take before it is done in blocks.
 DEFAULT_MEMORY = 4e9
-
 #: Arrays of the snapshots' size, in double precision, that a decomposition at once needs.
 COPIES = 3
-
 #: Part of the tolerance that truncation before the last decomposition may use.
 BLOCK_SHARE = 0.1
 

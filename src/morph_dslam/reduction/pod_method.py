@@ -27,10 +27,8 @@ from morph_dslam.reduction.truncation import Truncation, truncate
 from morph_dslam.studies.problem import Snapshot
 
 Array = NDArray[np.float64]
-
 #: Bases that interpolate on a grid, and error of a separated form there as a part of the tolerance.
 GRID_BASES, SHARE = ("cubic_spline", "hat"), 0.2
-
 #: Modes that those kept are chosen from: to this part of the tolerance, and so many times ``max_modes``.
 FINER, MORE_MODES = 0.1, 3
 

@@ -19,10 +19,8 @@ if TYPE_CHECKING:
     from morph_dslam.reduction.task import ReductionTask
 
 Reduce = Callable[["ReductionTask"], "ReducedModel"]
-
 #: For a number of parameters, the names of formats and of bases that a method has, its default first.
 OfferedFunctions = Callable[[int], tuple[tuple[str, ...], tuple[str, ...]]]
-
 #: Modules that register the built-in methods.
 _BUILT_IN = ("galerkin_method", "pod_method", "sparse_pgd", "pgd_method")
 

@@ -11,16 +11,12 @@ from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
 from morph_dslam.reduction.sparse_expansion import weighted_degree_indices
 
 Array = NDArray[np.float64]
-
 #: Tikhonov weight relative to the largest singular value; it only settles directions the data leave open.
 RIDGE = 1e-8
-
 #: Parts that the samples are split into for cross-validation.
 FOLDS = 5
-
 #: A parameter gets a higher degree than the others if the error falls below this part of what it was.
 WORTH_RAISING = 0.9
-
 #: Most terms that raised degrees may lead to: the time of a fit grows with their square.
 MOST_TERMS = 2000
 

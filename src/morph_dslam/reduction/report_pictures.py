@@ -25,27 +25,19 @@ from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.render.model_view import draw_shapes
 
 Array = NDArray[np.float64]
-
 OURS, REFERENCE, FAILED = "#0b5cad", "#b4530a", "#c1272d"
-
 #: Width of the page's text, inches.
 WIDTH = 10.3
-
 #: Colours of the first modes, distinct for colour-blind readers too (Okabe and Ito 2008).
 CYCLE = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
-
 #: Errors below this are rounding; they are drawn here, where a logarithm still has a meaning, mm.
 LEAST_MM = 1e-12
-
 #: Points at which functions of a parameter are drawn.
 N_POINTS = 201
-
 #: Pixels of a picture of a mode, its largest displacement as a part of the body's size, and how many are drawn.
 SIZE, AMPLITUDE, MOST_MODES = (480, 400), 0.15, len(CYCLE)
-
 #: Bodies whose height is below this part of their width are looked down upon.
 FLAT = 0.3
-
 _STYLE: dict[Any, Any] = {
     "font.size": 9.5,
     "axes.titlesize": 10,

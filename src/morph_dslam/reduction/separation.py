@@ -23,19 +23,14 @@ from morph_dslam.errors import StudyError
 from morph_dslam.model import Parameter
 
 Array = NDArray[np.float64]
-
 #: V: a vector (N,) for parameters (d,).
 VectorFunction = Callable[[Array], Array]
-
 #: What is left out of the functions and of the sum, relative to the largest.
 TOLERANCE = 1e-11
-
 #: Relative error at random points up to which the sum is V.
 EXACT = 1e-10
-
 #: Highest degree along one parameter, most terms, and most points at which V is sampled for its vectors.
 HIGHEST_DEGREE, MOST_SEPARATED_TERMS, MOST_POINTS = 256, 400, 4000
-
 N_FIBRES, N_CHECKS = 2, 10
 
 

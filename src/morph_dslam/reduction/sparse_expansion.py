@@ -24,15 +24,11 @@ from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.model.tensor_functions import TensorTrainFunctions
 
 Array = NDArray[np.float64]
-
 Indices = NDArray[np.int64]
-
 #: Samples for each term of an expansion, and the part of the samples that only chooses its size.
 OVERSAMPLING, KEPT_ASIDE = 2.0, 0.1
-
 #: Most terms of an expansion.
 MOST_TERMS = 2500
-
 #: The set of degrees grows by this factor until the expansion is good enough.
 GROWTH = 1.2
 

@@ -26,20 +26,15 @@ from morph_dslam.reduction.task import ReductionTask, parameter_bases
 from morph_dslam.studies.sections import BasisName
 
 Array = NDArray[np.float64]
-
 #: Candidates of the smoothing weight, relative to the ratio of the data's and the penalty's traces.
 SMOOTHING = np.logspace(-14.0, 2.0, 33)
-
 #: The alternating directions of one enrichment end at this relative change, or after so many iterations.
 INNER_TOLERANCE, INNER_ITERATIONS = 1e-4, 30
-
 #: All modes are refitted after so many enrichments, by so many sweeps at most, and until a sweep lowers the
 #: misfit by less than this, relatively.
 REFIT_EVERY, REFIT_SWEEPS, SETTLED = 2, 30, 0.02
-
 #: Share of the samples kept aside to choose the number of modes, and refits without a better prediction.
 VALIDATION_SHARE, PATIENCE = 0.15, 3
-
 #: A relative misfit that is rounding: what is left has no direction to be enriched by.
 EXACT = 1e-12
 

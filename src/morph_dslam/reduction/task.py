@@ -27,8 +27,6 @@ from morph_dslam.studies.problem import ModelMesh, Snapshot, SweepProblem
 from morph_dslam.studies.sections import BasisName, ReductionSection
 
 Array = NDArray[np.float64]
-
-
 STRESS = "stress_"
 
 

@@ -19,7 +19,6 @@ from morph_dslam.model.separated import ComponentModes
 from morph_dslam.reduction.task import ReductionTask
 
 Array = NDArray[np.float64]
-
 #: Directions of so little of the largest norm are rounding.
 RANK = 1e-13
 

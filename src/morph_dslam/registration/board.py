@@ -82,7 +82,6 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 DICTIONARIES = tuple(
     sorted({name[5:].lower() for name in dir(cv2.aruco) if name.startswith("DICT_")})  # type: ignore[attr-defined]
 )
-
 #: Fewer corners are not believed: one marker has four.
 FEWEST_CORNERS = 4
 DOTS_PER_INCH = 300

@@ -40,7 +40,6 @@ def interpolate_key_frames(frames: Sequence[int] | NDArray, values: Array, wante
 Colour = tuple[
     Annotated[int, Field(ge=0, le=255)], Annotated[int, Field(ge=0, le=255)], Annotated[int, Field(ge=0, le=255)]
 ]
-
 #: No number of a scene is meant where it is larger: a kilometre in millimetres, degrees, pixels, frames. What
 #: is computed with those below cannot overflow.
 LARGEST = 1_000_000

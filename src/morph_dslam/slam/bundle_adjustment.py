@@ -86,7 +86,6 @@ def orthonormal(poses):
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
 #: Damping of the first iteration, as a part of the diagonal, and its bounds.
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-9, 1e8
 #: A point's block is kept invertible by this much: a point seen once has no depth of its own, px^2/m^2.

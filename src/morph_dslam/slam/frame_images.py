@@ -26,13 +26,11 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Image = NDArray[np.uint8]
 Descriptors = NDArray[np.uint8]
-
 #: ORB's patch radius in pixels, and what it needs around a keypoint at the first scale.
 PATCH_RADIUS, BORDER = 15, 32
 SCALE_STEP = 1.2
 #: Octaves that points are described at, for changes of scale between 0.6 and 1.6.
 OCTAVES = (0, 2, 4)
-
 #: Bits in a descriptor.
 N_BITS = 256
 

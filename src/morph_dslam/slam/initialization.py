@@ -22,7 +22,6 @@ from morph_dslam.tracking.patches import FLOW_WINDOW, follow, patch_correlation,
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
 #: Corners that are followed from the first view.
 START_CORNERS = 500
 #: Median angle between the first two views' rays, degrees.

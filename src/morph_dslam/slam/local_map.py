@@ -18,7 +18,6 @@ from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, Followed, Indices, Keyfr
 from morph_dslam.tracking.patches import FLOW_WINDOW, spread_corners
 
 Array = NDArray[np.float64]
-
 #: Disparity from which the depth of a point in one frame makes it a map point, pixels; the baseline of depth images
 #: counts as 8 cm.
 LEAST_DISPARITY_PX = 10.0

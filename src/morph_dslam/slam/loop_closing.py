@@ -27,7 +27,6 @@ from morph_dslam.slam.tracking import Tracker
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
 #: Step of the numerical derivatives, and the step at which iterations end.
 DIFFERENCE, LEAST_STEP = 1e-6, 1e-8
 

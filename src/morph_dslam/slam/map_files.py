@@ -22,7 +22,6 @@ from morph_dslam.sources import FrameSource
 from morph_dslam.tracking.patches import LEVELS
 
 Array = NDArray[np.float64]
-
 #: Frames and poses belong together if they are at most this far apart in time, seconds.
 MOST_TIME_DIFFERENCE = 0.01
 #: Depth of points of which nothing is known, in lengths of the path: images then move by rotation alone.
@@ -101,7 +100,6 @@ class _PosedTracker(Tracker):
 
 FORMAT, VERSION = "morph-dslam map", 3
 KEYFRAME_ARRAYS = ("normalized", "camera_from_world", "point_ids", "pixels", "right", "described_ids", "descriptors")
-
 TRAJECTORY_ARRAYS = ("timestamps", "world_from_camera", "indices")
 
 

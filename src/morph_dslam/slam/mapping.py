@@ -25,8 +25,6 @@ from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, NOWHERE, Followed, Indic
 from morph_dslam.slam.tracking import Tracked
 
 Array = NDArray[np.float64]
-
-
 #: A keyframe is due when fewer than this share of the last one's points are left, when points have moved this far
 #: since it (median), or when the camera has moved this part of the median depth.
 KEYFRAME_SHARE, KEYFRAME_MOTION_PX, KEYFRAME_BASELINE = 0.75, 30.0, 0.06
@@ -242,7 +240,6 @@ def pose_in_keyframe(camera_from_world: Array, keyframe: Keyframe) -> Array:
 
 
 Work = Generator[None, None, None]
-
 #: By how much the thread's priority is lower, in steps of `nice`: with this it still gets a third of what
 #: another program gets. With far less it would be stopped for long while it holds the interpreter.
 STANDS_BACK = 5

@@ -229,7 +229,6 @@ def find_pose(
 
 #: Share of homography score above which the homography is believed (ORB-SLAM's value).
 PLANE_SHARE = 0.45
-
 #: Squared errors that 95 % of the inliers stay below, for one and two degrees of freedom, in pixel variances.
 CHI2_ONE, CHI2_TWO = 3.841, 5.991
 

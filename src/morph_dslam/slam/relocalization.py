@@ -32,7 +32,6 @@ from morph_dslam.slam.tracking import Tracker
 from morph_dslam.tracking.patches import spread_corners
 
 Array = NDArray[np.float64]
-
 N_WORDS = 400
 #: Descriptors that words are trained from, and rounds of clustering.
 N_TRAINING, ROUNDS = 6000, 6
@@ -119,7 +118,6 @@ class PlaceIndex:
 
 
 Image = NDArray[np.uint8]
-
 #: Corners of the image that are described.
 N_CORNERS = 600
 #: Keyframes tried in one frame: the one that looks most alike, and one more in turn of those that follow.

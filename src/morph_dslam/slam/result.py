@@ -12,7 +12,6 @@ from morph_dslam.slam.pose import PoseEstimate
 from morph_dslam.slam.rigid_map import NOWHERE, Followed
 
 Array = NDArray[np.float64]
-
 STAGES = ("prepare", "start", "track", "map", "relocalise")
 
 

@@ -18,7 +18,6 @@ from morph_dslam.slam.pose import inverse, reprojection_errors
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-
 CANDIDATE, GOOD, REMOVED = 0, 1, 2
 #: Arrays of a map with one row a point.
 POINT_ARRAYS = (
@@ -31,10 +30,8 @@ POINT_ARRAYS = (
     "n_expected",
     "n_found",
 )
-
 #: These and what is of no use to later runs, so not kept in files.
 _ALL_POINT_ARRAYS = (*POINT_ARRAYS, "merged_into")
-
 #: A frame is kept when the points have moved this far since the last one kept (median), pixels.
 LEAST_MOTION_PX = 2.0
 #: Frames kept at most; then every other one is left out.

@@ -32,7 +32,6 @@ from morph_dslam.sources import open_source, open_stream
 from morph_dslam.sources.live import LiveStream
 
 Array = NDArray[np.float64]
-
 DPI = 110
 PATH_COLOUR, POINT_COLOUR = "#b4530a", "#8fb3d9"
 #: Blue, green, red of what the video shows.

@@ -33,10 +33,8 @@ from morph_dslam.threads import threads_side_by_side
 from morph_dslam.tracking.patches import patch_correlation
 
 Array = NDArray[np.float64]
-
 #: Factors of the focal length that are tried; the ends mean that it may lie beyond.
 FACTORS = np.exp(np.linspace(np.log(0.7), np.log(1.43), 9))
-
 #: Keyframes that are adjusted, and the fewest that say anything.
 MOST_KEYFRAMES, LEAST_KEYFRAMES = 12, 5
 #: The cost with the best factor has to be this part of the given one's, and the factor this far from 1.

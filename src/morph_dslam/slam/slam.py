@@ -28,7 +28,6 @@ from morph_dslam.slam.tracking import Tracked, Tracker
 from morph_dslam.timing import WaitClock, frame_clock, stage
 
 Array = NDArray[np.float64]
-
 #: Frames that a relocalised pose has to be tracked for before the map grows again.
 HELD_FRAMES = 3
 #: The scene deforms when more than this share of its points disagree with a rigid one in so many frames on end.

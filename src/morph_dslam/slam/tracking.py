@@ -44,7 +44,6 @@ from morph_dslam.slam.rigid_map import (
 from morph_dslam.tracking.patches import FLOW_WINDOW, LEVELS, NEUTRAL, follow, patch_correlation
 
 Array = NDArray[np.float64]
-
 #: Keyframes chosen for most points; one that adds fewer points than this is not worth its image.
 MOST_VIEWS, LEAST_POINTS = 4, 10
 
@@ -83,7 +82,6 @@ class FewTemplates:
 
 
 Image = NDArray[np.uint8]
-
 #: Patches that are turned by less and scaled by less, along either axis, are followed as they are.
 MOST_TURN_DEG, MOST_STRETCH = 14.0, 1.25
 #: A warped view is used again while what it lacks is this part of those.
@@ -156,7 +154,6 @@ class WarpedViews:
 
 
 Mask = NDArray[np.bool_]
-
 #: Points are looked for from a keyframe only if they are seen from there at about this angle and distance.
 MOST_VIEW_ANGLE_DEG = 35.0
 MOST_SCALE_CHANGE = 1.6
@@ -173,8 +170,6 @@ ENOUGH_POINTS = 340
 SEARCH_RADIUS_PX = 5.0
 #: Weight of the newest frame in the usual error.
 USUAL_RATE = 0.1
-
-
 #: Errors beyond these multiples of the usual one count linearly, and not at all; within bounds, in pixels.
 #: With wider ones a near object that moves draws the pose along: a turn and a move of the camera nearly
 #: explain it.

@@ -21,11 +21,8 @@ from morph_dslam.sources.ros_bag import RosBag, is_bag
 from morph_dslam.sources.video import VideoFile
 
 __all__ = ["Frame", "FrameSource", "FrameStream", "open_live", "open_source", "open_stream", "register_source"]
-
 Matches = Callable[[Path], bool]
-
 Open = Callable[[Path, int | None, int | None], FrameStream]
-
 _KINDS: list[tuple[Matches, Open]] = []
 
 

@@ -17,7 +17,6 @@ from morph_dslam.errors import SourceError
 #: Frames per second where a recording does not tell it.
 ASSUMED_FPS = 30.0
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
-
 #: The bytes with which a complete file of this kind ends; the decoder itself fills what is missing with grey.
 END_MARKERS = {".png": b"IEND", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 

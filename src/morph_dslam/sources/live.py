@@ -18,7 +18,6 @@ from morph_dslam.errors import SourceError
 from morph_dslam.sources.frames import Frame, FrameStream, frame_rate, open_capture
 
 Item = TypeVar("Item")
-
 _WEBCAM = re.compile(r"webcam:(\d+)")
 
 

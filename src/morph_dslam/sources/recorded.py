@@ -22,11 +22,9 @@ from morph_dslam.sources.frames import (
 )
 
 TUM_DEPTH = DepthScale(values_per_metre=5000.0)
-
 #: Colour and depth are not taken at the same instant; these belong together, seconds.
 MOST_TIME_DIFFERENCE = 0.02
 SEVEN_SCENES_DEPTH = DepthScale(values_per_metre=1000.0, unknown=(0, 65535), registered=False)
-
 #: 7-Scenes carry no timestamps.
 SEVEN_SCENES_FPS = 30.0
 _COLOUR = re.compile(r"frame-(\d+)\.color\.(png|jpg)")

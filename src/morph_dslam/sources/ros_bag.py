@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-
 #: Channels of 8 bits of each encoding, and OpenCV's conversion to blue, green, red. ROS names a Bayer pattern
 #: by its first two pixels, OpenCV by those of the second row from the second column.
 ENCODINGS: dict[str, tuple[int, int | None]] = {

@@ -20,13 +20,10 @@ from morph_dslam.model import Parameter
 from morph_dslam.units import FACTORS, quantity_of, to_si
 
 Array = NDArray[np.float64]
-
 #: No number of a study is meant where it is larger, in whatever unit: what follows from it could overflow.
 LARGEST = 1e30
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-
 _WORD = r"[A-Za-z_][\w./]*"
-
 _TERM = re.compile(
     rf"(?:(?P<number>{_NUMBER})(?:\s+(?P<unit>{_WORD}))?(?:\s*\*\s*(?P<factor>{_WORD}))?|(?P<name>{_WORD}))"
     rf"(?:\s*/\s*(?P<divisor>{_NUMBER})\s+(?P<divisor_unit>{_WORD}))?"

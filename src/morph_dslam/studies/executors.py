@@ -114,7 +114,6 @@ def default_executor(workers: int | None) -> Iterator[Executor]:
 
 #: Seconds to wait for a scheduler to answer.
 PATIENCE = 10.0
-
 #: What must be of one version here and on the workers, by the name that Python imports.
 PACKAGES = ("morph_dslam", "ngsolve", "numpy", "scipy", "dask", "distributed")
 

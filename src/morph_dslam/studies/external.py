@@ -25,10 +25,8 @@ from morph_dslam.studies.sections import ReductionSection, Section
 from morph_dslam.units import quantity_of, to_si
 
 Array = NDArray[np.float64]
-
 #: Of meshio, by the ending of a file's name: `meshio.read` itself ends the program where a file is damaged.
 _READERS = {".vtu": meshio.vtu.read, ".vtk": meshio.vtk.read, ".xdmf": meshio.xdmf.read, ".xmf": meshio.xdmf.read}
-
 #: Cell types by the names that meshio gives them; the order of their nodes is VTK's.
 _CELL_TYPES = {
     "hexahedron": "hex8",
@@ -42,10 +40,8 @@ _CELL_TYPES = {
     "triangle": "tri3",
     "quad": "quad4",
 }
-
 #: Where xx, yy, zz, yz, xz, xy stand among VTK's six components, and among nine row by row.
 _VOIGT = {6: [0, 1, 2, 4, 5, 3], 9: [0, 4, 8, 5, 2, 1]}
-
 #: Nodes may differ by so much of the mesh's size from file to file, which is written in single precision.
 _SAME = 1e-5
 _COLUMN = re.compile(r"\s*(?P<name>\w+)\s*(?:\[(?P<unit>[^\]]+)\])?\s*")

@@ -19,7 +19,6 @@ from morph_dslam.studies.problem import ParametricStudy, SweepProblem
 from morph_dslam.studies.snapshots import encode_snapshot
 
 Array = NDArray[np.float64]
-
 #: A problem holds one state at a time; a worker of several threads solves one sample after the other.
 _one_at_a_time = threading.Lock()
 

@@ -15,10 +15,8 @@ from morph_dslam.errors import StudyError
 from morph_dslam.studies.problem import ParametricStudy, bounds
 
 Array = NDArray[np.float64]
-
 #: How far training samples are moved from uniform to the Chebyshev density (`sample_box`).
 TRAINING_TOWARDS_EDGES = 0.5
-
 #: More points than these on a full grid are taken for a mistake: other schemes need far fewer.
 MOST_GRID_POINTS = 100_000
 

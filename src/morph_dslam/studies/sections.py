@@ -32,13 +32,9 @@ def quantity(kind: str) -> BeforeValidator:
 
 #: A plain number of a study: a ratio, a component of a direction.
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
-
 Length = Annotated[float, quantity("length")]
-
 PositiveLength = Annotated[float, quantity("length"), Field(gt=0, allow_inf_nan=False)]
-
 Stress = Annotated[float, quantity("stress"), Field(gt=0, allow_inf_nan=False)]
-
 Angle = Annotated[float, quantity("angle")]
 
 
@@ -94,7 +90,6 @@ class SamplingSection(Section):
 
 #: Names of formats of functions of several parameters, and of functions of one.
 FormatName = Literal["tucker", "tensor_train", "cp", "polynomial"]
-
 BasisName = Literal["chebyshev", "cubic_spline", "p_spline", "kriging", "fourier", "hat"]
 
 

@@ -36,12 +36,9 @@ from morph_dslam.studies.sections import (
 from morph_dslam.studies.snapshots import SOLVER_VERSION
 
 Array = NDArray[np.float64]
-
 #: Signs that the coordinates take when the sheet is mirrored in its own plane, in x = 0 and in y = 0.
 MIRROR_Z = np.array([-1.0, 1.0, -1.0, 1.0])
-
 MIRROR_X = np.array([1.0, 1.0, -1.0, -1.0])
-
 MIRROR_Y = np.array([1.0, 1.0, 1.0, -1.0])
 
 
@@ -137,7 +134,6 @@ def upside_down(snapshot: Snapshot, columns: int) -> Snapshot:
 
 #: Cells along a side of a sheet: more than these are a mistake.
 Count = Annotated[int, Field(ge=1, le=1000)]
-
 #: Smallest |bulge| that is solved, over the largest: in the flat state itself the equations are singular.
 SMALLEST_BULGE = 0.02
 

@@ -34,9 +34,7 @@ from morph_dslam.studies.sections import Angle, Length, Number, PositiveLength, 
 from morph_dslam.units import to_si
 
 CellName = Literal["hex8", "hex20", "hex27", "tet4", "tet10", "prism6", "prism15", "prism18"]
-
 Count = Annotated[int, Field(ge=1)]
-
 #: More cells than these are a mistake: no memory holds their factorisation.
 MOST_CELLS = 5_000_000
 
@@ -261,9 +259,7 @@ def _check_ends(
 
 #: A quantity in a study file.
 Value = str | float
-
 Triple = tuple[Value, Value, Value]
-
 #: Turns a value that measures a quantity (None: any) into a number or an expression of parameters, SI.
 Reader = Callable[[Value, str | None], Any]
 
@@ -423,7 +419,6 @@ class MovingLineLoad(Section):
 SupportSection = Annotated[
     FixedSupport | DisplacementSupport | RotationSupport | FoundationSupport, Field(discriminator="kind")
 ]
-
 LoadSection = Annotated[
     TractionLoad | PressureLoad | BodyForceLoad | GravityLoad | PointLoadSection | MovingPatchLoad | MovingLineLoad,
     Field(discriminator="kind"),

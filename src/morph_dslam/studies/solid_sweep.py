@@ -15,7 +15,6 @@ from morph_dslam.mechanics.solvers.newton import Linearisation, State, sensitivi
 from morph_dslam.studies.problem import Snapshot
 
 Array = NDArray[np.float64]
-
 #: Fields of a snapshot and what they are called when recovered.
 _FIELDS = {"displacement": "displacement", "stress_solid": "stress", "strain": "strain"}
 

@@ -26,11 +26,8 @@ from morph_dslam.studies.sample_task import SampleResult, solve_sample
 from morph_dslam.studies.snapshots import PARTIAL, SOLVER_VERSION, damage, load_state, snapshot_keys, write_atomically
 
 Array = NDArray[np.float64]
-
 #: A sample is given up after so many attempts from different neighbours.
 MOST_ATTEMPTS = 2
-
-
 #: Steps and paths that differ by less, relatively, are equally long: rounding decides nothing.
 TIE = 1e-9
 

@@ -32,16 +32,12 @@ from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.reference import ReferenceView
 
 Array = NDArray[np.float64]
-
 #: A map point this near to the surface, over the object's size, lies on it: that is what maps are good for.
 ON_SURFACE = 0.03
-
 #: Points that stand for the surface, much closer together than `ON_SURFACE`.
 N_SAMPLES = 10_000
-
 #: What moves by more than this part of the object's size over the parameter box is no part of the scene.
 MOVES = 0.005
-
 #: Two objects that share more than this part of one's movable points are in the same place.
 SHARED = 0.5
 
@@ -130,7 +126,6 @@ def _check_places(movable: Mapping[str, NDArray[np.bool_]]) -> None:
 
 #: Spread of residuals, pixels, before any frame has shown one, and the least that is believed.
 FIRST_SIGMA_PX, LEAST_SIGMA_PX = 0.5, 0.1
-
 #: How much more a pose counts that is to be held.
 HELD = 1e6
 

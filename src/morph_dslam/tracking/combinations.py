@@ -43,7 +43,6 @@ OF_OBJECT: tuple[tuple[Callable[[ObjectOptions], bool], str], ...] = (
         "a picture or a guess, which are looked for there again",
     ),
 )
-
 #: Of the whole run.
 OF_RUN: tuple[tuple[Callable[[TrackOptions], bool], str], ...] = (
     (

@@ -19,11 +19,8 @@ from morph_dslam.model.separated import combine_modes
 from morph_dslam.tracking.state import BoundPoints, State
 
 Array = NDArray[np.float64]
-
-
 #: Standard deviation of one pixel's depth at 1 m, metres; it grows with the distance squared.
 SIGMA_AT_1M = 2.0e-3
-
 #: Neighbours nearer than this, pixels, have the same error, as those of structured light have.
 ALIKE_PX = 3
 #: Side of the square of pixels through which a plane is laid.

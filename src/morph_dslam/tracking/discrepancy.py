@@ -27,7 +27,6 @@ from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.state import BoundPoints, State
 
 Array = NDArray[np.float64]
-
 #: Each sample of the surface counts for so many independent strains of the lines to its neighbours.
 STRAINS_A_SAMPLE = 0.2
 

@@ -29,7 +29,6 @@ from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.run_results import RunResults
 
 Array = NDArray[np.float64]
-
 #: A hexahedron as six tetrahedra around its diagonal 0-6, corners in VTK's order.
 _HEX = np.array([[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]])
 #: A prism as three tetrahedra.
@@ -161,7 +160,6 @@ def _edges(cells: NDArray[np.int64], pairs: list[tuple[int, int]]) -> NDArray[np
 
 
 Shown = Literal["stress", "strain", "displacement"]
-
 #: Opacity of the object's surface, of one that shows what it has inside, and of one that is cut open.
 OPACITY, SEE_THROUGH, CUT_OPEN = 0.65, 0.4, 0.9
 #: Colours of inner structures in turn: violet, yellow, green, blue.

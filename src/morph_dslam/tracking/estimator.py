@@ -238,7 +238,6 @@ class LinearCost:
 
 
 __all__ = ["BoundPoints", "Estimate", "EstimationOptions", "Estimator", "Prior", "State", "moved"]
-
 #: A parameter nearer to its bound than this share of its range counts as being at the bound.
 BOUND_SHARE = 1e-3
 

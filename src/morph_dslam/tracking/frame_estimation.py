@@ -26,7 +26,6 @@ from morph_dslam.tracking.shape_search import ShapeSearch
 
 #: Share of the cost below which another shape is a better explanation and not the same one.
 CLEARLY_BETTER = 0.95
-
 #: The least spread of residuals, pixels, that is believed when they are weighed against depths.
 LEAST_SIGMA_PX = 0.1
 

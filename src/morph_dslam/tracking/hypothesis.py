@@ -17,7 +17,6 @@ from morph_dslam.tracking.outline import OutlineMeasurement
 
 #: Where less than this share of all points agree, they must agree closely.
 MOST_AGREE = 0.5
-
 Array = NDArray[np.float64]
 
 

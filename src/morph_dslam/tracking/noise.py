@@ -14,7 +14,6 @@ from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.state import BoundPoints
 
 Array = NDArray[np.float64]
-
 #: Of errors: whole, or, of those that few others share, sparse.
 Correlation = Array | scipy.sparse.csr_array
 

@@ -20,7 +20,6 @@ from morph_dslam.model.separated import SeparatedField
 from morph_dslam.tracking.estimator import Estimate
 
 Array = NDArray[np.float64]
-
 #: A standard deviation of this share of a parameter's range makes the 95 % interval as wide as the range.
 UNOBSERVABLE_SHARE = 0.25
 #: A parameter takes part in a combination when its share of the direction is larger.

@@ -17,8 +17,6 @@ from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.tracking.estimator import BoundPoints, State
 
 Array = NDArray[np.float64]
-
-
 #: Points on the rim, evenly spread.
 N_POINTS = 120
 #: How far the outline is searched for to either side of where the estimate shows it, pixels.

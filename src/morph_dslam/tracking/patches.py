@@ -15,7 +15,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-
 #: A step longer than this, pixels, is no correction.
 LONGEST_STEP = 1.0
 #: Sums may be taken in any order: half the time.
@@ -199,8 +198,6 @@ def compare_patches(first, second, first_points, second_points, half):
 
 #: Grey level of a pixel that equals its neighbourhood's mean.
 NEUTRAL = 128
-
-
 #: Lucas-Kanade's window, pixels, and pyramid levels above the image itself.
 FLOW_WINDOW, LEVELS = 17, 3
 #: Side of the square over whose mean contrast is normalized, pixels.

@@ -34,9 +34,7 @@ from morph_dslam.tracking.views import KeyframeViews, choose_keyframe_views
 
 #: Correlation of two contrast-normalized images that are the same but for the compression.
 SAME_IMAGE = 0.8
-
 ReferenceImage = NDArray[np.uint8] | Image
-
 #: The frames of all cameras of this number, or the first ones.
 FramesAt = Callable[[int | None], tuple[Frame, ...]]
 

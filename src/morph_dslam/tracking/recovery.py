@@ -20,18 +20,14 @@ from morph_dslam.tracking.reference import ReferenceView
 from morph_dslam.tracking.state import State
 
 Array = NDArray[np.float64]
-
 #: An object that is found anew is believed if half of its points agree, or if they agree as closely as this,
 #: pixels, or as so many times the usual spread of their residuals: what looks alike by chance does not, nor
 #: do windows that see the rim of what is before the object.
 CLOSE_PX, CLOSE_TO_USUAL = 0.25, 1.5
-
 #: Something is before the object where less than this share of the points that it does not hide itself agree.
 UNHIDDEN = 0.75
-
 #: At most about so many shapes are tried, lest a mirrored one that fits nearly as well is taken.
 MOST_SHAPES = 27
-
 #: Share of the latest frame in the usual spread.
 LEARNING_RATE = 0.05
 

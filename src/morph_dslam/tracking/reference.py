@@ -53,16 +53,12 @@ from morph_dslam.tracking.patches import interior, spread_corners
 from morph_dslam.tracking.relocalization import Relocalizer
 
 Array = NDArray[np.float64]
-
 #: Samples of the surface: a share is then known to about three per cent.
 N_SAMPLES = 600
-
 #: Of the area in a frame that a reference view must show something with: a half in each direction.
 LEAST_AREA = 0.25
-
 #: The active view is kept as long as it covers this share of the surface that is seen.
 KEEP_SHARE = 0.6
-
 #: An earlier view, whose error is smaller, is gone back to when it covers this share: more, so that two views
 #: do not take turns.
 BACK_SHARE = 0.75

@@ -13,8 +13,6 @@ from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
 from morph_dslam.tracking.patches import detect_orb, match_descriptors
 
 Array = NDArray[np.float64]
-
-
 #: Features of an image.
 N_FEATURES = 1000
 #: Reprojection error, pixels, that a match may have before its shape is estimated; the shape is only guessed then.

@@ -18,7 +18,6 @@ from morph_dslam.tracking.outcomes import FoundBy, PoseSource, Rejection, Status
 
 Array = NDArray[np.float64]
 _Kind = TypeVar("_Kind", bound=TrackingWarning)
-
 #: The stages of a frame that are timed, in order; "locate" finds the camera in the map.
 STAGES = (
     "locate",

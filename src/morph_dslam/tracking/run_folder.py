@@ -33,9 +33,7 @@ from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.sinks import TrackedFrame
 
 Array = NDArray[np.float64]
-
 FORMAT = "morph-dslam run"
-
 VERSION = 1
 
 

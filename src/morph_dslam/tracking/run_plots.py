@@ -13,7 +13,6 @@ from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.run_results import RunResults
 
 DPI = 110
-
 #: Stages that are drawn with a colour of their own: as many as there are colours, with this part of the time.
 MOST_STAGES, LEAST_SHARE = 10, 0.005
 

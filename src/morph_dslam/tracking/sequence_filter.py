@@ -188,7 +188,6 @@ GATE, PATIENCE = 5.0, 3
 FAR_SURER = 0.2
 #: What was measured in a frame.
 Frame = TypeVar("Frame", Observations, RigObservations)
-
 _Taken = TypeVar("_Taken", Observations, RigObservations, contravariant=True)
 
 

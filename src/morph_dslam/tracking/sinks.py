@@ -133,12 +133,9 @@ class LivePicture:
 
 
 HOST = "127.0.0.1"
-
 JPEG_QUALITY = 80
-
 #: A gap in the frames longer than this, seconds, is not filled in the video.
 LONGEST_GAP = 2.0
-
 _PAGE = b"""<!doctype html><title>morph live</title>
 <body style="margin:0;background:#222;text-align:center">
 <img src="/stream.mjpg" style="max-width:100%">

@@ -32,7 +32,6 @@ from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR, BoundPart, SharedE
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, Prior, State, project_with_jacobian
 
 Array = NDArray[np.float64]
-
 #: More than this, pixels, and more than half of the residuals' variance, counts as the model's failure.
 UNEXPLAINED_PX = 0.5
 #: What comparing windows leaves in neighbours alike, pixels: an expectation well below says nothing.

@@ -47,7 +47,6 @@ from morph_dslam.tracking.sinks import BrowserSink, LivePicture, LiveTimes, Sink
 from morph_dslam.tracking.tracker import Tracker
 
 Tell = Callable[[Path, dict[str, Any]], object]
-
 Source = FrameSource | SynchronizedFrames | LiveStream
 
 

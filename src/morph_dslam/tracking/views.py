@@ -29,19 +29,14 @@ from morph_dslam.tracking.sequence_filter import PointChange
 from morph_dslam.tracking.systematic_errors import UNEXPLAINED_PX, SystematicErrors
 
 Array = NDArray[np.float64]
-
 #: Share of the visible points that must agree, and the largest robust spread of their residuals, pixels.
 LEAST_AGREEING, LARGEST_SIGMA_PX = 0.6, 1.0
-
 #: Largest standard deviation of the surface's position, root mean square, as a share of the object's size.
 LARGEST_SPREAD = 0.05
-
 #: An image whose edges are so much softer than those of the view it is compared with is blurred.
 LEAST_SHARPNESS = 0.8
-
 #: Around points that disagree something else may be in front of the object; so far, pixels, nothing is bound.
 KEEP_OFF_PX = 12
-
 #: How far the filters look that measure sharpness, pixels.
 REACH_PX = 8
 
@@ -218,10 +213,8 @@ def _as_frame(view: PosedImage) -> Image:
 
 #: The views are compared in every so many frames: the surface turns by a few degrees meanwhile.
 CHECK_EVERY = 3
-
 #: After a frame that showed too few corners for a view, so many are not tried.
 PAUSE = 15
-
 #: In a made view points do not count where the surface is seen flatter than in the view, by this factor of
 #: its area or a smaller one: patches are compared worst there, and another part, broad in both, tells enough.
 LEAST_BROADNESS = 0.3

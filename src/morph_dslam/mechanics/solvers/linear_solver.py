@@ -175,8 +175,6 @@ RESIDUAL_TOLERANCE = 1e-9
 BACKWARD_ERROR = 1e-14
 REFINEMENTS = 4
 ENVIRONMENT_VARIABLE = "MORPH_LINEAR_SOLVER"
-
-
 #: One library's factorisation of a square matrix; `factorise` replaces the one before.
 _Engine = Pardiso | SparseCholesky | SuperLU
 
