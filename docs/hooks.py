@@ -22,12 +22,10 @@ GROUPS = {
     "Models": ["build", "load_study", "make_study", "load_model", "save_model", "ReducedModel", "Parameter"],
     "Mechanics": ["SolidProblem", "write_build_report"],
     "Cameras, frames and scenes": [
-        *("Camera", "load_camera", "calibrate", "open_source", "open_live", "Frame"),
-        *("map_scene", "Scene", "load_scene"),
+        *("Camera", "load_camera", "calibrate", "Board", "open_source", "open_live", "Frame"),
+        *("map_scene", "SlamOptions", "Scene", "load_scene"),
     ],
-    "Registration": [
-        *("register", "register_landmarks", "register_board", "load_registration", "Registration", "Landmarks")
-    ],
+    "Registration": [*("register", "register_landmarks", "register_board", "load_registration", "Registration")],
     "Tracking": [
         *("Tracker", "TrackerOptions", "FrameResult", "Status", "TrackingWarning"),
         *("Session", "track", "TrackOptions"),
