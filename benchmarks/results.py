@@ -229,14 +229,20 @@ def machine() -> str:
     return f"{cores} core{'s' * (cores > 1)} of a shared {platform.machine()} machine, no GPU"
 
 
-def keep(name: str, output: str, day: str, command: str | None = None) -> None:
+def commit() -> str:
+    """The present commit, as git abbreviates it."""
+    command = ["git", "rev-parse", "--short=7", "HEAD"]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def keep(name: str, output: str, day: str, of_commit: str) -> None:
     """Keep the last lines of an output, without progress bars and lines that only name a file."""
     lines = [line.rpartition("\r")[2].rstrip() for line in output.split("\n")]
     lines = [line for line in lines if line and not re.search(r"\d+%\||^\w+ +/\S+$", line)]
     kept = [re.sub(r"/\S*/(?=(?:examples|benchmarks|demo)/)", "", line) for line in lines[-BENCHMARKS[name].lines :]]
-    content = {"date": day, "command": command or BENCHMARKS[name].command, "machine": machine(), "output": kept}
+    content = {"date": day, "commit": of_commit, "command": BENCHMARKS[name].command, "machine": machine()}
     KEPT.mkdir(exist_ok=True)
-    (KEPT / f"{name}.json").write_text(json.dumps(content, indent=2) + "\n")
+    (KEPT / f"{name}.json").write_text(json.dumps(content | {"output": kept}, indent=2) + "\n")
 
 
 def run(names: list[str], data: Path | None) -> int:
@@ -252,7 +258,7 @@ def run(names: list[str], data: Path | None) -> int:
         if done.returncode:
             failed += 1
         else:
-            keep(name, done.stdout, date.today().isoformat())
+            keep(name, done.stdout, date.today().isoformat(), commit())
     return failed
 
 
@@ -278,7 +284,11 @@ def page() -> str:
 
 
 def _entry(benchmark: Benchmark, content: dict) -> str:
-    rows = [("command", f"`{content['command']}`"), ("date", content["date"]), ("machine", content["machine"])]
+    rows = [
+        ("command", f"`{content['command']}`"),
+        ("date", f"{content['date']}, commit {content['commit']}"),
+        ("machine", content["machine"]),
+    ]
     rows += [("truth", benchmark.truth)] + [("noise", benchmark.noise)] * bool(benchmark.noise)
     table = "\n".join(["| | |", "|---|---|", *(f"| {key} | {value} |" for key, value in rows)])
     about = f"{benchmark.about}\n\n" if benchmark.about else ""
@@ -317,13 +327,14 @@ def main() -> int:
     keeping = commands.add_parser("keep", help="keep the last lines of an output that is in a file")
     keeping.add_argument("name", choices=BENCHMARKS, metavar="NAME")
     keeping.add_argument("log", type=Path)
+    keeping.add_argument("--commit", help="that was run (the present one)")
     commands.add_parser("page", help="write docs/results.md and the table in README.md")
     arguments = parser.parse_args()
     if arguments.command == "run":
         return run(arguments.names, arguments.data)
     if arguments.command == "keep":
         day = datetime.fromtimestamp(arguments.log.stat().st_mtime).date().isoformat()
-        keep(arguments.name, arguments.log.read_text(), day)
+        keep(arguments.name, arguments.log.read_text(), day, arguments.commit or commit())
     else:
         write_pages()
     return 0
