@@ -11,6 +11,7 @@ from morph_dslam.errors import TrackingError
 from morph_dslam.registration.initialization import InitializerFiles
 from morph_dslam.tracking.combinations import check_options
 from morph_dslam.tracking.drawing import DrawOptions
+from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.run_options import ObjectOptions
 
 CSV, JSON, TOML = Path("l.csv"), Path("r.json"), Path("b.toml")
@@ -42,6 +43,7 @@ FREE_LID = ObjectOptions(model=Path("lid.morph"), landmarks=CSV)
         ({"refine_reference": True, **BY_BOARD}, "--refine"),
         ({"refine_reference": True, "reregister_at": ((7, CSV),)}, "--reregister-at"),
         ({"refine_reference": True, "other_cameras": (Path("aside"),)}, "--with"),
+        ({"other_cameras": (Path("aside"),), "tracker": TrackerOptions(use_discrepancy=True)}, "--discrepancy"),
         ({"reference_frame": 3, **REGISTERED}, "--reference-frame"),
         ({"reference_frame": 3, **REGISTERED, "others": (("lid", LID),)}, "--reference-frame"),
         ({"video": False, "drawing": DrawOptions("strain")}, "--no-video"),

@@ -80,6 +80,10 @@ OF_RUN: tuple[tuple[Callable[[TrackOptions], bool], str], ...] = (
         "the reference is refined for one camera: leave out --refine or --with",
     ),
     (
+        lambda run: bool(run.other_cameras) and any(part.tracker.use_discrepancy for part in run.objects),
+        "the discrepancy is estimated from one camera: leave out --discrepancy or --with",
+    ),
+    (
         lambda run: (
             run.reference_frame is not None
             and not run.other_cameras

@@ -279,12 +279,12 @@ def _keyframe_views(
         PosedImage(
             images[view.frame],
             part.seen(State(own.model.default, view.pose)),
-            chain @ np.vstack([np.zeros((d, view.error_factors.shape[1])), view.error_factors]),
+            chain @ np.vstack([np.zeros((d, factors.shape[1])), factors]),
             seen=seen_part(own, others, part, view.frame),
             frame=view.frame,
         )
         for view in own.registration.views
-        if view.frame in images
+        if view.frame in images and (factors := view.error_factors) is not None
     ]
     return choose_keyframe_views(Estimator(own.model, part.camera), first, rest, own.options)
 

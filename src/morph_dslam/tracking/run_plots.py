@@ -60,7 +60,7 @@ def plot_confidence(path: Path, run: RunResults) -> None:
     for axes, (label, both) in zip(all_axes, rows, strict=True):
         # A frame that tells nothing must not hide what the others tell.
         top = 1.5 * float(np.nanmax(both[:, 0], initial=0.0)) or 1.0
-        _plot_band(axes, run, *both.T, (0.0, top))
+        _plot_band(axes, run, both[:, 0], both[:, 1], (0.0, top))
         axes.set_ylabel(label)
     all_axes[0].legend(loc="upper left", fontsize=8)
     figure.savefig(path, dpi=DPI)
