@@ -138,7 +138,8 @@ def value_line(figures: dict) -> str:
 
 #: Von Mises stress is sqrt(s' Q s), of three plane or of six components of the stress.
 _PLANE = np.array([[1.0, -0.5, 0.0], [-0.5, 1.0, 0.0], [0.0, 0.0, 3.0]])
-_SOLID = np.zeros((6, 6))
+_SOLID = np.diag([1.0, 1.0, 1.0, 3.0, 3.0, 3.0])
+_SOLID[:3, :3] = 1.5 * np.eye(3) - 0.5
 
 
 def displacement_std(model: ReducedModel, estimate: Estimate) -> Array:
