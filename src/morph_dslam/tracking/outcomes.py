@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import ClassVar
 
+from morph_dslam.notices import Notice
+
 
 class Status(StrEnum):
     """Whether the object was found in a frame."""
@@ -80,7 +82,7 @@ class Rejection:
 
 
 @dataclass(frozen=True)
-class TrackingWarning:
+class TrackingWarning(Notice):
     """Something that a reader of a frame's result must know; each kind is a class of its own.
 
     Attributes
@@ -89,12 +91,6 @@ class TrackingWarning:
     """
 
     doubts_result: ClassVar[bool] = True
-    template: ClassVar[str] = ""
-
-    @property
-    def text(self) -> str:
-        """For people."""
-        return self.template.format(**vars(self))
 
 
 @dataclass(frozen=True)

@@ -252,8 +252,7 @@ class Tracker:
         self, image: Image, hypothesis: PoseHypothesis, rejection: Rejection, camera: CameraLocalization
     ) -> tuple[PoseHypothesis, FoundBy, Rejection | None]:
         """Look for the object by its features; a hidden one, whose place is known, only now and then."""
-        is_placed = camera.pose_prior is not None and not self._anchoring.has_moved
-        if is_placed and self._n_lost % self.options.look_every:
+        if self._placed_by_map(camera) is not None and self._n_lost % self.options.look_every:
             return hypothesis, FoundBy.FEATURES, rejection
         found, why = self._view.recovery.recover(image, self._last.parameters, rejection)
         return hypothesis if found is None else found, FoundBy.FEATURES, why
@@ -287,8 +286,9 @@ class Tracker:
             self._learn(hypothesis)
         else:
             self.last_measured = self.reference.nothing_measured
-            if camera.pose_prior is not None and not self._anchoring.has_moved:
-                self._last = replace(self._last, camera_from_object=camera.pose_prior.pose)
+            placed = self._placed_by_map(camera)
+            if placed is not None:
+                self._last = replace(self._last, camera_from_object=placed.pose)
         self._image, self._lost = image, rejection is not None
         self._n_lost = self._n_lost + 1 if self._lost else 0
 
@@ -301,14 +301,15 @@ class Tracker:
         warnings = self._warnings_of_place(camera)
         n_points, n_inliers = hypothesis.counts
         if rejection is not None:
-            is_hidden = camera.pose_prior is not None and not self._anchoring.has_moved
+            placed = self._placed_by_map(camera)
+            is_hidden = placed is not None
             return FrameResult(
                 self.model,
                 Status.HIDDEN if is_hidden else Status.LOST,
                 rejection=rejection,
                 warnings=() if is_hidden else tuple(warnings),
                 pose_from=PoseSource.MAP if is_hidden else PoseSource.NONE,
-                pose_prior=camera.pose_prior if is_hidden else None,
+                pose_prior=placed,
                 n_points=n_points,
                 n_inliers=n_inliers,
                 view=self._view.number,
@@ -330,6 +331,10 @@ class Tracker:
             view=self._view.number,
             discrepancy=hypothesis.discrepancy,
         )
+
+    def _placed_by_map(self, camera: CameraLocalization) -> PosePrior | None:
+        """The object's pose by the map; None for a free or moved object, or where the camera is lost."""
+        return None if self._anchoring.has_moved else camera.pose_prior
 
     def _warnings_of_place(self, camera: CameraLocalization) -> list[TrackingWarning]:
         warnings: list[TrackingWarning] = [ObjectMoved()] if self._anchoring.has_moved else []
