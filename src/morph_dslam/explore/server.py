@@ -40,7 +40,7 @@ def _round_up(top: float) -> float:
 
 
 @dataclass(frozen=True)
-class ColourField:
+class _ColourField:
     """A scalar that the surface can be coloured by; ``top`` is the end of its colours, in ``unit``."""
 
     key: str
@@ -49,7 +49,7 @@ class ColourField:
     top: float
 
 
-class ModelSurface:
+class _ModelSurface:
     """The visible surface of a reduced model, evaluated for one state after the other.
 
     Attributes
@@ -81,7 +81,7 @@ class ModelSurface:
         return self.nodes.astype("<f4").tobytes() + self.triangles.astype("<u4").tobytes()
 
     @cached_property
-    def fields(self) -> tuple[ColourField, ...]:
+    def fields(self) -> tuple[_ColourField, ...]:
         """The fields to choose from, with one range of colours for the whole box."""
         model = self._model
         sobol = qmc.Sobol(len(model.parameters), scramble=False).random(_SAMPLES)
@@ -91,7 +91,7 @@ class ModelSurface:
         result = []
         for key, label in names.items():
             top = float(np.percentile([self.values(mu, key) for mu in samples], _PERCENTILE))
-            result.append(ColourField(key, label, "mm" if key == "displacement" else "MPa", _round_up(top)))
+            result.append(_ColourField(key, label, "mm" if key == "displacement" else "MPa", _round_up(top)))
         return tuple(result)
 
     def description(self) -> dict[str, Any]:
@@ -141,11 +141,11 @@ class _BadRequest(Exception):
     """What the page asked for cannot be answered."""
 
 
-class Answers:
+class _Answers:
     """Answers to the page's requests, without the network: (content type, content) for a path."""
 
     def __init__(self, model: ReducedModel) -> None:
-        self._model, self._surface = model, ModelSurface(model)
+        self._model, self._surface = model, _ModelSurface(model)
         self._model_json = json.dumps(self._surface.description()).encode()
         self._shape = self._surface.shape()
 
@@ -187,7 +187,7 @@ class Answers:
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
 
-    def __init__(self, answers: Answers, *arguments) -> None:
+    def __init__(self, answers: _Answers, *arguments) -> None:
         self._answers = answers
         super().__init__(*arguments)
 
@@ -231,7 +231,7 @@ class _Server(ThreadingHTTPServer):
 def make_server(model: ReducedModel, port: int) -> ThreadingHTTPServer:
     """A server for one model on this computer's own address; ``port`` 0 takes any free one."""
     try:
-        return _Server((HOST, port), partial(_Handler, Answers(model)))
+        return _Server((HOST, port), partial(_Handler, _Answers(model)))
     except (OSError, OverflowError) as error:
         raise ExploreError(
             f"port {port} cannot be taken ({error}); choose another with --port; --port 0 takes any free one"

@@ -31,14 +31,14 @@ SURFACES = (".stl", ".obj", ".ply")
 
 
 @dataclass(frozen=True)
-class TriangleSurface:
+class _TriangleSurface:
     """Points (n, 3) in file units and outward triangles (t, 3) of point indices."""
 
     points: Array
     triangles: Indices
 
 
-def read_surface(path: Path) -> TriangleSurface:
+def read_surface(path: Path) -> _TriangleSurface:
     """Read a surface; polygons are cut into triangles and coincident points made one.
 
     Raises StudyError if it is a file of another kind, cannot be read, or holds no faces.
@@ -58,7 +58,7 @@ def read_surface(path: Path) -> TriangleSurface:
     points, merged = np.unique(points, axis=0, return_inverse=True)
     triangles = merged.ravel()[triangles]
     flat = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
-    return TriangleSurface(points, triangles[~flat])
+    return _TriangleSurface(points, triangles[~flat])
 
 
 def _fans(polygons: Indices) -> Indices:
@@ -102,7 +102,7 @@ def _read_stl_or_ply(path: Path) -> tuple[Array, Indices]:
     return np.asarray(content.points, dtype=np.float64), triangles.astype(np.int64)
 
 
-def check_watertight(surface: TriangleSurface, path: Path) -> None:
+def check_watertight(surface: _TriangleSurface, path: Path) -> None:
     """Raise StudyError unless every edge joins two triangles that turn alike, with the inside within."""
     t = surface.triangles
     directed = np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]])
@@ -201,7 +201,7 @@ def mesh_surface_file(path: Path, size: float | None) -> Mesh:
     return _volume_mesh(content, path)
 
 
-def _filled(surface: TriangleSurface) -> Any:
+def _filled(surface: _TriangleSurface) -> Any:
     content = meshing.Mesh()
     content.dim = 3
     numbers = [content.Add(meshing.MeshPoint(meshing.Pnt(*point))) for point in surface.points.tolist()]
@@ -212,7 +212,7 @@ def _filled(surface: TriangleSurface) -> Any:
     return content
 
 
-def _meshed_anew(surface: TriangleSurface, size: float) -> Any:
+def _meshed_anew(surface: _TriangleSurface, size: float) -> Any:
     """Netgen reads the surface from a file only; STL is the one format that its mesher takes."""
     corners = surface.points[surface.triangles]
     facets = (

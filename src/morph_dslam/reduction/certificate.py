@@ -121,7 +121,7 @@ def confidence_statement(count: int) -> str:
     )
 
 
-class ErrorTally:
+class _ErrorTally:
     """Errors of one quantity, gathered sample by sample.
 
     Parameters
@@ -233,8 +233,8 @@ def _unit(name: str) -> tuple[str, float]:
     return next(unit for start, unit in _UNITS.items() if name.startswith(start))
 
 
-def _tally(field: SeparatedField, name: str, held_out: list[Snapshot]) -> ErrorTally:
-    tally = ErrorTally(_norm_weights(name, field.modes.shape[2]))
+def _tally(field: SeparatedField, name: str, held_out: list[Snapshot]) -> _ErrorTally:
+    tally = _ErrorTally(_norm_weights(name, field.modes.shape[2]))
     for snapshot in held_out:
         tally.add(field.value(snapshot.coordinates), snapshot.fields[name])
     return tally
@@ -262,7 +262,7 @@ def _displacement_errors(model: ReducedModel, held_out: list[Snapshot]) -> dict[
 def _field_errors(field: SeparatedField, name: str, held_out: list[Snapshot]) -> dict[str, Any]:
     figures = _tally(field, name, held_out).figures(*_unit(name))
     if name.startswith(_STRESS):
-        tally = ErrorTally(np.ones(1))
+        tally = _ErrorTally(np.ones(1))
         for snapshot in held_out:
             predicted = von_mises(field.value(snapshot.coordinates))
             truth = von_mises(snapshot.fields[name].astype(np.float64))
@@ -273,7 +273,7 @@ def _field_errors(field: SeparatedField, name: str, held_out: list[Snapshot]) ->
 
 def _sensitivity_errors(model: ReducedModel, held_out: list[Snapshot]) -> dict[str, Any]:
     """Relative errors of the displacement's derivative by each parameter."""
-    tallies = {parameter.name: ErrorTally(np.ones(3)) for parameter in model.parameters}
+    tallies = {parameter.name: _ErrorTally(np.ones(3)) for parameter in model.parameters}
     for snapshot in held_out:
         _, slopes = model.displacement.value_and_sensitivities(snapshot.coordinates)
         truth = snapshot.sensitivities["displacement"]

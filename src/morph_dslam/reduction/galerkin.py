@@ -52,7 +52,7 @@ def galerkin_modes(
     return modes
 
 
-class ProjectedLinearisation:
+class _ProjectedLinearisation:
     """Residual (k,) and dense tangent (k, k) of projected equations."""
 
     def __init__(self, residual: Array, tangent: Array) -> None:
@@ -110,10 +110,10 @@ class GalerkinEquations:
     def residual(self, x: Array, mu: Array) -> Array:
         return self.modes @ self.full.residual(self.lift(x, mu), mu)
 
-    def linearise(self, x: Array, mu: Array) -> ProjectedLinearisation:
+    def linearise(self, x: Array, mu: Array) -> _ProjectedLinearisation:
         linearisation = self.full.linearise(self.lift(x, mu), mu)
         tangent = linearisation.apply(self.modes) @ self.modes.T
-        return ProjectedLinearisation(self.modes @ linearisation.residual, tangent.T)
+        return _ProjectedLinearisation(self.modes @ linearisation.residual, tangent.T)
 
     def residual_slopes(self, x: Array, mu: Array) -> Array:
         state = self.lift(x, mu)

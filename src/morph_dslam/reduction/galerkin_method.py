@@ -94,7 +94,7 @@ def field_modes(task: ReductionTask, name: str, spread: Array, tolerance: float)
     return FieldModes(np.array(values), task.weights(len(values[0])), tolerance, len(snapshots))
 
 
-class SampledFields:
+class _SampledFields:
     """Coefficients of all fields at any parameters, one after another in one vector.
 
     Parameters
@@ -146,7 +146,7 @@ def reduce_by_galerkin(task: ReductionTask) -> ReducedModel:
     solver = ReducedSolver(problem, FullSolutions.read(task.files), box, tolerance)
     spread = np.diff(box, axis=1)[:, 0]
     modes = {name: field_modes(task, name, spread, tolerance) for name in task.field_names}
-    sampled = SampledFields(solver, problem, modes, SHARE * tolerance)
+    sampled = _SampledFields(solver, problem, modes, SHARE * tolerance)
     on_grid = len(task.parameters) <= MOST_GRID_PARAMETERS and task.options.format != "polynomial"
     dense = _on_grid(task, sampled) if on_grid else _scattered(task, sampled)
     fields, summaries = {}, {}
@@ -208,7 +208,7 @@ class _Expansion:
         return expansion_train(self.indices, found, bases, tolerance)
 
 
-def _on_grid(task: ReductionTask, sampled: SampledFields) -> _Grid:
+def _on_grid(task: ReductionTask, sampled: _SampledFields) -> _Grid:
     """All fields on the grid that lines through the box ask for."""
     basis = task.options.basis or "chebyshev"
     leading = sampled.parts["displacement"]
@@ -218,7 +218,7 @@ def _on_grid(task: ReductionTask, sampled: SampledFields) -> _Grid:
     return _Grid(bases, values, {"format": task.options.format or "tucker", "basis": basis, "grid": list(sizes)})
 
 
-def _scattered(task: ReductionTask, sampled: SampledFields) -> _Expansion:
+def _scattered(task: ReductionTask, sampled: _SampledFields) -> _Expansion:
     """All fields at scattered samples, fitted by a sparse expansion."""
     leading = sampled.parts["displacement"]
     sizes = sizes_along_lines(sampled.in_allowed_units, task.parameters, "chebyshev", leading)

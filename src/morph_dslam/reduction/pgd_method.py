@@ -33,7 +33,7 @@ N_PROBES = 8
 
 
 @dataclass(frozen=True)
-class PgdFields:
+class _PgdFields:
     """The fields of a solution.
 
     Attributes
@@ -148,7 +148,7 @@ def reduce_by_pgd(task: ReductionTask) -> ReducedModel:
     vectors = np.zeros((solid.problem.n_dofs, len(solution.modes)))
     vectors[solid.free] = solution.modes.T
     dofs = spline_terms(solid.prescribed, bases) + Terms(vectors, solution.functions.factors, bases)
-    fields = PgdFields(solid, dofs, task.mesh.weights, SHARE * options.tolerance)
+    fields = _PgdFields(solid, dofs, task.mesh.weights, SHARE * options.tolerance)
     displacement, singular_values = fields.displacement()
     summary: dict[str, Any] = {
         "method": "pgd",

@@ -100,7 +100,7 @@ def factorise(matrix: sp.csc_array) -> SuperLU:
     return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
-class SpaceOperators:
+class _SpaceOperators:
     """Weighted sums of the matrices A_q, symmetric positive definite and of one pattern, analysed once."""
 
     def __init__(self, problem: SeparableProblem) -> None:
@@ -151,7 +151,7 @@ class SeparatedSystem:
     load_vectors : per axis (J, size), integrals of g_j times its functions.
     """
 
-    operators: SpaceOperators
+    operators: _SpaceOperators
     grams: tuple[Array, ...]
     masses: tuple[Array, ...]
     loads: Array
@@ -162,7 +162,7 @@ class SeparatedSystem:
         """The system of a problem."""
         axes = problem.axes
         return cls(
-            SpaceOperators(problem),
+            _SpaceOperators(problem),
             tuple(
                 np.stack([a.integrate(image) for image in images])
                 for a, images in zip(axes, problem.images, strict=True)

@@ -53,7 +53,7 @@ _BOX_FACES = (
 
 
 @dataclass(frozen=True)
-class Face:
+class _Face:
     """A textured rectangle: its top left corner and its edges (3,), perpendicular, world, metres."""
 
     texture: str
@@ -84,7 +84,7 @@ class Face:
         return nodes, triangles, np.column_stack([a, b])
 
 
-def environment_faces(environment: Environment) -> list[Face]:
+def environment_faces(environment: Environment) -> list[_Face]:
     """All rectangles, those of the boxes among them."""
     faces = []
     for number, section in enumerate(environment.rectangles):
@@ -96,13 +96,13 @@ def environment_faces(environment: Environment) -> list[Face]:
             raise SceneError(
                 f"environment.rectangles.{number}: right_mm and down_mm must be its edges, perpendicular to each other"
             )
-        faces.append(Face(section.texture, centre - (right + down) / 2.0, right, down))
+        faces.append(_Face(section.texture, centre - (right + down) / 2.0, right, down))
     for section in environment.boxes:
         turn = rotation_exp(np.radians([0.0, 0.0, section.turn_deg]))
         half, centre = 0.5e-3 * np.array(section.size_mm), 1e-3 * np.array(section.centre_mm)
         for corner, right, down in _BOX_FACES:
             edges = [turn @ (half * np.array(edge)) for edge in (right, down)]
-            faces.append(Face(section.texture, centre + turn @ (half * np.array(corner)), *edges))
+            faces.append(_Face(section.texture, centre + turn @ (half * np.array(corner)), *edges))
     return faces
 
 
@@ -155,7 +155,7 @@ class StaticScene:
             image[mine] = drawn[mine]
 
 
-def _face_texture(face: Face, folder: Path, pixels_per_metre: float) -> Image:
+def _face_texture(face: _Face, folder: Path, pixels_per_metre: float) -> Image:
     size = np.maximum(np.rint(face.size * pixels_per_metre), 2.0)
     size *= min(1.0, LARGEST_TEXTURE / size.max())
     width, height = np.maximum(size, 2.0).astype(int)

@@ -44,7 +44,7 @@ def blend_surface(image, triangle_ids, weights, triangles, levels, brightness, t
 
 
 @dataclass(frozen=True)
-class Painted:
+class _Painted:
     """Where a surface was painted: ``covered`` (h, w) of the part of the image that begins at ``corner``.
 
     ``corner`` is (column, row), pixels.
@@ -62,7 +62,7 @@ class Painted:
         return int(rows[0]) + top, int(rows[-1]) + top, int(columns[0]) + left, int(columns[-1]) + left
 
 
-def _draw_outline(image: NDArray[np.uint8], painted: Painted, colour: tuple[int, int, int] = (245, 245, 245)) -> None:
+def _draw_outline(image: NDArray[np.uint8], painted: _Painted, colour: tuple[int, int, int] = (245, 245, 245)) -> None:
     contours, _ = cv2.findContours(
         painted.covered.view(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE, offset=painted.corner
     )
@@ -91,11 +91,11 @@ def _paint(
     table: NDArray,
     alpha: float,
     closed: bool,
-) -> Painted:
+) -> _Painted:
     """Blend a surface into ``image``; only the part of it that the surface may cover is looked at."""
     region = image_region(pixels, *image.shape[:2], margin=1)
     if region is None:
-        return Painted(np.zeros((1, 1), dtype=bool), (0, 0))
+        return _Painted(np.zeros((1, 1), dtype=bool), (0, 0))
     rows, columns = region
     corner = (columns.start, rows.start)
     size = (rows.stop - rows.start, columns.stop - columns.start)
@@ -112,7 +112,7 @@ def _paint(
         table,
         float(alpha),
     )
-    return Painted(buffers.covered, corner)
+    return _Painted(buffers.covered, corner)
 
 
 def paint_surface(
@@ -126,7 +126,7 @@ def paint_surface(
     alpha: float = 1.0,
     brightness: Array | None = None,
     closed: bool = False,
-) -> Painted:
+) -> _Painted:
     """Paint a surface coloured by a field into ``image``, which changes; arguments as of `draw_overlay`."""
     low, high = _widened(value_range)
     levels = (np.asarray(node_values, dtype=np.float64) - low) * (255.0 / (high - low))

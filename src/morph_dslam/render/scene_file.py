@@ -78,14 +78,14 @@ class Background(_Section):
     blur_px: Blur = 0.0
 
 
-class Light(_Section):
+class _Light(_Section):
     """A distant light in ``direction`` (towards it, in the frame of the poses), and ambient light (0-1)."""
 
     direction: Vector = (-0.4, -0.6, -1.0)
     ambient: float = Field(default=0.45, ge=0.0, le=1.0)
 
     @model_validator(mode="after")
-    def _has_direction(self) -> Light:
+    def _has_direction(self) -> _Light:
         if max(map(abs, self.direction)) < 1e-6:
             raise ValueError("direction must not be zero")
         return self
@@ -170,7 +170,7 @@ class DepthSensor(_Section):
     range_mm: float = Field(default=5000.0, gt=0.0, le=13000.0)
 
 
-class OccluderKeyFrame(_Section):
+class _OccluderKeyFrame(_Section):
     """Where the disc is in one frame."""
 
     frame: FrameNumber
@@ -182,7 +182,7 @@ class Occluder(_Section):
 
     radius_px: float = Field(gt=0.0, le=LARGEST)
     colour: Colour = (196, 150, 122)
-    path: list[OccluderKeyFrame] = Field(min_length=1)
+    path: list[_OccluderKeyFrame] = Field(min_length=1)
 
 
 class Scene(_Section):
@@ -197,7 +197,7 @@ class Scene(_Section):
     supersampling: int = Field(default=2, ge=1, le=4)
     surface: Surface
     background: Background = Background()
-    light: Light = Light()
+    light: _Light = _Light()
     sensor: Sensor = Sensor()
     parameters: list[ParameterKeyFrame] = []
     pose: list[PoseKeyFrame] = []

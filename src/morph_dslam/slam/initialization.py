@@ -47,7 +47,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Structure:
+class _Structure:
     """Three views explained: poses (3, 4, 4), points (n, 3), which of them fit, and the errors."""
 
     poses: Array
@@ -190,7 +190,7 @@ class MapInitializer:
         self._rows = np.empty(0, dtype=np.int64)
         self._open_views = 0
 
-    def _structure(self, hypothesis: TwoViewHypothesis, points: Array, pixels: list[Array]) -> Structure | None:
+    def _structure(self, hypothesis: TwoViewHypothesis, points: Array, pixels: list[Array]) -> _Structure | None:
         """A hypothesis adjusted to three views; None if the third camera cannot be placed."""
         known = np.isfinite(points[:, 0])
         if known.sum() < LEAST_START_POINTS:
@@ -215,9 +215,9 @@ class MapInitializer:
         rms = float(np.sqrt(np.mean(errors[:, fits] ** 2))) if fits.any() else np.inf
         all_points = np.full_like(points, np.nan)
         all_points[known] = adjusted.points
-        return Structure(adjusted.camera_from_world, all_points, fits, rms, mean_squared)
+        return _Structure(adjusted.camera_from_world, all_points, fits, rms, mean_squared)
 
-    def _objection(self, found: list[Structure], n_points: int) -> NoPose | None:
+    def _objection(self, found: list[_Structure], n_points: int) -> NoPose | None:
         """Why the best structure may not be accepted; None if it may."""
         if not found:
             return NoPose(SlamReason.THIRD_VIEW_UNEXPLAINED)
@@ -232,7 +232,7 @@ class MapInitializer:
         return None
 
 
-def _same(one: Structure, other: Structure) -> bool:
+def _same(one: _Structure, other: _Structure) -> bool:
     """Whether two structures are one up to scale."""
     for view in (1, 2):
         turn = np.linalg.norm(rotation_log(one.poses[view, :3, :3] @ other.poses[view, :3, :3].T))

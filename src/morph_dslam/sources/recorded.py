@@ -31,7 +31,7 @@ _COLOUR = re.compile(r"frame-(\d+)\.color\.(png|jpg)")
 
 
 @dataclass(frozen=True)
-class ImageRecord:
+class _ImageRecord:
     """Where one frame is: its number, its time in seconds, and the files of its images."""
 
     index: int
@@ -56,7 +56,7 @@ class RecordedFrames:
     def __init__(
         self,
         folder: Path,
-        records: Sequence[ImageRecord],
+        records: Sequence[_ImageRecord],
         first: int | None = None,
         last: int | None = None,
         *,
@@ -132,7 +132,7 @@ def numbered_images(folder: Path) -> dict[int, Path]:
 
 def image_folder(folder: Path, first: int | None = None, last: int | None = None) -> RecordedFrames:
     """A folder of numbered images; gaps in the numbering are kept as they are."""
-    records = [ImageRecord(number, number / ASSUMED_FPS, path) for number, path in numbered_images(folder).items()]
+    records = [_ImageRecord(number, number / ASSUMED_FPS, path) for number, path in numbered_images(folder).items()]
     return RecordedFrames(folder, records, first, last, fps=ASSUMED_FPS)
 
 
@@ -152,7 +152,7 @@ def tum_recording(folder: Path, first: int | None = None, last: int | None = Non
             nearest = int(np.abs(depth_times - timestamp).argmin())
             if abs(depth_times[nearest] - timestamp) <= MOST_TIME_DIFFERENCE:
                 depth = depths[nearest][1]
-        records.append(ImageRecord(index, timestamp, path, depth=depth))
+        records.append(_ImageRecord(index, timestamp, path, depth=depth))
     return RecordedFrames(folder, records, first, last, depth_scale=TUM_DEPTH)
 
 
@@ -191,7 +191,7 @@ def euroc_recording(folder: Path, first: int | None = None, last: int | None = N
     left = _read_euroc_list(base / "cam0")
     right = _read_euroc_list(base / "cam1") if (base / "cam1" / "data.csv").is_file() else {}
     records = [
-        ImageRecord(index, nanoseconds / 1e9, path, right=right.get(nanoseconds))
+        _ImageRecord(index, nanoseconds / 1e9, path, right=right.get(nanoseconds))
         for index, (nanoseconds, path) in enumerate(sorted(left.items()))
     ]
     return RecordedFrames(folder, records, first, last)
@@ -224,5 +224,5 @@ def seven_scenes_recording(folder: Path, first: int | None = None, last: int | N
         if matched:
             number, depth = int(matched[1]), folder / f"frame-{matched[1]}.depth.png"
             found = depth if depth.is_file() else None
-            records.append(ImageRecord(number, number / SEVEN_SCENES_FPS, path, depth=found))
+            records.append(_ImageRecord(number, number / SEVEN_SCENES_FPS, path, depth=found))
     return RecordedFrames(folder, records, first, last, depth_scale=SEVEN_SCENES_DEPTH, fps=SEVEN_SCENES_FPS)

@@ -50,7 +50,7 @@ class SerialExecutor(Executor):
         forget_problem()
 
 
-class WorkerProcesses(ProcessPoolExecutor):
+class _WorkerProcesses(ProcessPoolExecutor):
     """Processes that leave Ctrl-C to the main process and end when it does, however that ends."""
 
     def __init__(self, count: int) -> None:
@@ -98,7 +98,7 @@ def default_executor(workers: int | None) -> Iterator[Executor]:
         with SerialExecutor() as executor:
             yield executor
         return
-    executor = WorkerProcesses(workers or os.cpu_count() or 1)
+    executor = _WorkerProcesses(workers or os.cpu_count() or 1)
     try:
         yield executor
     except BaseException as error:

@@ -47,7 +47,7 @@ _SAME = 1e-5
 _COLUMN = re.compile(r"\s*(?P<name>\w+)\s*(?:\[(?P<unit>[^\]]+)\])?\s*")
 
 
-class ExternalSection(Section):
+class _ExternalSection(Section):
     """Where the solutions are.
 
     ``table`` is a CSV file, relative to the study: a column ``file`` names each solution (relative to the
@@ -70,7 +70,7 @@ class ExternalSection(Section):
         return Path((info.context or {}).get("folder", ".")) / table
 
 
-class HoldOutSection(Section):
+class _HoldOutSection(Section):
     """How many of the solutions only measure the error (a fifth, and at least 4, if absent), and which."""
 
     held_out: int | None = Field(default=None, ge=4)
@@ -81,8 +81,8 @@ class ExternalStudy(Section):
     """Solutions that were computed elsewhere, to be reduced like this program's own."""
 
     name: str
-    external: ExternalSection
-    sampling: HoldOutSection = HoldOutSection()
+    external: _ExternalSection
+    sampling: _HoldOutSection = _HoldOutSection()
     reduction: ReductionSection = ReductionSection()
 
     def solutions(self) -> tuple[ModelMesh, tuple[Parameter, ...], list[Snapshot]]:

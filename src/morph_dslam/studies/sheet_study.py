@@ -138,7 +138,7 @@ Count = Annotated[int, Field(ge=1, le=1000)]
 SMALLEST_BULGE = 0.02
 
 
-class SheetSection(Section):
+class _SheetSection(Section):
     """The flat sheet: length along x, width along y, thickness."""
 
     length: PositiveLength
@@ -146,7 +146,7 @@ class SheetSection(Section):
     thickness: PositiveLength
 
 
-class SheetMaterialSection(Section):
+class _SheetMaterialSection(Section):
     """Orthotropic elasticity, fibres along x: Young's moduli along and across, nu_12, G_12."""
 
     young_fibre: Stress
@@ -155,7 +155,7 @@ class SheetMaterialSection(Section):
     shear: Stress
 
 
-class GripsSection(Section):
+class _GripsSection(Section):
     """Two rigid grips on the short edges: depth along x, height along y, y of their centres."""
 
     depth: PositiveLength
@@ -174,7 +174,7 @@ class GripsSection(Section):
         return self.centre_left == self.centre_right == 0.0
 
 
-class SheetParametersSection(Section):
+class _SheetParametersSection(Section):
     """Ranges of the four coordinates (`morph_dslam.mechanics.grips` says what they mean)."""
 
     bulge: tuple[Length, Length]
@@ -188,7 +188,7 @@ class SheetParametersSection(Section):
         return np.array([getattr(self, name) for name in COORDINATES])
 
     @model_validator(mode="after")
-    def _check_order(self) -> SheetParametersSection:
+    def _check_order(self) -> _SheetParametersSection:
         for name in type(self).model_fields:
             lower, upper = getattr(self, name)
             if not lower < upper:
@@ -196,7 +196,7 @@ class SheetParametersSection(Section):
         return self
 
 
-class SheetSolverSection(WorkSection):
+class _SheetSolverSection(WorkSection):
     """Discretisation.
 
     ``thickness`` is the thickness at which equilibrium is solved, the sheet's own if absent. The shape of a
@@ -209,7 +209,7 @@ class SheetSolverSection(WorkSection):
     thickness: PositiveLength | None = None
 
 
-class SheetReductionSection(ReductionSection):
+class _SheetReductionSection(ReductionSection):
     """Reduction, and the cells of the model's mesh along x and y."""
 
     grid: tuple[Count, Count] = (60, 42)
@@ -219,13 +219,13 @@ class SheetStudy(Section):
     """A thin elastic sheet held by two rigid grips."""
 
     name: str
-    sheet: SheetSection
-    material: SheetMaterialSection
-    grips: GripsSection
-    parameters: SheetParametersSection
-    solver: SheetSolverSection = SheetSolverSection()
+    sheet: _SheetSection
+    material: _SheetMaterialSection
+    grips: _GripsSection
+    parameters: _SheetParametersSection
+    solver: _SheetSolverSection = _SheetSolverSection()
     sampling: SamplingSection = SamplingSection()
-    reduction: SheetReductionSection = SheetReductionSection()
+    reduction: _SheetReductionSection = _SheetReductionSection()
 
     @model_validator(mode="after")
     def _check_sizes(self) -> SheetStudy:
@@ -273,9 +273,9 @@ class SheetStudy(Section):
         )
         return GrippedSheet(material, grips, self.sheet.width, self.solver.divisions, self.solver.order)
 
-    def sweep_problem(self) -> GrippedSheetSweep:
+    def sweep_problem(self) -> _GrippedSheetSweep:
         """What the sweep solves with."""
-        return GrippedSheetSweep(
+        return _GrippedSheetSweep(
             self.problem(), self._output_points(), self.sheet.thickness / self.solve_thickness, self.root()
         )
 
@@ -363,7 +363,7 @@ class SheetStudy(Section):
 
 
 @dataclass(frozen=True)
-class GrippedSheetSweep:
+class _GrippedSheetSweep:
     """The gripped sheet as the sweep sees it (`morph_dslam.studies.problem.SweepProblem`).
 
     Attributes

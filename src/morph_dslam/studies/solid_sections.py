@@ -48,7 +48,7 @@ def _few(divisions: tuple[int, int, int]) -> tuple[int, int, int]:
 Divisions = Annotated[tuple[Count, Count, Count], AfterValidator(_few)]
 
 
-class FileMesh(Section):
+class _FileMesh(Section):
     """A mesh file: Abaqus or CalculiX .inp, Gmsh .msh, VTK, STL, OBJ, PLY or STEP.
 
     ``file`` is relative to the study file; ``unit`` is that of its coordinates; ``size`` the longest edge of
@@ -68,7 +68,7 @@ class FileMesh(Section):
         return load_mesh(self.file, self.unit, self.size)
 
 
-class BlockMesh(Section):
+class _BlockMesh(Section):
     """A block from the origin along x, y and z; sets x_min, x_max, y_min, y_max, z_min, z_max."""
 
     generator: Literal["block"]
@@ -80,7 +80,7 @@ class BlockMesh(Section):
         return mesh_generators.block(self.size, self.divisions, self.cells)
 
 
-class TubeMesh(Section):
+class _TubeMesh(Section):
     """A tube around the z axis; divisions are along z, through the wall and around it.
 
     Sets: inner, outer, bottom, top and, for less than a full turn, start and end.
@@ -100,7 +100,7 @@ class TubeMesh(Section):
         )
 
 
-class CollarSection(Section):
+class _CollarSection(Section):
     """A stretch of the wall, from ``start`` to ``stop`` of its length (0 to 1), thickened outside."""
 
     start: float = Field(ge=0.0, le=1.0)
@@ -109,7 +109,7 @@ class CollarSection(Section):
     layers: Count = 1
 
 
-class RevolutionMesh(Section):
+class _RevolutionMesh(Section):
     """A wall of revolution around the z axis; divisions are along the profile, through the wall and around.
 
     ``profile`` lists points [r, z] of the wall's middle from the bottom upwards, plain numbers in ``unit``.
@@ -123,7 +123,7 @@ class RevolutionMesh(Section):
     divisions: Divisions
     cells: CellName = "hex20"
     angles: tuple[Angle, Angle] = (0.0, 2.0 * np.pi)
-    collars: tuple[CollarSection, ...] = ()
+    collars: tuple[_CollarSection, ...] = ()
 
     @field_validator("unit")
     @classmethod
@@ -142,15 +142,15 @@ class RevolutionMesh(Section):
 
 def _kind(value: Any) -> str:
     if isinstance(value, Section):
-        return "file" if isinstance(value, FileMesh) else value.generator  # type: ignore[attr-defined]
+        return "file" if isinstance(value, _FileMesh) else value.generator  # type: ignore[attr-defined]
     return str(value.get("generator", "file")) if isinstance(value, dict) else "file"
 
 
 MeshSection = Annotated[
-    Annotated[FileMesh, Tag("file")]
-    | Annotated[BlockMesh, Tag("block")]
-    | Annotated[TubeMesh, Tag("tube")]
-    | Annotated[RevolutionMesh, Tag("revolution")],
+    Annotated[_FileMesh, Tag("file")]
+    | Annotated[_BlockMesh, Tag("block")]
+    | Annotated[_TubeMesh, Tag("tube")]
+    | Annotated[_RevolutionMesh, Tag("revolution")],
     Discriminator(_kind),
 ]
 
@@ -166,7 +166,7 @@ def file_stamp(path: Path) -> tuple[int, int]:
 
 def make_mesh(section: Any) -> Mesh:
     """The mesh of a `MeshSection`, checked; made once, and again when its file has been written again."""
-    return _made(section, file_stamp(section.file) if isinstance(section, FileMesh) else None)
+    return _made(section, file_stamp(section.file) if isinstance(section, _FileMesh) else None)
 
 
 @lru_cache(maxsize=2)
@@ -198,7 +198,7 @@ class _ShapeSection(Section):
         return read(self.amplitude, "length")
 
 
-class ThicknessShape(_ShapeSection):
+class _ThicknessShape(_ShapeSection):
     """A wall that is thicker by ``amplitude``: surface ``on`` moves outwards, surface ``kept`` stays."""
 
     kind: Literal["thickness"]
@@ -210,7 +210,7 @@ class ThicknessShape(_ShapeSection):
         return thickness_field(mesh, self.on, self.kept)
 
 
-class RadiusShape(_ShapeSection):
+class _RadiusShape(_ShapeSection):
     """A body that is wider by ``amplitude`` all around an axis, its wall as it was."""
 
     kind: Literal["radius"]
@@ -222,11 +222,11 @@ class RadiusShape(_ShapeSection):
         return radius_field(mesh.nodes, np.array(self.centre), np.array(self.axis))
 
 
-ShapeSection = Annotated[ThicknessShape | RadiusShape, Field(discriminator="kind")]
+ShapeSection = Annotated[_ThicknessShape | _RadiusShape, Field(discriminator="kind")]
 
 
 def shape_fields(
-    sections: Sequence[ThicknessShape | RadiusShape], mesh: Mesh, symbols: ParameterSymbols
+    sections: Sequence[_ThicknessShape | _RadiusShape], mesh: Mesh, symbols: ParameterSymbols
 ) -> list[ShapeField]:
     """The shape as the solver takes it, checked at the ends of the parameters that it depends on."""
     parameters = symbols.parameters
@@ -269,7 +269,7 @@ def _triple(values: Triple, quantity: str, read: Reader) -> tuple[Any, Any, Any]
     return x, y, z
 
 
-class FixedSupport(Section):
+class _FixedSupport(Section):
     """Holds a set in all three directions."""
 
     kind: Literal["fixed"]
@@ -279,7 +279,7 @@ class FixedSupport(Section):
         return supports.fixed(self.on)
 
 
-class DisplacementSupport(Section):
+class _DisplacementSupport(Section):
     """Moves a set by given lengths; a direction that is left out stays free."""
 
     kind: Literal["displacement"]
@@ -293,7 +293,7 @@ class DisplacementSupport(Section):
         return supports.PrescribedDisplacement(self.on, *values)
 
 
-class RotationSupport(Section):
+class _RotationSupport(Section):
     """Turns a set as a rigid body about an axis, then shifts it.
 
     ``axis`` gives the direction, right-handed; ``centre`` a point on it, or the set whose mean point it is
@@ -318,7 +318,7 @@ class RotationSupport(Section):
         )
 
 
-class FoundationSupport(Section):
+class _FoundationSupport(Section):
     """Springs spread over a surface: ``stiffness`` is force per area and displacement."""
 
     kind: Literal["foundation"]
@@ -330,7 +330,7 @@ class FoundationSupport(Section):
         return supports.ElasticFoundation(self.on, read(self.stiffness, "stiffness per area"), self.normal_only)
 
 
-class TractionLoad(Section):
+class _TractionLoad(Section):
     """Force per undeformed area that keeps its direction."""
 
     kind: Literal["traction"]
@@ -341,7 +341,7 @@ class TractionLoad(Section):
         return loads.DeadTraction(self.on, _triple(self.traction, "stress", read))
 
 
-class PressureLoad(Section):
+class _PressureLoad(Section):
     """Pressure that follows the deformed surface; positive pushes inwards."""
 
     kind: Literal["pressure"]
@@ -373,7 +373,7 @@ class GravityLoad(Section):
         return loads.Gravity(_triple(self.acceleration, "acceleration", read))
 
 
-class PointLoadSection(Section):
+class _PointLoadSection(Section):
     """A force shared equally by the nodes of a set."""
 
     kind: Literal["point"]
@@ -384,7 +384,7 @@ class PointLoadSection(Section):
         return loads.PointLoad(self.on, _triple(self.force, "force", read))
 
 
-class MovingPatchLoad(Section):
+class _MovingPatchLoad(Section):
     """A force spread over a round patch of a surface, whose ``centre`` may move with a parameter.
 
     ``width`` is the standard deviation of its Gaussian density, at least about half an element.
@@ -401,7 +401,7 @@ class MovingPatchLoad(Section):
         return loads.MovingPatch(self.on, force, centre, self.width)
 
 
-class MovingLineLoad(Section):
+class _MovingLineLoad(Section):
     """A force per length along a straight line over a surface; ``centre`` may move with a parameter."""
 
     kind: Literal["moving_line"]
@@ -417,9 +417,15 @@ class MovingLineLoad(Section):
 
 
 SupportSection = Annotated[
-    FixedSupport | DisplacementSupport | RotationSupport | FoundationSupport, Field(discriminator="kind")
+    _FixedSupport | _DisplacementSupport | _RotationSupport | _FoundationSupport, Field(discriminator="kind")
 ]
 LoadSection = Annotated[
-    TractionLoad | PressureLoad | BodyForceLoad | GravityLoad | PointLoadSection | MovingPatchLoad | MovingLineLoad,
+    _TractionLoad
+    | _PressureLoad
+    | BodyForceLoad
+    | GravityLoad
+    | _PointLoadSection
+    | _MovingPatchLoad
+    | _MovingLineLoad,
     Field(discriminator="kind"),
 ]

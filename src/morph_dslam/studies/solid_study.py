@@ -40,7 +40,7 @@ from morph_dslam.studies.solid_sweep import SolidSweep, ViscousSweep
 Array = NDArray[np.float64]
 
 
-class SolidSolverSection(WorkSection):
+class _SolidSolverSection(WorkSection):
     """Elements and how the machine is used.
 
     ``order`` is that of the displacements, the cells' own if absent; ``formulation`` "mixed" gives nearly
@@ -64,7 +64,7 @@ class SolidStudy(Section):
     shape: tuple[ShapeSection, ...] = ()
     parameters: dict[str, ParameterSection] = Field(min_length=1)
     time: TimeSection | None = None
-    solver: SolidSolverSection = SolidSolverSection()
+    solver: _SolidSolverSection = _SolidSolverSection()
     sampling: SamplingSection = SamplingSection()
     reduction: ReductionSection = ReductionSection()
 

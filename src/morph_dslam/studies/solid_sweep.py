@@ -75,7 +75,7 @@ def follow(problem: SolidProblem, start: State, target: Array) -> State:
 
 
 @dataclass(frozen=True)
-class SolidState:
+class _SolidState:
     """A solution and its derivatives.
 
     Attributes
@@ -105,24 +105,24 @@ class SolidSweep:
         self._tangent: tuple[Array, Linearisation] | None = None
         self._solved: Array | None = None
 
-    def first_state(self) -> SolidState:
+    def first_state(self) -> _SolidState:
         """Equilibrium at the parameters' defaults, all loads grown together."""
         return self._with_slopes(loaded_state(self.problem, self.problem.symbols.default))
 
-    def pack(self, state: SolidState) -> dict[str, Array]:
+    def pack(self, state: _SolidState) -> dict[str, Array]:
         pivots = -1 if state.negative_pivots is None else state.negative_pivots
         return {"mu": state.mu, "dofs": state.dofs, "slopes": state.slopes, "pivots": np.array(pivots)}
 
-    def unpack(self, arrays: dict[str, Array]) -> SolidState:
+    def unpack(self, arrays: dict[str, Array]) -> _SolidState:
         pivots = int(arrays["pivots"])
-        state = SolidState(arrays["mu"], arrays["dofs"], arrays["slopes"], None if pivots < 0 else pivots)
+        state = _SolidState(arrays["mu"], arrays["dofs"], arrays["slopes"], None if pivots < 0 else pivots)
         if self._solved is None or not np.array_equal(self._solved, state.dofs):
             self._tangent = None  # its memory is needed for the next one
             self._tangent = state.mu, self.problem.linearise(state.dofs, state.mu)
             self._solved = state.dofs
         return state
 
-    def advance(self, start: SolidState, target: Array) -> SolidState:
+    def advance(self, start: _SolidState, target: Array) -> _SolidState:
         """Solve at ``target``: from the prediction of the sensitivities, or else in increments.
 
         If the tangent at ``start`` is still at hand it serves first.
@@ -138,14 +138,14 @@ class SolidSweep:
             state = follow(self.problem, State(start.mu, start.dofs), target)
         return self._with_slopes(state)
 
-    def _with_slopes(self, state: State) -> SolidState:
+    def _with_slopes(self, state: State) -> _SolidState:
         self._tangent = self._solved = None
         tangent = self.problem.linearise(state.dofs, state.mu)
         slopes = sensitivities(self.problem, state, tangent)
         self._tangent, self._solved = (state.mu, tangent), state.dofs
-        return SolidState(state.mu, state.dofs, slopes, tangent.negative_pivots)
+        return _SolidState(state.mu, state.dofs, slopes, tangent.negative_pivots)
 
-    def take_snapshot(self, state: SolidState) -> Snapshot:
+    def take_snapshot(self, state: _SolidState) -> Snapshot:
         """Fields at the nodes, their slopes, reactions, and the tangent's negative pivots."""
         snapshot = solid_snapshot(self.problem, state.dofs, state.mu, state.slopes)
         if state.negative_pivots is not None:
@@ -154,7 +154,7 @@ class SolidSweep:
 
 
 @dataclass(frozen=True)
-class ViscousSolution:
+class _ViscousSolution:
     """A solution and what the materials remember.
 
     Attributes
@@ -187,28 +187,28 @@ class ViscousSweep:
         self.problem, self._clock, self._step = problem, clock, step
 
     @cached_property
-    def _loaded(self) -> ViscousSolution:
+    def _loaded(self) -> _ViscousSolution:
         """The default state, an instant after loading."""
         mu = self.problem.symbols.default
         state = loaded_state(self.problem, mu)
         self.problem.advance_history(state.dofs, mu)
         return self._with_memory(state)
 
-    def first_state(self) -> ViscousSolution:
+    def first_state(self) -> _ViscousSolution:
         """The response to the default loads an instant after they came."""
         return self._loaded
 
-    def _with_memory(self, state: State) -> ViscousSolution:
+    def _with_memory(self, state: State) -> _ViscousSolution:
         assert self.problem.history is not None
-        return ViscousSolution(state.mu, state.dofs, self.problem.history.values())
+        return _ViscousSolution(state.mu, state.dofs, self.problem.history.values())
 
-    def pack(self, state: ViscousSolution) -> dict[str, Array]:
+    def pack(self, state: _ViscousSolution) -> dict[str, Array]:
         return {"mu": state.mu, "dofs": state.dofs, "memory": state.memory}
 
-    def unpack(self, arrays: dict[str, Array]) -> ViscousSolution:
-        return ViscousSolution(arrays["mu"], arrays["dofs"], arrays["memory"])
+    def unpack(self, arrays: dict[str, Array]) -> _ViscousSolution:
+        return _ViscousSolution(arrays["mu"], arrays["dofs"], arrays["memory"])
 
-    def advance(self, start: ViscousSolution, target: Array) -> ViscousSolution:
+    def advance(self, start: _ViscousSolution, target: Array) -> _ViscousSolution:
         """Follow time to ``target`` (d,): on from ``start`` where that is earlier on the same path."""
         assert self.problem.history is not None
         same_path = np.array_equal(np.delete(start.mu, self._clock), np.delete(target, self._clock))
@@ -230,7 +230,7 @@ class ViscousSweep:
         moment[self._clock] = time
         return moment
 
-    def take_snapshot(self, state: ViscousSolution) -> Snapshot:
+    def take_snapshot(self, state: _ViscousSolution) -> Snapshot:
         """Fields at the nodes and reactions; no derivatives."""
         assert self.problem.history is not None
         self.problem.history.restore(state.memory)

@@ -80,7 +80,7 @@ def _next(waiting: NDArray[np.bool_], distance: Array, path: Array) -> int:
     return int(equals[np.argmax(path[equals] <= shortest * (1.0 + TIE))])
 
 
-class FailedAttempts:
+class _FailedAttempts:
     """Small text files beside the snapshots, one for each attempt, that hold the reason.
 
     Parameters
@@ -142,7 +142,7 @@ def run_sweep(study: ParametricStudy, samples: Array, folder: Path, executor: Ex
     ):
         for path, reason in damaged.items():
             progress.write(f"{path} is damaged ({reason}): that sample is solved again", sys.stderr)
-        attempts = FailedAttempts(folder, keys)
+        attempts = _FailedAttempts(folder, keys)
         sweep = _Sweep(study, fingerprint, samples, paths, found, attempts, executor, progress)
         result = sweep.run()
     _check_reach(study, samples, result, folder)
@@ -180,7 +180,7 @@ class _Sweep:
         samples: Array,
         paths: list[Path],
         found: set[int],
-        attempts: FailedAttempts,
+        attempts: _FailedAttempts,
         executor: Executor,
         progress: tqdm,
     ) -> None:

@@ -19,7 +19,7 @@ SMALLEST_INCREMENT = 1.0 / 64.0
 
 
 @runtime_checkable
-class History(Protocol):
+class _History(Protocol):
     """Equations whose response depends on the path (internal variables): each accepted solution advances it."""
 
     def advance_history(self, x: Array, mu: Array) -> None: ...
@@ -72,7 +72,7 @@ def advance(equations: Equations, start: State, target: Array, tolerance: float 
 
     def attempt(fraction: float, nearby: State) -> State:
         state = solve(equations, origin + fraction * (goal - origin), nearby, tolerance)
-        if isinstance(equations, History):
+        if isinstance(equations, _History):
             equations.advance_history(state.dofs, state.mu)
         states.append(state)
         return state

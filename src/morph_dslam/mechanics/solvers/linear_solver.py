@@ -96,7 +96,7 @@ def _same_pattern(one: Matrix, other: Matrix) -> bool:
     return np.array_equal(one.indptr, other.indptr) and np.array_equal(one.indices, other.indices)
 
 
-class SparseCholesky:
+class _SparseCholesky:
     """NGSolve's sparse L D L^T, without pivoting."""
 
     def __init__(self) -> None:
@@ -176,7 +176,7 @@ BACKWARD_ERROR = 1e-14
 REFINEMENTS = 4
 ENVIRONMENT_VARIABLE = "MORPH_LINEAR_SOLVER"
 #: One library's factorisation of a square matrix; `factorise` replaces the one before.
-_Engine = Pardiso | SparseCholesky | SuperLU
+_Engine = Pardiso | _SparseCholesky | SuperLU
 
 
 def default_engine() -> str:
@@ -329,7 +329,7 @@ class LinearSolver:
         if (engine or default_engine()) == "pardiso":
             self.engine: _Engine = Pardiso(symmetric, threads)
         else:
-            self.engine = SparseCholesky() if symmetric else SuperLU(triangular=False)
+            self.engine = _SparseCholesky() if symmetric else SuperLU(triangular=False)
         self._block: _FreeBlock | None = None
         self._pattern: tuple[Integers, Integers] | None = None
         self._triangle: tuple[Integers, bool] | None = None
