@@ -112,7 +112,7 @@ def variants(model: ReducedModel, hats: tuple[int, ...]) -> dict[str, tuple[Redu
     """Models and estimators by the name of the row."""
 
     def of(functions) -> ReducedModel:
-        return replace(model, displacement=replace(model.displacement, functions=functions, compact=None))
+        return replace(model, displacement=replace(model.displacement, functions=functions))
 
     functions = model.displacement.functions
     rows: dict[str, tuple[ReducedModel, type[Counted]]] = {

@@ -29,19 +29,22 @@ import numpy as np
 import tensorly.decomposition as tensorly
 from numpy.typing import NDArray
 
+from affine_bar import AffineBar
 from morph_dslam import ReducedModel, load_study
 from morph_dslam.extend import run_and_report_errors
 from morph_dslam.extend.models import SeparatedField, chebyshev_basis
 from morph_dslam.extend.reduction import cp, cp_functions
 from morph_dslam.extend.studies import Snapshot, SolidStudy
 from morph_dslam.reduction.grid_functions import interpolation_nodes
-from morph_dslam.reduction.linear_solid import LinearSolid, linear_solid
 from morph_dslam.reduction.pod import Pod, compute_pod
-from morph_dslam.reduction.separation import SeparatedVector
 from morph_dslam.reduction.tensor_formats import CP, Tucker, tucker, tucker_functions
 from morph_dslam.studies.build import certified_model
 from morph_dslam.studies.defaults import resolve_defaults
+from morph_dslam.studies.executors import default_executor
+from morph_dslam.studies.sampling import held_out_samples
+from morph_dslam.studies.snapshots import load_snapshot
 from morph_dslam.studies.solutions import take_snapshots
+from morph_dslam.studies.sweep import run_sweep
 from peer_environment import peer_python
 
 Array = NDArray[np.float64]
@@ -50,7 +53,6 @@ HERE = Path(__file__).resolve().parent
 TOLERANCE = 1e-4
 #: What each of the project's methods is asked for.
 METHODS: dict[str, dict[str, Any]] = {
-    "pgd": {"max_modes": 60},
     "galerkin": {"max_modes": 60},
     "reduced_basis": {"max_modes": 60},
     "pod": {"max_modes": 60, "max_degree": 12},
@@ -100,53 +102,46 @@ def own_model(study: SolidStudy, held_out: Path, folder: Path) -> tuple[ReducedM
     return model, time.process_time() - began
 
 
-def run_pymor(solid: LinearSolid, training: Array, table: Table, folder: Path) -> None:
+def solve_held_out(study: SolidStudy, folder: Path) -> list[Snapshot]:
+    """The held-out solutions, left in a folder from which every method takes them."""
+    with default_executor(1) as processes:
+        solved = run_sweep(study, study.canonical(held_out_samples(study)), folder, processes).solved
+    return [load_snapshot(path) for _, path in sorted(solved.items())]
+
+
+def run_pymor(bar: AffineBar, training: Array, table: Table, folder: Path) -> None:
     """pyMOR's reduced models from the separated problem."""
     python = peer_python("pymor", "pymor>=2025")
-    middle = solid.load.box.mean(axis=1)
     problem, result = folder / "problem.npz", folder / "pymor.npz"
     np.savez(
         problem,
-        stiffness=solid.stiffness.vectors.T,
-        indices=solid.indices,
-        indptr=solid.indptr,
-        middle=solid.stiffness.value(middle),
-        loads=solid.load.vectors,
-        training_a=factors(solid.stiffness, training),
-        training_f=factors(solid.load, training),
-        unseen_a=factors(solid.stiffness, table.samples),
-        unseen_f=factors(solid.load, table.samples),
+        stiffness=bar.matrices,
+        indices=bar.indices,
+        indptr=bar.indptr,
+        middle=bar.stiffness(bar.box.mean(axis=1)),
+        loads=bar.loads,
+        training_a=bar.weights(training),
+        training_f=bar.load_weights(training),
+        unseen_a=bar.weights(table.samples),
+        unseen_f=bar.load_weights(table.samples),
         modes=MODES,
     )
     subprocess.run([python, HERE / "peers" / "pymor_reduction.py", problem, result], check=True)
     with np.load(result) as found:
         for name in ("pod", "greedy"):
             for count in MODES:
-                nodal = nodal_displacements(solid, found[f"{name}_{count}"])
+                nodal = bar.nodal_displacements(found[f"{name}_{count}"])
                 times = float(found[f"{name}_seconds"]), float(found[f"{name}_{count}_query"])
                 table.add(f"pyMOR {name} {count}", int(found[f"{name}_solves"]), count, nodal, *times)
 
 
-def factors(vector: SeparatedVector, samples: Array) -> Array:
-    """Products of the functions (n, Q) of a separated vector at samples (n, d)."""
-    return np.prod([vector.functions(k, samples[:, k]).T for k in range(samples.shape[1])], axis=0)
-
-
-def nodal_displacements(solid: LinearSolid, found: Array) -> Array:
-    """(n, n_nodes, 3) of solutions (n, n_free); no displacement is prescribed but zero."""
-    dofs = np.zeros((len(found), solid.problem.n_dofs))
-    dofs[:, solid.free] = found
-    return np.array([solid.problem.nodal_displacement(x) for x in dofs])
-
-
-def run_tensors(solid: LinearSolid, table: Table) -> None:
+def run_tensors(bar: AffineBar, table: Table) -> None:
     """CP and Tucker forms of the solutions on a grid, by the project and by tensorly."""
     began = time.process_time()
-    bases = tuple(chebyshev_basis(p.lower, p.upper, n - 1) for p, n in zip(solid.parameters, GRID, strict=True))
+    bases = tuple(chebyshev_basis(*ends, n - 1) for ends, n in zip(bar.box, GRID, strict=True))
     nodes = tuple(interpolation_nodes(basis) for basis in bases)
     grid = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, len(bases))
-    fields = nodal_displacements(solid, np.array([solid.solve(mu) for mu in grid]))
-    flat = fields.reshape(len(grid), -1)
+    flat = bar.solve(grid).reshape(len(grid), -1)
     pod = compute_pod(flat, np.ones(flat.shape[1]), 0.1 * TOLERANCE, 100)
     tensor = pod.project(flat).T.reshape(-1, *GRID)
     solving = time.process_time() - began
@@ -182,16 +177,16 @@ def run(arguments: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         held_out = folder / "held_out"
-        table = Table(take_snapshots(reduced_by(study, "pgd"), held_out, workers=1).held_out)
+        table = Table(solve_held_out(study, held_out))
         for method in arguments.methods:
             model, seconds = own_model(reduced_by(study, method), held_out, folder / method)
             solves = model.certificate["samples"]["training"]
             table.add_field(method, solves, model.displacement, seconds)
-        solid = linear_solid(study.sweep_problem())
-        box, rng = solid.load.box, np.random.default_rng(0)
+        bar = AffineBar.of(study.problem())
+        box, rng = bar.box, np.random.default_rng(0)
         training = box[:, 0] + rng.random((study.sampling.training, len(box))) * np.diff(box, axis=1).T
-        run_pymor(solid, training, table, folder)
-        run_tensors(solid, table)
+        run_pymor(bar, training, table, folder)
+        run_tensors(bar, table)
     print(" ".join(f"{key.replace(' ', '_')}={error:.2e}" for key, error in table.errors.items()))
 
 

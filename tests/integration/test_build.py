@@ -188,16 +188,6 @@ def test_changed_study_solves_again_only_what_it_must(built: Path) -> None:
     json.dumps(model.provenance)
 
 
-def test_little_memory_gives_the_same_model_from_blocks(built: Path) -> None:
-    """A megabyte holds a few of the solutions and their mirror images at a time."""
-    (built / "small.toml").write_text(STUDY.replace("max_degree = 3", "max_degree = 3\nmemory_gb = 1e-3"))
-    models = [build(built / name, built / "tiny.morph", executor=InProcess()) for name in ("study.toml", "small.toml")]
-    for mu in ([0.01, 0.9, 0.02, 0.0], [-0.006, 0.7, -0.05, 0.01]):
-        direct, blocked = (model.displacement.value(np.array(mu)) for model in models)
-        assert np.linalg.norm(blocked - direct) < 1e-3 * np.linalg.norm(direct)
-        assert not np.array_equal(blocked, direct)
-
-
 def test_samples_are_canonical(built: Path) -> None:
     """The tiny sheet's grips are at the middle of its edges: one octant of the box stands for all."""
     study = load_study(built / "study.toml")

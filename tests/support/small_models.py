@@ -6,7 +6,6 @@ import numpy as np
 
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.model.basis_functions import Basis
-from morph_dslam.model.separated import ComponentModes
 from tests.support.function_formats import SMOOTH, make_functions
 
 PARAMETERS = (
@@ -18,10 +17,7 @@ N = 3  # nodes along each edge
 
 
 def block_model(form: str, bases: tuple[Basis, ...] = SMOOTH) -> ReducedModel:
-    """A cube of 8 hex8 cells with random fields of every kind, its displacement in the format ``form``.
-
-    "by_component" names the form of the modes; their functions are Tucker's.
-    """
+    """A cube of 8 hex8 cells with random fields of every kind, its displacement in the format ``form``."""
     rng = np.random.default_rng(2)
     index = np.arange(N**3).reshape(N, N, N)
     nodes = np.stack(np.meshgrid(*[np.linspace(0.0, 0.1, N)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -31,11 +27,7 @@ def block_model(form: str, bases: tuple[Basis, ...] = SMOOTH) -> ReducedModel:
     top = index[:, :, -1]
     a, b, c, d = (part.ravel() for part in (top[:-1, :-1], top[1:, :-1], top[1:, 1:], top[:-1, 1:]))
     tucker = make_functions("tucker", 6, bases)
-    if form == "by_component":
-        compact = ComponentModes(rng.normal(size=(6, N**3)), np.array([0, 1, 1, 2, 2, 2]), 3)
-        displacement = SeparatedField.from_compact(compact, tucker)
-    else:
-        displacement = SeparatedField(rng.normal(size=(6, N**3, 3)), make_functions(form, 6, bases))
+    displacement = SeparatedField(rng.normal(size=(6, N**3, 3)), make_functions(form, 6, bases))
     return ReducedModel(
         name="block",
         nodes=nodes,

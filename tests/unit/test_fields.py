@@ -11,7 +11,6 @@ from morph_dslam.mechanics.point_location import material_points
 from morph_dslam.model import SeparatedField, SurfacePoints
 from morph_dslam.model.basis_functions import chebyshev_basis, cubic_spline_basis, fourier_basis
 from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
-from morph_dslam.model.separated import ComponentModes
 from morph_dslam.model.tensor_functions import CPFunctions, TensorTrainFunctions, TuckerFunctions
 from tests.support.bent_sheet import LENGTH, bending_stress_terms, bent_sheet_model, deflection_terms
 from tests.support.function_formats import FORMATS, LOWER, OTHERS, SMOOTH, UPPER, make_functions
@@ -94,7 +93,6 @@ def test_arrays_that_do_not_fit_are_refused():
         lambda: CPFunctions(SMOOTH, factors, np.eye(3)),
         lambda: TuckerFunctions(SMOOTH, factors, rng.normal(size=(4, 2, 2, 3))),
         lambda: TensorTrainFunctions(SMOOTH, tuple(rng.normal(size=(2, b.size, 2)) for b in SMOOTH)),
-        lambda: ComponentModes(np.zeros((1, 5)), np.array([2]), 2),
     ):
         with pytest.raises(ValueError):  # noqa: PT011
             make()

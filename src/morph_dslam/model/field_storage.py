@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.model.basis_functions import Basis
 from morph_dslam.model.functions import Functions, ParameterFunctions
-from morph_dslam.model.separated import ComponentModes, SeparatedField
+from morph_dslam.model.separated import SeparatedField
 from morph_dslam.model.tensor_functions import CPFunctions, ProductFunctions, TensorTrainFunctions, TuckerFunctions
 
 Array = NDArray[np.float64]
@@ -99,12 +99,8 @@ def read_number(group: h5py.Group, name: str) -> float:
 
 def write_field(group: h5py.Group, field: SeparatedField) -> None:
     """Write a field into an empty group."""
-    compact = field.compact
-    group.attrs["modes"] = "full" if compact is None else "by_component"
-    _write_single(group, "modes", field.modes if compact is None else compact.values)
-    if compact is not None:
-        group.attrs["n_components"] = compact.n_components
-        group.create_dataset("components", data=compact.components.astype(np.uint8))
+    group.attrs["modes"] = "full"
+    _write_single(group, "modes", field.modes)
     _write_functions(group.create_group("functions"), field.functions)
 
 
@@ -156,8 +152,20 @@ def read_field(group: h5py.Group, lower: Array, upper: Array) -> SeparatedField:
         return SeparatedField(read_array(group, "modes", 3), functions)
     if form != "by_component":
         raise ValueError(f"modes are kept in the unknown form '{form}'")
-    components, count = read_array(group, "components", 1, np.int64), int(read_number(group, "n_components"))
-    return SeparatedField.from_compact(ComponentModes(read_array(group, "modes", 2), components, count), functions)
+    return SeparatedField(_read_by_component(group), functions)
+
+
+def _read_by_component(group: h5py.Group) -> Array:
+    """Modes (k, n, c) that move one component each, as releases before 0.2.0 could write them."""
+    values, components = read_array(group, "modes", 2), read_array(group, "components", 1, np.int64)
+    count = int(read_number(group, "n_components"))
+    if count not in (3, 6) or len(components) != len(values):
+        raise ValueError(f"{len(components)} components, each one of {count}, do not fit modes {values.shape}")
+    if components.min(initial=0) < 0 or components.max(initial=0) >= count:
+        raise ValueError(f"a mode's component is not one of {count}")
+    modes = np.zeros((*values.shape, count))
+    modes[np.arange(len(modes)), :, components] = values
+    return modes
 
 
 def _read_basis(group: h5py.Group) -> Basis:

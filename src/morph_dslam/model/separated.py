@@ -45,17 +45,10 @@ class SeparatedField:
     ----------
     modes : (n_modes, n_points, n_components), the functions F_i at the points, in the field's SI unit.
     functions : the n_modes functions H_i, in any format.
-    compact : the same modes without their zeros, where each moves one component only; None otherwise.
     """
 
     modes: Array
     functions: Functions
-    compact: ComponentModes | None = None
-
-    @classmethod
-    def from_compact(cls, compact: ComponentModes, functions: Functions) -> SeparatedField:
-        """A field whose modes move one component each; the model file keeps them without zeros."""
-        return cls(compact.expand(), functions, compact)
 
     @property
     def n_modes(self) -> int:
@@ -64,8 +57,7 @@ class SeparatedField:
     @property
     def n_floats(self) -> int:
         """Numbers stored, for the compression factor."""
-        modes = self.modes.size if self.compact is None else self.compact.n_floats
-        return modes + self.functions.n_floats
+        return self.modes.size + self.functions.n_floats
 
     def inside(self, mu: ArrayLike) -> NDArray[np.bool_]:
         """Which parameters (d,) of ``mu`` (d,) lie in their range; always so for a periodic one."""
@@ -106,35 +98,3 @@ class SeparatedField:
         weights : (p, c) interpolation weights.
         """
         return self.with_modes(np.einsum("pc,mpcx->mpx", weights, self.modes[:, corners]))
-
-
-@dataclass(frozen=True)
-class ComponentModes:
-    """Modes that move one component each: all their other components are zero.
-
-    Attributes
-    ----------
-    values : (n_modes, n_points), the component that is not zero.
-    components : (n_modes,) which one that is.
-    n_components : of the field.
-    """
-
-    values: Array
-    components: NDArray[np.int64]
-    n_components: int
-
-    def __post_init__(self) -> None:
-        if self.values.ndim != 2 or self.components.shape != self.values.shape[:1]:
-            raise ValueError(f"{self.components.shape} components do not fit modes {self.values.shape}")
-        if self.components.min(initial=0) < 0 or self.components.max(initial=0) >= self.n_components:
-            raise ValueError(f"a mode's component is not one of {self.n_components}")
-
-    @property
-    def n_floats(self) -> int:
-        """The values, and the components: each is one byte of a number's four."""
-        return self.values.size + -(-len(self.components) // 4)
-
-    def expand(self) -> Array:
-        modes = np.zeros((*self.values.shape, self.n_components))
-        modes[np.arange(len(modes)), :, self.components] = self.values
-        return modes

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.mechanics.loads import with_reactions
 from morph_dslam.mechanics.solid import SolidProblem
-from morph_dslam.model import ReducedModel
+from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.model.basis_functions import chebyshev_basis
 from morph_dslam.model.functions import Functions
 from morph_dslam.reduction.galerkin import FullSolutions, ReducedSolver, solid_equations
@@ -28,11 +28,10 @@ from morph_dslam.reduction.grid_functions import (
     sizes_along_lines,
     values_on_grid,
 )
-from morph_dslam.reduction.pod import compute_pod, weighted
+from morph_dslam.reduction.pod import compute_pod, truncate
 from morph_dslam.reduction.registry import register_reduction
 from morph_dslam.reduction.sparse_expansion import ScatteredValues, expansion_train, fit_expansion, polynomial_functions
 from morph_dslam.reduction.task import ReductionTask, parameter_bases
-from morph_dslam.reduction.truncation import truncate
 from morph_dslam.studies.solid_sweep import solid_snapshot
 
 Array = NDArray[np.float64]
@@ -71,7 +70,7 @@ class FieldModes:
         """Coefficients (k,) of a field (n_points, n_components); what is left out is added to the tally."""
         flat = values.ravel()
         found = self._pod.project(flat)
-        square = float(flat @ weighted(flat, self._pod.weights))
+        square = float(flat @ (flat * self._pod.weights))
         self._square += square
         self._missed += max(square - float(found @ found), 0.0)
         return found
@@ -152,8 +151,9 @@ def reduce_by_galerkin(task: ReductionTask) -> ReducedModel:
     fields, summaries = {}, {}
     for name, part in sampled.parts.items():
         flat = dense.coefficients[part].reshape(part.stop - part.start, -1)
-        kept = truncate(task, name, modes[name].modes, flat)
-        fields[name] = kept.field(dense.functions(kept.rotation, part, task, SHARE * tolerance))
+        weights = task.weights(modes[name].modes.shape[1])
+        kept = truncate(modes[name].modes, flat, weights, tolerance, task.options.max_modes)
+        fields[name] = SeparatedField(kept.modes, dense.functions(kept.rotation, part, task, SHARE * tolerance))
         summaries[name] = {
             "modes": len(kept.modes),
             "singular_values": kept.singular_values[:60].tolist(),

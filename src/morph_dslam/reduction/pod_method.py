@@ -14,16 +14,15 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from morph_dslam.errors import StudyError
-from morph_dslam.model import ReducedModel
+from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.model.basis_functions import chebyshev_basis
 from morph_dslam.model.functions import Functions, ParameterFunctions
 from morph_dslam.reduction.grid_functions import EvenGrid, functions_on_grid
-from morph_dslam.reduction.pod import Pod, compute_pod
+from morph_dslam.reduction.pod import Pod, Truncation, compute_pod, truncate
 from morph_dslam.reduction.registry import register_reduction
 from morph_dslam.reduction.regression import fit_functions
 from morph_dslam.reduction.sparse_expansion import expansion_train
-from morph_dslam.reduction.task import FieldRows, ReductionTask, parameter_bases
-from morph_dslam.reduction.truncation import Truncation, truncate
+from morph_dslam.reduction.task import ReductionTask, parameter_bases
 from morph_dslam.studies.problem import Snapshot
 
 Array = NDArray[np.float64]
@@ -43,18 +42,21 @@ def reduce_by_pod(task: ReductionTask) -> ReducedModel:
     use_grid = grid is not None and task.options.basis in (None, *GRID_BASES) and task.options.format != "polynomial"
     fields, summaries = {}, {}
     for name in tqdm(task.field_names, desc="modes and functions", unit="field"):
-        rows = FieldRows(snapshots, name)
-        pod = _field_pod(task, rows)
-        # One snapshot at a time: all of them together may not fit in memory.
-        coefficients = np.array([pod.project(rows[i : i + 1])[0] for i in range(len(snapshots))])
-        kept = truncate(task, name, pod.modes.reshape(-1, *rows.field_shape), coefficients.T)
+        values = task.values(name)
+        shape, weights = values.shape[1:], task.weights(values.shape[1])
+        pod = _field_pod(task, values.reshape(len(values), -1), np.repeat(weights, shape[1]))
+        # One snapshot at a time: their weighted copies would be another array as large as all of them.
+        coefficients = np.array([pod.project(value.reshape(1, -1))[0] for value in values])
+        kept = truncate(
+            pod.modes.reshape(-1, *shape), coefficients.T, weights, task.options.tolerance, task.options.max_modes
+        )
         coefficients = coefficients @ kept.rotation.T
         if use_grid:
             assert grid is not None
             functions, summary = _interpolated(task, grid, coefficients)
         else:
             functions, summary = _fitted(task, coefficients, _slopes(snapshots, name, pod, kept))
-        fields[name] = kept.field(functions)
+        fields[name] = SeparatedField(kept.modes, functions)
         summaries[name] = summary | {"modes": len(kept.modes), "singular_values": kept.singular_values[:60].tolist()}
     return task.model(fields, {"method": "pod", **summaries["displacement"]})
 
@@ -79,12 +81,9 @@ def _check_choices(task: ReductionTask, grid: EvenGrid | None) -> None:
         )
 
 
-def _field_pod(task: ReductionTask, rows: FieldRows) -> Pod:
-    """More modes of a field in all snapshots than are kept; points count by the nodes' weights."""
-    n_points, n_components = rows.field_shape
-    weights, options = np.repeat(task.weights(n_points), n_components), task.options
-    most = MORE_MODES * options.max_modes
-    return compute_pod(rows, weights, FINER * options.tolerance, most, 1e9 * options.memory_gb)
+def _field_pod(task: ReductionTask, values: Array, weights: Array) -> Pod:
+    """More modes of a field (n_snapshots, n) than are kept."""
+    return compute_pod(values, weights, FINER * task.options.tolerance, MORE_MODES * task.options.max_modes)
 
 
 def _slopes(snapshots: list[Snapshot], name: str, pod: Pod, kept: Truncation) -> Array | None:

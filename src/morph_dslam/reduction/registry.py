@@ -22,7 +22,7 @@ Reduce = Callable[["ReductionTask"], "ReducedModel"]
 #: For a number of parameters, the names of formats and of bases that a method has, its default first.
 OfferedFunctions = Callable[[int], tuple[tuple[str, ...], tuple[str, ...]]]
 #: Modules that register the built-in methods.
-_BUILT_IN = ("galerkin_method", "pod_method", "sparse_pgd", "pgd_method")
+_BUILT_IN = ("galerkin_method", "pod_method", "sparse_pgd")
 
 
 @dataclass(frozen=True)
@@ -34,20 +34,16 @@ class ReductionMethod:
     name : as ``[reduction] method`` names it.
     reduce : makes a reduced model from a `ReductionTask`.
     equations : whether it needs the equations of a solid without memory.
-    solutions : whether it needs training solutions; held-out ones are always solved.
     adaptive : whether samples are chosen by the Galerkin model's estimated error, unless the study says otherwise.
     greedy : whether adaptive sampling solves one sample at a time, and begins with as few as can be.
-    modes : whether it keeps modes of the solutions, for which ``components`` and ``inner_product`` are meant.
     functions : formats and bases that a study may ask for; any, if None.
     """
 
     name: str
     reduce: Reduce
     equations: bool = False
-    solutions: bool = True
     adaptive: bool = False
     greedy: bool = False
-    modes: bool = True
     functions: OfferedFunctions | None = None
 
 

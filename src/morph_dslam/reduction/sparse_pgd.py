@@ -277,6 +277,4 @@ def _fit_field(task: ReductionTask, name: str, bases: tuple[Basis, ...]) -> tupl
     return SeparatedField(modes, functions), summary
 
 
-register_reduction(
-    "sparse_pgd", reduce_by_sparse_pgd, modes=False, functions=lambda dimension: (("cp",), get_args(BasisName))
-)
+register_reduction("sparse_pgd", reduce_by_sparse_pgd, functions=lambda dimension: (("cp",), get_args(BasisName)))

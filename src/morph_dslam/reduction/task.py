@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -145,19 +145,3 @@ def parameter_bases(name: BasisName, parameters: tuple[Parameter, ...], sizes: t
             'study has none: use "chebyshev"'
         )
     return tuple(parameter_basis(name, p, size) for p, size in zip(parameters, sizes, strict=True))
-
-
-class FieldRows:
-    """One field of all snapshots as rows (n_snapshots, n_points * n_components), gathered when sliced.
-
-    It stands for the array where that may not fit in memory (`morph_dslam.reduction.pod`).
-    """
-
-    def __init__(self, snapshots: Sequence[Snapshot], name: str) -> None:
-        self._snapshots, self._name = snapshots, name
-        self.field_shape = snapshots[0].fields[name].shape
-        self.shape = len(snapshots), int(np.prod(self.field_shape))
-
-    def __getitem__(self, rows: slice) -> Array:
-        values = [snapshot.fields[self._name].ravel() for snapshot in self._snapshots[rows]]
-        return np.array(values, dtype=np.float64)

@@ -80,12 +80,11 @@ def certified_model(snapshots: Snapshots, options: ReductionSection, name: str) 
     task = ReductionTask(
         snapshots.mesh, snapshots.parameters, training, options, name, snapshots.problem, snapshots.training_files
     )
-    announce(f"reducing {len(training)} solutions by method {method.name}" if training else f"method {method.name}")
+    announce(f"reducing {len(training)} solutions by method {method.name}")
     model = method.reduce(task)
     announce(f"measuring errors at {len(held_out)} held-out solutions")
     model.certificate.update(certify(model, held_out))
-    if training:  # a method that needs no solutions compresses none
-        model.certificate["compression_percent"] = compression_percent(model, len(training) + len(held_out))
+    model.certificate["compression_percent"] = compression_percent(model, len(training) + len(held_out))
     model.certificate["samples"] = _samples(snapshots)
     if method.adaptive:
         model.certificate["estimator"] = estimator_check(task, snapshots.held_out_files)

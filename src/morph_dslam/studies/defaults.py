@@ -67,7 +67,7 @@ def _sampling(sampling: SamplingSection, method: ReductionMethod, dimension: int
 
 
 def _check_functions(options: ReductionSection, method: ReductionMethod, dimension: int) -> None:
-    """Refuse a format, a basis or modes that a method does not have (StudyError)."""
+    """Refuse a format or a basis that a method does not have (StudyError)."""
     formats, bases = method.functions(dimension) if method.functions else (None, None)
     for key, asked, offered in (("format", options.format, formats), ("basis", options.basis, bases)):
         if asked is not None and offered is not None and asked not in offered:
@@ -78,9 +78,3 @@ def _check_functions(options: ReductionSection, method: ReductionMethod, dimensi
             )
     if options.format == "polynomial" and method.adaptive and options.basis not in (None, "chebyshev"):
         raise StudyError('reduction.format = "polynomial" has Chebyshev polynomials: leave out reduction.basis')
-    for key, default in (("components", "together"), ("inner_product", "mass")):
-        if not method.modes and getattr(options, key) != default:
-            raise StudyError(
-                f'reduction.{key} is for modes of solutions, and method "{method.name}" has products of its '
-                'own: leave it out, or use method "galerkin" or "pod"'
-            )

@@ -98,22 +98,17 @@ class ReductionSection(Section):
 
     ``method`` finds the functions of the parameters, ``format`` is how those of several parameters are kept
     and ``basis`` what those of a single one are made of; the study and the method choose where one is absent.
-    ``inner_product`` is that in which modes are orthogonal: "mass" counts nodes by their volume, "energy" by
-    the stiffness. ``components`` "separate" gives every component of a field modes of its own. Modes are kept
-    until the relative norm left out is below ``tolerance``, and at most ``max_modes``; ``max_degree`` is the
-    highest polynomial degree tried in the parameters. ``memory_gb`` is what a decomposition of snapshots may
-    take, in 1e9 bytes; more of them are decomposed in blocks.
+    Modes, in which nodes count by their volume, are kept until the relative norm left out is below
+    ``tolerance``, and at most ``max_modes``; ``max_degree`` is the highest polynomial degree tried in the
+    parameters.
     """
 
     method: str | None = None
     format: FormatName | None = None
     basis: BasisName | None = None
-    inner_product: Literal["mass", "energy"] = "mass"
-    components: Literal["together", "separate"] = "together"
     tolerance: float = Field(default=5e-4, gt=0, lt=1)
     max_modes: int = Field(default=24, ge=1)
     max_degree: int = Field(default=8, ge=1, le=40)
-    memory_gb: float = Field(default=4.0, gt=0, allow_inf_nan=False)
 
     @field_validator("method")
     @classmethod

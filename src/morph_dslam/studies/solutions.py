@@ -16,7 +16,6 @@ from morph_dslam.mechanics.loads import reaction_names, with_reactions
 from morph_dslam.model import Parameter
 from morph_dslam.reduction.adaptive_sampling import sample_adaptively
 from morph_dslam.reduction.certificate import stability_report
-from morph_dslam.reduction.registry import reduction_method
 from morph_dslam.studies.executors import default_executor
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.problem import ModelMesh, ParametricStudy, Snapshot, SweepProblem, bounds
@@ -87,9 +86,7 @@ def _solve(study: ParametricStudy, folder: Path, executor: Executor) -> Snapshot
         return run_sweep(study, study.canonical(samples), folder, executor)
 
     problem, rounds = cache(study.sweep_problem), []
-    if not reduction_method(study.reduction.method or "pod").solutions:
-        training = np.zeros((0, len(study.model_parameters())))
-    elif study.sampling.scheme == "adaptive":
+    if study.sampling.scheme == "adaptive":
         training, rounds = sample_adaptively(study, problem(), sweep)
     else:
         training = training_samples(study)
@@ -109,7 +106,7 @@ def _gather(
     mesh = study.model_mesh()
     training = _images(study, samples, result, range(n_training))
     held_out = _images(study, samples, result, range(n_training, len(samples)))
-    first_of_each = [group[0] for group in training or held_out]
+    first_of_each = [group[0] for group in training]
     names = reaction_names(first_of_each, float(np.linalg.norm(np.ptp(mesh.nodes, axis=0))))
     files = sorted(result.solved.items())
     return Snapshots(
