@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam import TrackOptions, track
+from morph_dslam import TrackerOptions, TrackOptions, track
 from morph_dslam.extend.registration import run_registration
 from registration_seeds import MODEL, PATH, mapped, scene_text
 from support import keep_sequence
@@ -72,8 +72,8 @@ def tracked(seed: int, pose: str) -> NDArray[np.float64]:
             model=MODEL,
             camera=camera,
             registration=registration / "registration.json",
-            pose=pose,  # type: ignore[arg-type]
             output=folder / "run",
+            tracker=TrackerOptions(pose=pose),  # type: ignore[arg-type]
             video=False,
             overwrite=True,
         )

@@ -161,7 +161,7 @@ def test_an_object_that_was_moved_is_said_to_be_and_is_followed_by_its_points(re
 
 def test_a_pose_that_is_held_is_the_maps(recording):
     folder, _ = recording
-    sheet = OneObject(folder, pose="fixed")
+    sheet = OneObject(folder, tracker=md.TrackerOptions(pose="fixed"))
     for frame in frames_of(folder, 44, 46):
         located = sheet.locate(frame)
         result = sheet.tracker.track(frame, located)
@@ -172,7 +172,7 @@ def test_a_pose_that_is_held_is_the_maps(recording):
 def test_a_free_object_is_known_by_the_maps_pictures_wherever_it_is(recording):
     """The camera stands on its head, where the map would not have the object."""
     folder, truth = recording
-    sheet = OneObject(folder, pose="free")
+    sheet = OneObject(folder, tracker=md.TrackerOptions(pose="free"))
     assert new_anchor(sheet.placed) is None
     half_turn = RigidTransform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
     width, height = sheet.camera.width, sheet.camera.height
@@ -186,6 +186,24 @@ def test_a_free_object_is_known_by_the_maps_pictures_wherever_it_is(recording):
     found, true = result.estimate.state.camera_from_object, half_turn @ true_pose(truth, 52)
     apart = (found.apply(sheet.model.nodes) - true.apply(sheet.model.nodes)).mean(axis=0)
     assert np.linalg.norm(apart) < 2.0 * MAP_ERROR
+
+
+def test_a_tracker_knows_from_the_scene_what_an_object_looks_like_and_where_it_is(recording):
+    """Frame by frame from Python; the first frame that is tracked is not the reference."""
+    folder, truth = recording
+    model, camera = md.load_model(folder / "sheet.morph"), md.load_camera(folder / "sequence" / "camera.yaml")
+    scene = md.load_scene(folder / "map.h5", camera)
+    n_points = len(scene.points)
+    registration = md.load_registration(folder / "registration.json", model, scene)
+    tracker = md.Tracker(model, camera, registration)
+    for frame in frames_of(folder, 44, 47):
+        result = tracker.track(frame)
+        assert (result.status, result.pose_from) == ("tracked", "points and map"), result.reason
+        assert result.estimate.state.parameters[0] == pytest.approx(truth["parameters"][frame.index, 0], abs=0.5e-3)
+        assert np.linalg.norm(result.pose.translation - true_pose(truth, frame.index).translation) < MAP_ERROR
+    assert len(scene.points) == n_points  # what can move was taken out of a copy
+    with pytest.raises(TrackingError, match="outline"):
+        md.Tracker(model, camera, registration, md.TrackerOptions(use_outline=True))
 
 
 def test_a_live_run_keeps_the_pace_and_everything_it_found(recording, tmp_path):
@@ -253,7 +271,7 @@ def test_inputs_that_do_not_fit_are_refused(recording, tmp_path):
     with pytest.raises(MapError, match="it has no keyframe 1234"):
         OneObject(folder, **moved, map_path=folder / "map.h5")
     with pytest.raises(TrackingError, match="a registration needs the map"):
-        md.track(options(folder, tmp_path / "run", **moved, pose="free", live=True))
+        md.track(options(folder, tmp_path / "run", **moved, tracker=md.TrackerOptions(pose="free"), live=True))
     (tmp_path / "registration.json").write_text(json.dumps(content))
     alone = OneObject(folder, **moved)
     assert new_anchor(alone.placed) is None

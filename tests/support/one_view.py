@@ -1,7 +1,7 @@
 """The systematic errors of points that were bound in one reference picture."""
 
-from morph_dslam.tracking.covariance import BoundPart, error_factors_of
-from morph_dslam.tracking.systematic_errors import SystematicErrors
+from morph_dslam.tracking.covariance import BoundPart
+from morph_dslam.tracking.systematic_errors import SystematicErrors, error_factors_of
 
 WINDOW = 17
 

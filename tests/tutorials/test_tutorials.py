@@ -56,6 +56,7 @@ def test_own_sheet():
 def test_own_solid_in_a_scanned_scene():
     names = run_page("tutorials/solid.md")
     assert np.abs(names["error"]).mean() < 0.2e-3
+    np.testing.assert_allclose(names["pushes"], names["found"], atol=0.1e-3)  # frame by frame as by the command
 
 
 def test_own_material_and_parameters():

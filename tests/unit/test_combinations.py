@@ -29,7 +29,7 @@ FREE_LID = ObjectOptions(model=Path("lid.morph"), landmarks=CSV)
         ({"registration": JSON}, "in one way"),
         ({"initializer": InitializerFiles(picture=TOML, guess=TOML), "landmarks": None}, "in one way"),
         ({"others": (("lid", replace(LID, landmarks=CSV)),)}, "in one way"),
-        ({"pose": "fixed"}, "--registration"),
+        ({"tracker": md.TrackerOptions(pose="fixed")}, "--registration"),
         ({"reregister_at": ((7, None),)}, "--reregister-at N=FILE"),
         ({"map_path": Path("map.h5")}, "a map needs"),
         *(({"others": ((name, LID),)}, "plain name") for name in ("", "..", "a/b", "plots")),
@@ -58,7 +58,7 @@ def test_what_makes_no_sense_together_is_refused(changes, named):
     "changes",
     [
         {},
-        {**REGISTERED, "map_path": Path("map.h5"), "pose": "fixed"},
+        {**REGISTERED, "map_path": Path("map.h5"), "tracker": md.TrackerOptions(pose="fixed")},
         {**BY_BOARD, "reregister_at": ((7, None), (9, CSV)), "live": True, "serve": 0, "seconds": 2.0},
         {"others": (("lid", LID),), "map_path": Path("map.h5"), "reference_frame": 3, "refine_reference": True},
         {"others": (("lid", FREE_LID),), "other_cameras": (Path("aside"),)},

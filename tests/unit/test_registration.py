@@ -223,7 +223,8 @@ def test_an_anchor_keeps_the_scene_and_needs_to_know_how_well_the_place_is_known
         Anchor(rigid_map, camera, {"sheet": (place, model), "again": (place, model)})
     anchor = Anchor(rigid_map, camera, {"sheet": (place, model)})
     assert (anchor.n_movable, anchor.n_scene) == (expected.sum(), (~expected).sum())
-    np.testing.assert_array_equal(rigid_map.good, ids[~expected])
+    np.testing.assert_array_equal(anchor.slam.map.good, ids[~expected])
+    np.testing.assert_array_equal(rigid_map.good, ids)  # what it was made from is left alone
 
 
 WORLD = SimilarityTransform(1.0, Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix(), np.array([0.5, -1.2, 2.0]))

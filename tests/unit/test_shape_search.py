@@ -9,7 +9,7 @@ from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.registration.landmarks import shape_starts
 from morph_dslam.registration.registration import PosePrior
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOptions, Estimator, State
-from morph_dslam.tracking.shape_search import ShapeSearch, with_unobservable_at_default
+from morph_dslam.tracking.frame_estimation import ShapeSearch, with_unobservable_at_default
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.bent_tube import bent_tube
 

@@ -94,6 +94,7 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
     from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
 
     tracker = TrackerOptions(
+        pose=arguments.pose,
         use_depth=arguments.depth,
         use_discrepancy=arguments.discrepancy,
         start=arguments.start,
@@ -111,9 +112,8 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
             model=Path(model),
             landmarks=None if is_registered else Path(start),
             registration=Path(start) if is_registered else None,
-            pose=arguments.pose if is_registered else "map",
             reregister_at=frames_of(name),
-            tracker=tracker,
+            tracker=tracker if is_registered else replace(tracker, pose="map"),
         )
         others.append((name, part))
     unknown = {of for of, _, _ in arguments.reregister_at} - {"", *(name for name, _ in others)}
@@ -128,7 +128,6 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
         registration=arguments.registration,
         initializer=InitializerFiles(arguments.board, arguments.picture, arguments.guess),
         map_path=arguments.map,
-        pose=arguments.pose,
         inner=tuple(arguments.inner),
         reregister_at=frames_of(""),
         tracker=replace(

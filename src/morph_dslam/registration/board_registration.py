@@ -215,9 +215,8 @@ def register_board(scene: Scene, model: ReducedModel, board: FiducialBoard | str
         "outline_share": None,
     }
     keyframes = [KeyframePose(view.frame, camera_from_object(view, placed)) for view in views]
-    return registration_in_map(
-        model, MapRegistration(placed, mean_node, _about(found.covariance, arm)), keyframes, facts
-    )
+    in_map = MapRegistration(placed, mean_node, _about(found.covariance, arm))
+    return registration_in_map(model, in_map, keyframes, facts, scene=scene)
 
 
 def _find_in_map(board: FiducialBoard, views: Sequence[View], camera: Camera) -> _BoardInMap:

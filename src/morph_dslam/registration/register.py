@@ -64,7 +64,7 @@ def register(
         "outline_share": found.outline.share if found.outline.count else None,
     }
     in_map = MapRegistration(found.world_from_object, nodes.mean(axis=0), found.covariance)
-    return registration_in_map(model, in_map, _keyframes(found, views), facts, found.warnings, found.axis)
+    return registration_in_map(model, in_map, _keyframes(found, views), facts, found.warnings, found.axis, scene)
 
 
 def without_points_on(

@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.errors import RegistrationError
+from morph_dslam.errors import MapError, RegistrationError
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, cross_matrix, rotation_exp, rotation_log
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.discrepancy import Discrepancy
@@ -22,11 +22,16 @@ from morph_dslam.registration.messages import Ambiguous, AngleOpen, OutlineElsew
 from morph_dslam.slam.pose import PoseEstimate
 from morph_dslam.tracking.state import Prior, State
 
+if TYPE_CHECKING:
+    from morph_dslam.slam.scene import Scene
+
 Array = NDArray[np.float64]
 #: No number of a registration is meant to be larger.
 LARGEST = 1e20
 #: Mean nodes that are farther apart than this share of the size belong to different objects.
 OTHER_OBJECT = 0.1
+#: Keyframes are placed anew by the registration, but never by so much: rad, and share of the distance.
+OTHER_MAP_TURN, OTHER_MAP_SHIFT = 0.1, 0.1
 
 
 @dataclass(frozen=True)
@@ -185,6 +190,7 @@ class Registration:
     keyframes : of the map, with the object's pose in each.
     axis : of revolution; None if the object has none.
     discrepancy : what the object's shape has beyond the model's in the frame; None where it is not known.
+    scene : whose map it is registered in; None where there is none, or only its file is known.
     """
 
     model: ReducedModel
@@ -198,6 +204,7 @@ class Registration:
     keyframes: tuple[KeyframePose, ...] = ()
     axis: Axis | None = None
     discrepancy: Discrepancy | None = None
+    scene: Scene | None = field(default=None, repr=False, compare=False)
 
     @property
     def ambiguous(self) -> bool:
@@ -216,7 +223,7 @@ class Registration:
         return tuple(sorted(known, key=lambda view: view.frame != self.frame))
 
     def content(self) -> dict[str, Any]:
-        """All but model and discrepancy as plain JSON: what `save` writes."""
+        """All but model, discrepancy and scene as plain JSON: what `save` writes."""
         content = {**self.facts, "ambiguous": self.ambiguous}
         content["warnings"] = [warning.content() for warning in self.warnings]
         if self.map_registration is None:
@@ -274,6 +281,7 @@ def registration_in_map(
     facts: dict[str, Any],
     warnings: Sequence[Notice] = (),
     axis: Axis | None = None,
+    scene: Scene | None = None,
 ) -> Registration:
     """The undeformed object in the last of the map's keyframes; of the arguments see `Registration`."""
     last = max(keyframes, key=lambda view: view.frame)
@@ -294,6 +302,7 @@ def registration_in_map(
         map_registration,
         tuple(keyframes),
         axis,
+        scene=scene,
     )
 
 
@@ -309,18 +318,21 @@ _NO_FACTS = {"ambiguous", "warnings", "parameters", "camera_from_object", "state
 _NO_FACTS |= {"mean_node_m", "covariance", "axis_of_revolution", "keyframes", "map", "model"}
 
 
-def load_registration(path: str | Path, model: ReducedModel | None = None) -> Registration:
+def load_registration(path: str | Path, model: ReducedModel | None = None, scene: Scene | None = None) -> Registration:
     """Read what `Registration.save` or `morph register` wrote.
 
     Parameters
     ----------
     path : of the file, ``registration.json``.
     model : that was registered; the one that the file names by default.
+    scene : that it was registered in (`load_scene`). Without it a tracker does not know what the object looks like.
 
     Raises
     ------
     RegistrationError
         If the file is missing, damaged, or of another object.
+    MapError
+        If it is of another scene.
     ModelFileError
         If the model that it names cannot be read.
     """
@@ -334,7 +346,24 @@ def load_registration(path: str | Path, model: ReducedModel | None = None) -> Re
         raise RegistrationError(f"{path} is not a registration.json of `morph register` ({error})") from error
     if registration.map_registration is not None:
         _check_model(registration.map_registration, model, path)
-    return registration
+    return registration if scene is None else in_scene(registration, scene)
+
+
+def in_scene(registration: Registration, scene: Scene) -> Registration:
+    """The registration with its scene; raises MapError if it was made in another one."""
+    keyframe = next((each for each in scene.map.keyframes if each.index == registration.frame), None)
+    name, in_map = scene.path or "the scene", registration.map_registration
+    if keyframe is None or in_map is None:
+        raise MapError(f"{name} is not the map of the registration: it has no keyframe {registration.frame}")
+    by_map, pose = in_map.pose_in(keyframe.camera_from_world), registration.state.camera_from_object
+    turn = np.linalg.norm(rotation_log(by_map.rotation @ pose.rotation.T))
+    shift = np.linalg.norm(by_map.translation - pose.translation)
+    if turn > OTHER_MAP_TURN or shift > OTHER_MAP_SHIFT * np.linalg.norm(pose.translation):
+        raise MapError(
+            f"{name} is not the map of the registration: by the map the object is {1e3 * shift:.0f} mm and "
+            f"{np.degrees(turn):.0f} deg from where the registration has it in keyframe {registration.frame}"
+        )
+    return replace(registration, scene=scene)
 
 
 def read_content(path: Path) -> dict[str, Any]:

@@ -54,6 +54,7 @@ class Scene:
     trajectory : the camera's path, by frame numbers (``indices``) and ``timestamps``
     frames : what each frame gave, without its points; empty where the scene was loaded
     slam : what made the map, and finds the camera in further frames; None where the scene was loaded
+    path : of the file that it was loaded from; None where it was just mapped
     """
 
     camera: Camera
@@ -61,6 +62,7 @@ class Scene:
     trajectory: Trajectory
     frames: tuple[SlamFrame, ...] = ()
     slam: Slam | None = None
+    path: Path | None = None
 
     @property
     def points(self) -> Array:
@@ -97,7 +99,7 @@ def load_scene(path: str | Path, camera: Camera) -> Scene:
 
     Raises MapError if the file is missing, damaged, empty, of another version, or of a camera with other intrinsics.
     """
-    return Scene(camera, *load_map_and_trajectory(Path(path), camera))
+    return Scene(camera, *load_map_and_trajectory(Path(path), camera), path=Path(path))
 
 
 def map_scene(

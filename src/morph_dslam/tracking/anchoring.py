@@ -20,7 +20,7 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.reduced_model import spread_over
 from morph_dslam.registration.landmarks import shape_starts
-from morph_dslam.registration.registration import MapRegistration, PosePrior
+from morph_dslam.registration.registration import MapRegistration, PosePrior, Registration
 from morph_dslam.slam.result import SlamFrame
 from morph_dslam.slam.rigid_map import RigidMap
 from morph_dslam.slam.slam import Slam
@@ -63,7 +63,8 @@ class Anchor:
 
     Parameters
     ----------
-    rigid_map : of the scene with the undeformed objects; what can move is taken out of it.
+    rigid_map : of the scene with the undeformed objects; what can move is taken out of a copy of it.
+    camera : that looks for itself in the map.
     objects : by name, the place in the map and the model.
 
     Attributes
@@ -90,9 +91,21 @@ class Anchor:
         _check_places(movable)
         taken = np.logical_or.reduce(list(movable.values()))
         self.n_movable, self.n_scene = int(taken.sum()), int((~taken).sum())
-        rigid_map.remove(good[taken])
+        still = RigidMap(rigid_map.baseline_px)
+        still.copy_of(rigid_map)
+        still.remove(good[taken])
         self.slam = Slam(camera)
-        self.slam.use_map(rigid_map)
+        self.slam.use_map(still)
+
+    @classmethod
+    def of(cls, registrations: Mapping[str, Registration], camera: Camera) -> Anchor:
+        """The scene that objects, by name, are registered in; raises RegistrationError as well if there is none."""
+        found = {name: known.map_registration for name, known in registrations.items()}
+        first = next(iter(registrations.values()))
+        placed = {name: (place, registrations[name].model) for name, place in found.items() if place is not None}
+        if first.scene is None or len(placed) < len(found):
+            raise RegistrationError("the registration has no scene to find the camera in: register in a mapped scene")
+        return cls(first.scene.map, camera, placed)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -150,7 +163,7 @@ class Anchoring:
         """What the map tells of the pose; None if the camera is lost or the object has moved."""
         if known is None or self.has_moved:
             return None
-        return known.prior(self._d, self._squared_px, HELD if self._options.hold_pose else 1.0)
+        return known.prior(self._d, self._squared_px, HELD if self._options.pose == "fixed" else 1.0)
 
     def contradicts(self, known: PosePrior, attempt: PoseHypothesis) -> bool:
         """Whether the points of a believable attempt show the object elsewhere than in the map.

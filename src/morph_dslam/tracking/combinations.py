@@ -8,6 +8,7 @@ from pathlib import Path
 from morph_dslam.errors import TrackingError
 from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.drawing import shown_field
+from morph_dslam.tracking.options import NO_DISCREPANCY
 from morph_dslam.tracking.outline import rim
 from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
 from morph_dslam.tracking.setup import TrackedObject
@@ -34,7 +35,7 @@ OF_OBJECT: tuple[tuple[Callable[[ObjectOptions], bool], str], ...] = (
         "say where the object is, in one way: by landmarks, a registration in a map, a board, a picture or a guess",
     ),
     (
-        lambda part: part.pose == "fixed" and part.registration is None,
+        lambda part: part.tracker.pose == "fixed" and part.registration is None,
         "a pose is held fixed by a map: give the object's registration in it, --registration",
     ),
     (
@@ -79,10 +80,7 @@ OF_RUN: tuple[tuple[Callable[[TrackOptions], bool], str], ...] = (
         lambda run: run.refine_reference and bool(run.other_cameras),
         "the reference is refined for one camera: leave out --refine or --with",
     ),
-    (
-        lambda run: bool(run.other_cameras) and any(part.tracker.use_discrepancy for part in run.objects),
-        "the discrepancy is estimated from one camera: leave out --discrepancy or --with",
-    ),
+    (lambda run: bool(run.other_cameras) and any(part.tracker.use_discrepancy for part in run.objects), NO_DISCREPANCY),
     (
         lambda run: (
             run.reference_frame is not None
@@ -109,7 +107,9 @@ def check_inputs(run: TrackOptions, objects: Sequence[TrackedObject]) -> None:
     """Raise TrackingError if options do not suit the objects."""
     for part in objects:
         _refuse(_unsuited(run, part))
-    maps = dict.fromkeys(str(part.map_path.resolve()) for part in objects if part.map_path is not None)
+    maps = dict.fromkeys(
+        str(p.scene.path.resolve()) for p in objects if p.scene is not None and p.scene.path is not None
+    )
     if len(maps) > 1:
         raise TrackingError(
             f"the objects are anchored in different maps, {' and '.join(maps)}: register them all in one"
@@ -138,7 +138,7 @@ def _unsuited(run: TrackOptions, part: TrackedObject) -> Iterable[str]:
             "a registration needs the map that it was made in, to know what the object looks like: give --map, and "
             "leave out --outline"
         )
-    if run.reference_frame is not None and run.other_cameras and not (part.keyframes and part.map_path):
+    if run.reference_frame is not None and run.other_cameras and not (part.keyframes and part.scene):
         yield "without its map a registration brings its own reference frame: leave out --reference-frame"
 
 

@@ -30,17 +30,6 @@ class BoundPart:
     error_factors: Array | None
 
 
-def error_factors_of(covariance: Array | None, scale: Array) -> Array | None:
-    """As many error_factors as unknowns (n, n) for a state of this covariance; None where it is not known.
-
-    ``scale`` (n,) of the unknowns makes them comparable.
-    """
-    if covariance is None or not np.isfinite(covariance).all():
-        return None
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64)
-
-
 #: Over these shares of the points' spread a model's errors are taken to be alike, and are pairs compared.
 ALIKE_SHARE, PAIR_SHARE = 0.75, 0.5
 #: The factor leaves no more than this of any point's variance.

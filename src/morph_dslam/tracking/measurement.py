@@ -133,8 +133,9 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
 
     Parameters
     ----------
-    pixels, depths, triangles, closed : see `rasterise`. coordinates : (m, 3, 2) column and row of each
-        triangle's corners in the texture, texture pixels; outside it is its border
+    pixels, depths, triangles, closed : see `rasterise`.
+    coordinates : (m, 3, 2) column and row of each triangle's corners in the texture, texture pixels; outside it is its
+        border
     texture : (H, W) uint8.
     image, depth : (h, w) uint8 and float32, the unit of ``depths``; changed where the surface is nearest.
     """

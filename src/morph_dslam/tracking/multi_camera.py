@@ -15,21 +15,20 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import RegistrationError
+from morph_dslam.errors import RegistrationError, TrackingError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import FIRST_SIGMA_PX, HELD, LEAST_SIGMA_PX, Anchor
-from morph_dslam.tracking.covariance import error_factors_of
 from morph_dslam.tracking.estimator import Estimate, EstimationOptions, Estimator, LinearCost, Prior, State
 from morph_dslam.tracking.frame_estimation import new_filter
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.levenberg_marquardt import minimise
 from morph_dslam.tracking.measurement import PATCH_WINDOW
 from morph_dslam.tracking.noise import RigObservations
-from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.options import NO_DISCREPANCY, TrackerOptions
 from morph_dslam.tracking.outcomes import (
     CameraIgnored,
     CameraLost,
@@ -41,8 +40,9 @@ from morph_dslam.tracking.outcomes import (
     Status,
     TrackingWarning,
 )
+from morph_dslam.tracking.reference import PosedImage
 from morph_dslam.tracking.result import STAGES, FrameResult
-from morph_dslam.tracking.systematic_errors import SystematicErrors, inverse_of_seen
+from morph_dslam.tracking.systematic_errors import SystematicErrors, error_factors_of, inverse_of_seen
 from morph_dslam.tracking.tracker import CameraLocalization, Tracker
 from morph_dslam.tracking.views import KeyframeViews
 
@@ -71,6 +71,11 @@ class RigCamera:
         rotation = self.camera_from_rig.rotation
         turn = np.asarray(scipy.linalg.block_diag(rotation, rotation))
         return PosePrior(self.camera_from_rig @ known.pose, turn @ known.from_camera @ turn.T, turn @ known.lasting)
+
+    def seen_image(self, image: PosedImage) -> PosedImage:
+        """What is known of an image in the rig's frame, in this camera's."""
+        chain, factors = self.chain(len(image.state.parameters)), image.error_factors
+        return replace(image, state=self.seen(image.state), error_factors=None if factors is None else chain @ factors)
 
     def in_rig(self, state: State) -> State:
         """The inverse of `seen`."""
@@ -225,7 +230,7 @@ class RigTracker:
     RegistrationError
         If the object shows too few corners in a reference frame.
     TrackingError
-        As `Tracker` does.
+        As `Tracker` does, or if the discrepancy is asked for, which is estimated from one camera.
     """
 
     def __init__(
@@ -243,10 +248,12 @@ class RigTracker:
     ) -> None:
         self.model = registration.model if registration.per_sequence else model
         self.cameras, self.options = tuple(cameras), options or TrackerOptions()
+        if self.options.use_discrepancy:
+            raise TrackingError(NO_DISCREPANCY)
         self.estimator = RigEstimator(self.model, self.cameras, self.options.estimation)
         error_factors = error_factors_of(registration.covariance, self.estimator.scale)
-        # What earlier frames add, and the discrepancy, are found from all cameras together.
-        single = replace(self.options, per_sequence=(), random_walk=(), use_discrepancy=False, new_views=False)
+        # What earlier frames add is found from all cameras together.
+        single = replace(self.options, per_sequence=(), random_walk=(), new_views=False)
         self.trackers: list[Tracker] = []
         for number, (part, image) in enumerate(zip(self.cameras, references, strict=True)):
             grey = image.grey if isinstance(image, Image) else image
@@ -355,7 +362,7 @@ class RigTracker:
             return None
         redundancy = np.mean([tracker.reference.redundancy for tracker in self.trackers])
         squared_px = float(redundancy) * self._sigma_px**2
-        return known.prior(len(self.model.parameters), squared_px, HELD if self.options.hold_pose else 1.0)
+        return known.prior(len(self.model.parameters), squared_px, HELD if self.options.pose == "fixed" else 1.0)
 
     def _together(
         self, results: list[FrameResult], prior: Prior | None

@@ -9,8 +9,13 @@ from morph_dslam.tracking.depth import SIGMA_AT_1M
 from morph_dslam.tracking.discrepancy import DiscrepancyOptions
 from morph_dslam.tracking.estimator import EstimationOptions
 
+#: How an object's pose is found: by the map and its points, by the map alone, by its points alone.
+PoseFrom = Literal["map", "fixed", "free"]
 #: Where the search for a frame's state starts.
 StartFrom = Literal["previous", "constant-velocity"]
+
+#: Why several cameras refuse it.
+NO_DISCREPANCY = "the discrepancy is estimated from one camera: leave out --discrepancy or --with"
 
 
 @dataclass(frozen=True)
@@ -29,7 +34,8 @@ class TrackerOptions:
     few_sigma_px : where less than half of all points support it, their residuals must spread less than this.
     least_anchored, anchored_share : where the map tells the pose, fewer points will do: at least this many,
         if they are this share of the points found and agree as closely as few must.
-    hold_pose : take the pose from the map as exact, and estimate the parameters only.
+    pose : of an object in a map: "map", the camera is found in the map and the object with it; "fixed", and the
+        map's pose is taken as exact; "free", it may be anywhere.
     moved_share, moved_sigmas, moved_patience : an anchored object has moved when its points show it farther
         off than this share of its size, and than so many standard deviations, in so many frames on end.
     look_every : a hidden object is looked for elsewhere in every so many frames.
@@ -56,7 +62,7 @@ class TrackerOptions:
     few_sigma_px: float = 1.0
     least_anchored: int = 12
     anchored_share: float = 0.7
-    hold_pose: bool = False
+    pose: PoseFrom = "map"
     moved_share: float = 0.02
     moved_sigmas: float = 5.0
     moved_patience: int = 3

@@ -16,7 +16,6 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.model.inner_structure import CarriedStructure
 from morph_dslam.registration.registration import Registration
 from morph_dslam.slam.frame_images import FrameImages
-from morph_dslam.slam.map_files import load_map
 from morph_dslam.sources import Frame, open_source
 from morph_dslam.tracking.anchoring import Anchor
 from morph_dslam.tracking.binding import DrawnSurface
@@ -25,12 +24,11 @@ from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
 from morph_dslam.tracking.occlusion import drawn_depth, widened
 from morph_dslam.tracking.options import TrackerOptions
-from morph_dslam.tracking.reference import PosedImage
 from morph_dslam.tracking.run_options import TrackOptions
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.setup import TrackedObject
 from morph_dslam.tracking.tracker import Tracker
-from morph_dslam.tracking.views import KeyframeViews, choose_keyframe_views
+from morph_dslam.tracking.views import KeyframeViews, choose_keyframe_views, image_of, registered_images
 
 #: Correlation of two contrast-normalized images that are the same but for the compression.
 SAME_IMAGE = 0.8
@@ -152,26 +150,15 @@ class PlacedObject:
             return self.registration.state
         pose = next((view.pose for view in self.registration.views if view.frame == frame), None)
         keyframe, in_map = keyframe_of.keyframes.get(frame), self.registration.map_registration
-        if pose is None and self.object.map_path is not None and in_map is not None and keyframe is not None:
+        if pose is None and self.object.scene is not None and in_map is not None and keyframe is not None:
             pose = in_map.pose_in(keyframe.camera_from_world)
         return None if pose is None else State(self.model.default, pose)
 
 
 def new_anchor(placed: Sequence[PlacedObject]) -> Anchor | None:
     """The map with the anchored objects in it; None if all are free."""
-    return _anchor([(part.object, part.registration) for part in placed], placed[0].camera)
-
-
-def _anchor(objects: Sequence[tuple[TrackedObject, Registration]], camera: Camera) -> Anchor | None:
-    paths = [part.map_path for part, _ in objects if part.map_path is not None]
-    if not paths:
-        return None
-    anchored = {
-        part.name: (registration.map_registration, registration.model)
-        for part, registration in objects
-        if part.map_path is not None and registration.map_registration is not None
-    }
-    return Anchor(load_map(paths[0], camera), camera, anchored)
+    anchored = {part.name: part.registration for part in placed if part.object.scene is not None}
+    return Anchor.of(anchored, placed[0].camera) if anchored else None
 
 
 def frame_at(path: Path | str, number: int | None) -> Frame:
@@ -194,7 +181,7 @@ def place(part: TrackedObject, cameras: Sequence[RigCamera], frames_at: FramesAt
     start, camera = part.start, cameras[0].camera
     number = start.frame if isinstance(start, Registration) else run.reference_frame
     if isinstance(start, Registration) and number is not None and number in part.keyframes:
-        image = part.keyframes[number].image
+        image = image_of(part.keyframes[number])
         others = _beside_keyframe(image, number, camera, frames_at) if len(cameras) > 1 else []
         # The frames may be those of another recording: the object is looked for as after a loss.
         return PlacedObject(part, tuple(cameras), start, (image, *others), number)
@@ -228,8 +215,7 @@ def place_by_map(part: TrackedObject, camera: Camera, frame: Frame) -> TrackedOb
     registration = part.start
     if not isinstance(registration, Registration):
         return part
-    anchor = _anchor([(part, registration)], camera)
-    assert anchor is not None
+    anchor = Anchor.of({part.name: registration}, camera)
     poses, found = anchor.locate(frame.image, frame.index, frame.timestamp)
     if part.name not in poses:
         raise RegistrationError(
@@ -259,14 +245,13 @@ def with_other_images(placed: Sequence[PlacedObject], recordings: Sequence[Path]
 def _with_other_images(own: PlacedObject, others: Sequence[PlacedObject], recordings: Sequence[Path]) -> PlacedObject:
     seen = tuple(seen_part(own, others, part, own.frame) for part in own.cameras)
     own = replace(own, seen=seen)
-    views = own.registration.views
-    numbers = [view.frame for view in views if view.frame in own.object.keyframes]
-    if not own.is_by_keyframe or len(numbers) < 2 or not own.options.further_views:
+    keyframes = own.object.keyframes
+    images = {v.frame: image_of(keyframes[v.frame]) for v in own.registration.views if v.frame in keyframes}
+    if not own.is_by_keyframe or len(images) < 2 or not own.options.further_views:
         return own
-    images = {number: own.object.keyframes[number].image for number in numbers}
     found = [_keyframe_views(own, others, own.cameras[0], images)]
     for part, path in zip(own.cameras[1:], recordings, strict=True):
-        found.append(_keyframe_views(own, others, part, images_from(path, part.camera, numbers)))
+        found.append(_keyframe_views(own, others, part, images_from(path, part.camera, list(images))))
     return replace(own, keyframes=tuple(found))
 
 
@@ -274,17 +259,10 @@ def _keyframe_views(
     own: PlacedObject, others: Sequence[PlacedObject], part: RigCamera, images: dict[int, Image]
 ) -> KeyframeViews:
     """What a camera has of the undeformed object beside the reference frame."""
-    d, chain = len(own.model.parameters), part.chain(len(own.model.parameters))
+    posed = [part.seen_image(image) for image in registered_images(own.registration, images)]
     first, *rest = [
-        PosedImage(
-            images[view.frame],
-            part.seen(State(own.model.default, view.pose)),
-            chain @ np.vstack([np.zeros((d, factors.shape[1])), factors]),
-            seen=seen_part(own, others, part, view.frame),
-            frame=view.frame,
-        )
-        for view in own.registration.views
-        if view.frame in images and (factors := view.error_factors) is not None
+        replace(image, seen=None if image.frame is None else seen_part(own, others, part, image.frame))
+        for image in posed
     ]
     return choose_keyframe_views(Estimator(own.model, part.camera), first, rest, own.options)
 

@@ -123,7 +123,8 @@ def choose_view(shares: Sequence[float], errors: Sequence[float], active: int) -
 
     Parameters
     ----------
-    shares : of the surface seen now that each view covers. errors : of each view's own state, metres.
+    shares : of the surface seen now that each view covers.
+    errors : of each view's own state, metres.
     active : the view followed so far.
     """
     better = [k for k, share in enumerate(shares) if share >= BACK_SHARE and errors[k] < errors[active]]
@@ -185,10 +186,13 @@ class ReferenceView:
 
     Attributes
     ----------
-    state : in the first view. surface : what of the model is drawn.
-    points : p of them, bound in the views. parts : which of them in which view, in order.
+    state : in the first view.
+    surface : what of the model is drawn.
+    points : p of them, bound in the views.
+    parts : which of them in which view, in order.
     pixels : (p, 2) where they are in the first view, hidden or not.
-    outline : the object's rim, None where it is not used. all_points : with those of the outline.
+    outline : the object's rim, None where it is not used.
+    all_points : with those of the outline.
     correlation : of the errors of all points' measurements.
 
     Raises
@@ -316,7 +320,8 @@ class ReferenceView:
 
         Returns
         -------
-        masks : (h, w) each, 255 where points may be bound in the picture. per_pixel : how many a pixel.
+        masks : (h, w) each, 255 where points may be bound in the picture.
+        per_pixel : how many a pixel.
         """
         drawn, closed, camera = self.surface.model, self.surface.closed, self._estimator.camera
         buffers = [draw_view(mesh, drawn.triangles, camera) for mesh in meshes]

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 from morph_dslam.registration.initialization import InitializerFiles
 from morph_dslam.registration.landmarks import CLICK_PX
 from morph_dslam.tracking.drawing import DrawOptions
 from morph_dslam.tracking.options import TrackerOptions
-
-#: How an object's pose is found: by the map and its points, by the map alone, by its points alone.
-PoseFrom = Literal["map", "fixed", "free"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,8 +21,6 @@ class ObjectOptions:
     landmarks : points of the object and their pixels in the reference frame.
     registration : registration.json of `morph register`.
     initializer : a board, a picture of its print or a guess, which find it in the reference frame.
-    pose : of a registered object: "map", the camera is found in the map and the object with it; "fixed", and the
-        map's pose is taken as exact; "free", it may be anywhere.
     reregister_at : frames in which to register it anew, with landmarks there, or None for the initializer.
     inner : structures inside of it (`morph inner`), whose positions are written and drawn.
     tracker : what is measured, and what earlier frames add.
@@ -36,7 +30,6 @@ class ObjectOptions:
     landmarks: Path | None = None
     registration: Path | None = None
     initializer: InitializerFiles = field(default_factory=InitializerFiles)
-    pose: PoseFrom = "map"
     reregister_at: tuple[tuple[int, Path | None], ...] = ()
     inner: tuple[Path, ...] = ()
     tracker: TrackerOptions = field(default_factory=TrackerOptions)

@@ -52,7 +52,8 @@ class _LeftPoints:
 
     Attributes
     ----------
-    by_point : (p, 2, k), as in `_Errors`. covariance : (k, k) from it.
+    by_point : (p, 2, k), as in `_Errors`.
+    covariance : (k, k) from it.
     """
 
     by_point: Array

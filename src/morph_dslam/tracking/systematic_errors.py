@@ -44,6 +44,20 @@ CLEARLY_WORSE = 2.0
 LARGEST_STRETCH = 5.0
 
 
+def error_factors_of(covariance: Array | None, scale: Array) -> Array | None:
+    """As many error factors as unknowns (n, n) for a state of this covariance; None where it is not known.
+
+    Parameters
+    ----------
+    covariance : (n, n) of the state.
+    scale : (n,) of the unknowns, which makes them comparable.
+    """
+    if covariance is None or not np.isfinite(covariance).all():
+        return None
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64)
+
+
 @dataclass(frozen=True)
 class Unexplained:
     """What the model leaves of the residuals.

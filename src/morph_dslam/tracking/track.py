@@ -279,8 +279,8 @@ def _refined(part: PlacedObject, keyframes: list[Keyframe]) -> PlacedObject:
 def _facts(run: TrackOptions, files: ObjectOptions, part: PlacedObject, results: RunResults) -> dict[str, Any]:
     """What the summary says of a run beside its results."""
     named = {"frames": run.frames, "model": files.model, "camera": run.camera, "landmarks": files.landmarks}
-    named |= {"registration": files.registration, **vars(files.initializer), "map": part.object.map_path}
-    options = part.options
+    scene, options = part.object.scene, part.options
+    named |= {"registration": files.registration, **vars(files.initializer), "map": scene and scene.path}
     return temporal_facts(part.model.parameters, options) | {
         "new_reference_views": {
             "allowed": options.new_views,
@@ -294,6 +294,6 @@ def _facts(run: TrackOptions, files: ObjectOptions, part: PlacedObject, results:
         "outline_used": options.use_outline,
         "depth_used": options.use_depth,
         "discrepancy_used": options.use_discrepancy,
-        "pose": "free" if part.object.map_path is None else files.pose,
+        "pose": "free" if scene is None else options.pose,
         "settings": {"click_px": run.click_px, "tracker": asdict(options)},
     }

@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
+from morph_dslam.errors import TrackingError
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import Anchor, Anchoring
-from morph_dslam.tracking.covariance import error_factors_of
 from morph_dslam.tracking.discrepancy import DiscrepancyFit
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
-from morph_dslam.tracking.frame_estimation import at_constant_velocity, new_filter
+from morph_dslam.tracking.frame_estimation import at_constant_velocity, new_filter, with_unobservable_at_default
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.measurement import Measurement
 from morph_dslam.tracking.options import TrackerOptions
@@ -43,9 +43,17 @@ from morph_dslam.tracking.patches import follow, normalize_contrast
 from morph_dslam.tracking.reference import PosedImage, ReferenceView
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.result import STAGES, FrameResult
-from morph_dslam.tracking.shape_search import with_unobservable_at_default
-from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE
-from morph_dslam.tracking.views import ActiveView, Change, KeyframeViews, ViewSet
+from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE, error_factors_of
+from morph_dslam.tracking.views import (
+    ActiveView,
+    Change,
+    KeyframeViews,
+    ViewSet,
+    choose_keyframe_views,
+    image_of,
+    registered_images,
+    registered_keyframes,
+)
 
 Array = NDArray[np.float64]
 
@@ -75,11 +83,12 @@ class Tracker:
     camera : its intrinsics and lens.
     registration : pose and parameters in the reference frame, and how well they are known.
     options : what is measured and what is demanded; defaults if None.
-    reference : (h, w, 3) uint8, the reference frame as recorded, or made ready; None if it is the first frame
-        that is tracked.
-    in_sequence : whether the first frame to track is the reference frame or follows it; if not, the object is
-        looked for as after a loss.
-    anchor : the map that the object is anchored in; None for a free object.
+    reference : (h, w, 3) uint8, the reference frame as recorded, or made ready; by default the keyframes of the
+        scene that the object is registered in or, without one, the first frame that is tracked.
+    in_sequence : whether the first frame to track is the reference frame or follows it; if not, as always after
+        keyframes, the object is looked for as after a loss.
+    anchor : the map that the object is anchored in; by default that of the keyframes, unless the options' pose is
+        free.
     seen : (h, w), where the reference frame shows the object; all that it covers by default.
     keyframes : other images of the object as it is in the reference frame; they bring the error of the
         registration with them.
@@ -94,9 +103,10 @@ class Tracker:
     Raises
     ------
     RegistrationError
-        If the object shows too few corners in the reference frame.
+        If the object shows too few corners in the reference frame, or its place in the scene has no covariance.
     TrackingError
-        If a per-sequence parameter, or one that walks, is not in the model.
+        If a per-sequence parameter, or one that walks, is not in the model; or the outline is asked for without a
+        reference frame, since keyframes hold no grey values.
     """
 
     def __init__(
@@ -121,6 +131,8 @@ class Tracker:
         self._discrepancy = DiscrepancyFit(self.model, camera, sought) if use else None
         self._filter = new_filter(self.estimator, self.options)
         self._unfiltered = np.zeros((len(self.model.parameters) + 6,) * 2)
+        if registration.scene is not None and reference is None:
+            reference, in_sequence = self._from_scene(), False
         self._lost, self._n_lost = not in_sequence, 0
         self.last_seen: Keyframe | None = None
         self._views: ViewSet | None = None
@@ -179,6 +191,19 @@ class Tracker:
             return CameraLocalization()
         poses, camera = self.anchor.locate(frame.image, frame.index, frame.timestamp)
         return CameraLocalization(next(iter(poses.values()), None), str(camera.reason or ""), camera.total_ms)
+
+    def _from_scene(self) -> Image:
+        """Take what the scene shows of the object, and its map, and return the reference image."""
+        known, options = self._registration, self.options
+        keyframes = {frame: image_of(view) for frame, view in registered_keyframes(known, options).items()}
+        if known.frame not in keyframes:
+            raise TrackingError("keyframes of a scene hold no grey values to look for the outline in: give reference")
+        if self._keyframes is None and options.further_views and len(known.views) > 1:
+            first, *others = registered_images(known, keyframes)
+            self._keyframes = choose_keyframe_views(self.estimator, first, others, options)
+        if self.anchor is None and options.pose != "free":
+            self.anchor = Anchor.of({self.model.name: known}, self.camera)
+        return keyframes[known.frame]
 
     # -- the steps of a frame -----------------------------------------------------------------------------
 

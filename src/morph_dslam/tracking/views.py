@@ -6,7 +6,7 @@ points agree closely and nearly all of them, the surface's place is known, and t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import RegistrationError
+from morph_dslam.registration.registration import Registration
+from morph_dslam.slam.rigid_map import Keyframe
 from morph_dslam.timing import stage
 from morph_dslam.tracking.binding import DrawnSurface, draw_view, view_of
-from morph_dslam.tracking.covariance import error_factors_of
 from morph_dslam.tracking.estimator import Estimate, Estimator, State
 from morph_dslam.tracking.frame_estimation import FrameEstimation
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
@@ -26,7 +27,7 @@ from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.recovery import Recovery
 from morph_dslam.tracking.reference import PosedImage, ReferenceView, SurfaceSamples, choose_view, covered_share
 from morph_dslam.tracking.sequence_filter import PointChange
-from morph_dslam.tracking.systematic_errors import UNEXPLAINED_PX, SystematicErrors
+from morph_dslam.tracking.systematic_errors import UNEXPLAINED_PX, SystematicErrors, error_factors_of
 
 Array = NDArray[np.float64]
 #: Share of the visible points that must agree, and the largest robust spread of their residuals, pixels.
@@ -67,8 +68,8 @@ def is_sharp(picture: Image, attempt: PoseHypothesis, should_be: Rendering, half
 
     Parameters
     ----------
-    should_be : that view in the state of the attempt. half : of the side of the squares about points in which
-        sharpness is compared, pixels.
+    should_be : that view in the state of the attempt.
+    half : of the side of the squares about points in which sharpness is compared, pixels.
     """
     near = around(picture, attempt.measurement.pixels[attempt.inliers], half)
     return sharpness(picture.normalized, near) > LEAST_SHARPNESS * sharpness(should_be.image, near)
@@ -79,7 +80,8 @@ def seen_part(picture: Image, attempt: PoseHypothesis, should_be: Rendering, vie
 
     Parameters
     ----------
-    attempt : made against ``view``. should_be : that view in the state of the attempt.
+    attempt : made against ``view``.
+    should_be : that view in the state of the attempt.
     """
     disagree = attempt.measurement.visible & ~attempt.inliers
     seen = np.isfinite(should_be.depth)
@@ -139,6 +141,40 @@ class KeyframeViews:
 
     error_factors: Array | None
     views: tuple[PosedImage, ...] = ()
+
+
+def registered_keyframes(registration: Registration, options: TrackerOptions) -> dict[int, Keyframe]:
+    """The keyframes of the scene by frame, if that of the registration can be the reference view.
+
+    Keyframes have contrast-normalized images only. The outline is looked for in grey values: then a frame has to
+    be the reference.
+    """
+    if registration.scene is None or options.use_outline:
+        return {}
+    return {keyframe.index: keyframe for keyframe in registration.scene.map.keyframes}
+
+
+def image_of(keyframe: Keyframe) -> Image:
+    """A keyframe's image as a tracker takes it."""
+    return Image(keyframe.normalized, keyframe.normalized)
+
+
+def registered_images(registration: Registration, images: Mapping[int, Image]) -> list[PosedImage]:
+    """The undeformed object in keyframes of the map, that of the registration first.
+
+    Parameters
+    ----------
+    registration : in the map.
+    images : of keyframes, by frame; others are left out.
+    """
+    model, found = registration.model, []
+    for view in registration.views:
+        if view.frame in images and view.error_factors is not None:
+            state = State(model.default, view.pose)
+            exact = np.zeros((len(model.parameters), view.error_factors.shape[1]))
+            factors = np.vstack([exact, view.error_factors])
+            found.append(PosedImage(images[view.frame], state, factors, frame=view.frame))
+    return found
 
 
 def choose_keyframe_views(
@@ -260,7 +296,8 @@ class Change:
 
     Attributes
     ----------
-    supported : (p,) which of its points to follow from this frame on. pixels : (p, 2) where they are.
+    supported : (p,) which of its points to follow from this frame on.
+    pixels : (p, 2) where they are.
     is_new : whether it was followed never before.
     """
 
@@ -276,7 +313,8 @@ class _BegunView:
 
     Attributes
     ----------
-    error : as in `ActiveView`. seen : of `SurfaceSamples` in it.
+    error : as in `ActiveView`.
+    seen : of `SurfaceSamples` in it.
     """
 
     reference: ReferenceView
@@ -321,8 +359,9 @@ class ViewSet:
 
         Parameters
         ----------
-        attempt : made against the active view. stated : its estimate with all errors in its
-            covariance. unexplained_px : see `new_view.is_known_well`.
+        attempt : made against the active view.
+        stated : its estimate with all errors in its covariance.
+        unexplained_px : see `new_view.is_known_well`.
         """
         self._n_frames, self._pause = self._n_frames + 1, max(self._pause - 1, 0)
         if not self._options.new_views:
