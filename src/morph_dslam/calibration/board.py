@@ -192,7 +192,9 @@ def select_by_coverage(
 
     Parameters
     ----------
-    corners : (n, 2) pixels in each view, row by row. columns : corners in a row. size : of the images.
+    corners : (n, 2) pixels in each view, row by row.
+    columns : corners in a row.
+    size : of the images.
 
     Returns
     -------

@@ -137,7 +137,8 @@ def calibrate(
 
     Parameters
     ----------
-    sources : images, one folder of images, or one video or other recording. output : the camera file.
+    sources : images, one folder of images, or one video or other recording.
+    output : the camera file.
 
     Raises CameraError if the board is found in too few images, images differ in size, the views do not determine the
     focal length, or the camera file cannot be written. Raises SourceError if an image or a video cannot be read.

@@ -54,7 +54,8 @@ class _ModelSurface:
 
     Attributes
     ----------
-    nodes : (n, 3) surface nodes at rest, metres. triangles : (m, 3) in these nodes.
+    nodes : (n, 3) surface nodes at rest, metres.
+    triangles : (m, 3) in these nodes.
     """
 
     def __init__(self, model: ReducedModel) -> None:

@@ -25,7 +25,8 @@ class VideoWriter:
     Parameters
     ----------
     path : where the video goes; a file of that name is replaced.
-    fps : frames per second. size : (width, height) in pixels.
+    fps : frames per second.
+    size : (width, height) in pixels.
 
     Raises
     ------

@@ -32,8 +32,10 @@ class CarriedStructure:
 
     Attributes
     ----------
-    name : of the structure. triangles : (m, 3) its surface.
-    rest : (p, 3) its nodes in the undeformed object, metres. field : their displacement.
+    name : of the structure.
+    triangles : (m, 3) its surface.
+    rest : (p, 3) its nodes in the undeformed object, metres.
+    field : their displacement.
     """
 
     name: str

@@ -33,8 +33,9 @@ def stability_report(
 
     Parameters
     ----------
-    samples : (n, d), SI. pivots : of each solved sample, the negative pivots of its tangent; None if they
-        are not known. parents : of every sample, the neighbour that the sweep tree joins it to, or -1.
+    samples : (n, d), SI.
+    pivots : of each solved sample, the negative pivots of its tangent; None if they are not known.
+    parents : of every sample, the neighbour that the sweep tree joins it to, or -1.
 
     Returns
     -------

@@ -153,7 +153,9 @@ class FullSolutions:
 
     Attributes
     ----------
-    samples : (n, d) parameters. states : (n, n_dofs). slopes : (n, d, n_dofs) of the states by parameters.
+    samples : (n, d) parameters.
+    states : (n, n_dofs).
+    slopes : (n, d, n_dofs) of the states by parameters.
     """
 
     samples: Array

@@ -39,8 +39,8 @@ class EvenGrid:
 
     Attributes
     ----------
-    counts : points along each parameter. order : (n,) the samples in the grid's order, the last parameter
-        running fastest.
+    counts : points along each parameter.
+    order : (n,) the samples in the grid's order, the last parameter running fastest.
     """
 
     counts: tuple[int, ...]

@@ -107,8 +107,9 @@ def fit_functions(
 
     Parameters
     ----------
-    samples : (n, d). values : (n, n_functions). gradients : (n, d, n_functions), by the parameters; None
-        where they are unknown.
+    samples : (n, d).
+    values : (n, n_functions).
+    gradients : (n, d, n_functions), by the parameters; None where they are unknown.
     groups : (n,) label of the fold that each sample is left out with; mirror images share one.
     gradient_weight : weight of gradients (over the half range) relative to values.
     raise_single : whether parameters may have higher degrees than the others where that predicts clearly

@@ -126,7 +126,8 @@ def expansion_train(
 
     Parameters
     ----------
-    indices : (n_terms, d), distinct. coefficients : (n_terms, n_functions).
+    indices : (n_terms, d), distinct.
+    coefficients : (n_terms, n_functions).
     """
     norms = [np.where((np.arange(b.size) > 0) & (b.kind == "chebyshev"), np.sqrt(0.5), 1.0) for b in bases]
     scale = np.prod([n[indices[:, k]] for k, n in enumerate(norms)], axis=0)

@@ -36,7 +36,8 @@ class Affine:
 
     Attributes
     ----------
-    constant : SI. slopes : (d,) by the parameters, SI.
+    constant : SI.
+    slopes : (d,) by the parameters, SI.
     """
 
     constant: float

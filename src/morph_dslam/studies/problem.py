@@ -46,7 +46,8 @@ class ModelMesh:
 
     Attributes
     ----------
-    nodes : (n, 3) undeformed, m. triangles : (t, 3) the visible surface.
+    nodes : (n, 3) undeformed, m.
+    triangles : (t, 3) the visible surface.
     cells : volume cells (m, k) by type; empty for sheets.
     weights : (n,) share of each node in the volume, or in a sheet's area; they sum to 1.
     """

@@ -39,7 +39,8 @@ def make_study(content: Mapping[str, Any], folder: str | Path = Path(), where: s
 
     Parameters
     ----------
-    content : sections and keys as in a study file. folder : what paths in it are relative to.
+    content : sections and keys as in a study file.
+    folder : what paths in it are relative to.
     where : what messages call it.
 
     Raises

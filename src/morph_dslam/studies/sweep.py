@@ -43,12 +43,15 @@ def neighbour_tree(
 
     Parameters
     ----------
-    samples : (n, d). scale : (d,) lengths in which steps are measured. root : (d,).
+    samples : (n, d).
+    scale : (d,) lengths in which steps are measured.
+    root : (d,).
     solved, failed : samples that may be started from already, and samples that nothing is to start from.
 
     Returns
     -------
-    order : the unsolved samples. parent : for every sample, another one or -1 for the root state.
+    order : the unsolved samples.
+    parent : for every sample, another one or -1 for the root state.
     """
     points = samples / scale
     distance = np.linalg.norm(points - root / scale, axis=1)
@@ -169,7 +172,8 @@ class _Sweep:
 
     Parameters
     ----------
-    paths : of the samples' files. found : samples whose files are there already.
+    paths : of the samples' files.
+    found : samples whose files are there already.
     attempts : those that failed, in this sweep and in earlier ones.
     """
 
