@@ -7,7 +7,7 @@ basis and the quadrature of the integral over it. Operators are symmetric and po
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,6 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.linalg import SuperLU, splu
 
-from morph_dslam.mechanics.solvers.linear_solver import Factorisation, LinearSolver
 from morph_dslam.model.basis_functions import Basis, hat_basis
 
 Array = NDArray[np.float64]
@@ -101,20 +100,11 @@ def factorise(matrix: sp.csc_array) -> SuperLU:
 
 
 class _SpaceOperators:
-    """Weighted sums of the matrices A_q, symmetric positive definite and of one pattern, analysed once."""
+    """Weighted sums of the matrices A_q, symmetric positive definite."""
 
-    def __init__(self, problem: SeparableProblem) -> None:
-        self.matrices = problem.matrices
-        self.n_terms = len(problem.matrices)
-        pattern: Any = sp.csr_array(reduce(lambda a, b: a + b, [abs(m) for m in problem.matrices]))
-        pattern.sort_indices()
-        self._indices, self._indptr = pattern.indices, pattern.indptr
-        self._data = np.stack([_data_in(pattern, m) for m in problem.matrices])
-        self._solver = LinearSolver(np.ones(pattern.shape[0], dtype=bool), symmetric=True)
-        self._single = self._factorise(np.ones(1)) if self.n_terms == 1 else None
-
-    def _factorise(self, weights: Array) -> Factorisation:
-        return self._solver.factorise(weights @ self._data, self._indices, self._indptr)
+    def __init__(self, matrices: tuple[sp.csc_array, ...]) -> None:
+        self.matrices, self.n_terms = matrices, len(matrices)
+        self._single = factorise(matrices[0]) if self.n_terms == 1 else None
 
     def apply(self, term: int, vectors: Array) -> Array:
         """A_q of a term times ``vectors`` (n, ...)."""
@@ -124,18 +114,8 @@ class _SpaceOperators:
         """Solve [sum_q weights_q A_q] x = right (n,)."""
         if self._single is not None:
             return self._single.solve(right) / weights[0]
-        return self._factorise(weights).solve(right)
-
-
-def _data_in(pattern: Any, matrix: sp.csc_array) -> Array:
-    """The entries of a matrix in the order of a pattern (CSR, sorted) that holds them all."""
-    entries: Any = sp.coo_array(matrix)
-    size = pattern.shape[1]
-    rows = np.repeat(np.arange(pattern.shape[0], dtype=np.int64), np.diff(pattern.indptr))
-    places = np.searchsorted(rows * size + pattern.indices, entries.row.astype(np.int64) * size + entries.col)
-    data = np.zeros(pattern.nnz)
-    np.add.at(data, places, entries.data)
-    return data
+        total: Any = sum(weight * matrix for weight, matrix in zip(weights, self.matrices, strict=True))
+        return factorise(total).solve(right)
 
 
 @dataclass(frozen=True)
@@ -162,7 +142,7 @@ class SeparatedSystem:
         """The system of a problem."""
         axes = problem.axes
         return cls(
-            _SpaceOperators(problem),
+            _SpaceOperators(problem.matrices),
             tuple(
                 np.stack([a.integrate(image) for image in images])
                 for a, images in zip(axes, problem.images, strict=True)
