@@ -48,14 +48,14 @@ def compute_pod(snapshots: Array, weights: Array, tolerance: float, max_modes: i
     root = np.sqrt(weights)
     factors: Any = scipy.linalg.qr((snapshots * root).T, mode="economic", overwrite_a=True)
     _, values, right = np.linalg.svd(factors[1].T, full_matrices=False)
-    kept = min(_rank(values, tolerance), max_modes)
+    kept = min(rank_for(values, tolerance * float(np.linalg.norm(values))), max_modes)
     return Pod(right[:kept] @ (factors[0].T / root), values, weights)
 
 
-def _rank(values: Array, tolerance: float) -> int:
-    """How many singular values to keep for the others' part of the norm to be at most the ``tolerance``."""
-    left_out = np.append(np.cumsum(values[::-1] ** 2)[::-1][1:], 0.0)
-    return int(np.argmax(left_out <= tolerance**2 * float(np.sum(values**2)))) + 1
+def rank_for(singular_values: Array, allowed: float) -> int:
+    """The smallest rank, at least one, whose tail of singular values has norm at most ``allowed``."""
+    tails = np.sqrt(np.cumsum(singular_values[::-1] ** 2))[::-1]
+    return max(1, int(np.sum(tails > allowed)))
 
 
 @dataclass(frozen=True)
@@ -93,8 +93,7 @@ def truncate(modes: Array, coefficients: Array, weights: Array, tolerance: float
     kept = lengths > RANK * max(lengths.max(), np.finfo(float).tiny)
     root, vectors = np.sqrt(lengths[kept]), vectors[:, kept]
     left, singular, _ = np.linalg.svd((root[:, None] * vectors.T) @ coefficients, full_matrices=False)
-    left_out = np.sqrt(np.cumsum(singular[::-1] ** 2))[::-1]
-    left = left[:, : min(max(1, int(np.sum(left_out > tolerance * left_out[0]))), max_modes)]
+    left = left[:, : min(rank_for(singular, tolerance * float(np.linalg.norm(singular))), max_modes)]
     return Truncation(
         np.tensordot((left / root[:, None]).T @ vectors.T, modes, axes=1),
         left.T @ (root[:, None] * vectors.T),

@@ -22,6 +22,7 @@ from tqdm import tqdm
 from morph_dslam.model.basis_functions import Basis, chebyshev_basis
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.model.tensor_functions import TensorTrainFunctions
+from morph_dslam.reduction.pod import rank_for
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -142,8 +143,7 @@ def expansion_train(
             cores.append(block)
             break
         left, values, right = np.linalg.svd(block.reshape(-1, block.shape[2]), full_matrices=False)
-        left_out = np.sqrt(np.cumsum(values[::-1] ** 2))[::-1]
-        rank = max(1, int(np.sum(left_out > allowed)))
+        rank = rank_for(values, allowed)
         cores.append(left[:, :rank].reshape(len(rest), basis.size, rank))
         rest, remaining = values[:rank, None] * right[:rank], tails
     cores = [np.ascontiguousarray(core / n[None, :, None]) for core, n in zip(cores, norms, strict=True)]

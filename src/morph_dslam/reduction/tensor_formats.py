@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.model.basis_functions import Basis
 from morph_dslam.model.tensor_functions import CPFunctions, TensorTrainFunctions, TuckerFunctions
+from morph_dslam.reduction.pod import rank_for
 
 Array = NDArray[np.float64]
 
@@ -81,12 +82,6 @@ def khatri_rao(factors: tuple[Array, ...]) -> Array:
     return result
 
 
-def _rank_for(singular_values: Array, allowed: float) -> int:
-    """The smallest rank, at least one, whose tail of singular values has norm at most ``allowed``."""
-    tails = np.sqrt(np.cumsum(singular_values[::-1] ** 2))[::-1]
-    return max(1, int(np.sum(tails > allowed)))
-
-
 def tensor_train(tensor: Array, tolerance: float) -> TensorTrain:
     """TT-SVD: one truncated SVD per cut, each with its share tolerance / sqrt(d) of the error."""
     shape, cores, rank = tensor.shape, [], 1
@@ -94,7 +89,7 @@ def tensor_train(tensor: Array, tolerance: float) -> TensorTrain:
     rest = tensor
     for size in shape[:-1]:
         left, values, right = np.linalg.svd(rest.reshape(rank * size, -1), full_matrices=False)
-        new = _rank_for(values, allowed)
+        new = rank_for(values, allowed)
         cores.append(left[:, :new].reshape(rank, size, new))
         rest, rank = values[:new, None] * right[:new], new
     cores.append(rest.reshape(rank, shape[-1], 1))
@@ -119,7 +114,7 @@ def tucker(tensor: Array, tolerance: float, sweeps: int = 2) -> Tucker:
     factors = []
     for axis in range(tensor.ndim):
         left, values = _leading_vectors(unfold(tensor, axis))
-        factors.append(left[:, : _rank_for(values, allowed)])
+        factors.append(left[:, : rank_for(values, allowed)])
     for _ in range(sweeps):
         for axis in range(tensor.ndim):
             others = multiply_axes(tensor, tuple(f.T for f in factors), skip=axis)
