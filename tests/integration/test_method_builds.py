@@ -13,24 +13,9 @@ from morph_dslam.cli import app as cli
 from morph_dslam.errors import StudyError
 from morph_dslam.model import load_model
 from morph_dslam.studies.defaults import resolve_defaults
-from tests.support.block_study import STUDY, write_study
+from tests.support.block_study import STUDY, bent_block, write_study
 
-BLOCK = {
-    "name": "rubber block",
-    "mesh": {"generator": "block", "size": ["20 mm", "20 mm", "60 mm"], "divisions": [2, 2, 6], "cells": "hex8"},
-    "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.4}},
-    "supports": [
-        {"kind": "fixed", "on": "z_min"},
-        {
-            "kind": "rotation",
-            "on": "z_max",
-            "axis": [0, 1, 0],
-            "angle": "bend",
-            "translation": ["0 mm", "0 mm", "-1 * squash"],
-        },
-    ],
-    "parameters": {"bend": {"range": ["-25 deg", "25 deg"]}, "squash": {"range": ["0 mm", "5 mm"]}},
-    "solver": {"threads": 1},
+BLOCK = bent_block(["20 mm", "20 mm", "60 mm"], [2, 2, 6], 0.4, "25 deg", "5 mm") | {
     "sampling": {"held_out": 6, "training": 24},
     "reduction": {"method": "reduced_basis", "tolerance": 1e-5},
 }

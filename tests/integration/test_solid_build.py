@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import re
+import tomllib
 
 import numpy as np
 import pytest
 
+from morph_dslam import build, load_study, make_study
 from morph_dslam.cli import app as cli
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.model import load_model
 from morph_dslam.studies.snapshots import load_snapshot
+from tests.support.block_study import sliding
 from tests.support.scenes import write_texture
 
 BLOCK = """
@@ -177,9 +180,7 @@ def test_a_closed_surface_has_no_outline_to_track(built, filmed, capsys):
 
 def test_uniaxial_stretch_reaches_the_closed_form_through_the_whole_chain(tmp_path):
     """E = 3 MPa, nu = 0.45, stretch 1.5: lateral stretch 0.830679, nominal stress 1.075843 MPa."""
-    text = BLOCK[: BLOCK.index("[[supports]]")]
-    for face, axis in (("x_min", "x"), ("y_min", "y"), ("z_min", "z")):
-        text += f'[[supports]]\nkind = "displacement"\non = "{face}"\n{axis} = "0 mm"\n'
+    text = BLOCK[: BLOCK.index("[[supports]]")] + sliding(("x_min", "x"), ("y_min", "y"), ("z_min", "z"))
     text += '[[supports]]\nkind = "displacement"\non = "z_max"\nz = "80 mm * stretch"\n'
     text += '[parameters.stretch]\nrange = [0.0, 0.6]\n[sampling]\nscheme = "even"\ntraining = 13\nheld_out = 5\n'
     text += "[reduction]\nmax_degree = 10\ntolerance = 1e-7\n"
@@ -223,17 +224,28 @@ def test_a_mistake_in_a_study_is_one_message(tmp_path, capsys, mistake):
     assert re.search(message, printed)
 
 
-def test_an_inverted_mesh_is_one_message(tmp_path, capsys):
-    inverted = "0 1 3 2 4 5 6 7"  # the top face crosses itself
+def write_cube(folder, nodes="1, 2, 4, 3, 5, 6, 8, 7", height=10):
+    """The study with a mesh file in place of the block: one cell of the nodes given."""
     lines = ["*NODE"] + [
-        f"{1 + i + 2 * j + 4 * k}, {10 * i}, {10 * j}, {10 * k}" for k in (0, 1) for j in (0, 1) for i in (0, 1)
+        f"{1 + i + 2 * j + 4 * k}, {10 * i}, {10 * j}, {height * k}" for k in (0, 1) for j in (0, 1) for i in (0, 1)
     ]
-    lines += ["*ELEMENT, TYPE=C3D8, ELSET=all_of_it", "1, " + ", ".join(str(1 + int(n)) for n in inverted.split())]
+    lines += ["*ELEMENT, TYPE=C3D8, ELSET=all_of_it", f"1, {nodes}"]
     lines += ["*NSET, NSET=z_min", "1, 2, 3, 4", "*NSET, NSET=z_max", "5, 6, 7, 8"]
-    (tmp_path / "cube.inp").write_text("\n".join(lines) + "\n")
+    (folder / "cube.inp").write_text("\n".join(lines) + "\n")
     start, end = BLOCK.index("generator"), BLOCK.index("[materials")
-    (tmp_path / "study.toml").write_text(BLOCK[:start] + 'file = "cube.inp"\nunit = "mm"\n' + BLOCK[end:])
-    assert cli.main(["build", str(tmp_path / "study.toml"), "-o", str(tmp_path / "x.morph")]) == 2
+    (folder / "study.toml").write_text(BLOCK[:start] + 'file = "cube.inp"\nunit = "mm"\n' + BLOCK[end:])
+    return folder / "study.toml"
+
+
+def test_a_mesh_file_that_was_written_again_is_read_again(tmp_path):
+    """In one process too, in a notebook say."""
+    heights = [load_study(write_cube(tmp_path, height=h)).model_mesh().nodes[:, 2].max() for h in (20, 30)]
+    np.testing.assert_allclose(heights, [0.02, 0.03])
+
+
+def test_an_inverted_mesh_is_one_message(tmp_path, capsys):
+    study = write_cube(tmp_path, "1, 2, 4, 3, 5, 6, 7, 8")  # the top face crosses itself
+    assert cli.main(["build", str(study), "-o", str(tmp_path / "x.morph")]) == 2
     assert re.search(r"morph: .*(inverted|folded|inside out)", capsys.readouterr().err)
 
 
@@ -242,8 +254,7 @@ def test_a_load_past_its_limit_point_names_the_last_value_that_converged(tmp_pat
     text = BLOCK[: BLOCK.index("generator")] + 'generator = "tube"\ninner_radius = "19 mm"\n'
     text += 'outer_radius = "21 mm"\nlength = "5 mm"\ndivisions = [1, 1, 6]\ncells = "hex20"\n'
     text += 'angles = ["0 deg", "90 deg"]\n' + BLOCK[BLOCK.index("[materials") : BLOCK.index("[[supports]]")]
-    for on, axis in (("bottom", "z"), ("top", "z"), ("start", "y"), ("end", "x")):
-        text += f'[[supports]]\nkind = "displacement"\non = "{on}"\n{axis} = "0 mm"\n'
+    text += sliding(("bottom", "z"), ("top", "z"), ("start", "y"), ("end", "x"))
     text += '[[loads]]\nkind = "pressure"\non = "inner"\npressure = "inside"\n'
     text += '[parameters.inside]\nrange = ["0 kPa", "150 kPa"]\n[solver]\nthreads = 1\n'
     text += '[sampling]\nscheme = "even"\ntraining = 16\nheld_out = 4\n'
@@ -259,10 +270,6 @@ def test_a_load_past_its_limit_point_names_the_last_value_that_converged(tmp_pat
 
 def test_python_states_the_same_study(built):
     """A dictionary in place of the file: the same solutions are found again, none is solved anew."""
-    import tomllib
-
-    from morph_dslam import build, load_study, make_study
-
     study = make_study(tomllib.loads(BLOCK))
     assert study == load_study(built / "study.toml")
     before = sorted((built / "block.morph.snapshots").glob("*.npz"))

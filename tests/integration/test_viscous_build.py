@@ -10,6 +10,7 @@ import pytest
 from morph_dslam import load_model
 from morph_dslam.cli import app as cli
 from morph_dslam.model import ReducedModel
+from tests.support.block_study import sliding
 
 BAR = """
 name = "bar"
@@ -23,18 +24,6 @@ law = "neo_hookean"
 young = "3 MPa"
 poisson = POISSON
 prony = { relative_moduli = [0.6], times = ["2 s"] }
-[[supports]]
-kind = "displacement"
-on = "x_min"
-x = "0 mm"
-[[supports]]
-kind = "displacement"
-on = "y_min"
-y = "0 mm"
-[[supports]]
-kind = "displacement"
-on = "z_min"
-z = "0 mm"
 [[supports]]
 kind = "displacement"
 on = "z_max"
@@ -58,7 +47,7 @@ tolerance = 1e-7
 
 def built(folder: Path, **words: str) -> ReducedModel:
     """The model of the bar with words of the study replaced."""
-    text = BAR
+    text = BAR + sliding(("x_min", "x"), ("y_min", "y"), ("z_min", "z"))
     for word, value in words.items():
         text = text.replace(word, value)
     (folder / "study.toml").write_text(text)

@@ -6,24 +6,9 @@ import pytest
 from morph_dslam.errors import StudyError
 from morph_dslam.reduction.galerkin import FullSolutions, ReducedSolver, balancing_weights, solid_equations
 from morph_dslam.studies.solid_study import SolidStudy
+from tests.support.block_study import bent_block
 
-BLOCK = {
-    "name": "block",
-    "mesh": {"generator": "block", "size": ["20 mm", "20 mm", "40 mm"], "divisions": [2, 2, 4], "cells": "hex8"},
-    "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.45}},
-    "supports": [
-        {"kind": "fixed", "on": "z_min"},
-        {
-            "kind": "rotation",
-            "on": "z_max",
-            "axis": [0, 1, 0],
-            "angle": "bend",
-            "translation": ["0 mm", "0 mm", "-1 * squash"],
-        },
-    ],
-    "parameters": {"bend": {"range": ["-30 deg", "30 deg"]}, "squash": {"range": ["0 mm", "5 mm"]}},
-    "solver": {"threads": 1},
-}
+BLOCK = bent_block(["20 mm", "20 mm", "40 mm"], [2, 2, 4], 0.45, "30 deg", "5 mm")
 BOX = np.array([[-np.pi / 6, np.pi / 6], [0.0, 0.005]])
 
 

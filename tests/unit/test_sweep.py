@@ -9,6 +9,7 @@ import pytest
 
 from morph_dslam.errors import StudyError
 from morph_dslam.studies import sweep
+from morph_dslam.studies.executors import SerialExecutor
 from morph_dslam.studies.problem import Snapshot
 from morph_dslam.studies.sample_task import SampleResult
 from morph_dslam.studies.sheet_study import SheetStudy
@@ -28,15 +29,6 @@ STUDY = SheetStudy.model_validate(
         },
     }
 )
-
-
-class AtOnce(Executor):
-    """Runs every task when it is submitted."""
-
-    def submit(self, fn, /, *args, **kwargs):
-        future: Future = Future()
-        future.set_result(fn(*args, **kwargs))
-        return future
 
 
 def row(bulges) -> np.ndarray:
@@ -61,7 +53,7 @@ def stand_in(monkeypatch, solvable):
 
 def test_each_sample_starts_from_its_solved_neighbour(monkeypatch, tmp_path):
     attempts = stand_in(monkeypatch, lambda bulge, origin: True)
-    result = sweep.run_sweep(STUDY, row([0.02, 0.012, 0.016, 0.008]), tmp_path, AtOnce())
+    result = sweep.run_sweep(STUDY, row([0.02, 0.012, 0.016, 0.008]), tmp_path, SerialExecutor())
     assert attempts == [(0.008, None), (0.012, 0.008), (0.016, 0.012), (0.02, 0.016)]
     assert len(result.solved) == 4
     assert not result.failed
@@ -70,7 +62,7 @@ def test_each_sample_starts_from_its_solved_neighbour(monkeypatch, tmp_path):
 def test_what_lies_behind_a_failure_is_reached_from_elsewhere(monkeypatch, tmp_path):
     """0.012 cannot be solved; what it would have led to is solved in the next pass from 0.008."""
     attempts = stand_in(monkeypatch, lambda bulge, origin: abs(bulge - 0.012) > 1e-9)
-    result = sweep.run_sweep(STUDY, row([0.008, 0.012, 0.016, 0.02]), tmp_path, AtOnce())
+    result = sweep.run_sweep(STUDY, row([0.008, 0.012, 0.016, 0.02]), tmp_path, SerialExecutor())
     assert sorted(result.solved) == [0, 2, 3]
     assert result.failed == {1: "no equilibrium"}
     assert (0.016, None) in attempts or (0.016, 0.008) in attempts
@@ -79,7 +71,7 @@ def test_what_lies_behind_a_failure_is_reached_from_elsewhere(monkeypatch, tmp_p
 
 def test_unreachable_samples_are_named(monkeypatch, tmp_path):
     stand_in(monkeypatch, lambda bulge, origin: bulge < 0.0125)
-    result = sweep.run_sweep(STUDY, row([0.006, 0.008, 0.012, 0.016, 0.02]), tmp_path, AtOnce())
+    result = sweep.run_sweep(STUDY, row([0.006, 0.008, 0.012, 0.016, 0.02]), tmp_path, SerialExecutor())
     assert sorted(result.solved) == [0, 1, 2]
     assert sorted(result.failed) == [3, 4]
 
@@ -87,16 +79,16 @@ def test_unreachable_samples_are_named(monkeypatch, tmp_path):
 def test_too_few_solved_is_an_error_that_names_the_first_failure(monkeypatch, tmp_path):
     stand_in(monkeypatch, lambda bulge, origin: bulge < 0.007)
     with pytest.raises(StudyError, match=r"only 1 of 4 samples .* no equilibrium\. .* kept in"):
-        sweep.run_sweep(STUDY, row([0.006, 0.012, 0.016, 0.02]), tmp_path, AtOnce())
+        sweep.run_sweep(STUDY, row([0.006, 0.012, 0.016, 0.02]), tmp_path, SerialExecutor())
     assert len(list(tmp_path.glob("*.npz"))) == 1
 
 
 def test_solved_samples_are_not_solved_again(monkeypatch, tmp_path):
     samples = row([0.008, 0.012, 0.016])
     stand_in(monkeypatch, lambda bulge, origin: True)
-    sweep.run_sweep(STUDY, samples, tmp_path, AtOnce())
+    sweep.run_sweep(STUDY, samples, tmp_path, SerialExecutor())
     attempts = stand_in(monkeypatch, lambda bulge, origin: True)
-    result = sweep.run_sweep(STUDY, samples, tmp_path, AtOnce())
+    result = sweep.run_sweep(STUDY, samples, tmp_path, SerialExecutor())
     assert attempts == []
     assert len(result.solved) == 3
 
@@ -104,12 +96,12 @@ def test_solved_samples_are_not_solved_again(monkeypatch, tmp_path):
 def test_damaged_files_are_named_and_solved_again(monkeypatch, tmp_path, capsys):
     samples = row([0.008, 0.012, 0.016])
     stand_in(monkeypatch, lambda bulge, origin: True)
-    first = sweep.run_sweep(STUDY, samples, tmp_path, AtOnce())
+    first = sweep.run_sweep(STUDY, samples, tmp_path, SerialExecutor())
     contents = [first.solved[sample].read_bytes() for sample in range(3)]
     first.solved[1].write_bytes(contents[1][:-20])
     attempts = stand_in(monkeypatch, lambda bulge, origin: True)
     capsys.readouterr()
-    again = sweep.run_sweep(STUDY, samples, tmp_path, AtOnce())
+    again = sweep.run_sweep(STUDY, samples, tmp_path, SerialExecutor())
     assert f"{first.solved[1]} is damaged (" in capsys.readouterr().err
     assert attempts == [(0.012, 0.008)]
     assert [again.solved[sample].read_bytes() for sample in range(3)] == contents
@@ -118,9 +110,9 @@ def test_damaged_files_are_named_and_solved_again(monkeypatch, tmp_path, capsys)
 def test_failed_attempts_are_not_repeated_by_the_next_build(monkeypatch, tmp_path):
     samples = row([0.008, 0.012, 0.016, 0.02])
     stand_in(monkeypatch, lambda bulge, origin: abs(bulge - 0.012) > 1e-9)
-    first = sweep.run_sweep(STUDY, samples, tmp_path, AtOnce())
+    first = sweep.run_sweep(STUDY, samples, tmp_path, SerialExecutor())
     attempts = stand_in(monkeypatch, lambda bulge, origin: True)
-    again = sweep.run_sweep(STUDY, samples, tmp_path, AtOnce())
+    again = sweep.run_sweep(STUDY, samples, tmp_path, SerialExecutor())
     assert attempts == []
     assert again == first
     assert again.failed == {1: "no equilibrium"}
@@ -129,9 +121,9 @@ def test_failed_attempts_are_not_repeated_by_the_next_build(monkeypatch, tmp_pat
 def test_more_samples_keep_those_solved_and_fill_in_between(monkeypatch, tmp_path):
     """A caller adds samples: only they are solved, each from its nearest neighbour, old or new."""
     stand_in(monkeypatch, lambda bulge, origin: True)
-    sweep.run_sweep(STUDY, row([0.008, 0.016]), tmp_path, AtOnce())
+    sweep.run_sweep(STUDY, row([0.008, 0.016]), tmp_path, SerialExecutor())
     attempts = stand_in(monkeypatch, lambda bulge, origin: True)
-    result = sweep.run_sweep(STUDY, row([0.008, 0.016, 0.013, 0.014]), tmp_path, AtOnce())
+    result = sweep.run_sweep(STUDY, row([0.008, 0.016, 0.013, 0.014]), tmp_path, SerialExecutor())
     assert attempts == [(0.013, 0.008), (0.014, 0.013)] or attempts == [(0.014, 0.016), (0.013, 0.014)]
     assert sorted(result.solved) == [0, 1, 2, 3]
 
@@ -168,12 +160,12 @@ def test_two_builds_in_one_folder_are_refused(monkeypatch, tmp_path):
 
     def solve_meanwhile(bulge, origin):
         with pytest.raises(StudyError, match=r"another build is solving in") as caught:
-            sweep.run_sweep(STUDY, samples, tmp_path, AtOnce())
+            sweep.run_sweep(STUDY, samples, tmp_path, SerialExecutor())
         inner.append(str(caught.value))
         return True
 
     stand_in(monkeypatch, solve_meanwhile)
-    assert len(sweep.run_sweep(STUDY, samples, tmp_path, AtOnce()).solved) == 2
+    assert len(sweep.run_sweep(STUDY, samples, tmp_path, SerialExecutor()).solved) == 2
     assert len(inner) == 2
 
 
@@ -210,7 +202,7 @@ def test_progress_counts_what_is_solved_now_for_the_time_left(monkeypatch, tmp_p
     """Samples found on disk are there from the start and say nothing of the rate."""
     samples = row(np.linspace(0.006, 0.02, 12))
     stand_in(monkeypatch, lambda bulge, origin: True)
-    sweep.run_sweep(STUDY, samples[:8], tmp_path, AtOnce())
+    sweep.run_sweep(STUDY, samples[:8], tmp_path, SerialExecutor())
     seen: list[tuple[int, int]] = []
     make = sweep.tqdm
 
@@ -219,6 +211,6 @@ def test_progress_counts_what_is_solved_now_for_the_time_left(monkeypatch, tmp_p
         return make(*args, **kwargs)
 
     monkeypatch.setattr(sweep, "tqdm", recorded)
-    sweep.run_sweep(STUDY, samples, tmp_path, AtOnce())
+    sweep.run_sweep(STUDY, samples, tmp_path, SerialExecutor())
     assert seen == [(8, 12)]
     assert "12/12" in capsys.readouterr().err
