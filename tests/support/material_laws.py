@@ -37,6 +37,17 @@ AXES = rotation(0.4, -0.3, 0.8)
 FIBRE, FIBRE_2 = np.array([0.6, 0.8, 0.0]), np.array([0.6, -0.64, 0.48])
 MODULI, EXPONENTS = (0.4, -0.1, 0.05), (1.6, -2.2, 5.0)
 ORTHO = {"e": (9.0, 4.0, 2.5), "n": (0.3, 0.25, 0.2), "g": (1.7, 1.2, 0.9)}
+#: A deformation gradient without any symmetry.
+BULGED = np.array([[1.3, 0.2, -0.1], [0.05, 0.85, 0.3], [0.15, -0.2, 1.1]])
+
+
+def orthotropic(**changed):
+    """The law with the constants of `ORTHO`, but for those that are given."""
+    pairs = ("12", "13", "23")
+    values = {f"young_{i}": e for i, e in zip("123", ORTHO["e"], strict=True)}
+    values |= {f"poisson_{pair}": n for pair, n in zip(pairs, ORTHO["n"], strict=True)}
+    values |= {f"shear_{pair}": g for pair, g in zip(pairs, ORTHO["g"], strict=True)}
+    return Orthotropic(**(values | changed))
 
 
 def user_energy(F, c10, c01):
@@ -72,11 +83,7 @@ LAWS = {
         partial(exact.ogden, moduli=MODULI, exponents=EXPONENTS, bulk=7.0),
     ),
     "orthotropic": (
-        Orthotropic(
-            young_1=9.0, young_2=4.0, young_3=2.5, poisson_12=0.3, poisson_13=0.25, poisson_23=0.2,
-            shear_12=1.7, shear_13=1.2, shear_23=0.9,
-            axis_1=tuple(AXES[:, 0]), axis_2=tuple(AXES[:, 1] + 0.3 * AXES[:, 0]),
-        ),
+        orthotropic(axis_1=tuple(AXES[:, 0]), axis_2=tuple(AXES[:, 1] + 0.3 * AXES[:, 0])),
         partial(exact.orthotropic, axes=AXES, **ORTHO),
     ),
     "transversely_isotropic": (
@@ -114,3 +121,13 @@ def tangent(material, F):
     """dP/dF (3, 3, 3, 3)."""
     F = tensor(F).MakeVariable()
     return evaluate(material.energy(F).Diff(F).Diff(F)).reshape(3, 3, 3, 3)
+
+
+def tangent_by_differences(exact_stress, F, h=1e-5):
+    """dP/dF (3, 3, 3, 3) of a closed form P(F), by central differences."""
+    differences = np.zeros((3, 3, 3, 3))
+    for i, j in np.ndindex(3, 3):
+        d = np.zeros((3, 3))
+        d[i, j] = h
+        differences[:, :, i, j] = (exact_stress(F + d) - exact_stress(F - d)) / (2.0 * h)
+    return differences

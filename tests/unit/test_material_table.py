@@ -10,10 +10,9 @@ from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden
 from morph_dslam.mechanics.materials.isotropic import MooneyRivlin, NeoHookean, Ogden
 from morph_dslam.mechanics.materials.library import constant_quantities, material_from_table
+from tests.support.material_laws import BULGED as F
 from tests.support.material_laws import stress
 from tests.support.real_data import ROOT
-
-F = np.array([[1.3, 0.2, -0.1], [0.05, 0.85, 0.3], [0.15, -0.2, 1.1]])
 
 
 def test_a_table_becomes_its_material():

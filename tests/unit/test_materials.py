@@ -7,12 +7,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.mechanics.materials.anisotropic import (
-    HolzapfelGasserOgden,
-    Orthotropic,
-    TransverselyIsotropic,
-    turned_direction,
-)
+from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden, TransverselyIsotropic, turned_direction
 from morph_dslam.mechanics.materials.base import evaluate, isotropic_average
 from morph_dslam.mechanics.materials.isotropic import (
     Gent,
@@ -29,10 +24,21 @@ from morph_dslam.mechanics.solid import SolidProblem
 from morph_dslam.mechanics.supports import fixed
 from morph_dslam.meshing.generators import block
 from tests.support.closed_form_stress import from_invariants, orthotropic_stiffness, volumetric
-from tests.support.material_laws import AXES, LAWS, energy, rotation, stress, tangent, tensor
+from tests.support.material_laws import (
+    AXES,
+    BULGED,
+    LAWS,
+    ORTHO,
+    energy,
+    orthotropic,
+    rotation,
+    stress,
+    tangent,
+    tangent_by_differences,
+    tensor,
+)
 from tests.support.solids import AffineSupport
 
-BULGED = np.array([[1.3, 0.2, -0.1], [0.05, 0.85, 0.3], [0.15, -0.2, 1.1]])
 STATES = {
     "uniaxial": np.diag([1.5, 0.85, 0.85]),
     "compressed": np.diag([0.75, 1.1, 1.1]),
@@ -56,13 +62,8 @@ def test_the_stress_is_that_of_the_closed_form(name, state):
 @pytest.mark.parametrize("state", ["uniaxial", "bulged"])
 def test_the_tangent_is_the_difference_quotient_of_the_closed_form(name, state):
     material, exact = LAWS[name]
-    F, h = STATES[state], 1e-5
-    differences = np.zeros((3, 3, 3, 3))
-    for i, j in np.ndindex(3, 3):
-        d = np.zeros((3, 3))
-        d[i, j] = h
-        differences[:, :, i, j] = (exact(F + d) - exact(F - d)) / (2.0 * h)
-    computed = tangent(material, F)
+    differences = tangent_by_differences(exact, STATES[state])
+    computed = tangent(material, STATES[state])
     np.testing.assert_allclose(computed, differences, rtol=0, atol=1e-7 * abs(differences).max())
 
 
@@ -113,12 +114,8 @@ def test_isotropic_laws_become_hookes_law_at_small_strain(name, bulk, shear):
 
 
 def test_orthotropy_in_the_axes_of_space_has_the_inverse_of_its_compliance():
-    values = {"e": (9.0, 4.0, 2.5), "n": (0.3, 0.25, 0.2), "g": (1.7, 1.2, 0.9)}
-    law = Orthotropic(
-        young_1=9.0, young_2=4.0, young_3=2.5, poisson_12=0.3, poisson_13=0.25, poisson_23=0.2,
-        shear_12=1.7, shear_13=1.2, shear_23=0.9,
-    )  # fmt: skip
-    np.testing.assert_allclose(law.small_strain_stiffness(), orthotropic_stiffness(**values), atol=1e-13)
+    expected = orthotropic_stiffness(**ORTHO)
+    np.testing.assert_allclose(orthotropic().small_strain_stiffness(), expected, atol=1e-13)
 
 
 def test_transverse_isotropy_has_its_five_constants_at_small_strain():
@@ -195,14 +192,6 @@ def test_fibres_that_do_not_suit_the_mesh_are_refused(directions):
         SolidProblem(block((1.0, 1.0, 1.0), (1, 1, 1), "tet4"), {"all": law}, [fixed("x_min")])
 
 
-def orthotropic(**changed):
-    values = {
-        "young_1": 9.0, "young_2": 4.0, "young_3": 2.5, "poisson_12": 0.3, "poisson_13": 0.25,
-        "poisson_23": 0.2, "shear_12": 1.7, "shear_13": 1.2, "shear_23": 0.9,
-    }  # fmt: skip
-    return Orthotropic(**(values | changed))
-
-
 HGO = {"shear": 0.5, "k1": 1.3, "k2": 0.7, "bulk": 7.0}
 
 
@@ -249,7 +238,7 @@ def test_unstable_constants_are_refused(material, message):
 def test_the_axes_of_orthotropy_are_those_given():
     law, _ = LAWS["orthotropic"]
     stretched = stress(law, np.eye(3) + 1e-7 * np.outer(AXES[:, 2], AXES[:, 2]))
-    expected = orthotropic_stiffness((9.0, 4.0, 2.5), (0.3, 0.25, 0.2), (1.7, 1.2, 0.9))[2, 2]
+    expected = orthotropic_stiffness(**ORTHO)[2, 2]
     assert AXES[:, 2] @ stretched @ AXES[:, 2] / 1e-7 == pytest.approx(expected, rel=1e-5)
 
 
@@ -298,12 +287,8 @@ def polynomial_stress(F):
 @pytest.mark.parametrize("eigenvalues", EIGENVALUES)
 def test_stress_and_tangent_are_exact_where_stretches_meet(eigenvalues):
     law = Ogden(moduli=(1.0, 1.0, 1.0), exponents=(2.0, 4.0, -2.0), bulk=10.0)
-    F, h = rotation(0.1, 0.2, 0.3) @ np.diag(np.sqrt(eigenvalues)) @ TURNED, 1e-5
-    differences = np.zeros((3, 3, 3, 3))
-    for i, j in np.ndindex(3, 3):
-        d = np.zeros((3, 3))
-        d[i, j] = h
-        differences[:, :, i, j] = (polynomial_stress(F + d) - polynomial_stress(F - d)) / (2.0 * h)
+    F = rotation(0.1, 0.2, 0.3) @ np.diag(np.sqrt(eigenvalues)) @ TURNED
+    differences = tangent_by_differences(polynomial_stress, F)
     size = abs(differences).max()
     np.testing.assert_allclose(stress(law, F), polynomial_stress(F), rtol=0, atol=1e-12 * size)
     np.testing.assert_allclose(tangent(law, F), differences, rtol=0, atol=1e-6 * size)

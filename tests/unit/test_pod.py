@@ -34,6 +34,14 @@ def test_modes_in_weights_are_those_of_numpy(tolerance: float) -> None:
     assert missed <= tolerance * np.linalg.norm(values) < np.linalg.norm(values[count - 1 :])
 
 
+def test_a_sum_of_three_fields_has_three_modes() -> None:
+    rng = np.random.default_rng(6)
+    snapshots = (rng.normal(size=(40, 3)) * [10.0, 1.0, 0.1]) @ rng.normal(size=(3, N))
+    pod = compute_pod(snapshots, np.ones(N), 1e-10, 20)
+    assert len(pod.modes) == 3
+    assert pod.project(snapshots) @ pod.modes == pytest.approx(snapshots, abs=1e-9)
+
+
 def test_fields_that_are_zero_everywhere_have_one_mode() -> None:
     pod = compute_pod(np.zeros((6, N)), np.ones(N), 1e-3, 5)
     assert len(pod.modes) == 1

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import platform
+import tomllib
 from dataclasses import replace
 from importlib.metadata import version
 
@@ -11,6 +12,7 @@ import numpy as np
 from morph_dslam import make_study
 from morph_dslam.studies.provenance import mesh_hash, provenance
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.block_study import STUDY
 from tests.support.stretched_block import stretched_block_model
 
 
@@ -28,18 +30,9 @@ def test_any_other_mesh_has_another_hash():
     assert len({mesh_hash(each) for each in [model, *others]}) == 4
 
 
-SOLID = {
-    "name": "block",
-    "mesh": {"generator": "block", "size": ["1 mm", "1 mm", "1 mm"], "divisions": [1, 1, 1]},
-    "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.0}},
-    "supports": [{"kind": "fixed", "on": "z_min"}],
-    "parameters": {"pull": {"range": ["0 kPa", "600 kPa"]}},
-}
-
-
 def test_versions_and_linear_solver(monkeypatch):
     monkeypatch.setenv("MORPH_LINEAR_SOLVER", "sparsecholesky")
-    facts = provenance("name = 'x'", make_study(SOLID), bent_sheet_model(3, 3))
+    facts = provenance("name = 'x'", make_study(tomllib.loads(STUDY)), bent_sheet_model(3, 3))
     assert facts["study"] == "name = 'x'"
     assert facts["linear_solver"] == "sparsecholesky"
     assert facts["versions"]["numpy"] == version("numpy")

@@ -1,5 +1,7 @@
 """A method of reduction of one's own: registered in a few lines, and named in a study."""
 
+import tomllib
+
 import numpy as np
 import pytest
 
@@ -33,8 +35,6 @@ def registered(monkeypatch):
 
 def test_a_method_of_ones_own_builds_a_model(registered, tmp_path):
     """Small loads move a block in proportion to them."""
-    import tomllib
-
     content = tomllib.loads(STUDY) | {
         "parameters": {"pull": {"range": ["0 kPa", "20 kPa"]}, "push": {"range": ["-0.1 kPa", "0.1 kPa"]}},
         "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.3}},

@@ -1,11 +1,10 @@
-"""Regression and POD against functions and decompositions known in closed form."""
+"""Regression against functions known in closed form."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from morph_dslam.reduction.pod import compute_pod
 from morph_dslam.reduction.regression import fit_functions
 
 LOWER, UPPER = np.array([-2.0, 0.5, 10.0]), np.array([1.0, 1.5, 40.0])
@@ -87,27 +86,3 @@ def test_too_high_a_degree_is_not_chosen_for_noisy_values() -> None:
     functions, errors = fit_functions(x, values, gradients, LOWER, UPPER, 8, np.arange(80))
     assert functions.multi_indices.sum(axis=1).max() <= 4
     assert errors[2] < errors[max(errors)]
-
-
-def test_pod_finds_the_rank_and_keeps_the_weights() -> None:
-    rng = np.random.default_rng(6)
-    weights = rng.uniform(0.5, 2.0, 90)
-    left, right = rng.normal(size=(40, 3)), rng.normal(size=(3, 90))
-    snapshots = (left * [10.0, 1.0, 0.1]) @ right
-    pod = compute_pod(snapshots, weights, tolerance=1e-10, max_modes=20)
-    assert len(pod.modes) == 3
-    assert (pod.modes * weights) @ pod.modes.T == pytest.approx(np.eye(3), abs=1e-12)
-    assert pod.project(snapshots) @ pod.modes == pytest.approx(snapshots, abs=1e-9)
-
-
-def test_pod_error_equals_the_singular_values_left_out() -> None:
-    """Eckart-Young: the best rank-r error is the root of the discarded squared singular values."""
-    rng = np.random.default_rng(7)
-    snapshots = rng.normal(size=(30, 60)) * np.exp(-0.3 * np.arange(60))
-    singular = np.linalg.svd(snapshots, compute_uv=False)
-    pod = compute_pod(snapshots, np.ones(60), tolerance=0.05, max_modes=60)
-    count = len(pod.modes)
-    missed = np.linalg.norm(snapshots - pod.project(snapshots) @ pod.modes)
-    assert missed == pytest.approx(np.sqrt(np.sum(singular[count:] ** 2)), rel=1e-9)
-    total = np.linalg.norm(singular)
-    assert missed <= 0.05 * total < np.sqrt(np.sum(singular[count - 1 :] ** 2))

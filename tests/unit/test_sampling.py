@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import tomllib
 from typing import Any
 
 import numpy as np
@@ -13,17 +14,17 @@ from morph_dslam.studies.problem import bounds
 from morph_dslam.studies.sampling import candidate_samples, held_out_samples, training_samples
 from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.studies.study import make_study
+from tests.support.block_study import STUDY
 
 
 def study(sampling: dict[str, Any], parameters: int = 3) -> SolidStudy:
     names = ("pull", "push", "lift")[:parameters]
     ranges = (("0 kPa", "600 kPa"), ("-30 kPa", "30 kPa"), ("10 kPa", "20 kPa"))
     made = make_study(
-        {
-            "name": "block",
-            "mesh": {"generator": "block", "size": ["2 mm", "2 mm", "6 mm"], "divisions": [1, 1, 1]},
+        tomllib.loads(STUDY)
+        | {
             "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.3}},
-            "supports": [{"kind": "fixed", "on": "z_min"}],
+            "loads": [],
             "parameters": {name: {"range": ends} for name, ends in zip(names, ranges, strict=False)},
             "sampling": sampling,
         }

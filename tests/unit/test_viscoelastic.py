@@ -7,9 +7,9 @@ from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.materials.isotropic import NeoHookean
 from morph_dslam.mechanics.materials.viscoelastic import Prony
 from tests.support import closed_form_stress as exact
+from tests.support.material_laws import BULGED as F_HELD
 from tests.support.solids import PrescribedCells
 
-F_HELD = np.array([[1.3, 0.2, -0.1], [0.05, 0.85, 0.3], [0.15, -0.2, 1.1]])
 ELASTIC = NeoHookean(young=3.0, poisson=0.3)
 MATERIAL = NeoHookean(young=3.0, poisson=0.3, prony=Prony((0.3, 0.2), (0.5, 4.0), (0.0, 0.0)))
 
