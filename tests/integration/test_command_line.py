@@ -12,8 +12,8 @@ import yaml
 
 from morph_dslam import load_model
 from morph_dslam.cli import app as cli
+from morph_dslam.io.checksum import write_checksum
 from morph_dslam.io.video import VideoWriter
-from morph_dslam.model.storage import write_checksum
 from tests.support.real_data import ROOT
 from tests.support.scenes import write_scene
 
@@ -133,7 +133,7 @@ def newer_model(folder, tmp_path):
     shutil.copyfile(folder / "sheet.morph", tmp_path / "newer.morph")
     with h5py.File(tmp_path / "newer.morph", "r+") as file:
         file.attrs["version"] = 7
-    write_checksum(tmp_path / "newer.morph")
+    write_checksum(tmp_path / "newer.morph", "morph-dslam reduced model")
     return {"model": tmp_path / "newer.morph"}
 
 

@@ -10,8 +10,8 @@ import pytest
 
 from morph_dslam.cli import app as cli
 from morph_dslam.errors import ModelFileError
+from morph_dslam.io.checksum import write_checksum
 from morph_dslam.model import SeparatedField, load_model, save_model
-from morph_dslam.model.storage import write_checksum
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.function_formats import FORMATS, OTHERS, SMOOTH, make_functions
 from tests.support.small_models import block_model
@@ -76,7 +76,7 @@ def change(path, edit):
     """Edit a file and renew its checksum, as a faulty writer would."""
     with h5py.File(path, "r+") as file:
         edit(file)
-    write_checksum(path)
+    write_checksum(path, "morph-dslam reduced model")
 
 
 def by_component(file, components=(0, 1, 1, 2, 2, 2), count=3):
@@ -111,7 +111,7 @@ def test_other_files_are_refused(tmp_path):
     with pytest.raises(ModelFileError, match="there is no model file"):
         load_model(tmp_path)
     (tmp_path / "text.morph").write_text("not a model")
-    with pytest.raises(ModelFileError, match=r"damaged or cut short .*does not begin as a model file"):
+    with pytest.raises(ModelFileError, match=r"damaged or cut short .*does not begin as such a file"):
         load_model(tmp_path / "text.morph")
     with h5py.File(tmp_path / "other.morph", "w") as file:
         file["nodes"] = np.zeros(3)

@@ -1,15 +1,12 @@
 """The `.morph` file: HDF5, versioned, without pickles, and checked in full when loaded (docs/model-file.md).
 
-It begins with a block that HDF5 leaves to its user: a line of text and the SHA-256 of the rest. That is compared
-before the HDF5 library sees the file, which damaged structures can lead astray; then every array is checked by
-itself (`field_storage`) and against the others, so that a file of a faulty writer is refused as well.
+It begins with a checksum (`io.checksum`). Then every array is checked by itself (`field_storage`) and against the
+others, so that a file of a faulty writer is refused as well.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
-import os
 import re
 from dataclasses import asdict
 from pathlib import Path
@@ -20,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import ModelFileError
+from morph_dslam.io.checksum import check_checksum, is_other_hdf5, written_with_checksum
 from morph_dslam.model.field_storage import names, read_array, read_field, read_group, read_text, write_field
 from morph_dslam.model.reduced_model import Parameter, ReducedModel
 from morph_dslam.model.separated import SeparatedField
@@ -86,39 +84,6 @@ def _check_field(
         raise ValueError(f"field '{name}' holds values that are not finite")
 
 
-#: Length of the block in bytes; HDF5 asks for a power of two from 512.
-BLOCK = 512
-_TITLE = b"morph-dslam reduced model\n"
-#: How every HDF5 file begins that has no block before it.
-HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-
-
-def _block(path: Path) -> bytes:
-    with path.open("rb") as file:
-        file.seek(BLOCK)
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return (_TITLE + f"sha256 {digest}\n".encode()).ljust(BLOCK, b"\0")
-
-
-def write_checksum(path: Path) -> None:
-    """Write the checksum into the block of a complete HDF5 file that begins with an empty one."""
-    block = _block(path)
-    with path.open("r+b") as file:
-        file.write(block)
-
-
-def check_checksum(path: Path) -> None:
-    """Compare a model file with its checksum."""
-    with path.open("rb") as file:
-        found = file.read(BLOCK)
-    if found.startswith(HDF5_SIGNATURE):
-        raise ModelFileError(f"{path} is an HDF5 file but not a morph-dslam model")
-    if not found.startswith(_TITLE):
-        raise ValueError("it does not begin as a model file")
-    if found != _block(path):
-        raise ValueError("its content does not match its checksum")
-
-
 FORMAT = "morph-dslam reduced model"
 VERSION = 3
 #: What stays as it is in the name of a field's group; "/" would start another group.
@@ -135,8 +100,7 @@ def save_model(path: str | Path, model: ReducedModel) -> None:
     """
     check_model(model)
     path = Path(path)
-    partial = path.with_name(path.name + ".partial")
-    with h5py.File(partial, "w", userblock_size=BLOCK) as file:
+    with written_with_checksum(path, FORMAT) as file:
         file.attrs["format"] = FORMAT
         file.attrs["version"] = VERSION
         file.attrs["name"] = model.name
@@ -149,8 +113,6 @@ def save_model(path: str | Path, model: ReducedModel) -> None:
             file.create_dataset(f"cells/{cell_type}", data=connectivity.astype(np.int32))
         for name, field in model.fields.items():
             write_field(file.create_group(f"fields/{quote(name, safe=_PLAIN)}"), field)
-    write_checksum(partial)
-    os.replace(partial, path)
 
 
 def _read_parameters(file: h5py.File) -> tuple[Parameter, ...]:
@@ -196,7 +158,9 @@ def _read_model(file: h5py.File) -> ReducedModel:
 
 
 def _open_and_read(path: Path) -> ReducedModel:
-    check_checksum(path)
+    if is_other_hdf5(path):
+        raise ModelFileError(f"{path} is an HDF5 file but not a morph-dslam model")
+    check_checksum(path, FORMAT)
     with h5py.File(path, "r") as file:
         if file.attrs.get("format") != FORMAT:
             raise ModelFileError(f"{path} is an HDF5 file but not a morph-dslam model")

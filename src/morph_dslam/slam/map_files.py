@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import MapError
+from morph_dslam.io.checksum import check_checksum, is_other_hdf5, written_with_checksum
 from morph_dslam.io.colmap import ColmapImage, ColmapModel
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam.frame_images import OCTAVES, FrameImages, FrameView, describe
@@ -98,14 +99,14 @@ class _PosedTracker(Tracker):
         return result
 
 
-FORMAT, VERSION = "morph-dslam map", 3
+FORMAT, VERSION = "morph-dslam map", 4
 KEYFRAME_ARRAYS = ("normalized", "camera_from_world", "point_ids", "pixels", "right", "described_ids", "descriptors")
 TRAJECTORY_ARRAYS = ("timestamps", "world_from_camera", "indices")
 
 
 def save_map(path: Path, rigid_map: RigidMap, camera: Camera, trajectory: Trajectory | None = None) -> None:
     """Write points, keyframes with their contrast-normalized images, their camera, and its path, as HDF5."""
-    with h5py.File(path, "w") as file:
+    with written_with_checksum(path, FORMAT) as file:
         file.attrs.update({"format": FORMAT, "version": VERSION, "usual_rms_px": rigid_map.usual_rms_px})
         file.attrs["baseline_px"] = rigid_map.baseline_px
         file.attrs.update({"intrinsics": camera.intrinsics, "size": (camera.width, camera.height)})
@@ -139,12 +140,16 @@ def load_map_and_trajectory(path: Path, camera: Camera) -> tuple[RigidMap, Traje
     if not path.is_file():
         raise MapError(f"there is no map {path}")
     try:
+        if not is_other_hdf5(path):  # maps of earlier versions have no checksum
+            check_checksum(path, FORMAT)
         with h5py.File(path, "r") as file:
             none = Trajectory(np.empty(0), np.empty((0, 4, 4)))
             path_of_run = [np.asarray(file[f"trajectory/{name}"]) for name in TRAJECTORY_ARRAYS if "trajectory" in file]
             return _read(path, file, camera), Trajectory(*path_of_run) if path_of_run else none
-    except (OSError, KeyError) as error:
-        raise MapError(f"{path} is no map of `morph slam`, or damaged: {error}") from error
+    except (OSError, KeyError, ValueError) as error:
+        raise MapError(
+            f"{path} is no map of `morph slam`, or damaged ({error}): copy it again, or map the scene again"
+        ) from error
 
 
 def _read(path: Path, file: h5py.File, camera: Camera) -> RigidMap:

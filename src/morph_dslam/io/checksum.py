@@ -1,0 +1,60 @@
+"""The checksum at the head of an HDF5 file, compared before the HDF5 library sees it.
+
+Damaged structures can lead that library astray. The block before them, which HDF5 leaves to its user, holds a line of
+text that says what the file is, and the SHA-256 of the rest.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+
+#: Length of the block in bytes; HDF5 asks for a power of two from 512.
+BLOCK = 512
+#: How every HDF5 file begins that has no block before it.
+HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+
+
+def _block(path: Path, title: str) -> bytes:
+    with path.open("rb") as file:
+        file.seek(BLOCK)
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return f"{title}\nsha256 {digest}\n".encode().ljust(BLOCK, b"\0")
+
+
+@contextmanager
+def written_with_checksum(path: Path, title: str) -> Iterator[h5py.File]:
+    """A new HDF5 file, which appears under its name with its checksum only when it is complete."""
+    partial = path.with_name(path.name + ".partial")
+    with h5py.File(partial, "w", userblock_size=BLOCK) as file:
+        yield file
+    write_checksum(partial, title)
+    os.replace(partial, path)
+
+
+def write_checksum(path: Path, title: str) -> None:
+    """Write the checksum into the block of a complete HDF5 file that begins with an empty one."""
+    block = _block(path, title)
+    with path.open("r+b") as file:
+        file.write(block)
+
+
+def is_other_hdf5(path: Path) -> bool:
+    """Whether a file is HDF5 without such a block."""
+    with path.open("rb") as file:
+        return file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE
+
+
+def check_checksum(path: Path, title: str) -> None:
+    """Raise ValueError, which says why, if a file does not begin with the title, or was changed later."""
+    with path.open("rb") as file:
+        found = file.read(BLOCK)
+    if not found.startswith(f"{title}\n".encode()):
+        raise ValueError("it does not begin as such a file")
+    if found != _block(path, title):
+        raise ValueError("its content does not match its checksum")
