@@ -10,7 +10,6 @@ from typing import Any
 import cv2
 import h5py
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
@@ -25,65 +24,19 @@ from morph_dslam.sources.recorded import numbered_images
 Array = NDArray[np.float64]
 
 
-@njit(cache=True, nogil=True)
-def _minus(a, b):
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
-
-
-@njit(cache=True, nogil=True)
-def _along(a, b, share):
-    return a[0] - share * b[0], a[1] - share * b[1], a[2] - share * b[2]
-
-
-@njit(cache=True, nogil=True)
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@njit(cache=True, nogil=True)
-def _square_distance_to_triangle(p, a, b, c):
-    """Squared distance of a point to a triangle (Ericson, Real-Time Collision Detection, 2005, 5.1.5).
-
-    Points are tuples of three numbers: arrays as small would cost more than what is computed with them.
-    """
-    ab, ac, ap = _minus(b, a), _minus(c, a), _minus(p, a)
-    d1, d2 = _dot(ab, ap), _dot(ac, ap)
-    if d1 <= 0.0 and d2 <= 0.0:
-        return _dot(ap, ap)
-    bp = _minus(p, b)
-    d3, d4 = _dot(ab, bp), _dot(ac, bp)
-    if d3 >= 0.0 and d4 <= d3:
-        return _dot(bp, bp)
-    cp = _minus(p, c)
-    d5, d6 = _dot(ab, cp), _dot(ac, cp)
-    if d6 >= 0.0 and d5 <= d6:
-        return _dot(cp, cp)
-    vc, vb, va = d1 * d4 - d3 * d2, d5 * d2 - d1 * d6, d3 * d6 - d5 * d4
-    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        off = _along(ap, ab, d1 / (d1 - d3))
-    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        off = _along(ap, ac, d2 / (d2 - d6))
-    elif va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
-        off = _along(bp, _minus(c, b), (d4 - d3) / ((d4 - d3) + (d5 - d6)))
-    else:
-        scale = 1.0 / (va + vb + vc)
-        off = _along(_along(ap, ab, vb * scale), ac, vc * scale)
-    return _dot(off, off)
-
-
-@njit(cache=True, nogil=True)
-def _least_distances(points, corners, candidates, starts):
-    """Distance of point i to the nearest of the triangles ``candidates[starts[i] : starts[i + 1]]``."""
-    result = np.empty(len(points))
-    for i in range(len(points)):
-        p, best = (points[i, 0], points[i, 1], points[i, 2]), np.inf
-        for t in candidates[starts[i] : starts[i + 1]]:
-            a = (corners[t, 0, 0], corners[t, 0, 1], corners[t, 0, 2])
-            b = (corners[t, 1, 0], corners[t, 1, 1], corners[t, 1, 2])
-            c = (corners[t, 2, 0], corners[t, 2, 1], corners[t, 2, 2])
-            best = min(best, _square_distance_to_triangle(p, a, b, c))
-        result[i] = np.sqrt(best)
-    return result
+def _distances_to_triangles(points: Array, corners: Array) -> Array:
+    """Distance (k,) of each point (k, 3) to its own triangle (k, 3, 3): to its edges, or its plane if above it."""
+    edges = np.roll(corners, -1, axis=1) - corners
+    offsets = points[:, None] - corners
+    squares = np.maximum(np.einsum("kex,kex->ke", edges, edges), 1e-300)
+    shares = np.clip(np.einsum("kex,kex->ke", edges, offsets) / squares, 0.0, 1.0)
+    to_edges = np.linalg.norm(offsets - shares[..., None] * edges, axis=2).min(axis=1)
+    normals = np.cross(edges[:, 0], edges[:, 1])
+    sides = np.einsum("kex,kex->ke", np.cross(normals[:, None], edges), offsets)
+    heights = np.abs(np.einsum("kx,kx->k", normals, offsets[:, 0]))
+    lengths = np.maximum(np.linalg.norm(normals, axis=1), 1e-300)
+    # The sides of a triangle without area are all zero.
+    return np.where((sides > 0.0).all(axis=1), heights / lengths, to_edges)
 
 
 def distances_to_surface(points: Array, nodes: Array, triangles: NDArray[np.integer]) -> Array:
@@ -100,8 +53,10 @@ def distances_to_surface(points: Array, nodes: Array, triangles: NDArray[np.inte
     tree = KDTree(centres)
     reach = tree.query(points)[0] + np.linalg.norm(corners - centres[:, None], axis=2).max()
     near = tree.query_ball_point(points, reach * (1.0 + 1e-9))
-    starts = np.concatenate([[0], np.cumsum([len(found) for found in near])])
-    return _least_distances(points, corners, np.concatenate(near).astype(np.int64), starts)
+    counts = np.array([len(found) for found in near])
+    candidates = np.concatenate(near).astype(np.int64)
+    distances = _distances_to_triangles(np.repeat(points, counts, axis=0), corners[candidates])
+    return np.minimum.reduceat(distances, np.cumsum(counts) - counts)
 
 
 DepthImage = NDArray[np.float32]

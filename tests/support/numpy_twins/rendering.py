@@ -91,22 +91,3 @@ def vertex_normals(points, triangles):
     normals = np.column_stack([np.bincount(nodes, np.tile(component, 3), len(points)) for component in face_normals.T])
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return normals / np.where(length > 0.0, length, 1.0)
-
-
-def distances_to_surface(points, nodes, triangles):
-    corners = nodes[triangles]
-    edges = [(corners[:, i], corners[:, (i + 1) % 3] - corners[:, i]) for i in range(3)]
-    normal = np.cross(edges[0][1], -edges[2][1])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    result = np.empty(len(points))
-    for i, point in enumerate(points):
-        height = np.abs(np.einsum("tx,tx->t", point - corners[:, 0], normal))
-        inside = np.ones(len(corners), dtype=bool)
-        nearest = np.full(len(corners), np.inf)
-        for start, edge in edges:
-            inside &= np.einsum("tx,tx->t", np.cross(edge, point - start), normal) >= 0.0
-            along = np.einsum("tx,tx->t", point - start, edge) / np.einsum("tx,tx->t", edge, edge)
-            foot = start + np.clip(along, 0.0, 1.0)[:, None] * edge
-            nearest = np.minimum(nearest, np.linalg.norm(point - foot, axis=1))
-        result[i] = np.where(inside, height, nearest).min()
-    return result
