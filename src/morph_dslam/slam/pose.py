@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from morph_dslam.geometry import rotation_exp
+from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.slam.bundle_adjustment import (
     LEAST_DEPTH,
     cholesky_solve,
@@ -30,10 +30,16 @@ from morph_dslam.slam.bundle_adjustment import (
 Array = NDArray[np.float64]
 
 
+def camera_matrix(intrinsics: Array) -> Array:
+    """The matrix (3, 3) of fx, fy, cx, cy (4,)."""
+    fx, fy, cx, cy = intrinsics
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
 def project(camera_from_world: Array, points: Array, intrinsics: Array) -> tuple[Array, Array]:
     """Pixels (n, 2) and depths (n,) of points (n, 3); pixels are NaN where a point is not in front."""
     local = points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-    depth = np.where(local[:, 2] > 1e-6, local[:, 2], np.nan)
+    depth = np.where(local[:, 2] > LEAST_DEPTH, local[:, 2], np.nan)
     return local[:, :2] / depth[:, None] * intrinsics[:2] + intrinsics[2:], local[:, 2]
 
 
@@ -72,6 +78,8 @@ def inside(pixels: Array, shape: tuple[int, ...], margin: float) -> NDArray[np.b
 #: this a few points that move draw the pose along for as long as they stay below ``inlier_px``. Pixels below
 #: which all count.
 CORE_RATIO, LEAST_CORE_PX = 3.0, 0.6
+#: Rounds in which a pose is refined.
+ROUNDS = 2
 
 
 @njit(cache=True, nogil=True)
@@ -140,9 +148,7 @@ class PoseEstimate:
 
 def reprojection_errors(camera_from_world: Array, points: Array, pixels: Array, intrinsics: Array) -> Array:
     """Distances (n,) in pixels between projected points (n, 3) and pixels (n, 2); inf behind the camera."""
-    local = points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-    depth = np.where(local[:, 2] > LEAST_DEPTH, local[:, 2], np.nan)
-    projected = local[:, :2] / depth[:, None] * intrinsics[:2] + intrinsics[2:]
+    projected, _ = project(camera_from_world, points, intrinsics)
     return np.nan_to_num(np.linalg.norm(projected - pixels, axis=1), nan=np.inf)
 
 
@@ -153,7 +159,6 @@ def refine_pose(
     intrinsics: Array,
     huber_px: float = 1.5,
     inlier_px: float = 3.0,
-    rounds: int = 2,
     right: Array | None = None,
     baseline_px: float = 0.0,
     trusted: NDArray[np.bool_] | None = None,
@@ -171,7 +176,7 @@ def refine_pose(
     matrix = np.eye(6)
     columns = np.full(len(points), np.nan) if right is None else right
     rows, camera = np.column_stack([pixels, columns]), np.append(intrinsics, baseline_px)
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         if used.sum() < 4:
             return PoseEstimate(pose, np.full((6, 6), np.inf), np.zeros(len(points), dtype=bool), float("inf"))
         pose, matrix = _refine(
@@ -195,31 +200,52 @@ def _core_px(errors: Array, inlier_px: float) -> float:
     return min(inlier_px, max(CORE_RATIO * float(np.median(inliers)), LEAST_CORE_PX)) if len(inliers) else 0.0
 
 
+def ransac_pose(
+    points: Array, pixels: Array, matrix: Array, inlier_px: float, method: int, iterations: int, confidence: float
+) -> tuple[RigidTransform, NDArray[np.bool_]] | None:
+    """A pose with which most points (n, 3) are near their pixels (n, 2), and which are; None if none is found.
+
+    Parameters
+    ----------
+    matrix : (3, 3) of the camera.
+    inlier_px : how far points may miss their pixels.
+    method : OpenCV's flag of the solver for the least number of points.
+    iterations : samples tried at most.
+    confidence : probability at which no more samples are tried.
+    """
+    try:
+        found, turn, shift, rows = cv2.solvePnPRansac(
+            points,
+            pixels,
+            matrix,
+            None,  # type: ignore[arg-type]
+            iterationsCount=iterations,
+            reprojectionError=inlier_px,
+            confidence=confidence,
+            flags=method,
+        )
+    except cv2.error:
+        return None  # matches of nearly the same few points span no pose
+    if not found or rows is None:
+        return None
+    agreeing = np.zeros(len(points), dtype=bool)
+    agreeing[np.asarray(rows, dtype=np.int64).ravel()] = True
+    return RigidTransform(rotation_exp(turn.ravel()), np.asarray(shift, dtype=float).ravel()), agreeing
+
+
 def find_pose(
     points: Array, pixels: Array, intrinsics: Array, inlier_px: float = 4.0, least: int = 15
 ) -> PoseEstimate | None:
     """Pose from matches among which many are wrong (P3P in RANSAC); None if fewer than ``least`` agree."""
     if len(points) < least:
         return None
-    matrix = np.array([[intrinsics[0], 0.0, intrinsics[2]], [0.0, intrinsics[1], intrinsics[3]], [0.0, 0.0, 1.0]])
     cv2.setRNGSeed(0)
-    found, turn, shift, rows = cv2.solvePnPRansac(
-        points,
-        pixels,
-        matrix,
-        None,  # type: ignore[arg-type]
-        iterationsCount=1000,
-        reprojectionError=inlier_px,
-        confidence=0.999,
-        flags=cv2.SOLVEPNP_AP3P,
-    )
-    if not found or rows is None or len(rows) < least:
+    found = ransac_pose(points, pixels, camera_matrix(intrinsics), inlier_px, cv2.SOLVEPNP_AP3P, 1000, 0.999)
+    if found is None or found[1].sum() < least:
         return None
-    start = np.eye(4)
-    start[:3, :3], start[:3, 3] = rotation_exp(turn.ravel()), shift.ravel()
     # The matches that RANSAC rejects are too many for a Huber weight.
-    agreeing = np.asarray(rows, dtype=np.int64).ravel()
-    start = refine_pose(start, points[agreeing], pixels[agreeing], intrinsics).camera_from_world
+    pose, agreeing = found
+    start = refine_pose(pose.matrix, points[agreeing], pixels[agreeing], intrinsics).camera_from_world
     used = reprojection_errors(start, points, pixels, intrinsics) < inlier_px
     estimate = refine_pose(start, points[used], pixels[used], intrinsics, inlier_px=inlier_px)
     used[used] = estimate.inliers
@@ -231,6 +257,8 @@ def find_pose(
 PLANE_SHARE = 0.45
 #: Squared errors that 95 % of the inliers stay below, for one and two degrees of freedom, in pixel variances.
 CHI2_ONE, CHI2_TWO = 3.841, 5.991
+#: How far points of two views may miss their pixels, whose noise is taken to be a pixel.
+MOST_MISS_PX = 2.5
 
 
 @dataclass(frozen=True)
@@ -282,10 +310,7 @@ def check_points(
     """Which points (n, 3) lie in front of every camera and project within ``max_px`` of their pixels."""
     good = np.asarray(np.isfinite(points).all(axis=1))
     for pose, seen in zip(poses, pixels, strict=True):
-        local = points @ pose[:3, :3].T + pose[:3, 3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            projected = local[:, :2] / local[:, 2:] * intrinsics[:2] + intrinsics[2:]
-            good &= (local[:, 2] > 0.0) & (np.linalg.norm(projected - seen, axis=1) < max_px)
+        good &= reprojection_errors(pose, points, seen, intrinsics) < max_px
     return good
 
 
@@ -296,8 +321,7 @@ def _score(squared_errors: Array, limit: float) -> float:
 
 def _epipolar_errors(essential: Array, first: Array, second: Array, intrinsics: Array) -> tuple[Array, Array]:
     """Squared distances (n,) to the epipolar lines in either image, px^2."""
-    inverse = np.diag([1.0 / intrinsics[0], 1.0 / intrinsics[1], 1.0])
-    inverse[:2, 2] = -intrinsics[2:] / intrinsics[:2]
+    inverse = np.linalg.inv(camera_matrix(intrinsics))
     fundamental = inverse.T @ essential @ inverse
     a, b = np.column_stack([first, np.ones(len(first))]), np.column_stack([second, np.ones(len(second))])
     in_second, in_first = a @ fundamental.T, b @ fundamental
@@ -317,22 +341,17 @@ def _transfer_errors(homography: Array, first: Array, second: Array) -> tuple[Ar
     return backward, forward
 
 
-def two_view_hypotheses(
-    first: Array, second: Array, intrinsics: Array, noise_px: float = 1.0
-) -> list[TwoViewHypothesis]:
+def two_view_hypotheses(first: Array, second: Array, intrinsics: Array) -> list[TwoViewHypothesis]:
     """Relative poses that matched pixels (n, 2) allow, most points in front first; empty if none is clear."""
-    matrix = np.array([[intrinsics[0], 0.0, intrinsics[2]], [0.0, intrinsics[1], intrinsics[3]], [0.0, 0.0, 1.0]])
+    matrix = camera_matrix(intrinsics)
     cv2.setRNGSeed(0)
-    essential, _ = cv2.findEssentialMat(
-        first, second, matrix, method=cv2.USAC_MAGSAC, threshold=1.5 * noise_px, prob=0.9999
-    )
-    homography, _ = cv2.findHomography(first, second, cv2.USAC_MAGSAC, 2.0 * noise_px, None, 2000, 0.9999)
+    essential, _ = cv2.findEssentialMat(first, second, matrix, method=cv2.USAC_MAGSAC, threshold=1.5, prob=0.9999)
+    homography, _ = cv2.findHomography(first, second, cv2.USAC_MAGSAC, 2.0, None, 2000, 0.9999)
     if essential is None or homography is None or essential.shape != (3, 3):
         return []
     essential, homography = np.asarray(essential, dtype=float), np.asarray(homography, dtype=float)
-    variance = noise_px**2
-    by_lines = sum(_score(e / variance, CHI2_ONE) for e in _epipolar_errors(essential, first, second, intrinsics))
-    by_plane = sum(_score(e / variance, CHI2_TWO) for e in _transfer_errors(homography, first, second))
+    by_lines = sum(_score(e, CHI2_ONE) for e in _epipolar_errors(essential, first, second, intrinsics))
+    by_plane = sum(_score(e, CHI2_TWO) for e in _transfer_errors(homography, first, second))
     if by_plane > PLANE_SHARE * (by_plane + by_lines):
         _, rotations, shifts, _ = cv2.decomposeHomographyMat(homography, matrix)
         motions = [(r, s.ravel()) for r, s in zip(rotations, shifts, strict=True) if np.linalg.norm(s) > 1e-9]
@@ -340,21 +359,18 @@ def two_view_hypotheses(
         one, other, shift = cv2.decomposeEssentialMat(essential)
         motions = [(r, sign * shift.ravel()) for r in (one, other) for sign in (1.0, -1.0)]
     hypotheses = [
-        _hypothesis(np.asarray(r, dtype=float), np.asarray(s, dtype=float), first, second, intrinsics, noise_px)
+        _hypothesis(np.asarray(r, dtype=float), np.asarray(s, dtype=float), first, second, intrinsics)
         for r, s in motions
     ]
     hypotheses.sort(key=lambda hypothesis: -int(hypothesis.good.sum()))
     return hypotheses
 
 
-def _hypothesis(
-    rotation: Array, shift: Array, first: Array, second: Array, intrinsics: Array, noise_px: float
-) -> TwoViewHypothesis:
+def _hypothesis(rotation: Array, shift: Array, first: Array, second: Array, intrinsics: Array) -> TwoViewHypothesis:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, shift / np.linalg.norm(shift)
-    rays = [np.column_stack([(p - intrinsics[2:]) / intrinsics[:2], np.ones(len(p))]) for p in (first, second)]
-    points = triangulate(np.eye(4), pose, *rays)
-    good = check_points(points, [np.eye(4), pose], [first, second], intrinsics, 2.5 * noise_px)
+    points = triangulate(np.eye(4), pose, rays(first, intrinsics), rays(second, intrinsics))
+    good = check_points(points, [np.eye(4), pose], [first, second], intrinsics, MOST_MISS_PX)
     points[~good] = np.nan
     angles = ray_angles(points[good], np.zeros(3), camera_centre(pose))
     return TwoViewHypothesis(pose, points, float(np.median(angles)) if good.any() else 0.0)

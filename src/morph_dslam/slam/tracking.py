@@ -22,6 +22,7 @@ from morph_dslam.slam.pose import (
     LEAST_DEPTH,
     PoseEstimate,
     camera_centre,
+    camera_matrix,
     find_pose,
     inside,
     inverse,
@@ -93,8 +94,7 @@ def plane_homography(keyframe_pose: Array, pose: Array, depth: float, intrinsics
 
     Poses (4, 4) are camera_from_world.
     """
-    fx, fy, cx, cy = intrinsics
-    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    matrix = camera_matrix(intrinsics)
     relative = pose @ inverse(keyframe_pose)
     plane = relative[:3, :3].copy()
     plane[:, 2] += relative[:3, 3] / depth

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import ReducedModel
+from morph_dslam.slam.pose import ransac_pose
 from morph_dslam.tracking.binding import View, bind_pixels
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
 from morph_dslam.tracking.patches import detect_orb, match_descriptors
@@ -83,9 +83,9 @@ def state_from_matches(
     best, inliers = None, np.zeros(len(points), dtype=bool)
     for shape in shapes:
         positions = points.rest + points.field.value(shape)
-        pose, agreeing = _ransac(positions, pixels, estimator.camera.matrix, pnp_px)
-        if pose is not None and agreeing.sum() > inliers.sum():
-            best, inliers = State(shape, pose), agreeing
+        found = ransac_pose(positions, pixels, estimator.camera.matrix, pnp_px, cv2.SOLVEPNP_SQPNP, 200, 0.99)
+        if found is not None and found[1].sum() > inliers.sum():
+            best, inliers = State(shape, found[0]), found[1]
     if best is None or inliers.sum() < least:
         return None, inliers
     # Estimated from the agreeing matches, then once more from all that agree with the result.
@@ -94,27 +94,3 @@ def state_from_matches(
         best = estimate.state
         inliers = np.linalg.norm(estimate.residuals, axis=1) < pnp_px
     return (best if inliers.sum() >= least else None), inliers
-
-
-def _ransac(
-    points: Array, pixels: Array, matrix: Array, limit_px: float
-) -> tuple[RigidTransform | None, NDArray[np.bool_]]:
-    """A pose (camera from object) with which most points (k, 3) are near their pixels, and which are."""
-    agreeing = np.zeros(len(points), dtype=bool)
-    try:
-        found, rotation, translation, rows = cv2.solvePnPRansac(
-            points,
-            pixels,
-            matrix,
-            None,  # type: ignore[arg-type]
-            iterationsCount=200,
-            reprojectionError=limit_px,
-            flags=cv2.SOLVEPNP_SQPNP,
-        )
-    except cv2.error:
-        return None, agreeing  # matches of nearly the same few points span no pose
-    if not found or rows is None:
-        return None, agreeing
-    agreeing[np.asarray(rows, dtype=np.int64).ravel()] = True
-    pose = RigidTransform(rotation_exp(rotation.ravel()), np.asarray(translation, dtype=float).ravel())
-    return pose, agreeing
