@@ -146,9 +146,12 @@ class DepthError:
 
     Attributes
     ----------
-    frames : (e,) frames compared. distances : by frame, (p,) of sensor points to the surface.
-    nodes : by frame, (p,) the mesh node nearest to each point. gate : larger distances are left out.
-    left_out : (e,) share of sensor points left out. base_frame : undeformed, or None.
+    frames : (e,) frames compared.
+    distances : by frame, (p,) of sensor points to the surface.
+    nodes : by frame, (p,) the mesh node nearest to each point.
+    gate : larger distances are left out.
+    left_out : (e,) share of sensor points left out.
+    base_frame : undeformed, or None.
     """
 
     frames: NDArray[np.int64]

@@ -26,7 +26,9 @@ def evaluate(folder: str | Path, truth_path: str | Path, bind_frame: int) -> dic
 
     Parameters
     ----------
-    folder : a run folder. truth_path : a truth file. bind_frame : the frame whose pixels bind the points.
+    folder : a run folder.
+    truth_path : a truth file.
+    bind_frame : the frame whose pixels bind the points.
 
     Returns
     -------
@@ -63,7 +65,8 @@ def evaluate_depth(
 
     Parameters
     ----------
-    folder : a run folder. depth, values_per_metre : see `read_depths`.
+    folder : a run folder.
+    depth, values_per_metre : see `read_depths`.
     base_frame : a frame in which the object is not deformed, whose error stands beside the others'.
 
     Returns

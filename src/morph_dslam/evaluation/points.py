@@ -111,7 +111,8 @@ class Binding:
     Attributes
     ----------
     frame : the frame whose pixels bound them.
-    columns : (b,) which truth points. points : where they are on the mesh, length b.
+    columns : (b,) which truth points.
+    points : where they are on the mesh, length b.
     n_outline : how many of them missed the surface by at most `OUTLINE_TOLERANCE_PX`.
     unbound : (u,) the other truth points, which cannot be compared: those that missed it by more, and
         ``n_unseen`` that are hidden or not measured in ``frame``.
@@ -131,10 +132,12 @@ class MaterialError:
 
     Attributes
     ----------
-    frames : (e,) the frames compared. vectors : (e, b, 3) estimate minus truth in the camera frame, NaN where
-        a point was not measured. measured : (e, b, 3) the truth points.
+    frames : (e,) the frames compared.
+    vectors : (e, b, 3) estimate minus truth in the camera frame, NaN where a point was not measured.
+    measured : (e, b, 3) the truth points.
     sight : (e, b, 3) unit directions from the camera to the truth points.
-    untracked : truth frames that the run has but did not track. outside : truth frames that it does not have.
+    untracked : truth frames that the run has but did not track.
+    outside : truth frames that it does not have.
     """
 
     binding: Binding

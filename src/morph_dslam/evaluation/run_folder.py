@@ -29,8 +29,10 @@ class Run:
 
     Attributes
     ----------
-    frames : (f,) frame numbers. status, reasons : one text a frame; the state exists where "tracked".
-    camera_from_object : (f, 4, 4), NaN where not tracked. parameters : (f, d), SI.
+    frames : (f,) frame numbers.
+    status, reasons : one text a frame; the state exists where "tracked".
+    camera_from_object : (f, 4, 4), NaN where not tracked.
+    parameters : (f, d), SI.
     stage_times : (f,) milliseconds by stage name.
     discrepancies : what the shapes have beyond the model's, by row; empty where it was not looked for.
     """

@@ -81,7 +81,8 @@ class AbsoluteError:
 
     Attributes
     ----------
-    truth_from_estimate : the alignment. aligned : (n, 3) estimated centres in the truth's world, metres.
+    truth_from_estimate : the alignment.
+    aligned : (n, 3) estimated centres in the truth's world, metres.
     distances : (n,) metres.
     """
 
@@ -97,7 +98,8 @@ class RelativeError:
     Attributes
     ----------
     timestamps : (m,) when each motion begins, seconds.
-    translations : (m,) metres. rotations : (m,) radians.
+    translations : (m,) metres.
+    rotations : (m,) radians.
     """
 
     timestamps: Array
@@ -198,7 +200,8 @@ def evaluate_trajectory(run: str | Path, truth_path: str | Path) -> dict[str, An
 
     Parameters
     ----------
-    run : a run folder with ``trajectory.txt``, or any trajectory file. truth_path : a trajectory.
+    run : a run folder with ``trajectory.txt``, or any trajectory file.
+    truth_path : a trajectory.
 
     Returns
     -------

@@ -68,7 +68,9 @@ def outline_fit(
 
     Parameters
     ----------
-    place : metres to the map's unit. nodes : (n, 3) metres. camera : of the views, without distortion.
+    place : metres to the map's unit.
+    nodes : (n, 3) metres.
+    camera : of the views, without distortion.
     """
     world = place.apply(nodes)
     found, agreed = np.zeros(0, dtype=bool), np.zeros(0, dtype=bool)

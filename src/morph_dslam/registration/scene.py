@@ -39,8 +39,10 @@ class View:
     Attributes
     ----------
     frame : its number in the recording.
-    normalized : (h, w) uint8 its contrast-normalized image, undistorted. camera_from_world : its pose.
-    point_ids : (k,) rows of the map points seen. pixels : (k, 2) where.
+    normalized : (h, w) uint8 its contrast-normalized image, undistorted.
+    camera_from_world : its pose.
+    point_ids : (k,) rows of the map points seen.
+    pixels : (k, 2) where.
     """
 
     frame: int

@@ -136,7 +136,8 @@ def attitudes(axis: Axis | None, normal: Array | None) -> list[Array]:
 
     Parameters
     ----------
-    axis : of a body of revolution. normal : (3,) of the plane that holds most of the map, if there is one.
+    axis : of a body of revolution.
+    normal : (3,) of the plane that holds most of the map, if there is one.
     """
     rotations = list(Rotation.create_group("I").as_matrix())
     if normal is not None:

@@ -111,10 +111,12 @@ class StaticScene:
 
     Parameters
     ----------
-    environment : its description. folder : what paths in it are relative to.
-    camera : whose pictures are drawn. positions : (T, 3) where the camera is, world, metres; textures are
-        made as fine as they can be seen from there.
-    light : (3,) direction towards a distant light, world. ambient : its ambient part.
+    environment : its description.
+    folder : what paths in it are relative to.
+    camera : whose pictures are drawn.
+    positions : (T, 3) where the camera is, world, metres; textures are made as fine as they can be seen from there.
+    light : (3,) direction towards a distant light, world.
+    ambient : its ambient part.
     """
 
     def __init__(

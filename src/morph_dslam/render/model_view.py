@@ -41,7 +41,8 @@ def fitting_view(
 
     Parameters
     ----------
-    size : width and height, pixels. middle : where the shapes' middle is across the picture, 0 to 1.
+    size : width and height, pixels.
+    middle : where the shapes' middle is across the picture, 0 to 1.
     """
     corners = np.concatenate(shapes)
     centre, extent = (corners.min(axis=0) + corners.max(axis=0)) / 2.0, np.ptp(corners, axis=0).max()
@@ -72,9 +73,11 @@ def draw_shapes(
 
     Parameters
     ----------
-    triangles : (m, 3) the surface. shapes : node positions (n, 3) of each picture.
+    triangles : (m, 3) the surface.
+    shapes : node positions (n, 3) of each picture.
     node_values : (n,) what colours each picture; ``value_range`` at the ends of ``colour_map``.
-    direction : (3,) in which the camera looks, object frame, not along z. size : of each picture, pixels.
+    direction : (3,) in which the camera looks, object frame, not along z.
+    size : of each picture, pixels.
 
     Returns
     -------
@@ -115,8 +118,10 @@ def draw_states(
 
     Parameters
     ----------
-    states : parameters (d,) of each, SI. captions : a line for each.
-    direction : (3,) in which the camera looks, object frame, not along z. place : a key of `model.stresses`.
+    states : parameters (d,) of each, SI.
+    captions : a line for each.
+    direction : (3,) in which the camera looks, object frame, not along z.
+    place : a key of `model.stresses`.
     size : width and height of each picture, pixels.
 
     Returns

@@ -21,9 +21,12 @@ def blend_surface(image, triangle_ids, weights, triangles, levels, brightness, t
 
     Parameters
     ----------
-    image : (h, w, 3) uint8. triangle_ids, weights : from `rasterise`, of ``triangles`` (m, 3).
-    levels : (n,) node values scaled to 0-255. brightness : (n,) factor on the colour.
-    table : (256, 3) colours. alpha : opacity.
+    image : (h, w, 3) uint8.
+    triangle_ids, weights : from `rasterise`, of ``triangles`` (m, 3).
+    levels : (n,) node values scaled to 0-255.
+    brightness : (n,) factor on the colour.
+    table : (256, 3) colours.
+    alpha : opacity.
     """
     height, width = triangle_ids.shape
     for row in range(height):
@@ -203,7 +206,9 @@ def draw_inner_surface(
     ----------
     image : (h, w, 3) uint8, blue, green, red, with the object drawn in it already; not changed.
     pixels, depths, triangles, brightness : of the inner surface, as of `draw_overlay`.
-    colour : blue, green, red. label : written beside it. alpha : opacity, 0 to 1.
+    colour : blue, green, red.
+    label : written beside it.
+    alpha : opacity, 0 to 1.
 
     Returns
     -------

@@ -53,8 +53,10 @@ def _in_cells(rays: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array,
 
     Returns
     -------
-    order : (p,) rays, cell by cell. starts : (cells + 1,) where in it each cell begins.
-    corner : (2,) of the grid. size : (2,) of a cell.
+    order : (p,) rays, cell by cell.
+    starts : (cells + 1,) where in it each cell begins.
+    corner : (2,) of the grid.
+    size : (2,) of a cell.
     """
     places = rays[:, :2] / rays[:, 2:]
     corner = places.min(axis=0)
@@ -128,8 +130,10 @@ def nearest_on_outline(
 
     Parameters
     ----------
-    camera_points : (n, 3) mesh nodes in the camera frame. node_pixels : (n, 2) their pixels.
-    triangles : (m, 3) node indices. pixels : (p, 2).
+    camera_points : (n, 3) mesh nodes in the camera frame.
+    node_pixels : (n, 2) their pixels.
+    triangles : (m, 3) node indices.
+    pixels : (p, 2).
 
     Returns
     -------

@@ -25,7 +25,9 @@ def interpolate_key_frames(frames: Sequence[int] | NDArray, values: Array, wante
 
     Parameters
     ----------
-    frames : (k,) strictly increasing frame numbers. values : (k, ...) values there. wanted : (T,) frames.
+    frames : (k,) strictly increasing frame numbers.
+    values : (k, ...) values there.
+    wanted : (T,) frames.
 
     Returns
     -------

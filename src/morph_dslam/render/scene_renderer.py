@@ -54,8 +54,9 @@ def print_texture(surface: Surface, folder: Path, size: Array, pixels_per_metre:
 
     Parameters
     ----------
-    size : (2,) of the sheet, metres. pixels_per_metre : of the image, where the sheet is seen face on; less
-        is taken where the longer side would have more than `LARGEST_PRINT` pixels.
+    size : (2,) of the sheet, metres.
+    pixels_per_metre : of the image, where the sheet is seen face on; less is taken where the longer side would have
+        more than `LARGEST_PRINT` pixels.
     """
     photograph = load_photograph(surface.texture, folder)
     pixels_per_metre = min(pixels_per_metre, LARGEST_PRINT / float(size.max()))
@@ -129,7 +130,9 @@ class SceneRenderer:
 
     Parameters
     ----------
-    scene : its description. model : the object. camera : without lens distortion.
+    scene : its description.
+    model : the object.
+    camera : without lens distortion.
     folder : what paths in the scene are relative to.
     nearest_depth : metres; the print is made as fine as it can be seen from there.
     surroundings : what stands around the object, for `supersampled` pictures, or None.
@@ -186,7 +189,8 @@ class SceneRenderer:
 
         Parameters
         ----------
-        points : (n, 3) nodes in the camera frame, metres. frame : its number, which seeds the noise.
+        points : (n, 3) nodes in the camera frame, metres.
+        frame : its number, which seeds the noise.
         occluder_centre : (2,) pixels, or None without an occluder.
         camera_from_world : where the camera is, in a scene that has a world.
         """

@@ -38,7 +38,8 @@ def vertex_normals(points: Array, triangles: NDArray) -> Array:
 
     Parameters
     ----------
-    points : (n, 3) node positions. triangles : (m, 3), whose order of nodes gives the normal its side.
+    points : (n, 3) node positions.
+    triangles : (m, 3), whose order of nodes gives the normal its side.
     """
     normals = np.zeros((len(points), 3))
     _sum_normals(np.asarray(points, dtype=np.float64), np.asarray(triangles, dtype=np.int64), normals)
@@ -89,7 +90,8 @@ def colour_bar(height: int, low: float, high: float, label: str, colour_map: str
 
     Parameters
     ----------
-    height : of the panel, pixels. low, high : values at the bar's ends, in the unit that ``label`` names.
+    height : of the panel, pixels.
+    low, high : values at the bar's ends, in the unit that ``label`` names.
     scale : size of the text, as OpenCV's ``fontScale``.
     """
     ticks = [tick for tick in MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high) if low <= tick <= high]

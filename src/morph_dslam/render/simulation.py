@@ -257,7 +257,8 @@ def simulate(scene_path: str | Path, output: str | Path, progress: bool = True) 
 
     Parameters
     ----------
-    scene_path : the scene file. output : the folder to write; made if missing, frames in it are replaced.
+    scene_path : the scene file.
+    output : the folder to write; made if missing, frames in it are replaced.
     progress : show a progress bar.
 
     Raises

@@ -230,7 +230,8 @@ class TexturedSurface:
 
     Attributes
     ----------
-    nodes : (k,) mesh node of each vertex. triangles : (m, 3) vertices, in the mesh's order of triangles.
+    nodes : (k,) mesh node of each vertex.
+    triangles : (m, 3) vertices, in the mesh's order of triangles.
     coordinates : (k, 2) column and row in the texture, texture pixels.
     """
 

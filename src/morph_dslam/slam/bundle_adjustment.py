@@ -294,7 +294,8 @@ class Observations:
 
     Attributes
     ----------
-    camera_idx, point_idx : (o,). pixels : (o, 2), undistorted.
+    camera_idx, point_idx : (o,).
+    pixels : (o, 2), undistorted.
     right_columns : (o,) column of the point in the right image, NaN where depth was not measured; None if
         nowhere.
     """
@@ -335,7 +336,8 @@ def adjust(
 
     Parameters
     ----------
-    camera_from_world : (c, 4, 4). points : (p, 3) in the world.
+    camera_from_world : (c, 4, 4).
+    points : (p, 3) in the world.
     intrinsics : (4,) fx, fy, cx, cy, of all cameras.
     fixed : (c,) cameras that stay; without depth at least two of them, or the scale is free.
     baseline_px : focal length times baseline, px m, for observations with depth.

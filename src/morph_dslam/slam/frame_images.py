@@ -104,7 +104,8 @@ def least_distances(
 
     Parameters
     ----------
-    first, second : (i, 32), (j, 32). first_points, second_points : (i,), (j,) whose each one is.
+    first, second : (i, 32), (j, 32).
+    first_points, second_points : (i,), (j,) whose each one is.
     """
     shape = (int(first_points.max(initial=-1)) + 1, int(second_points.max(initial=-1)) + 1)
     result = np.full(shape, N_BITS, dtype=np.uint16)
@@ -250,7 +251,9 @@ class FrameView:
 
     Attributes
     ----------
-    grey : (h, w) undistorted. normalized : (h, w) the same contrast-normalized. depth : None where nothing measured it.
+    grey : (h, w) undistorted.
+    normalized : (h, w) the same contrast-normalized.
+    depth : None where nothing measured it.
     """
 
     index: int
@@ -265,7 +268,8 @@ class FrameImages:
 
     Attributes
     ----------
-    camera : of the undistorted images. baseline_px : of the depth (`RigidMap`), 0 without depth.
+    camera : of the undistorted images.
+    baseline_px : of the depth (`RigidMap`), 0 without depth.
 
     Raises CameraError if a stereo pair is to have depth images too, or cannot be rectified.
     """

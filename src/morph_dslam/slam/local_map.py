@@ -155,8 +155,11 @@ class MapProblem:
 
     Attributes
     ----------
-    numbers : (k,) keyframes, of which ``held`` (k,) stay where they are. free : those whose points count.
-    ids : (n,) points. camera_from_world : (k, 4, 4). positions : (n, 3).
+    numbers : (k,) keyframes, of which ``held`` (k,) stay where they are.
+    free : those whose points count.
+    ids : (n,) points.
+    camera_from_world : (k, 4, 4).
+    positions : (n, 3).
     """
 
     numbers: Indices

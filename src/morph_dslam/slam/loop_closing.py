@@ -93,7 +93,8 @@ def optimise(
 
     Parameters
     ----------
-    edges : (m, 2) rows of the first and the second transform of each edge. measured : (m,).
+    edges : (m, 2) rows of the first and the second transform of each edge.
+    measured : (m,).
     with_scale : whether scales are unknown too.
     """
     n_free = 7 if with_scale else 6
@@ -149,9 +150,12 @@ class Loop:
 
     Attributes
     ----------
-    number : the new keyframe. old : (g,) the old ones.
-    camera_from_world : (4, 4) the new one by the old points. scale : of old lengths to new ones.
-    found : old points in the new view. pairs : (p, 2) old and new numbers of points that are one.
+    number : the new keyframe.
+    old : (g,) the old ones.
+    camera_from_world : (4, 4) the new one by the old points.
+    scale : of old lengths to new ones.
+    found : old points in the new view.
+    pairs : (p, 2) old and new numbers of points that are one.
     """
 
     number: int

@@ -274,7 +274,8 @@ class MappingWork:
     Parameters
     ----------
     threaded : whether steps are done in a thread beside the frames.
-    before : done there before each step. after : done after each, by who goes on with the work.
+    before : done there before each step.
+    after : done after each, by who goes on with the work.
     """
 
     def __init__(

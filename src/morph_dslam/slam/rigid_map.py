@@ -48,8 +48,11 @@ class Keyframe:
 
     Attributes
     ----------
-    index, timestamp : of its frame. normalized : (h, w) its contrast-normalized image.
-    camera_from_world : (4, 4). point_ids : (k,) points seen, ascending. pixels : (k, 2) where.
+    index, timestamp : of its frame.
+    normalized : (h, w) its contrast-normalized image.
+    camera_from_world : (4, 4).
+    point_ids : (k,) points seen, ascending.
+    pixels : (k, 2) where.
     right : (k,) their columns in a right image (`Followed`); all unmeasured by default.
     described_ids, descriptors : (d,), (d, 32) what points looked like, by `descriptors.describe`.
     carrier : number of the keyframe that stands for this one since it was taken out, -1 before.
@@ -94,7 +97,8 @@ class Followed:
 
     Attributes
     ----------
-    ids : (n,) their numbers. pixels : (n, 2).
+    ids : (n,) their numbers.
+    pixels : (n, 2).
     right : (n,) their columns in a right image at the map's baseline, NaN where depth was not measured.
     """
 

@@ -281,8 +281,9 @@ class Tracked:
     Attributes
     ----------
     pose : from the map points; its ``inliers`` belong to the rows of ``points`` that are map points.
-    points : inliers and candidates. disagreeing : points that look like their map point but are not where a
-        rigid scene would have them. moved : (m,) those that surely have moved.
+    points : inliers and candidates.
+    disagreeing : points that look like their map point but are not where a rigid scene would have them.
+    moved : (m,) those that surely have moved.
     image_motion_px : how far the points moved since the previous frame, median.
     """
 
@@ -299,7 +300,8 @@ class Tracker:
 
     Attributes
     ----------
-    camera_from_world : (4, 4) the newest pose. points : what is followed.
+    camera_from_world : (4, 4) the newest pose.
+    points : what is followed.
     """
 
     def __init__(self, rigid_map: RigidMap, intrinsics: Array) -> None:

@@ -26,7 +26,9 @@ class Relocalizer:
 
     Parameters
     ----------
-    drawn : the model as it is drawn. grey : the reference image (h, w). mask : 255 where the object is seen.
+    drawn : the model as it is drawn.
+    grey : the reference image (h, w).
+    mask : 255 where the object is seen.
     view : the drawn mesh in it.
     """
 
@@ -46,7 +48,8 @@ class Relocalizer:
 
         Parameters
         ----------
-        grey : (h, w). shapes : parameters (d,) to try the first pose with.
+        grey : (h, w).
+        shapes : parameters (d,) to try the first pose with.
         mask : (h, w), 0 where not to look.
 
         Returns
@@ -74,7 +77,8 @@ def state_from_matches(
 
     Parameters
     ----------
-    points, pixels : (k) and (k, 2). shapes : parameters (d,) to try the first pose with.
+    points, pixels : (k) and (k, 2).
+    shapes : parameters (d,) to try the first pose with.
 
     Returns
     -------
