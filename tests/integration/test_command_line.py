@@ -238,7 +238,7 @@ def test_an_interrupt_keeps_the_frames_so_far_and_says_so(sequence, tmp_path, ca
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        (("frames = 16", "frames = 16\nzoom = 2"), "unknown key 'zoom'"),
+        (("frames = 16", "frames = 16\nzoom = 2"), "unknown key zoom; known here"),
         (("arch = 8.0", "arch = 900.0"), "arch"),
         (('model = "sheet.morph"', 'model = "absent.morph"'), r"there is no model file .*absent\.morph"),
         (('texture = "print.png"', 'texture = "absent.png"'), r"absent\.png"),

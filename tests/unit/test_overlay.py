@@ -97,7 +97,6 @@ def test_normals_of_an_arch_are_those_of_its_surface():
     inner = np.abs(x) < 0.49 * LENGTH
     found = vertex_normals(points, model.triangles)
     np.testing.assert_allclose(found[inner], expected[inner], atol=2e-3)
-    np.testing.assert_allclose(found, rendering.vertex_normals(points, model.triangles), atol=1e-12)
 
 
 def test_only_the_part_of_the_image_with_the_surface_is_painted():

@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.slam.frame_images import describe, least_distances, match_points, orientations
-from morph_dslam.slam.relocalization import PlaceIndex, Vocabulary, bit_counts
+from morph_dslam.slam.relocalization import PlaceIndex, Vocabulary
 from morph_dslam.slam.rigid_map import Keyframe, RigidMap
 from morph_dslam.slam.tracking import WarpedViews, is_small, local_change, plane_homography, warp_pixels
 from tests.support.rendered_sequence import printed_texture
@@ -154,12 +154,3 @@ def test_only_views_that_look_much_different_are_warped():
 )
 def test_changes_within_reach_of_following(change, small):
     assert is_small(change) is small
-
-
-def test_bits_are_counted_for_each_word():
-    rng = np.random.default_rng(5)
-    descriptors, members = rng.integers(0, 256, (50, 32), dtype=np.uint8), rng.integers(0, 3, 50)
-    bits = np.unpackbits(descriptors, axis=1).astype(int)
-    # No descriptor belongs to the fourth word.
-    expected = [bits[members == word].sum(axis=0) for word in range(4)]
-    assert np.array_equal(bit_counts(descriptors, members, 4), expected)

@@ -43,7 +43,7 @@ def test_unknown_key_is_named_with_those_known(tmp_path, top, tail, key, known):
     with pytest.raises(SceneError) as caught:
         load_scene_file(path)
     said, listed = str(caught.value).split("; known here: ")
-    assert said == f"{path}: unknown key '{key}'"
+    assert said == f"{path}: unknown key {key}"
     assert known in listed.split(", ")
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import types
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError,
 from scipy.interpolate import CubicSpline
 
 from morph_dslam.errors import SceneError
+from morph_dslam.io.sections import explain
 from morph_dslam.io.text import read_toml
 
 Array = NDArray[np.float64]
@@ -228,32 +228,6 @@ class Scene(_Section):
         return self
 
 
-def _section_at(section: type[BaseModel], location: tuple[int | str, ...]) -> type[BaseModel]:
-    """The section of the scene file in which the last key of a pydantic error ``location`` was written."""
-    for part in location[:-1]:
-        if isinstance(part, str):
-            pending = [section.model_fields[part].annotation]
-            while pending:
-                annotation = pending.pop()
-                if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
-                    section = annotation if issubclass(annotation, BaseModel) else section
-                pending.extend(get_args(annotation))
-    return section
-
-
-def _explain(path: Path, error: ValidationError) -> SceneError:
-    first = error.errors()[0]
-    location = first["loc"]
-    name = ".".join(str(part) for part in location)
-    if first["type"] == "extra_forbidden":
-        known = ", ".join(_section_at(Scene, location).model_fields)
-        return SceneError(f"{path}: unknown key '{name}'; known here: {known}")
-    if first["type"] == "missing":
-        return SceneError(f"{path}: the key '{name}' is missing")
-    message = first["msg"].removeprefix("Value error, ")
-    return SceneError(f"{path}: {name}: {message}" if name else f"{path}: {message}")
-
-
 def load_scene_file(path: Path) -> Scene:
     """Read and check a scene file.
 
@@ -266,4 +240,4 @@ def load_scene_file(path: Path) -> Scene:
     try:
         return Scene.model_validate(content)
     except ValidationError as error:
-        raise _explain(path, error) from error
+        raise SceneError(f"{path}: {explain(Scene, error)}") from error

@@ -11,7 +11,8 @@ from typing import Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from morph_dslam.studies.study import ExternalStudy, SheetStudy, SolidStudy, sections_of
+from morph_dslam.io.sections import sections_of
+from morph_dslam.studies.study import ExternalStudy, SheetStudy, SolidStudy
 
 #: Kinds of studies with their headings.
 _STUDIES = {"Solid": SolidStudy, "Sheet in two grips": SheetStudy, "Solutions of another program": ExternalStudy}

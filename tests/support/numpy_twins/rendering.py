@@ -82,12 +82,3 @@ def blend_surface(image, triangle_ids, weights, triangles, levels, brightness, t
     entry = (np.clip(level[:, 0], 0.0, 255.0) + 0.5).astype(int)
     colour = np.minimum(light * table[entry], 255.0)
     image[covered] = ((1.0 - alpha) * image[covered] + alpha * colour + 0.5).astype(np.uint8)
-
-
-def vertex_normals(points, triangles):
-    a, b, c = (points[triangles[:, corner]] for corner in range(3))
-    face_normals = np.cross(b - a, c - a)
-    nodes = triangles.T.ravel()
-    normals = np.column_stack([np.bincount(nodes, np.tile(component, 3), len(points)) for component in face_normals.T])
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return normals / np.where(length > 0.0, length, 1.0)
