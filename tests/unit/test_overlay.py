@@ -103,7 +103,7 @@ def test_only_the_part_of_the_image_with_the_surface_is_painted():
     """A square that leaves the image at the left: found where its corners are, cut at the border."""
     image = GREY.copy()
     shifted = PIXELS - np.array([60.0, 0.0])
-    painted = paint_surface(image, shifted, np.ones(4), TRIANGLES, np.ones(4), (0.0, 1.0))
+    painted = paint_surface(image, shifted, np.ones(4), TRIANGLES, np.full(4, 255.0), colour_table("turbo"))
     assert painted.box() == (40, 139, 0, 59)
     changed = (image != GREY).any(axis=2)
     assert changed.sum() == painted.covered.sum() == 100 * 60

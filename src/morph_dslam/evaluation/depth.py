@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import EvaluationError, SourceError
+from morph_dslam.evaluation.points import millimetres
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.sources import open_source
@@ -255,30 +256,21 @@ def _check(frames: list[int], distances: list[Array], base_frame: int | None, pa
         )
 
 
-def _millimetres(distances: Array) -> dict[str, float]:
-    values = 1e3 * distances
-    if not len(values):
-        return {"n_points": 0}
-    return {
-        "mean_mm": float(values.mean()),
-        "median_mm": float(np.median(values)),
-        "p95_mm": float(np.percentile(values, 95)),
-        "max_mm": float(values.max()),
-        "n_points": len(values),
-    }
+def _figures(distances: Array) -> dict[str, float]:
+    return {**(millimetres(distances) if len(distances) else {}), "n_points": len(distances)}
 
 
 def summarise_depth(error: DepthError) -> dict[str, Any]:
     """The figures of ``depth_evaluation.json``, millimetres, plain JSON."""
     return {
-        **_millimetres(error.compared),
+        **_figures(error.compared),
         "base_frame": error.base_frame,
-        "base": None if error.base is None else _millimetres(error.base),
+        "base": None if error.base is None else _figures(error.base),
         "left_out_beyond_mm": 1e3 * error.gate,
         "left_out_percent": 100.0 * float(error.left_out.mean()),
         "frames_compared": error.frames.tolist(),
         "per_frame": {
-            str(frame): {**_millimetres(distance), "left_out_percent": 100.0 * float(share)}
+            str(frame): {**_figures(distance), "left_out_percent": 100.0 * float(share)}
             for frame, distance, share in zip(error.frames, error.distances, error.left_out, strict=True)
         },
     }

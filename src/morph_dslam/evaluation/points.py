@@ -163,21 +163,6 @@ class MaterialError:
         """Length (e, b) of the error across the sight line, metres."""
         return np.linalg.norm(self.vectors - self.along_sight[..., None] * self.sight, axis=2)
 
-    @property
-    def mean(self) -> float:
-        """Mean error over all points and frames, metres."""
-        return float(np.nanmean(self.distances))
-
-    @property
-    def median(self) -> float:
-        """Median error over all points and frames, metres."""
-        return float(np.nanmedian(self.distances))
-
-    @property
-    def p95(self) -> float:
-        """95th percentile of the error over all points and frames, metres."""
-        return float(np.nanpercentile(self.distances, 95))
-
 
 def bind_truth(run: Run, truth: PointTruth, frame: int) -> Binding:
     """Bind truth points to the mesh by their pixels in ``frame``, in the state estimated there."""
@@ -248,13 +233,20 @@ def material_error(run: Run, truth: PointTruth, bind_frame: int) -> MaterialErro
     )
 
 
-def _millimetres(error: MaterialError, rows: slice) -> dict[str, float]:
-    distances = 1e3 * error.distances[rows]
+def millimetres(distances: Array) -> dict[str, float]:
+    """Mean, median, 95th percentile and largest of distances in metres, at least one of them not NaN."""
+    values = 1e3 * distances
     return {
-        "mean_mm": float(np.nanmean(distances)),
-        "median_mm": float(np.nanmedian(distances)),
-        "p95_mm": float(np.nanpercentile(distances, 95)),
-        "max_mm": float(np.nanmax(distances)),
+        "mean_mm": float(np.nanmean(values)),
+        "median_mm": float(np.nanmedian(values)),
+        "p95_mm": float(np.nanpercentile(values, 95)),
+        "max_mm": float(np.nanmax(values)),
+    }
+
+
+def _figures(error: MaterialError, rows: slice) -> dict[str, float]:
+    return {
+        **millimetres(error.distances[rows]),
         "mean_along_sight_mm": float(1e3 * np.nanmean(np.abs(error.along_sight[rows]))),
         "mean_across_sight_mm": float(1e3 * np.nanmean(error.across_sight[rows])),
     }
@@ -264,12 +256,12 @@ def summarise(error: MaterialError) -> dict[str, Any]:
     """The figures of `evaluation.json`, millimetres, plain JSON."""
     measured = np.isfinite(error.distances)
     per_frame = {
-        str(frame): _millimetres(error, slice(i, i + 1))
+        str(frame): _figures(error, slice(i, i + 1))
         for i, frame in enumerate(error.frames.tolist())
         if measured[i].any()
     }
     return {
-        **_millimetres(error, slice(None)),
+        **_figures(error, slice(None)),
         "bind_frame": error.binding.frame,
         "n_points": len(error.binding.columns) + len(error.binding.unbound),
         "n_points_bound": len(error.binding.columns),

@@ -79,12 +79,6 @@ def _texts(file: h5py.File, name: str) -> tuple[str, ...]:
     return tuple(str(value) for value in dataset.asstr()[()])
 
 
-def _array(file: h5py.File, name: str) -> NDArray:
-    dataset = file[name]
-    assert isinstance(dataset, h5py.Dataset)
-    return np.asarray(dataset[()])
-
-
 def load_run(folder: Path) -> Run:
     """Read a run folder.
 
@@ -108,12 +102,12 @@ def load_run(folder: Path) -> Run:
                 folder=folder,
                 model=model,
                 camera=camera,
-                frames=_array(file, "frame").astype(np.int64),
+                frames=np.asarray(file["frame"]).astype(np.int64),
                 status=_texts(file, "status"),
                 reasons=_texts(file, "reason"),
-                camera_from_object=_array(file, "camera_from_object").astype(float).reshape(-1, 4, 4),
-                parameters=_array(file, "parameters").astype(float),
-                stage_times=dict(zip(names, _array(file, "timings_ms").T, strict=True)),
+                camera_from_object=np.asarray(file["camera_from_object"]).astype(float).reshape(-1, 4, 4),
+                parameters=np.asarray(file["parameters"]).astype(float),
+                stage_times=dict(zip(names, np.asarray(file["timings_ms"]).T, strict=True)),
                 discrepancies=load_discrepancies(file),
             )
     except EvaluationError:

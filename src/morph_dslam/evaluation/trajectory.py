@@ -16,21 +16,14 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from morph_dslam.errors import EvaluationError
-from morph_dslam.evaluation.points import MaterialError
+from morph_dslam.evaluation.points import MaterialError, millimetres
 from morph_dslam.geometry import SimilarityTransform, fit_similarity, rotation_log
 from morph_dslam.io.trajectory import Trajectory, load_trajectory
 
 Array = NDArray[np.float64]
-
-
-def _statistics(distances: Array) -> dict[str, float]:
-    return {
-        "mean_mm": float(1e3 * np.mean(distances)),
-        "median_mm": float(1e3 * np.median(distances)),
-        "p95_mm": float(1e3 * np.percentile(distances, 95)),
-    }
 
 
 def _remaining(measured: Array, vectors: Array) -> Array:
@@ -57,11 +50,11 @@ def summarise_alignment(error: MaterialError) -> dict[str, Any]:
     together = np.linalg.norm(motion.apply(measured) - predicted, axis=1)
     return {
         "after_one_rigid_motion": {
-            **_statistics(together),
+            **millimetres(together),
             "rotation_deg": np.degrees(rotation_log(motion.rotation)).tolist(),
             "shift_of_centre_mm": (1e3 * shift).tolist(),
         },
-        "after_one_in_each_frame": _statistics(np.concatenate(single)),
+        "after_one_in_each_frame": millimetres(np.concatenate(single)),
     }
 
 
@@ -177,14 +170,8 @@ def relative_error(estimate: Trajectory, truth: Trajectory, interval: float, sca
     moved = np.linalg.inv(scaled[starts]) @ scaled[ends]
     expected = np.linalg.inv(truth.world_from_camera[starts]) @ truth.world_from_camera[ends]
     difference = np.linalg.inv(expected) @ moved
-    return RelativeError(times[starts], np.linalg.norm(difference[:, :3, 3], axis=1), _angles(difference[:, :3, :3]))
-
-
-def _angles(rotations: Array) -> Array:
-    """Angles (n,) of rotation matrices (n, 3, 3), radians; exact near zero and near pi."""
-    skew = 0.5 * (rotations - rotations.transpose(0, 2, 1))
-    sine = np.sqrt(skew[:, 2, 1] ** 2 + skew[:, 0, 2] ** 2 + skew[:, 1, 0] ** 2)
-    return np.arctan2(sine, 0.5 * (np.trace(rotations, axis1=1, axis2=2) - 1.0))
+    angles = Rotation.from_matrix(difference[:, :3, :3]).magnitude()
+    return RelativeError(times[starts], np.linalg.norm(difference[:, :3, 3], axis=1), angles)
 
 
 #: The relative error is taken over motions this long, seconds, where the trajectory allows it.

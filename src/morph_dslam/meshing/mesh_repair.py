@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 
-from morph_dslam.meshing.cell_types import CellType, cell_type
+from morph_dslam.meshing.cell_types import CellType
 from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces, jacobian_determinants
 
 
@@ -46,31 +45,21 @@ def reoriented(mesh: Mesh) -> Mesh:
     return _with_faces_found_again(replace(mesh, blocks=tuple(blocks)), mesh)
 
 
-def _collapses() -> list[tuple[tuple[tuple[int, int], tuple[int, int]], list[int]]]:
-    """Pairs of a hexahedron's edges, opposite on one face, and the nodes of the prism left if both vanish."""
-    hexahedron = cell_type("hex8")
-    edges = cell_type("hex20").parents
-    gaps = np.linalg.norm(hexahedron.nodes[:, None] - hexahedron.nodes, axis=2)
-    result = []
-    for one, other in combinations(edges, 2):
-        a, b = hexahedron.nodes[list(one)]
-        c, d = hexahedron.nodes[list(other)]
-        face = set(one) | set(other)
-        if len(face) < 4 or not any(face == set(corners) for corners in hexahedron.faces):
-            continue
-        if np.dot(b - a, d - c) < 0.0:
-            other = other[::-1]
-        ends = []
-        for edge in (one, other):
-            (side,) = [set(f) for f in hexahedron.faces if set(edge) <= set(f) and set(f) != face]
-            # The triangle left of that side: where the edge was, then the corners beyond, the near one first.
-            beyond = sorted(side - set(edge), key=gaps[edge[0]].__getitem__)
-            ends.append([edge[0], *beyond])
-        base, top = hexahedron.nodes[ends[0]], hexahedron.nodes[ends[1]]
-        if np.dot(np.cross(base[1] - base[0], base[2] - base[0]), top[0] - base[0]) < 0.0:
-            ends = [[x, z, y] for x, y, z in ends]
-        result.append(((one, other), ends[0] + ends[1]))
-    return result
+#: Pairs of a hexahedron's edges, opposite on one face, and the nodes of the prism left if both vanish.
+_COLLAPSES = (
+    (((0, 1), (3, 2)), [0, 4, 5, 3, 7, 6]),
+    (((0, 1), (4, 5)), [0, 2, 3, 4, 6, 7]),
+    (((1, 2), (0, 3)), [1, 5, 6, 0, 4, 7]),
+    (((1, 2), (5, 6)), [1, 3, 0, 5, 7, 4]),
+    (((2, 3), (6, 7)), [2, 0, 1, 6, 4, 5]),
+    (((3, 0), (7, 4)), [3, 1, 2, 7, 5, 6]),
+    (((4, 5), (7, 6)), [4, 1, 0, 7, 2, 3]),
+    (((5, 6), (4, 7)), [5, 2, 1, 4, 3, 0]),
+    (((0, 4), (1, 5)), [0, 3, 7, 1, 2, 6]),
+    (((0, 4), (3, 7)), [0, 5, 1, 3, 6, 2]),
+    (((1, 5), (2, 6)), [1, 0, 4, 2, 3, 7]),
+    (((2, 6), (3, 7)), [2, 1, 5, 3, 0, 4]),
+)
 
 
 def without_collapsed_cells(mesh: Mesh) -> Mesh:
@@ -83,7 +72,7 @@ def without_collapsed_cells(mesh: Mesh) -> Mesh:
     for block, start in zip(mesh.blocks, starts[:-1], strict=True):
         cells = np.arange(start, start + len(block.connectivity))
         collapsed = np.zeros(len(cells), dtype=bool)
-        for ((a, b), (c, d)), prism in _collapses() if block.cell_type == "hex8" else ():
+        for ((a, b), (c, d)), prism in _COLLAPSES if block.cell_type == "hex8" else ():
             nodes = block.connectivity
             twice = (nodes[:, a] == nodes[:, b]) & (nodes[:, c] == nodes[:, d]) & ~collapsed
             prisms.append(nodes[twice][:, prism])

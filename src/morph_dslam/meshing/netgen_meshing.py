@@ -214,16 +214,11 @@ def _filled(surface: _TriangleSurface) -> Any:
 
 def _meshed_anew(surface: _TriangleSurface, size: float) -> Any:
     """Netgen reads the surface from a file only; STL is the one format that its mesher takes."""
-    corners = surface.points[surface.triangles]
-    facets = (
-        "facet normal 0 0 0\nouter loop\n"
-        + "".join("vertex {!r} {!r} {!r}\n".format(*corner) for corner in triangle)
-        + "endloop\nendfacet\n"
-        for triangle in corners.tolist()
-    )
+    normals = {"facet_normals": [np.zeros(surface.triangles.shape)]}
+    content = meshio.Mesh(surface.points, {"triangle": surface.triangles}, cell_data=normals)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "surface.stl"
-        file.write_text("solid surface\n" + "".join(facets) + "endsolid surface\n")
+        content.write(file)
         geometry = stl.LoadSTLGeometry(str(file))
     return geometry.GenerateMesh(maxh=size)
 

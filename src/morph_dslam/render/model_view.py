@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
-from morph_dslam.render.overlay import draw_overlay, paint_surface
-from morph_dslam.render.shading import lambert, vertex_normals
+from morph_dslam.render.overlay import colour_levels, draw_overlay, paint_surface
+from morph_dslam.render.shading import colour_table, lambert, vertex_normals
 
 Array = NDArray[np.float64]
 VIEW_BACKGROUND = 245
+#: Width and height of the picture of one state, pixels.
+STATE_SIZE = (600, 520)
 #: Size of the object over that of the picture, and its distance from the camera over its size.
 FILLING, DISTANCE = 0.8, 4.0
 #: Size of what is drawn without letters over that of the picture.
@@ -96,9 +98,8 @@ def draw_shapes(
             camera.project(nodes),
             nodes[:, 2],
             triangles,
-            values,
-            value_range,
-            colour_map,
+            colour_levels(values, value_range),
+            colour_table(colour_map),
             brightness=lambert(vertex_normals(nodes, triangles), LIGHT, 0.4),
         )
         # Averaged down from twice the size, for smooth edges.
@@ -107,41 +108,33 @@ def draw_shapes(
 
 
 def draw_states(
-    model: ReducedModel,
-    states: Sequence[Array],
-    captions: Sequence[str],
-    direction: Array,
-    place: str = "solid",
-    size: tuple[int, int] = (600, 520),
+    model: ReducedModel, states: Sequence[Array], captions: Sequence[str], direction: Array
 ) -> NDArray[np.uint8]:
-    """States of a model side by side, coloured by von Mises stress in one range of colours.
+    """States of a solid side by side, coloured by von Mises stress in one range of colours.
 
     Parameters
     ----------
     states : parameters (d,) of each, SI.
     captions : a line for each.
     direction : (3,) in which the camera looks, object frame, not along z.
-    place : a key of `model.stresses`.
-    size : width and height of each picture, pixels.
 
     Returns
     -------
     (h, w, 3) uint8, blue, green, red.
     """
-    width, height = size
     shapes = [model.positions(mu) for mu in states]
-    stresses = [1e-6 * model.von_mises(mu, place) for mu in states]
+    stresses = [1e-6 * model.von_mises(mu, "solid") for mu in states]
     seen = np.unique(model.triangles)
     top = max(float(np.percentile(np.concatenate([stress[seen] for stress in stresses]), 99.5)), 1e-9)
     # The colour bar takes the right.
-    pose, camera = fitting_view([shape[seen] for shape in shapes], direction, size, middle=0.43)
+    pose, camera = fitting_view([shape[seen] for shape in shapes], direction, STATE_SIZE, middle=0.43)
     pictures = []
     for shape, stress, caption in zip(shapes, stresses, captions, strict=True):
         nodes = pose.apply(shape)
         brightness = lambert(vertex_normals(nodes, model.triangles), LIGHT, 0.4)
         pictures.append(
             draw_overlay(
-                np.full((height, width, 3), VIEW_BACKGROUND, dtype=np.uint8),
+                np.full((*STATE_SIZE[::-1], 3), VIEW_BACKGROUND, dtype=np.uint8),
                 camera.project(nodes),
                 nodes[:, 2],
                 model.triangles,

@@ -84,18 +84,27 @@ def _widened(value_range: tuple[float, float]) -> tuple[float, float]:
     return low, high if high > low else low + 1e-9 + abs(low) * 1e-6
 
 
-def _paint(
+def colour_levels(node_values: Array, value_range: tuple[float, float]) -> Array:
+    """Node values scaled so that 0 and 255 are the ends of the range."""
+    low, high = _widened(value_range)
+    return (np.asarray(node_values, dtype=np.float64) - low) * (255.0 / (high - low))
+
+
+def paint_surface(
     image: NDArray[np.uint8],
     pixels: Array,
     depths: Array,
     triangles: NDArray,
     levels: Array,
-    brightness: Array | None,
     table: NDArray,
-    alpha: float,
-    closed: bool,
+    alpha: float = 1.0,
+    brightness: Array | None = None,
+    closed: bool = False,
 ) -> _Painted:
-    """Blend a surface into ``image``; only the part of it that the surface may cover is looked at."""
+    """Paint a surface into ``image``, which changes; only the part of it that the surface may cover is looked at.
+
+    Other parameters are those of `blend_surface` and `draw_overlay`.
+    """
     region = image_region(pixels, *image.shape[:2], margin=1)
     if region is None:
         return _Painted(np.zeros((1, 1), dtype=bool), (0, 0))
@@ -105,36 +114,9 @@ def _paint(
     corners = np.ascontiguousarray(triangles, dtype=np.int64)
     buffers = rasterise(pixels - np.array(corner, dtype=float), depths, corners, *size, closed=closed)
     light = np.ones(len(pixels)) if brightness is None else np.asarray(brightness, dtype=np.float64)
-    blend_surface(
-        image[rows, columns],
-        buffers.triangle_ids,
-        buffers.weights,
-        corners,
-        np.asarray(levels, dtype=np.float64),
-        light,
-        table,
-        float(alpha),
-    )
+    part = image[rows, columns]
+    blend_surface(part, buffers.triangle_ids, buffers.weights, corners, levels, light, table, float(alpha))
     return _Painted(buffers.covered, corner)
-
-
-def paint_surface(
-    image: NDArray[np.uint8],
-    pixels: Array,
-    depths: Array,
-    triangles: NDArray,
-    node_values: Array,
-    value_range: tuple[float, float],
-    colour_map: str = "turbo",
-    alpha: float = 1.0,
-    brightness: Array | None = None,
-    closed: bool = False,
-) -> _Painted:
-    """Paint a surface coloured by a field into ``image``, which changes; arguments as of `draw_overlay`."""
-    low, high = _widened(value_range)
-    levels = (np.asarray(node_values, dtype=np.float64) - low) * (255.0 / (high - low))
-    table = colour_table(colour_map)
-    return _paint(image, pixels, depths, triangles, levels, brightness, table, alpha, closed)
 
 
 def draw_overlay(
@@ -176,9 +158,8 @@ def draw_overlay(
     height, width = image.shape[:2]
     scale = 0.42 * max(height / 480.0, 0.6)
     low, high = _widened(value_range)
-    painted = paint_surface(
-        result, pixels, depths, triangles, node_values, value_range, colour_map, alpha, brightness, closed
-    )
+    levels, table = colour_levels(node_values, value_range), colour_table(colour_map)
+    painted = paint_surface(result, pixels, depths, triangles, levels, table, alpha, brightness, closed)
     _draw_outline(result, painted)
     margin = round(0.02 * height)
     bar = colour_bar(round(0.6 * height), float(low), float(high), label, colour_map, scale)
@@ -216,8 +197,7 @@ def draw_inner_surface(
     """
     result = image.copy()
     table = np.tile(np.array(colour, dtype=np.float64), (256, 1))
-    levels = np.zeros(len(pixels))
-    painted = _paint(result, pixels, depths, triangles, levels, brightness, table, alpha, closed=False)
+    painted = paint_surface(result, pixels, depths, triangles, np.zeros(len(pixels)), table, alpha, brightness)
     _draw_outline(result, painted, colour)
     box = painted.box()
     if label and box is not None:
