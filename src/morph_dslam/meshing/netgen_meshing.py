@@ -214,8 +214,11 @@ def _filled(surface: _TriangleSurface) -> Any:
 
 def _meshed_anew(surface: _TriangleSurface, size: float) -> Any:
     """Netgen reads the surface from a file only; STL is the one format that its mesher takes."""
-    normals = {"facet_normals": [np.zeros(surface.triangles.shape)]}
-    content = meshio.Mesh(surface.points, {"triangle": surface.triangles}, cell_data=normals)
+    content = meshio.Mesh(
+        surface.points,
+        {"triangle": surface.triangles},
+        cell_data={"facet_normals": [np.zeros(surface.triangles.shape)]},
+    )
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "surface.stl"
         content.write(file)
