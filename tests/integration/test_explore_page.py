@@ -1,4 +1,4 @@
-"""The page of `morph explore` in a real browser: what it says, and what it draws."""
+"""The page of `morph explore` and the build's report in a real browser: what they say, and what they draw."""
 
 import threading
 from urllib.parse import urlsplit
@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from morph_dslam.explore.server import make_server
+from morph_dslam.reduction.report import write_build_report
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.certified_block import certified_block_model
 from tests.support.chromium import Page, find_chromium
 from tests.support.stretched_block import SHEAR_MODULUS, SIZE, YOUNG_MODULUS, stretched_block_model
 
@@ -113,3 +115,20 @@ def test_the_fields_of_a_sheet_and_their_colour_bar(show):
     page.evaluate("(s => { s.value = 0; s.dispatchEvent(new Event('input')); })(document.getElementById('scale'))")
     _, flat = drawn(page)
     assert (arched != flat).mean() > 0.01
+
+
+def test_the_report_shows_in_a_browser(tmp_path):
+    path = tmp_path / "block.report.html"
+    write_build_report(path, certified_block_model())
+    with Page(tmp_path / "profile") as page:
+        page.send("Page.navigate", url=path.as_uri())
+        page.wait_for("document.title.startsWith('stretched block') && document.readyState === 'complete'")
+        widths = page.evaluate("[...document.images].map(image => image.complete ? image.naturalWidth : 0)")
+        assert len(widths) == 4
+        assert min(widths) > 600
+        for width in (1000, 480):
+            metrics = {"height": 700, "deviceScaleFactor": 1, "mobile": False}
+            page.send("Emulation.setDeviceMetricsOverride", width=width, **metrics)
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert page.problems == []
+        assert [url for url in page.requests if not url.startswith("data:")] == [path.as_uri()]
