@@ -14,7 +14,7 @@ from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solid import SolidProblem
 from morph_dslam.mechanics.solvers.continuation import advance
 from morph_dslam.mechanics.solvers.newton import State
-from morph_dslam.mechanics.supports import AffineMotion
+from morph_dslam.mechanics.supports import AffineMotion, PrescribedDisplacement
 from morph_dslam.meshing.generators import block
 from morph_dslam.meshing.meshes import CellBlock, Mesh
 from morph_dslam.model import Parameter
@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 SOLID_CELLS = ("hex8", "hex20", "hex27", "tet4", "tet10", "prism6", "prism15", "prism18")
 FACES = ("x_min", "x_max", "y_min", "y_max", "z_min", "z_max")
 RUBBER = NeoHookean(young=3e6, poisson=0.45)
+#: Symmetry planes of a block that is stretched.
+ROLLERS = tuple(PrescribedDisplacement(f"{axis}_min", **{axis: 0.0}) for axis in "xyz")
 
 
 def load_parameter(**defaults: float) -> ParameterSymbols:

@@ -11,13 +11,8 @@ from morph_dslam.mechanics.materials.isotropic import NeoHookean, StVenantKirchh
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.supports import PrescribedDisplacement
 from morph_dslam.meshing.generators import block
-from tests.support.solids import FACES, RUBBER, AffineSupport, distorted, load_parameter, solved
+from tests.support.solids import FACES, ROLLERS, RUBBER, AffineSupport, distorted, load_parameter, solved
 
-ROLLERS = (
-    PrescribedDisplacement("x_min", x=0.0),
-    PrescribedDisplacement("y_min", y=0.0),
-    PrescribedDisplacement("z_min", z=0.0),
-)
 #: Lame's constants 4 and 1 (MPa): Poisson's ratio lambda / 2(lambda + mu), E = 2 mu (1 + nu).
 STIFF = NeoHookean(young=2.8e6, poisson=0.4)
 #: Hooke's law in the Green-Lagrange strain: l_2^2 = 1 - nu (l^2 - 1) and P = l E (l^2 - 1) / 2.
