@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from morph_dslam.cli.app import main
-from morph_dslam.evaluation.depth import RIM_PX, depth_error
+from morph_dslam.evaluation.depth import RIM_PX, DepthError, depth_error, summarise_depth
 from morph_dslam.evaluation.run_folder import load_run
+from morph_dslam.evaluation.run_report import plot_depth_errors_by_frame
 from tests.support.numpy_twins import rendering
 from tests.support.run_folders import CAMERA, write_run
 
@@ -79,6 +80,18 @@ def test_a_folder_of_images_is_read_in_its_unit(folder, tmp_path):
     error = depth_error(load_run(folder), tmp_path, values_per_metre=4000.0)
     assert error.frames.tolist() == [11]
     assert error.compared.max() <= 0.125e-3 + 1e-6  # half of the sensor's step
+
+
+@pytest.mark.parametrize("n_frames", [3, 40])
+def test_a_frame_whose_depth_is_all_of_something_else_is_counted_and_not_drawn(tmp_path, n_frames):
+    distances = [np.array([]), *(np.full(5, 1e-3 * k) for k in range(1, n_frames))]
+    nodes = [np.zeros(len(row), dtype=int) for row in distances]
+    error = DepthError(np.arange(n_frames), distances, nodes, 0.1, np.eye(n_frames)[0], None)
+    plot_depth_errors_by_frame(tmp_path / "errors.png", error)
+    assert (tmp_path / "errors.png").read_bytes().startswith(b"\x89PNG")
+    figures = summarise_depth(error)
+    assert figures["per_frame"]["0"] == {"n_points": 0, "left_out_percent": 100.0}
+    assert figures["mean_mm"] == pytest.approx(np.arange(1, n_frames).mean())
 
 
 @pytest.mark.parametrize(

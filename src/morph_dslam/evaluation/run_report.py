@@ -66,14 +66,18 @@ def plot_errors_by_frame(path: Path, error: MaterialError) -> None:
 
 def plot_depth_errors_by_frame(path: Path, error: DepthError) -> None:
     """The spread of the surface error over the sensor's points of each frame, beside that of the sensor."""
-    distances = [1e3 * row for row in error.distances]
+    # In a frame that shows something else before the whole object, all points are left out.
+    frames, rows = zip(
+        *((f, row) for f, row in zip(error.frames, error.distances, strict=True) if len(row)), strict=True
+    )
+    distances = [1e3 * row for row in rows]
     base = error.base
     title = "no base frame"
     if base is not None and len(base):
         title = f"sensor and registration in frame {error.base_frame}: mean {1e3 * base.mean():.2f} mm (dotted)"
     shown = None if base is None or not len(base) else 1e3 * float(base.mean())
     label = "distance to the estimated surface [mm]"
-    _plot_by_frame(path, error.frames, distances, [1e3 * error.compared], label, title, shown)
+    _plot_by_frame(path, np.array(frames), distances, [1e3 * error.compared], label, title, shown)
 
 
 def _plot_by_frame(
