@@ -40,10 +40,6 @@ class RunWarning(StrEnum):
         "parameter '{parameter}' is at the {side} bound of its range ({bound}) in {count} frames: the object may be "
         "outside what the model covers"
     )
-    RESTS_AT_BOUND = (
-        "parameter '{parameter}' is at the {side} bound of its range ({bound}) in {count} frames: the object rests "
-        "there, or is outside what the model covers"
-    )
     UNOBSERVABLE = "{statement}"
     REREGISTERED = "registered anew in frame {frame}"
     NOT_REREGISTERED = "not registered anew in frame {frame}: {why}"
@@ -104,7 +100,7 @@ def notices_of(run: RunResults) -> list[RunNotice]:
 
 
 def _at_bound(run: RunResults) -> list[RunNotice]:
-    """Parameters that the images put to an end of their range."""
+    """Parameters that the images put to an end of their range, unless the undeformed object has them there."""
     found = []
     with np.errstate(invalid="ignore"):
         determined = run.parameter_std() < UNOBSERVABLE_SHARE * (run.model.upper - run.model.lower)
@@ -114,10 +110,11 @@ def _at_bound(run: RunResults) -> list[RunNotice]:
         unit = "" if parameter.quantity == "ratio" else f" {parameter.unit}"
         for bound, side, rows in ((parameter.lower, "lower", ~upper), (parameter.upper, "upper", upper)):
             count = int((at_bound[:, k] & rows).sum())
-            if count:
-                warning = RunWarning.RESTS_AT_BOUND if bound == parameter.default else RunWarning.AT_BOUND
+            if count and bound != parameter.default:
                 shown = f"{parameter.display(bound):.4g}{unit}"
-                found.append(RunNotice.of(warning, parameter=parameter.name, side=side, bound=shown, count=count))
+                found.append(
+                    RunNotice.of(RunWarning.AT_BOUND, parameter=parameter.name, side=side, bound=shown, count=count)
+                )
     return found
 
 
