@@ -20,6 +20,7 @@ PROJECT = Path(__file__).parents[1]
 #: Public names by subject; names in no group come last.
 GROUPS = {
     "Models": ["build", "load_study", "make_study", "load_model", "save_model", "ReducedModel", "Parameter"],
+    "Models in other programs": ["export", "StateChoice", "explore"],
     "Mechanics": ["SolidProblem", "write_build_report"],
     "Cameras, frames and scenes": [
         *("Camera", "load_camera", "calibrate", "Board", "open_source", "open_live", "Frame"),
@@ -30,7 +31,9 @@ GROUPS = {
         *("Tracker", "TrackerOptions", "FrameResult", "Status", "TrackingWarning"),
         *("Session", "track", "TrackOptions"),
     ],
-    "Simulation and evaluation": ["simulate", "evaluate", "evaluate_depth", "evaluate_trajectory"],
+    "Simulation and evaluation": [
+        *("simulate", "Run", "load_run", "evaluate", "evaluate_depth", "evaluate_trajectory")
+    ],
     "Errors": ["MorphError"],
 }
 

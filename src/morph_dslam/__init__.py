@@ -20,10 +20,12 @@ __all__ = [
     "Parameter",
     "ReducedModel",
     "Registration",
+    "Run",
     "Scene",
     "Session",
     "SlamOptions",
     "SolidProblem",
+    "StateChoice",
     "Status",
     "TrackOptions",
     "Tracker",
@@ -34,9 +36,12 @@ __all__ = [
     "evaluate",
     "evaluate_depth",
     "evaluate_trajectory",
+    "explore",
+    "export",
     "load_camera",
     "load_model",
     "load_registration",
+    "load_run",
     "load_scene",
     "load_study",
     "make_study",
@@ -61,10 +66,12 @@ _MODULES = {
     "Parameter": "model",
     "ReducedModel": "model",
     "Registration": "registration.registration",
+    "Run": "evaluation.run_folder",
     "Scene": "slam.scene",
     "Session": "tracking.session",
     "SlamOptions": "slam.options",
     "SolidProblem": "mechanics.solid",
+    "StateChoice": "io.export",
     "Status": "tracking.outcomes",
     "TrackOptions": "tracking.run_options",
     "Tracker": "tracking.tracker",
@@ -75,9 +82,12 @@ _MODULES = {
     "evaluate": "evaluation.evaluate",
     "evaluate_depth": "evaluation.evaluate",
     "evaluate_trajectory": "evaluation.trajectory",
+    "explore": "explorer.server",
+    "export": "io.export",
     "load_camera": "io.camera_files",
     "load_model": "model",
     "load_registration": "registration.registration",
+    "load_run": "evaluation.run_folder",
     "load_scene": "slam.scene",
     "load_study": "studies.study",
     "make_study": "studies.study",
@@ -99,8 +109,11 @@ if TYPE_CHECKING:  # the same for editors and type checkers
     from morph_dslam.camera import Camera
     from morph_dslam.errors import MorphError
     from morph_dslam.evaluation.evaluate import evaluate, evaluate_depth
+    from morph_dslam.evaluation.run_folder import Run, load_run
     from morph_dslam.evaluation.trajectory import evaluate_trajectory
+    from morph_dslam.explorer.server import explore
     from morph_dslam.io.camera_files import load_camera
+    from morph_dslam.io.export import StateChoice, export
     from morph_dslam.mechanics.solid import SolidProblem
     from morph_dslam.model import Parameter, ReducedModel, load_model, save_model
     from morph_dslam.reduction.report import write_build_report

@@ -6,7 +6,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from morph_dslam.explore.server import make_server
+from morph_dslam.explorer.server import make_server
 from morph_dslam.reduction.report import write_build_report
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.certified_block import certified_block_model

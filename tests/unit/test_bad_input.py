@@ -163,7 +163,7 @@ def test_a_damaged_summary_is_named(tmp_path):
     for text in ("", "[]", '{"flags": ['):
         (tmp_path / "summary.json").write_text(text)
         with pytest.raises(EvaluationError, match=r"summary\.json"):
-            write_run_report(run, {})
+            write_run_report(tmp_path, run, {})
 
 
 def test_a_folder_that_holds_a_run_or_cannot_be_made(tmp_path):

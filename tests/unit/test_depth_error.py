@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.cli.app import main
-from morph_dslam.evaluation.depth import RIM_PX, DepthError, depth_error, summarise_depth
+from morph_dslam.evaluation.depth import RIM_PX, DepthError, depth_error, read_depths, summarise_depth
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.evaluation.run_report import plot_depth_errors_by_frame
 from tests.support.numpy_twins import rendering
@@ -38,7 +38,7 @@ def folder(tmp_path_factory):
 
 
 def test_distances_are_those_of_the_sensor_and_what_is_in_front_is_left_out(folder):
-    error = depth_error(load_run(folder), folder.parent / "depth.h5", base_frame=10)
+    error = depth_error(load_run(folder), read_depths(folder.parent / "depth.h5", range(12)), base_frame=10)
     assert error.frames.tolist() == [10, 11]
     assert error.base is not None
     assert error.base.max() < 1e-5
@@ -54,7 +54,7 @@ def test_distances_are_those_of_the_sensor_and_what_is_in_front_is_left_out(fold
 
 def test_means_at_nodes_are_of_the_points_around_them(folder):
     run = load_run(folder)
-    error = depth_error(run, folder.parent / "depth.h5")
+    error = depth_error(run, read_depths(folder.parent / "depth.h5", [10, 11]))
     means = error.node_means(len(run.model.nodes))
     seen = np.isfinite(means)
     assert seen.mean() > 0.8
@@ -77,7 +77,7 @@ def test_the_command_prints_the_base_beside_the_error(folder, capsys):
 def test_a_folder_of_images_is_read_in_its_unit(folder, tmp_path):
     depth = surface_depth(load_run(folder), 1)
     cv2.imwrite(str(tmp_path / "depth-11.png"), np.rint(4000.0 * depth).astype(np.uint16))
-    error = depth_error(load_run(folder), tmp_path, values_per_metre=4000.0)
+    error = depth_error(load_run(folder), read_depths(tmp_path, [10, 11], values_per_metre=4000.0))
     assert error.frames.tolist() == [11]
     assert error.compared.max() <= 0.125e-3 + 1e-6  # half of the sensor's step
 

@@ -10,8 +10,8 @@ import pytest
 
 from morph_dslam import make_study
 from morph_dslam.errors import StudyError
-from morph_dslam.export import StateChoice
 from morph_dslam.io.camera_files import load_camera
+from morph_dslam.io.export import StateChoice
 from morph_dslam.io.landmarks import load_landmarks
 from morph_dslam.mechanics.materials.user import UserMaterial
 from morph_dslam.model import Parameter, save_model
@@ -26,6 +26,7 @@ from morph_dslam.studies.sheet_study import SheetStudy
 from morph_dslam.studies.solid_study import SolidStudy
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.documents import PAGES, samples
+from tests.support.run_folders import exact_truth, write_run
 
 
 def test_every_sample_file_is_read_by_a_test_here():
@@ -167,6 +168,7 @@ def test_every_program_is_run_by_a_test():
         "materials": 1,
         "meshes": 1,
         "model-file": 2,
+        "run-folder": 1,
         "slam": 2,
         "solid-study": 2,
     }
@@ -206,3 +208,13 @@ def test_report_from_the_model_alone(tmp_path, monkeypatch):
     save_model(Path("seal.morph"), bent_sheet_model(9, 7))
     run_sample("certificate")
     assert "<html" in Path("seal.report.html").read_text()
+
+
+def test_evaluation_in_memory(tmp_path, monkeypatch):
+    """Truth that follows the run exactly has no error in any frame but the binding one."""
+    monkeypatch.chdir(tmp_path)
+    np.savez("truth.npz", **exact_truth(write_run(Path("run"))))
+    before = sorted(tmp_path.rglob("*"))
+    in_frame = run_sample("run-folder")["in_frame"]
+    assert in_frame == pytest.approx(dict.fromkeys(("11", "12", "13", "14", "15"), 0.0), abs=1e-4)
+    assert sorted(tmp_path.rglob("*")) == before

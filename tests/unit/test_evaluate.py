@@ -6,8 +6,16 @@ import re
 import numpy as np
 import pytest
 
+import morph_dslam as md
 from morph_dslam.cli.app import main
-from tests.support.run_folders import exact_truth, write_run
+from morph_dslam.errors import EvaluationError
+from morph_dslam.extend.reports import PointTruth
+from morph_dslam.extend.slam import Trajectory
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.tracking.estimator import Estimate
+from morph_dslam.tracking.state import State
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.run_folders import CAMERA, FRAMES, exact_truth, states, write_run
 
 
 @pytest.fixture
@@ -53,3 +61,49 @@ def test_a_frame_that_cannot_bind_is_one_message(run_and_truth, capsys, frame, m
     assert message in captured.err
     assert captured.err.count("\n") == 1
     assert not (run / "evaluation.json").exists()
+
+
+@pytest.fixture
+def results():
+    """What a tracker returns that follows `states`, and loses the third frame."""
+    model, found = bent_sheet_model(22, 16), {}
+    for frame, mu, pose in zip(FRAMES.tolist(), *states(len(FRAMES)), strict=True):
+        state = State(mu, RigidTransform.from_matrix(pose))
+        estimate = Estimate(state, 1.0, np.zeros((0, 2)), 0.3, np.eye(9), np.zeros(3, bool), 4, True)
+        found[frame] = md.FrameResult(model, md.Status.TRACKED, estimate, total_ms=7.0)
+    found[12] = md.FrameResult(model, md.Status.LOST)
+    return found
+
+
+def test_results_in_memory_are_compared_with_points(results):
+    truth = exact_truth(results[10].model)
+    points = 1e-3 * (truth["points_mm"] + np.array([0.0, 3.0, 4.0]))
+    given = PointTruth(truth["frame"], points, truth["pixels"], np.zeros(points.shape[:2], dtype=bool))
+    figures = md.evaluate(md.Run.of(CAMERA, results), given, 10)
+    assert figures["mean_mm"] == pytest.approx(5.0, abs=1e-3)
+    assert (figures["n_frames_tracked"], figures["truth_frames_not_tracked"]) == (5, [12])
+    assert figures["median_ms"] == pytest.approx(7.0)
+
+
+def test_results_in_memory_are_compared_with_depth(results):
+    """A plane 2 mm behind the flat sheet at 0.6 m, which faces the camera."""
+    flat = State(np.zeros(3), RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6])))
+    estimate = Estimate(flat, 1.0, np.zeros((0, 2)), 0.3, np.eye(9), np.zeros(3, bool), 4, True)
+    run = md.Run.of(CAMERA, {10: md.FrameResult(results[10].model, md.Status.TRACKED, estimate)})
+    figures = md.evaluate_depth(run, [(9, np.zeros((1, 1))), (10, np.full((480, 640), 0.602))])
+    assert figures["frames_compared"] == [10]
+    assert figures["mean_mm"] == pytest.approx(2.0, abs=1e-3)
+    with pytest.raises(EvaluationError, match="show nothing of the estimated surface"):
+        md.evaluate_depth(run, [])
+
+
+def test_paths_in_memory_are_compared():
+    """A path twice as long as the true one, which climbs steadily round a corner."""
+    poses = np.tile(np.eye(4), (30, 1, 1))
+    poses[:, :2, 3] = np.column_stack([np.arange(30.0), np.maximum(0.0, np.arange(30.0) - 10.0)])
+    larger = poses.copy()
+    larger[:, :3, 3] *= 2.0
+    figures = md.evaluate_trajectory(Trajectory(np.arange(30.0), larger), Trajectory(np.arange(30.0), poses))
+    assert figures["sim3"]["scale"] == pytest.approx(0.5)
+    assert figures["sim3"]["absolute_mm"]["max"] < 1e-6
+    assert figures["truth_length_m"] == pytest.approx(10.0 + 19.0 * np.sqrt(2.0))

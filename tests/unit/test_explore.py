@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from morph_dslam.cli import app as cli
-from morph_dslam.explore.server import HOST, make_server
+from morph_dslam.explorer.server import make_server
+from morph_dslam.io.local_server import HOST
 from morph_dslam.model import save_model
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.stretched_block import SHEAR_MODULUS, SIZE, YOUNG_MODULUS, stretched_block_model

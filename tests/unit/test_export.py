@@ -10,7 +10,7 @@ import pytest
 
 from morph_dslam.cli import app as cli
 from morph_dslam.errors import ExportError
-from morph_dslam.export import FRAMES_PER_SECOND, StateChoice, export
+from morph_dslam.io.export import FRAMES_PER_SECOND, StateChoice, export
 from morph_dslam.meshing.generators import block
 from morph_dslam.model import save_model
 from tests.support.bent_sheet import bent_sheet_model

@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 
 from morph_dslam.cli import app as cli
-from morph_dslam.evaluation.model_summary import describe_point, summarise_model
-from morph_dslam.evaluation.points import error_table, field_title, sensitivity_table
+from morph_dslam.evaluation.model_summary import (
+    describe_point,
+    error_table,
+    field_title,
+    sensitivity_table,
+    summarise_model,
+)
 from morph_dslam.evaluation.report import Table
 from morph_dslam.model import Parameter, save_model
 from morph_dslam.model.basis_functions import chebyshev_basis

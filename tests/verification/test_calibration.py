@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.calibration.board import Board, View, find_corners, parse_board, select_by_coverage
+from morph_dslam.calibration.board import Board, View, find_corners, select_by_coverage
 from morph_dslam.calibration.calibrate import calibrate
 from morph_dslam.calibration.solve import solve_intrinsics
 from morph_dslam.camera import Camera
@@ -183,11 +183,11 @@ def test_a_camera_file_that_cannot_be_written(pictures, tmp_path):
 )
 def test_boards_that_are_refused(board, square, message):
     with pytest.raises(CameraError, match=message):
-        parse_board(board, square)
+        Board.parse(board, square)
 
 
 def test_boards_as_users_write_them():
-    assert parse_board(" 9 x 6", "25mm") == parse_board("9X6", "0.025 m") == BOARD
+    assert Board.parse(" 9 x 6", "25mm") == Board.parse("9X6", "0.025 m") == BOARD
 
 
 def test_selection_prefers_views_that_differ():

@@ -13,11 +13,11 @@ from tests.support.real_data import real_data
 CAMERA = Camera(640, 480, 528.0144, 528.0144, 320.0, 240.0)
 
 
-def rigid_run(folder, frames, poses):
+def rigid_run(frames, poses):
     shape = np.zeros((len(frames), 3))
     words = ("tracked",) * len(frames), ("",) * len(frames)
     times = {"total": np.ones(len(frames))}
-    return Run(folder, bent_sheet_model(), CAMERA, frames, *words, np.array(poses), shape, times)
+    return Run(bent_sheet_model(), CAMERA, frames, *words, np.array(poses), shape, times)
 
 
 def plane_pose(points):
@@ -40,12 +40,12 @@ def test_a_rigid_sheet_explains_the_flat_frames_and_not_the_bent_ones():
     folder = real_data("kinect_paper")
     truth = load_truth(folder / "ground_truth.npz")
     flat = plane_pose(truth.points[0])
-    binding = bind_truth(rigid_run(folder, truth.frames[:1], [flat.matrix]), truth, 9)
+    binding = bind_truth(rigid_run(truth.frames[:1], [flat.matrix]), truth, 9)
     assert len(binding.columns) == 301
     assert binding.n_outline == 0
     rest = bent_sheet_model().rest_positions(binding.points)
     poses = [flat.matrix, *(nearest_pose(rest, points).matrix for points in truth.points[1:])]
-    error = material_error(rigid_run(folder, truth.frames, poses), truth, 9)
+    error = material_error(rigid_run(truth.frames, poses), truth, 9)
     by_frame = dict(zip(error.frames.tolist(), 1e3 * error.distances.mean(axis=1), strict=True))
     assert by_frame[17] < 1.5
     # An independent prototype measured 11.2 mm over all frames for the best rigid flat sheet.

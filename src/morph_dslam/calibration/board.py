@@ -35,6 +35,28 @@ class Board:
     rows: int
     square: float
 
+    @classmethod
+    def parse(cls, text: str, square: str) -> Board:
+        """The board of "9x6" inner corners and squares of "25 mm".
+
+        Raises CameraError if one of them is not of that form, or the board is too small to be recognised.
+        """
+        size = re.fullmatch(r"(\d+)\s*[xX×]\s*(\d+)", text.strip())
+        if size is None:
+            raise CameraError(f"'{text}' is no board: give its inner corners, 9x6 say")
+        columns, rows = int(size[1]), int(size[2])
+        if min(columns, rows) < 3:
+            raise CameraError(f"a board of {columns}x{rows} inner corners is too small: it needs 3x3 at least")
+        length = re.fullmatch(r"([0-9.eE+-]+)\s*([a-z]+)", square.strip())
+        units = FACTORS["length"]
+        try:
+            side = float(length[1]) * units[length[2]]  # type: ignore[index]
+        except (TypeError, ValueError, KeyError):
+            raise CameraError(f"'{square}' is no length: give a number and one of {', '.join(units)}") from None
+        if not 0.0 < side < np.inf:
+            raise CameraError(f"a square of {square} is impossible: measure the side of one square")
+        return cls(columns, rows, side)
+
     @property
     def points(self) -> Array:
         """The inner corners (columns * rows, 3) row by row in the plane z = 0, metres."""
@@ -45,28 +67,6 @@ class Board:
     def has_one_orientation(self) -> bool:
         """Whether its colours tell the board from itself turned by half a turn."""
         return (self.columns + self.rows) % 2 == 1
-
-
-def parse_board(text: str, square: str) -> Board:
-    """The board of "9x6" inner corners and squares of "25 mm".
-
-    Raises CameraError if one of them is not of that form, or the board is too small to be recognised.
-    """
-    size = re.fullmatch(r"(\d+)\s*[xX×]\s*(\d+)", text.strip())
-    if size is None:
-        raise CameraError(f"'{text}' is no board: give its inner corners, 9x6 say")
-    columns, rows = int(size[1]), int(size[2])
-    if min(columns, rows) < 3:
-        raise CameraError(f"a board of {columns}x{rows} inner corners is too small: it needs 3x3 at least")
-    length = re.fullmatch(r"([0-9.eE+-]+)\s*([a-z]+)", square.strip())
-    units = FACTORS["length"]
-    try:
-        side = float(length[1]) * units[length[2]]  # type: ignore[index]
-    except (TypeError, ValueError, KeyError):
-        raise CameraError(f"'{square}' is no length: give a number and one of {', '.join(units)}") from None
-    if not 0.0 < side < np.inf:
-        raise CameraError(f"a square of {square} is impossible: measure the side of one square")
-    return Board(columns, rows, side)
 
 
 def find_corners(grey: NDArray[np.uint8], board: Board) -> Array | None:

@@ -81,11 +81,12 @@ BENT = 0.005
 
 @dataclass(frozen=True)
 class Calibration:
-    """What was solved, and from what."""
+    """What was solved, from what, and the picture of its residuals, where one was written."""
 
     solution: Solution
     found: Views
     board: Board
+    picture: Path | None = None
 
     @property
     def coverage(self) -> float:
@@ -131,34 +132,39 @@ class Calibration:
 
 
 def calibrate(
-    sources: Sequence[str | Path], board: Board, output: str | Path, lens_model: LensModel = "radial-tangential"
+    sources: Sequence[str | Path],
+    board: Board,
+    output: str | Path | None = None,
+    lens_model: LensModel = "radial-tangential",
 ) -> Calibration:
-    """Calibrate a camera and write the camera file and, beside it, a picture (`picture_path`).
+    """Calibrate a camera; its intrinsics and distortion are the ``solution.camera`` of the result.
 
     Parameters
     ----------
     sources : images, one folder of images, or one video or other recording.
-    output : the camera file.
+    board : that they show.
+    output : the camera file to write, and beside it a picture of the residuals; None to write nothing.
+    lens_model : of the camera.
 
     Raises CameraError if the board is found in too few images, images differ in size, the views do not determine the
     focal length, or the camera file cannot be written. Raises SourceError if an image or a video cannot be read.
     """
-    output = Path(output)
+    picture = None if output is None else _picture_path(Path(output))
+    found = collect_views([Path(source) for source in sources], board, ignored=picture)
+    calibration = Calibration(solve_intrinsics(found.views, board, found.size, lens_model), found, board, picture)
+    if output is not None and picture is not None:
+        try:
+            save_camera(Path(output), calibration.solution.camera)
+            plot_calibration(picture, calibration.solution)
+        except OSError as error:
+            raise CameraError(f"cannot write {error.filename}: {error.strerror}") from error
+    return calibration
+
+
+def _picture_path(output: Path) -> Path:
+    """Where the picture of a calibration goes, by its camera file, which is checked."""
     if output.suffix not in (".yaml", ".yml"):
         raise CameraError(f"cannot write {output}: a camera file has the ending .yaml")
     if not output.parent.is_dir():
         raise CameraError(f"cannot write {output}: there is no folder {output.parent}")
-    picture = picture_path(output)
-    found = collect_views([Path(source) for source in sources], board, ignored=picture)
-    calibration = Calibration(solve_intrinsics(found.views, board, found.size, lens_model), found, board)
-    try:
-        save_camera(output, calibration.solution.camera)
-        plot_calibration(picture, calibration.solution)
-    except OSError as error:
-        raise CameraError(f"cannot write {error.filename}: {error.strerror}") from error
-    return calibration
-
-
-def picture_path(output: Path) -> Path:
-    """Where the picture of a calibration goes, by its camera file."""
     return output.with_name(f"{output.stem}_calibration.png")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 #: No value in whatever unit is meant by what is larger: its square could overflow.
 LARGEST = 1e30
@@ -33,6 +34,31 @@ def frame_range(text: str) -> tuple[int | None, int | None]:
     if text in ("", "-") or (None not in numbers and numbers[0] > numbers[1]):  # type: ignore[operator]
         raise argparse.ArgumentTypeError(f"'{text}' is not a range of frames such as 9-100")
     return numbers
+
+
+def add_file(
+    command: argparse._ActionsContainer, name: str, text: str, metavar: str | None = None, required: bool = False
+) -> None:
+    """Add a path."""
+    more: dict[str, Any] = {"required": True} if required else {}
+    command.add_argument(name, type=Path, metavar=metavar, help=text, **more)
+
+
+def add_output(command: argparse.ArgumentParser, metavar: str, text: str) -> None:
+    """Add ``-o``, the path to write to."""
+    command.add_argument("-o", "--output", type=Path, required=True, metavar=metavar, help=text)
+
+
+def add_flag(command: argparse.ArgumentParser, name: str, text: str) -> None:
+    """Add an option without a value."""
+    command.add_argument(name, action="store_true", help=text)
+
+
+def add_repeated(
+    command: argparse.ArgumentParser, name: str, text: str, metavar: str, kind: Callable[[str], Any] = str
+) -> None:
+    """Add an option that may be given several times, whose values make a list."""
+    command.add_argument(name, action="append", default=[], type=kind, metavar=metavar, help=f"{text}; may be repeated")
 
 
 def add_range(command: argparse.ArgumentParser, text: str) -> None:

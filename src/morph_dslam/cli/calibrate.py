@@ -1,9 +1,9 @@
 """`morph calibrate`: a camera's intrinsics and distortion."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
+
+from morph_dslam.cli.arguments import add_output
 
 HELP = "find a camera's intrinsics and distortion from pictures of a checkerboard"
 KEPT = "nothing was written"
@@ -23,20 +23,17 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         default="radial-tangential",
         help="lens model: fisheye for views of more than about 120 degrees",
     )
-    command.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="CAMERA", help="camera file to write (.yaml)"
-    )
+    add_output(command, "CAMERA", "camera file to write (.yaml)")
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Calibrate and print how well the corners fit."""
-    from morph_dslam.calibration.board import parse_board
-    from morph_dslam.calibration.calibrate import calibrate, picture_path
+    from morph_dslam import Board, calibrate
 
-    board = parse_board(arguments.board, arguments.square)
+    board = Board.parse(arguments.board, arguments.square)
     calibration = calibrate(arguments.source, board, arguments.output, arguments.lens)
     print(calibration.table())
     for remark in calibration.remarks():
         print(f"note: {remark}")
-    print(f"wrote {arguments.output} and {picture_path(arguments.output)}")
+    print(f"wrote {arguments.output} and {calibration.picture}")
     print(calibration.line())

@@ -1,10 +1,8 @@
 """`morph evaluate`: a run against the truth."""
 
-from __future__ import annotations
-
 import argparse
-from pathlib import Path
 
+from morph_dslam.cli.arguments import add_file
 from morph_dslam.errors import EvaluationError
 
 HELP = "compare a run with measured points or depth images, or its camera path with the true one"
@@ -12,17 +10,12 @@ KEPT = "the run is unchanged"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    command.add_argument("run_folder", type=Path, metavar="RUN", help="run folder, or a trajectory file")
+    add_file(command, "run_folder", "run folder, or a trajectory file", "RUN")
     truth = command.add_mutually_exclusive_group(required=True)
-    truth.add_argument("--points", type=Path, metavar="TRUTH", help="truth file, .npz (docs/run-folder.md)")
-    truth.add_argument(
-        "--trajectory", type=Path, metavar="TRUTH", help="true camera path (TUM, KITTI, COLMAP or 7-Scenes)"
-    )
-    truth.add_argument(
-        "--depth",
-        type=Path,
-        metavar="DEPTH",
-        help="depth.h5 of a simulation, a recording with depth, or a folder of 16-bit images",
+    add_file(truth, "--points", "truth file, .npz (docs/run-folder.md)", "TRUTH")
+    add_file(truth, "--trajectory", "true camera path (TUM, KITTI, COLMAP or 7-Scenes)", "TRUTH")
+    add_file(
+        truth, "--depth", "depth.h5 of a simulation, a recording with depth, or a folder of 16-bit images", "DEPTH"
     )
     command.add_argument(
         "--base-frame", type=int, metavar="N", help="with --depth: a frame in which nothing is deformed"
@@ -40,15 +33,24 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Compare and print the figures."""
-    _check(arguments)
-    if arguments.trajectory is not None:
-        from morph_dslam.evaluation.trajectory import evaluate_trajectory, trajectory_line
+    from morph_dslam import evaluate, evaluate_depth, evaluate_trajectory
+    from morph_dslam.extend.reports import alignment_line, depth_line, remarks, result_line, trajectory_line
 
-        print(trajectory_line(evaluate_trajectory(arguments.run_folder, arguments.trajectory)))
+    _check(arguments)
+    folder = arguments.run_folder
+    if arguments.trajectory is not None:
+        print(trajectory_line(evaluate_trajectory(folder, arguments.trajectory)))
     elif arguments.depth is not None:
-        _by_depth(arguments)
+        found = evaluate_depth(folder, arguments.depth, arguments.base_frame, arguments.depth_per_metre)
+        print(f"wrote {folder / 'depth_evaluation.json'} and depth_evaluation.png")
+        print(depth_line(found))
     else:
-        _by_points(arguments)
+        figures = evaluate(folder, arguments.points, arguments.bind_frame)
+        for remark in remarks(figures):
+            print(f"note: {remark}")
+        print(f"wrote {folder / 'evaluation.json'} and {folder / 'report.html'}")
+        print(alignment_line(figures))
+        print(result_line(figures))
 
 
 def _check(arguments: argparse.Namespace) -> None:
@@ -59,25 +61,3 @@ def _check(arguments: argparse.Namespace) -> None:
         raise EvaluationError("--bind-frame goes with --points: leave it out")
     if arguments.points is not None and arguments.bind_frame is None:
         raise EvaluationError("--points needs --bind-frame N, the frame whose pixels bind the points to the mesh")
-
-
-def _by_depth(arguments: argparse.Namespace) -> None:
-    from morph_dslam.evaluation.evaluate import evaluate_depth
-    from morph_dslam.evaluation.run_folder import depth_line
-
-    folder = arguments.run_folder
-    found = evaluate_depth(folder, arguments.depth, arguments.base_frame, arguments.depth_per_metre)
-    print(f"wrote {folder / 'depth_evaluation.json'} and depth_evaluation.png")
-    print(depth_line(found))
-
-
-def _by_points(arguments: argparse.Namespace) -> None:
-    from morph_dslam.evaluation.evaluate import evaluate
-    from morph_dslam.evaluation.run_folder import alignment_line, remarks, result_line
-
-    figures = evaluate(arguments.run_folder, arguments.points, arguments.bind_frame)
-    for remark in remarks(figures):
-        print(f"note: {remark}")
-    print(f"wrote {arguments.run_folder / 'evaluation.json'} and {arguments.run_folder / 'report.html'}")
-    print(alignment_line(figures))
-    print(result_line(figures))

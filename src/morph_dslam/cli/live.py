@@ -1,7 +1,5 @@
 """`morph live`: as `morph track`, in frames as they come."""
 
-from __future__ import annotations
-
 import argparse
 
 from morph_dslam.cli.arguments import positive_number
@@ -22,7 +20,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Track until the stream ends, and print the figures of each run folder."""
-    from morph_dslam.tracking.track import track
+    from morph_dslam import track
 
     options = run_options(
         arguments, frames=arguments.source, live=True, serve=arguments.serve, seconds=arguments.seconds

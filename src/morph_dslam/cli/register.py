@@ -1,32 +1,28 @@
 """`morph register`: an undeformed object in the map of a scene."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
+
+from morph_dslam.cli.arguments import add_file, add_output, add_repeated
 
 HELP = "find an undeformed object in the map of a scene, and the size of the map's unit"
 KEPT = "nothing was written"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    command.add_argument("map", type=Path, help="map.h5 of a run of `morph slam`")
-    command.add_argument("--model", type=Path, required=True, help="model file of the object")
-    command.add_argument("--camera", type=Path, required=True, help="camera file of the map")
-    command.add_argument("-o", "--output", type=Path, required=True, metavar="FOLDER", help="folder to write")
-    command.add_argument(
-        "--board",
-        type=Path,
-        metavar="TOML",
-        help="register the object, and find the map's unit, by a board that stands in the scene",
+    add_file(command, "map", "map.h5 of a run of `morph slam`")
+    add_file(command, "--model", "model file of the object", required=True)
+    add_file(command, "--camera", "camera file of the map", required=True)
+    add_output(command, "FOLDER", "folder to write")
+    add_file(
+        command, "--board", "register the object, and find the map's unit, by a board that stands in the scene", "TOML"
     )
-    command.add_argument(
+    add_repeated(
+        command,
         "--beside",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="JSON",
-        help="registration.json of another object in this map, to which its points are left; may be repeated",
+        "registration.json of another object in this map, to which its points are left",
+        "JSON",
+        Path,
     )
 
 

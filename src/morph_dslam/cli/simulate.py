@@ -1,20 +1,19 @@
 """`morph simulate`: film a model moving, with exact truth."""
 
-from __future__ import annotations
-
 import argparse
-from pathlib import Path
+
+from morph_dslam.cli.arguments import add_file, add_output
 
 HELP = "film a model moving through given parameters and camera positions, with exact truth"
 KEPT = "the frames written so far are kept, without truth"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    command.add_argument("scene", type=Path, help="scene file (docs/scene-file.md)")
-    command.add_argument("-o", "--output", type=Path, required=True, metavar="FOLDER", help="folder to write")
+    add_file(command, "scene", "scene file (docs/scene-file.md)")
+    add_output(command, "FOLDER", "folder to write")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from morph_dslam.render.simulation import simulate
+    from morph_dslam import simulate
 
     simulate(arguments.scene, arguments.output)

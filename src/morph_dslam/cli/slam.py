@@ -1,66 +1,54 @@
 """`morph slam`: the path of a camera, and a map of the scene."""
 
-from __future__ import annotations
-
 import argparse
-from pathlib import Path
 
-from morph_dslam.cli.arguments import add_range, frame_number
+from morph_dslam.cli.arguments import add_file, add_flag, add_output, add_range, frame_number
 
 HELP = "find the path of a camera through a rigid scene, and a map of the scene"
 KEPT = "the frames tracked so far and their map are kept in the run folder"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    command.add_argument("source", type=Path, help="recording (docs/sources.md), or webcam:0")
-    command.add_argument(
+    add_file(command, "source", "recording (docs/sources.md), or webcam:0")
+    add_file(
+        command,
         "--camera",
-        type=Path,
+        "camera file: size, intrinsics, distortion; a Kalibr camchain or EuRoC folder for a stereo pair",
         required=True,
-        help="camera file: size, intrinsics, distortion; a Kalibr camchain or EuRoC folder for a stereo pair",
     )
-    command.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="run folder to write")
+    add_output(command, "RUN", "run folder to write")
     add_range(command, "frames to track")
-    command.add_argument(
-        "--map",
-        type=Path,
-        metavar="MAP",
-        help="map.h5 of an earlier run, or the folder of a COLMAP text model, to find the camera in",
+    add_file(
+        command, "--map", "map.h5 of an earlier run, or the folder of a COLMAP text model, to find the camera in", "MAP"
     )
-    command.add_argument(
+    add_file(
+        command,
         "--trajectory",
-        type=Path,
-        metavar="FILE",
-        help="make the map with these poses, of whatever program (TUM's format), and find the camera in it",
+        "make the map with these poses, of whatever program (TUM's format), and find the camera in it",
+        "FILE",
     )
-    command.add_argument(
+    add_file(
+        command,
         "--images",
-        type=Path,
-        metavar="RECORDING",
-        help="recording that the COLMAP model or the poses are of, where it is not the one to track",
+        "recording that the COLMAP model or the poses are of, where it is not the one to track",
+        "RECORDING",
     )
-    command.add_argument(
-        "--extend",
-        action="store_true",
-        help="with --map or --trajectory: let the map grow, instead of keeping it as it is",
-    )
+    add_flag(command, "--extend", "with --map or --trajectory: let the map grow, instead of keeping it as it is")
     command.add_argument(
         "--freeze-at", type=frame_number, metavar="N", help="from this frame on keep the map and only find the camera"
     )
-    command.add_argument(
-        "--freeze-when-deforming",
-        action="store_true",
-        help="keep the map from when a part of the scene begins to move or to deform",
+    add_flag(
+        command, "--freeze-when-deforming", "keep the map from when a part of the scene begins to move or to deform"
     )
-    command.add_argument("--no-depth", action="store_true", help="leave the depth images of the recording aside")
-    command.add_argument("--overwrite", action="store_true", help="replace a run that is in the run folder")
-    command.add_argument("--no-video", action="store_true", help="do not draw the video with tracked points")
+    add_flag(command, "--no-depth", "leave the depth images of the recording aside")
+    add_flag(command, "--overwrite", "replace a run that is in the run folder")
+    add_flag(command, "--no-video", "do not draw the video with tracked points")
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Map the scene and print the figures."""
-    from morph_dslam.slam.options import SlamOptions
-    from morph_dslam.slam.run import run_slam
+    from morph_dslam import SlamOptions
+    from morph_dslam.extend.slam import run_slam
 
     summary = run_slam(
         arguments.source,

@@ -7,22 +7,27 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from morph_dslam.cli.arguments import add_range, frame_and_file, named_value
+from morph_dslam.cli.arguments import (
+    add_file,
+    add_flag,
+    add_output,
+    add_range,
+    add_repeated,
+    frame_and_file,
+    named_value,
+)
 from morph_dslam.errors import TrackingError
 
 if TYPE_CHECKING:
-    from morph_dslam.tracking.run_options import TrackOptions
+    from morph_dslam import TrackOptions
 
 HELP = "find an object's pose and parameters in every frame, and draw the stress over the video"
 KEPT = "the frames tracked so far are kept in the run folder"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "frames",
-        type=Path,
-        metavar="FRAMES",
-        help="video file, folder of numbered images, or another recording (docs/sources.md)",
+    add_file(
+        command, "frames", "video file, folder of numbered images, or another recording (docs/sources.md)", "FRAMES"
     )
     add_tracking_arguments(command)
     command.add_argument(
@@ -32,9 +37,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help="frame that the landmarks, or another start, belong to (default: the first one tracked); with "
         "--registration and --with: one in which the object is undeformed",
     )
-    command.add_argument(
-        "--refine", action="store_true", help="refine the reference state over the whole sequence and track once more"
-    )
+    add_flag(command, "--refine", "refine the reference state over the whole sequence and track once more")
     command.add_argument(
         "--with",
         type=Path,
@@ -49,7 +52,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Track and print the figures of each run folder."""
-    from morph_dslam.tracking.track import track
+    from morph_dslam import track
 
     options = run_options(
         arguments,
@@ -63,7 +66,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def print_summary(folder: Path, summary: dict[str, Any]) -> None:
     """Print what came of a run, recorded or live; without a summary no frame was tracked."""
-    from morph_dslam.tracking.observability import value_line
+    from morph_dslam.extend.reports import value_line
 
     if not summary:
         print("no frame was tracked: nothing was written")
@@ -88,10 +91,9 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
 
     What is asked for of parameters, the outline and inner structures holds for the first object only.
     """
-    from morph_dslam.registration.initialization import InitializerFiles
-    from morph_dslam.tracking.drawing import DrawOptions, SectionPlane
-    from morph_dslam.tracking.options import TrackerOptions
-    from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
+    from morph_dslam import TrackerOptions, TrackOptions
+    from morph_dslam.extend.registration import InitializerFiles
+    from morph_dslam.extend.tracking import DrawOptions, ObjectOptions, SectionPlane
 
     tracker = TrackerOptions(
         pose=arguments.pose,
@@ -159,25 +161,19 @@ def _random_walk(arguments: argparse.Namespace) -> tuple[tuple[str, float], ...]
 
 def add_tracking_arguments(command: argparse.ArgumentParser) -> None:
     """The arguments that say what is tracked, with what, and where it is at first."""
-    command.add_argument("--model", type=Path, required=True, help="model file of `morph build`")
-    command.add_argument("--camera", type=Path, required=True, help="camera file: size, intrinsics, distortion")
+    add_file(command, "--model", "model file of `morph build`", required=True)
+    add_file(command, "--camera", "camera file: size, intrinsics, distortion", required=True)
     start = command.add_mutually_exclusive_group(required=True)
-    start.add_argument("--landmarks", type=Path, help="object points and their pixels in the reference frame")
-    start.add_argument(
-        "--registration", type=Path, metavar="JSON", help="registration.json of `morph register` in a map"
-    )
-    start.add_argument(
-        "--board", type=Path, metavar="TOML", help="a printed board of markers, and where the object is on it"
-    )
-    start.add_argument(
-        "--picture", type=Path, metavar="TOML", help="a picture of the object's print, and where it is on it"
-    )
-    start.add_argument("--guess", type=Path, metavar="TOML", help="about where the object is in the reference frame")
-    command.add_argument(
+    add_file(start, "--landmarks", "object points and their pixels in the reference frame")
+    add_file(start, "--registration", "registration.json of `morph register` in a map", "JSON")
+    add_file(start, "--board", "a printed board of markers, and where the object is on it", "TOML")
+    add_file(start, "--picture", "a picture of the object's print, and where it is on it", "TOML")
+    add_file(start, "--guess", "about where the object is in the reference frame", "TOML")
+    add_file(
+        command,
         "--map",
-        type=Path,
-        metavar="H5",
-        help="with --registration: the map that the camera is found in (default: the one that was registered in)",
+        "with --registration: the map that the camera is found in (default: the one that was registered in)",
+        "H5",
     )
     command.add_argument(
         "--pose",
@@ -186,49 +182,32 @@ def add_tracking_arguments(command: argparse.ArgumentParser) -> None:
         help="the object's pose with --registration: by map and points together, by the map alone, or by its points "
         "alone (default: %(default)s)",
     )
-    command.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="run folder to write")
-    command.add_argument("--overwrite", action="store_true", help="replace a run that is in the run folder")
-    command.add_argument(
-        "--outline",
-        action="store_true",
-        help="let the object's outline count too, where it stands out from the background",
-    )
-    command.add_argument(
+    add_output(command, "RUN", "run folder to write")
+    add_flag(command, "--overwrite", "replace a run that is in the run folder")
+    add_flag(command, "--outline", "let the object's outline count too, where it stands out from the background")
+    add_flag(
+        command,
         "--discrepancy",
-        action="store_true",
-        help="look for what the object's shape has beyond the model's: small smooth displacements that "
+        "look for what the object's shape has beyond the model's: small smooth displacements that "
         "hardly stretch it; with --refine in the reference view too",
     )
-    command.add_argument(
+    add_flag(
+        command,
         "--one-view",
-        action="store_true",
-        help="take one keyframe of the map as reference view, and make none when the object turns other "
-        "parts to the camera",
+        "take one keyframe of the map as reference view, and make none when the object turns other parts to the camera",
     )
-    command.add_argument("--depth", action="store_true", help="let the depth images of an RGB-D recording count too")
-    command.add_argument(
-        "--inner",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="a structure inside of the object (`morph inner`) to draw and report; may be repeated",
+    add_flag(command, "--depth", "let the depth images of an RGB-D recording count too")
+    add_repeated(
+        command, "--inner", "a structure inside of the object (`morph inner`) to draw and report", "FILE", Path
     )
-    command.add_argument(
-        "--per-sequence",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="a parameter that is one over the whole sequence; may be repeated",
-    )
-    command.add_argument(
+    add_repeated(command, "--per-sequence", "a parameter that is one over the whole sequence", "NAME")
+    add_repeated(
+        command,
         "--random-walk",
-        type=named_value,
-        action="append",
-        default=[],
-        metavar="NAME=STEP",
-        help="a prior on a parameter: the standard deviation of its change from frame to frame, in its own "
-        "unit; may be repeated (default: none)",
+        "a prior on a parameter: the standard deviation of its change from frame to frame, in its own "
+        "unit (default: none)",
+        "NAME=STEP",
+        named_value,
     )
     command.add_argument(
         "--start",
@@ -236,14 +215,13 @@ def add_tracking_arguments(command: argparse.ArgumentParser) -> None:
         default="previous",
         help="where the search for a frame's state starts (default: %(default)s state)",
     )
-    command.add_argument(
+    add_repeated(
+        command,
         "--reregister-at",
-        type=frame_and_file,
-        action="append",
-        default=[],
-        metavar="[NAME:]N[=FILE]",
-        help="register the object, or that of --also NAME, anew in frame N, by landmarks there or by the board, "
-        "picture or guess that the run starts from; may be repeated",
+        "register the object, or that of --also NAME, anew in frame N, by landmarks there or by the board, "
+        "picture or guess that the run starts from",
+        "[NAME:]N[=FILE]",
+        frame_and_file,
     )
     command.add_argument(
         "--also",
@@ -265,4 +243,4 @@ def add_tracking_arguments(command: argparse.ArgumentParser) -> None:
         help="draw a solid cut open: x=12 takes away all beyond x = 12 mm, -x=12 all before it; also y and z",
     )
     add_range(command, "frames to track, of a recording")
-    command.add_argument("--no-video", action="store_true", help="do not draw the augmented video")
+    add_flag(command, "--no-video", "do not draw the augmented video")

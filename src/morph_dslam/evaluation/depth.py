@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -182,7 +182,7 @@ class DepthError:
         return np.divide(total, count, out=np.full(n_nodes, np.nan), where=count > 0)
 
 
-def sensor_points(depth: DepthImage, mask: NDArray[np.bool_], camera: Camera) -> Array:
+def sensor_points(depth: NDArray[np.floating], mask: NDArray[np.bool_], camera: Camera) -> Array:
     """Points (p, 3) in the camera frame, metres, of pixels that have depth (h, w), evenly spread.
 
     ``mask`` (h, w) is of the undistorted image, ``depth`` of the image as recorded.
@@ -206,28 +206,28 @@ def surface_mask(nodes: Array, triangles: NDArray[np.int64], camera: Camera) -> 
 
 
 def depth_error(
-    run: Run, path: Path, base_frame: int | None = None, values_per_metre: float | None = None
+    run: Run, depths: Iterable[tuple[int, NDArray[np.floating]]], base_frame: int | None = None
 ) -> DepthError:
     """Compare every tracked frame that has depth with the run.
 
     Parameters
     ----------
-    path, values_per_metre : see `read_depths`; the depth images are as the run's camera sees them.
+    depths : frame numbers, each with its image (h, w) as the run's camera sees it, see `read_depths`.
     base_frame : a frame in which the object is not deformed.
     """
     camera, triangles = run.camera, run.model.triangles
     surface_nodes = np.unique(triangles)
     gate = LARGEST_DISTANCE * float(np.linalg.norm(np.ptp(run.model.nodes, axis=0)))
-    tracked = run.frames[run.tracked].tolist()
     frames, distances, nearest, left_out = [], [], [], []
-    for frame, depth in read_depths(path, tracked, values_per_metre):
+    for frame, depth in depths:
+        row = run.row(frame)
+        if row is None or not run.tracked[row]:
+            continue
         if depth.shape != (camera.height, camera.width):
             raise EvaluationError(
                 f"the depth image of frame {frame} is {depth.shape[1]}x{depth.shape[0]} pixels, the run's "
                 f"camera {camera.width}x{camera.height}: register the depth to the colour camera"
             )
-        row = run.row(frame)
-        assert row is not None
         surface = run.camera_points(row)
         points = sensor_points(depth, surface_mask(surface, triangles, camera), camera)
         if not len(points):
@@ -240,15 +240,15 @@ def depth_error(
         # A new tree in each frame: one that is not balanced is made faster.
         _, found = KDTree(surface[surface_nodes], balanced_tree=False).query(points[kept])
         nearest.append(surface_nodes[found])
-    _check(frames, distances, base_frame, path)
+    _check(frames, distances, base_frame)
     return DepthError(np.array(frames), distances, nearest, gate, np.array(left_out), base_frame)
 
 
-def _check(frames: list[int], distances: list[Array], base_frame: int | None, path: Path) -> None:
+def _check(frames: list[int], distances: list[Array], base_frame: int | None) -> None:
     if not any(len(distance) for distance in distances):
         raise EvaluationError(
-            f"{path} has no depth on the estimated surface in any tracked frame: are its numbers those of "
-            "the run's frames, and its depths in the unit given?"
+            "the depth images show nothing of the estimated surface in any tracked frame: are their numbers those "
+            "of the run's frames, and their depths in the unit given?"
         )
     if base_frame is not None and base_frame not in frames:
         raise EvaluationError(

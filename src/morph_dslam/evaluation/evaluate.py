@@ -1,16 +1,18 @@
-"""The evaluation of a run: figures, pictures and a report, written into its folder."""
+"""The evaluation of a run: figures, and for a run folder pictures and a report, written into it."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from morph_dslam.evaluation.depth import depth_error, summarise_depth
-from morph_dslam.evaluation.points import load_truth, material_error, summarise
-from morph_dslam.evaluation.run_folder import load_run
+from morph_dslam.evaluation.depth import depth_error, read_depths, summarise_depth
+from morph_dslam.evaluation.points import PointTruth, load_truth, material_error, summarise
+from morph_dslam.evaluation.run_folder import Run, load_run
 from morph_dslam.evaluation.run_report import (
     plot_depth_error_map,
     plot_depth_errors_by_frame,
@@ -21,13 +23,15 @@ from morph_dslam.evaluation.run_report import (
 from morph_dslam.evaluation.trajectory import summarise_alignment
 
 
-def evaluate(folder: str | Path, truth_path: str | Path, bind_frame: int) -> dict[str, Any]:
-    """Compare a run with truth points and write ``evaluation.json``, pictures and ``report.html`` into it.
+def evaluate(run: str | Path | Run, truth: str | Path | PointTruth, bind_frame: int) -> dict[str, Any]:
+    """Compare a run with truth points.
+
+    Of a run folder, ``evaluation.json``, pictures and ``report.html`` are written into it.
 
     Parameters
     ----------
-    folder : a run folder.
-    truth_path : a truth file.
+    run : a run folder, or a run in memory.
+    truth : a truth file, or truth in memory.
     bind_frame : the frame whose pixels bind the points.
 
     Returns
@@ -39,35 +43,42 @@ def evaluate(folder: str | Path, truth_path: str | Path, bind_frame: int) -> dic
     EvaluationError
         If the run and the truth cannot be read or do not fit together.
     """
-    folder, truth_path = Path(folder), Path(truth_path)
-    run, truth = load_run(folder), load_truth(truth_path)
-    error = material_error(run, truth, bind_frame)
+    tracked = run if isinstance(run, Run) else load_run(run)
+    points = truth if isinstance(truth, PointTruth) else load_truth(Path(truth))
+    error = material_error(tracked, points, bind_frame)
     figures = {
         **summarise(error),
         **summarise_alignment(error),
-        "truth": str(truth_path),
-        "n_frames": len(run.frames),
-        "n_frames_tracked": int(run.tracked.sum()),
-        "median_ms": float(np.nanmedian(run.frame_times)),
-        "p95_ms": float(np.nanpercentile(run.frame_times, 95)),
+        "truth": None if isinstance(truth, PointTruth) else str(truth),
+        **_counts(tracked),
+        "median_ms": float(np.nanmedian(tracked.frame_times)),
+        "p95_ms": float(np.nanpercentile(tracked.frame_times, 95)),
     }
-    (folder / "evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
-    plot_errors_by_frame(folder / "evaluation.png", error)
-    plot_error_map(folder / "error_map.png", error, run.model)
-    write_run_report(run, figures)
+    if not isinstance(run, Run):
+        folder = Path(run)
+        (folder / "evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
+        plot_errors_by_frame(folder / "evaluation.png", error)
+        plot_error_map(folder / "error_map.png", error, tracked.model)
+        write_run_report(folder, tracked, figures)
     return figures
 
 
 def evaluate_depth(
-    folder: str | Path, depth: str | Path, base_frame: int | None = None, values_per_metre: float | None = None
+    run: str | Path | Run,
+    depth: str | Path | Iterable[tuple[int, NDArray[np.floating]]],
+    base_frame: int | None = None,
+    values_per_metre: float | None = None,
 ) -> dict[str, Any]:
-    """Compare a run's surfaces with depth images; writes ``depth_evaluation.json`` and pictures into it.
+    """Compare a run's surfaces with depth images.
+
+    Of a run folder, ``depth_evaluation.json`` and pictures are written into it.
 
     Parameters
     ----------
-    folder : a run folder.
-    depth, values_per_metre : see `read_depths`.
+    run : a run folder, or a run in memory.
+    depth : a path, see `read_depths`; or frame numbers, each with its image (h, w) in metres, NaN where unknown.
     base_frame : a frame in which the object is not deformed, whose error stands beside the others'.
+    values_per_metre : of the images of a folder.
 
     Returns
     -------
@@ -78,16 +89,19 @@ def evaluate_depth(
     EvaluationError
         If the run or the depth images cannot be read or do not fit together.
     """
-    folder, depth = Path(folder), Path(depth)
-    run = load_run(folder)
-    error = depth_error(run, depth, base_frame, values_per_metre)
-    figures = {
-        **summarise_depth(error),
-        "depth": str(depth),
-        "n_frames": len(run.frames),
-        "n_frames_tracked": int(run.tracked.sum()),
-    }
-    (folder / "depth_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
-    plot_depth_errors_by_frame(folder / "depth_evaluation.png", error)
-    plot_depth_error_map(folder / "depth_error_map.png", error, run.model)
+    tracked = run if isinstance(run, Run) else load_run(run)
+    path = str(depth) if isinstance(depth, str | Path) else None
+    if isinstance(depth, str | Path):
+        depth = read_depths(Path(depth), tracked.frames[tracked.tracked].tolist(), values_per_metre)
+    error = depth_error(tracked, depth, base_frame)
+    figures = {**summarise_depth(error), "depth": path, **_counts(tracked)}
+    if not isinstance(run, Run):
+        folder = Path(run)
+        (folder / "depth_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
+        plot_depth_errors_by_frame(folder / "depth_evaluation.png", error)
+        plot_depth_error_map(folder / "depth_error_map.png", error, tracked.model)
     return figures
+
+
+def _counts(run: Run) -> dict[str, int]:
+    return {"n_frames": len(run.frames), "n_frames_tracked": int(run.tracked.sum())}

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from morph_dslam.evaluation.points import error_table, field_title, sensitivity_table
 from morph_dslam.evaluation.report import Table
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.model.functions import ParameterFunctions
@@ -166,3 +165,65 @@ def _versions_last(provenance: Mapping[str, Any]) -> dict[str, Any]:
     if facts.get("linear_solver", "") is None:
         facts["linear_solver"] = "that of another program"
     return facts | dict(provenance.get("versions", {}))
+
+
+_TITLES = {
+    "displacement": "displacement",
+    "stress_top": "stress, top face",
+    "stress_bottom": "stress, bottom face",
+    "stress_solid": "Cauchy stress",
+    "strain": "strain",
+}
+_REACTIONS = {"reaction_force_": "force on ", "reaction_moment_": "moment on "}
+
+
+def field_title(name: str) -> str:
+    """The field's name for a table, "force on top" for "reaction_force_top"."""
+    for start, words in _REACTIONS.items():
+        if name.startswith(start):
+            return words + name.removeprefix(start)
+    return _TITLES.get(name, name)
+
+
+#: Endings of a certificate's keys and the unit in which their values are.
+_ERROR_UNITS = {"_mm": "mm", "_MPa": "MPa", "_Nmm": "N mm", "_N": "N"}
+_ABSOLUTE = ("mean", "max", "worst_sample_mean", "largest")
+_HEADER = ("field", "mean", "largest", "worst mean", "largest value", "unit", "mean / largest", "relative L2")
+_SENSITIVITY_HEADER = ("parameter", "mean / largest", "relative L2")
+_UNKNOWN = "–"
+
+
+def error_table(certificate: Mapping[str, Any]) -> Table:
+    """One row for each field with its errors, and one for the von Mises stress of each stress."""
+    rows = []
+    for name, entry in certificate.items():
+        if name not in ("displacement", "strain") and not name.startswith(("stress_", "reaction_")):
+            continue
+        rows.append(_row(field_title(name), entry))
+        if "von_mises" in entry:
+            place = field_title(name).partition(", ")[2]
+            rows.append(_row(f"von Mises stress, {place}".removesuffix(", "), entry["von_mises"]))
+    return Table(rows, _HEADER)
+
+
+def sensitivity_table(certificate: Mapping[str, Any]) -> Table:
+    """One row for each parameter with both measures of its sensitivity's error."""
+    entries = certificate.get("sensitivity", {})
+    return Table([[name, *_relative(errors)] for name, errors in entries.items()], _SENSITIVITY_HEADER)
+
+
+def _row(title: str, errors: Mapping[str, Any]) -> list[str]:
+    ending = next((ending for ending in _ERROR_UNITS if f"mean{ending}" in errors), "")
+    absolute = [_number(errors.get(name + ending), "#.3g") for name in _ABSOLUTE]
+    return [title, *absolute, _ERROR_UNITS.get(ending, _UNKNOWN), *_relative(errors)]
+
+
+def _relative(errors: Mapping[str, Any]) -> list[str]:
+    return [_number(errors.get(name), ".2e") for name in ("mean_relative_to_largest", "relative_l2")]
+
+
+def _number(value: float | None, form: str) -> str:
+    if value is None:
+        return _UNKNOWN
+    # Thousands in full, not as a power of ten.
+    return f"{value:.0f}" if abs(value) >= 1e3 else f"{value:{form}}".removesuffix(".")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import EvaluationError
-from morph_dslam.evaluation.report import Table
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.model import SurfacePoints
 from morph_dslam.render.picking import nearest_on_outline, pick_surface
@@ -41,7 +39,7 @@ class PointTruth:
     hidden: NDArray[np.bool_]
 
 
-def load_truth(path: Path) -> PointTruth:
+def load_truth(path: str | Path) -> PointTruth:
     """Read a truth file, a NumPy archive with the arrays of `LAYOUT`.
 
     Raises
@@ -50,7 +48,7 @@ def load_truth(path: Path) -> PointTruth:
         If the file is missing or damaged, or an array is absent or of the wrong shape.
     """
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             missing = [name for name in ("frame", "points_mm", "pixels") if name not in archive]
             if missing:
                 raise EvaluationError(f"{path} has no array {', '.join(missing)}; a truth file has {LAYOUT}")
@@ -80,24 +78,6 @@ def load_truth(path: Path) -> PointTruth:
     if len(np.unique(frames)) != len(frames):
         raise EvaluationError(f"{path}: a frame number occurs twice")
     return PointTruth(frames.astype(np.int64), points.astype(float) / 1000.0, pixels.astype(float), ~visible)
-
-
-_TITLES = {
-    "displacement": "displacement",
-    "stress_top": "stress, top face",
-    "stress_bottom": "stress, bottom face",
-    "stress_solid": "Cauchy stress",
-    "strain": "strain",
-}
-_REACTIONS = {"reaction_force_": "force on ", "reaction_moment_": "moment on "}
-
-
-def field_title(name: str) -> str:
-    """The field's name for a table, "force on top" for "reaction_force_top"."""
-    for start, words in _REACTIONS.items():
-        if name.startswith(start):
-            return words + name.removeprefix(start)
-    return _TITLES.get(name, name)
 
 
 #: A truth point whose pixel misses the estimated surface by no more than this is bound to its outline.
@@ -276,47 +256,3 @@ def summarise(error: MaterialError) -> dict[str, Any]:
         "truth_frames_outside_the_run": list(error.outside),
         "per_frame": per_frame,
     }
-
-
-#: Endings of a certificate's keys and the unit in which their values are.
-_UNITS = {"_mm": "mm", "_MPa": "MPa", "_Nmm": "N mm", "_N": "N"}
-_ABSOLUTE = ("mean", "max", "worst_sample_mean", "largest")
-_HEADER = ("field", "mean", "largest", "worst mean", "largest value", "unit", "mean / largest", "relative L2")
-_SENSITIVITY_HEADER = ("parameter", "mean / largest", "relative L2")
-_UNKNOWN = "–"
-
-
-def error_table(certificate: Mapping[str, Any]) -> Table:
-    """One row for each field with its errors, and one for the von Mises stress of each stress."""
-    rows = []
-    for name, entry in certificate.items():
-        if name not in ("displacement", "strain") and not name.startswith(("stress_", "reaction_")):
-            continue
-        rows.append(_row(field_title(name), entry))
-        if "von_mises" in entry:
-            place = field_title(name).partition(", ")[2]
-            rows.append(_row(f"von Mises stress, {place}".removesuffix(", "), entry["von_mises"]))
-    return Table(rows, _HEADER)
-
-
-def sensitivity_table(certificate: Mapping[str, Any]) -> Table:
-    """One row for each parameter with both measures of its sensitivity's error."""
-    entries = certificate.get("sensitivity", {})
-    return Table([[name, *_relative(errors)] for name, errors in entries.items()], _SENSITIVITY_HEADER)
-
-
-def _row(title: str, errors: Mapping[str, Any]) -> list[str]:
-    ending = next((ending for ending in _UNITS if f"mean{ending}" in errors), "")
-    absolute = [_number(errors.get(name + ending), "#.3g") for name in _ABSOLUTE]
-    return [title, *absolute, _UNITS.get(ending, _UNKNOWN), *_relative(errors)]
-
-
-def _relative(errors: Mapping[str, Any]) -> list[str]:
-    return [_number(errors.get(name), ".2e") for name in ("mean_relative_to_largest", "relative_l2")]
-
-
-def _number(value: float | None, form: str) -> str:
-    if value is None:
-        return _UNKNOWN
-    # Thousands in full, not as a power of ten.
-    return f"{value:.0f}" if abs(value) >= 1e3 else f"{value:{form}}".removesuffix(".")

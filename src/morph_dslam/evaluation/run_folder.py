@@ -1,11 +1,11 @@
-"""A run folder, read back: what `morph track` found, with the model and the camera it used."""
+"""A tracked sequence as it is evaluated: read back from a run folder, or made of results in memory."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
@@ -18,6 +18,9 @@ from morph_dslam.io.camera_files import load_camera
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.discrepancy import Discrepancy, load_discrepancies
 
+if TYPE_CHECKING:
+    from morph_dslam.tracking.result import FrameResult
+
 Array = NDArray[np.float64]
 FORMAT = "morph-dslam run"
 VERSION = 1
@@ -29,15 +32,17 @@ class Run:
 
     Attributes
     ----------
+    model : that was tracked.
+    camera : that saw the frames.
     frames : (f,) frame numbers.
-    status, reasons : one text a frame; the state exists where "tracked".
+    status : one text a frame; the state exists where it is "tracked".
+    reasons : one text a frame.
     camera_from_object : (f, 4, 4), NaN where not tracked.
     parameters : (f, d), SI.
     stage_times : (f,) milliseconds by stage name.
     discrepancies : what the shapes have beyond the model's, by row; empty where it was not looked for.
     """
 
-    folder: Path
     model: ReducedModel
     camera: Camera
     frames: NDArray[np.int64]
@@ -47,6 +52,23 @@ class Run:
     parameters: Array
     stage_times: dict[str, Array]
     discrepancies: dict[int, Discrepancy] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, camera: Camera, results: Mapping[int, FrameResult]) -> Run:
+        """The run of results (at least one) by frame number, as a `morph_dslam.Tracker` returns them."""
+        found = list(results.values())
+        lost = np.full((4, 4), np.nan)
+        return cls(
+            model=found[0].model,
+            camera=camera,
+            frames=np.array(list(results), dtype=np.int64),
+            status=tuple(str(result.status.value) for result in found),
+            reasons=tuple(result.reason for result in found),
+            camera_from_object=np.array([lost if r.pose is None else r.pose.matrix for r in found]),
+            parameters=np.array([list(result.parameters.values()) for result in found]),
+            stage_times={"total": np.array([result.total_ms for result in found])},
+            discrepancies={row: r.discrepancy for row, r in enumerate(found) if r.discrepancy is not None},
+        )
 
     @property
     def tracked(self) -> NDArray[np.bool_]:
@@ -79,7 +101,7 @@ def _texts(file: h5py.File, name: str) -> tuple[str, ...]:
     return tuple(str(value) for value in dataset.asstr()[()])
 
 
-def load_run(folder: Path) -> Run:
+def load_run(folder: str | Path) -> Run:
     """Read a run folder.
 
     Raises
@@ -89,6 +111,7 @@ def load_run(folder: Path) -> Run:
     ModelFileError, CameraError
         If the copies of the model or of the camera file in it cannot be read.
     """
+    folder = Path(folder)
     path = folder / "result.h5"
     if not path.is_file():
         raise EvaluationError(f"{folder} holds no result.h5: give a folder that `morph track -o` has written")
@@ -99,7 +122,6 @@ def load_run(folder: Path) -> Run:
                 raise EvaluationError(f"{path} is not a run of version {VERSION}: track again with this release")
             names = np.atleast_1d(np.asarray(file["timings_ms"].attrs["names"], dtype=str)).tolist()
             run = Run(
-                folder=folder,
                 model=model,
                 camera=camera,
                 frames=np.asarray(file["frame"]).astype(np.int64),

@@ -179,7 +179,7 @@ def sample_video(path: Path, count: int) -> list[tuple[int, bytes]]:
     return pictures
 
 
-def _error_section(run: Run, figures: Mapping[str, Any]) -> Section:
+def _error_section(folder: Path, figures: Mapping[str, Any]) -> Section:
     rows = {
         "mean": f"{figures['mean_mm']:.3f} mm",
         "median": f"{figures['median_mm']:.3f} mm",
@@ -195,16 +195,16 @@ def _error_section(run: Run, figures: Mapping[str, Any]) -> Section:
         "time a frame": f"median {figures['median_ms']:.2f} ms, 95th percentile {figures['p95_ms']:.2f} ms",
     }
     notes = [Text(remark, warning=True) for remark in remarks(figures)]
-    plots = [Picture.read(run.folder / name, caption) for name, caption in _CAPTIONS.items()]
+    plots = [Picture.read(folder / name, caption) for name, caption in _CAPTIONS.items()]
     return Section("Material error, without alignment", [Table.of(rows), *notes, *plots])
 
 
-def _video_section(run: Run) -> Section:
-    if not (run.folder / VIDEO).is_file():
+def _video_section(folder: Path, run: Run) -> Section:
+    if not (folder / VIDEO).is_file():
         return Section("Augmented video", [])
     frames = [
         Picture(data, ".jpg", f"Frame {run.frames[min(position, len(run.frames) - 1)]}")
-        for position, data in sample_video(run.folder / VIDEO, N_FRAMES_SHOWN)
+        for position, data in sample_video(folder / VIDEO, N_FRAMES_SHOWN)
     ]
     return Section("Augmented video", [Link(VIDEO, f"The whole video ({VIDEO})"), *frames])
 
@@ -228,29 +228,29 @@ def _summary(path: Path) -> dict[str, Any]:
     return content
 
 
-def _tracking_sections(run: Run) -> list[Section]:
-    summary = _summary(run.folder / "summary.json")
+def _tracking_sections(folder: Path) -> list[Section]:
+    summary = _summary(folder / "summary.json")
     flags = [Text(str(flag), warning=True) for flag in summary.pop("flags", [])]
     background = {key: summary.pop(key) for key in ("inputs", "settings", "versions") if key in summary}
     facts = flatten({key: value for key, value in summary.items() if key not in _SHOWN_ABOVE})
-    plots = [Picture.read(plot, plot.stem) for plot in sorted((run.folder / "plots").glob("*.png"))]
+    plots = [Picture.read(plot, plot.stem) for plot in sorted((folder / "plots").glob("*.png"))]
     return [
         Section("Tracking", [*flags, *([Table.of(facts)] if facts else []), *plots]),
         Section("Settings and versions", [Table.of(flatten(background))] if background else []),
     ]
 
 
-def write_run_report(run: Run, figures: Mapping[str, Any]) -> Path:
+def write_run_report(folder: Path, run: Run, figures: Mapping[str, Any]) -> Path:
     """Write ``report.html`` into a run folder; ``figures`` are those of ``evaluation.json``."""
-    tracking, settings = _tracking_sections(run)
+    tracking, settings = _tracking_sections(folder)
     sections = [
-        _error_section(run, figures),
-        _video_section(run),
+        _error_section(folder, figures),
+        _video_section(folder, run),
         _lost_section(run),
         tracking,
         *(Section(f"Model: {name}", [table]) for name, table in summarise_model(run.model).items()),
         settings,
     ]
-    path = run.folder / "report.html"
+    path = folder / "report.html"
     write_report(path, f"{run.model.name}: tracked in {len(run.frames)} frames", sections)
     return path

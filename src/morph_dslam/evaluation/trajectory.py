@@ -180,15 +180,16 @@ DPI = 110
 TRUTH, ESTIMATE = "#1b1f24", "#b4530a"
 
 
-def evaluate_trajectory(run: str | Path, truth_path: str | Path) -> dict[str, Any]:
+def evaluate_trajectory(run: str | Path | Trajectory, truth: str | Path | Trajectory) -> dict[str, Any]:
     """Compare the camera path of a run with the truth.
 
-    Writes ``trajectory_evaluation.json`` and ``trajectory_evaluation.png`` beside the trajectory.
+    Of a run folder or a file, ``trajectory_evaluation.json`` and ``trajectory_evaluation.png`` are written beside the
+    trajectory.
 
     Parameters
     ----------
-    run : a run folder with ``trajectory.txt``, or any trajectory file.
-    truth_path : a trajectory.
+    run : a run folder with ``trajectory.txt``, any trajectory file, or a trajectory in memory.
+    truth : a trajectory or its file.
 
     Returns
     -------
@@ -201,24 +202,25 @@ def evaluate_trajectory(run: str | Path, truth_path: str | Path) -> dict[str, An
     TrajectoryError
         If one of them cannot be read.
     """
-    path = Path(run)
-    path = path / "trajectory.txt" if path.is_dir() else path
-    if not path.is_file():
-        raise EvaluationError(f"there is no trajectory {path}: give a run folder with one, or a trajectory file")
-    loaded, loaded_truth = load_trajectory(path), load_trajectory(Path(truth_path))
-    estimate, truth = match(loaded, loaded_truth)
+    if isinstance(run, Trajectory):
+        path, loaded = None, run
+    else:
+        path = _trajectory_file(Path(run))
+        loaded = load_trajectory(path)
+    in_memory = isinstance(truth, Trajectory)
+    estimate, expected = match(loaded, truth if in_memory else load_trajectory(Path(truth)))
     figures: dict[str, Any] = {
-        "truth": str(truth_path),
+        "truth": None if in_memory else str(truth),
         "n_poses": len(loaded),
         "n_pairs": len(estimate),
-        "truth_length_m": truth.length,
+        "truth_length_m": expected.length,
         "relative_interval_s": _interval(estimate),
     }
     errors = {}
     for name, with_scale in (("se3", False), ("sim3", True)):
-        absolute = absolute_error(estimate, truth, with_scale)
+        absolute = absolute_error(estimate, expected, with_scale)
         scale = absolute.truth_from_estimate.scale
-        relative = relative_error(estimate, truth, figures["relative_interval_s"], scale)
+        relative = relative_error(estimate, expected, figures["relative_interval_s"], scale)
         figures[name] = {
             "scale": scale,
             "absolute_mm": statistics(1e3 * absolute.distances),
@@ -226,9 +228,17 @@ def evaluate_trajectory(run: str | Path, truth_path: str | Path) -> dict[str, An
             "relative_deg": statistics(np.rad2deg(relative.rotations)),
         }
         errors[name] = absolute, relative
-    path.with_name(f"{path.stem}_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
-    plot_trajectory(path.with_name(f"{path.stem}_evaluation.png"), estimate, truth, *errors["sim3"])
+    if path is not None:
+        path.with_name(f"{path.stem}_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
+        plot_trajectory(path.with_name(f"{path.stem}_evaluation.png"), estimate, expected, *errors["sim3"])
     return figures
+
+
+def _trajectory_file(path: Path) -> Path:
+    path = path / "trajectory.txt" if path.is_dir() else path
+    if not path.is_file():
+        raise EvaluationError(f"there is no trajectory {path}: give a run folder with one, or a trajectory file")
+    return path
 
 
 def _interval(trajectory: Trajectory) -> float:

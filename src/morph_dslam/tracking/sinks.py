@@ -8,10 +8,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from types import TracebackType
-from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -19,6 +17,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import TrackingError
+from morph_dslam.io.local_server import LocalHandler, local_server
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.sources import Frame
 from morph_dslam.tracking.drawing import AugmentedView, with_caption
@@ -132,7 +131,6 @@ class LivePicture:
         return image
 
 
-HOST = "127.0.0.1"
 JPEG_QUALITY = 80
 #: A gap in the frames longer than this, seconds, is not filled in the video.
 LONGEST_GAP = 2.0
@@ -179,13 +177,8 @@ class BrowserSink:
     def __init__(self, port: int) -> None:
         self._changed = threading.Condition()
         self._jpeg, self._number, self._viewers, self._ended = b"", 0, 0, False
-        try:
-            self._server = _Server((HOST, port), partial(_Handler, self))
-        except (OSError, OverflowError) as error:
-            raise TrackingError(
-                f"port {port} cannot be taken ({error}); choose another with --serve; 0 takes any free one"
-            ) from error
-        self.address = f"http://{HOST}:{self._server.server_address[1]}/"
+        self._server = local_server(port, partial(_Handler, self), TrackingError, "--serve")
+        self.address = self._server.address
         self._thread = threading.Thread(target=self._server.serve_forever, name="browser", daemon=True)
 
     def __enter__(self) -> BrowserSink:
@@ -228,32 +221,22 @@ class BrowserSink:
             return (number, b"") if self._ended else (self._number, self._jpeg)
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _Handler(LocalHandler):
     def __init__(self, sink: BrowserSink, *arguments) -> None:
         self._sink = sink
         super().__init__(*arguments)
 
-    def do_GET(self) -> None:
-        # Else a page from elsewhere could look on under a name of its own for this address.
-        if urlsplit(f"//{self.headers.get('Host', '')}").hostname not in (HOST, "localhost"):
-            self.send_error(HTTPStatus.FORBIDDEN)
-        elif self.path == "/":
-            self._begin("text/html; charset=utf-8")
+    def answer(self) -> None:
+        if self.path == "/":
+            self.begin("text/html; charset=utf-8")
             self.wfile.write(_PAGE)
         elif self.path == "/stream.mjpg":
             self._stream()
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
 
-    def _begin(self, content_type: str) -> None:
-        self.send_response(HTTPStatus.OK)
-        self.send_header("Content-Type", content_type)
-        self.send_header("Cache-Control", "no-store")
-        self.send_header("X-Content-Type-Options", "nosniff")
-        self.end_headers()
-
     def _stream(self) -> None:
-        self._begin("multipart/x-mixed-replace; boundary=frame")
+        self.begin("multipart/x-mixed-replace; boundary=frame")
         self._sink.watch(1)
         try:
             number, jpeg = self._sink.next_after(0)
@@ -265,10 +248,3 @@ class _Handler(BaseHTTPRequestHandler):
             pass  # the page was closed
         finally:
             self._sink.watch(-1)
-
-    def log_message(self, format: str, *args) -> None:
-        """Nothing: requests are no news."""
-
-
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import sys
 import webbrowser
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -20,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from morph_dslam.errors import ExploreError
+from morph_dslam.io.local_server import LocalHandler, LocalServer, local_server
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.reduced_model import von_mises
 from morph_dslam.units import to_si
@@ -119,7 +118,6 @@ class _ModelSurface:
         }
 
 
-HOST = "127.0.0.1"
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -155,7 +153,7 @@ class _Answers:
         url = urlsplit(target)
         if url.path in _FILES:
             name = _FILES[url.path]
-            content = files("morph_dslam.explore").joinpath("static", *name.split("/")).read_bytes()
+            content = files("morph_dslam.explorer").joinpath("static", *name.split("/")).read_bytes()
             return _TYPES[Path(name).suffix], content
         if url.path == "/model.json":
             return "application/json", self._model_json
@@ -185,62 +183,40 @@ class _Answers:
         return np.clip(mu, model.lower, model.upper)
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _Handler(LocalHandler):
     protocol_version = "HTTP/1.1"
 
     def __init__(self, answers: _Answers, *arguments) -> None:
         self._answers = answers
         super().__init__(*arguments)
 
-    def do_GET(self) -> None:
-        # Else a page from elsewhere could read the model under a name of its own for this address.
-        if urlsplit(f"//{self.headers.get('Host', '')}").hostname not in (HOST, "localhost"):
-            self.send_error(HTTPStatus.FORBIDDEN)
-            return
+    def answer(self) -> None:
+        status = HTTPStatus.OK
         try:
             answer = self._answers.answer(self.path)
         except _BadRequest as error:
-            self._send(HTTPStatus.BAD_REQUEST, "text/plain; charset=utf-8", str(error).encode())
-            return
+            status, answer = HTTPStatus.BAD_REQUEST, ("text/plain; charset=utf-8", str(error).encode())
         if answer is None:
             self.send_error(HTTPStatus.NOT_FOUND)
-        else:
-            self._send(HTTPStatus.OK, *answer)
-
-    def _send(self, status: HTTPStatus, content_type: str, content: bytes) -> None:
-        self.send_response(status)
-        self.send_header("Content-Type", content_type)
-        self.send_header("Content-Length", str(len(content)))
-        self.send_header("Cache-Control", "no-store")
-        self.send_header("X-Content-Type-Options", "nosniff")
-        self.end_headers()
+            return
+        content_type, content = answer
+        self.begin(content_type, len(content), status)
         self.wfile.write(content)
 
-    def log_message(self, format: str, *args) -> None:
-        """Nothing: a slider asks many times a second."""
+
+def make_server(model: ReducedModel, port: int) -> LocalServer:
+    """A server for one model; ``port`` 0 takes any free one."""
+    return local_server(port, partial(_Handler, _Answers(model)), ExploreError, "--port")
 
 
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
+def explore(model: str | Path | ReducedModel, port: int = 8765, open_browser: bool = False) -> None:
+    """Serve a model's page to browsers on this computer until interrupted.
 
-    def handle_error(self, request, client_address) -> None:
-        """Say nothing of a page that was closed before its answer came."""
-        if not isinstance(sys.exception(), ConnectionError):
-            super().handle_error(request, client_address)
-
-
-def make_server(model: ReducedModel, port: int) -> ThreadingHTTPServer:
-    """A server for one model on this computer's own address; ``port`` 0 takes any free one."""
-    try:
-        return _Server((HOST, port), partial(_Handler, _Answers(model)))
-    except (OSError, OverflowError) as error:
-        raise ExploreError(
-            f"port {port} cannot be taken ({error}); choose another with --port; --port 0 takes any free one"
-        ) from error
-
-
-def explore(model_path: Path, port: int, open_browser: bool) -> None:
-    """Serve a model's page until interrupted.
+    Parameters
+    ----------
+    model : a model or its file.
+    port : 0 takes any free one.
+    open_browser : whether to open the page at once.
 
     Raises
     ------
@@ -249,11 +225,12 @@ def explore(model_path: Path, port: int, open_browser: bool) -> None:
     ExploreError
         If the port cannot be taken.
     """
-    with make_server(load_model(model_path), port) as server:
-        address = f"http://{HOST}:{server.server_address[1]}/"
-        print(f"{model_path} is shown at {address} (Ctrl-C ends it)", flush=True)
+    shown = model if isinstance(model, ReducedModel) else load_model(model)
+    with make_server(shown, port) as server:
+        name = shown.name if shown is model else model
+        print(f"{name} is shown at {server.address} (Ctrl-C ends it)", flush=True)
         if open_browser:
-            webbrowser.open(address)
+            webbrowser.open(server.address)
         try:
             server.serve_forever()
         except KeyboardInterrupt:

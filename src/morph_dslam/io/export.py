@@ -14,7 +14,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from xml.etree import ElementTree
 
 import h5py
@@ -352,12 +352,9 @@ def write_xdmf_series(folder: Path, stem: str, model: ReducedModel, states: Arra
     return series
 
 
-FORMATS = ("xdmf", "vtu", "gltf")
-
-
 @dataclass(frozen=True)
 class StateChoice:
-    """What the command line says about the states, in the parameters' units.
+    """Which states of a model to export, in the parameters' units.
 
     Attributes
     ----------
@@ -367,7 +364,7 @@ class StateChoice:
     """
 
     vary: Sequence[str] = ()
-    path: Path | None = None
+    path: str | Path | None = None
     at: Sequence[str] = ()
 
     def states(self, model: ReducedModel) -> NDArray[np.float64]:
@@ -379,16 +376,24 @@ class StateChoice:
             raise ExportError("--path and --vary both choose the states: give one of them")
         base = fixed_values(model, self.at)
         if self.path is not None:
-            return read_path(model, self.path, base)
+            return read_path(model, Path(self.path), base)
         return grid(model, self.vary, base) if self.vary else tour(model, base)
 
 
-def export(model_path: Path, folder: Path, file_format: str, choice: StateChoice) -> Path:
-    """Write a model's states into ``folder``; returns the file to open.
+def export(
+    model: str | Path | ReducedModel,
+    folder: str | Path,
+    file_format: Literal["xdmf", "vtu", "gltf"] = "xdmf",
+    choice: StateChoice | ArrayLike = StateChoice(),
+) -> Path:
+    """Write a model's states for ParaView or as an animation; returns the file to open.
 
     Parameters
     ----------
-    file_format : one of `FORMATS`.
+    model : a model or its file.
+    folder : to write into; made if missing.
+    file_format : "xdmf" or "vtu" for ParaView, "gltf" for 3-D viewers.
+    choice : of the states, by default each parameter in turn; or their parameters (s, d), SI.
 
     Raises
     ------
@@ -397,16 +402,20 @@ def export(model_path: Path, folder: Path, file_format: str, choice: StateChoice
     ExportError
         If the states are not in the model's box, or the folder cannot be written.
     """
-    model = load_model(model_path)
-    states = choice.states(model)
+    if isinstance(model, ReducedModel):
+        loaded, stem = model, model.name
+    else:
+        loaded, stem = load_model(model), Path(model).stem
+    states = choice.states(loaded) if isinstance(choice, StateChoice) else np.atleast_2d(choice)
+    folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if file_format == "gltf":
-            target = folder / f"{model_path.stem}.glb"
-            write_glb(target, model, states)
-            write_table(folder / "states.csv", model, states, [{"frame": i} for i in range(len(states))])
+            target = folder / f"{stem}.glb"
+            write_glb(target, loaded, states)
+            write_table(folder / "states.csv", loaded, states, [{"frame": i} for i in range(len(states))])
             return target
         write = write_xdmf_series if file_format == "xdmf" else write_vtu_series
-        return write(folder, model_path.stem, model, states)
+        return write(folder, stem, loaded, states)
     except OSError as error:
         raise ExportError(f"cannot write to {folder}: {error.strerror or error}") from error
