@@ -15,7 +15,7 @@ from morph_dslam.model.basis_functions import (
     kriging_basis,
     p_spline_basis,
 )
-from tests.support.numpy_twins.fields import basis_values
+from tests.support.function_formats import basis_values
 
 BASES = {
     "chebyshev": chebyshev_basis(-1.0, 3.0, 7),
@@ -31,7 +31,7 @@ every_basis = pytest.mark.parametrize("basis", BASES.values(), ids=BASES.keys())
 
 @every_basis
 @pytest.mark.parametrize("order", [0, 1, 2])
-def test_compiled_and_plain_values_agree_inside_and_outside(basis: Basis, order: int) -> None:
+def test_values_are_those_of_scipy_and_numpy_inside_and_outside(basis: Basis, order: int) -> None:
     x = np.linspace(-2.5, 4.5, 301)
     np.testing.assert_allclose(basis.evaluate(x, order), basis_values(basis, x, order), atol=1e-11)
 

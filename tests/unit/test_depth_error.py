@@ -11,14 +11,14 @@ from morph_dslam.cli.app import main
 from morph_dslam.evaluation.depth import RIM_PX, DepthError, depth_error, read_depths, summarise_depth
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.evaluation.run_report import plot_depth_errors_by_frame
-from tests.support.numpy_twins import rendering
+from morph_dslam.render.rasteriser import rasterise
 from tests.support.run_folders import CAMERA, write_run
 
 
 def surface_depth(run, row):
-    """Exact depth (h, w) of the estimated surface, 0 beside it, drawn by the plain rasteriser."""
+    """Exact depth (h, w) of the estimated surface, 0 beside it."""
     nodes = run.camera_points(row)
-    drawn = rendering.rasterise(CAMERA.project(nodes), nodes[:, 2], run.model.triangles, 480, 640).depth
+    drawn = rasterise(CAMERA.project(nodes), nodes[:, 2], run.model.triangles, 480, 640).depth
     return np.where(np.isfinite(drawn), drawn, 0.0)
 
 

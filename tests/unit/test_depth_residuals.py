@@ -6,12 +6,11 @@ import pytest
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.tracking.depth import SIGMA_AT_1M, PointDepths, linearise_depths
+from morph_dslam.tracking.depth import SIGMA_AT_1M, PointDepths
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State, moved
 from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model
-from tests.support.numpy_twins import tracking as plain
 
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 MODEL = bent_sheet_model(22, 16)
@@ -36,22 +35,6 @@ def measured_depths(points, rng, sigma=0.0, huber_px=2.0 * SIGMA_PX):
     return PointDepths(depths, weights, SIGMA_PX**2, huber_px)
 
 
-def arguments(points, state, depths):
-    pose = state.camera_from_object
-    return (
-        points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
-        points.field.modes, depths.depths, depths.weights, depths.huber_px,
-    )  # fmt: skip
-
-
-def test_compiled_and_plain_normal_equations_agree():
-    points = bound()
-    depths = measured_depths(points, np.random.default_rng(1), 2e-3)
-    given = arguments(points, moved(TRUTH, np.full(9, 4e-3)), depths)
-    for compiled, expected in zip(linearise_depths(*given), plain.linearise_depths(*given), strict=True):
-        np.testing.assert_allclose(compiled, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
-
-
 def test_gradient_is_that_of_the_cost_of_depths():
     """The cost is recomputed from positions; some residuals are beyond Huber's limit and some are not."""
     points = bound()
@@ -66,9 +49,14 @@ def test_gradient_is_that_of_the_cost_of_depths():
 
     found, _, gradient, _ = depths.terms(points, state)
     assert found == pytest.approx(cost(state))
+    exact = PointDepths(points.in_camera(state)[:, 2], depths.weights, SIGMA_PX**2, depths.huber_px)
+    hessian = exact.terms(points, state)[1]
     for k, unit in enumerate(np.eye(9)):
         slope = (cost(moved(state, 1e-7 * unit)) - cost(moved(state, -1e-7 * unit))) / 2e-7
         assert gradient[k] == pytest.approx(slope, rel=1e-4, abs=1e-3)
+        # Where all depths are met the Hessian is that of the gradient.
+        ahead, behind = (exact.terms(points, moved(state, sign * 1e-6 * unit))[2] for sign in (1, -1))
+        np.testing.assert_allclose(hessian[k], (ahead - behind) / 2e-6, atol=1e-6 * np.abs(hessian).max())
 
 
 def test_depth_helps_along_the_sight_line_and_deviations_say_how_much():

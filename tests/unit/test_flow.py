@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 
 from morph_dslam.geometry import RigidTransform
+from morph_dslam.render.rasteriser import rasterise
+from morph_dslam.render.texture import render_textured
 from morph_dslam.tracking.binding import view_of
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.measurement import ReferenceAppearance, draw_textured
@@ -18,7 +20,6 @@ from morph_dslam.tracking.patches import (
     spread_corners,
 )
 from tests.support.bent_sheet import bent_sheet_model
-from tests.support.numpy_twins import tracking as plain
 from tests.support.rendered_sequence import CAMERA, SheetFilm, printed_texture, sheet_state
 
 
@@ -108,13 +109,21 @@ def test_rendering_looks_like_the_frame_it_predicts():
     assert (rendering.image[~np.isfinite(rendering.depth)] == NEUTRAL).all()
 
 
+def draw_in_two_passes(pixels, depths, triangles, coordinates, texture, closed, image, depth):
+    buffers = rasterise(pixels, depths, triangles, *depth.shape, closed=closed)
+    nearest = buffers.depth < depth
+    corners = np.arange(3 * len(triangles)).reshape(-1, 3)
+    image[nearest] = render_textured(buffers, corners, coordinates.reshape(-1, 2), texture)[nearest]
+    depth[nearest] = buffers.depth[nearest]
+
+
 @pytest.mark.parametrize("closed", [False, True])
 def test_drawing_in_one_pass_equals_drawing_in_two(closed):
     model = bent_sheet_model(22, 16)
     texture = np.random.default_rng(4).integers(0, 256, (480, 640)).astype(np.uint8)
     view, other = (view_of(model, CAMERA, sheet_state(bend)) for bend in (0.0, 0.15))
     pictures, places = [], view.pixels[model.triangles]
-    for draw in (draw_textured, plain.draw_textured):
+    for draw in (draw_textured, draw_in_two_passes):
         image, depth = np.full((480, 640), NEUTRAL, np.uint8), np.full((480, 640), np.inf, np.float32)
         # Something is drawn there already, nearer than the right half.
         depth[:, 320:400] = 0.01

@@ -9,9 +9,8 @@ import pytest
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.tracking.estimator import State, moved
-from morph_dslam.tracking.outline import Outline, rim, search_outline
+from morph_dslam.tracking.outline import Outline, rim
 from tests.support.bent_sheet import bent_sheet_model
-from tests.support.numpy_twins import tracking as plain
 
 CAMERA = Camera(640, 480, 520.0, 520.0, 320.0, 240.0)
 POSE = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.55]))
@@ -78,19 +77,6 @@ def test_wrong_brightness_inside_is_not_taken_for_the_sheet(model):
     outline = Outline(model, CAMERA, drawn(model, state), state)
     assert not outline.measure(drawn(model, state, inner=100, outer=20), state, 14).valid.any()
     assert not outline.measure(np.full((480, 640), 210, np.uint8), state, 14).valid.any()
-
-
-def test_compiled_and_plain_search_agree(model):
-    rng = np.random.default_rng(0)
-    image = cv2.GaussianBlur(rng.integers(0, 256, (480, 640)).astype(np.uint8), (0, 0), 3.0)
-    pixels = rng.uniform(0.0, 640.0, (200, 2))
-    pixels[0] = np.nan
-    angle = rng.uniform(0.0, 2.0 * np.pi, 200)
-    normals = np.column_stack([np.cos(angle), np.sin(angle)])
-    given = (image, pixels, normals, rng.uniform(100.0, 150.0, 200), 10, 3, 5.0, 0.1)
-    compiled = search_outline(*given)
-    np.testing.assert_allclose(compiled, plain.search_outline(*given), atol=1e-6)
-    assert 40 < np.isfinite(compiled).sum() < 160
 
 
 def _to_segments(point: np.ndarray, segments: np.ndarray) -> float:

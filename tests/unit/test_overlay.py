@@ -4,11 +4,9 @@ import matplotlib
 import numpy as np
 import pytest
 
-from morph_dslam.render.overlay import blend_surface, draw_overlay, paint_surface
-from morph_dslam.render.rasteriser import rasterise
+from morph_dslam.render.overlay import draw_overlay, paint_surface
 from morph_dslam.render.shading import colour_bar, colour_table, lambert, vertex_normals
 from tests.support.bent_sheet import LENGTH, bent_sheet_model
-from tests.support.numpy_twins import rendering
 
 PIXELS = np.array([[20.0, 40.0], [119.0, 40.0], [119.0, 139.0], [20.0, 139.0]])
 TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
@@ -46,22 +44,6 @@ def test_colours_follow_the_node_values_across_the_surface():
     row = image[90, 25:115, 0].astype(float)
     # A table of 256 entries may be one entry off, and matplotlib cuts its greys down to whole levels.
     np.testing.assert_allclose(row, (np.arange(25, 115) - 20) / 99 * 255, atol=2.0)
-
-
-def test_blending_agrees_with_its_plain_twin():
-    rng = np.random.default_rng(2)
-    buffers = rasterise(PIXELS, np.array([1.0, 1.2, 1.5, 0.9]), TRIANGLES, 240, 320)
-    start = rng.integers(0, 256, (240, 320, 3), dtype=np.uint8)
-    images = []
-    for blend in (blend_surface, rendering.blend_surface):
-        image = start.copy()
-        levels, brightness = np.array([-40.0, 120.0, 300.0, 80.0]), np.array([0.4, 1.0, 1.3, 0.8])
-        table = colour_table("turbo")
-        blend(image, buffers.triangle_ids, buffers.weights, TRIANGLES, levels, brightness, table, 0.6)
-        images.append(image.astype(int))
-    # Values that fall on the border of two colours may differ in the last bit.
-    assert (np.abs(images[0] - images[1]).max(axis=2) > 1).mean() < 1e-3
-    assert (images[0] != start).any()
 
 
 def test_colour_bar_runs_from_high_at_the_top_to_low_at_the_bottom():

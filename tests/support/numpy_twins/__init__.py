@@ -1,1 +1,0 @@
-"""Plain numpy and scipy versions of compiled functions, to compare with."""
