@@ -8,9 +8,9 @@ import pytest
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.model import SurfacePoints
-from morph_dslam.tracking.estimator import BoundPoints, Estimator, State, moved
+from morph_dslam.tracking.estimator import Estimator, State, moved
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.measured_points import bound_points
 from tests.support.real_data import ROOT
 
 MODEL = bent_sheet_model(22, 16)
@@ -59,8 +59,7 @@ def test_hat_functions_are_exact_at_their_values_and_straight_between(alternativ
 
 def test_differences_of_the_residual_give_the_normal_equations(alternatives):
     rng, camera = np.random.default_rng(0), Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
-    surface = SurfacePoints(rng.integers(0, len(MODEL.triangles), 40), rng.dirichlet(np.ones(3), 40))
-    points = BoundPoints.from_surface(MODEL, surface)
+    points = bound_points(MODEL, 40, rng)
     truth = State(MU, RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6])))
     pixels = camera.project(points.in_camera(truth)) + rng.standard_normal((40, 2))
     state = moved(truth, np.full(9, 5e-3))

@@ -7,12 +7,11 @@ import pytest
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.model import SurfacePoints
 from morph_dslam.model.revolution import with_revolution_angle
-from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
-from morph_dslam.tracking.noise import Observations
+from morph_dslam.tracking.estimator import Estimator, State
 from morph_dslam.tracking.sequence_filter import SequenceFilter, without_clear_effect
 from tests.support.bent_tube import AXIS, bent_tube
+from tests.support.measured_points import bound_points, measured
 
 CAMERA = Camera(640, 480, 560.0, 560.0, 320.0, 240.0)
 MODEL = with_revolution_angle(bent_tube(), AXIS)
@@ -24,24 +23,17 @@ COUNT, SIGMA = 80, 0.05
 LOADS = 0.03 * np.maximum(np.arange(24) - 9, 0)
 
 
-def bound():
-    rng = np.random.default_rng(0)
-    surface = SurfacePoints(rng.integers(0, len(MODEL.triangles), COUNT), rng.dirichlet(np.ones(3), COUNT))
-    return BoundPoints.from_surface(MODEL, surface)
-
-
-def measured(points, state, errors):
-    pixels = CAMERA.project(points.in_camera(state)) + errors
-    return Observations(points, pixels, np.ones(COUNT), np.zeros((COUNT, 2)), np.eye(COUNT))
+def seen_of(points, state, errors=0.0):
+    return measured(points, CAMERA.project(points.in_camera(state)) + errors)
 
 
 def followed(seed):
     """Errors and stated deviations (f,) of the side, half of the noise being the same in all frames."""
-    points, rng, start, found = bound(), np.random.default_rng(seed), State(MODEL.default, POSE), []
+    points, rng, start, found = bound_points(MODEL, COUNT), np.random.default_rng(seed), State(MODEL.default, POSE), []
     filtered, stays = SequenceFilter(ESTIMATOR, [TURN]), rng.standard_normal((COUNT, 2))
     for load in LOADS:
         errors = np.sqrt(0.5) * SIGMA * (stays + rng.standard_normal((COUNT, 2)))
-        seen = measured(points, State(np.array([load, SIDE]), POSE), errors)
+        seen = seen_of(points, State(np.array([load, SIDE]), POSE), errors)
         starts = [State(np.array([0.1, side]), POSE) for side in (-2.0, 0.0, 2.0)]
         alone = min((ESTIMATOR.fit(seen, one) for one in (start, *starts)), key=lambda estimate: estimate.cost)
         estimate = filtered.fuse(seen, alone)
@@ -65,9 +57,9 @@ def test_the_side_of_what_is_not_bent_is_not_said_to_be_known():
 @pytest.mark.parametrize(("lengths", "absent"), [(3.5, True), (4.5, False)])
 def test_an_effect_is_clear_from_four_standard_deviations_on(lengths, absent):
     """The side acts in proportion to the load."""
-    points, load = bound(), 0.2
+    points, load = bound_points(MODEL, COUNT), 0.2
     state = State(np.array([load, SIDE]), POSE)
-    seen = measured(points, state, np.zeros((COUNT, 2)))
+    seen = seen_of(points, state)
     alone = ESTIMATOR.fit(seen, state)
 
     def linear_at(there):
@@ -79,7 +71,7 @@ def test_an_effect_is_clear_from_four_standard_deviations_on(lengths, absent):
 
 
 def test_what_is_held_leaves_the_others_as_if_it_were_known():
-    seen = measured(bound(), State(np.array([0.3, SIDE]), POSE), np.zeros((COUNT, 2)))
+    seen = seen_of(bound_points(MODEL, COUNT), State(np.array([0.3, SIDE]), POSE))
     linear = ESTIMATOR.linear(seen, ESTIMATOR.fit(seen, State(np.array([0.3, SIDE]), POSE)))
     others = np.delete(np.arange(8), TURN)
     expected = np.linalg.inv(np.delete(np.delete(linear.hessian, TURN, 0), TURN, 1))

@@ -5,12 +5,11 @@ import pytest
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.model import SurfacePoints
 from morph_dslam.tracking.depth import SIGMA_AT_1M, PointDepths
-from morph_dslam.tracking.estimator import BoundPoints, Estimator, State, moved
-from morph_dslam.tracking.noise import Observations
+from morph_dslam.tracking.estimator import Estimator, State, moved
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.measured_points import bound_points, measured
 
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 MODEL = bent_sheet_model(22, 16)
@@ -19,12 +18,6 @@ POSE = RigidTransform(
 )
 TRUTH = State(np.array([0.035, 0.3, 0.1]), POSE)
 SIGMA_PX = 0.4
-
-
-def bound(count=80):
-    rng = np.random.default_rng(0)
-    surface = SurfacePoints(rng.integers(0, len(MODEL.triangles), count), rng.dirichlet(np.ones(3), count))
-    return BoundPoints.from_surface(MODEL, surface)
 
 
 def measured_depths(points, rng, sigma=0.0, huber_px=2.0 * SIGMA_PX):
@@ -37,7 +30,7 @@ def measured_depths(points, rng, sigma=0.0, huber_px=2.0 * SIGMA_PX):
 
 def test_gradient_is_that_of_the_cost_of_depths():
     """The cost is recomputed from positions; some residuals are beyond Huber's limit and some are not."""
-    points = bound()
+    points = bound_points(MODEL, 80)
     depths = measured_depths(points, np.random.default_rng(1), 2e-3, huber_px=0.4)
     state = moved(TRUTH, np.full(9, 2e-3))
 
@@ -61,17 +54,15 @@ def test_gradient_is_that_of_the_cost_of_depths():
 
 def test_depth_helps_along_the_sight_line_and_deviations_say_how_much():
     """Repeated measurements: the spread is as stated, and less than without depth."""
-    points, estimator = bound(), Estimator(MODEL, CAMERA)
+    points, estimator = bound_points(MODEL, 80), Estimator(MODEL, CAMERA)
     found, stated = {True: [], False: []}, {True: [], False: []}
     for seed in range(60):
         rng = np.random.default_rng(seed)
         pixels = CAMERA.project(points.in_camera(TRUTH)) + SIGMA_PX * rng.standard_normal((80, 2))
-        weights, normals = np.ones(80), np.zeros((80, 2))
         for with_depth in (True, False):
             depths = measured_depths(points, rng, 0.6e-3) if with_depth else None
-            alone = estimator.estimate(points, pixels, weights, TRUTH, depths=depths)
-            measured = Observations(points, pixels, weights, normals, np.eye(80), depths)
-            estimate = SequenceFilter(estimator, []).fuse(measured, alone)
+            seen = measured(points, pixels, depths=depths)
+            estimate = SequenceFilter(estimator, []).fuse(seen, estimator.fit(seen, TRUTH))
             found[with_depth].append([*estimate.state.parameters, *estimate.state.camera_from_object.translation])
             stated[with_depth].append([*estimate.parameter_std, *estimate.pose_std[3:]])
     spread = {key: np.std(values, axis=0) for key, values in found.items()}
@@ -82,7 +73,7 @@ def test_depth_helps_along_the_sight_line_and_deviations_say_how_much():
 
 
 def test_wrong_depths_do_not_take_pixels_along():
-    points, rng = bound(), np.random.default_rng(3)
+    points, rng = bound_points(MODEL, 80), np.random.default_rng(3)
     depths = measured_depths(points, rng, 1e-3)
     depths.depths[1:12] += 0.3
     pixels = CAMERA.project(points.in_camera(TRUTH))
@@ -139,6 +130,6 @@ def test_lens_is_taken_into_account():
 
 
 def test_padding_adds_points_without_depth():
-    depths = measured_depths(bound(10), np.random.default_rng(0)).padded(14)
+    depths = measured_depths(bound_points(MODEL, 10), np.random.default_rng(0)).padded(14)
     assert len(depths.depths) == 14
     assert depths.count == 8

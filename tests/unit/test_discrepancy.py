@@ -7,7 +7,6 @@ from scipy.special import gamma, kv
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.model import SurfacePoints
 from morph_dslam.model.discrepancy import (
     Discrepancy,
     DiscrepancyBasis,
@@ -17,10 +16,10 @@ from morph_dslam.model.discrepancy import (
     save_discrepancies,
 )
 from morph_dslam.tracking.discrepancy import DiscrepancyFit, DiscrepancyOptions, Reference, refine_discrepancy
-from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
-from morph_dslam.tracking.noise import Observations
+from morph_dslam.tracking.estimator import Estimator, State
 from morph_dslam.tracking.refinement import Keyframe
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.measured_points import bound_points, measured
 
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 MODEL = bent_sheet_model(22, 16, known=1)
@@ -40,12 +39,6 @@ def rolled(points, radius, angle):
         + np.outer(points @ across, across)
         + np.outer(height, [0.0, 0.0, 1.0])
     )
-
-
-def bound(count=200, seed=0):
-    rng = np.random.default_rng(seed)
-    surface = SurfacePoints(rng.integers(0, len(MODEL.triangles), count), rng.dirichlet(np.ones(3), count))
-    return BoundPoints.from_surface(MODEL, surface)
 
 
 def seen(points, shape, rng):
@@ -101,35 +94,33 @@ def test_a_rigid_motion_is_no_deformation():
 @pytest.mark.parametrize(("radius", "angle"), [(0.45, 0.5), (-0.6, -0.4)])
 def test_a_shape_that_the_model_does_not_have_is_found_from_one_image(radius, angle):
     """A sheet rolled about an axis that is oblique to it, with a model that only arches along its length."""
-    rng, points = np.random.default_rng(2), bound()
+    rng, points = np.random.default_rng(2), bound_points(MODEL, 200)
     truth = rolled(MODEL.nodes, radius, angle)
     pixels, weights = seen(points, lambda rest: rolled(rest, radius, angle), rng), np.ones(200)
     pixels[::7], weights[::7] = np.nan, 0.0
-    normals = np.zeros((200, 2))
     state = Estimator(MODEL, CAMERA).estimate(points, pixels, weights, State(np.array([0.01]), POSE)).state
     fit = DiscrepancyFit(MODEL, CAMERA, DiscrepancyOptions(steps=4))
-    found = fit.fit(Observations(points, pixels, weights, normals, np.zeros((0, 0))), state)
+    found = fit.fit(measured(points, pixels, weights), state)
     by_model = mean_distance(state, None, truth)
     assert by_model > 4e-3
     assert mean_distance(state, found, truth) < 0.4 * by_model
     # From the discrepancy of the frame before one step leads to the same.
-    again = fit.fit(Observations(points, pixels, weights, normals, np.zeros((0, 0))), state, found)
+    again = fit.fit(measured(points, pixels, weights), state, found)
     np.testing.assert_allclose(again.values, found.values, atol=3e-4)
 
 
 def test_where_the_model_is_right_nothing_is_added():
-    rng, points = np.random.default_rng(3), bound()
+    rng, points = np.random.default_rng(3), bound_points(MODEL, 200)
     state = State(np.array([0.03]), POSE)
-    exact = CAMERA.project(points.in_camera(state))
-    pixels, none = exact + NOISE_PX * rng.standard_normal((200, 2)), np.zeros((200, 2))
+    pixels = CAMERA.project(points.in_camera(state)) + NOISE_PX * rng.standard_normal((200, 2))
     fit = DiscrepancyFit(MODEL, CAMERA, DiscrepancyOptions())
-    found = fit.fit(Observations(points, pixels, np.ones(200), none, np.zeros((0, 0))), state)
+    found = fit.fit(measured(points, pixels), state)
     assert mean_distance(state, found, MODEL.positions(state.parameters)) < 0.7e-3
 
 
 def test_other_frames_tell_the_shape_in_the_reference_view():
     """The reference is rolled too, so the points are bound beside their places by the model alone."""
-    rng, points = np.random.default_rng(4), bound(250)
+    rng, points = np.random.default_rng(4), bound_points(MODEL, 250)
     turns = [(0.5, 0.5), (0.8, 0.2), (-0.7, 0.5), (1.5, 0.0), (-0.9, -0.3), (0.6, -0.2), (-1.2, 0.6)]
     truth = rolled(MODEL.nodes, 0.55, 0.4)
     estimator, start = Estimator(MODEL, CAMERA), State(np.array([0.01]), POSE)
@@ -140,7 +131,7 @@ def test_other_frames_tell_the_shape_in_the_reference_view():
         pixels = seen(points, lambda rest, r=radius, a=angle: rolled(rest, r, a), rng)
         own = estimator.estimate(points, pixels, np.ones(250), start).state
         keyframes.append(Keyframe(pixels, np.ones(250), own, 0.5))
-    corners = bound(12, seed=5)
+    corners = bound_points(MODEL, 12, seed=5)
     corner_pixels = seen(corners, lambda rest: rolled(rest, 0.55, 0.4), rng)
     known = Reference(state, reference_pixels, corners, corner_pixels, 0.5)
     fit = DiscrepancyFit(MODEL, CAMERA, DiscrepancyOptions())

@@ -6,7 +6,6 @@ from scipy.optimize import least_squares
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.model import SurfacePoints
 from morph_dslam.tracking.estimator import (
     BoundPoints,
     EstimationOptions,
@@ -19,6 +18,7 @@ from morph_dslam.tracking.estimator import (
 )
 from morph_dslam.tracking.levenberg_marquardt import bounded_step
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.measured_points import bound_points
 
 CAMERA = Camera(640, 480, 528.0, 520.0, 320.0, 240.0)
 POSE = RigidTransform(
@@ -34,9 +34,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def points(model):
-    rng = np.random.default_rng(0)
-    surface = SurfacePoints(rng.integers(0, len(model.triangles), 150), rng.dirichlet(np.ones(3), size=150))
-    return BoundPoints.from_surface(model, surface)
+    return bound_points(model, 150)
 
 
 def arguments(points, state, pixels, weights, huber=1.5, normals=None):

@@ -7,11 +7,11 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.landmarks import Landmarks, load_landmarks, save_landmarks
-from morph_dslam.model import SurfacePoints
 from morph_dslam.registration.landmarks import register_landmarks, shape_starts, solve_pnp
 from morph_dslam.registration.messages import Ambiguity, Ambiguous, AtBound, Underdetermined
-from morph_dslam.tracking.estimator import BoundPoints, State
+from morph_dslam.tracking.estimator import State
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.measured_points import bound_points
 
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 POSE = RigidTransform(
@@ -110,9 +110,7 @@ def test_pnp_returns_the_pose_of_a_flat_and_of_a_bent_shape():
 
 
 def test_landmarks_between_nodes_are_bound_to_their_triangle():
-    rng = np.random.default_rng(2)
-    surface = SurfacePoints(rng.integers(0, len(MODEL.triangles), 12), rng.dirichlet(np.ones(3), 12))
-    bound = BoundPoints.from_surface(MODEL, surface)
+    bound = bound_points(MODEL, 12, seed=2)
     found = register_landmarks(MODEL, CAMERA, Landmarks(bound.rest, CAMERA.project(bound.in_camera(BENT))))
     np.testing.assert_allclose(found.state.parameters, BENT.parameters, atol=1e-6)
 

@@ -5,10 +5,9 @@ import pytest
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.model import Parameter, ReducedModel, SeparatedField, SurfacePoints
+from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
-from morph_dslam.tracking.noise import Observations
+from morph_dslam.tracking.estimator import Estimator, State
 from morph_dslam.tracking.observability import one_value, statement, unobservable, value_line
 from morph_dslam.tracking.outcomes import FoundBy, Status
 from morph_dslam.tracking.result import STAGES, FrameResult
@@ -16,6 +15,7 @@ from morph_dslam.tracking.run_folder import summarise
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import sheet_mesh
+from tests.support.measured_points import bound_points, measured
 
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 POSE = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
@@ -45,17 +45,15 @@ MODEL = beam_model()
 def run_of(per_sequence, frames=3):
     """A run in which 80 points with noise are seen in every frame."""
     rng = np.random.default_rng(0)
-    surface = SurfacePoints(rng.integers(0, len(MODEL.triangles), 80), rng.dirichlet(np.ones(3), 80))
-    points, truth = BoundPoints.from_surface(MODEL, surface), State(np.array([0.3, 0.1, 0.2, 0.0]), POSE)
+    points, truth = bound_points(MODEL, 80, rng), State(np.array([0.3, 0.1, 0.2, 0.0]), POSE)
     estimator = Estimator(MODEL, CAMERA)
     names = [parameter.name for parameter in MODEL.parameters]
     filtered = SequenceFilter(estimator, [names.index(name) for name in per_sequence])
     run = RunResults(MODEL, 0, per_sequence=per_sequence)
     for number in range(frames):
         pixels = CAMERA.project(points.in_camera(truth)) + 0.3 * rng.standard_normal((80, 2))
-        weights, normals = np.ones(80), np.zeros((80, 2))
-        alone = estimator.estimate(points, pixels, weights, truth)
-        estimate = filtered.fuse(Observations(points, pixels, weights, normals, np.eye(80)), alone)
+        seen = measured(points, pixels)
+        estimate = filtered.fuse(seen, estimator.fit(seen, truth))
         times = dict.fromkeys(STAGES, 1.0)
         run.add(
             number,

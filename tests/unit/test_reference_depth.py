@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import RegistrationError
-from morph_dslam.model import SurfacePoints
-from morph_dslam.tracking.estimator import BoundPoints, Estimator
+from morph_dslam.tracking.estimator import Estimator
 from morph_dslam.tracking.refinement import refine_by_depth
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.measured_points import bound_points
 from tests.support.rendered_sequence import CAMERA, sheet_depth, sheet_state
 
 MODEL = bent_sheet_model(22, 16)
@@ -23,8 +23,7 @@ def along_the_sight_line(state):
 def by_landmarks(seed, sigma_px=1.5):
     """Landmarks that a hand has set, and the state they give."""
     rng = np.random.default_rng(seed)
-    surface = SurfacePoints(rng.integers(0, len(MODEL.triangles), 14), rng.dirichlet(np.ones(3), 14))
-    landmarks = BoundPoints.from_surface(MODEL, surface)
+    landmarks = bound_points(MODEL, 14, rng)
     pixels = CAMERA.project(landmarks.in_camera(TRUTH)) + sigma_px * rng.standard_normal((14, 2))
     estimate = Estimator(MODEL, CAMERA).estimate(landmarks, pixels, np.ones(14), TRUTH)
     return landmarks, pixels, estimate

@@ -5,12 +5,12 @@ import numpy as np
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.landmarks import Landmarks
-from morph_dslam.model import SurfacePoints
 from morph_dslam.registration.landmarks import register_landmarks
 from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
 from morph_dslam.tracking.refinement import Keyframe, choose_keyframes, refine_reference
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.measured_points import bound_points
 from tests.support.rendered_sequence import mean_error, sheet_state
 
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
@@ -25,8 +25,7 @@ def test_other_frames_correct_a_reference_that_bad_landmarks_spoiled():
     model = bent_sheet_model(22, 16)
     rng = np.random.default_rng(0)
     truth = sheet_state(0.0)
-    surface = SurfacePoints(rng.integers(0, len(model.triangles), 120), rng.dirichlet(np.ones(3), 120))
-    points = BoundPoints.from_surface(model, surface)
+    points = bound_points(model, 120, rng)
     keyframes = [keyframe(points, sheet_state(time), rng) for time in np.linspace(0.1, 0.9, 8)]
     # Ten landmarks, each a pixel and a half off.
     object_points = model.nodes[rng.choice(len(model.nodes), 10, replace=False)]
@@ -54,8 +53,7 @@ def test_a_right_reference_is_left_where_it_is():
         np.array([0.02, 0.1, 0.05]),
         RigidTransform(rotation_exp(np.array([0.2, 0.1, 0.0])) @ np.diag([1.0, -1.0, -1.0]), np.array([0, 0, 0.6])),
     )
-    surface = SurfacePoints(rng.integers(0, len(model.triangles), 80), rng.dirichlet(np.ones(3), 80))
-    points = BoundPoints.from_surface(model, surface)
+    points = bound_points(model, 80, rng)
     keyframes = [keyframe(points, sheet_state(time), rng, noise=0.0) for time in (0.2, 0.5)]
     pixels = CAMERA.project(points.in_camera(truth))
     refined = refine_reference(Estimator(model, CAMERA), points, pixels, pixels, truth, keyframes)

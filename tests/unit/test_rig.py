@@ -12,9 +12,10 @@ from morph_dslam.model import SurfacePoints
 from morph_dslam.registration.registration import PosePrior
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, Prior, State, moved
 from morph_dslam.tracking.multi_camera import RigCamera, RigEstimator
-from morph_dslam.tracking.noise import Observations, RigObservations
+from morph_dslam.tracking.noise import RigObservations
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.measured_points import measured
 
 MODEL = bent_sheet_model(22, 16)
 LEFT = RigCamera(Camera(640, 480, 528.0, 528.0, 320.0, 240.0), RigidTransform.identity())
@@ -41,9 +42,7 @@ def bound(count, seed, columns=(-1.0, 1.0)):
 
 def seen_by(part, points, rng, sigma=SIGMA):
     pixels = part.camera.project(points.in_camera(part.seen(TRUTH)))
-    pixels = pixels + sigma * rng.standard_normal(pixels.shape)
-    count = len(points)
-    return Observations(points, pixels, np.ones(count), np.zeros((count, 2)), np.eye(count))
+    return measured(points, pixels + sigma * rng.standard_normal(pixels.shape))
 
 
 def test_a_pose_known_in_the_rig_is_known_as_well_in_each_camera():
@@ -98,9 +97,9 @@ def test_both_cameras_are_better_than_one_and_deviations_say_so():
     for seed in range(80):
         rng = np.random.default_rng(seed)
         views = seen_by(LEFT, points[0], rng), seen_by(ASIDE, points[1], rng)
-        for name, measured in (("left", views[0]), ("rig", RigObservations(views))):
+        for name, seen in (("left", views[0]), ("rig", RigObservations(views))):
             estimator = estimators[name]
-            estimate = SequenceFilter(estimator, []).fuse(measured, estimator.fit(measured, TRUTH))
+            estimate = SequenceFilter(estimator, []).fuse(seen, estimator.fit(seen, TRUTH))
             found[name].append([*estimate.state.parameters, *estimate.state.camera_from_object.translation])
             stated[name].append([*estimate.parameter_std, *estimate.pose_std[3:]])
     spread = {name: np.std(values, axis=0) for name, values in found.items()}
@@ -127,18 +126,18 @@ def test_parameter_over_the_sequence_sharpens_with_a_rig():
     filtered, deviations = SequenceFilter(estimator, [2]), []
     for seed in range(16):
         rng = np.random.default_rng(seed)
-        measured = RigObservations((seen_by(LEFT, points[0], rng), seen_by(ASIDE, points[1], rng)))
-        estimate = filtered.fuse(measured, estimator.fit(measured, TRUTH))
+        seen = RigObservations((seen_by(LEFT, points[0], rng), seen_by(ASIDE, points[1], rng)))
+        estimate = filtered.fuse(seen, estimator.fit(seen, TRUTH))
         deviations.append(estimate.parameter_std[2])
     assert deviations[-1] == pytest.approx(deviations[0] / 4.0, rel=0.35)
     assert abs(estimate.state.parameters[2] - TRUTH.parameters[2]) < 4.0 * deviations[-1]
 
 
 def test_prior_of_the_pose_is_in_the_rigs_frame():
-    measured = RigObservations((seen_by(ASIDE, bound(60, 9), np.random.default_rng(9)),))
+    seen = RigObservations((seen_by(ASIDE, bound(60, 9), np.random.default_rng(9)),))
     pose = moved(TRUTH, np.full(9, 0.01)).camera_from_object
     prior = Prior(np.zeros(3), np.zeros((3, 3)), pose, 1e12 * np.eye(6))
-    found = RigEstimator(MODEL, [ASIDE]).fit(measured, TRUTH, prior)
+    found = RigEstimator(MODEL, [ASIDE]).fit(seen, TRUTH, prior)
     np.testing.assert_allclose(found.state.camera_from_object.matrix, pose.matrix, atol=1e-6)
 
 

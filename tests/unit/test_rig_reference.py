@@ -13,10 +13,11 @@ from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.covariance import BoundPart
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions
 from morph_dslam.tracking.multi_camera import RigCamera, RigEstimator, RigReference
-from morph_dslam.tracking.noise import Observations, RigObservations
+from morph_dslam.tracking.noise import RigObservations
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.state import moved
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.measured_points import measured
 from tests.support.rendered_sequence import CAMERA, sheet_state
 
 REFERENCE, ANOTHER, LATER = sheet_state(0.1), sheet_state(0.3), sheet_state(0.6)
@@ -65,23 +66,22 @@ def estimated(model, pictures):
         every_true = [bound(model, part, true, true) for true, _, _ in pictures]
         every = [bound(model, part, true, taken) for true, taken, _ in pictures]
         true_points, points = (reduce(BoundPoints.joined, parts) for parts in (every_true, every))
-        count, options = len(points), TrackerOptions()
         pixels = part.camera.project(true_points.in_camera(part.seen(LATER)))
-        views.append(Observations(points, pixels, np.ones(count), np.zeros((count, 2)), np.eye(count)))
+        views.append(measured(points, pixels))
         ends, parts = np.cumsum([len(own) for own in every]), []
         for own, end, (_, taken, error_factors) in zip(every, ends, pictures, strict=True):
             seen = None if error_factors is None else part.chain(len(model.parameters)) @ error_factors
             parts.append(BoundPart(slice(end - len(own), end), part.seen(taken), seen))
         reference = SimpleNamespace(points=points, parts=parts)
-        trackers.append(SimpleNamespace(estimator=single, reference=reference, options=options))
-    measured = RigObservations(tuple(views))
-    return estimator.fit(measured, LATER), measured, trackers
+        trackers.append(SimpleNamespace(estimator=single, reference=reference, options=TrackerOptions()))
+    seen = RigObservations(tuple(views))
+    return estimator.fit(seen, LATER), seen, trackers
 
 
 def check_prediction(model, pictures):
-    found, measured, trackers = estimated(model, pictures)
+    found, seen, trackers = estimated(model, pictures)
     plain = replace(found, covariance=np.zeros((9, 9)))
-    stated = RigReference(trackers, RIG).added(plain, measured, None).covariance
+    stated = RigReference(trackers, RIG).added(plain, seen, None).covariance
     pose, true = found.state.camera_from_object, LATER.camera_from_object
     turn = pose.rotation @ true.rotation.T
     away = np.concatenate(
@@ -110,5 +110,5 @@ def test_of_two_pictures_each_is_off_in_its_own_way_by_the_same_cause(model, ste
 
 
 def test_nothing_is_added_where_nothing_is_known(model):
-    found, measured, trackers = estimated(model, [(REFERENCE, REFERENCE, None)])
-    assert RigReference(trackers, RIG).added(found, measured, None) is found
+    found, seen, trackers = estimated(model, [(REFERENCE, REFERENCE, None)])
+    assert RigReference(trackers, RIG).added(found, seen, None) is found

@@ -1,5 +1,7 @@
 """The filter of what is one per sequence, against the errors of simulated measurements."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -8,15 +10,17 @@ from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
 from morph_dslam.registration.registration import PosePrior
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, Prior, State, moved
-from morph_dslam.tracking.noise import Observations, window_correlation
+from morph_dslam.tracking.noise import window_correlation
 from morph_dslam.tracking.sequence_filter import PointChange, SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.measured_points import bound_points, measured
 
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 MODEL = bent_sheet_model(22, 16)
 ESTIMATOR = Estimator(MODEL, CAMERA)
 TWIST = 2
 SIGMA = 0.4
+bound = partial(bound_points, MODEL)
 
 
 def truth(number, twist_deg=5.0):
@@ -26,20 +30,13 @@ def truth(number, twist_deg=5.0):
     return State(np.array([0.03 * np.cos(0.1 * number), 0.1, np.radians(twist_deg)]), pose)
 
 
-def bound(count, seed=0):
-    rng = np.random.default_rng(seed)
-    surface = SurfacePoints(rng.integers(0, len(MODEL.triangles), count), rng.dirichlet(np.ones(3), count))
-    return BoundPoints.from_surface(MODEL, surface)
-
-
 def fused(filtered, points, errors, states, correlation):
     """The estimates of frames whose pixels are off by ``errors`` (f, p, 2)."""
     estimates = []
     for state, error in zip(states, errors, strict=True):
         pixels, weights = CAMERA.project(points.in_camera(state)) + error, np.ones(len(points))
         alone = ESTIMATOR.estimate(points, pixels, weights, state)
-        measured = Observations(points, pixels, weights, np.zeros_like(pixels), correlation)
-        estimates.append(filtered.fuse(measured, alone))
+        estimates.append(filtered.fuse(measured(points, pixels, weights, correlation), alone))
     return estimates
 
 
@@ -95,10 +92,8 @@ def runs_with_known_poses(lasting, anew, frames=8, repeats=24, count=40):
             pose = moved(state, np.concatenate([np.zeros(3), -error])).camera_from_object
             known = Prior(np.zeros(3), np.zeros((3, 3)), pose, information, lasting, SIGMA**2)
             pixels = CAMERA.project(points.in_camera(state)) + SIGMA * rng.standard_normal((count, 2))
-            weights, normals = np.ones(count), np.zeros((count, 2))
-            alone = ESTIMATOR.estimate(points, pixels, weights, state, prior=known)
-            measured = Observations(points, pixels, weights, normals, np.eye(count))
-            fused = filtered.fuse(measured, alone, known)
+            seen = measured(points, pixels)
+            fused = filtered.fuse(seen, ESTIMATOR.fit(seen, state, known), known)
             found.append((fused.state.parameters[0] - state.parameters[0], fused.parameter_std[0]))
     return np.array(found).reshape(repeats, frames, 2).transpose(2, 0, 1)
 
@@ -119,11 +114,9 @@ def test_pose_that_is_held_is_not_said_to_be_better_known():
     lasting, anew = np.diag([5e-3, 4e-3, 3e-3, 1e-3, 2e-3, 3e-3]), 1e-3 * np.eye(6)
     known = PosePrior(state.camera_from_object, anew @ anew.T, lasting).prior(3, SIGMA**2, 1e6)
     pixels = CAMERA.project(points.in_camera(state)) + SIGMA * rng.standard_normal((60, 2))
-    measured = Observations(points, pixels, np.ones(60), np.zeros((60, 2)), np.eye(60))
-    filtered = SequenceFilter(ESTIMATOR, [TWIST])
+    seen, filtered = measured(points, pixels), SequenceFilter(ESTIMATOR, [TWIST])
     for _ in range(3):
-        alone = ESTIMATOR.fit(measured, state, known)
-        fused = filtered.fuse(measured, alone, known)
+        fused = filtered.fuse(seen, ESTIMATOR.fit(seen, state, known), known)
         np.testing.assert_allclose(fused.state.camera_from_object.matrix, state.camera_from_object.matrix, atol=1e-5)
         np.testing.assert_allclose(fused.pose_std, np.sqrt(np.diag(lasting**2 + anew**2)), rtol=0.01)
         assert np.linalg.eigvalsh(fused.covariance)[0] > -1e-12
@@ -176,9 +169,9 @@ def test_frame_that_knows_little_does_not_overrule_many_that_know_much():
         state = truth(number, -18.0 if is_odd else 5.0)
         pixels = CAMERA.project(points.in_camera(state)) + SIGMA * rng.standard_normal((120, 2))
         weights = in_middle.astype(float) if is_odd else np.ones(120)
-        measured = Observations(points, pixels, weights, np.zeros((120, 2)), np.eye(120))
-        alone = ESTIMATOR.fit(measured, state)
-        twists = np.degrees([e.state.parameters[TWIST] for e in (alone, filtered.fuse(measured, alone))])
+        seen = measured(points, pixels, weights)
+        alone = ESTIMATOR.fit(seen, state)
+        twists = np.degrees([e.state.parameters[TWIST] for e in (alone, filtered.fuse(seen, alone))])
         if is_odd:
             assert twists[0] < -10.0
         assert abs(twists[1] - 5.0) < 1.0
@@ -220,8 +213,7 @@ def test_points_measured_less_exactly_count_by_their_weights():
     for _ in range(60):
         seen = pixels + sigma[:, None] * rng.standard_normal((150, 2))
         alone = ESTIMATOR.estimate(points, seen, weights, state)
-        measured = Observations(points, seen, weights, np.zeros_like(seen), np.eye(150))
-        estimate = SequenceFilter(ESTIMATOR, []).fuse(measured, alone)
+        estimate = SequenceFilter(ESTIMATOR, []).fuse(measured(points, seen, weights), alone)
         found.append(estimate.state.parameters)
         stated.append(estimate.parameter_std)
         alike.append(ESTIMATOR.estimate(points, seen, np.ones(150), state).state.parameters)
@@ -241,8 +233,7 @@ def test_noise_is_not_taken_for_smaller_where_an_estimate_takes_up_much_of_it():
     for _ in range(200):
         seen = pixels + SIGMA * root @ rng.standard_normal((60, 2))
         alone = ESTIMATOR.estimate(points, seen, ones, state)
-        measured = Observations(points, seen, ones, np.zeros_like(seen), correlation)
-        estimate = SequenceFilter(ESTIMATOR, []).fuse(measured, alone)
+        estimate = SequenceFilter(ESTIMATOR, []).fuse(measured(points, seen, correlation=correlation), alone)
         stated.append(estimate.parameter_std)
         found.append(estimate.state.parameters)
         left.append(np.mean(alone.residuals**2))
@@ -282,10 +273,8 @@ def followed(seed, views, lasting=0.8):
             filtered.change_points(change(views[number - 1], view))
         state, points = truth(number), VIEWS[view]
         error = of_points[view] + np.sqrt(1.0 - lasting) * SIGMA * rng.standard_normal((COUNT, 2))
-        pixels, weights = CAMERA.project(points.in_camera(state)) + error, np.ones(COUNT)
-        alone = ESTIMATOR.estimate(points, pixels, weights, state)
-        measured = Observations(points, pixels, weights, np.zeros_like(pixels), np.eye(COUNT))
-        estimates.append(filtered.fuse(measured, alone))
+        seen = measured(points, CAMERA.project(points.in_camera(state)) + error)
+        estimates.append(filtered.fuse(seen, ESTIMATOR.fit(seen, state)))
         states.append(state)
     return (*twist_errors(estimates, states), filtered)
 
@@ -321,9 +310,8 @@ def test_points_of_a_view_that_cannot_come_back_keep_their_part_of_the_covarianc
         filtered.change_points(change(0, 1, still_there))
         state, points = truth(6), VIEWS[1]
         pixels = CAMERA.project(points.in_camera(state))
-        measured = Observations(points, pixels, np.ones(COUNT), np.zeros_like(pixels), np.eye(COUNT))
         alone = ESTIMATOR.estimate(points, pixels + 0.3, np.ones(COUNT), state)
-        stated.append(filtered.fuse(measured, alone).covariance)
+        stated.append(filtered.fuse(measured(points, pixels), alone).covariance)
     np.testing.assert_allclose(stated[1], stated[0], rtol=1e-9)
 
 

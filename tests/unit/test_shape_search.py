@@ -4,14 +4,14 @@ import numpy as np
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.model import SurfacePoints
 from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.registration.landmarks import shape_starts
 from morph_dslam.registration.registration import PosePrior
-from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOptions, Estimator, State
+from morph_dslam.tracking.estimator import Estimate, EstimationOptions, Estimator, State
 from morph_dslam.tracking.frame_estimation import ShapeSearch, with_unobservable_at_default
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.bent_tube import bent_tube
+from tests.support.measured_points import bound_points
 
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 POSE = RigidTransform(rotation_exp(np.array([0.3, -0.2, 0.0])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
@@ -36,9 +36,7 @@ def test_every_shape_is_handed_out_once_before_any_is_repeated():
 def test_a_mirrored_bend_is_left_by_way_of_another_start():
     """From the wrong sign of the arch in the pose that hides it best, other starts find the right one."""
     model = bent_sheet_model(22, 16)
-    rng = np.random.default_rng(0)
-    surface = SurfacePoints(rng.integers(0, len(model.triangles), 150), rng.dirichlet(np.ones(3), 150))
-    points = BoundPoints.from_surface(model, surface)
+    points = bound_points(model, 150)
     truth = State(np.array([0.03, 0.2, 0.05]), POSE)
     pixels, weights = CAMERA.project(points.in_camera(truth)), np.ones(150)
     estimator = Estimator(model, CAMERA, EstimationOptions(max_iterations=10, tolerance=1e-3))
@@ -51,8 +49,7 @@ def test_only_undetermined_parameters_return_to_their_default():
     """Without an arch the skew has no effect; its estimate is dropped, the twist's is kept."""
     model = bent_sheet_model(22, 16)
     rng = np.random.default_rng(1)
-    surface = SurfacePoints(rng.integers(0, len(model.triangles), 150), rng.dirichlet(np.ones(3), 150))
-    points = BoundPoints.from_surface(model, surface)
+    points = bound_points(model, 150, rng)
     truth = State(np.array([0.0, 0.0, 0.2]), POSE)
     pixels = CAMERA.project(points.in_camera(truth)) + 0.1 * rng.standard_normal((150, 2))
     start = State(np.array([0.001, 0.5, 0.2]), POSE)
@@ -66,8 +63,7 @@ def test_an_estimate_leaves_a_bound_that_it_reached_on_the_wrong_side():
     """A tube that is bent away from where its load is sought looks as if the load were less than none."""
     model = with_revolution_angle(bent_tube(), np.array([0.0, 0.0, 1.0]))
     rng = np.random.default_rng(2)
-    surface = SurfacePoints(rng.integers(0, len(model.triangles), 80), rng.dirichlet(np.ones(3), 80))
-    points, weights = BoundPoints.from_surface(model, surface), np.ones(80)
+    points, weights = bound_points(model, 80, rng), np.ones(80)
     truth = State(np.array([0.5, np.pi - 0.1]), RigidTransform(POSE.rotation, np.array([0.0, 0.0, 0.4])))
     pixels = CAMERA.project(points.in_camera(truth)) + 0.1 * rng.standard_normal((80, 2))
     known = PosePrior(truth.camera_from_object, 1e-8 * np.eye(6), np.zeros((6, 0))).prior(2, 0.01)

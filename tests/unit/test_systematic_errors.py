@@ -7,12 +7,12 @@ import pytest
 
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator
-from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.observability import position_std
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from morph_dslam.tracking.state import moved
 from morph_dslam.tracking.systematic_errors import FLOOR_PX, ReferenceMisfit
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.measured_points import measured
 from tests.support.one_view import errors_of
 from tests.support.rendered_sequence import CAMERA, sheet_state
 
@@ -148,8 +148,8 @@ def test_an_error_of_the_reference_stays_in_a_shared_parameter_as_predicted(mode
         truth = replace(sheet_state(time), parameters=np.array([0.03, *sheet_state(time).parameters[1:]]))
         seen = CAMERA.project(true_points.in_camera(truth))
         used = weights if time < 0.9 else 1e-4 * weights
-        measured = Observations(points, seen, used, np.zeros_like(seen), np.eye(len(seen)))
-        fused = filtered.fuse(measured, estimator.fit(measured, truth))
+        frame = measured(points, seen, used)
+        fused = filtered.fuse(frame, estimator.fit(frame, truth))
         plain = replace(fused, covariance=np.zeros((9, 9)))
         stated = errors.added(
             plain, used, 0.0, past_information=filtered.past_information, keeps=filtered.keeps, learns=False
