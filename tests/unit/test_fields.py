@@ -1,4 +1,4 @@
-"""Functions of the parameters in every format, fields and reduced models, against numpy and closed forms."""
+"""Functions of the parameters in every format, fields, models and their surfaces, against scipy and closed forms."""
 
 from math import radians
 
@@ -10,6 +10,7 @@ from morph_dslam.mechanics.point_location import material_points
 from morph_dslam.model import SeparatedField, SurfacePoints
 from morph_dslam.model.basis_functions import chebyshev_basis, cubic_spline_basis, fourier_basis
 from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
+from morph_dslam.model.reduced_model import spread_over, triangle_normals
 from morph_dslam.model.tensor_functions import CPFunctions, TensorTrainFunctions, TuckerFunctions
 from tests.support.bent_sheet import LENGTH, bending_stress_terms, bent_sheet_model, deflection_terms
 from tests.support.function_formats import FORMATS, OTHERS, SMOOTH, function_values, make_functions
@@ -243,3 +244,52 @@ def test_interpolated_functions_are_those_of_one_parameter():
     mixed = functions.mixed(np.array([[1.0], [2.0]]))
     assert mixed.is_unmixed
     np.testing.assert_allclose(mixed.evaluate([0.3])[0], [0.3 + 2.0 * 0.09])
+
+
+def test_separated_form_equals_the_formula():
+    model = bent_sheet_model(9, 7)
+    arch, skew, twist = 0.05, -0.4, 0.2
+    x, y, _ = model.nodes.T
+    s = 2 * x / LENGTH
+    z = arch * (1 - s**2) * (1 + skew * s) + twist * s * y
+    np.testing.assert_allclose(model.positions(np.array([arch, skew, twist]))[:, 2], z, atol=1e-15)
+    np.testing.assert_allclose(model.positions(model.default), model.nodes, atol=1e-15)
+
+
+def test_length_along_the_middle_is_kept_to_second_order():
+    model = bent_sheet_model()
+    middle = np.flatnonzero(model.nodes[:, 1] == 0.0)
+    for arch in (0.01, 0.02):
+        line = model.positions(np.array([arch, 0.5, 0.3]))[middle]
+        length = np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
+        assert abs(length / LENGTH - 1) < 12 * (arch / LENGTH) ** 3
+
+
+#: A rectangle 4 by 1 in three triangles of areas 0.5, 1.5 and 2.
+NODES = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [4.0, 0.0, 0.0], [4.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+TRIANGLES = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4]])
+
+
+def test_normals_are_twice_as_long_as_the_areas():
+    np.testing.assert_allclose(triangle_normals(NODES, TRIANGLES), [[0, 0, 1], [0, 0, 3], [0, 0, 4]])
+
+
+def test_each_triangle_gets_as_many_points_as_its_area_asks_for():
+    points = spread_over(NODES, TRIANGLES, 800)
+    assert np.bincount(points.triangles).tolist() == [100, 300, 400]
+    assert (points.weights >= 0.0).all()
+    np.testing.assert_allclose(points.weights.sum(axis=1), 1.0)
+
+
+def test_points_are_spread_evenly_within_the_triangles_and_the_same_every_time():
+    points = spread_over(NODES, TRIANGLES, 8000)
+    places = np.einsum("pc,pcx->px", points.weights, NODES[TRIANGLES[points.triangles]])
+    # Of a rectangle: the middle, and a twelfth of the squared sides.
+    np.testing.assert_allclose(places.mean(axis=0), [2.0, 0.5, 0.0], atol=0.03)
+    np.testing.assert_allclose(places.var(axis=0), [16 / 12, 1 / 12, 0.0], rtol=0.03)
+    np.testing.assert_array_equal(spread_over(NODES, TRIANGLES, 8000).weights, points.weights)
+
+
+def test_a_triangle_without_area_gets_no_point():
+    points = spread_over(NODES, np.concatenate([TRIANGLES, [[0, 0, 1]]]), 801)
+    assert points.triangles.max() == 2

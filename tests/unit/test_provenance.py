@@ -1,4 +1,4 @@
-"""Where a model comes from: the mesh by its hash, the programs by their versions."""
+"""Where a model comes from: the mesh by its hash, the programs by their versions; the keys of its study."""
 
 import hashlib
 import json
@@ -11,6 +11,7 @@ import numpy as np
 
 from morph_dslam import make_study
 from morph_dslam.studies.provenance import mesh_hash, provenance
+from morph_dslam.studies.reference import study_reference
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.block_study import STUDY
 from tests.support.stretched_block import stretched_block_model
@@ -38,3 +39,18 @@ def test_versions_and_linear_solver(monkeypatch):
     assert facts["versions"]["numpy"] == version("numpy")
     assert facts["versions"]["python"] == platform.python_version()
     json.dumps(facts)
+
+
+def test_every_key_stands_in_the_reference():
+    page = study_reference()
+    for text in (
+        "[sampling]",
+        "[parameters.NAME]",
+        "[[loads]] kind = gravity",
+        "[mesh] generator = block",
+        "[external]",
+    ):
+        assert f"`{text}`" in page
+    assert "| `held_out` | whole number | `59` |" in page
+    assert "| `thickness` | length |" in page
+    assert page.count("| key | value | default |") > 25

@@ -1,19 +1,18 @@
-"""The refined reference state against the truth, on exact and on noisy projections."""
+"""The reference state refined by other frames and by depth, against the truth."""
 
 import numpy as np
+import pytest
 
-from morph_dslam.camera import Camera
+from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.registration.landmarks import register_landmarks
 from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
-from morph_dslam.tracking.refinement import Keyframe, choose_keyframes, refine_reference
+from morph_dslam.tracking.refinement import Keyframe, choose_keyframes, refine_by_depth, refine_reference
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points
-from tests.support.rendered_sequence import mean_error, sheet_state
-
-CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
+from tests.support.rendered_sequence import CAMERA, mean_error, sheet_depth, sheet_state
 
 
 def keyframe(points, state, rng, noise=0.1):
@@ -64,3 +63,42 @@ def test_keyframes_are_spread_over_the_sequence():
     assert choose_keyframes([], 5) == []
     assert choose_keyframes(list(range(3)), 5) == [0, 1, 2]
     assert choose_keyframes(list(range(101)), 5) == [0, 25, 50, 75, 100]
+
+
+MODEL = bent_sheet_model(22, 16)
+TRUTH = sheet_state(0.3)
+
+
+def along_the_sight_line(state):
+    """Mean distance of the nodes from where they truly are, along the optical axis, metres."""
+    here, there = (s.camera_from_object.apply(MODEL.positions(s.parameters)) for s in (state, TRUTH))
+    return np.abs(here - there)[:, 2].mean()
+
+
+def by_landmarks(seed, sigma_px=1.5):
+    """Landmarks that a hand has set, and the state they give."""
+    rng = np.random.default_rng(seed)
+    landmarks = bound_points(MODEL, 14, rng)
+    pixels = CAMERA.project(landmarks.in_camera(TRUTH)) + sigma_px * rng.standard_normal((14, 2))
+    estimate = Estimator(MODEL, CAMERA).estimate(landmarks, pixels, np.ones(14), TRUTH)
+    return landmarks, pixels, estimate
+
+
+def test_depth_places_the_object_along_the_sight_line():
+    before, after = [], []
+    for seed in range(4):
+        landmarks, pixels, start = by_landmarks(seed)
+        image = sheet_depth(MODEL, TRUTH, np.random.default_rng(seed))
+        found = refine_by_depth(Estimator(MODEL, CAMERA), landmarks, pixels, start.state, 1.5, image)
+        before.append(along_the_sight_line(start.state))
+        after.append(along_the_sight_line(found.state))
+        assert (found.pose_std < start.pose_std).all()
+    assert np.mean(before) > 1e-3
+    assert np.mean(after) < 0.3e-3
+
+
+def test_depth_of_something_else_is_refused():
+    landmarks, pixels, start = by_landmarks(0)
+    image = sheet_depth(MODEL, TRUTH, np.random.default_rng(0)) + np.float32(0.3)
+    with pytest.raises(RegistrationError, match="is the depth registered to this camera"):
+        refine_by_depth(Estimator(MODEL, CAMERA), landmarks, pixels, start.state, 1.5, image)
