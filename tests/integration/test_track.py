@@ -13,12 +13,10 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import CameraError, RegistrationError, SourceError, TrackingError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.io.camera_files import save_camera
-from morph_dslam.io.landmarks import Landmarks, save_landmarks
-from morph_dslam.model import save_model
 from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
-from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state
+from tests.support.rendered_sequence import SheetFilm, sheet_state, write_landmarks, write_recording
 
 TIMES = np.linspace(0.0, 0.24, 7)
 BLANK = 4  # position of the frame that shows nothing
@@ -30,24 +28,17 @@ def inputs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sequence")
     model = bent_sheet_model(43, 31)
     film = SheetFilm(model)
-    (folder / "frames").mkdir()
-    for number, time in enumerate(TIMES):
-        image = film.blank() if number == BLANK else film.frame(sheet_state(time))
-        cv2.imwrite(str(folder / "frames" / f"{20 + number:06d}.png"), image)
-    save_model(folder / "sheet.morph", model)
-    save_camera(folder / "camera.yaml", CAMERA)
-    nodes = np.random.default_rng(0).choice(len(model.nodes), 16, replace=False)
-    state = sheet_state(0.0)
-    seen = CAMERA.project(state.camera_from_object.apply(model.positions(state.parameters)))[nodes]
-    save_landmarks(folder / "landmarks.csv", Landmarks(model.nodes[nodes], seen))
+    images = [film.blank() if number == BLANK else film.frame(sheet_state(time)) for number, time in enumerate(TIMES)]
+    write_recording(folder, dict(enumerate(images, 20)), model)
+    write_landmarks(folder / "landmarks.csv", model, sheet_state(0.0))
     return folder
 
 
 def options(inputs, output, **changes):
     files = {"frames": "frames", "model": "sheet.morph", "camera": "camera.yaml", "landmarks": "landmarks.csv"}
     # The landmarks are exact but for rounding.
-    changes = {"click_px": 0.01, **changes}
-    return TrackOptions(**{name: inputs / path for name, path in files.items()}, output=output, **changes)
+    known = {name: inputs / path for name, path in files.items()} | {"click_px": 0.01, "output": output}
+    return TrackOptions(**known | changes)
 
 
 @pytest.fixture(scope="module")
@@ -56,15 +47,20 @@ def finished(inputs, tmp_path_factory):
     return folder, track(options(inputs, folder))
 
 
+def error_of(run, position):
+    """Mean distance of the nodes of one frame from the truth in the camera frame, metres."""
+    truth = sheet_state(TIMES[position])
+    expected = truth.camera_from_object.apply(run.model.positions(truth.parameters))
+    return np.linalg.norm(run.camera_points(position) - expected, axis=1).mean()
+
+
 def test_run_folder_holds_the_states(finished):
     folder, _ = finished
     run = load_run(folder)
     assert run.frames.tolist() == list(range(20, 27))
     assert run.tracked.tolist() == [position != BLANK for position in range(7)]
     for position in np.flatnonzero(run.tracked):
-        truth = sheet_state(TIMES[position])
-        expected = truth.camera_from_object.apply(run.model.positions(truth.parameters))
-        assert np.linalg.norm(run.camera_points(position) - expected, axis=1).mean() < 0.5e-3
+        assert error_of(run, position) < 0.5e-3
 
 
 def test_result_file_has_the_documented_layout(finished):
@@ -154,29 +150,23 @@ def test_interrupt_keeps_the_frames_so_far(inputs, tmp_path, monkeypatch):
 
 def test_reference_may_lie_inside_the_range(inputs, tmp_path):
     """Frame 23 as the reference: the landmarks' pixels there, and the sequence still starts at 21."""
-    model = bent_sheet_model(43, 31)
-    nodes = np.random.default_rng(1).choice(len(model.nodes), 16, replace=False)
-    state = sheet_state(TIMES[3])
-    seen = CAMERA.project(state.camera_from_object.apply(model.positions(state.parameters)))[nodes]
-    save_landmarks(tmp_path / "landmarks.csv", Landmarks(model.nodes[nodes], seen))
-    chosen = options(inputs, tmp_path / "run", first=21, last=23, reference_frame=23, video=False)
-    summary = track(TrackOptions(**{**vars(chosen), "landmarks": tmp_path / "landmarks.csv"}))
+    write_landmarks(tmp_path / "landmarks.csv", bent_sheet_model(43, 31), sheet_state(TIMES[3]), seed=1)
+    there = {"landmarks": tmp_path / "landmarks.csv", "reference_frame": 23}
+    summary = track(options(inputs, tmp_path / "run", first=21, last=23, video=False, **there))
     assert summary["n_tracked"] == 3
     assert summary["reference_frame"] == 23
 
 
 def test_camera_of_another_size_is_refused(inputs, tmp_path):
     save_camera(tmp_path / "camera.yaml", Camera(1280, 720, 900.0, 900.0, 640.0, 360.0))
-    chosen = {**vars(options(inputs, tmp_path / "run")), "camera": tmp_path / "camera.yaml"}
     with pytest.raises(CameraError, match="is 640x480 pixels but the camera file is for 1280x720"):
-        track(TrackOptions(**chosen))
+        track(options(inputs, tmp_path / "run", camera=tmp_path / "camera.yaml"))
 
 
 def test_landmarks_off_the_object_are_refused(inputs, tmp_path):
     (tmp_path / "landmarks.csv").write_text("x_mm,y_mm,z_mm,u_px,v_px\n" + "900,0,0,100,100\n" * 6)
-    chosen = {**vars(options(inputs, tmp_path / "run")), "landmarks": tmp_path / "landmarks.csv"}
     with pytest.raises(RegistrationError, match=r"landmark 1 at \(900, 0, 0\) mm is 690.0 mm off"):
-        track(TrackOptions(**chosen))
+        track(options(inputs, tmp_path / "run", landmarks=tmp_path / "landmarks.csv"))
 
 
 def test_broken_frame_ends_the_run_but_keeps_it(inputs, tmp_path):
@@ -185,9 +175,8 @@ def test_broken_frame_ends_the_run_but_keeps_it(inputs, tmp_path):
     for path in sorted((inputs / "frames").iterdir())[:4]:
         (frames / path.name).write_bytes(path.read_bytes())
     (frames / "000022.png").write_bytes((frames / "000022.png").read_bytes()[:500])
-    chosen = {**vars(options(inputs, tmp_path / "run")), "frames": frames}
     with pytest.raises(SourceError, match="000022"):
-        track(TrackOptions(**chosen))
+        track(options(inputs, tmp_path / "run", frames=frames))
     assert load_run(tmp_path / "run").frames.tolist() == [20, 21]
     assert (tmp_path / "run" / "augmented.mp4").is_file()
 
@@ -197,9 +186,7 @@ def test_refined_reference_is_named_and_still_right(inputs, tmp_path):
     assert summary["reference_refined_over_the_sequence"]
     run = load_run(tmp_path / "run")
     assert run.tracked.sum() == 6
-    truth = sheet_state(TIMES[-1])
-    expected = truth.camera_from_object.apply(run.model.positions(truth.parameters))
-    assert np.linalg.norm(run.camera_points(6) - expected, axis=1).mean() < 1e-3
+    assert error_of(run, 6) < 1e-3
 
 
 def test_run_without_the_object_is_whole_and_says_that_nothing_was_found(inputs, tmp_path):
