@@ -1,4 +1,4 @@
-"""Koiter sheets against the elastica, closed forms and a published cantilever, their derivatives against differences."""
+"""Koiter sheets against the elastica, closed forms and a published cantilever, derivatives against differences."""
 
 from __future__ import annotations
 
