@@ -132,48 +132,45 @@ def expected_flat_image(folder):
     return print_value(x, y), (np.abs(x) < 0.48) & (np.abs(y) < 0.48)
 
 
+def picture_of(scene):
+    """The only picture of a flat scene, the expected one, and the pixels well inside the sheet."""
+    simulate(scene, scene.parent / "sequence", progress=False)
+    (frame,) = open_source(scene.parent / "sequence" / "frames")
+    return frame.image, *expected_flat_image(scene.parent)
+
+
 def test_flat_sheet_face_on_shows_its_print(tmp_path):
-    simulate(flat_scene(tmp_path), tmp_path / "sequence", progress=False)
-    expected, inside = expected_flat_image(tmp_path)
-    (frame,) = open_source(tmp_path / "sequence" / "frames")
-    difference = frame.image.astype(float) - expected[:, :, None]
+    image, expected, inside = picture_of(flat_scene(tmp_path))
+    difference = image.astype(float) - expected[:, :, None]
     assert np.abs(difference[inside]).max() < 2.0
     assert abs(difference[inside].mean()) < 0.4
     np.testing.assert_allclose(read_depth(tmp_path)[0][inside], 0.6, rtol=1e-6)
 
 
 def test_noise_has_the_deviation_asked_for(tmp_path):
-    simulate(flat_scene(tmp_path, "[sensor]\nnoise = 4.0\n"), tmp_path / "sequence", progress=False)
-    expected, inside = expected_flat_image(tmp_path)
-    (frame,) = open_source(tmp_path / "sequence" / "frames")
-    difference = (frame.image.astype(float) - expected[:, :, None])[inside]
+    image, expected, inside = picture_of(flat_scene(tmp_path, "[sensor]\nnoise = 4.0\n"))
+    difference = (image.astype(float) - expected[:, :, None])[inside]
     assert difference.std() == pytest.approx(4.0, rel=0.03)
 
 
 def test_back_of_the_sheet_has_its_colour(tmp_path):
-    simulate(flat_scene(tmp_path, rotation="[0, 0, 0]"), tmp_path / "sequence", progress=False)
-    _, inside = expected_flat_image(tmp_path)
-    (frame,) = open_source(tmp_path / "sequence" / "frames")
-    assert (frame.image[inside] == [218, 224, 226]).all()
+    image, _, inside = picture_of(flat_scene(tmp_path, rotation="[0, 0, 0]"))
+    assert (image[inside] == [218, 224, 226]).all()
 
 
 def test_lambert_light_from_the_side(tmp_path):
     light = "direction = [-0.6, 0.0, -0.8]\nambient = 0.25\n"
     scene = flat_scene(tmp_path, rotation="[0, 0, 0]")
     scene.write_text(scene.read_text().replace("ambient = 1.0\n", light))
-    simulate(scene, tmp_path / "sequence", progress=False)
-    _, inside = expected_flat_image(tmp_path)
-    (frame,) = open_source(tmp_path / "sequence" / "frames")
+    image, _, inside = picture_of(scene)
     # 0.25 + 0.75 cos, with the light 0.8 along the normal.
-    np.testing.assert_allclose(frame.image[inside].mean(axis=0), 0.85 * np.array([218, 224, 226]), atol=0.6)
+    np.testing.assert_allclose(image[inside].mean(axis=0), 0.85 * np.array([218, 224, 226]), atol=0.6)
 
 
 def test_outline_is_antialiased_at_the_right_place(tmp_path):
-    scene = flat_scene(tmp_path, "[background]\ncolour = [0, 0, 0]\n")
-    simulate(scene, tmp_path / "sequence", progress=False)
-    (frame,) = open_source(tmp_path / "sequence" / "frames")
+    image, _, _ = picture_of(flat_scene(tmp_path, "[background]\ncolour = [0, 0, 0]\n"))
     # The left edge falls on 158 px - 260 px * 210 mm / 600 mm = 67, the middle of a pixel.
-    row = frame.image[121, :, 0].astype(float)
+    row = image[121, :, 0].astype(float)
     assert row[66] == 0.0
     assert row[67] == pytest.approx(row[68] / 2, rel=0.05)
     assert row[68] == pytest.approx(row[69], rel=0.1)

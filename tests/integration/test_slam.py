@@ -76,8 +76,10 @@ def test_the_path_through_a_room_is_found_and_the_map_lies_on_its_walls(room_sce
     assert summary["n_keyframes"] == len(room_scene.keyframes) > 4
 
 
-def test_the_same_film_gives_the_same_result(room_scene, room_film):
-    again = map_scene(Film(room_film[0]), CAMERA)
+def test_the_same_film_gives_the_same_result_and_a_rigid_scene_does_not_freeze(room_scene, room_film):
+    again = map_scene(Film(room_film[0]), CAMERA, SlamOptions(freeze_when_deforming=True))
+    assert not again.slam.is_frozen
+    assert again.slam.frozen_at is None
     assert np.array_equal(again.trajectory.world_from_camera, room_scene.trajectory.world_from_camera)
     assert np.array_equal(again.points, room_scene.points)
 
@@ -285,12 +287,6 @@ def test_the_map_freezes_by_itself_when_a_part_of_the_scene_moves():
     assert set(statuses(scene.frames[frozen_at:])) == {TRACKED}
     assert not any(frame.is_keyframe for frame in scene.frames[frozen_at + 1 :])
     assert np.median(path_errors(scene.trajectory, truth)[-10:]) < 0.01
-
-
-def test_a_rigid_scene_does_not_freeze(room_film):
-    scene = map_scene(Film(room_film[0]), CAMERA, SlamOptions(freeze_when_deforming=True))
-    assert not scene.slam.is_frozen
-    assert scene.slam.frozen_at is None
 
 
 def test_a_map_that_cannot_be_used_is_refused(tmp_path, room_scene):

@@ -3,19 +3,12 @@
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from morph_dslam.slam.bundle_adjustment import Observations, adjust, total_cost
+from tests.support.rendered_room import pose as rigid_pose
 
 INTRINSICS = np.array([520.0, 515.0, 321.0, 238.0])
 BASELINE_PX = 50.0
-
-
-def pose_matrix(vector):
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_rotvec(vector[:3]).as_matrix()
-    pose[:3, 3] = vector[3:]
-    return pose
 
 
 def images(poses, points, depth):
@@ -30,7 +23,7 @@ def scene(depth=False, noise=0.0, seed=0):
     rng = np.random.default_rng(seed)
     points = rng.uniform([-1, -1, 3], [1, 1, 5], size=(40, 3))
     vectors = np.column_stack([0.05 * rng.normal(size=(5, 3)), rng.uniform(-0.4, 0.4, size=(5, 3))])
-    poses = np.array([pose_matrix(vector) for vector in vectors])
+    poses = np.array([rigid_pose(vector[3:], vector[:3]) for vector in vectors])
     seen = rng.random((5, 40)) < 0.8
     seen[:2] = True
     camera_idx, point_idx = np.nonzero(seen)
@@ -43,7 +36,8 @@ def disturbed(poses, points, fixed, seed=1):
     rng = np.random.default_rng(seed)
     moved = poses.copy()
     for c in np.flatnonzero(~fixed):
-        moved[c] = pose_matrix(np.append(0.01 * rng.normal(size=3), 0.02 * rng.normal(size=3))) @ poses[c]
+        turn, shift = rng.normal(size=(2, 3))
+        moved[c] = rigid_pose(0.02 * shift, 0.01 * turn) @ poses[c]
     return moved, points + 0.03 * rng.normal(size=points.shape)
 
 
@@ -64,7 +58,7 @@ def test_noisy_pixels_give_the_optimum_that_scipy_finds():
 
     def residuals(x):
         moved = poses.copy()
-        moved[2:] = [pose_matrix(vector) for vector in x[:18].reshape(3, 6)]
+        moved[2:] = [rigid_pose(vector[3:], vector[:3]) for vector in x[:18].reshape(3, 6)]
         predicted = images(moved, x[18:].reshape(-1, 3), False)
         return (predicted[observations.camera_idx, observations.point_idx, :2] - pixels).ravel()
 

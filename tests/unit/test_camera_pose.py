@@ -8,15 +8,9 @@ from scipy.spatial.transform import Rotation
 from morph_dslam.slam.bundle_adjustment import cholesky_solve, inverse_3x3, orthonormal
 from morph_dslam.slam.initialization import turn_residual_px
 from morph_dslam.slam.pose import camera_centre, find_pose, ray_angles, refine_pose, triangulate, two_view_hypotheses
+from tests.support.rendered_room import pose as rigid_pose
 
 INTRINSICS = np.array([520.0, 515.0, 321.0, 238.0])
-
-
-def pose_matrix(rotation_vector, translation):
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_rotvec(rotation_vector).as_matrix()
-    pose[:3, 3] = translation
-    return pose
 
 
 def pixels_of(pose, points):
@@ -33,7 +27,7 @@ def points():
     return np.random.default_rng(0).uniform([-1.5, -1.0, 2.5], [1.5, 1.0, 5.0], size=(200, 3))
 
 
-TRUTH = pose_matrix([0.05, -0.1, 0.03], [0.2, -0.1, 0.15])
+TRUTH = rigid_pose([0.2, -0.1, 0.15], [0.05, -0.1, 0.03])
 
 
 def test_the_pose_of_exact_pixels_is_exact(points):
@@ -62,14 +56,14 @@ def test_the_optimum_and_covariance_are_those_of_scipy(points):
     pixels = pixels_of(TRUTH, points) + 0.5 * np.random.default_rng(2).normal(size=(200, 2))
 
     def residuals(twist):
-        turn = pose_matrix(twist[:3], [0.0, 0.0, 0.0])
+        turn = rigid_pose([0.0, 0.0, 0.0], twist[:3])
         moved = turn @ TRUTH
         moved[:3, 3] += twist[3:]
         return (pixels_of(moved, points) - pixels).ravel()
 
     expected = least_squares(residuals, np.zeros(6), xtol=1e-14)
     found = refine_pose(TRUTH, points, pixels, INTRINSICS, huber_px=1e6, inlier_px=1e6)
-    pose = pose_matrix(expected.x[:3], [0.0, 0.0, 0.0]) @ TRUTH
+    pose = rigid_pose([0.0, 0.0, 0.0], expected.x[:3]) @ TRUTH
     pose[:3, 3] += expected.x[3:]
     assert np.allclose(found.camera_from_world, pose, atol=1e-7)
     covariance = np.linalg.inv(expected.jac.T @ expected.jac) * (expected.fun**2).mean()
@@ -78,7 +72,7 @@ def test_the_optimum_and_covariance_are_those_of_scipy(points):
 
 def test_a_pose_is_found_without_a_start_among_wrong_matches(points):
     rng = np.random.default_rng(3)
-    far = pose_matrix([0.2, 2.5, -0.4], [0.5, 0.2, 6.0])
+    far = rigid_pose([0.5, 0.2, 6.0], [0.2, 2.5, -0.4])
     pixels = pixels_of(far, points)
     pixels[::2] = rng.uniform(0, 480, size=(100, 2))
     found = find_pose(points, pixels, INTRINSICS)
@@ -98,7 +92,7 @@ def test_systems_are_solved_as_by_numpy():
 
 
 def test_rotations_are_made_orthonormal():
-    pose = pose_matrix([0.4, 0.2, -0.9], [1.0, 2.0, 3.0])
+    pose = rigid_pose([1.0, 2.0, 3.0], [0.4, 0.2, -0.9])
     spoilt = pose + np.pad(1e-4 * np.random.default_rng(5).normal(size=(3, 3)), (0, 1))
     mended = orthonormal(spoilt[None])[0]
     assert np.allclose(mended[:3, :3] @ mended[:3, :3].T, np.eye(3), atol=1e-14)
@@ -107,7 +101,7 @@ def test_rotations_are_made_orthonormal():
 
 
 def test_rays_meet_at_their_point_at_the_angle_of_the_triangle(points):
-    first, second = pose_matrix([0, 0, 0], [0, 0, 0]), TRUTH
+    first, second = rigid_pose([0, 0, 0], [0, 0, 0]), TRUTH
     found = triangulate(first, second, rays_of(pixels_of(first, points)), rays_of(pixels_of(second, points)))
     assert np.allclose(found, points, atol=1e-9)
     # An equilateral triangle.
@@ -143,11 +137,11 @@ def test_two_views_of_a_plane_give_the_motion_among_others(points):
 
 
 def test_a_turn_leaves_nothing_and_a_shift_its_parallax(points):
-    turned = pose_matrix([0.02, 0.2, 0.1], [0.0, 0.0, 0.0])
+    turned = rigid_pose([0.0, 0.0, 0.0], [0.02, 0.2, 0.1])
     first = pixels_of(np.eye(4), points)
     assert turn_residual_px(first, pixels_of(turned, points), INTRINSICS) == pytest.approx(0.0, abs=1e-6)
     # Points at two depths: the turn can only take up the mean of their shifts.
     points[:, 2] = np.where(np.arange(200) % 2, 2.0, 4.0)
-    moved = pose_matrix([0.0, 0.0, 0.0], [0.1, 0.0, 0.0])
+    moved = rigid_pose([0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
     residual = turn_residual_px(pixels_of(np.eye(4), points), pixels_of(moved, points), INTRINSICS)
     assert 1.0 < residual < 0.5 * 520.0 * 0.1 * (1 / 2.0 - 1 / 4.0) * 2.5

@@ -23,25 +23,34 @@ def saved(path, arrays):
     return load_truth(path)
 
 
-def test_exact_truth_has_no_error(tracked, tmp_path):
+@pytest.fixture
+def compare(tracked, tmp_path):
+    """A function that compares the run with its exact truth, some of whose arrays are changed."""
     run, truth = tracked
-    error = material_error(run, saved(tmp_path / "truth.npz", truth), 10)
+
+    def compared(bind_frame=10, **changes):
+        return material_error(run, saved(tmp_path / "truth.npz", truth | changes), bind_frame)
+
+    return compared
+
+
+def test_exact_truth_has_no_error(compare):
+    error = compare()
     # The model file keeps its modes in single precision: nanometres on a sheet of half a metre.
     assert error.distances.max() < 1e-7
     assert error.frames.tolist() == [11, 12, 13, 14, 15]
     assert error.distances.shape == (5, 60)
 
 
-def test_known_offsets_are_split_along_and_across_the_sight_line(tracked, tmp_path):
-    run, truth = tracked
-    points = truth["points_mm"].copy()
+def test_known_offsets_are_split_along_and_across_the_sight_line(tracked, compare):
+    points = tracked[1]["points_mm"].copy()
     sight = points / np.linalg.norm(points, axis=2, keepdims=True)
     across = np.cross(sight, [0.0, 1.0, 0.0])
     across /= np.linalg.norm(across, axis=2, keepdims=True)
     points[1] += 3.0 * sight[1]  # the truth is 3 mm farther away than the estimate
     points[2] += 4.0 * across[2]
     points[3] += 3.0 * sight[3] + 4.0 * across[3]
-    figures = summarise(material_error(run, saved(tmp_path / "truth.npz", truth | {"points_mm": points}), 10))
+    figures = summarise(compare(points_mm=points))
     per_frame = figures["per_frame"]
     assert per_frame["11"]["mean_mm"] == pytest.approx(3.0, abs=1e-4)
     assert per_frame["11"]["mean_along_sight_mm"] == pytest.approx(3.0, abs=1e-4)
@@ -53,10 +62,8 @@ def test_known_offsets_are_split_along_and_across_the_sight_line(tracked, tmp_pa
     assert figures["p95_mm"] == pytest.approx(5.0, abs=1e-4)
 
 
-def test_the_error_is_not_aligned_away(tracked, tmp_path):
-    run, truth = tracked
-    shifted = truth["points_mm"] + np.array([0.0, 0.0, 2.0])
-    error = material_error(run, saved(tmp_path / "truth.npz", truth | {"points_mm": shifted}), 10)
+def test_the_error_is_not_aligned_away(tracked, compare):
+    error = compare(points_mm=tracked[1]["points_mm"] + np.array([0.0, 0.0, 2.0]))
     assert np.nanmean(error.distances) == pytest.approx(2e-3, abs=1e-7)
 
 
@@ -86,11 +93,10 @@ def test_points_off_the_surface_are_counted(tracked, tmp_path):
     assert binding.columns.tolist() == [0, *range(3, 60)]
 
 
-def test_unmeasured_points_are_left_out_and_counted(tracked, tmp_path):
-    run, truth = tracked
-    points = truth["points_mm"].copy()
+def test_unmeasured_points_are_left_out_and_counted(tracked, compare):
+    points = tracked[1]["points_mm"].copy()
     points[1, :5] = np.nan
-    figures = summarise(material_error(run, saved(tmp_path / "truth.npz", truth | {"points_mm": points}), 10))
+    figures = summarise(compare(points_mm=points))
     assert figures["n_comparisons_without_measurement"] == 5
     assert figures["n_comparisons"] == 5 * 60 - 5
     assert figures["mean_mm"] < 1e-4
@@ -104,24 +110,17 @@ def test_binding_frame_must_be_known(tmp_path, frame, message):
         material_error(load_run(tmp_path), truth, frame)
 
 
-def test_binding_frame_outside_the_run(tracked, tmp_path):
-    run, truth = tracked
-    moved = saved(tmp_path / "truth.npz", truth | {"frame": truth["frame"] + 100})
-    with pytest.raises(EvaluationError, match="the run has no frame 110"):
-        material_error(run, moved, 110)
-
-
-def test_nothing_to_compare(tracked, tmp_path):
-    run, truth = tracked
-    one = {name: array[:1] for name, array in truth.items()}
-    with pytest.raises(EvaluationError, match="no truth frame besides 10"):
-        material_error(run, saved(tmp_path / "truth.npz", one), 10)
-
-
-def test_truth_pixels_off_the_object(tracked, tmp_path):
-    run, truth = tracked
-    with pytest.raises(EvaluationError, match="no truth pixel falls"):
-        material_error(run, saved(tmp_path / "truth.npz", truth | {"pixels": truth["pixels"] + 1000.0}), 10)
+@pytest.mark.parametrize(
+    ("bind_frame", "change", "message"),
+    [
+        (110, lambda t: {"frame": t["frame"] + 100}, "the run has no frame 110"),
+        (10, lambda t: {name: array[:1] for name, array in t.items()}, "no truth frame besides 10"),
+        (10, lambda t: {"pixels": t["pixels"] + 1000.0}, "no truth pixel falls"),
+    ],
+)
+def test_truth_that_cannot_be_compared(tracked, compare, bind_frame, change, message):
+    with pytest.raises(EvaluationError, match=message):
+        compare(bind_frame, **change(tracked[1]))
 
 
 @pytest.mark.parametrize(
@@ -165,13 +164,12 @@ def test_run_folders_that_cannot_be_read(tmp_path):
         load_run(tmp_path)
 
 
-def test_a_turned_truth_is_told_apart_from_errors_of_shape(tracked, tmp_path):
-    run, truth = tracked
+def test_a_turned_truth_is_told_apart_from_errors_of_shape(tracked, compare):
     turn = np.radians([0.5, -2.0, 1.0])
-    points = truth["points_mm"] @ rotation_exp(turn) + np.array([3.0, 0.0, -4.0])
+    points = tracked[1]["points_mm"] @ rotation_exp(turn) + np.array([3.0, 0.0, -4.0])
     points[3] += [0.0, 0.0, 5.0]  # one frame is moved by itself
     points[4, 7] = np.nan
-    error = material_error(run, saved(tmp_path / "truth.npz", truth | {"points_mm": points}), 10)
+    error = compare(points_mm=points)
     figures = summarise_alignment(error)
     # Of five frames one is 5 mm off the others: the best motion lies a fifth of the way.
     together = figures["after_one_rigid_motion"]
@@ -181,7 +179,6 @@ def test_a_turned_truth_is_told_apart_from_errors_of_shape(tracked, tmp_path):
     assert figures["after_one_in_each_frame"]["mean_mm"] < 1e-3
     even = points.copy()
     even[3] -= [0.0, 0.0, 5.0]
-    error = material_error(run, saved(tmp_path / "even.npz", truth | {"points_mm": even}), 10)
-    together = summarise_alignment(error)["after_one_rigid_motion"]
+    together = summarise_alignment(compare(points_mm=even))["after_one_rigid_motion"]
     assert together["mean_mm"] < 1e-3
     np.testing.assert_allclose(together["rotation_deg"], [0.5, -2.0, 1.0], atol=1e-3)
