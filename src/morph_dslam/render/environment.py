@@ -215,14 +215,9 @@ class Motion:
     occluder_centres: Array | None
 
 
-def _in_range(parameter: Parameter, values: Array) -> NDArray[np.bool_]:
-    """Which values (SI) the model covers; the slack is for the rounding of converted units."""
-    slack = 1e-9 * (parameter.upper - parameter.lower)
-    return (values >= parameter.lower - slack) & (values <= parameter.upper + slack)
-
-
 def _check_parameter(parameter: Parameter, frames: NDArray, values: Array, remedy: str) -> None:
-    wrong = np.flatnonzero(~_in_range(parameter, values))
+    slack = 1e-9 * (parameter.upper - parameter.lower)  # for the rounding of converted units
+    wrong = np.flatnonzero((values < parameter.lower - slack) | (values > parameter.upper + slack))
     if wrong.size:
         first = wrong[0]
         value, low, high = (
@@ -271,8 +266,8 @@ def _pose_track(keys: list[PoseKeyFrame], frames: NDArray, upright: Vector) -> l
 def _camera_track(keys: list[CameraKeyFrame], frames: NDArray) -> list[RigidTransform]:
     """Poses camera_from_world of a camera that looks at its target with the world's z axis up."""
     numbers = [key.frame for key in keys]
-    positions = interpolate_key_frames(numbers, np.array([key.position_mm for key in keys]) * 1e-3, frames)
-    targets = interpolate_key_frames(numbers, np.array([key.target_mm for key in keys]) * 1e-3, frames)
+    both = 1e-3 * np.array([(key.position_mm, key.target_mm) for key in keys])
+    positions, targets = interpolate_key_frames(numbers, both, frames).transpose(1, 0, 2)
     poses = []
     for frame, position, target in zip(frames, positions, targets, strict=True):
         ahead = target - position

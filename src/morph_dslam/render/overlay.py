@@ -58,11 +58,9 @@ class _Painted:
 
     def box(self) -> tuple[int, int, int, int] | None:
         """First and last row, first and last column that are covered, in the image; None if none is."""
-        rows, columns = np.flatnonzero(self.covered.any(axis=1)), np.flatnonzero(self.covered.any(axis=0))
-        if not len(rows):
-            return None
-        left, top = self.corner
-        return int(rows[0]) + top, int(rows[-1]) + top, int(columns[0]) + left, int(columns[-1]) + left
+        column, row, width, height = cv2.boundingRect(self.covered.view(np.uint8))
+        left, top = column + self.corner[0], row + self.corner[1]
+        return (top, top + height - 1, left, left + width - 1) if width else None
 
 
 def _draw_outline(image: NDArray[np.uint8], painted: _Painted, colour: tuple[int, int, int] = (245, 245, 245)) -> None:

@@ -131,14 +131,6 @@ def _fill_triangles(pixels, depths, triangles, closed, triangle_ids, weights, de
             _fill_triangle(t, area, u, v, q, triangle_ids, weights, depth)
 
 
-def _empty_buffers(height: int, width: int) -> Buffers:
-    return Buffers(
-        triangle_ids=np.full((height, width), -1, dtype=np.int32),
-        weights=np.zeros((height, width, 3), dtype=np.float32),
-        depth=np.full((height, width), np.inf, dtype=np.float32),
-    )
-
-
 def rasterise(
     pixels: Array, depths: Array, triangles: NDArray, height: int, width: int, closed: bool = False
 ) -> Buffers:
@@ -157,7 +149,11 @@ def rasterise(
     -------
     Buffers, whose depth is in the unit of ``depths``.
     """
-    buffers = _empty_buffers(height, width)
+    buffers = Buffers(
+        triangle_ids=np.full((height, width), -1, dtype=np.int32),
+        weights=np.zeros((height, width, 3), dtype=np.float32),
+        depth=np.full((height, width), np.inf, dtype=np.float32),
+    )
     _fill_triangles(
         np.ascontiguousarray(pixels, dtype=np.float64),
         np.ascontiguousarray(depths, dtype=np.float64),

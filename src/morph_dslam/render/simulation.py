@@ -95,9 +95,6 @@ def _load_world(scene_path: Path) -> _World:
     model = load_model(folder / scene.model)
     try:
         motion = plan_motion(scene, model)
-    except SceneError as error:
-        raise SceneError(f"{scene_path}: {error}") from error
-    try:
         surroundings = _surroundings(scene, folder, camera, motion)
     except SceneError as error:
         raise SceneError(f"{scene_path}: {error}") from error

@@ -301,7 +301,7 @@ class FrameImages:
         Raises CameraError if an image has not the camera's size.
         """
         grey = self._grey(image, f"frame {index}", self._maps)
-        normalized = self._normalized(grey)
+        normalized = normalize_contrast(grey)
         return FrameView(index, timestamp, grey, normalized, self._depth(index, normalized, depth, right))
 
     def _depth(
@@ -313,7 +313,7 @@ class FrameImages:
             if right is None:
                 return None
             right = self._grey(right, f"the right image of frame {index}", self._right_maps)
-            return StereoImages(normalized, self._normalized(right))
+            return StereoImages(normalized, normalize_contrast(right))
         if depth is None:
             return None
         self.camera.check_image(depth, f"the depth image of frame {index}")
@@ -326,9 +326,6 @@ class FrameImages:
         self.camera.check_image(image, where)
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         return self._remapped(np.asarray(grey, dtype=np.uint8), maps)
-
-    def _normalized(self, grey: Image) -> Image:
-        return normalize_contrast(grey)
 
     @staticmethod
     def _remapped(image: Image, maps: tuple[NDArray, NDArray] | None) -> Image:

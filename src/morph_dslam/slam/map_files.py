@@ -13,7 +13,7 @@ from morph_dslam.errors import MapError
 from morph_dslam.io.checksum import check_checksum, is_other_hdf5, written_with_checksum
 from morph_dslam.io.colmap import ColmapImage, ColmapModel
 from morph_dslam.io.trajectory import Trajectory
-from morph_dslam.slam.frame_images import OCTAVES, FrameImages, FrameView, describe
+from morph_dslam.slam.frame_images import FrameImages, FrameView
 from morph_dslam.slam.mapping import Mapper, do_all
 from morph_dslam.slam.options import INLIER_PX, LEAST_START_POINTS, PATCH_HALF
 from morph_dslam.slam.pose import PoseEstimate, inside, inverse, reprojection_errors
@@ -225,10 +225,7 @@ def _add_keyframe(
     errors = reprojection_errors(image.camera_from_world, model.points[ids], pixels, intrinsics)
     good = (errors < MOST_ERROR_PX) & inside(pixels, view.normalized.shape, PATCH_HALF + 2)
     seen = Followed(ids, pixels)[good]
-    keyframe = Keyframe(
-        view.index, view.timestamp, view.normalized, image.camera_from_world, seen.ids, seen.pixels, seen.right
-    )
+    keyframe = Keyframe.of_view(view, image.camera_from_world, seen)
     rigid_map.add_keyframe(keyframe)
-    described, keyframe.descriptors = describe(view.grey, keyframe.pixels, OCTAVES)
-    keyframe.described_ids = keyframe.point_ids[described]
+    keyframe.describe(view.grey)
     return errors

@@ -16,7 +16,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.slam.frame_images import OCTAVES, FrameView, describe
+from morph_dslam.slam.frame_images import FrameView
 from morph_dslam.slam.initialization import MapStart
 from morph_dslam.slam.local_map import PointMaker, free_corners, gather, local_window, put_back
 from morph_dslam.slam.options import LEAST_INLIERS
@@ -158,15 +158,15 @@ class Mapper:
         for view, pose in zip(start.views, start.poses, strict=True):
             scaled = pose.copy()
             scaled[:3, 3] *= scale
-            self._map.add_keyframe(_keyframe(view.frame, scaled, Followed(ids.copy(), view.pixels)))
+            self._map.add_keyframe(Keyframe.of_view(view.frame, scaled, Followed(ids.copy(), view.pixels)))
         self._adjust_locally()
         for number in (0, 1):
-            self._describe(number, start.views[number].frame)
+            self._map.keyframes[number].describe(start.views[number].frame.grey)
         do_all(self._finish(2, start.views[2].frame))
 
     def begin_at(self, view: FrameView, camera_from_world: Array) -> int:
         """Fill the empty map from one view at a pose (4, 4); returns how many points have a depth."""
-        number = self._map.add_keyframe(_keyframe(view, camera_from_world, NOWHERE))
+        number = self._map.add_keyframe(Keyframe.of_view(view, camera_from_world, NOWHERE))
         do_all(self._finish(number, view))
         return int((self._map.state == GOOD).sum())
 
@@ -181,7 +181,7 @@ class Mapper:
         points must not hold the camera.
         """
         self._map.remove(tracked.moved)
-        number = self._map.add_keyframe(_keyframe(view, tracked.pose.camera_from_world, tracked.points))
+        number = self._map.add_keyframe(Keyframe.of_view(view, tracked.pose.camera_from_world, tracked.points))
         self._points.place_by_depth(number, view.depth)
         self._points.triangulate(number)
         self._points.fuse(number)
@@ -207,12 +207,7 @@ class Mapper:
         self._points.place_by_depth(number, view.depth)
         self._choice.kept(number, view.index)
         yield
-        self._describe(number, view)
-
-    def _describe(self, number: int, view: FrameView) -> None:
-        keyframe = self._map.keyframes[number]
-        rows, descriptors = describe(view.grey, keyframe.pixels, OCTAVES)
-        keyframe.described_ids, keyframe.descriptors = keyframe.point_ids[rows], descriptors
+        keyframe.describe(view.grey)
 
     def _adjust_locally(self) -> None:
         """Bundle adjustment of the newest keyframes that see the same points, held by others that do."""
@@ -228,10 +223,6 @@ class Mapper:
         rigid_map = self._map
         rare = rigid_map.n_found < LEAST_FOUND * rigid_map.n_expected
         rigid_map.remove(np.flatnonzero((rigid_map.state == GOOD) & rare & (rigid_map.n_expected >= 20)))
-
-
-def _keyframe(view: FrameView, pose: Array, seen: Followed) -> Keyframe:
-    return Keyframe(view.index, view.timestamp, view.normalized, pose, seen.ids, seen.pixels, seen.right)
 
 
 def pose_in_keyframe(camera_from_world: Array, keyframe: Keyframe) -> Array:

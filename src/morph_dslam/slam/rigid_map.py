@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.slam.frame_images import OCTAVES, FrameView, describe
 from morph_dslam.slam.pose import inverse, reprojection_errors
 
 Array = NDArray[np.float64]
@@ -54,7 +55,7 @@ class Keyframe:
     point_ids : (k,) points seen, ascending.
     pixels : (k, 2) where.
     right : (k,) their columns in a right image (`Followed`); all unmeasured by default.
-    described_ids, descriptors : (d,), (d, 32) what points looked like, by `descriptors.describe`.
+    described_ids, descriptors : (d,), (d, 32) what points looked like, by `frame_images.describe`.
     carrier : number of the keyframe that stands for this one since it was taken out, -1 before.
     from_carrier : (4, 4) this one as seen from it.
     """
@@ -74,6 +75,16 @@ class Keyframe:
     def __post_init__(self) -> None:
         if self.right is None:
             self.right = np.full(len(self.point_ids), np.nan)
+
+    @classmethod
+    def of_view(cls, view: FrameView, camera_from_world: Array, seen: Followed) -> Keyframe:
+        """A frame at a pose (4, 4), with the points seen in it."""
+        return cls(view.index, view.timestamp, view.normalized, camera_from_world, seen.ids, seen.pixels, seen.right)
+
+    def describe(self, grey: NDArray[np.uint8]) -> None:
+        """Describe what its points look like in its grey image (h, w), so that they can be recognised."""
+        rows, self.descriptors = describe(grey, self.pixels, OCTAVES)
+        self.described_ids = self.point_ids[rows]
 
     @property
     def seen(self) -> Followed:

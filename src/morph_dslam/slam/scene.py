@@ -19,11 +19,12 @@ from morph_dslam.io.colmap import ColmapModel
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam.bundle_adjustment import Observations, adjust
 from morph_dslam.slam.frame_images import least_distances, orientations
+from morph_dslam.slam.local_map import gather
 from morph_dslam.slam.map_files import load_map_and_trajectory, map_from_colmap, map_from_trajectory, save_map
 from morph_dslam.slam.options import SlamOptions
 from morph_dslam.slam.pose import inverse, refine_pose
 from morph_dslam.slam.result import STAGES, SlamFrame, SlamStatus
-from morph_dslam.slam.rigid_map import GOOD, Keyframe, RigidMap
+from morph_dslam.slam.rigid_map import Keyframe, RigidMap
 from morph_dslam.slam.slam import Slam
 from morph_dslam.sources import FrameSource, FrameStream, open_stream
 from morph_dslam.sources.frames import has_registered_depth
@@ -264,24 +265,20 @@ def _cost(rigid_map: RigidMap, intrinsics: Array, factor: float) -> float:
     """Huber cost, px^2, of keyframes spread over the map after adjustment with another focal length."""
     kept = rigid_map.kept_keyframes
     chosen = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), MOST_KEYFRAMES)).astype(int))
-    keyframes = [rigid_map.keyframes[k] for k in kept[chosen]]
-    counts = np.zeros(len(rigid_map.state), dtype=int)
-    for keyframe in keyframes:
-        counts[keyframe.point_ids] += 1
-    wanted = (counts >= 2) & (rigid_map.state == GOOD)
-    local = np.cumsum(wanted) - 1
-    rows_of = [wanted[keyframe.point_ids] for keyframe in keyframes]
-    seen = [(local[k.point_ids[rows]], k.pixels[rows]) for k, rows in zip(keyframes, rows_of, strict=True)]
-    observations = Observations(
-        np.repeat(np.arange(len(keyframes)), [len(ids) for ids, _ in seen]),
-        np.concatenate([ids for ids, _ in seen]),
-        np.concatenate([pixels for _, pixels in seen]),
-    )
-    poses = np.array([keyframe.camera_from_world for keyframe in keyframes])
-    scaled = intrinsics * [factor, factor, 1.0, 1.0]
-    held = np.arange(len(keyframes)) == 0
-    points = rigid_map.positions[wanted]
-    return adjust(poses, points, observations, scaled, held, huber_px=1.0, iterations=25, tolerance=1e-4).cost
+    problem = gather(rigid_map, intrinsics, kept[chosen], kept[:0], iterations=25)
+    seen, scaled = problem.observations, intrinsics * [factor, factor, 1.0, 1.0]
+    twice = np.bincount(seen.point_idx)[seen.point_idx] >= 2
+    observations = Observations(seen.camera_idx[twice], seen.point_idx[twice], seen.pixels[twice])
+    return adjust(
+        problem.camera_from_world,
+        problem.positions,
+        observations,
+        scaled,
+        problem.held,
+        huber_px=1.0,
+        iterations=problem.iterations,
+        tolerance=1e-4,
+    ).cost
 
 
 def warm_up() -> None:
