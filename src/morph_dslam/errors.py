@@ -21,7 +21,7 @@ class SolverError(MorphError):
 
 
 class WorkerError(MorphError):
-    """The processes or the cluster that a sweep runs on cannot be reached, do not fit, or were lost."""
+    """A process that a sweep runs in was lost."""
 
 
 class ModelFileError(MorphError):

@@ -130,12 +130,12 @@ def test_every_command_and_option_is_documented():
 
 
 def test_options_that_pages_name_exist():
-    """Of the command line, or of a program in examples/ or benchmarks/ that has it; Dask's are its own."""
+    """Of the command line, or of a program in examples/ or benchmarks/ that has it."""
     known = {text for parser in commands().values() for a in parser._actions for text in a.option_strings}
     for folder in ("examples", "benchmarks"):
         for path in (PROJECT / folder).rglob("*.py"):
             known |= set(re.findall(r"\"(--[a-z][\w-]*)\"", path.read_text()))
-    known |= {"--nworkers", "--nthreads", "--fifo", "--help"}
+    known |= {"--fifo", "--help"}
     for page, text in PAGES.items():
         assert set(re.findall(r"(?<![\w-])--[a-z][\w-]*", text)) <= known, page
 

@@ -2,7 +2,6 @@
 
 import argparse
 import warnings
-from contextlib import nullcontext
 
 from morph_dslam.cli.arguments import add_file, add_output, positive_integer
 from morph_dslam.errors import StudyError
@@ -14,12 +13,8 @@ KEPT = "the solutions found so far are kept, and the same command goes on from t
 def add_arguments(command: argparse.ArgumentParser) -> None:
     add_file(command, "study", "study file (docs/study-file.md)")
     add_output(command, "MODEL", "model file to write")
-    where = command.add_mutually_exclusive_group()
-    where.add_argument(
+    command.add_argument(
         "--workers", type=positive_integer, metavar="N", help="processes to solve in (default: one a core)"
-    )
-    where.add_argument(
-        "--scheduler", metavar="ADDRESS", help="solve on a Dask cluster, tcp://host:8786 say (docs/clusters.md)"
     )
     add_file(
         command,
@@ -34,16 +29,15 @@ def run(arguments: argparse.Namespace) -> None:
     from morph_dslam import build, write_build_report
     from morph_dslam.extend.mechanics import NearlyIncompressibleWarning
     from morph_dslam.extend.reduction import read_reference_curve, report_path
-    from morph_dslam.extend.studies import build_warnings, cluster_executor
+    from morph_dslam.extend.studies import build_warnings
 
     output = arguments.output
     if output.is_dir():
         raise StudyError(f"{output} is a folder: give the name of the model file to write")
     reference = None if arguments.reference_curve is None else read_reference_curve(arguments.reference_curve)
-    cluster = nullcontext() if arguments.scheduler is None else cluster_executor(arguments.scheduler)
-    with cluster as executor, warnings.catch_warnings():
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", NearlyIncompressibleWarning)  # printed once, at the end
-        model = build(arguments.study, output, arguments.workers, executor)
+        model = build(arguments.study, output, arguments.workers)
     write_build_report(report_path(output), model, reference)
     print(f"wrote {output} and {report_path(output)}")
     for line in build_warnings(model.certificate):

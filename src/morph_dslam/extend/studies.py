@@ -1,7 +1,7 @@
 """Studies as objects, their solved samples, and what solves and reads them."""
 
 from morph_dslam.studies.build import build_warnings
-from morph_dslam.studies.executors import cluster_executor, default_executor
+from morph_dslam.studies.executors import default_executor
 from morph_dslam.studies.inner_structures import place_inner_structure, read_inner_structure
 from morph_dslam.studies.problem import ModelMesh, Snapshot
 from morph_dslam.studies.sampling import held_out_samples, training_samples
@@ -17,7 +17,6 @@ __all__ = [
     "SolidStudy",
     "Study",
     "build_warnings",
-    "cluster_executor",
     "default_executor",
     "held_out_samples",
     "load_snapshot",

@@ -35,7 +35,7 @@ def build(
     study : a study, its file, or the folder of a file study.toml.
     output : the model file to write.
     workers : processes to solve in, the study's own number if absent.
-    executor : what to solve on in their place, a Dask cluster's say.
+    executor : what to solve on in their place: any that runs tasks in processes, a Dask client's say.
 
     Raises
     ------

@@ -67,7 +67,7 @@ def take_snapshots(
     study : with its defaults resolved (`resolve_defaults`).
     folder : where solutions are kept.
     workers : processes to solve in, the study's own number if absent.
-    executor : what to solve on in their place, a Dask cluster's say.
+    executor : what to solve on in their place.
     """
     if isinstance(study, ExternalStudy):
         mesh, parameters, snapshots = study.solutions()
