@@ -75,14 +75,18 @@ def _separated(terms, parameters):
     return SeparatedField(np.ascontiguousarray(np.stack(list(terms.values()))), functions)
 
 
+def grid_triangles(columns, rows):
+    """Triangles (m, 3) of a grid of nodes, row after row, two in a cell."""
+    i = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (part.ravel() for part in (i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]))
+    return np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+
+
 def sheet_mesh(columns=43, rows=31):
     """Nodes (n, 3) and triangles (m, 3) of the flat sheet, centred, in the plane z = 0, metres."""
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, columns) * LENGTH, np.linspace(-0.5, 0.5, rows) * WIDTH)
     nodes = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-    i = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (part.ravel() for part in (i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]))
-    triangles = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
-    return nodes, triangles.astype(np.int64)
+    return nodes, grid_triangles(columns, rows)
 
 
 def bent_sheet_model(columns=43, rows=31, known=3):

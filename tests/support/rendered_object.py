@@ -11,6 +11,7 @@ from morph_dslam.render.model_view import looking_at
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
 from morph_dslam.tracking.patches import normalize_contrast
+from tests.support.bent_sheet import grid_triangles
 from tests.support.rendered_sequence import printed_texture
 
 CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
@@ -28,13 +29,11 @@ def wedge(cells=8):
     """Nodes (n, 3), outward triangles (m, 3), and texture coordinates (n, 2), each face cut into cells."""
     nodes, triangles, coordinates, offset = [], [], [], 0
     a, b = (x.ravel() for x in np.meshgrid(np.linspace(0, 1, cells + 1), np.linspace(0, 1, cells + 1)))
-    index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
-    p, q, r, s = (x.ravel() for x in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
     for number, face in enumerate(_FACES):
         c = _CORNERS[list(face)]
         weights = np.column_stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b])
         nodes.append(weights @ c)
-        triangles.append(np.concatenate([np.column_stack([p, q, r]), np.column_stack([p, r, s])]) + offset)
+        triangles.append(grid_triangles(cells + 1, cells + 1) + offset)
         coordinates.append(np.column_stack([a, b]) * 150.0 + [150.0 * (number % 3) + 20, 160.0 * (number // 3) + 20])
         offset += len(a)
     nodes, triangles = np.concatenate(nodes), np.concatenate(triangles)

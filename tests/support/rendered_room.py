@@ -12,6 +12,7 @@ from morph_dslam.io.camera_files import save_camera
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
 from morph_dslam.sources import Frame
+from tests.support.bent_sheet import grid_triangles
 from tests.support.rendered_sequence import printed_texture
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -25,10 +26,7 @@ def _rectangle(corner, right, down, texture_corner, cells=12):
     a, b = (axis.ravel() for axis in np.meshgrid(np.linspace(0, 1, cells + 1), np.linspace(0, 1, cells + 1)))
     nodes = corner + a[:, None] * right + b[:, None] * down
     size = DENSITY * np.array([np.linalg.norm(right), np.linalg.norm(down)])
-    index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
-    p, q, r, s = (x.ravel() for x in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
-    triangles = np.concatenate([np.column_stack([p, q, r]), np.column_stack([p, r, s])])
-    return nodes, triangles, np.column_stack([a, b]) * size + texture_corner
+    return nodes, grid_triangles(cells + 1, cells + 1), np.column_stack([a, b]) * size + texture_corner
 
 
 def _box(centre, size, rng):

@@ -43,6 +43,17 @@ def sheet_state(time):
     return State(parameters, RigidTransform(turn @ UPRIGHT, position))
 
 
+def clutter(rng, camera=CAMERA):
+    """A grey background (h, w) uint8."""
+    cells = rng.integers(60, 190, (24, 32)).astype(np.uint8)
+    return cv2.resize(cells, (camera.width, camera.height), interpolation=cv2.INTER_CUBIC)
+
+
+def colours(image):
+    """A grey image (h, w) as a camera gives it, (h, w, 3) uint8."""
+    return np.repeat(np.clip(image, 0, 255).astype(np.uint8)[:, :, None], 3, axis=2)
+
+
 class SheetFilm:
     """Renders a model of an A3 sheet before a cluttered background."""
 
@@ -52,8 +63,7 @@ class SheetFilm:
         self.texture = printed_texture(seed=seed)
         x, y = model.nodes[:, 0], model.nodes[:, 1]
         self.coordinates = np.column_stack([(x / 0.420 + 0.5) * 839.0, (0.5 - y / 0.297) * 593.0])
-        clutter = self.rng.integers(60, 190, (24, 32)).astype(np.uint8)
-        self.background = cv2.resize(clutter, (camera.width, camera.height), interpolation=cv2.INTER_CUBIC)
+        self.background = clutter(self.rng, camera)
 
     def frame(self, state, noise=2.0, light=1.0, occluder=None):
         """One image (h, w, 3) uint8; ``light`` scales the sheet only, ``occluder`` is (x, y, w, h)."""
@@ -67,13 +77,11 @@ class SheetFilm:
             image[max(y, 0) : y + height, max(x, 0) : x + width] = self.background[:height, :width][
                 max(-y, 0) : camera.height - y, max(-x, 0) : camera.width - x
             ]
-        image = image + noise * self.rng.standard_normal(image.shape)
-        return np.repeat(np.clip(image, 0, 255).astype(np.uint8)[:, :, None], 3, axis=2)
+        return colours(image + noise * self.rng.standard_normal(image.shape))
 
     def blank(self, noise=2.0):
         """A frame that shows nothing."""
-        image = 120.0 + noise * self.rng.standard_normal((self.camera.height, self.camera.width))
-        return np.repeat(np.clip(image, 0, 255).astype(np.uint8)[:, :, None], 3, axis=2)
+        return colours(120.0 + noise * self.rng.standard_normal((self.camera.height, self.camera.width)))
 
 
 def sheet_depth(model, state, rng, noise_at_1m=1.4e-3, background=1.5, camera=CAMERA):
@@ -84,10 +92,10 @@ def sheet_depth(model, state, rng, noise_at_1m=1.4e-3, background=1.5, camera=CA
     return (exact + noise_at_1m * exact**2 * rng.standard_normal(exact.shape)).astype(np.float32)
 
 
-def mean_error(model, found, truth):
+def mean_error(model, found, truth, true_model=None):
     """Mean distance of the mesh nodes of two states in the camera frame, metres."""
     a = found.camera_from_object.apply(model.positions(found.parameters))
-    b = truth.camera_from_object.apply(model.positions(truth.parameters))
+    b = truth.camera_from_object.apply((true_model or model).positions(truth.parameters))
     return float(np.linalg.norm(a - b, axis=1).mean())
 
 

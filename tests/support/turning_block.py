@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from math import radians
 
-import cv2
 import numpy as np
 
 from morph_dslam.geometry import RigidTransform, rotation_exp
@@ -12,8 +11,8 @@ from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
 from morph_dslam.tracking.estimator import State
-from tests.support.bent_sheet import _separated
-from tests.support.rendered_sequence import CAMERA, UPRIGHT, printed_texture
+from tests.support.bent_sheet import _separated, grid_triangles
+from tests.support.rendered_sequence import CAMERA, UPRIGHT, clutter, colours, printed_texture
 
 #: Edges along x, y and z, metres; it turns about y.
 SIZE = np.array([0.10, 0.13, 0.08])
@@ -37,11 +36,9 @@ _PRINT = 300
 def _faces(cells):
     """Nodes (n, 3) of all faces, each with its own, triangles (m, 3) and places on the print (n, 2)."""
     a, b = (part.ravel() for part in np.meshgrid(np.linspace(0, 1, cells + 1), np.linspace(0, 1, cells + 1)))
-    index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
-    p, q, r, s = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
     weights = np.column_stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b])
     nodes = [weights @ (0.5 * SIZE * np.array(face)) for face in _FACES]
-    squares = np.concatenate([np.column_stack([p, q, r]), np.column_stack([p, r, s])])
+    squares = grid_triangles(cells + 1, cells + 1)
     triangles = [squares + k * len(a) for k in range(len(_FACES))]
     places = [np.column_stack([a + k % 3, b + k // 3]) * (_PRINT - 1.0) + [k % 3, k // 3] for k in range(len(_FACES))]
     return np.concatenate(nodes), np.concatenate(triangles), np.concatenate(places)
@@ -75,8 +72,7 @@ class BlockFilm:
         _, self._triangles, self._places = _faces(cells)
         self.rng = np.random.default_rng(seed)
         self._print = printed_texture(2 * _PRINT, 3 * _PRINT, seed)
-        clutter = self.rng.integers(60, 190, (24, 32)).astype(np.uint8)
-        self._background = cv2.resize(clutter, (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_CUBIC)
+        self._background = clutter(self.rng)
 
     def frame(self, state, noise=2.0):
         """One image (h, w, 3) uint8."""
@@ -86,5 +82,4 @@ class BlockFilm:
         )
         block = render_textured(buffers, self._triangles, self._places, self._print)
         image = np.where(buffers.covered, block, self._background)
-        image = image + noise * self.rng.standard_normal(image.shape)
-        return np.repeat(np.clip(image, 0, 255).astype(np.uint8)[:, :, None], 3, axis=2)
+        return colours(image + noise * self.rng.standard_normal(image.shape))
