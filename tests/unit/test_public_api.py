@@ -3,6 +3,7 @@
 import ast
 import importlib
 import inspect
+import pkgutil
 import re
 import subprocess
 import sys
@@ -42,10 +43,10 @@ def test_there_are_few_public_names():
     assert 15 <= len(md.__all__) <= 45
     assert list(md.__all__) == sorted(md.__all__)
     assert set(md.__all__) <= set(dir(md))
-    package = Path(md.__file__).parent
-    assert (package / "py.typed").is_file()
+    assert Path(md.__file__).with_name("py.typed").is_file()
     # An import of such a module would hide the name.
-    assert {path.stem for path in package.iterdir()} & set(md.__all__) == set()
+    modules = {module.name for module in pkgutil.iter_modules(md.__path__)}
+    assert modules & set(md.__all__) == set()
 
 
 #: The modules of building blocks.
