@@ -21,16 +21,7 @@ file that registers it. Building blocks stand in a module for each subject:
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__all__ = [
-    "frame_range",
-    "one_thread_for_algebra",
-    "register_law",
-    "register_reduction",
-    "register_source",
-    "run_and_report_errors",
-    "threads_side_by_side",
-]
-#: The module of each name, as in the imports below; imported when it is first used.
+#: The module of each public name, as in the imports below; it is imported when the name is first used.
 _MODULES = {
     "frame_range": "cli.arguments",
     "one_thread_for_algebra": "threads",
@@ -40,14 +31,16 @@ _MODULES = {
     "run_and_report_errors": "cli.app",
     "threads_side_by_side": "threads",
 }
+__all__ = sorted(_MODULES)  # pyright: ignore[reportUnsupportedDunderAll]
 
 if TYPE_CHECKING:
-    from morph_dslam.cli.app import run_and_report_errors
-    from morph_dslam.cli.arguments import frame_range
-    from morph_dslam.mechanics.materials.base import register_law
-    from morph_dslam.reduction.registry import register_reduction
-    from morph_dslam.sources import register_source
-    from morph_dslam.threads import one_thread_for_algebra, threads_side_by_side
+    from morph_dslam.cli.app import run_and_report_errors as run_and_report_errors
+    from morph_dslam.cli.arguments import frame_range as frame_range
+    from morph_dslam.mechanics.materials.base import register_law as register_law
+    from morph_dslam.reduction.registry import register_reduction as register_reduction
+    from morph_dslam.sources import register_source as register_source
+    from morph_dslam.threads import one_thread_for_algebra as one_thread_for_algebra
+    from morph_dslam.threads import threads_side_by_side as threads_side_by_side
 
 
 def __getattr__(name: str) -> Any:
