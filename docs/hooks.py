@@ -118,7 +118,13 @@ def on_page_content(content, page, config, files):
 
 def public_names() -> list[str]:
     """Dotted names of all that is public: `morph_dslam` and `morph_dslam.extend` with its modules."""
-    return [f"{module}.{name}" for module in _modules() for name in importlib.import_module(module).__all__]
+    return [f"{module}.{name}" for module in _modules() for name in names_of(module)]
+
+
+def names_of(module: str) -> list[str]:
+    """The public names of a module: those that it lists, or all that it imports."""
+    found = importlib.import_module(module)
+    return getattr(found, "__all__", None) or sorted(name for name in vars(found) if not name.startswith("_"))
 
 
 def _modules() -> list[str]:
@@ -156,7 +162,7 @@ def _canonical(dotted: str) -> str:
 
 def api_page() -> str:
     """`morph_dslam.__all__` by subject."""
-    names = importlib.import_module("morph_dslam").__all__
+    names = names_of("morph_dslam")
     groups = {heading: [name for name in group if name in names] for heading, group in GROUPS.items()}
     grouped = {name for group in GROUPS.values() for name in group}
     groups["More"] = [name for name in names if name not in grouped]
@@ -170,11 +176,11 @@ def api_page() -> str:
 def extend_page() -> str:
     """`morph_dslam.extend` and its modules."""
     parts = [EXTEND_INTRODUCTION]
-    known = {_canonical(f"morph_dslam.{name}") for name in importlib.import_module("morph_dslam").__all__}
+    known = {_canonical(f"morph_dslam.{name}") for name in names_of("morph_dslam")}
     for module in _modules()[1:]:
         found = importlib.import_module(module)
         parts += [f"## `{module.removeprefix('morph_dslam.')}`\n", f"{(found.__doc__ or '').strip().splitlines()[0]}\n"]
-        for name in found.__all__:
+        for name in names_of(module):
             canonical = _canonical(f"{module}.{name}")
             if canonical not in known and canonical.startswith("morph_dslam."):
                 known.add(canonical)

@@ -64,40 +64,36 @@ if TYPE_CHECKING:  # the same for editors and type checkers
     from morph_dslam.calibration.calibrate import calibrate as calibrate
     from morph_dslam.camera import Camera as Camera
     from morph_dslam.errors import MorphError as MorphError
-    from morph_dslam.evaluation.evaluate import evaluate as evaluate
-    from morph_dslam.evaluation.evaluate import evaluate_depth as evaluate_depth
-    from morph_dslam.evaluation.run_folder import Run as Run
-    from morph_dslam.evaluation.run_folder import load_run as load_run
+    from morph_dslam.evaluation.evaluate import evaluate as evaluate, evaluate_depth as evaluate_depth
+    from morph_dslam.evaluation.run_folder import Run as Run, load_run as load_run
     from morph_dslam.evaluation.trajectory import evaluate_trajectory as evaluate_trajectory
     from morph_dslam.explorer.server import explore as explore
     from morph_dslam.io.camera_files import load_camera as load_camera
-    from morph_dslam.io.export import StateChoice as StateChoice
-    from morph_dslam.io.export import export as export
+    from morph_dslam.io.export import StateChoice as StateChoice, export as export
     from morph_dslam.mechanics.solid import SolidProblem as SolidProblem
-    from morph_dslam.model import Parameter as Parameter
-    from morph_dslam.model import ReducedModel as ReducedModel
-    from morph_dslam.model import load_model as load_model
-    from morph_dslam.model import save_model as save_model
+    from morph_dslam.model import (
+        Parameter as Parameter,
+        ReducedModel as ReducedModel,
+        load_model as load_model,
+        save_model as save_model,
+    )
     from morph_dslam.reduction.report import write_build_report as write_build_report
     from morph_dslam.registration.board_registration import register_board as register_board
     from morph_dslam.registration.landmarks import register_landmarks as register_landmarks
     from morph_dslam.registration.register import register as register
-    from morph_dslam.registration.registration import Registration as Registration
-    from morph_dslam.registration.registration import load_registration as load_registration
+    from morph_dslam.registration.registration import (
+        Registration as Registration,
+        load_registration as load_registration,
+    )
     from morph_dslam.render.simulation import simulate as simulate
     from morph_dslam.slam.options import SlamOptions as SlamOptions
-    from morph_dslam.slam.scene import Scene as Scene
-    from morph_dslam.slam.scene import load_scene as load_scene
-    from morph_dslam.slam.scene import map_scene as map_scene
-    from morph_dslam.sources import open_live as open_live
-    from morph_dslam.sources import open_source as open_source
+    from morph_dslam.slam.scene import Scene as Scene, load_scene as load_scene, map_scene as map_scene
+    from morph_dslam.sources import open_live as open_live, open_source as open_source
     from morph_dslam.sources.frames import Frame as Frame
     from morph_dslam.studies.build import build as build
-    from morph_dslam.studies.study import load_study as load_study
-    from morph_dslam.studies.study import make_study as make_study
+    from morph_dslam.studies.study import load_study as load_study, make_study as make_study
     from morph_dslam.tracking.options import TrackerOptions as TrackerOptions
-    from morph_dslam.tracking.outcomes import Status as Status
-    from morph_dslam.tracking.outcomes import TrackingWarning as TrackingWarning
+    from morph_dslam.tracking.outcomes import Status as Status, TrackingWarning as TrackingWarning
     from morph_dslam.tracking.result import FrameResult as FrameResult
     from morph_dslam.tracking.run_options import TrackOptions as TrackOptions
     from morph_dslam.tracking.session import Session as Session

@@ -10,8 +10,7 @@ from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden
 from morph_dslam.mechanics.materials.isotropic import MooneyRivlin, NeoHookean, Ogden
 from morph_dslam.mechanics.materials.library import constant_quantities, material_from_table
-from tests.support.material_laws import BULGED as F
-from tests.support.material_laws import stress
+from tests.support.material_laws import BULGED as F, stress
 from tests.support.real_data import ROOT
 
 

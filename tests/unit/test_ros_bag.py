@@ -12,8 +12,7 @@ from morph_dslam.sources import open_source
 pytest.importorskip("rosbags", reason="rosbags is not installed")
 
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
+from rosbags.rosbag2 import StoragePlugin, Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 STEP = 40_000_000  # nanoseconds

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tensorly
-from tensorly.decomposition import parafac
-from tensorly.decomposition import tensor_train as tensorly_train
-from tensorly.decomposition import tucker as tensorly_tucker
+from tensorly.decomposition import parafac, tensor_train as tensorly_train, tucker as tensorly_tucker
 
 from morph_dslam.model.basis_functions import chebyshev_basis, cubic_spline_basis
 from morph_dslam.reduction.tensor_formats import (

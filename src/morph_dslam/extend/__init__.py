@@ -39,8 +39,10 @@ if TYPE_CHECKING:
     from morph_dslam.mechanics.materials.base import register_law as register_law
     from morph_dslam.reduction.registry import register_reduction as register_reduction
     from morph_dslam.sources import register_source as register_source
-    from morph_dslam.threads import one_thread_for_algebra as one_thread_for_algebra
-    from morph_dslam.threads import threads_side_by_side as threads_side_by_side
+    from morph_dslam.threads import (
+        one_thread_for_algebra as one_thread_for_algebra,
+        threads_side_by_side as threads_side_by_side,
+    )
 
 
 def __getattr__(name: str) -> Any:

@@ -1,5 +1,9 @@
 """Transforms of three-dimensional space."""
 
-from morph_dslam.geometry import RigidTransform, SimilarityTransform, cross_matrix, fit_similarity, rotation_exp
-
-__all__ = ["RigidTransform", "SimilarityTransform", "cross_matrix", "fit_similarity", "rotation_exp"]
+from morph_dslam.geometry import (
+    RigidTransform as RigidTransform,
+    SimilarityTransform as SimilarityTransform,
+    cross_matrix as cross_matrix,
+    fit_similarity as fit_similarity,
+    rotation_exp as rotation_exp,
+)

@@ -1,87 +1,49 @@
 """Meshes, hyperelastic laws, supports and loads of a `morph_dslam.SolidProblem`, and what solves it."""
 
 from morph_dslam.mechanics.loads import (
-    BodyForce,
-    DeadTraction,
-    FollowerPressure,
-    Gravity,
-    MovingLine,
-    MovingPatch,
-    NodalForces,
-    PointLoad,
+    BodyForce as BodyForce,
+    DeadTraction as DeadTraction,
+    FollowerPressure as FollowerPressure,
+    Gravity as Gravity,
+    MovingLine as MovingLine,
+    MovingPatch as MovingPatch,
+    NodalForces as NodalForces,
+    PointLoad as PointLoad,
 )
-from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden
-from morph_dslam.mechanics.materials.base import Constant, Material, green_lagrange, log_volume, right_cauchy_green
+from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden as HolzapfelGasserOgden
+from morph_dslam.mechanics.materials.base import (
+    Constant as Constant,
+    Material as Material,
+    green_lagrange as green_lagrange,
+    log_volume as log_volume,
+    right_cauchy_green as right_cauchy_green,
+)
 from morph_dslam.mechanics.materials.isotropic import (
-    Gent,
-    LinearElastic,
-    MooneyRivlin,
-    NeoHookean,
-    Ogden,
-    Rubber,
-    StVenantKirchhoff,
-    Yeoh,
-    first_invariant,
-    second_invariant,
+    Gent as Gent,
+    LinearElastic as LinearElastic,
+    MooneyRivlin as MooneyRivlin,
+    NeoHookean as NeoHookean,
+    Ogden as Ogden,
+    Rubber as Rubber,
+    StVenantKirchhoff as StVenantKirchhoff,
+    Yeoh as Yeoh,
+    first_invariant as first_invariant,
+    second_invariant as second_invariant,
 )
-from morph_dslam.mechanics.materials.viscoelastic import Prony
-from morph_dslam.mechanics.parameters import ParameterSymbols
-from morph_dslam.mechanics.solid import SolidOptions
-from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning
-from morph_dslam.mechanics.solvers.continuation import advance
-from morph_dslam.mechanics.solvers.newton import State, sensitivities, solve
-from morph_dslam.mechanics.supports import ElasticFoundation, PrescribedDisplacement, RigidRotation, fixed
-from morph_dslam.meshing.generators import Profile, block, revolution, tube
-from morph_dslam.meshing.mesh_checks import check_mesh
-from morph_dslam.meshing.mesh_files import load_mesh
-from morph_dslam.meshing.meshes import CellBlock, Mesh, model_mesh_of
-from morph_dslam.meshing.second_order import to_second_order
-
-__all__ = [
-    "BodyForce",
-    "CellBlock",
-    "Constant",
-    "DeadTraction",
-    "ElasticFoundation",
-    "FollowerPressure",
-    "Gent",
-    "Gravity",
-    "HolzapfelGasserOgden",
-    "LinearElastic",
-    "Material",
-    "Mesh",
-    "MooneyRivlin",
-    "MovingLine",
-    "MovingPatch",
-    "NearlyIncompressibleWarning",
-    "NeoHookean",
-    "NodalForces",
-    "Ogden",
-    "ParameterSymbols",
-    "PointLoad",
-    "PrescribedDisplacement",
-    "Profile",
-    "Prony",
-    "RigidRotation",
-    "Rubber",
-    "SolidOptions",
-    "StVenantKirchhoff",
-    "State",
-    "Yeoh",
-    "advance",
-    "block",
-    "check_mesh",
-    "first_invariant",
-    "fixed",
-    "green_lagrange",
-    "load_mesh",
-    "log_volume",
-    "model_mesh_of",
-    "revolution",
-    "right_cauchy_green",
-    "second_invariant",
-    "sensitivities",
-    "solve",
-    "to_second_order",
-    "tube",
-]
+from morph_dslam.mechanics.materials.viscoelastic import Prony as Prony
+from morph_dslam.mechanics.parameters import ParameterSymbols as ParameterSymbols
+from morph_dslam.mechanics.solid import SolidOptions as SolidOptions
+from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning as NearlyIncompressibleWarning
+from morph_dslam.mechanics.solvers.continuation import advance as advance
+from morph_dslam.mechanics.solvers.newton import State as State, sensitivities as sensitivities, solve as solve
+from morph_dslam.mechanics.supports import (
+    ElasticFoundation as ElasticFoundation,
+    PrescribedDisplacement as PrescribedDisplacement,
+    RigidRotation as RigidRotation,
+    fixed as fixed,
+)
+from morph_dslam.meshing.generators import Profile as Profile, block as block, revolution as revolution, tube as tube
+from morph_dslam.meshing.mesh_checks import check_mesh as check_mesh
+from morph_dslam.meshing.mesh_files import load_mesh as load_mesh
+from morph_dslam.meshing.meshes import CellBlock as CellBlock, Mesh as Mesh, model_mesh_of as model_mesh_of
+from morph_dslam.meshing.second_order import to_second_order as to_second_order

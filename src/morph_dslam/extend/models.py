@@ -1,25 +1,24 @@
 """What reduced models are made of: separated fields, functions of the parameters, points that a model carries."""
 
-from morph_dslam.model import MaterialPoints, SeparatedField, SurfacePoints
-from morph_dslam.model.basis_functions import Basis, chebyshev_basis, cubic_spline_basis, hat_basis
-from morph_dslam.model.functions import Functions, ParameterFunctions, total_degree_indices
-from morph_dslam.model.inner_structure import CarriedStructure, save_inner_structure
-from morph_dslam.model.reduced_model import von_mises
-from morph_dslam.model.tensor_functions import CPFunctions
-
-__all__ = [
-    "Basis",
-    "CPFunctions",
-    "CarriedStructure",
-    "Functions",
-    "MaterialPoints",
-    "ParameterFunctions",
-    "SeparatedField",
-    "SurfacePoints",
-    "chebyshev_basis",
-    "cubic_spline_basis",
-    "hat_basis",
-    "save_inner_structure",
-    "total_degree_indices",
-    "von_mises",
-]
+from morph_dslam.model import (
+    MaterialPoints as MaterialPoints,
+    SeparatedField as SeparatedField,
+    SurfacePoints as SurfacePoints,
+)
+from morph_dslam.model.basis_functions import (
+    Basis as Basis,
+    chebyshev_basis as chebyshev_basis,
+    cubic_spline_basis as cubic_spline_basis,
+    hat_basis as hat_basis,
+)
+from morph_dslam.model.functions import (
+    Functions as Functions,
+    ParameterFunctions as ParameterFunctions,
+    total_degree_indices as total_degree_indices,
+)
+from morph_dslam.model.inner_structure import (
+    CarriedStructure as CarriedStructure,
+    save_inner_structure as save_inner_structure,
+)
+from morph_dslam.model.reduced_model import von_mises as von_mises
+from morph_dslam.model.tensor_functions import CPFunctions as CPFunctions

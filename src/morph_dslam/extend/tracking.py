@@ -1,25 +1,20 @@
 """Points bound to a model, and the estimator of parameters and pose that `morph_dslam.Tracker` is built on."""
 
-from morph_dslam.tracking.binding import bind_pixels, draw_view, facing, view_of
-from morph_dslam.tracking.depth import PointDepths
-from morph_dslam.tracking.drawing import DrawOptions, SectionPlane
-from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOptions, Estimator, Prior, State, moved
-from morph_dslam.tracking.run_options import ObjectOptions
-
-__all__ = [
-    "BoundPoints",
-    "DrawOptions",
-    "Estimate",
-    "EstimationOptions",
-    "Estimator",
-    "ObjectOptions",
-    "PointDepths",
-    "Prior",
-    "SectionPlane",
-    "State",
-    "bind_pixels",
-    "draw_view",
-    "facing",
-    "moved",
-    "view_of",
-]
+from morph_dslam.tracking.binding import (
+    bind_pixels as bind_pixels,
+    draw_view as draw_view,
+    facing as facing,
+    view_of as view_of,
+)
+from morph_dslam.tracking.depth import PointDepths as PointDepths
+from morph_dslam.tracking.drawing import DrawOptions as DrawOptions, SectionPlane as SectionPlane
+from morph_dslam.tracking.estimator import (
+    BoundPoints as BoundPoints,
+    Estimate as Estimate,
+    EstimationOptions as EstimationOptions,
+    Estimator as Estimator,
+    Prior as Prior,
+    State as State,
+    moved as moved,
+)
+from morph_dslam.tracking.run_options import ObjectOptions as ObjectOptions
