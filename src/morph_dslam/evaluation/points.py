@@ -1,4 +1,4 @@
-"""Ground truth: material points measured, or rendered, in some frames of a sequence."""
+"""Material error: points measured, or rendered, in some frames of a sequence, against where a run has them."""
 
 from __future__ import annotations
 

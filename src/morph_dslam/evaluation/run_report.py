@@ -1,4 +1,4 @@
-"""Pictures of the material error and of the surface error."""
+"""The report of an evaluated run, and its pictures of the material error and of the surface error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much of a material error is one rigid motion: a second figure, always beside the error as it is.
+"""Camera paths against true ones, and how much of a material error is one rigid motion.
 
 A truth sensor whose place relative to the camera is not known exactly moves all truth points of a recording
 by one rigid motion, and so does a wrong reference state of the estimate. What is left after the best such

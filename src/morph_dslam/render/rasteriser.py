@@ -1,4 +1,4 @@
-"""Which pixels one projected triangle covers, and where on it each lies; for compiled loops over a mesh.
+"""Rasterising meshes: which triangle each pixel shows, where on it, and at which depth, in compiled loops.
 
 Edge functions decide coverage (Pineda 1988). They are linear in the image, so along a row each is the value
 at the first pixel plus so many steps.

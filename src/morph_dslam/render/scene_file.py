@@ -1,4 +1,4 @@
-"""Key frames: values given at a few frames, joined by a curve with continuous second derivative."""
+"""Scene files: what is filmed, by which camera, along which paths; checked when read."""
 
 from __future__ import annotations
 

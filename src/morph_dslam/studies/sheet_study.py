@@ -1,4 +1,4 @@
-"""Snapshots of the gripped sheet: fields on the output grid, and their mirror images.
+"""The study of a sheet in two grips: its sections, samples, snapshots on an output grid, and their mirror images.
 
 A sheet does not know its two sides apart, so the mirror image of a solution is a solution; if its grips are
 at the same height, it does not know left from right either, and if that is half its width, nor top from

@@ -131,12 +131,6 @@ def _check_places(movable: Mapping[str, NDArray[np.bool_]]) -> None:
             )
 
 
-# Whether an object is still where the map has it, and how much its pose in the map counts.
-# An anchored object's pose comes from the camera's, and its points have to agree with it. Where they do not,
-# in several frames on end, the object has been moved: then its points alone say where it is, until they agree
-# with the map again.
-
-
 #: Spread of residuals, pixels, before any frame has shown one, and the least that is believed.
 FIRST_SIGMA_PX, LEAST_SIGMA_PX = 0.5, 0.1
 #: How much more a pose counts that is to be held.
@@ -144,7 +138,10 @@ HELD = 1e6
 
 
 class Anchoring:
-    """Decides frame by frame.
+    """Decides frame by frame whether an object is still where the map has it, and how much its pose there counts.
+
+    Its pose comes from the camera's, and its points have to agree with it. Where they do not, in several frames
+    on end, the object has moved: then its points alone say where it is, until they agree with the map again.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Points that were bound in one reference picture, and how the object's state there may be off."""
+"""Covariances: from a Huber cost, and of errors that the points of one reference image share."""
 
 from __future__ import annotations
 

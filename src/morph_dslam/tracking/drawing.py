@@ -1,4 +1,4 @@
-"""Sections: what a plane through an undeformed solid cuts open, to be carried along as the solid deforms."""
+"""Drawing an object over its video: coloured by a field, whole or cut open by a plane, with what is inside of it."""
 
 from __future__ import annotations
 

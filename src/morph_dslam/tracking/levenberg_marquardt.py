@@ -1,4 +1,7 @@
-"""Minimiser of a quadratic model inside a box, by an active set (Nocedal & Wright, ch. 16.7)."""
+"""Levenberg-Marquardt in a box of parameters; each step minimises a quadratic model by an active set.
+
+The active set is that of Nocedal & Wright, ch. 16.7.
+"""
 
 from __future__ import annotations
 

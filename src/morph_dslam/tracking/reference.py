@@ -1,8 +1,7 @@
-"""How much of the surface that a frame shows a reference view shows too, and which view is to be followed.
+"""The reference view: the object's texture, the points bound in it, and features to find it again by.
 
-Samples of the surface are drawn into the view; the rasteriser says which of them are hidden. What the view
-shows of a sample is the area of its triangle in the image over its undeformed area. A reference view serves
-a frame where it shows the same side of the surface, and not much smaller.
+Of an object in a map there are many images, from all sides from which it was scanned. What the first one does
+not show, or shows very flat, takes its texture and its points from another.
 """
 
 from __future__ import annotations
@@ -66,6 +65,9 @@ BACK_SHARE = 0.75
 
 class SurfaceSamples:
     """Triangles spread over the undeformed surface, as many as their area asks for.
+
+    What a view shows of one is its area in the image over its undeformed area. A reference view serves a frame
+    where it shows the same side of the surface, and not much smaller.
 
     Attributes
     ----------
@@ -134,11 +136,6 @@ def choose_view(shares: Sequence[float], errors: Sequence[float], active: int) -
         return active
     serving = [k for k, share in enumerate(shares) if share >= KEEP_SHARE]
     return max(serving, key=lambda k: shares[k]) if serving else None
-
-
-# The reference view: the object's texture, the points bound in it, and features to find it again by.
-# Of an object in a map there are many pictures, from all sides from which it was scanned. What the first one
-# does not show, or shows very flat, takes its texture and its points from another.
 
 
 #: With several pictures there are at most so many times the points of one.

@@ -1,7 +1,7 @@
-"""Whether a frame, with the state estimated in it, is fit to become a reference view, and which part of it.
+"""The reference views of a tracked object: keyframes of a scan, and frames that become views while tracking.
 
-All that is measured against the view later is bound by this state in this image, so both must be good: the
-points agree closely and nearly all of them, the surface's place is known, and the image is sharp.
+All that is measured against a view is bound by the state in its image, so both must be good: the points agree
+closely and nearly all of them, the surface's place is known, and the image is sharp.
 """
 
 from __future__ import annotations
@@ -120,12 +120,6 @@ def around(picture: Image, pixels: Array, half: int) -> NDArray[np.bool_]:
     return cv2.dilate(marks, np.ones((2 * half + 1,) * 2, np.uint8)) > 0
 
 
-# Which pictures of a scan show what the first reference view does not, and which of them are to be believed.
-# A map holds pictures of the object from all sides, with its place in each. Those are taken that show most of
-# the surface much larger than the pictures taken so far. Something may have been before the object in one of
-# them, so what is bound in it is compared with the others, and counts only where another one agrees.
-
-
 #: Another picture is taken as long as it adds this share of what all of them show, and at most so many are.
 LEAST_GAIN, MOST_FURTHER = 0.03, 5
 
@@ -239,14 +233,6 @@ def _as_frame(view: PosedImage) -> Image:
     return replace(view.picture, occluder_depth=np.where(view.seen, np.float32(np.inf), np.float32(0.0)))
 
 
-# The reference views of a tracked object: the first one, and those made while tracking.
-# A view serves as long as it shows most of the surface that is seen. When none does, a frame that is fit for
-# it becomes a view in its estimated state. That state's covariance holds the error of the view that it was
-# found by, and enters whatever is found by the new view, so errors add up from view to view and are stated.
-# Views are kept; an earlier one is gone back to as soon as it serves again, and takes the later ones' errors
-# away.
-
-
 #: The views are compared in every so many frames: the surface turns by a few degrees meanwhile.
 CHECK_EVERY = 3
 #: After a frame that showed too few corners for a view, so many are not tried.
@@ -324,6 +310,12 @@ class _BegunView:
 
 class ViewSet:
     """Keeps the views and says which one to follow.
+
+    A view serves as long as it shows most of the surface that is seen. When none does, a frame that is fit for
+    it becomes a view in its estimated state. That state's covariance holds the error of the view that it was
+    found by, and enters whatever is found by the new view, so errors add up from view to view and are stated.
+    Views are kept; an earlier one is gone back to as soon as it serves again, and takes the later ones' errors
+    away.
 
     Parameters
     ----------
