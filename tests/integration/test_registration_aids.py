@@ -133,7 +133,7 @@ def test_a_board_that_is_not_seen_or_of_other_sizes_is_refused(tmp_path, scene):
         (("gap_mm = 9", ""), "a grid needs gap_mm"),
         (("gap_mm = 9", "gap_mm = 9\nsquare_mm = 40"), "square_mm is for the other kind of board"),
         (("columns = 4", "columns = 0"), "columns: "),
-        (("columns = 4", "columns = 50\nmargin = 3"), "margin: "),
+        (("columns = 4", "columns = 50\nmargin = 3"), "unknown key margin; known here: kind, dictionary"),
     ],
 )
 def test_mistakes_in_a_board_file_are_named(tmp_path, change, message):

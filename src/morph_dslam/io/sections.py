@@ -3,9 +3,30 @@
 from __future__ import annotations
 
 import types
-from typing import Any, get_args
+from pathlib import Path
+from typing import Any, TypeVar, get_args
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from morph_dslam.errors import MorphError
+from morph_dslam.io.text import read_toml
+
+
+class Section(BaseModel):
+    """A part of a file; unknown keys are mistakes."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+AnySection = TypeVar("AnySection", bound=Section)
+
+
+def read_sections(path: Path, what: str, kind: type[AnySection], error_class: type[MorphError]) -> AnySection:
+    """Read a TOML file whose content is of this kind; other parameters as of `read_text`."""
+    try:
+        return kind.model_validate(read_toml(path, what, error_class))
+    except ValidationError as error:
+        raise error_class(f"{path}: {explain(kind, error)}") from error
 
 
 def explain(kind: type[BaseModel], error: ValidationError) -> str:

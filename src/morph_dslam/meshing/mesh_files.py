@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import StringIO
@@ -185,10 +185,8 @@ def _check_sections_closed(path: Path) -> None:
 
 
 def _dimension(name: str, path: Path) -> int:
-    if name in _CELLS:
-        return cell_type(_CELLS[name]).dimension
-    if name in _BOUNDING:
-        return _BOUNDING[name]
+    if name in _CELLS or name in _BOUNDING:
+        return _any_dimension(name)
     raise StudyError(f"{path} holds {name} cells, which are not known; use {', '.join(_CELLS)}")
 
 
@@ -209,9 +207,16 @@ def _groups(content: Any) -> Iterator[tuple[str, list[Indices]]]:
                     for block, tags in zip(content.cells, physical, strict=True)
                 ],
             )
-    for name, columns in content.cell_data.items():
-        parts = [_column(part) for part in columns]
-        if name.startswith("gmsh:") or not all(_is_one_integer_each(part) for part in parts):
+    yield from _integer_groups(content.cell_data)
+
+
+def _integer_groups(data: Mapping[str, Sequence[np.ndarray]]) -> Iterator[tuple[str, list[Indices]]]:
+    """Names of groups that integer data make, and for each part of the data the group's positions in it."""
+    for name, columns in data.items():
+        # Legacy VTK that states its one component, `SCALARS part int 1`, is read as a column (n, 1).
+        parts = [part[:, 0] if part.ndim == 2 and part.shape[1] == 1 else part for part in columns]
+        is_integer = all(part.ndim == 1 and np.issubdtype(part.dtype, np.integer) for part in parts)
+        if name.startswith("gmsh:") or not is_integer:
             continue
         values = np.unique(np.concatenate(parts))
         for value in values if len(values) <= _MOST_GROUPS else ():
@@ -239,7 +244,8 @@ def _with_groups(mesh: Mesh, content: Any, top: list[int], dimension: int, path:
         node_sets[name] = np.unique(np.concatenate([part.ravel() for part in bounding])).astype(np.int64)
         if dimension == 3 and all(_any_dimension(content.cells[i].type) == 2 for i, _ in rows):
             surfaces[name] = _faces(mesh, content, rows, name, path)
-    node_sets |= dict(_point_groups(content))
+    points = {name: [column] for name, column in content.point_data.items()}
+    node_sets |= {name: nodes for name, (nodes,) in _integer_groups(points)}
     return Mesh(mesh.nodes, mesh.blocks, node_sets, cell_sets, surfaces).without_unused_nodes()
 
 
@@ -252,22 +258,3 @@ def _faces(mesh: Mesh, content: Any, rows: list[tuple[int, Indices]], name: str,
     if (faces < 0).any():
         raise StudyError(f"{path}: {(faces[:, 0] < 0).sum()} faces of group '{name}' are faces of no solid cell")
     return faces
-
-
-def _point_groups(content: Any) -> Iterator[tuple[str, Indices]]:
-    for name, column in content.point_data.items():
-        values = _column(column)
-        if name.startswith("gmsh:") or not _is_one_integer_each(values):
-            continue
-        kinds = np.unique(values)
-        for value in kinds if len(kinds) <= _MOST_GROUPS else ():
-            yield f"{name}_{value}", np.flatnonzero(values == value)
-
-
-def _column(values: np.ndarray) -> np.ndarray:
-    """Legacy VTK that states its one component, `SCALARS part int 1`, is read as a column (n, 1)."""
-    return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
-
-
-def _is_one_integer_each(values: np.ndarray) -> bool:
-    return values.ndim == 1 and np.issubdtype(values.dtype, np.integer)

@@ -94,12 +94,14 @@ class Discrepancy:
         return self.basis.influence(positions) @ self.values
 
 
-def farthest_points(nodes: Array, count: int) -> NDArray[np.int64]:
+def farthest_points(nodes: Array, count: int, first: int | None = None) -> NDArray[np.int64]:
     """Indices of at most ``count`` of the nodes (n, 3), each as far as can be from those before it.
 
-    It begins with the node that is farthest from the middle (Gonzalez, Theor. Comput. Sci. 38, 1985).
+    Without a ``first`` one it begins with the node that is farthest from the middle (Gonzalez, Theor. Comput. Sci. 38,
+    1985).
     """
-    first = int(np.linalg.norm(nodes - nodes.mean(axis=0), axis=1).argmax())
+    if first is None:
+        first = int(np.linalg.norm(nodes - nodes.mean(axis=0), axis=1).argmax())
     chosen, gaps = [first], np.linalg.norm(nodes - nodes[first], axis=1)
     while len(chosen) < min(count, len(nodes)) and gaps.max() > 0.0:
         chosen.append(int(gaps.argmax()))

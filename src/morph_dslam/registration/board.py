@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.registration.initialization import Section, Vector, read_file
+from morph_dslam.io.sections import Section, read_sections
+from morph_dslam.registration.initialization import Vector
 
 Array = NDArray[np.float64]
 #: Places on an edge, the part of it they spread over, and how far across it its brightness is looked at, as a
@@ -198,7 +199,7 @@ class FiducialBoard:
 
 def load_board(path: Path) -> FiducialBoard:
     """Read a board file."""
-    description = read_file(path, "board file", BoardFile)
+    description = read_sections(path, "board file", BoardFile, RegistrationError)
     board = FiducialBoard(description)
     try:
         _ = board._board

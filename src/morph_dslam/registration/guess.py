@@ -20,8 +20,9 @@ from scipy.spatial.transform import Rotation
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import RigidTransform
+from morph_dslam.io.sections import Section, read_sections
 from morph_dslam.model import ReducedModel, SurfacePoints
-from morph_dslam.registration.initialization import Section, Vector, read_file
+from morph_dslam.registration.initialization import Vector
 from morph_dslam.registration.messages import OutlineOnly
 from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.binding import DrawnSurface, draw_view, view_of
@@ -103,7 +104,7 @@ class GuessInitializer:
 
 def load_guess(path: Path) -> GuessInitializer:
     """Read a guess; raises RegistrationError if the file is missing or malformed."""
-    return GuessInitializer(read_file(path, "guess", GuessFile))
+    return GuessInitializer(read_sections(path, "guess", GuessFile, RegistrationError))
 
 
 class _OutlineSearch:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Protocol, TypeVar
+from typing import Annotated, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import RegistrationError, TrackingError
-from morph_dslam.io.text import read_toml
+from morph_dslam.errors import TrackingError
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.registration import Registration
 
@@ -21,34 +20,6 @@ Image = NDArray[np.uint8]
 #: A coordinate or an angle. None is meant by what is larger: in millimetres it would be ten kilometres.
 Number = Annotated[float, Field(ge=-1e7, le=1e7)]
 Vector = tuple[Number, Number, Number]
-
-
-class Section(BaseModel):
-    """A part of a file; unknown keys are mistakes."""
-
-    model_config = ConfigDict(extra="forbid")
-
-
-AnySection = TypeVar("AnySection", bound=Section)
-
-
-def read_file(path: Path, what: str, kind: type[AnySection]) -> AnySection:
-    """Read a TOML file and check it.
-
-    Parameters
-    ----------
-    path : of the file.
-    what : the file is, for the message.
-    kind : its content.
-    """
-    content = read_toml(path, what, RegistrationError)
-    try:
-        return kind.model_validate(content)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        message = first["msg"].removeprefix("Value error, ")
-        raise RegistrationError(f"{path}: {where}: {message}" if where else f"{path}: {message}") from error
 
 
 class Initializer(Protocol):

@@ -13,8 +13,9 @@ from pydantic import model_validator
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.io.landmarks import Landmarks
+from morph_dslam.io.sections import Section, read_sections
 from morph_dslam.model import ReducedModel
-from morph_dslam.registration.initialization import Section, Vector, read_file
+from morph_dslam.registration.initialization import Vector
 from morph_dslam.registration.landmarks import register_landmarks, shape_starts
 from morph_dslam.registration.messages import Ambiguity, Ambiguous
 from morph_dslam.registration.registration import Registration
@@ -123,7 +124,7 @@ class PictureInitializer:
 
 def load_picture(path: Path) -> PictureInitializer:
     """Read a picture file and its image; raises RegistrationError or SourceError if one is wrong."""
-    described = read_file(path, "picture file", PictureFile)
+    described = read_sections(path, "picture file", PictureFile, RegistrationError)
     image = read_image(path.parent / described.image, "picture of the print")
     grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
     if described.rectangle is not None:

@@ -8,12 +8,11 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 from scipy.interpolate import CubicSpline
 
 from morph_dslam.errors import SceneError
-from morph_dslam.io.sections import explain
-from morph_dslam.io.text import read_toml
+from morph_dslam.io.sections import Section, read_sections
 
 Array = NDArray[np.float64]
 
@@ -53,11 +52,7 @@ Side = Annotated[float, Field(ge=1e-3, le=LARGEST)]
 Blur = Annotated[float, Field(ge=0.0, le=100.0)]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-
-class Surface(_Section):
+class Surface(Section):
     """How the sheet looks.
 
     ``texture`` is an image file relative to the scene file, or a photograph packaged with scikit-image. It is
@@ -72,7 +67,7 @@ class Surface(_Section):
     back_colour: Colour = (226, 224, 218)
 
 
-class Background(_Section):
+class Background(Section):
     """A photograph, out of focus by ``blur_px``, or a colour (red, green, blue) where no image is named."""
 
     image: str | None = None
@@ -80,7 +75,7 @@ class Background(_Section):
     blur_px: Blur = 0.0
 
 
-class _Light(_Section):
+class _Light(Section):
     """A distant light in ``direction`` (towards it, in the frame of the poses), and ambient light (0-1)."""
 
     direction: Vector = (-0.4, -0.6, -1.0)
@@ -93,7 +88,7 @@ class _Light(_Section):
         return self
 
 
-class Sensor(_Section):
+class Sensor(Section):
     """Gaussian blur (standard deviation, pixels), then Gaussian noise (standard deviation, grey levels)."""
 
     blur_px: Blur = 0.0
@@ -108,7 +103,7 @@ class ParameterKeyFrame(BaseModel):
     frame: FrameNumber
 
 
-class PoseKeyFrame(_Section):
+class PoseKeyFrame(Section):
     """Where the object is: in the camera frame (x right, y down, z ahead), or in the world if there is a
     ``camera_path``.
 
@@ -121,7 +116,7 @@ class PoseKeyFrame(_Section):
     rotation_deg: Vector | None = None
 
 
-class CameraKeyFrame(_Section):
+class CameraKeyFrame(Section):
     """Where the camera is in the world, and the point that it looks at; the world's z axis points up."""
 
     frame: FrameNumber
@@ -129,7 +124,7 @@ class CameraKeyFrame(_Section):
     target_mm: Vector
 
 
-class Rectangle(_Section):
+class Rectangle(Section):
     """A textured rectangle: its centre and its whole edges to the right and down, world."""
 
     texture: str
@@ -138,7 +133,7 @@ class Rectangle(_Section):
     down_mm: Vector
 
 
-class Box(_Section):
+class Box(Section):
     """A textured box that stands upright, turned about the vertical."""
 
     texture: str
@@ -147,11 +142,11 @@ class Box(_Section):
     turn_deg: Number = 0.0
 
 
-class Environment(_Section):
+class Environment(Section):
     """What stands still around the object; textures are cut to the proportions of each face."""
 
-    rectangles: list[Rectangle] = []
-    boxes: list[Box] = []
+    rectangles: list[Rectangle] = Field(default_factory=list)
+    boxes: list[Box] = Field(default_factory=list)
 
     @model_validator(mode="after")
     def _has_something(self) -> Environment:
@@ -160,7 +155,7 @@ class Environment(_Section):
         return self
 
 
-class DepthSensor(_Section):
+class DepthSensor(Section):
     """A depth camera in the place of the colour camera.
 
     ``noise_mm_at_1m`` is the standard deviation at 1 m and grows with the square of the distance. Within
@@ -172,14 +167,14 @@ class DepthSensor(_Section):
     range_mm: float = Field(default=5000.0, gt=0.0, le=13000.0)
 
 
-class _OccluderKeyFrame(_Section):
+class _OccluderKeyFrame(Section):
     """Where the disc is in one frame."""
 
     frame: FrameNumber
     centre_px: tuple[Number, Number]
 
 
-class Occluder(_Section):
+class Occluder(Section):
     """A disc of one colour (red, green, blue) in front of everything, moving over the image."""
 
     radius_px: float = Field(gt=0.0, le=LARGEST)
@@ -187,7 +182,7 @@ class Occluder(_Section):
     path: list[_OccluderKeyFrame] = Field(min_length=1)
 
 
-class Scene(_Section):
+class Scene(Section):
     """A scene file; paths in it are relative to the file."""
 
     model: str
@@ -201,9 +196,9 @@ class Scene(_Section):
     background: Background = Background()
     light: _Light = _Light()
     sensor: Sensor = Sensor()
-    parameters: list[ParameterKeyFrame] = []
-    pose: list[PoseKeyFrame] = []
-    camera_path: list[CameraKeyFrame] = []
+    parameters: list[ParameterKeyFrame] = Field(default_factory=list)
+    pose: list[PoseKeyFrame] = Field(default_factory=list)
+    camera_path: list[CameraKeyFrame] = Field(default_factory=list)
     environment: Environment | None = None
     depth_sensor: DepthSensor | None = None
     occluder: Occluder | None = None
@@ -236,8 +231,4 @@ def load_scene_file(path: Path) -> Scene:
     SceneError
         If the file is missing, is not TOML, or a key is unknown, missing or has an impossible value.
     """
-    content = read_toml(path, "scene file", SceneError)
-    try:
-        return Scene.model_validate(content)
-    except ValidationError as error:
-        raise SceneError(f"{path}: {explain(Scene, error)}") from error
+    return read_sections(path, "scene file", Scene, SceneError)

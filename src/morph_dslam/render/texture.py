@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import SceneError, SourceError
 from morph_dslam.model import ReducedModel, SurfacePoints
+from morph_dslam.model.discrepancy import farthest_points
 from morph_dslam.model.reduced_model import triangle_normals
+from morph_dslam.render.picking import pick_surface
 from morph_dslam.render.rasteriser import Buffers
 from morph_dslam.sources.frames import read_image
 
@@ -177,23 +179,6 @@ def texture_coordinates(model: ReducedModel, printed_face: str, width: int, heig
     return fraction * [width, height] - 0.5
 
 
-def locate_in_plane(model: ReducedModel, places: Array) -> tuple[SurfacePoints, NDArray[np.bool_]]:
-    """Surface points above places (p, 2) of the rest plane, and which places (p,) are on the sheet at all."""
-    corners = model.nodes[model.triangles, :2]
-    edges = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=2)
-    inverse = np.linalg.inv(edges)
-    triangles = np.zeros(len(places), dtype=np.int64)
-    weights = np.zeros((len(places), 3))
-    inside = np.zeros(len(places), dtype=bool)
-    for p, place in enumerate(places):
-        local = np.einsum("mij,mj->mi", inverse, place - corners[:, 0])
-        barycentric = np.column_stack([1.0 - local.sum(axis=1), local])
-        triangles[p] = barycentric.min(axis=1).argmax()
-        weights[p] = barycentric[triangles[p]]
-        inside[p] = weights[p].min() > -1e-9
-    return SurfacePoints(triangles, weights), inside
-
-
 def regular_points(model: ReducedModel, count: int) -> SurfacePoints:
     """About ``count`` surface points on a regular grid over the sheet, half a spacing off its edges."""
     low, high = sheet_bounds(model)
@@ -202,8 +187,11 @@ def regular_points(model: ReducedModel, count: int) -> SurfacePoints:
     columns, rows = np.maximum(np.rint(size / spacing).astype(int), 1)
     x = low[0] + (np.arange(columns) + 0.5) / columns * size[0]
     y = low[1] + (np.arange(rows) + 0.5) / rows * size[1]
-    points, inside = locate_in_plane(model, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
-    return points.take(inside)
+    # In the plane z = 1 a ray's first two components are where it meets the sheet.
+    flat, places = np.ones((len(model.nodes), 3)), np.ones((columns * rows, 3))
+    flat[:, :2], places[:, :2] = model.nodes[:, :2], np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    points = pick_surface(flat, model.triangles, places)
+    return points.take(points.triangles >= 0)
 
 
 def landmark_nodes(model: ReducedModel) -> NDArray[np.int64]:
@@ -259,13 +247,8 @@ def box_projection(model: ReducedModel, pixels: int) -> TexturedSurface:
     return TexturedSurface(nodes, inverse.reshape(-1, 3), coordinates)
 
 
-def spread_nodes(model: ReducedModel, count: int = N_LANDMARKS) -> NDArray[np.int64]:
+def spread_nodes(model: ReducedModel) -> NDArray[np.int64]:
     """Surface nodes (k,), each as far as possible from those before it, from the lowest corner on."""
     candidates = np.unique(model.triangles)
     places = model.nodes[candidates]
-    chosen = [int(places.sum(axis=1).argmin())]
-    distance = np.linalg.norm(places - places[chosen[0]], axis=1)
-    while len(chosen) < min(count, len(candidates)):
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(places - places[chosen[-1]], axis=1))
-    return candidates[chosen]
+    return candidates[farthest_points(places, N_LANDMARKS, first=int(places.sum(axis=1).argmin()))]

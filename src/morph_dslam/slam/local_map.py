@@ -204,13 +204,11 @@ def usual_error(errors: Array) -> float:
 def local_window(rigid_map: RigidMap) -> tuple[Indices, Indices]:
     """The newest keyframe and those that see the same points, to be adjusted, and others to hold them."""
     newest = len(rigid_map.keyframes) - 1
-    ids = rigid_map.keyframes[newest].point_ids
-    shared = rigid_map.shared_points(ids[rigid_map.state[ids] == GOOD])
+    shared = rigid_map.shared_points(rigid_map.good_in(newest))
     shared[newest] = np.iinfo(np.int64).max
     window = np.argsort(-shared, kind="stable")[:WINDOW]
     window = window[shared[window] > 0]
-    local = np.unique(np.concatenate([rigid_map.keyframes[k].point_ids for k in window]))
-    around = rigid_map.shared_points(local[rigid_map.state[local] == GOOD])
+    around = rigid_map.shared_points(np.unique(np.concatenate([rigid_map.good_in(k) for k in window])))
     around[window] = 0
     holders = np.argsort(-around, kind="stable")[:FIXED_WINDOW]
     return np.sort(window), np.sort(holders[around[holders] > 0])

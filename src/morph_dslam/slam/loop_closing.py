@@ -210,8 +210,7 @@ class LoopCloser:
 
     def _find(self, view: FrameView) -> Loop | None:
         number = len(self._copy.keyframes) - 1
-        ids = self._copy.keyframes[number].point_ids
-        shared = self._copy.shared_points(ids[self._copy.state[ids] == GOOD])
+        shared = self._copy.shared_points(self._copy.good_in(number))
         old = shared < MOST_SHARED
         old[max(number - LEAST_AGE, 0) :] = False
         if not old.any():
@@ -271,10 +270,9 @@ class LoopCloser:
 
     def _edges(self) -> Indices:
         """Pairs of keyframes that follow each other, or see many of the same points."""
-        n, state = len(self._map.keyframes), self._map.state
-        seen = np.zeros((n, len(state)), dtype=np.float32)
+        seen = np.zeros((len(self._map.keyframes), len(self._map.state)), dtype=np.float32)
         for row, keyframe in zip(seen, self._map.keyframes, strict=True):
-            row[keyframe.point_ids[state[keyframe.point_ids] == GOOD]] = 1.0
+            row[self._map.good_among(keyframe.point_ids)] = 1.0
         first, second = np.nonzero(np.triu(seen @ seen.T >= LEAST_COVISIBLE, k=1))
         kept = self._map.kept_keyframes
         pairs = np.concatenate([np.column_stack([kept[:-1], kept[1:]]), np.column_stack([first, second])])

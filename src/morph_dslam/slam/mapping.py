@@ -38,8 +38,7 @@ LEAST_FRAMES_BETWEEN = 3
 
 def median_depth(rigid_map: RigidMap, pose: Array, ids: Indices, intrinsics: Array, unknown: float) -> float:
     """Median depth of the map points among some, seen from a pose (4, 4); ``unknown`` without any."""
-    known = ids[rigid_map.state[ids] == GOOD]
-    _, depths = project(pose, rigid_map.positions[known], intrinsics)
+    _, depths = project(pose, rigid_map.positions[rigid_map.good_among(ids)], intrinsics)
     return max(float(np.median(depths)), 1e-6) if len(depths) else unknown
 
 
@@ -58,8 +57,7 @@ class KeyframeChoice:
 
     def kept(self, number: int, frame_index: int) -> int:
         """Note a new keyframe; returns how many map points it sees."""
-        ids, self._frame_index = self._map.keyframes[number].point_ids, frame_index
-        self._n_points = int((self._map.state[ids] == GOOD).sum())
+        self._n_points, self._frame_index = len(self._map.good_in(number)), frame_index
         return self._n_points
 
     def wants(self, tracked: Tracked, frame_index: int) -> bool:
@@ -99,8 +97,7 @@ def cull_keyframes(rigid_map: RigidMap) -> None:
     for _ in range(MOST_AT_ONCE):
         if len(rigid_map.kept_keyframes) <= ENOUGH_KEYFRAMES:
             return
-        newest = rigid_map.keyframes[-1].point_ids
-        shared = rigid_map.shared_points(newest[rigid_map.state[newest] == GOOD])
+        shared = rigid_map.shared_points(rigid_map.good_in(-1))
         numbers = np.flatnonzero(shared[:-RECENT])
         # The first keyframe holds the world; candidates get their depth from where they were first seen.
         waited_for = rigid_map.first_keyframe[rigid_map.state == CANDIDATE]
@@ -109,7 +106,7 @@ def cull_keyframes(rigid_map: RigidMap) -> None:
         if not len(numbers) or shares.max() < REDUNDANT_SHARE:
             return
         gone = int(numbers[shares.argmax()])
-        others = rigid_map.shared_points(_good(rigid_map, gone))
+        others = rigid_map.shared_points(rigid_map.good_in(gone))
         others[gone] = 0
         rigid_map.remove_keyframe(gone, carrier=int(others.argmax()))
 
@@ -119,13 +116,8 @@ def redundancy(rigid_map: RigidMap, numbers: Indices) -> NDArray[np.float64]:
     counts = np.zeros(len(rigid_map.state), dtype=np.int64)
     for keyframe in rigid_map.keyframes:
         counts[keyframe.point_ids] += 1
-    known = [_good(rigid_map, k) for k in numbers]
+    known = [rigid_map.good_in(k) for k in numbers]
     return np.array([float((counts[ids] > ENOUGH_OTHERS).mean()) if len(ids) else 1.0 for ids in known])
-
-
-def _good(rigid_map: RigidMap, number: int) -> Indices:
-    ids = rigid_map.keyframes[number].point_ids
-    return ids[rigid_map.state[ids] == GOOD]
 
 
 #: Map points that are found in a smaller share of the frames that should show them are taken out.

@@ -185,8 +185,7 @@ class Relocalizer:
 
     def group(self, number: int) -> Indices:
         """A keyframe and those that share most of its points."""
-        ids = self._map.keyframes[number].point_ids
-        shared = self._map.shared_points(ids[self._map.state[ids] == GOOD])
+        shared = self._map.shared_points(self._map.good_in(number))
         shared[number] = np.iinfo(np.int64).max
         best = np.argsort(-shared, kind="stable")[:GROUP]
         return best[shared[best] >= LEAST_SHARED]
@@ -207,8 +206,7 @@ class Relocalizer:
         self, group: Indices, normalized: Image, pose: Array, tracker: Tracker
     ) -> tuple[PoseEstimate, Followed] | None:
         """The pose from all points of the group, found near a rough pose (4, 4); None if too few are."""
-        ids = np.unique(np.concatenate([self._map.keyframes[k].point_ids for k in group]))
-        ids = ids[self._map.state[ids] == GOOD]
+        ids = np.unique(np.concatenate([self._map.good_in(k) for k in group]))
         guesses, depths = project(pose, self._map.positions[ids], self._intrinsics)
         seen = inside(guesses, normalized.shape, PATCH_HALF + 2)
         seen &= tracker.is_similar_view(ids, pose, depths)

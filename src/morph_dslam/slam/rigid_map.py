@@ -245,6 +245,14 @@ class RigidMap:
         """Numbers of the map points."""
         return np.flatnonzero(self.state == GOOD)
 
+    def good_in(self, number: int) -> Indices:
+        """Numbers of the map points that a keyframe sees."""
+        return self.good_among(self.keyframes[number].point_ids)
+
+    def good_among(self, ids: Indices) -> Indices:
+        """Those of some points that are map points."""
+        return ids[self.state[ids] == GOOD]
+
     def copy_of(self, other: RigidMap) -> None:
         """Become what another map is now, and stay so while it changes."""
         self.usual_rms_px, self.passing = other.usual_rms_px, other.passing.copy()
