@@ -11,6 +11,7 @@ from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.registration.registration import Registration
 from morph_dslam.sources import Frame
+from morph_dslam.sources.live import PacedRecording
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
 from morph_dslam.tracking.occlusion import MultiObjectTracker
@@ -244,6 +245,45 @@ def test_depth_images_of_the_first_camera_count(model, rig_films):
             found.append(abs(away[2]))
         sight_line[use_depth] = np.mean(found)
     assert sight_line[True] < 0.5 * sight_line[False]
+
+
+class DepthFilm:
+    """A recording of the first camera, with depth."""
+
+    name, fps, has_registered_depth = "depth film", 30.0, True
+
+    def __init__(self, model, films):
+        self.model, self.film = model, films[0]
+
+    def __iter__(self):
+        rng = np.random.default_rng(0)
+        for number, time in enumerate(RIG_TIMES):
+            depth = sheet_depth(self.model, sheet_state(time), rng, 1e-4, camera=FRONT.camera)
+            yield Frame(number, time, self.film.frame(sheet_state(time)), depth=depth)
+
+
+def test_depth_images_count_live(model, rig_films):
+    """The place along the sight line is known much better with them; frames may be dropped."""
+    first, error, deviation = rig_films[0].frame(sheet_state(0.0)), {}, {}
+    for use_depth in (False, True):
+        options, found = md.TrackerOptions(use_depth=use_depth, depth_sigma=1e-4), []
+        tracker = Tracker(model, FRONT.camera, Registration(model, sheet_state(0.0)), options, reference=first)
+        with PacedRecording(DepthFilm(model, rig_films)) as stream:
+            md.Session({"sheet": tracker}, stream, [found.append]).run()
+        result, truth = found[-1].results["sheet"], sheet_state(found[-1].frame.timestamp)
+        error[use_depth] = mean_error(model, result.estimate.state, truth)
+        deviation[use_depth] = result.estimate.pose_std[5]
+    assert deviation[True] < 0.5 * deviation[False]
+    assert error[True] < 0.6e-3
+
+
+def test_the_outline_counts_in_every_camera(model, rig_films):
+    rig = new_rig(model, images(rig_films, 0.0), use_outline=True)
+    for time in RIG_TIMES:
+        result = rig.track(images(rig_films, time))
+        assert mean_error(model, result.estimate.state, sheet_state(time)) < 0.3e-3
+        for tracker in rig.trackers:
+            assert (tracker.last_measured.weights[len(tracker.reference.points) :] > 0.0).any()
 
 
 @pytest.fixture(scope="module")
