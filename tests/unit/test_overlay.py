@@ -28,8 +28,8 @@ def test_opaque_surface_has_the_colour_of_its_value(value, position):
 
 def test_transparency_mixes_and_brightness_dims():
     opaque = overlay([1.0] * 4, alpha=1.0)[90, 70].astype(float)
-    mixed = overlay([1.0] * 4, alpha=0.25, brightness=np.full(4, 0.5))[90, 70]
-    np.testing.assert_allclose(mixed, 0.75 * 90 + 0.25 * 0.5 * opaque, atol=1.0)
+    mixed = overlay([1.0] * 4, alpha=0.25, brightness=np.array([0.0, 1.0, 1.0, 0.0]))[90, 70]
+    np.testing.assert_allclose(mixed, 0.75 * 90 + 0.25 * 50 / 99 * opaque, atol=1.0)
 
 
 def test_the_rest_of_the_image_and_the_input_stay():

@@ -167,6 +167,20 @@ def test_pick_takes_the_nearer_of_two_sheets_and_survives_edge_on_and_hidden_tri
     np.testing.assert_allclose(met, 3.0 * rays[:2], atol=1e-12)
 
 
+def test_of_many_triangles_that_is_picked_which_a_ray_meets_first():
+    """By a linear system for each triangle and ray; some triangles are behind the camera or reach there."""
+    rng = np.random.default_rng(5)
+    nodes, rays = rng.normal((0.0, 0.0, 1.5), 1.0, (300, 3)), rng.normal(size=(400, 3))
+    triangles = np.array([rng.choice(300, 3, replace=False) for _ in range(80)])
+    corners = nodes[triangles].transpose(0, 2, 1)
+    shares = np.linalg.solve(corners[:, None], rays[None, :, :, None])[..., 0]
+    met = (shares > 0.0).all(axis=2) & (corners[:, 2] > 0.0).all(axis=1)[:, None]
+    nearest = np.where(met, shares.sum(axis=2), 0.0).argmax(axis=0)
+    picked = pick_surface(nodes, triangles, rays)
+    np.testing.assert_array_equal(picked.triangles, np.where(met.any(axis=0), nearest, -1))
+    assert 50 < np.count_nonzero(picked.triangles >= 0) < 350
+
+
 def test_pick_without_any_triangle_in_front():
     picked = pick_surface(-np.eye(3), np.array([[0, 1, 2]]), np.array([[0.0, 0.0, 1.0]]))
     assert picked.triangles.tolist() == [-1]

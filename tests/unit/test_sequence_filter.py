@@ -200,6 +200,9 @@ def test_windows_correlate_by_what_they_share():
     pixels = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 5.0], [30.0, 0.0]])
     expected = np.array([1.0, 6 / 10, 6 / 10 * 5 / 10, 0.0])
     np.testing.assert_allclose(window_correlation(pixels, 10).toarray()[0], expected)
+    many = np.random.default_rng(0).uniform(0.0, 60.0, (40, 2))
+    shared = np.clip(1.0 - np.abs(many[:, None] - many) / 17, 0.0, None).prod(axis=2)
+    np.testing.assert_allclose(window_correlation(many, 17).toarray(), shared, atol=1e-12)
     pixels[1] = np.nan
     np.testing.assert_array_equal(window_correlation(pixels, 10).toarray()[1], np.eye(4)[1])
 
