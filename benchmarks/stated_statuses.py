@@ -171,7 +171,8 @@ class InMap:
 
     Parameters
     ----------
-    seed : of the errors. model : undeformed in the map.
+    seed : of the errors.
+    model : undeformed in the map.
     """
 
     def __init__(self, scene: Scene, model: ReducedModel, seed: int) -> None:

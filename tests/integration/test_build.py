@@ -112,16 +112,21 @@ def test_interrupted_build_solves_only_what_is_missing(built: Path) -> None:
     assert after == pytest.approx(before, abs=1e-7)
 
 
-def test_failed_samples_are_named_and_the_rest_is_kept(built: Path, tmp_path: Path, monkeypatch) -> None:
-    """A solver that gives up above a bulge of 11 mm: the model is still built, the certificate says so."""
+def give_up_above(bulge: float, monkeypatch) -> None:
+    """The solver gives up above so large a bulge."""
     solve = GrippedSheet.solve
 
     def limited(self, coordinates, start):
-        if coordinates[0] > 11e-3:
+        if coordinates[0] > bulge:
             raise SolverError("beyond the limit point")
         return solve(self, coordinates, start)
 
     monkeypatch.setattr(GrippedSheet, "solve", limited)
+
+
+def test_failed_samples_are_named_and_the_rest_is_kept(built: Path, tmp_path: Path, monkeypatch) -> None:
+    """A solver that gives up above a bulge of 11 mm: the model is still built, the certificate says so."""
+    give_up_above(11e-3, monkeypatch)
     (tmp_path / "study.toml").write_text(STUDY)
     build(tmp_path / "study.toml", tmp_path / "tiny.morph", executor=InProcess())
     failed = load_model(tmp_path / "tiny.morph").certificate["samples"]["failed"]
@@ -131,14 +136,7 @@ def test_failed_samples_are_named_and_the_rest_is_kept(built: Path, tmp_path: Pa
 
 
 def test_hopeless_range_is_refused_and_solved_samples_stay(tmp_path: Path, monkeypatch) -> None:
-    solve = GrippedSheet.solve
-
-    def limited(self, coordinates, start):
-        if coordinates[0] > 6.1e-3:
-            raise SolverError("beyond the limit point")
-        return solve(self, coordinates, start)
-
-    monkeypatch.setattr(GrippedSheet, "solve", limited)
+    give_up_above(6.1e-3, monkeypatch)
     (tmp_path / "study.toml").write_text(STUDY.replace('"12 mm"', '"60 mm"').replace("-12 mm", "-60 mm"))
     with pytest.raises(StudyError, match=r"of 32 samples could be solved; the first failure: beyond .* kept in"):
         build(tmp_path / "study.toml", tmp_path / "tiny.morph", executor=InProcess())

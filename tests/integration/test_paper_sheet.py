@@ -9,19 +9,18 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-import cv2
 import numpy as np
 import pytest
 
-from morph_dslam import MorphError, TrackOptions, load_model, track
+from morph_dslam import MorphError, load_model
 from morph_dslam.evaluation.evaluate import evaluate
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.mechanics.shell import OrthotropicSheet
 from morph_dslam.model import save_model
-from morph_dslam.render.simulation import simulate
 from morph_dslam.studies.problem import Snapshot
 from morph_dslam.studies.snapshots import load_snapshot
 from tests.support.real_data import ROOT
+from tests.support.scenes import film_and_track, write_texture
 
 RESULT = r"positions=(\d+) largest_mm=([\d.]+) pcr_path_N=([\d.]+) pcr_eigen_N=([\d.]+) seconds=(\d+)"
 
@@ -236,21 +235,9 @@ def test_a_flat_sheet_is_followed_to_whichever_side_it_bends(
 ) -> None:
     snapshots = [rolled(path) for path in np.linspace(0.0, 1.0, 81)]
     save_model(tmp_path / "sheet.morph", sides.tracked_model(snapshots, reduction.Grid((LENGTH, WIDTH), CELLS)))
-    noise = np.random.default_rng(3).integers(0, 256, (40, 60, 3)).astype(np.uint8)
-    cv2.imwrite(str(tmp_path / "print.png"), cv2.resize(noise, (900, 600), interpolation=cv2.INTER_CUBIC))
+    write_texture(tmp_path, (40, 60), (900, 600))
     (tmp_path / "scene.toml").write_text(SCENE)
-    sequence, run = tmp_path / "sequence", tmp_path / "run"
-    simulate(tmp_path / "scene.toml", sequence)
-    track(
-        TrackOptions(
-            frames=sequence / "frames",
-            model=tmp_path / "sheet.morph",
-            camera=sequence / "camera.yaml",
-            landmarks=sequence / "landmarks.csv",
-            output=run,
-            video=False,
-        )
-    )
+    _, sequence, run = film_and_track(tmp_path / "scene.toml", tmp_path / "sheet.morph")
     figures = evaluate(run, sequence / "truth.npz", 0)
     assert figures["n_frames_tracked"] == 19
     assert figures["mean_mm"] <= 0.5

@@ -2,16 +2,15 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
-from morph_dslam import TrackerOptions, TrackOptions, track
+from morph_dslam import TrackerOptions
 from morph_dslam.meshing.generators import block
 from morph_dslam.model import load_model
-from morph_dslam.render.simulation import simulate
 from morph_dslam.studies.build import build
 from morph_dslam.studies.study import make_study
+from tests.support.scenes import film_and_track, write_texture
 
 SIZE, CELLS = (0.16, 0.05, 0.006), (16, 4, 1)
 RATIO = 2.2
@@ -83,31 +82,19 @@ def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("bar")
     write_bar(path / "bar.inp")
     build(make_study(STUDY, path), path / "bar.morph")
-    noise = np.random.default_rng(3).integers(0, 256, (40, 60, 3)).astype(np.uint8)
-    cv2.imwrite(str(path / "print.png"), cv2.resize(noise, (900, 600), interpolation=cv2.INTER_CUBIC))
+    write_texture(path, (40, 60), (900, 600))
     return path
 
 
-def film_and_track(folder: Path, name: str, lift: float, frames: int) -> dict:
+def tracked(folder: Path, name: str, lift: float, frames: int) -> dict:
     """The summary of a tracked film in which the bar's end is lifted and let down."""
-    scene, sequence = folder / f"{name}.toml", folder / name
+    scene = folder / f"{name}.toml"
     scene.write_text(SCENE.format(frames=frames, middle=frames // 2, last=frames - 1, lift=lift, ratio=RATIO))
-    simulate(scene, sequence)
-    return track(
-        TrackOptions(
-            frames=sequence / "frames",
-            model=folder / "bar.morph",
-            camera=sequence / "camera.yaml",
-            landmarks=sequence / "landmarks.csv",
-            output=folder / f"{name}-run",
-            tracker=TrackerOptions(per_sequence=("ratio",)),
-            video=False,
-        )
-    )
+    return film_and_track(scene, folder / "bar.morph", tracker=TrackerOptions(per_sequence=("ratio",)))[0]
 
 
 def test_a_stiffness_ratio_is_estimated_over_a_sequence_with_an_interval_that_holds_it(folder):
-    summary = film_and_track(folder, "lifted", lift=55.0, frames=24)
+    summary = tracked(folder, "lifted", lift=55.0, frames=24)
     assert summary["n_tracked"] == 24
     (ratio,) = summary["one_over_the_sequence"]
     low, high = ratio["interval_95"]
@@ -117,7 +104,7 @@ def test_a_stiffness_ratio_is_estimated_over_a_sequence_with_an_interval_that_ho
 
 
 def test_a_stiffness_ratio_of_a_bar_that_is_not_bent_is_said_not_to_be_told(folder):
-    summary = film_and_track(folder, "straight", lift=0.0, frames=4)
+    summary = tracked(folder, "straight", lift=0.0, frames=4)
     (ratio,) = summary["one_over_the_sequence"]
     assert not ratio["observable"]
     assert any("'ratio' is unobservable" in flag for flag in summary["flags"])

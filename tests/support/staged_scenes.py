@@ -35,7 +35,7 @@ HEIGHT, REACH = 0.07, 0.02
 def bending_wedge(turned: bool = False, power: float = 2.0) -> ReducedModel:
     """The wedge of `rendered_object`, its top pushed along x and y as z²; ``turned``: twisted and raised.
 
-    ``power`` : another one than 2 is that of another material: 1 shears, 4 is soft at the top.
+    Another ``power`` than 2 is that of another material: 1 shears, 4 is soft at the top.
     """
     nodes, triangles, _ = wedge()
     x, y, z = (nodes - [0.045, 0.03, 0.0]).T
@@ -69,7 +69,8 @@ class Stage:
 
     Attributes
     ----------
-    coordinates : (n, 2) of the nodes in ``texture``. backdrop : (h, w) grey, behind all.
+    coordinates : (n, 2) of the nodes in ``texture``.
+    backdrop : (h, w) grey, behind all.
     """
 
     model: ReducedModel
@@ -133,7 +134,9 @@ class Scene:
 
     Attributes
     ----------
-    stage : that renders it. state : of the object at a time from 0 to 1. others : wrong models by name.
+    stage : that renders it.
+    state : of the object at a time from 0 to 1.
+    others : wrong models by name.
     beside : a step to the side, metres, that puts a second object just next to the first.
     """
 

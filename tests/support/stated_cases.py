@@ -35,12 +35,15 @@ class Outcome:
 
     Attributes
     ----------
-    said : the error, or the flags of the run and the reasons of lost frames. n_frames : of the recording.
-    n_tracked, n_lost : of them. n_beyond : off beyond what they state. n_wrong : those of them of which
-        neither the frame's reason nor, where the model is wrong, a flag of the registration says that they are
-        not to be relied on.
+    said : the error, or the flags of the run and the reasons of lost frames.
+    n_frames : of the recording.
+    n_tracked, n_lost : of them.
+    n_beyond : off beyond what they state.
+    n_wrong : those of them of which neither the frame's reason nor, where the model is wrong, a flag of the
+        registration says that they are not to be relied on.
     back_after : frames after the object could be seen whole again until it was tracked; None if it never was.
-    largest_error : of a tracked frame, metres; NaN without one. statuses : of the frames.
+    largest_error : of a tracked frame, metres; NaN without one.
+    statuses : of the frames.
     """
 
     said: tuple[str, ...]
@@ -60,8 +63,10 @@ class Shown:
 
     Attributes
     ----------
-    state : the true one of the object, None if it is absent. others : of more like it. cover, thing,
-    strangers : see `Stage.frame`. place : where the map has the object.
+    state : the true one of the object, None if it is absent.
+    others : of more like it.
+    cover, thing, strangers : see `Stage.frame`.
+    place : where the map has the object.
     """
 
     state: State | None

@@ -213,8 +213,7 @@ def bound_in(model, part, reference, state):
 def estimated(model, pictures):
     """What exact measurements of a later frame lead to, and by what.
 
-    ``pictures`` : in each, the reference state, what it was taken for, and the error_factors (9, c) of that
-        error.
+    Each of ``pictures`` has the reference state, what it was taken for, and the factors (9, c) of that error.
     """
     views, trackers = [], []
     estimator = RigEstimator(model, RIG, EstimationOptions(huber_px=50.0, max_iterations=50, tolerance=1e-9))

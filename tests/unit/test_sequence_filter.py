@@ -266,7 +266,7 @@ def change(left, taken, kept=(0, 1), besides=NOTHING):
 def followed(seed, views, lasting=0.8):
     """Twist errors and stated deviations when frames are compared with these ``views``, by number.
 
-    ``lasting`` : the part of the error's variance that stays with each point of each view.
+    ``lasting`` is the part of the error's variance that stays with each point of each view.
     """
     rng = np.random.default_rng(seed)
     of_points = np.sqrt(lasting) * SIGMA * rng.standard_normal((2, COUNT, 2))
