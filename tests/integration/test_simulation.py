@@ -110,67 +110,62 @@ def test_landmarks_are_mesh_nodes_with_their_pixels(moving, truth):
         np.testing.assert_allclose([u, v], expected, atol=1e-4)
 
 
-def flat_scene(folder, extra="", rotation="[180, 0, 0]"):
-    """A flat sheet face on at 0.6 m whose print is a smooth function of the place on it."""
-    x, y = np.meshgrid((np.arange(840) + 0.5) / 840 - 0.5, 0.5 - (np.arange(594) + 0.5) / 594)
-    cv2.imwrite(str(folder / "smooth.png"), np.rint(print_value(x, y)).astype(np.uint8))
-    tail = f"[[pose]]\nframe = 0\nposition_mm = [0, 0, 600]\nrotation_deg = {rotation}\n[light]\nambient = 1.0\n"
-    return write_scene(folder, top="frames = 1\n", tail=tail + extra, texture="smooth.png")
-
-
 def print_value(x, y):
     """Grey level at fractions x, y in [-0.5, 0.5] of the sheet, x to the right and y up."""
     return 120.0 + 60.0 * np.sin(14.0 * x) + 50.0 * np.cos(9.0 * y + 0.7)
 
 
-def expected_flat_image(folder):
-    """The picture of `flat_scene`, by the pinhole formula, and the pixels well inside the sheet."""
+def flat_picture(folder, extra="", rotation="[180, 0, 0]", light="ambient = 1.0\n"):
+    """A flat sheet face on at 0.6 m whose print is a smooth function of the place on it.
+
+    Returns
+    -------
+    picture : (h, w, 3)
+    expected : (h, w), by the pinhole formula.
+    inside : (h, w), the pixels well inside the sheet.
+    """
+    x, y = np.meshgrid((np.arange(840) + 0.5) / 840 - 0.5, 0.5 - (np.arange(594) + 0.5) / 594)
+    cv2.imwrite(str(folder / "smooth.png"), np.rint(print_value(x, y)).astype(np.uint8))
+    tail = f"[[pose]]\nframe = 0\nposition_mm = [0, 0, 600]\nrotation_deg = {rotation}\n[light]\n{light}{extra}"
+    scene = write_scene(folder, top="frames = 1\n", tail=tail, texture="smooth.png")
+    simulate(scene, folder / "sequence", progress=False)
     camera = load_camera(folder / "sequence" / "camera.yaml")
     rows, columns = np.indices((240, 320))
     x = (columns - camera.cx) / camera.fx * 0.6 / LENGTH
     y = -(rows - camera.cy) / camera.fy * 0.6 / WIDTH
-    return print_value(x, y), (np.abs(x) < 0.48) & (np.abs(y) < 0.48)
-
-
-def picture_of(scene):
-    """The only picture of a flat scene, the expected one, and the pixels well inside the sheet."""
-    simulate(scene, scene.parent / "sequence", progress=False)
-    (frame,) = open_source(scene.parent / "sequence" / "frames")
-    return frame.image, *expected_flat_image(scene.parent)
+    (frame,) = open_source(folder / "sequence" / "frames")
+    return frame.image.astype(float), print_value(x, y)[:, :, None], (np.abs(x) < 0.48) & (np.abs(y) < 0.48)
 
 
 def test_flat_sheet_face_on_shows_its_print(tmp_path):
-    image, expected, inside = picture_of(flat_scene(tmp_path))
-    difference = image.astype(float) - expected[:, :, None]
-    assert np.abs(difference[inside]).max() < 2.0
-    assert abs(difference[inside].mean()) < 0.4
+    picture, expected, inside = flat_picture(tmp_path)
+    difference = (picture - expected)[inside]
+    assert np.abs(difference).max() < 2.0
+    assert abs(difference.mean()) < 0.4
     np.testing.assert_allclose(read_depth(tmp_path)[0][inside], 0.6, rtol=1e-6)
 
 
 def test_noise_has_the_deviation_asked_for(tmp_path):
-    image, expected, inside = picture_of(flat_scene(tmp_path, "[sensor]\nnoise = 4.0\n"))
-    difference = (image.astype(float) - expected[:, :, None])[inside]
-    assert difference.std() == pytest.approx(4.0, rel=0.03)
+    picture, expected, inside = flat_picture(tmp_path, "[sensor]\nnoise = 4.0\n")
+    assert (picture - expected)[inside].std() == pytest.approx(4.0, rel=0.03)
 
 
 def test_back_of_the_sheet_has_its_colour(tmp_path):
-    image, _, inside = picture_of(flat_scene(tmp_path, rotation="[0, 0, 0]"))
-    assert (image[inside] == [218, 224, 226]).all()
+    picture, _, inside = flat_picture(tmp_path, rotation="[0, 0, 0]")
+    assert (picture[inside] == [218, 224, 226]).all()
 
 
 def test_lambert_light_from_the_side(tmp_path):
     light = "direction = [-0.6, 0.0, -0.8]\nambient = 0.25\n"
-    scene = flat_scene(tmp_path, rotation="[0, 0, 0]")
-    scene.write_text(scene.read_text().replace("ambient = 1.0\n", light))
-    image, _, inside = picture_of(scene)
+    picture, _, inside = flat_picture(tmp_path, rotation="[0, 0, 0]", light=light)
     # 0.25 + 0.75 cos, with the light 0.8 along the normal.
-    np.testing.assert_allclose(image[inside].mean(axis=0), 0.85 * np.array([218, 224, 226]), atol=0.6)
+    np.testing.assert_allclose(picture[inside].mean(axis=0), 0.85 * np.array([218, 224, 226]), atol=0.6)
 
 
 def test_outline_is_antialiased_at_the_right_place(tmp_path):
-    image, _, _ = picture_of(flat_scene(tmp_path, "[background]\ncolour = [0, 0, 0]\n"))
+    picture, _, _ = flat_picture(tmp_path, "[background]\ncolour = [0, 0, 0]\n")
     # The left edge falls on 158 px - 260 px * 210 mm / 600 mm = 67, the middle of a pixel.
-    row = image[121, :, 0].astype(float)
+    row = picture[121, :, 0]
     assert row[66] == 0.0
     assert row[67] == pytest.approx(row[68] / 2, rel=0.05)
     assert row[68] == pytest.approx(row[69], rel=0.1)
