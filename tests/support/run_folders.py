@@ -5,13 +5,12 @@ from __future__ import annotations
 import h5py
 import numpy as np
 
-from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.camera_files import save_camera
 from morph_dslam.model import SurfacePoints, save_model
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.rendered_sequence import CAMERA
 
-CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 FRAMES = np.arange(10, 16)
 
 

@@ -6,14 +6,13 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial import ConvexHull
 
-from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.tracking.binding import DrawnSurface, bind_pixels, draw_view, facing, nearest_surface_points, view_of
 from morph_dslam.tracking.estimator import BoundPoints, State
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.rendered_sequence import CAMERA
 
-CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 STATE = State(np.array([0.03, 0.2, 0.1]), RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6])))
 
 

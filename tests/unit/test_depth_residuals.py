@@ -10,8 +10,8 @@ from morph_dslam.tracking.estimator import Estimator, State, moved
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points, measured
+from tests.support.rendered_sequence import CAMERA
 
-CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 MODEL = bent_sheet_model(22, 16)
 POSE = RigidTransform(
     rotation_exp(np.array([0.2, -0.3, 0.05])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.02, -0.01, 0.6])

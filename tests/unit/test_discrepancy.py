@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from scipy.special import gamma, kv
 
-from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model.discrepancy import (
     Discrepancy,
@@ -20,8 +19,8 @@ from morph_dslam.tracking.estimator import Estimator, State
 from morph_dslam.tracking.refinement import Keyframe
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points, measured
+from tests.support.rendered_sequence import CAMERA
 
-CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 MODEL = bent_sheet_model(22, 16, known=1)
 POSE = RigidTransform(
     rotation_exp(np.array([0.15, -0.2, 0.05])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.02, -0.01, 0.6])

@@ -12,8 +12,8 @@ from morph_dslam.registration.messages import Ambiguity, Ambiguous, AtBound, Und
 from morph_dslam.tracking.estimator import State
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points
+from tests.support.rendered_sequence import CAMERA
 
-CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 POSE = RigidTransform(
     rotation_exp(np.array([0.25, -0.3, 0.1])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.02, -0.01, 0.6])
 )

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
@@ -26,8 +25,8 @@ from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model, sheet_mesh
 from tests.support.measured_points import bound_points, measured
+from tests.support.rendered_sequence import CAMERA
 
-CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 POSE = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
 
 

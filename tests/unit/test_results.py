@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel, SeparatedField, SurfacePoints
 from morph_dslam.model.functions import ParameterFunctions
@@ -19,8 +18,8 @@ from morph_dslam.tracking.run_folder import summarise
 from morph_dslam.tracking.run_notices import RunNotice, RunWarning, notices_of
 from morph_dslam.tracking.run_results import RunResults
 from tests.support.bent_sheet import PARAMETERS, bent_sheet_model
+from tests.support.rendered_sequence import CAMERA
 
-CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 FRONT = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
 MODEL = bent_sheet_model(22, 16)
 BACK = RigidTransform(np.diag([-1.0, -1.0, 1.0]), np.array([0.0, 0.0, 0.6]))

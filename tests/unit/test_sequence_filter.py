@@ -5,7 +5,6 @@ from functools import partial
 import numpy as np
 import pytest
 
-from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
 from morph_dslam.registration.registration import PosePrior
@@ -14,8 +13,8 @@ from morph_dslam.tracking.noise import window_correlation
 from morph_dslam.tracking.sequence_filter import PointChange, SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points, measured
+from tests.support.rendered_sequence import CAMERA
 
-CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 MODEL = bent_sheet_model(22, 16)
 ESTIMATOR = Estimator(MODEL, CAMERA)
 TWIST = 2

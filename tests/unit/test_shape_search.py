@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.registration.landmarks import shape_starts
@@ -12,8 +11,8 @@ from morph_dslam.tracking.frame_estimation import ShapeSearch, with_unobservable
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.bent_tube import bent_tube
 from tests.support.measured_points import bound_points
+from tests.support.rendered_sequence import CAMERA
 
-CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 POSE = RigidTransform(rotation_exp(np.array([0.3, -0.2, 0.0])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
 
 

@@ -3,15 +3,13 @@
 import numpy as np
 import pytest
 
-from morph_dslam.camera import Camera
 from morph_dslam.errors import TrackingError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.tracking.estimator import Estimator, State
 from morph_dslam.tracking.frame_estimation import at_constant_velocity, new_filter, temporal_facts
 from morph_dslam.tracking.options import TrackerOptions
 from tests.support.bent_sheet import PARAMETERS, bent_sheet_model
-
-CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
+from tests.support.rendered_sequence import CAMERA
 
 
 @pytest.mark.parametrize(
