@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from morph_dslam.cli.app import main
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
 from tests.support.rendered_anchored import make_anchored_recording
 from tests.support.rendered_anchored_rig import (
@@ -25,6 +26,23 @@ from tests.support.rendered_room import RoomFilm, hand_held, write_film
 
 def pytest_configure(config):
     cv2.setNumThreads(1)
+
+
+@pytest.fixture
+def refused(capsys):
+    """A function that runs a command, which must end with status 2 and one message, and returns the message."""
+
+    def message_of(*words) -> str:
+        capsys.readouterr()
+        try:
+            status = main([str(word) for word in words])
+        except SystemExit as usage:
+            status = usage.code
+        said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("morph")]
+        assert (status, len(said)) == (2, 1), said
+        return said[0]
+
+    return message_of
 
 
 @pytest.fixture(scope="session")

@@ -4,11 +4,12 @@ import subprocess
 import sys
 
 import cv2
+import meshio
 import numpy as np
 import pytest
 
 from morph_dslam.cli import app as cli
-from morph_dslam.errors import EvaluationError, MorphError, RegistrationError, TrackingError
+from morph_dslam.errors import EvaluationError, MorphError, RegistrationError, StudyError, TrackingError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.evaluation.run_report import write_run_report
 from morph_dslam.io.camera_files import load_camera
@@ -17,8 +18,9 @@ from morph_dslam.io.landmarks import load_landmarks
 from morph_dslam.io.trajectory import load_trajectory
 from morph_dslam.model import save_model
 from morph_dslam.registration.board import load_board
-from tests.support.bent_sheet import bent_sheet_model
+from morph_dslam.studies.study import load_study
 from tests.support.block_study import write_study
+from tests.support.documents import PROJECT
 from tests.support.run_folders import write_run
 from tests.support.small_models import block_model
 
@@ -30,36 +32,7 @@ rows = 3
 marker_mm = 30
 gap_mm = 9
 """
-STL = "solid t\n{}endsolid t\n".format(
-    "".join(
-        "facet normal 0 0 0\nouter loop\n"
-        + "".join("vertex {} {} {}\n".format(*corner) for corner in corners)
-        + "endloop\nendfacet\n"
-        for corners in (
-            [(40, 40, 40), (50, 60, 40), (60, 40, 40)],
-            [(40, 40, 40), (60, 40, 40), (50, 50, 60)],
-            [(60, 40, 40), (50, 60, 40), (50, 50, 60)],
-            [(50, 60, 40), (40, 40, 40), (50, 50, 60)],
-        )
-    )
-)
 CAMERA = "width: 640\nheight: 480\nfx: 528\nfy: 528\ncx: 319.5\ncy: 239.5\n"
-
-
-def message_of(capsys, *arguments):
-    """The one line with which a command refuses its arguments."""
-    status = cli.main([str(argument) for argument in arguments])
-    lines = capsys.readouterr().err.splitlines()
-    assert status == 2
-    assert len(lines) == 1
-    return lines[0]
-
-
-def refused_by_parser(capsys, *arguments):
-    with pytest.raises(SystemExit) as caught:
-        cli.main([str(argument) for argument in arguments])
-    assert caught.value.code == 2
-    return capsys.readouterr().err.splitlines()[-1]
 
 
 @pytest.fixture
@@ -67,52 +40,52 @@ def folder(tmp_path):
     (tmp_path / "file").write_text("hello\n")
     (tmp_path / "camera.yaml").write_text(CAMERA)
     (tmp_path / "board.toml").write_text(BOARD)
-    (tmp_path / "tumour.stl").write_text(STL)
+    tumour = [[40, 40, 40], [50, 60, 40], [60, 40, 40], [50, 50, 60]]
+    faces = [[0, 1, 2], [0, 2, 3], [2, 1, 3], [1, 0, 3]]
+    meshio.Mesh(np.array(tumour, dtype=float), [("triangle", np.array(faces))]).write(tmp_path / "tumour.ply")
     save_model(tmp_path / "block.morph", block_model("tucker"))
-    save_model(tmp_path / "sheet.morph", bent_sheet_model(7, 5))
     return tmp_path
 
 
 @pytest.mark.parametrize("name", ["", "file/t.h5", "absent/t.h5"])
-def test_an_inner_structure_that_cannot_be_written(folder, capsys, name):
-    command = ["inner", folder / "tumour.stl", "--model", folder / "block.morph", "--unit", "mm"]
+def test_an_inner_structure_that_cannot_be_written(folder, refused, name):
+    command = ["inner", folder / "tumour.ply", "--model", folder / "block.morph", "--unit", "mm"]
     assert cli.main([str(argument) for argument in [*command, "-o", folder / "tumour.h5"]]) == 0
-    capsys.readouterr()
-    assert "cannot write the inner structure" in message_of(capsys, *command, "-o", folder / name)
+    assert "cannot write the inner structure" in refused(*command, "-o", folder / name)
 
 
 @pytest.mark.parametrize("name", ["board", "board.jpg", "", "absent/board.png", "file/board.pdf"])
-def test_a_board_that_cannot_be_written(folder, capsys, name):
+def test_a_board_that_cannot_be_written(folder, refused, name):
     before = sorted(folder.parent.iterdir())
-    assert "cannot write the board to" in message_of(capsys, "board", folder / "board.toml", "-o", folder / name)
+    assert "cannot write the board to" in refused("board", folder / "board.toml", "-o", folder / name)
     assert sorted(folder.parent.iterdir()) == before
 
 
-def test_a_board_in_the_wrong_unit(folder, capsys):
+def test_a_board_in_the_wrong_unit(folder, refused):
     (folder / "board.toml").write_text(BOARD.replace("30", "3e9"))
-    assert "sizes are in millimetres" in message_of(capsys, "board", folder / "board.toml", "-o", folder / "board.png")
+    assert "sizes are in millimetres" in refused("board", folder / "board.toml", "-o", folder / "board.png")
     (folder / "board.toml").write_text(BOARD + "[object]\nposition_mm = [1e300, 0, 0]\n")
     with pytest.raises(RegistrationError, match="position_mm"):
         load_board(folder / "board.toml")
 
 
-def test_a_model_file_is_no_folder_and_workers_are_counted(folder, capsys):
+def test_a_model_file_is_no_folder_and_workers_are_counted(folder, refused):
     study = write_study(folder)
-    assert "give the name of the model file" in message_of(capsys, "build", study, "-o", folder)
+    assert "give the name of the model file" in refused("build", study, "-o", folder)
     for workers in ("0", "-1", "two"):
-        said = refused_by_parser(capsys, "build", study, "-o", folder / "b.morph", f"--workers={workers}")
+        said = refused("build", study, "-o", folder / "b.morph", f"--workers={workers}")
         assert "is not a whole number above zero" in said
 
 
-def test_a_calibration_is_written_where_it_can_be_read(folder, capsys):
+def test_a_calibration_is_written_where_it_can_be_read(folder, refused):
     command = ["calibrate", folder, "--board", "9x6", "--square", "25 mm", "-o"]
-    assert "has the ending .yaml" in message_of(capsys, *command, folder / "camera.png")
+    assert "has the ending .yaml" in refused(*command, folder / "camera.png")
 
 
 @pytest.mark.parametrize("seconds", ["-1", "0", "nan", "inf", "soon"])
-def test_a_length_of_time_is_above_zero(capsys, seconds):
+def test_a_length_of_time_is_above_zero(refused, seconds):
     command = ["live", "webcam:0", "--model", "m", "--camera", "c", "--landmarks", "l", "-o", "r"]
-    assert "is not a number above zero" in refused_by_parser(capsys, *command, f"--seconds={seconds}")
+    assert "is not a number above zero" in refused(*command, f"--seconds={seconds}")
 
 
 def test_nothing_but_our_message_is_printed_of_a_damaged_video(folder):
@@ -131,14 +104,14 @@ def test_nothing_but_our_message_is_printed_of_a_damaged_video(folder):
     assert "cannot be opened as a video" in line
 
 
-def test_options_without_effect_are_refused(folder, capsys):
+def test_options_without_effect_are_refused(folder, refused):
     output = ["-o", folder / "run"]
     slam = ["slam", folder, "--camera", folder / "camera.yaml", *output]
-    assert "--images says what" in message_of(capsys, *slam, "--images", folder)
-    assert "is not a frame number" in refused_by_parser(capsys, *slam, "--freeze-at=-1")
-    said = message_of(capsys, "evaluate", folder, "--points", "truth.npz", "--base-frame", 0)
+    assert "--images says what" in refused(*slam, "--images", folder)
+    assert "is not a frame number" in refused(*slam, "--freeze-at=-1")
+    said = refused("evaluate", folder, "--points", "truth.npz", "--base-frame", 0)
     assert "go with --depth" in said
-    said = message_of(capsys, "evaluate", folder, "--trajectory", "truth.txt", "--bind-frame", 0)
+    said = refused("evaluate", folder, "--trajectory", "truth.txt", "--bind-frame", 0)
     assert "goes with --points" in said
 
 
@@ -181,27 +154,44 @@ def test_a_folder_that_holds_a_run_or_cannot_be_made(tmp_path):
 
 
 @pytest.mark.parametrize("start", ["board", "picture", "guess"])
-def test_a_reference_that_is_to_be_refined_without_landmarks(tmp_path, capsys, start):
+def test_a_reference_that_is_to_be_refined_without_landmarks(tmp_path, refused, start):
     """It would be tracked as it is, and the option have no effect."""
     arguments = ("track", "film", "--model", "m.morph", "--camera", "c.yaml", f"--{start}", "start.toml")
-    assert "start from landmarks, or leave out --refine" in message_of(
-        capsys, *arguments, "--refine", "-o", tmp_path / "run"
-    )
+    assert "start from landmarks, or leave out --refine" in refused(*arguments, "--refine", "-o", tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("command", ["track", "live"])
 @pytest.mark.parametrize("option", [["--show", "strain"], ["--section", "x=3"]])
-def test_what_a_video_is_to_show_that_is_not_drawn(tmp_path, capsys, command, option):
+def test_what_a_video_is_to_show_that_is_not_drawn(tmp_path, refused, command, option):
     arguments = (command, "film", "--model", "m.morph", "--camera", "c.yaml", "--landmarks", "l.csv")
-    assert "leave them or --no-video out" in message_of(
-        capsys, *arguments, "-o", tmp_path / "run", "--no-video", *option
-    )
+    assert "leave them or --no-video out" in refused(*arguments, "-o", tmp_path / "run", "--no-video", *option)
 
 
-def test_a_random_walk_whose_square_overflows(capsys):
+def test_a_random_walk_whose_square_overflows(refused):
     arguments = ["track", "film", "--model", "m", "--camera", "c", "--landmarks", "l", "-o", "run"]
-    with pytest.raises(SystemExit) as caught:
-        cli.main([*arguments, "--random-walk", "arch=1e300"])
-    assert caught.value.code == 2
-    assert "'arch=1e300' is not a name and a positive number" in capsys.readouterr().err
+    said = refused(*arguments, "--random-walk", "arch=1e300")
+    assert "'arch=1e300' is not a name and a positive number" in said
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (("[grips]", "[grips]\ncolour = 3"), "unknown key grips.colour; known here: depth, height"),
+        (('length = "297 mm"', "length = 297"), "sheet.length: write the value with its unit"),
+        (('length = "297 mm"', 'length = "297 deg"'), "'deg' is not a unit of length"),
+        (('length = "297 mm"\n', ""), "sheet.length is missing"),
+        (('bulge = ["-34 mm", "34 mm"]', 'bulge = ["34 mm", "-34 mm"]'), "bulge"),
+        (("[sheet]", "[sheet"), "not a TOML file"),
+    ],
+)
+def test_mistakes_in_a_study_are_named_with_its_file(tmp_path, change, expected):
+    text = (PROJECT / "examples" / "demo" / "study.toml").read_text()
+    assert change[0] in text
+    (tmp_path / "study.toml").write_text(text.replace(*change))
+    with pytest.raises(StudyError) as caught:
+        load_study(tmp_path / "study.toml")
+    assert expected in str(caught.value)
+    assert "study.toml" in str(caught.value)
+    with pytest.raises(StudyError, match="cannot read the study file"):
+        load_study(tmp_path / "absent.toml")

@@ -113,15 +113,12 @@ def test_a_frame_whose_depth_is_all_of_something_else_is_counted_and_not_drawn(t
         (["depth.h5", "--depth-per-metre", "1000"], "--depth-per-metre is for a folder of depth images"),
     ],
 )
-def test_what_cannot_be_compared_is_one_message(folder, capsys, arguments, message):
+def test_what_cannot_be_compared_is_one_message(folder, refused, arguments, message):
     parent = folder.parent
     (parent / "small").mkdir(exist_ok=True)
     cv2.imwrite(str(parent / "small" / "11.png"), np.full((24, 32), 600, np.uint16))
     (parent / "broken.h5").write_bytes((parent / "depth.h5").read_bytes()[:3000])
-    assert main(["evaluate", str(folder), "--depth", str(parent / arguments[0]), *arguments[1:]]) == 2
-    captured = capsys.readouterr()
-    assert message in captured.err
-    assert captured.err.count("\n") == 1
+    assert message in refused("evaluate", folder, "--depth", parent / arguments[0], *arguments[1:])
 
 
 TRIANGLE = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 4.0, 0.0]])

@@ -54,12 +54,9 @@ def test_evaluate_writes_figures_pictures_and_report_and_ends_with_the_result(ru
 @pytest.mark.parametrize(
     ("frame", "message"), [("12", "frame 12 was not tracked (too few points)"), ("77", "the truth has no frame 77")]
 )
-def test_a_frame_that_cannot_bind_is_one_message(run_and_truth, capsys, frame, message):
+def test_a_frame_that_cannot_bind_is_one_message(run_and_truth, refused, frame, message):
     run, truth = run_and_truth
-    assert main(["evaluate", str(run), "--points", str(truth), "--bind-frame", frame]) == 2
-    captured = capsys.readouterr()
-    assert message in captured.err
-    assert captured.err.count("\n") == 1
+    assert message in refused("evaluate", run, "--points", truth, "--bind-frame", frame)
     assert not (run / "evaluation.json").exists()
 
 

@@ -13,7 +13,6 @@ import threading
 import numpy as np
 import pytest
 
-from morph_dslam.cli import app as cli
 from morph_dslam.explorer.server import make_server
 from morph_dslam.io.local_server import HOST
 from morph_dslam.model import save_model
@@ -155,14 +154,13 @@ def test_only_this_computer_is_answered(serve):
         assert get("/model.json", host=host)[0] == status
 
 
-def test_a_port_that_is_taken(serve, tmp_path, capsys):
+def test_a_port_that_is_taken(tmp_path, refused):
     model = stretched_block_model()
     save_model(tmp_path / "block.morph", model)
     with make_server(model, 0) as server:
         port = str(server.server_address[1])
         for taken in (port, "70000"):
-            assert cli.main(["explore", str(tmp_path / "block.morph"), "--port", taken]) == 2
-            assert f"morph: port {taken} cannot be taken" in capsys.readouterr().err
+            assert f"port {taken} cannot be taken" in refused("explore", tmp_path / "block.morph", "--port", taken)
 
 
 def test_the_command_serves_until_it_is_interrupted(tmp_path):

@@ -227,7 +227,6 @@ def test_states_that_cannot_be_are_refused(choice, message, tmp_path):
         choice.states(stretched_block_model())
 
 
-def test_a_folder_that_cannot_be_written_is_refused(folder, tmp_path, capsys):
+def test_a_folder_that_cannot_be_written_is_refused(folder, tmp_path, refused):
     (tmp_path / "file").write_text("")
-    assert cli.main(["export", str(folder / "block.morph"), "-o", str(tmp_path / "file" / "out")]) == 2
-    assert "morph: cannot write to" in capsys.readouterr().err
+    assert "cannot write to" in refused("export", folder / "block.morph", "-o", tmp_path / "file" / "out")

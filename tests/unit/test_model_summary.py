@@ -100,7 +100,10 @@ def test_info_prints_the_whole_certificate(tmp_path, capsys):
     printed = capsys.readouterr().out
     words = " ".join(printed.split())
     for fact in (
+        "nodes 12",
+        "triangles 20",
         "hex8 cells 2",
+        "extent 80 x 40 x 40 mm",
         "stretch -0.2 to 0.2, default 0; strain along x",
         "slide -10 to 10 mm, default 0; motion of the top along x",
         "Cauchy stress 2 polynomials",
@@ -118,6 +121,7 @@ def test_info_prints_the_whole_certificate(tmp_path, capsys):
     ):
         assert fact in words
     assert "singular" not in printed
+    assert "name = 'x'" not in printed
     assert max(len(line) for line in printed.splitlines()) < 140
 
 
