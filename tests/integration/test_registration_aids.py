@@ -21,8 +21,6 @@ from morph_dslam.registration.initialization import InitializerFiles
 from morph_dslam.registration.messages import Ambiguous, AssumedUndeformed
 from morph_dslam.registration.picture import PictureInitializer, load_picture
 from morph_dslam.registration.registration import load_registration
-from morph_dslam.render.rasteriser import rasterise
-from morph_dslam.render.texture import render_textured
 from morph_dslam.slam.map_files import save_map
 from morph_dslam.slam.rigid_map import GOOD, Keyframe, RigidMap
 from morph_dslam.tracking.estimator import Estimator
@@ -30,7 +28,7 @@ from morph_dslam.tracking.patches import normalize_contrast
 from morph_dslam.tracking.relocalization import LEAST_MATCHES, state_from_matches
 from morph_dslam.tracking.state import BoundPoints, State
 from tests.support.bent_sheet import LENGTH, WIDTH
-from tests.support.rendered_sequence import CAMERA, write_landmarks
+from tests.support.rendered_sequence import CAMERA, mean_error, write_landmarks, write_recording
 from tests.support.staged_scenes import SCENES, aside
 
 GRID = """
@@ -45,6 +43,13 @@ position_mm = [20, -40, -15]
 rotation_deg = [10, 5, 30]
 """
 CHARUCO = GRID.replace('"grid"', '"charuco"').replace("gap_mm = 9", "square_mm = 40").replace("36h11", "25h9")
+PICTURE = """
+image = "print.png"
+[rectangle]
+corner_mm = [-210, 148.5, 0]
+right_mm = [420, 0, 0]
+down_mm = [0, -297, 0]
+"""
 BOARD_POSE = RigidTransform(rotation_exp(np.array([0.35, -0.5, 0.2])), np.array([-0.06, -0.05, 0.55]))
 
 
@@ -60,31 +65,20 @@ def written(folder, text):
 
 
 def picture_of(board: FiducialBoard, pose: RigidTransform, noise=2.0):
-    """A print (h, w) with a white margin of 2 cm in the camera, in front of grey."""
-    density, margin = 8000.0, 0.02
+    """A print (h, w) with a white margin of 2 cm in the camera, in front of grey: a plane's homography."""
+    density, margin, fine = 4000.0, 0.02, 4
     print_ = cv2.copyMakeBorder(board.image(density), *[int(margin * density)] * 4, cv2.BORDER_CONSTANT, value=255)
-    width, height = board.size
-    a, b = np.meshgrid(np.linspace(-margin, width + margin, 30), np.linspace(-margin, height + margin, 30))
-    nodes = np.column_stack([a.ravel(), b.ravel(), np.zeros(a.size)])
-    i = np.arange(900).reshape(30, 30)
-    p, q, r, s = (part.ravel() for part in (i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]))
-    triangles = np.concatenate([np.column_stack([p, q, r]), np.column_stack([p, r, s])])
-    local = pose.apply(nodes)
-    fine = 4
-    pixels = fine * (CAMERA.project(local) + 0.5) - 0.5
-    buffers = rasterise(pixels, local[:, 2], triangles, fine * CAMERA.height, fine * CAMERA.width)
-    coordinates = (nodes[:, :2] + margin) * density - 0.5
-    image = render_textured(buffers, triangles, coordinates, print_).astype(float)
-    image[~buffers.covered] = 120.0
+    # Pixel (0, 0) is the centre of the first one, of the print, the picture and the finer one.
+    corner = 0.5 / density - margin
+    board_from_print = np.array([[1 / density, 0, corner], [0, 1 / density, corner], [0, 0, 1]])
+    image_from_board = CAMERA.matrix @ np.column_stack([pose.rotation[:, :2], pose.translation])
+    shift = (fine - 1) / 2
+    finer = np.array([[fine, 0, shift], [0, fine, shift], [0, 0, 1]])
+    size = (fine * CAMERA.width, fine * CAMERA.height)
+    image = cv2.warpPerspective(print_, finer @ image_from_board @ board_from_print, size, borderValue=120)
     image = cv2.resize(image, (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_AREA)
-    image += noise * np.random.default_rng(0).standard_normal(image.shape)
-    return np.clip(image, 0, 255).astype(np.uint8)
-
-
-def mean_distance(model, one, other):
-    """Of the nodes of two states in the camera frame, millimetres."""
-    a, b = (s.camera_from_object.apply(model.positions(s.parameters)) for s in (one, other))
-    return 1e3 * np.linalg.norm(a - b, axis=1).mean()
+    noisy = image + noise * np.random.default_rng(0).standard_normal(image.shape)
+    return np.clip(noisy, 0, 255).astype(np.uint8)
 
 
 @pytest.mark.parametrize("text", [GRID, CHARUCO], ids=["apriltag grid", "charuco"])
@@ -107,7 +101,7 @@ def test_an_object_on_a_board_is_where_the_file_says(tmp_path, scene):
     placed = BoardInitializer(board).register(scene.model, CAMERA, picture_of(board, BOARD_POSE))
     turn = Rotation.from_euler("xyz", [10, 5, 30], degrees=True).as_matrix()
     truth = BOARD_POSE @ RigidTransform(turn, np.array([0.020, -0.040, -0.015]))
-    assert mean_distance(scene.model, placed.state, State(scene.model.default, truth)) < 1.0
+    assert 1e3 * mean_error(scene.model, placed.state, State(scene.model.default, truth)) < 1.0
     assert placed.warnings == (AssumedUndeformed(),)
     off = placed.state.camera_from_object.translation - truth.translation
     d = len(scene.model.parameters)
@@ -179,7 +173,7 @@ def test_a_board_in_a_map_tells_the_unit_and_the_place(tmp_path, scene):
     assert placed.facts["map_units_per_metre"] == pytest.approx(3.7, rel=2e-3)
     turn = Rotation.from_euler("xyz", [10, 5, 30], degrees=True).as_matrix()
     truth = pose @ RigidTransform(turn, np.array([0.020, -0.040, -0.015]))
-    assert mean_distance(scene.model, placed.state, State(scene.model.default, truth)) < 1.5
+    assert 1e3 * mean_error(scene.model, placed.state, State(scene.model.default, truth)) < 1.5
     assert placed.covariance is not None
     # The folder may be moved as a whole.
     content = json.loads((tmp_path / "place" / "registration.json").read_text())
@@ -198,10 +192,10 @@ def grey(scene, states):
 def test_a_picture_of_the_print_places_a_bent_sheet(scene):
     truth = scene.state(0.3)
     by_rectangle = print_on_sheet(scene).register(scene.model, CAMERA, grey(scene, [truth]))
-    assert mean_distance(scene.model, by_rectangle.state, truth) < 3.0
+    assert 1e3 * mean_error(scene.model, by_rectangle.state, truth) < 3.0
     by_nodes = PictureInitializer(scene.stage.texture, None, scene.stage.coordinates)
     placed = by_nodes.register(scene.model, CAMERA, grey(scene, [truth]))
-    assert mean_distance(scene.model, placed.state, truth) < 1.5
+    assert 1e3 * mean_error(scene.model, placed.state, truth) < 1.5
     assert placed.facts["n_agreeing"] > 200
     assert not placed.ambiguous
 
@@ -220,10 +214,7 @@ def test_a_second_sheet_with_the_print_is_told_and_another_print_is_refused(scen
 def test_a_picture_file_is_read_and_its_mistakes_named(tmp_path, scene):
     cv2.imwrite(str(tmp_path / "print.png"), scene.stage.texture)
     path = tmp_path / "picture.toml"
-    path.write_text(
-        'image = "print.png"\n[rectangle]\ncorner_mm = [-210, 148.5, 0]\nright_mm = [420, 0, 0]\n'
-        "down_mm = [0, -297, 0]\n"
-    )
+    path.write_text(PICTURE)
     read = load_picture(path)
     np.testing.assert_allclose(read.rectangle, print_on_sheet(scene).rectangle)
     np.testing.assert_array_equal(read.image, scene.stage.texture)
@@ -250,8 +241,8 @@ def test_a_guess_is_refined_to_a_hundredth_of_the_distance(name):
     truth = scene.state(0.0)
     guess = guess_near(scene, truth, np.array([6e-3, -5e-3, 8e-3]), [0.02, -0.03, 0.03])
     placed = guess.register(scene.model, scene.stage.camera, grey(scene, [truth]))
-    off = mean_distance(scene.model, placed.state, truth)
-    assert off < mean_distance(scene.model, guess.state(scene.model), truth)
+    off = 1e3 * mean_error(scene.model, placed.state, truth)
+    assert off < 1e3 * mean_error(scene.model, guess.state(scene.model), truth)
     assert off < 25.0 * truth.camera_from_object.translation[2]
     assert placed.facts["outline_on_edges"] > 0.8
     assert placed.facts["by_chance"] < 0.15
@@ -273,17 +264,13 @@ def test_a_guess_that_the_image_contradicts_is_refused(name):
 def recording(tmp_path_factory, scene):
     """Twelve frames of the sheet, which jumps to another place behind a covered camera at frame 6."""
     folder = tmp_path_factory.mktemp("recording")
-    (folder / "frames").mkdir()
-    for number in range(12):
-        image = scene.stage.frame([state_of(scene, number)], cover=1.0 if number in (4, 5) else 0.0)
-        cv2.imwrite(str(folder / "frames" / f"{number:06d}.png"), image)
-    save_model(folder / "sheet.morph", scene.model)
-    save_camera(folder / "camera.yaml", CAMERA)
+    images = {
+        number: scene.stage.frame([state_of(scene, number)], cover=1.0 if number in (4, 5) else 0.0)
+        for number in range(12)
+    }
+    write_recording(folder, images, scene.model)
     cv2.imwrite(str(folder / "print.png"), scene.stage.texture)
-    (folder / "picture.toml").write_text(
-        'image = "print.png"\n[rectangle]\ncorner_mm = [-210, 148.5, 0]\nright_mm = [420, 0, 0]\n'
-        "down_mm = [0, -297, 0]\n"
-    )
+    (folder / "picture.toml").write_text(PICTURE)
     return folder
 
 
@@ -304,9 +291,8 @@ def frames_of(summary, kind):
 
 def error_mm(scene, run, row):
     """Mean distance of the nodes from the truth in one frame."""
-    truth = state_of(scene, run.frames[row])
-    expected = truth.camera_from_object.apply(scene.model.positions(truth.parameters))
-    return 1e3 * np.linalg.norm(run.camera_points(row) - expected, axis=1).mean()
+    found = State(run.parameters[row], RigidTransform.from_matrix(run.camera_from_object[row]))
+    return 1e3 * mean_error(scene.model, found, state_of(scene, run.frames[row]))
 
 
 def test_a_run_starts_from_a_picture_and_is_registered_anew(recording, scene, tmp_path):

@@ -109,10 +109,10 @@ def test_options_without_effect_are_refused(folder, refused):
     slam = ["slam", folder, "--camera", folder / "camera.yaml", *output]
     assert "--images says what" in refused(*slam, "--images", folder)
     assert "is not a frame number" in refused(*slam, "--freeze-at=-1")
-    said = refused("evaluate", folder, "--points", "truth.npz", "--base-frame", 0)
-    assert "go with --depth" in said
-    said = refused("evaluate", folder, "--trajectory", "truth.txt", "--bind-frame", 0)
-    assert "goes with --points" in said
+    assert "go with --depth" in refused("evaluate", folder, "--points", "truth.npz", "--base-frame", 0)
+    assert "goes with --points" in refused("evaluate", folder, "--trajectory", "truth.txt", "--bind-frame", 0)
+    assert "--points needs --bind-frame N" in refused("evaluate", folder, "--points", "truth.npz")
+    assert "there is no trajectory" in refused("evaluate", folder / "absent", "--trajectory", "truth.txt")
 
 
 @pytest.mark.parametrize(

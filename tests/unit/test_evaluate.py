@@ -51,15 +51,6 @@ def test_evaluate_writes_figures_pictures_and_report_and_ends_with_the_result(ru
     assert not re.search(r'(src|href)="(http|/)', page)  # self-contained
 
 
-@pytest.mark.parametrize(
-    ("frame", "message"), [("12", "frame 12 was not tracked (too few points)"), ("77", "the truth has no frame 77")]
-)
-def test_a_frame_that_cannot_bind_is_one_message(run_and_truth, refused, frame, message):
-    run, truth = run_and_truth
-    assert message in refused("evaluate", run, "--points", truth, "--bind-frame", frame)
-    assert not (run / "evaluation.json").exists()
-
-
 @pytest.fixture
 def results():
     """What a tracker returns that follows `states`, and loses the third frame."""

@@ -112,17 +112,6 @@ def test_the_command_writes_figures_and_a_picture(tmp_path, capsys):
     assert (run / "trajectory_evaluation.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["absent", "--trajectory", "truth.txt"], "there is no trajectory absent"),
-        (["absent", "--points", "truth.npz"], "--points needs --bind-frame N"),
-    ],
-)
-def test_the_command_refuses(words, message, refused):
-    assert message in refused("evaluate", *words)
-
-
 def test_published_figures_of_freiburg1_xyz():
     folder = real_data("trajectories")
     estimate, truth = match(
