@@ -43,7 +43,7 @@ def keys_of(*roots: type[BaseModel]) -> set[str]:
 @pytest.mark.parametrize(
     ("pages", "roots", "n_keys"),
     [
-        (["scene-file"], [Scene], 50),
+        (["scene-file"], [Scene], 40),
         (["cameras"], [_CameraFile], 8),
         (["registration-aids"], [BoardFile, PictureFile, GuessFile], 15),
         (["solid-study"], [SolidStudy, ExternalStudy], 70),
