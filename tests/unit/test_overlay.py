@@ -4,7 +4,7 @@ import matplotlib
 import numpy as np
 import pytest
 
-from morph_dslam.render.overlay import draw_overlay, paint_surface
+from morph_dslam.render.overlay import BarSide, draw_overlay, paint_surface
 from morph_dslam.render.shading import colour_bar, colour_table, lambert, vertex_normals
 from tests.support.bent_sheet import LENGTH, bent_sheet_model
 
@@ -52,6 +52,17 @@ def test_colour_bar_runs_from_high_at_the_top_to_low_at_the_bottom():
     top, bottom = (np.argwhere((bar == colour).all(axis=2)) for colour in (table[255], table[0]))
     assert top[:, 0].max() < 20
     assert bottom[:, 0].min() > 180
+
+
+def test_the_colour_bar_makes_room_for_the_object_and_does_not_jump():
+    side, bar, found = BarSide(), np.zeros((140, 60, 3), dtype=np.uint8), []
+    for left, right in ((100, 200), (100, 310), (30, 310), (200, 310), (20, 120)):
+        picture = np.zeros((240, 320, 3), dtype=np.uint8)
+        corners = np.array([[left, 20.0], [right, 20.0], [right, 200.0], [left, 200.0]])
+        painted = paint_surface(picture, corners, np.ones(4), TRIANGLES, np.zeros(4), np.zeros((256, 3)))
+        found.append(side.column(painted, bar, 5, 320))
+    # In the middle; on the right; on both sides, where it stays; on the right; on the left.
+    assert found == [255, 5, 5, 5, 255]
 
 
 def test_surface_out_of_sight_and_flat_range_still_draw():

@@ -13,6 +13,8 @@ from morph_dslam.render.rasteriser import image_region, rasterise
 from morph_dslam.render.shading import colour_bar, colour_table, text_patch
 
 Array = NDArray[np.float64]
+#: The colour bar changes sides where more than this share of it would lie on the object.
+MOST_UNDER_BAR = 0.02
 
 
 @njit(cache=True, nogil=True)
@@ -55,6 +57,13 @@ class _Painted:
 
     covered: NDArray[np.bool_]
     corner: tuple[int, int]
+
+    def share(self, top: int, left: int, panel: NDArray[np.uint8]) -> float:
+        """The share of a panel at (top, left) of the image that lies on the surface."""
+        column, row = max(left - self.corner[0], 0), max(top - self.corner[1], 0)
+        last = (top + panel.shape[0] - self.corner[1], left + panel.shape[1] - self.corner[0])
+        below = self.covered[row : max(last[0], 0), column : max(last[1], 0)]
+        return np.count_nonzero(below) / (panel.shape[0] * panel.shape[1])
 
     def box(self) -> tuple[int, int, int, int] | None:
         """First and last row, first and last column that are covered, in the image; None if none is."""
@@ -117,6 +126,25 @@ def paint_surface(
     return _Painted(buffers.covered, corner)
 
 
+class BarSide:
+    """On which side of the image the colour bar stands: on the right, until the object is there and not on the left.
+
+    One of them serves a whole video, so that the bar does not jump to and fro.
+    """
+
+    def __init__(self) -> None:
+        self.is_left = False
+
+    def column(self, painted: _Painted, bar: NDArray[np.uint8], top: int, width: int) -> int:
+        """The first column of the bar in an image of a width, ``top`` pixels away from its edges."""
+        left, right = top, width - top - bar.shape[1]
+        on_left, on_right = painted.share(top, left, bar), painted.share(top, right, bar)
+        here, there = (on_left, on_right) if self.is_left else (on_right, on_left)
+        if here > MOST_UNDER_BAR and there < 0.5 * here:
+            self.is_left = not self.is_left
+        return left if self.is_left else right
+
+
 def draw_overlay(
     image: NDArray[np.uint8],
     pixels: Array,
@@ -131,6 +159,7 @@ def draw_overlay(
     brightness: Array | None = None,
     caption: str = "",
     closed: bool = False,
+    side: BarSide | None = None,
 ) -> NDArray[np.uint8]:
     """Draw a surface coloured by a field over an image.
 
@@ -147,6 +176,7 @@ def draw_overlay(
     brightness : (n,) factor on the colour at each node, for example from `shading.lambert`; 1 by default.
     caption : a line of text for the lower left corner.
     closed : see `rasterise`.
+    side : of the colour bar, kept from frame to frame; chosen by this image alone if None.
 
     Returns
     -------
@@ -161,7 +191,7 @@ def draw_overlay(
     _draw_outline(result, painted)
     margin = round(0.02 * height)
     bar = colour_bar(round(0.6 * height), float(low), float(high), label, colour_map, scale)
-    _blend_panel(result, bar, margin, width - margin - bar.shape[1])
+    _blend_panel(result, bar, margin, (side or BarSide()).column(painted, bar, margin, width))
     if caption:
         line = text_patch(caption, scale)
         _blend_panel(result, line, height - margin - line.shape[0], margin)

@@ -21,7 +21,7 @@ from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.inner_structure import CarriedStructure
 from morph_dslam.model.reduced_model import MaterialPoints, von_mises
-from morph_dslam.render.overlay import draw_inner_surface, draw_overlay
+from morph_dslam.render.overlay import BarSide, draw_inner_surface, draw_overlay
 from morph_dslam.render.shading import lambert, text_patch, vertex_normals
 from morph_dslam.sources import FrameSource
 from morph_dslam.tracking.binding import DrawnSurface, View, facing
@@ -206,7 +206,7 @@ class AugmentedView:
         inner: Sequence[CarriedStructure] = (),
     ) -> None:
         options = options or DrawOptions()
-        self._camera, self._inner, self._model = camera, inner, model
+        self._camera, self._inner, self._model, self._side = camera, inner, model, BarSide()
         self.show = shown_field(model, options.show)
         self._points, self._triangles = _drawn_mesh(model, options.section)
         self._closed = options.section is None and DrawnSurface.of(model).closed
@@ -301,6 +301,7 @@ class AugmentedView:
             brightness=lambert(vertex_normals(view.nodes, self._triangles), LIGHT, AMBIENT),
             caption=caption,
             closed=self._closed,
+            side=self._side,
         )
         for number, structure in enumerate(self._inner):
             nodes = structure.nodes(state.parameters)
