@@ -152,6 +152,18 @@ def test_hexahedra_collapsed_onto_an_axis_become_prisms(axis):
     assert centres[0] == centres[1]
 
 
+@pytest.mark.parametrize("face", cell_type("hex8").faces)
+@pytest.mark.parametrize("start", [0, 1])
+def test_a_cube_two_of_whose_edges_vanish_is_half_of_it(face, start):
+    nodes, cell = cell_type("hex8").nodes, np.arange(8)
+    a, b, c, d = np.roll(face, start)
+    cell[b], cell[c] = a, d
+    mesh = Mesh(nodes, (CellBlock("hex8", cell[None]),)).without_unused_nodes()
+    mended = without_collapsed_cells(mesh)
+    assert [block.cell_type for block in mended.blocks] == ["prism6"]
+    assert cell_volumes(mended) == pytest.approx([0.5])
+
+
 def _centre(mesh, cell):
     starts = mesh.block_starts()
     i = int(np.searchsorted(starts, cell, side="right")) - 1

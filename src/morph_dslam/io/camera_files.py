@@ -13,12 +13,13 @@ from typing import Any, cast
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import Field, FiniteFloat, ValidationError
 
 from morph_dslam.camera import Camera, LensModel, StereoCamera
 from morph_dslam.errors import CameraError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.colmap import read_cameras
+from morph_dslam.io.sections import Section, explain
 from morph_dslam.io.text import read_text
 
 Mapping = dict[str, Any]
@@ -41,15 +42,14 @@ _MATRIX_NAMES = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "k", "M1
 _DISTORTION_NAMES = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D", "d", "D1")
 
 
-class _CameraFile(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+class _CameraFile(Section):
     width: int = Field(gt=0, le=LARGEST_SIDE_PX)
     height: int = Field(gt=0, le=LARGEST_SIDE_PX)
     fx: float = Field(gt=0, lt=LARGEST_PX)
     fy: float = Field(gt=0, lt=LARGEST_PX)
     cx: float = Field(gt=-LARGEST_PX, lt=LARGEST_PX)
     cy: float = Field(gt=-LARGEST_PX, lt=LARGEST_PX)
-    distortion: list[FiniteFloat] = []
+    distortion: list[FiniteFloat] = Field(default_factory=list)
     lens: str = "radial-tangential"
 
 
@@ -131,10 +131,8 @@ def parse_camera(content: object, where: str) -> Camera:
     try:
         values = _CameraFile.model_validate(content)
     except ValidationError as error:
-        first = error.errors()[0]
-        name = ".".join(str(part) for part in first["loc"])
         raise CameraError(
-            f"{where}: {name}: {first['msg']}; a camera file has width, height, fx, fy, cx, cy "
+            f"{where}: {explain(_CameraFile, error)}; a camera file has width, height, fx, fy, cx, cy "
             "and optionally distortion [k1, k2, p1, p2, k3] and lens"
         ) from error
     intrinsics = (values.width, values.height, values.fx, values.fy, values.cx, values.cy)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
+from morph_dslam.model.reduced_model import triangle_normals
 from morph_dslam.render.environment import StaticScene
 from morph_dslam.render.rasteriser import Buffers, rasterise
 from morph_dslam.render.scene_file import Background, Scene, Sensor, Surface
@@ -120,9 +121,7 @@ def _printed_sides(model: ReducedModel, printed_face: str) -> Array:
     """
     if not is_sheet(model):
         return np.ones(len(model.triangles))
-    rest = model.nodes[model.triangles]
-    normal_z = np.cross(rest[:, 1] - rest[:, 0], rest[:, 2] - rest[:, 0])[:, 2]
-    return np.sign(normal_z) * (1.0 if printed_face == "top" else -1.0)
+    return np.sign(triangle_normals(model.nodes, model.triangles)[:, 2]) * (1.0 if printed_face == "top" else -1.0)
 
 
 class SceneRenderer:
@@ -162,9 +161,8 @@ class SceneRenderer:
 
     def _shows_print(self, points: Array) -> NDArray[np.bool_]:
         """Which triangles (m,) turn their printed face to the camera."""
-        corners = points[self._triangles]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        return self._sides * np.einsum("mx,mx->m", normals, corners[:, 0]) < 0.0
+        normals, corners = triangle_normals(points, self._triangles), points[self._triangles[:, 0]]
+        return self._sides * np.einsum("mx,mx->m", normals, corners) < 0.0
 
     def _paint_surface(
         self, image: Image, buffers: Buffers, points: Array, camera_from_world: RigidTransform | None

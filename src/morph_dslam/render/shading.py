@@ -10,6 +10,8 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from morph_dslam.model.reduced_model import triangle_normals
+
 Array = NDArray[np.float64]
 
 
@@ -21,8 +23,7 @@ def vertex_normals(points: Array, triangles: NDArray) -> Array:
     points : (n, 3) node positions.
     triangles : (m, 3), whose order of nodes gives the normal its side.
     """
-    a, b, c = points[triangles.T]
-    nodes, normals = triangles.T.ravel(), np.cross(b - a, c - a)
+    nodes, normals = triangles.T.ravel(), triangle_normals(points, triangles)
     sums = np.column_stack([np.bincount(nodes, np.tile(component, 3), len(points)) for component in normals.T])
     lengths = np.linalg.norm(sums, axis=1, keepdims=True)
     return np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > 0.0)
