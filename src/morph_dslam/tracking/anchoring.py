@@ -25,9 +25,8 @@ from morph_dslam.slam.result import SlamFrame
 from morph_dslam.slam.rigid_map import RigidMap
 from morph_dslam.slam.slam import Slam
 from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR
-from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, moved
+from morph_dslam.tracking.estimator import Estimator, Prior, moved
 from morph_dslam.tracking.hypothesis import PoseHypothesis
-from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.reference import ReferenceView
 
@@ -199,7 +198,7 @@ class Anchoring:
         if self._n_other >= self._options.moved_patience:
             self.has_moved, self._n_other = elsewhere, 0
 
-    def learn(self, estimate: Estimate, measured: Observations) -> None:
+    def learn(self, sigma_px: float, redundancy: float) -> None:
         """Take in how well the points of an accepted frame agree, and how many count as one."""
-        if np.isfinite(estimate.sigma_px):
-            self._squared_px = measured.redundancy * max(estimate.sigma_px, LEAST_SIGMA_PX) ** 2
+        if np.isfinite(sigma_px):
+            self._squared_px = redundancy * max(sigma_px, LEAST_SIGMA_PX) ** 2

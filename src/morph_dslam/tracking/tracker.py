@@ -450,7 +450,7 @@ class Tracker:
             self._start = at_constant_velocity(self._velocity_base, self._start)
         self._supported = inliers
         self._pixels = np.where(inliers[:, None], pixels, self.reference.projected(self._last))
-        self._anchoring.learn(estimate, self.last_measured)
+        self._anchoring.learn(estimate.sigma_px, self.last_measured.redundancy)
         self._view.estimation.learn(hypothesis)
         if not self._lost:
             self._view.recovery.learn(hypothesis)
