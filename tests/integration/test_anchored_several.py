@@ -117,30 +117,31 @@ def changed(path, target, **changes):
     return target
 
 
-def test_registrations_of_different_maps_are_refused(recording, tmp_path, capsys):
+def test_registrations_of_different_maps_are_refused(recording, tmp_path, refused):
     folder, _ = recording
     other = tmp_path / "other.h5"
     other.write_bytes((folder / "map.h5").read_bytes())
     start = changed(folder / "wedge" / "registration.json", tmp_path / "wedge.json", map=str(other))
-    assert main(command(folder, tmp_path / "run", *also(folder, "wedge", start))) == 2
-    assert "the objects are anchored in different maps" in capsys.readouterr().err
+    assert "the objects are anchored in different maps" in refused(
+        *command(folder, tmp_path / "run", *also(folder, "wedge", start))
+    )
 
 
-def test_a_registration_that_has_the_object_elsewhere_is_refused(recording, tmp_path, capsys):
+def test_a_registration_that_has_the_object_elsewhere_is_refused(recording, tmp_path, refused):
     folder, _ = recording
     path = folder / "wedge" / "registration.json"
     matrix = np.array(json.loads(path.read_text())["world_from_object"])
     matrix[0, 3] += 0.5
     start = changed(path, tmp_path / "wedge.json", world_from_object=matrix.tolist())
-    assert main(command(folder, tmp_path / "run", *also(folder, "wedge", start))) == 2
-    assert "is not the map of the registration: by the map the object is" in capsys.readouterr().err
+    assert "is not the map of the registration: by the map the object is" in refused(
+        *command(folder, tmp_path / "run", *also(folder, "wedge", start))
+    )
 
 
-def test_objects_in_the_same_place_are_refused(recording, tmp_path, capsys):
+def test_objects_in_the_same_place_are_refused(recording, tmp_path, refused):
     folder, _ = recording
     twice = ["--also", "twin", folder / "sheet.morph", folder / "sheet" / "registration.json"]
-    assert main(command(folder, tmp_path / "run", *twice)) == 2
-    assert "are registered in the same place of the map" in capsys.readouterr().err
+    assert "are registered in the same place of the map" in refused(*command(folder, tmp_path / "run", *twice))
 
 
 def with_both(folder, output, *more, first="wedge", front=None, aside=None):
@@ -246,23 +247,20 @@ def renumbered(source, target, shift, last=FRAMES):
     return target
 
 
-def test_recordings_that_do_not_go_together_are_refused(recording, tmp_path, capsys):
+def test_recordings_that_do_not_go_together_are_refused(recording, tmp_path, refused):
     folder, _ = recording
     later = renumbered(folder / "front", tmp_path / "later", 1)
-    assert main(with_both(folder, tmp_path / "run", front=later)) == 2
-    assert "map's keyframe" in capsys.readouterr().err
+    assert "map's keyframe" in refused(*with_both(folder, tmp_path / "run", front=later))
     beside = renumbered(folder / "aside", tmp_path / "beside", 20)
-    assert main(with_both(folder, tmp_path / "run", aside=beside)) == 2
-    assert f"frame {SCAN - 1} is not in" in capsys.readouterr().err
+    assert f"frame {SCAN - 1} is not in" in refused(*with_both(folder, tmp_path / "run", aside=beside))
 
 
-def test_another_recording_than_the_scan_begins_with_an_undeformed_frame(recording, tmp_path, capsys):
+def test_another_recording_than_the_scan_begins_with_an_undeformed_frame(recording, tmp_path, refused):
     folder, truth = recording
     front, aside = (renumbered(folder / name, tmp_path / name, 100) for name in ("front", "aside"))
     arguments = with_both(folder, tmp_path / "run", front=front, aside=aside)
     arguments[arguments.index("--range") + 1] = f"{SCAN + 99}-{FRAMES + 99}"
-    assert main(arguments) == 2
-    assert "name a frame of these recordings in which it is undeformed" in capsys.readouterr().err
+    assert "name a frame of these recordings in which it is undeformed" in refused(*arguments)
     assert main([*arguments, "--reference-frame", f"{SCAN + 97}"]) == 0
     run = load_run(tmp_path / "run")
     assert run.frames[0] == SCAN + 99
@@ -275,13 +273,12 @@ def test_another_recording_than_the_scan_begins_with_an_undeformed_frame(recordi
     assert (apart < 3.0 * column(tmp_path / "run", "pose_std")[:, 3:]).all()
 
 
-def test_a_shorter_recording_ends_the_run_and_is_named(recording, tmp_path, capsys):
+def test_a_shorter_recording_ends_the_run_and_is_named(recording, tmp_path, capsys, refused):
     folder, _ = recording
     front = renumbered(folder / "front", tmp_path / "front", 0, last=SCAN + 5)
     short = renumbered(folder / "aside", tmp_path / "short", 0, last=SCAN + 2)
     arguments = with_both(folder, tmp_path / "run", front=front, aside=short)
-    assert main(arguments) == 2
-    assert f"frame {FRAMES - 1} is not in" in capsys.readouterr().err
+    assert f"frame {FRAMES - 1} is not in" in refused(*arguments)
     row = arguments.index("--range")
     assert main(arguments[:row] + arguments[row + 2 :]) == 0
     assert "9 were tracked, to the end of the shortest recording" in capsys.readouterr().out
@@ -294,11 +291,10 @@ def live_command(folder, output, *more):
     return ["live", *map(str, [*arguments, *more])]
 
 
-def test_two_objects_are_tracked_live_in_one_map(recording, tmp_path, capsys):
+def test_two_objects_are_tracked_live_in_one_map(recording, tmp_path, capsys, refused):
     folder, truth = recording
     run = tmp_path / "run"
-    assert main(live_command(folder, run)) == 2
-    assert "--show displacement" in capsys.readouterr().err
+    assert "--show displacement" in refused(*live_command(folder, run))
     assert not run.exists()
     assert main(live_command(folder, run, "--show", "displacement")) == 0
     said = capsys.readouterr().out

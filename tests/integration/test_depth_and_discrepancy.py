@@ -122,8 +122,7 @@ def test_depth_puts_the_object_right_along_the_sight_line(recording, tmp_path):
     assert '"depth_used": true' in (tmp_path / "with" / "summary.json").read_text()
 
 
-def test_recording_without_depth_is_refused(recording, tmp_path, capsys):
+def test_recording_without_depth_is_refused(recording, tmp_path, refused):
     arguments = ["--model", str(recording / "sheet.morph"), "--camera", str(recording / "camera.yaml")]
     arguments += ["--landmarks", str(recording / "landmarks.csv"), "-o", str(tmp_path / "run")]
-    assert main(["track", str(recording / "rgb"), *arguments, "--depth"]) == 2
-    assert "has no depth images that belong to its pixels" in capsys.readouterr().err
+    assert "has no depth images that belong to its pixels" in refused("track", recording / "rgb", *arguments, "--depth")

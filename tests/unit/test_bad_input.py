@@ -107,7 +107,6 @@ def test_nothing_but_our_message_is_printed_of_a_damaged_video(folder):
 def test_options_without_effect_are_refused(folder, refused):
     output = ["-o", folder / "run"]
     slam = ["slam", folder, "--camera", folder / "camera.yaml", *output]
-    assert "--images says what" in refused(*slam, "--images", folder)
     assert "is not a frame number" in refused(*slam, "--freeze-at=-1")
     assert "go with --depth" in refused("evaluate", folder, "--points", "truth.npz", "--base-frame", 0)
     assert "goes with --points" in refused("evaluate", folder, "--trajectory", "truth.txt", "--bind-frame", 0)
@@ -151,21 +150,6 @@ def test_a_folder_that_holds_a_run_or_cannot_be_made(tmp_path):
     for name in ("file", "file/run"):
         with pytest.raises(TrackingError, match="cannot write the run to"):
             make_run_folder(tmp_path / name, overwrite=True)
-
-
-@pytest.mark.parametrize("start", ["board", "picture", "guess"])
-def test_a_reference_that_is_to_be_refined_without_landmarks(tmp_path, refused, start):
-    """It would be tracked as it is, and the option have no effect."""
-    arguments = ("track", "film", "--model", "m.morph", "--camera", "c.yaml", f"--{start}", "start.toml")
-    assert "start from landmarks, or leave out --refine" in refused(*arguments, "--refine", "-o", tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("command", ["track", "live"])
-@pytest.mark.parametrize("option", [["--show", "strain"], ["--section", "x=3"]])
-def test_what_a_video_is_to_show_that_is_not_drawn(tmp_path, refused, command, option):
-    arguments = (command, "film", "--model", "m.morph", "--camera", "c.yaml", "--landmarks", "l.csv")
-    assert "leave them or --no-video out" in refused(*arguments, "-o", tmp_path / "run", "--no-video", *option)
 
 
 def test_a_random_walk_whose_square_overflows(refused):

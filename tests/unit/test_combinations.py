@@ -6,11 +6,10 @@ from pathlib import Path
 import pytest
 
 import morph_dslam as md
-from morph_dslam.cli.app import main
 from morph_dslam.errors import TrackingError
 from morph_dslam.registration.initialization import InitializerFiles
 from morph_dslam.tracking.combinations import check_options
-from morph_dslam.tracking.drawing import DrawOptions
+from morph_dslam.tracking.drawing import DrawOptions, SectionPlane
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.run_options import ObjectOptions
 
@@ -47,6 +46,7 @@ FREE_LID = ObjectOptions(model=Path("lid.morph"), landmarks=CSV)
         ({"reference_frame": 3, **REGISTERED}, "--reference-frame"),
         ({"reference_frame": 3, **REGISTERED, "others": (("lid", LID),)}, "--reference-frame"),
         ({"video": False, "drawing": DrawOptions("strain")}, "--no-video"),
+        ({"video": False, "drawing": DrawOptions(section=SectionPlane.parse("x=3"))}, "--no-video"),
     ],
 )
 def test_what_makes_no_sense_together_is_refused(changes, named):
@@ -70,10 +70,8 @@ def test_what_makes_sense_is_not_refused(changes):
     check_options(replace(PLAIN, **changes))
 
 
-def test_the_command_line_refuses_before_it_reads(tmp_path, capsys):
+def test_the_command_line_refuses_before_it_reads(tmp_path, refused):
     arguments = ["track", "film", "--model", "m.morph", "--camera", "c.yaml", "--landmarks", "l.csv", "--no-video"]
-    assert main([*arguments, "--show", "strain", "-o", str(tmp_path / "run")]) == 2
-    assert "--no-video" in capsys.readouterr().err
-    assert main([*arguments, "--reregister-at", "lid:7=l.csv", "-o", str(tmp_path / "run")]) == 2
-    assert "lid" in capsys.readouterr().err
+    assert "--no-video" in refused(*arguments, "--show", "strain", "-o", tmp_path / "run")
+    assert "lid" in refused(*arguments, "--reregister-at", "lid:7=l.csv", "-o", tmp_path / "run")
     assert not (tmp_path / "run").exists()
