@@ -1,7 +1,10 @@
 """The documentation as tests read it: its pages, their samples, and the words that they show as code."""
 
+import argparse
 import re
 from pathlib import Path
+
+from morph_dslam.cli.app import new_parser
 
 PROJECT = Path(__file__).parents[2]
 _FILES = [*(PROJECT / "docs").rglob("*.md"), PROJECT / "README.md"]
@@ -19,3 +22,14 @@ def code_words(page: str) -> set[str]:
     blocks = re.findall(r"^```.*?^```$", PAGES[page], flags=re.DOTALL | re.MULTILINE)
     spans = re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```$", "", PAGES[page], flags=re.DOTALL | re.MULTILINE))
     return set(re.findall(r"\w+", " ".join([*blocks, *spans])))
+
+
+def commands() -> dict[str, argparse.ArgumentParser]:
+    """The parser of each command."""
+    (action,) = (a for a in new_parser()._actions if isinstance(a, argparse._SubParsersAction))
+    return dict(action.choices)
+
+
+def options(parser: argparse.ArgumentParser) -> set[str]:
+    """What a command takes, "--output" say."""
+    return {text for action in parser._actions for text in action.option_strings if text.startswith("--")}

@@ -1,32 +1,30 @@
 """The programs in the documentation do what it says."""
 
-import argparse
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
-from morph_dslam.cli import app as cli
 from morph_dslam.model import SeparatedField, load_model, save_model
 from morph_dslam.model.basis_functions import chebyshev_basis
 from morph_dslam.model.tensor_functions import TuckerFunctions
 from tests.support.bent_sheet import bent_sheet_model
-from tests.support.documents import code_words
+from tests.support.documents import PROJECT, code_words, commands, options, samples
 from tests.support.function_formats import FORMATS
 from tests.support.small_models import block_model
 
-DOCS = Path(__file__).parents[2] / "docs"
-PAGES = [*DOCS.rglob("*.md"), *(DOCS.parent / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG"))]
+PAGES = [
+    *(PROJECT / "docs").rglob("*.md"),
+    *(PROJECT / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG")),
+]
 
 
 def documented_readers():
     """The programs that read model files without the library: the short one, and the one for all formats."""
-    programs = re.findall(r"```python\n(.*?)```", (DOCS / "model-file.md").read_text(), flags=re.DOTALL)
     readers = []
-    for program in programs:
+    for program in samples("model-file", "python"):
         assert "morph_dslam" not in program
         names = {}
         exec(program, names)
@@ -81,8 +79,7 @@ def test_every_format_can_be_read_with_the_documented_program(tmp_path, reader, 
 def test_the_programs_for_solids_pull_a_block_as_far_as_its_law_says(tmp_path, monkeypatch):
     """E = 3 MPa, nu = 0, nominal stress 0.3 MPa = mu (s - 1/s): the stretch s is 1.104988."""
     monkeypatch.chdir(tmp_path)
-    text = (DOCS / "solid-study.md").read_text()
-    study, problem = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    study, problem = samples("solid-study", "python")
     names = {}
     exec(study, names)
     top = names["model"].nodes[:, 2] > 0.0599
@@ -122,15 +119,12 @@ def test_links_of_pages_outside_the_site_lead_somewhere():
 
 def test_commands_in_documents_have_these_options():
     """What the pages tell to type after `morph` is known to the command line; a # begins a remark."""
-    (commands,) = (a for a in cli.new_parser()._actions if isinstance(a, argparse._SubParsersAction))
-    n_options = 0
+    known, n_options = {name: options(parser) for name, parser in commands().items()}, 0
     for page in PAGES:
         text = re.sub(r"\\\n\s*", " ", page.read_text())
         for name, rest in re.findall(r"(?:^|`)morph ([a-z]+)\b([^`\n#]*)", text, flags=re.MULTILINE):
-            assert name in commands.choices, f"{page.name}: morph {name}"
-            known = {option for a in commands.choices[name]._actions for option in a.option_strings}
             used = set(re.findall(r"(?<![\w-])--[a-z][\w-]*", rest))
-            assert used <= known, f"{page.name}: morph {name} {used - known}"
+            assert used <= known[name], f"{page.name}: morph {name} {used - known[name]}"
             n_options += len(used)
     assert n_options > 30
 
@@ -140,7 +134,7 @@ def test_programs_and_files_in_documents_exist():
     for page in PAGES:
         for name in re.findall(r"(?<![\w/.])(?:examples|benchmarks|tests|docs)/[\w/-]+\.\w+", page.read_text()):
             if "output/" not in name and "/NAME/" not in name:
-                assert (DOCS.parent / name).exists(), f"{page.name}: {name}"
+                assert (PROJECT / name).exists(), f"{page.name}: {name}"
                 n_files += 1
     assert n_files > 50
 
@@ -148,14 +142,14 @@ def test_programs_and_files_in_documents_exist():
 def test_pages_that_messages_and_programs_name_exist():
     named = set()
     for folder in ("src", "examples", "benchmarks"):
-        for path in (DOCS.parent / folder).rglob("*.py"):
+        for path in (PROJECT / folder).rglob("*.py"):
             named |= set(re.findall(r"\bdocs/[\w-]+\.md", path.read_text()))
     assert len(named) > 5
-    assert {name for name in named if not (DOCS.parent / name).exists()} == set()
+    assert {name for name in named if not (PROJECT / name).exists()} == set()
 
 
 def test_targets_of_make_exist():
-    targets = set(re.findall(r"^([a-z-]+):", (DOCS.parent / "Makefile").read_text(), flags=re.MULTILINE))
+    targets = set(re.findall(r"^([a-z-]+):", (PROJECT / "Makefile").read_text(), flags=re.MULTILINE))
     named = {t for page in PAGES for t in re.findall(r"(?:^|`)make ([a-z-]+)", page.read_text(), re.MULTILINE)}
     assert {"demo", "test", "test-all"} <= named
     assert named <= targets

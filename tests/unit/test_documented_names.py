@@ -1,6 +1,5 @@
 """What the program accepts, writes and flags is documented, and what the documentation names exists."""
 
-import argparse
 import importlib.util
 import pydoc
 import re
@@ -12,7 +11,6 @@ import pytest
 from pydantic import BaseModel
 
 from morph_dslam.camera import Camera
-from morph_dslam.cli import app as cli
 from morph_dslam.io.camera_files import _CameraFile
 from morph_dslam.mechanics.materials.library import constant_quantities, laws
 from morph_dslam.registration.board import BoardFile
@@ -29,7 +27,7 @@ from morph_dslam.tracking.outcomes import Status, TrackingWarning
 from morph_dslam.tracking.run_folder import summarise, write_csv, write_hdf5
 from morph_dslam.tracking.run_results import RunResults
 from tests.support.bent_sheet import bent_sheet_model
-from tests.support.documents import PAGES, PROJECT, code_words
+from tests.support.documents import PAGES, PROJECT, code_words, commands, options
 from tests.unit.test_results import frame_result
 
 
@@ -102,23 +100,17 @@ def test_every_key_in_a_table_exists(page, roots):
     assert n_keys > 15
 
 
-def commands() -> dict[str, argparse.ArgumentParser]:
-    (action,) = (a for a in cli.new_parser()._actions if isinstance(a, argparse._SubParsersAction))
-    return dict(action.choices)
-
-
 def test_every_command_and_option_is_documented():
     everything = " ".join(PAGES.values())
     for name, parser in commands().items():
         assert re.search(rf"morph {name}\b", everything), name
-        options = {text for a in parser._actions for text in a.option_strings if text.startswith("--")}
-        missing = {o for o in options - {"--help", "--output"} if not re.search(rf"{o}\b(?!-)", everything)}
+        missing = {o for o in options(parser) - {"--help", "--output"} if not re.search(rf"{o}\b(?!-)", everything)}
         assert missing == set(), name
 
 
 def test_options_that_pages_name_exist():
     """Of the command line, or of a program in examples/ or benchmarks/ that has it."""
-    known = {text for parser in commands().values() for a in parser._actions for text in a.option_strings}
+    known = set().union(*map(options, commands().values()))
     for folder in ("examples", "benchmarks"):
         for path in (PROJECT / folder).rglob("*.py"):
             known |= set(re.findall(r"\"(--[a-z][\w-]*)\"", path.read_text()))
