@@ -208,7 +208,7 @@ def test_a_path_from_a_table_of_states_and_from_a_tracked_run(tmp_path):
         ({"vary": ["slide=0:1:1000000000"]}, "10000 is the most"),
         ({"vary": ["slide=0:1:101", "stretch=0:0.1:101"]}, "make 10201 states"),
         ({"at": ["slide"]}, "--at slide is not a parameter and its value"),
-        ({"at": ["slide=x"]}, "--at slide=x is not a parameter and its value"),
+        ({"at": ["slide=x"]}, "--at slide=x: 'x' is not a value of slide"),
         ({"vary": ["slide=0:1:2"], "path": "p.csv"}, "give one of them"),
         ({"path": "absent.csv"}, r"cannot read the path .*absent\.csv"),
         ({"path": ("a,b\n1,2\n",)}, r"no column of a parameter; name the columns 'stretch \[1\]', 'slide"),

@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-import re
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -62,15 +61,11 @@ def fixed_values(model: ReducedModel, settings: Sequence[str]) -> Array:
     """The parameters (d,) with some of them set by texts "name=value"; the others keep their defaults."""
     mu = model.default
     for text in settings:
-        matched = re.fullmatch(r"(\w+)=([^:]+)", text)
-        try:
-            name, value = (matched[1], float(matched[2])) if matched else ("", math.nan)
-        except ValueError:
-            name = ""
-        if not name:
+        name, equals, value = text.partition("=")
+        if not equals:
             raise ExportError(f"--at {text} is not a parameter and its value, such as bend=12.5")
         k = _index(model, name)
-        mu[k] = _to_range(model.parameters[k], value, f"--at {text}")
+        mu[k] = _number(model.parameters[k], value, f"--at {text}")
     return mu
 
 
