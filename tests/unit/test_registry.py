@@ -39,15 +39,17 @@ def registered(monkeypatch):
     register_reduction("planes", reduce_by_planes)
 
 
-def test_a_method_of_ones_own_builds_a_model(registered, tmp_path):
-    """Small loads move a block in proportion to them."""
+def test_a_method_of_ones_own_builds_a_model(registered, tmp_path, monkeypatch):
+    """Small loads move a block in proportion to them; nothing is written unless a file is named."""
+    monkeypatch.chdir(tmp_path)
     content = tomllib.loads(STUDY) | {
         "parameters": {"pull": {"range": ["0 kPa", "20 kPa"]}, "push": {"range": ["-0.1 kPa", "0.1 kPa"]}},
         "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.3}},
         "sampling": {"training": 8, "held_out": 4},
         "reduction": {"method": "planes"},
     }
-    model = build(make_study(content), tmp_path / "block.morph")
+    model = build(make_study(content))
+    assert list(tmp_path.iterdir()) == []
     assert model.certificate["reduction"]["method"] == "planes"
     assert model.certificate["displacement"]["relative_l2"] < 2e-2
     stretch = np.ptp(model.at({"pull": 2e4}).positions()[:, 2]) / 0.06 - 1.0

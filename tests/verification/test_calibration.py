@@ -76,7 +76,8 @@ def test_a_video_is_calibrated_from_a_selection_of_its_frames(pictures, tmp_path
     for image in [np.full_like(pictures[0][0], 90), *pictures[0]]:
         writer.write(image)
     writer.release()
-    calibration = calibrate([path], BOARD, tmp_path / "cam.yaml")
+    calibration = calibrate([path], BOARD)
+    assert list(tmp_path.iterdir()) == [path]
     assert calibration.solution.camera.fx == pytest.approx(CAMERA.fx, rel=3e-3)
     assert calibration.found.n_searched == 17
     assert [view.name for view in calibration.found.views][:2] == ["frame 1", "frame 2"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import Executor
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from morph_dslam.errors import StudyError
@@ -24,7 +25,10 @@ FEWEST_HELD_OUT = 4
 
 
 def build(
-    study: str | Path | Study, output: str | Path, workers: int | None = None, executor: Executor | None = None
+    study: str | Path | Study,
+    output: str | Path | None = None,
+    workers: int | None = None,
+    executor: Executor | None = None,
 ) -> ReducedModel:
     """Solve a study and write its model file.
 
@@ -33,7 +37,7 @@ def build(
     Parameters
     ----------
     study : a study, its file, or the folder of a file study.toml.
-    output : the model file to write.
+    output : the model file to write; None to keep neither it nor the solutions.
     workers : processes to solve in, the study's own number if absent.
     executor : what to solve on in their place: any that runs tasks in processes, a Dask client's say.
 
@@ -42,6 +46,9 @@ def build(
     StudyError
         If the study is wrong or too few samples converge.
     """
+    if output is None:
+        with TemporaryDirectory() as folder:
+            return build(study, Path(folder) / "model.morph", workers, executor)
     output = Path(output)
     if not output.parent.is_dir():
         raise StudyError(f"the folder {output.parent} for the model file does not exist: make it first")
