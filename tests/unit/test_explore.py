@@ -13,6 +13,8 @@ import threading
 import numpy as np
 import pytest
 
+import morph_dslam as md
+from morph_dslam.errors import ExploreError
 from morph_dslam.explorer.server import make_server
 from morph_dslam.io.local_server import HOST
 from morph_dslam.model import save_model
@@ -154,13 +156,12 @@ def test_only_this_computer_is_answered(serve):
         assert get("/model.json", host=host)[0] == status
 
 
-def test_a_port_that_is_taken(tmp_path, refused):
+def test_a_port_that_is_taken():
     model = stretched_block_model()
-    save_model(tmp_path / "block.morph", model)
     with make_server(model, 0) as server:
-        port = str(server.server_address[1])
-        for taken in (port, "70000"):
-            assert f"port {taken} cannot be taken" in refused("explore", tmp_path / "block.morph", "--port", taken)
+        for taken in (server.server_address[1], 70000):
+            with pytest.raises(ExploreError, match=f"port {taken} cannot be taken"):
+                md.explore(model, taken)
 
 
 def test_the_command_serves_until_it_is_interrupted(tmp_path):
