@@ -38,15 +38,12 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--registration and --with: one in which the object is undeformed",
     )
     add_flag(command, "--refine", "refine the reference state over the whole sequence and track once more")
-    command.add_argument(
+    add_repeated(
+        command,
         "--with",
-        type=Path,
-        action="append",
-        default=[],
-        dest="other_cameras",
-        metavar="FRAMES",
-        help="what the next camera of the rig saw; with --camera camchain.yaml#cam0, which a map is of too; "
-        "may be repeated",
+        "what the next camera of the rig saw; with --camera camchain.yaml#cam0, which a map is of too",
+        "FRAMES",
+        Path,
     )
 
 
@@ -59,7 +56,7 @@ def run(arguments: argparse.Namespace) -> None:
         frames=arguments.frames,
         reference_frame=arguments.reference_frame,
         refine_reference=arguments.refine,
-        other_cameras=tuple(arguments.other_cameras),
+        other_cameras=tuple(vars(arguments)["with"]),  # a keyword of the language
     )
     track(options, print_summary)
 
