@@ -8,20 +8,23 @@ weights on the triangle in space: no image-plane weights and no pixel grid are i
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from morph_dslam.model import SurfacePoints
 
 Array = NDArray[np.float64]
 #: Barycentric slack, so that a ray through a shared edge meets at least one of its triangles.
 EDGE_TOLERANCE = 1e-9
+#: Cells along each side of the grid in which rays are looked up.
+GRID = 64
 
 
 def pick_surface(camera_points: Array, triangles: NDArray[np.int64], rays: Array) -> SurfacePoints:
     """The nearest surface point on each ray from the camera centre.
 
-    Each triangle is tried with the rays about it only, by where they meet the plane one unit before the camera.
+    Rays are looked up by where they meet the plane one unit before the camera, so each triangle is tried with
+    those about it only.
 
     Parameters
     ----------
@@ -34,41 +37,88 @@ def pick_surface(camera_points: Array, triangles: NDArray[np.int64], rays: Array
     SurfacePoints of length p; where a ray meets nothing, ``triangles`` is -1 and ``weights`` NaN.
     """
     found, weights = np.full(len(rays), -1, dtype=np.int64), np.full((len(rays), 3), np.nan)
-    corners = camera_points[triangles]
-    a, b, c = corners.transpose(1, 0, 2)
-    volumes = _dot(a, np.cross(b, c))
-    # Rays ahead meet triangles ahead only; one whose volume is nought is seen edge-on.
-    usable = np.flatnonzero((corners[:, :, 2] > 0.0).all(axis=1) & (volumes != 0.0))
+    # Triangles in front of the camera are met by no others.
     ahead = np.flatnonzero(np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.0))
-    if not ahead.size or not usable.size:
+    if not ahead.size:
         return SurfacePoints(found, weights)
-    ray, triangle = _candidates(rays[ahead], corners[usable])
-    ray, triangle = ahead[ray], usable[triangle]
-    normals = (np.cross(b, c), np.cross(c, a), np.cross(a, b))
-    scaled = np.column_stack([_dot(rays[ray], normal[triangle]) for normal in normals]) / volumes[triangle, None]
-    # 1 / (the multiple of the ray at which it meets the plane)
-    inverse_range = scaled.sum(axis=1)
-    hits = np.flatnonzero((inverse_range > 0.0) & (scaled.min(axis=1) >= -EDGE_TOLERANCE * inverse_range))
-    # The nearest triangle of each ray, and of equally near ones the first, is set last.
-    hits = hits[np.lexsort([-triangle[hits], inverse_range[hits]])]
-    found[ray[hits]] = triangle[hits]
-    inside = np.maximum(scaled[hits], 0.0)
-    weights[ray[hits]] = inside / inside.sum(axis=1, keepdims=True)
+    rays = np.ascontiguousarray(rays[ahead], dtype=np.float64)
+    nodes = np.ascontiguousarray(camera_points, dtype=np.float64)
+    triangles = np.ascontiguousarray(triangles, dtype=np.int64)
+    found[ahead], weights[ahead] = _nearest(nodes, triangles, rays, *_in_cells(rays))
     return SurfacePoints(found, weights)
 
 
-def _dot(a: Array, b: Array) -> Array:
-    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
+def _in_cells(rays: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]:
+    """Rays (p, 3) by cells of a grid on the plane z = 1.
+
+    Returns
+    -------
+    order : (p,) rays, cell by cell.
+    starts : (cells + 1,) where in it each cell begins.
+    corner : (2,) of the grid.
+    size : (2,) of a cell.
+    """
+    places = rays[:, :2] / rays[:, 2:]
+    corner = places.min(axis=0)
+    size = np.maximum(np.ptp(places, axis=0), 1e-12) / GRID * (1.0 + 1e-9)
+    column, row = ((places - corner) / size).astype(np.int64).T
+    cell = row * GRID + column
+    starts = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=GRID * GRID))])
+    return np.argsort(cell, kind="stable"), starts, corner, size
 
 
-def _candidates(rays: Array, corners: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs of a ray (p, 3) and a triangle (m, 3, 3) within whose circle it lies, both before the camera."""
-    places, seen = rays[:, :2] / rays[:, 2:], corners[:, :, :2] / corners[:, :, 2:]
-    centres = seen.mean(axis=1)
-    radii = np.linalg.norm(seen - centres[:, None], axis=2).max(axis=1)
-    about = KDTree(places).query_ball_point(centres, (1.0 + 1e-6) * radii + 1e-9)
-    triangle = np.repeat(np.arange(len(corners)), [len(rows) for rows in about])
-    return np.concatenate(about).astype(np.int64), triangle
+@njit(cache=True, nogil=True)
+def _cells_between(a, b, c, corner, size):
+    """First and last cell along one axis that a triangle meets, widened by what rounding may hide."""
+    low, high = min(a, b, c), max(a, b, c)
+    slack = 1e-6 * (high - low) + 1e-9 * size
+    first = max(np.floor((low - slack - corner) / size), 0.0)
+    last = min(np.floor((high + slack - corner) / size), GRID - 1.0)
+    return int(min(first, float(GRID))), int(max(last, -1.0))
+
+
+@njit(cache=True, nogil=True)
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@njit(cache=True, nogil=True)
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True, nogil=True)
+def _nearest(nodes, triangles, rays, order, starts, corner, size):
+    found, nearest = np.full(len(rays), -1, dtype=np.int64), np.zeros(len(rays))
+    weights = np.full((len(rays), 3), np.nan)
+    for t in range(len(triangles)):
+        i, j, k = triangles[t]
+        a = (nodes[i, 0], nodes[i, 1], nodes[i, 2])
+        b = (nodes[j, 0], nodes[j, 1], nodes[j, 2])
+        c = (nodes[k, 0], nodes[k, 1], nodes[k, 2])
+        volume = _dot(a, _cross(b, c))
+        if not (a[2] > 0.0 and b[2] > 0.0 and c[2] > 0.0) or volume == 0.0:  # behind, or seen edge-on
+            continue
+        left, right = _cells_between(a[0] / a[2], b[0] / b[2], c[0] / c[2], corner[0], size[0])
+        top, bottom = _cells_between(a[1] / a[2], b[1] / b[2], c[1] / c[2], corner[1], size[1])
+        for row in range(top, bottom + 1):
+            for place in range(starts[row * GRID + left], starts[row * GRID + right + 1]):
+                ray = order[place]
+                d = (rays[ray, 0], rays[ray, 1], rays[ray, 2])
+                of_a = _dot(d, _cross(b, c)) / volume
+                of_b = _dot(d, _cross(c, a)) / volume
+                of_c = _dot(d, _cross(a, b)) / volume
+                # 1 / (the multiple of the ray at which it meets the plane)
+                inverse_range = of_a + of_b + of_c
+                if inverse_range <= nearest[ray]:
+                    continue
+                if min(of_a, of_b, of_c) < -EDGE_TOLERANCE * inverse_range:
+                    continue
+                found[ray], nearest[ray] = t, inverse_range
+                of_a, of_b, of_c = max(of_a, 0.0), max(of_b, 0.0), max(of_c, 0.0)
+                total = of_a + of_b + of_c
+                weights[ray] = of_a / total, of_b / total, of_c / total
+    return found, weights
 
 
 def nearest_on_outline(
