@@ -10,6 +10,7 @@ import html
 import importlib
 import json
 import re
+import runpy
 from pathlib import Path
 
 from latex2mathml.converter import convert
@@ -212,7 +213,7 @@ def commands_page() -> str:
 
 def study_keys_page() -> str:
     """All keys of studies, from the models that read them."""
-    return STUDY_KEYS_INTRODUCTION + importlib.import_module("morph_dslam.studies.reference").study_reference()
+    return STUDY_KEYS_INTRODUCTION + runpy.run_path(str(PROJECT / "docs" / "study_keys.py"))["study_reference"]()
 
 
 def _spelling(action: argparse.Action) -> str:

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import platform
+import runpy
 import tomllib
 from dataclasses import replace
 from importlib.metadata import version
@@ -11,9 +12,9 @@ import numpy as np
 
 from morph_dslam import make_study
 from morph_dslam.studies.provenance import mesh_hash, provenance
-from morph_dslam.studies.reference import study_reference
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.block_study import STUDY
+from tests.support.documents import PROJECT
 from tests.support.stretched_block import stretched_block_model
 
 
@@ -42,7 +43,7 @@ def test_versions_and_linear_solver(monkeypatch):
 
 
 def test_every_key_stands_in_the_reference():
-    page = study_reference()
+    page = runpy.run_path(str(PROJECT / "docs" / "study_keys.py"))["study_reference"]()
     for text in (
         "[sampling]",
         "[parameters.NAME]",

@@ -8,11 +8,29 @@ import cv2
 import matplotlib
 import numpy as np
 from matplotlib.ticker import MaxNLocator
+from numba import njit
 from numpy.typing import NDArray
 
-from morph_dslam.model.reduced_model import triangle_normals
-
 Array = NDArray[np.float64]
+
+
+@njit(cache=True, nogil=True)
+def _sum_normals(points, triangles, normals):
+    """Add to ``normals`` (n, 3) the normals of all triangles, as long as these are large, and normalise."""
+    for t in range(len(triangles)):
+        i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        ux, uy, uz = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
+        vx, vy, vz = points[k, 0] - points[i, 0], points[k, 1] - points[i, 1], points[k, 2] - points[i, 2]
+        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        for node in (i, j, k):
+            normals[node, 0] += x
+            normals[node, 1] += y
+            normals[node, 2] += z
+    for n in range(len(normals)):
+        length = np.sqrt(normals[n, 0] ** 2 + normals[n, 1] ** 2 + normals[n, 2] ** 2)
+        if length > 0.0:
+            for c in range(3):
+                normals[n, c] /= length
 
 
 def vertex_normals(points: Array, triangles: NDArray) -> Array:
@@ -23,10 +41,9 @@ def vertex_normals(points: Array, triangles: NDArray) -> Array:
     points : (n, 3) node positions.
     triangles : (m, 3), whose order of nodes gives the normal its side.
     """
-    nodes, normals = triangles.T.ravel(), triangle_normals(points, triangles)
-    sums = np.column_stack([np.bincount(nodes, np.tile(component, 3), len(points)) for component in normals.T])
-    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
-    return np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > 0.0)
+    normals = np.zeros((len(points), 3))
+    _sum_normals(np.asarray(points, dtype=np.float64), np.asarray(triangles, dtype=np.int64), normals)
+    return normals
 
 
 def lambert(normals: Array, to_light: Array, ambient: float) -> Array:

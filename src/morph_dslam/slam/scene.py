@@ -23,6 +23,7 @@ from morph_dslam.slam.local_map import gather
 from morph_dslam.slam.map_files import load_map_and_trajectory, map_from_colmap, map_from_trajectory, save_map
 from morph_dslam.slam.options import SlamOptions
 from morph_dslam.slam.pose import inverse, refine_pose
+from morph_dslam.slam.relocalization import bit_counts
 from morph_dslam.slam.result import STAGES, SlamFrame, SlamStatus
 from morph_dslam.slam.rigid_map import Keyframe, RigidMap
 from morph_dslam.slam.slam import Slam
@@ -294,3 +295,4 @@ def warm_up() -> None:
     orientations(image, centre)
     words, rows = rng.integers(0, 255, (4, 32)).astype(np.uint8), np.arange(4)
     least_distances(words, rows, words, rows)
+    bit_counts(words, rows, len(words))

@@ -79,7 +79,3 @@ def _default(field: FieldInfo) -> str:
         return "required"
     default = field.get_default(call_default_factory=True)
     return "none" if default is None else f"`{default}`"
-
-
-if __name__ == "__main__":
-    print(study_reference())
