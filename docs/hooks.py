@@ -33,7 +33,8 @@ GROUPS = {
         *("Session", "track", "TrackOptions"),
     ],
     "Simulation and evaluation": [
-        *("simulate", "Run", "load_run", "evaluate", "evaluate_depth", "evaluate_trajectory")
+        *("simulate", "SimulatedSequence", "Run", "load_run"),
+        *("evaluate", "evaluate_depth", "evaluate_trajectory"),
     ],
     "Errors": ["MorphError"],
 }

@@ -24,6 +24,7 @@ _MODULES = {
     "Run": "evaluation.run_folder",
     "Scene": "slam.scene",
     "Session": "tracking.session",
+    "SimulatedSequence": "render.simulation",
     "SlamOptions": "slam.options",
     "SolidProblem": "mechanics.solid",
     "StateChoice": "io.export",
@@ -85,7 +86,7 @@ if TYPE_CHECKING:  # the same for editors and type checkers
         Registration as Registration,
         load_registration as load_registration,
     )
-    from morph_dslam.render.simulation import simulate as simulate
+    from morph_dslam.render.simulation import SimulatedSequence as SimulatedSequence, simulate as simulate
     from morph_dslam.slam.options import SlamOptions as SlamOptions
     from morph_dslam.slam.scene import Scene as Scene, load_scene as load_scene, map_scene as map_scene
     from morph_dslam.sources import open_live as open_live, open_source as open_source

@@ -5,6 +5,7 @@ import h5py
 import numpy as np
 import pytest
 
+import morph_dslam as md
 from morph_dslam.cli.app import main
 from morph_dslam.io.camera_files import load_camera
 from morph_dslam.io.trajectory import load_trajectory
@@ -46,6 +47,18 @@ def test_the_folder_holds_what_a_tracker_needs(moving, truth):
     assert truth["pixels"].shape == (5, n_points, 2)
     assert truth["visible"].shape == (5, n_points)
     assert truth["frame"].tolist() == [0, 1, 2, 3, 4]
+
+
+def test_a_sequence_in_memory_is_that_of_the_folder(moving, truth):
+    sequence = md.SimulatedSequence(moving / "scene.toml")
+    np.testing.assert_array_equal(sequence.parameters, truth["parameters"])
+    poses = [pose.matrix for pose in sequence.camera_from_object]
+    np.testing.assert_array_equal(poses, truth["camera_from_object"])
+    written = list(open_source(moving / "sequence" / "frames"))
+    assert len(sequence) == len(written)
+    for frame, other in zip(sequence, written, strict=True):
+        assert (frame.index, frame.depth) == (other.index, None)
+        np.testing.assert_array_equal(frame.image, other.image)
 
 
 def test_truth_points_follow_the_sheet_equation(truth):
@@ -274,6 +287,7 @@ def test_the_depth_sensor_is_as_noisy_as_asked_and_makes_a_recording(tmp_path):
     (frame,) = open_source(tmp_path / "sequence")  # TUM's layout
     assert frame.image.shape == (240, 320, 3)
     assert frame.depth is not None
+    np.testing.assert_array_equal(next(iter(md.SimulatedSequence(scene))).depth, frame.depth)
     wall = frame.depth[20:100, 20:300]
     assert np.mean(wall) == pytest.approx(WALL, abs=1e-4)
     assert np.std(wall) == pytest.approx(4.0e-3 * WALL**2, rel=0.03)

@@ -27,6 +27,7 @@ from morph_dslam.studies.solid_study import SolidStudy
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.documents import PAGES, samples
 from tests.support.run_folders import exact_truth, write_run
+from tests.support.scenes import MOTION, write_scene
 
 
 def test_every_sample_file_is_read_by_a_test_here():
@@ -158,6 +159,14 @@ def run_sample(page: str, number: int = 0) -> dict:
     return names
 
 
+def test_a_simulated_sequence_is_tracked_in_memory(tmp_path, monkeypatch):
+    write_scene(tmp_path, tail=MOTION)
+    monkeypatch.chdir(tmp_path)
+    names = run_sample("scene-file")
+    assert names["frame"].index == 4
+    assert abs(names["result"].estimate.state.parameters[0] - names["true"][0]) < 0.5e-3
+
+
 def test_every_program_is_run_by_a_test():
     """Those of model-file and solid-study in `test_docs`, of slam in `test_slam`, the others in tests/tutorials."""
     run_elsewhere = {"README", "quick-start", "extending"}
@@ -169,6 +178,7 @@ def test_every_program_is_run_by_a_test():
         "meshes": 1,
         "model-file": 2,
         "run-folder": 1,
+        "scene-file": 1,
         "slam": 2,
         "solid-study": 2,
     }

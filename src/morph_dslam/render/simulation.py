@@ -8,6 +8,7 @@ The truth is computed from the model, never read off the images.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,11 +25,12 @@ from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
 from morph_dslam.model import ReducedModel, SurfacePoints, load_model
 from morph_dslam.model.reduced_model import spread_over
-from morph_dslam.render.environment import Motion, StaticScene, plan_motion, sensor_depth
+from morph_dslam.render.environment import VALUES_PER_METRE, Motion, StaticScene, plan_motion, sensor_depth
 from morph_dslam.render.rasteriser import rasterise, visible_points
 from morph_dslam.render.scene_file import Scene, load_scene_file
 from morph_dslam.render.scene_renderer import SceneRenderer, in_disc, pixel_axes, supersampled
 from morph_dslam.render.texture import is_sheet, landmark_nodes, regular_points, spread_nodes
+from morph_dslam.sources.frames import Frame
 
 Array = NDArray[np.float64]
 N_TRUTH_POINTS = 300
@@ -82,6 +84,29 @@ class _World:
         pixels = self.camera.project(points)
         seen = visible_points(pixels, points[:, 2], depth, HIDDEN_BY)
         return seen & ~self.occluded(frame, pixels[:, 0], pixels[:, 1])
+
+    def renderer(self) -> SceneRenderer:
+        """What makes the images."""
+        return SceneRenderer(self.scene, self.model, self.camera, self.folder, self.nearest_depth(), self.surroundings)
+
+    def image(self, frame: int, renderer: SceneRenderer) -> NDArray[np.uint8]:
+        """The image (h, w, 3) of a frame."""
+        centres, cameras = self.motion.occluder_centres, self.motion.camera_from_world
+        return renderer.render(
+            self.node_positions(frame),
+            frame,
+            None if centres is None else centres[frame],
+            None if cameras is None else cameras[frame],
+        )
+
+    def measured_depth(self, frame: int) -> NDArray[np.uint16] | None:
+        """What the depth sensor gives (h, w); None without one."""
+        if self.scene.depth_sensor is None:
+            return None
+        occluded = self.occluded(frame, *pixel_axes(self.camera.height, self.camera.width))
+        depth = np.minimum(self.depth_image(self.node_positions(frame)), self.surroundings_depth(frame))
+        seen = np.where(occluded, np.float32(np.inf), depth)
+        return sensor_depth(seen, self.scene.depth_sensor, (self.scene.seed, frame))
 
 
 def _load_world(scene_path: Path) -> _World:
@@ -139,8 +164,8 @@ def _prepare_folder(output: Path) -> None:
         (output / name).unlink(missing_ok=True)
 
 
-def _write_landmarks(path: Path, world: _World) -> None:
-    """Write landmarks that frame 0 shows: mesh nodes and their pixels."""
+def _landmarks(world: _World) -> Landmarks:
+    """Landmarks that frame 0 shows: mesh nodes and their pixels."""
     nodes = landmark_nodes(world.model) if is_sheet(world.model) else spread_nodes(world.model)
     positions = world.node_positions(0)
     depth = np.minimum(world.depth_image(positions), world.surroundings_depth(0))
@@ -150,8 +175,7 @@ def _write_landmarks(path: Path, world: _World) -> None:
             f"frame 0 shows {len(nodes)} landmarks of the object, and a tracker needs {MIN_LANDMARKS}: "
             "let the first key frames show all of it, without the occluder"
         )
-    landmarks = Landmarks(world.model.nodes[nodes], world.camera.project(positions[nodes]))
-    save_landmarks(path, landmarks)
+    return Landmarks(world.model.nodes[nodes], world.camera.project(positions[nodes]))
 
 
 def _truth_points(model: ReducedModel) -> SurfacePoints:
@@ -211,26 +235,20 @@ def _render_frames(
     world: _World, renderer: SceneRenderer, output: Path, truth: Array, progress: bool
 ) -> NDArray[np.bool_]:
     """Write all images and depths; says which truth points (T, p) are visible."""
-    scene, camera, centres = world.scene, world.camera, world.motion.occluder_centres
-    cameras = world.motion.camera_from_world
+    scene, camera = world.scene, world.camera
     columns, rows = pixel_axes(camera.height, camera.width)
     visible = np.zeros(truth.shape[:2], dtype=bool)
     with h5py.File(output / "depth.h5", "w") as file:
         depths = _create_depth(file, world)
         for frame in tqdm(range(scene.frames), desc="rendering", unit="frame", disable=not progress):
-            nodes = world.node_positions(frame)
-            image = renderer.render(
-                nodes, frame, None if centres is None else centres[frame], None if cameras is None else cameras[frame]
-            )
-            _write_image(output / "frames" / f"{frame:06}.{scene.image_format}", image)
-            depth, behind = world.depth_image(nodes), world.surroundings_depth(frame)
+            _write_image(output / "frames" / f"{frame:06}.{scene.image_format}", world.image(frame, renderer))
+            depth, behind = world.depth_image(world.node_positions(frame)), world.surroundings_depth(frame)
             both, occluded = np.minimum(depth, behind), world.occluded(frame, columns, rows)
             visible[frame] = world.visible(frame, truth[frame], both)
             hidden = np.isinf(depth) | (behind < depth) | occluded
             depths[frame] = np.where(hidden, np.float32(0.0), depth)
-            if scene.depth_sensor is not None:
-                seen = np.where(occluded, np.float32(np.inf), both)
-                measured = sensor_depth(seen, scene.depth_sensor, (scene.seed, frame))
+            measured = world.measured_depth(frame)
+            if measured is not None:
                 cv2.imwrite(str(output / "depth" / f"{frame:06}.png"), measured)
     return visible
 
@@ -247,6 +265,49 @@ def _write_lists(output: Path, world: _World) -> None:
     for name, folder, suffix in (("rgb", "frames", world.scene.image_format), ("depth", "depth", "png")):
         lines = [f"{time:.6f} {folder}/{frame:06}.{suffix}" for frame, time in enumerate(times)]
         (output / f"{name}.txt").write_text("\n".join(lines) + "\n")
+
+
+class SimulatedSequence:
+    """The frames of a scene file, rendered as they are asked for, and the truth about them; nothing is written.
+
+    Parameters
+    ----------
+    scene_path : the scene file.
+
+    Attributes
+    ----------
+    name : of the scene file.
+    fps : frames a second.
+    camera : that films.
+    model : that is filmed.
+    landmarks : nodes of the model that frame 0 shows, and their pixels.
+    parameters : (T, d) the model's, in each frame.
+    camera_from_object : (T,) the model's pose in each frame, metres.
+    has_registered_depth : whether the scene has a depth sensor.
+
+    Raises
+    ------
+    SceneError, CameraError, ModelFileError
+        As `simulate` does.
+    """
+
+    def __init__(self, scene_path: str | Path) -> None:
+        self._world = world = _load_world(Path(scene_path))
+        self.name, self.fps, self.camera, self.model = str(scene_path), world.scene.fps, world.camera, world.model
+        self.landmarks, self.parameters = _landmarks(world), world.motion.parameters
+        self.camera_from_object = tuple(world.motion.camera_from_object)
+        self.has_registered_depth = world.scene.depth_sensor is not None
+
+    def __len__(self) -> int:
+        return self._world.scene.frames
+
+    def __iter__(self) -> Iterator[Frame]:
+        renderer = self._world.renderer()
+        for number in range(len(self)):
+            depth = self._world.measured_depth(number)
+            if depth is not None:
+                depth = np.where(depth > 0, depth / np.float32(VALUES_PER_METRE), np.float32(np.nan))
+            yield Frame(number, number / self.fps, self._world.image(number, renderer), depth=depth)
 
 
 def simulate(scene_path: str | Path, output: str | Path, progress: bool = True) -> None:
@@ -266,13 +327,10 @@ def simulate(scene_path: str | Path, output: str | Path, progress: bool = True) 
         If the camera or the model that it names cannot be read.
     """
     world = _load_world(Path(scene_path))
-    renderer = SceneRenderer(
-        world.scene, world.model, world.camera, world.folder, world.nearest_depth(), world.surroundings
-    )
-    output = Path(output)
+    renderer, output = world.renderer(), Path(output)
     _prepare_folder(output)
     save_camera(output / "camera.yaml", world.camera)
-    _write_landmarks(output / "landmarks.csv", world)
+    save_landmarks(output / "landmarks.csv", _landmarks(world))
     truth = _truth_positions(world, _truth_points(world.model))
     visible = _render_frames(world, renderer, output, truth, progress)
     _write_truth(output / "truth.npz", world, truth, visible)
