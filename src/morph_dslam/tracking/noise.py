@@ -70,7 +70,8 @@ class RigObservations:
     @cached_property
     def correlation(self) -> Correlation:
         """(p, p); the errors of different cameras have nothing in common."""
-        return scipy.sparse.csr_array(scipy.sparse.block_diag([view.correlation for view in self.views]))
+        blocks = [scipy.sparse.csr_array(view.correlation) for view in self.views]
+        return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))
 
 
 def window_correlation(pixels: Array, window: int) -> scipy.sparse.csr_array:

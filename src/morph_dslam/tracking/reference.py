@@ -365,4 +365,4 @@ class ReferenceView:
             rows = slice(part.rows.start, end)
             places = camera.project(self.all_points.in_camera(part.state)[rows])
             blocks.append(window_correlation(places, window))
-        return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))
+        return scipy.sparse.csr_array(scipy.sparse.block_diag([scipy.sparse.csr_array(block) for block in blocks]))
