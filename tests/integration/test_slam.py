@@ -13,7 +13,7 @@ import pytest
 from morph_dslam.cli.app import main
 from morph_dslam.errors import CameraError, MapError
 from morph_dslam.io.trajectory import load_trajectory
-from morph_dslam.slam.map_files import load_map, save_map
+from morph_dslam.slam.map_files import save_map
 from morph_dslam.slam.mapping import Mapper
 from morph_dslam.slam.options import SlamOptions
 from morph_dslam.slam.result import NoPose, SlamReason, SlamStatus
@@ -223,7 +223,7 @@ def test_an_interrupt_at_any_frame_keeps_what_was_mapped(tmp_path, room_folder, 
     assert (summary["n_tracked"] > 0) == (at > 10)
     if summary["n_tracked"]:
         assert len(load_trajectory(tmp_path / "run" / "trajectory.txt")) == summary["n_tracked"]
-        assert len(load_map(tmp_path / "run" / "map.h5", CAMERA).good) == summary["n_map_points"] > 80
+        assert len(load_scene(tmp_path / "run" / "map.h5", CAMERA).map.good) == summary["n_map_points"] > 80
 
 
 def test_a_young_map_that_stays_lost_is_given_up_with_its_poses(room_film):

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from morph_dslam.camera import Camera
-from morph_dslam.slam.map_files import load_map, save_map
+from morph_dslam.slam.map_files import save_map
 from morph_dslam.slam.mapping import ENOUGH_KEYFRAMES, MOST_AT_ONCE, RECENT, cull_keyframes
 from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, REMOVED, Followed, Keyframe, RigidMap
+from morph_dslam.slam.scene import load_scene
 from morph_dslam.slam.tracking import FewTemplates
 from tests.support.rendered_room import pose
 
@@ -177,7 +178,7 @@ def test_a_saved_map_has_only_the_keyframes_that_are_left(tmp_path):
     rigid_map = map_of([0, 1], [0, 1], [0, 1], [0, 1], n_points=2)
     rigid_map.remove_keyframe(1, carrier=0)
     save_map(tmp_path / "map.h5", rigid_map, CAMERA)
-    loaded = load_map(tmp_path / "map.h5", CAMERA)
+    loaded = load_scene(tmp_path / "map.h5", CAMERA).map
     assert [keyframe.index for keyframe in loaded.keyframes] == [0, 20, 30]
     assert loaded.template_keyframe.tolist() == [2, 2]
     assert loaded.keyframes[loaded.template_keyframe[0]].normalized[0, 0] == 3

@@ -89,22 +89,22 @@ class _World:
         """What makes the images."""
         return SceneRenderer(self.scene, self.model, self.camera, self.folder, self.nearest_depth(), self.surroundings)
 
-    def image(self, frame: int, renderer: SceneRenderer) -> NDArray[np.uint8]:
-        """The image (h, w, 3) of a frame."""
+    def image(self, frame: int, nodes: Array, renderer: SceneRenderer) -> NDArray[np.uint8]:
+        """The image (h, w, 3) of a frame, with the object's nodes (n, 3) in the camera frame."""
         centres, cameras = self.motion.occluder_centres, self.motion.camera_from_world
         return renderer.render(
-            self.node_positions(frame),
-            frame,
-            None if centres is None else centres[frame],
-            None if cameras is None else cameras[frame],
+            nodes, frame, None if centres is None else centres[frame], None if cameras is None else cameras[frame]
         )
 
-    def measured_depth(self, frame: int) -> NDArray[np.uint16] | None:
-        """What the depth sensor gives (h, w); None without one."""
+    def measured_depth(
+        self, frame: int, depth: NDArray[np.float32], occluded: NDArray[np.bool_]
+    ) -> NDArray[np.uint16] | None:
+        """What the depth sensor gives (h, w); None without one.
+
+        ``depth`` (h, w) is that of the object and its surroundings, and ``occluded`` (h, w) where the occluder is.
+        """
         if self.scene.depth_sensor is None:
             return None
-        occluded = self.occluded(frame, *pixel_axes(self.camera.height, self.camera.width))
-        depth = np.minimum(self.depth_image(self.node_positions(frame)), self.surroundings_depth(frame))
         seen = np.where(occluded, np.float32(np.inf), depth)
         return sensor_depth(seen, self.scene.depth_sensor, (self.scene.seed, frame))
 
@@ -241,13 +241,14 @@ def _render_frames(
     with h5py.File(output / "depth.h5", "w") as file:
         depths = _create_depth(file, world)
         for frame in tqdm(range(scene.frames), desc="rendering", unit="frame", disable=not progress):
-            _write_image(output / "frames" / f"{frame:06}.{scene.image_format}", world.image(frame, renderer))
-            depth, behind = world.depth_image(world.node_positions(frame)), world.surroundings_depth(frame)
+            nodes = world.node_positions(frame)
+            _write_image(output / "frames" / f"{frame:06}.{scene.image_format}", world.image(frame, nodes, renderer))
+            depth, behind = world.depth_image(nodes), world.surroundings_depth(frame)
             both, occluded = np.minimum(depth, behind), world.occluded(frame, columns, rows)
             visible[frame] = world.visible(frame, truth[frame], both)
             hidden = np.isinf(depth) | (behind < depth) | occluded
             depths[frame] = np.where(hidden, np.float32(0.0), depth)
-            measured = world.measured_depth(frame)
+            measured = world.measured_depth(frame, both, occluded)
             if measured is not None:
                 cv2.imwrite(str(output / "depth" / f"{frame:06}.png"), measured)
     return visible
@@ -302,12 +303,15 @@ class SimulatedSequence:
         return self._world.scene.frames
 
     def __iter__(self) -> Iterator[Frame]:
-        renderer = self._world.renderer()
+        world, renderer = self._world, self._world.renderer()
         for number in range(len(self)):
-            depth = self._world.measured_depth(number)
-            if depth is not None:
-                depth = np.where(depth > 0, depth / np.float32(VALUES_PER_METRE), np.float32(np.nan))
-            yield Frame(number, number / self.fps, self._world.image(number, renderer), depth=depth)
+            nodes, depth = world.node_positions(number), None
+            if self.has_registered_depth:
+                both = np.minimum(world.depth_image(nodes), world.surroundings_depth(number))
+                occluded = world.occluded(number, *pixel_axes(self.camera.height, self.camera.width))
+                measured = world.measured_depth(number, both, occluded)
+                depth = np.where(measured > 0, measured / np.float32(VALUES_PER_METRE), np.float32(np.nan))
+            yield Frame(number, number / self.fps, world.image(number, nodes, renderer), depth=depth)
 
 
 def simulate(scene_path: str | Path, output: str | Path, progress: bool = True) -> None:

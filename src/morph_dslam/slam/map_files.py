@@ -127,11 +127,6 @@ def save_map(path: Path, rigid_map: RigidMap, camera: Camera, trajectory: Trajec
             file[f"trajectory/{name}"] = getattr(trajectory, name)
 
 
-def load_map(path: Path, camera: Camera) -> RigidMap:
-    """The map alone of a file, as `load_scene` reads it."""
-    return load_map_and_trajectory(path, camera)[0]
-
-
 def load_map_and_trajectory(path: Path, camera: Camera) -> tuple[RigidMap, Trajectory]:
     """Read a map and the path of the run that made it, which is empty where the file holds none.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
@@ -20,7 +19,7 @@ from morph_dslam.model.inner_structure import InnerStructure, load_inner_structu
 from morph_dslam.notices import Remark
 from morph_dslam.registration.initialization import Initializer, register_by_initializer
 from morph_dslam.registration.landmarks import CLICK_PX, register_landmarks
-from morph_dslam.registration.registration import Registration, in_scene, load_registration
+from morph_dslam.registration.registration import Registration, in_scene, load_registration, read_content
 from morph_dslam.slam.rigid_map import Keyframe
 from morph_dslam.slam.scene import Scene, load_scene
 from morph_dslam.sources import Frame
@@ -142,7 +141,7 @@ def map_of(registration: Path, given: Path | None) -> Path | None:
     if given is not None:
         return given
     beside = [registration.with_name("map.h5")]
-    named = json.loads(registration.read_text()).get("map")
+    named = read_content(registration).get("map")
     if named:
         beside.insert(0, registration.parent / named)
     return next((path for path in beside if path.is_file()), None)
