@@ -129,24 +129,27 @@ def test_numbers_that_cannot_be_meant(tmp_path, load, name, text):
         load(tmp_path / name)
 
 
-def test_a_damaged_summary_is_named(tmp_path):
+@pytest.mark.parametrize("name", ["summary.json", "pixel_evaluation.json"])
+def test_damaged_figures_are_named(tmp_path, name):
     write_run(tmp_path)
     run = load_run(tmp_path)
     for text in ("", "[]", '{"flags": ['):
-        (tmp_path / "summary.json").write_text(text)
-        with pytest.raises(EvaluationError, match=r"summary\.json"):
-            write_run_report(tmp_path, run, {})
+        (tmp_path / name).write_text(text)
+        with pytest.raises(EvaluationError, match=name):
+            write_run_report(tmp_path, run)
 
 
 def test_a_folder_that_holds_a_run_or_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("")
     make_run_folder(tmp_path / "a" / "run", overwrite=False)
     assert (tmp_path / "a" / "run").is_dir()
+    (tmp_path / "a" / "run" / "pixel_evaluation.json").write_text("{}")
     for sign in ("result.h5", "trajectory.txt"):
         (tmp_path / "a" / "run" / sign).write_text("")
         with pytest.raises(TrackingError, match="holds a run already"):
             make_run_folder(tmp_path / "a" / "run", False, sign)
         make_run_folder(tmp_path / "a" / "run", True, sign)
+    assert not (tmp_path / "a" / "run" / "pixel_evaluation.json").exists()  # of the run that was overwritten
     for name in ("file", "file/run"):
         with pytest.raises(TrackingError, match="cannot write the run to"):
             make_run_folder(tmp_path / name, overwrite=True)

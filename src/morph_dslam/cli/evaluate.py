@@ -5,7 +5,7 @@ import argparse
 from morph_dslam.cli.arguments import add_file
 from morph_dslam.errors import EvaluationError
 
-HELP = "compare a run with measured points or depth images, or its camera path with the true one"
+HELP = "compare a run with measured points, tracks in images or depth images, or its camera path with the true one"
 KEPT = "the run is unchanged"
 
 
@@ -13,6 +13,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add_file(command, "run_folder", "run folder, or a trajectory file", "RUN")
     truth = command.add_mutually_exclusive_group(required=True)
     add_file(truth, "--points", "truth file, .npz (docs/run-folder.md)", "TRUTH")
+    add_file(truth, "--pixels", "points followed in the images, CSV with frame,id,u,v", "TRACKS")
     add_file(truth, "--trajectory", "true camera path (TUM, KITTI, COLMAP or 7-Scenes)", "TRUTH")
     add_file(
         truth, "--depth", "depth.h5 of a simulation, a recording with depth, or a folder of 16-bit images", "DEPTH"
@@ -27,14 +28,23 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--bind-frame",
         type=int,
         metavar="N",
-        help="with --points: frame whose pixels bind the truth points to the mesh",
+        help="with --points and --pixels: frame whose pixels bind the points to the mesh",
     )
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Compare and print the figures."""
     from morph_dslam import evaluate, evaluate_depth, evaluate_trajectory
-    from morph_dslam.extend.reports import alignment_line, depth_line, remarks, result_line, trajectory_line
+    from morph_dslam.extend.reports import (
+        alignment_line,
+        depth_line,
+        evaluate_pixels,
+        pixel_line,
+        pixel_remarks,
+        remarks,
+        result_line,
+        trajectory_line,
+    )
 
     _check(arguments)
     folder = arguments.run_folder
@@ -44,20 +54,29 @@ def run(arguments: argparse.Namespace) -> None:
         found = evaluate_depth(folder, arguments.depth, arguments.base_frame, arguments.depth_per_metre)
         print(f"wrote {folder / 'depth_evaluation.json'} and depth_evaluation.png")
         print(depth_line(found))
+    elif arguments.pixels is not None:
+        figures = evaluate_pixels(folder, arguments.pixels, arguments.bind_frame)
+        _print_notes(pixel_remarks(figures))
+        print(f"wrote {folder / 'pixel_evaluation.json'} and {folder / 'report.html'}")
+        print(pixel_line(figures))
     else:
         figures = evaluate(folder, arguments.points, arguments.bind_frame)
-        for remark in remarks(figures):
-            print(f"note: {remark}")
+        _print_notes(remarks(figures))
         print(f"wrote {folder / 'evaluation.json'} and {folder / 'report.html'}")
         print(alignment_line(figures))
         print(result_line(figures))
+
+
+def _print_notes(lines: list[str]) -> None:
+    for line in lines:
+        print(f"note: {line}")
 
 
 def _check(arguments: argparse.Namespace) -> None:
     """Refuse options that would have no effect."""
     if arguments.depth is None and (arguments.base_frame, arguments.depth_per_metre) != (None, None):
         raise EvaluationError("--base-frame and --depth-per-metre go with --depth: leave them out")
-    if arguments.points is None and arguments.bind_frame is not None:
-        raise EvaluationError("--bind-frame goes with --points: leave it out")
+    if arguments.points is None and arguments.pixels is None and arguments.bind_frame is not None:
+        raise EvaluationError("--bind-frame goes with --points and --pixels: leave it out")
     if arguments.points is not None and arguments.bind_frame is None:
         raise EvaluationError("--points needs --bind-frame N, the frame whose pixels bind the points to the mesh")

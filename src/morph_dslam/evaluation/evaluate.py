@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.evaluation.depth import depth_error, read_depths, summarise_depth
+from morph_dslam.evaluation.pixels import PixelTracks, load_tracks, pixel_error, summarise_pixels
 from morph_dslam.evaluation.points import PointTruth, load_truth, material_error, summarise
 from morph_dslam.evaluation.run_folder import Run, load_run
 from morph_dslam.evaluation.run_report import (
@@ -18,6 +19,8 @@ from morph_dslam.evaluation.run_report import (
     plot_depth_errors_by_frame,
     plot_error_map,
     plot_errors_by_frame,
+    plot_pixel_error_map,
+    plot_pixel_errors_by_frame,
     write_run_report,
 )
 from morph_dslam.evaluation.trajectory import summarise_alignment
@@ -59,7 +62,7 @@ def evaluate(run: str | Path | Run, truth: str | Path | PointTruth, bind_frame: 
         (folder / "evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
         plot_errors_by_frame(folder / "evaluation.png", error)
         plot_error_map(folder / "error_map.png", error, tracked.model)
-        write_run_report(folder, tracked, figures)
+        write_run_report(folder, tracked)
     return figures
 
 
@@ -100,6 +103,45 @@ def evaluate_depth(
         (folder / "depth_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
         plot_depth_errors_by_frame(folder / "depth_evaluation.png", error)
         plot_depth_error_map(folder / "depth_error_map.png", error, tracked.model)
+    return figures
+
+
+def evaluate_pixels(
+    run: str | Path | Run, tracks: str | Path | PixelTracks, bind_frame: int | None = None
+) -> dict[str, Any]:
+    """Compare a run with points followed in its images.
+
+    Of a run folder, ``pixel_evaluation.json``, pictures and ``report.html`` are written into it.
+
+    Parameters
+    ----------
+    run : a run folder, or a run in memory.
+    tracks : a file, see `load_tracks`, or tracks in memory.
+    bind_frame : the frame whose pixels bind all tracks; where absent, each is bound in the first of its frames that the
+        run tracked.
+
+    Returns
+    -------
+    The content of ``pixel_evaluation.json``: pixels, and millimetres across the sight line.
+
+    Raises
+    ------
+    EvaluationError
+        If the run and the tracks cannot be read or do not fit together.
+    """
+    tracked = run if isinstance(run, Run) else load_run(run)
+    error = pixel_error(tracked, tracks if isinstance(tracks, PixelTracks) else load_tracks(tracks), bind_frame)
+    figures = {
+        **summarise_pixels(error),
+        "tracks": None if isinstance(tracks, PixelTracks) else str(tracks),
+        **_counts(tracked),
+    }
+    if not isinstance(run, Run):
+        folder = Path(run)
+        (folder / "pixel_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
+        plot_pixel_errors_by_frame(folder / "pixel_evaluation.png", error)
+        plot_pixel_error_map(folder / "pixel_error_map.png", error, tracked.model)
+        write_run_report(folder, tracked)
     return figures
 
 

@@ -144,6 +144,27 @@ class MaterialError:
         return np.linalg.norm(self.vectors - self.along_sight[..., None] * self.sight, axis=2)
 
 
+def bind_pixels(run: Run, row: int, recorded: Array) -> tuple[SurfacePoints, int]:
+    """The surface points that pixels (p, 2) of the recorded image show, in the state estimated there.
+
+    Returns
+    -------
+    points : length p; triangle -1 where a pixel misses the surface by more than `OUTLINE_TOLERANCE_PX`.
+    n_outline : how many missed it by less, and are bound to its outline.
+    """
+    pixels = run.camera.undistort_pixels(recorded)
+    nodes, triangles = run.camera_points(row), run.model.triangles
+    points = pick_surface(nodes, triangles, run.camera.rays(pixels))
+    missed = np.flatnonzero((points.triangles < 0) & np.isfinite(pixels).all(axis=1))
+    if not missed.size:
+        return points, 0
+    outline, distance = nearest_on_outline(nodes, run.camera.project(nodes), triangles, pixels[missed])
+    close = distance <= OUTLINE_TOLERANCE_PX
+    points.triangles[missed[close]] = outline.triangles[close]
+    points.weights[missed[close]] = outline.weights[close]
+    return points, int(close.sum())
+
+
 def bind_truth(run: Run, truth: PointTruth, frame: int) -> Binding:
     """Bind truth points to the mesh by their pixels in ``frame``, in the state estimated there."""
     in_truth = np.flatnonzero(truth.frames == frame)
@@ -158,21 +179,11 @@ def bind_truth(run: Run, truth: PointTruth, frame: int) -> Binding:
     recorded = truth.pixels[in_truth[0]]
     # The pixel of a hidden point belongs to whatever hides it, the front of the object itself for instance.
     columns = np.flatnonzero(np.isfinite(recorded).all(axis=1) & ~truth.hidden[in_truth[0]])
-    pixels = run.camera.undistort_pixels(recorded[columns])
-    nodes, triangles = run.camera_points(row), run.model.triangles
-    points = pick_surface(nodes, triangles, run.camera.rays(pixels))
-    missed = np.flatnonzero(points.triangles < 0)
+    points, n_outline = bind_pixels(run, row, recorded[columns])
     bound = points.triangles >= 0
-    if missed.size:
-        outline, distance = nearest_on_outline(nodes, run.camera.project(nodes), triangles, pixels[missed])
-        close = distance <= OUTLINE_TOLERANCE_PX
-        points.triangles[missed[close]] = outline.triangles[close]
-        points.weights[missed[close]] = outline.weights[close]
-        bound[missed[close]] = True
     if not bound.any():
         raise EvaluationError(f"in frame {frame} no truth pixel falls on the estimated surface")
     unbound = np.setdiff1d(np.arange(recorded.shape[0]), columns[bound])
-    n_outline = int(bound[missed].sum())
     n_unseen = len(recorded) - len(columns)
     return Binding(frame, columns[bound], points.take(bound), n_outline, unbound, n_unseen)
 

@@ -1,9 +1,9 @@
-"""The report of an evaluated run, and its pictures of the material error and of the surface error."""
+"""The report of an evaluated run, and the pictures of its errors."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import EvaluationError
 from morph_dslam.evaluation.depth import DepthError
 from morph_dslam.evaluation.model_summary import flatten, summarise_model
+from morph_dslam.evaluation.pixels import PixelError, pixel_remarks
 from morph_dslam.evaluation.points import MaterialError
 from morph_dslam.evaluation.report import Link, Picture, Section, Table, Text, write_report
 from morph_dslam.evaluation.run_folder import Run, remarks
@@ -80,6 +81,14 @@ def plot_depth_errors_by_frame(path: Path, error: DepthError) -> None:
     _plot_by_frame(path, np.array(frames), distances, [1e3 * error.compared], label, title, shown)
 
 
+def plot_pixel_errors_by_frame(path: Path, error: PixelError) -> None:
+    """The spread of the pixel error over the tracks of each frame."""
+    distances = [row[np.isfinite(row)] for row in error.distances_px]
+    across = 1e3 * error.across[np.isfinite(error.across)]
+    title = f"across the sight line: mean {across.mean():.3f} mm, 95th percentile {np.percentile(across, 95):.3f} mm"
+    _plot_by_frame(path, error.frames, distances, distances, "pixel error [px]", title, unit="px")
+
+
 def _plot_by_frame(
     path: Path,
     frames: NDArray[np.int64],
@@ -88,6 +97,7 @@ def _plot_by_frame(
     label: str,
     title: str,
     base: float | None = None,
+    unit: str = "mm",
 ) -> None:
     """Boxes for few frames, bands for many; the mean of ``counted`` dashed, ``base`` dotted."""
     figure = Figure(figsize=(9.0, 4.2), layout="constrained")
@@ -102,8 +112,8 @@ def _plot_by_frame(
     axes.set_ylabel(label)
     axes.set_ylim(bottom=0.0)
     axes.set_title(
-        f"mean {values.mean():.2f} mm (dashed), median {np.median(values):.2f} mm, "
-        f"95th percentile {np.percentile(values, 95):.2f} mm\n{title}",
+        f"mean {values.mean():.2f} {unit} (dashed), median {np.median(values):.2f} {unit}, "
+        f"95th percentile {np.percentile(values, 95):.2f} {unit}\n{title}",
         fontsize=10,
     )
     figure.savefig(path, dpi=DPI)
@@ -122,6 +132,13 @@ def plot_error_map(path: Path, error: MaterialError, model: ReducedModel) -> Non
     mean = np.nanmean(error.distances[:, measured], axis=0)
     rest = model.rest_positions(error.binding.points)[measured]
     _plot_map(path, rest, mean, model, "mean material error [mm]")
+
+
+def plot_pixel_error_map(path: Path, error: PixelError, model: ReducedModel) -> None:
+    """Mean error across the sight line of each track where its point lies on the undeformed object."""
+    measured = np.isfinite(error.across).any(axis=0)
+    rest = model.rest_positions(error.points)[measured]
+    _plot_map(path, rest, np.nanmean(error.across[:, measured], axis=0), model, "mean error across the sight line [mm]")
 
 
 def plot_depth_error_map(path: Path, error: DepthError, model: ReducedModel) -> None:
@@ -156,10 +173,6 @@ VIDEO = "augmented.mp4"
 N_FRAMES_SHOWN = 4
 #: Keys of ``summary.json`` that the figures of the evaluation repeat.
 _SHOWN_ABOVE = ("model", "n_frames", "n_tracked", "median_ms", "p95_ms")
-_CAPTIONS = {
-    "evaluation.png": "Material error over the points of each frame with truth.",
-    "error_map.png": "Mean material error where each point lies on the undeformed object.",
-}
 
 
 def sample_video(path: Path, count: int) -> list[tuple[int, bytes]]:
@@ -194,9 +207,52 @@ def _error_section(folder: Path, figures: Mapping[str, Any]) -> Section:
         "frames tracked": f"{figures['n_frames_tracked']} of {figures['n_frames']}",
         "time a frame": f"median {figures['median_ms']:.2f} ms, 95th percentile {figures['p95_ms']:.2f} ms",
     }
-    notes = [Text(remark, warning=True) for remark in remarks(figures)]
-    plots = [Picture.read(folder / name, caption) for name, caption in _CAPTIONS.items()]
-    return Section("Material error, without alignment", [Table.of(rows), *notes, *plots])
+    captions = {
+        "evaluation.png": "Material error over the points of each frame with truth.",
+        "error_map.png": "Mean material error where each point lies on the undeformed object.",
+    }
+    blocks = [Table.of(rows), *_warnings(remarks(figures)), *_pictures(folder, captions)]
+    return Section("Material error, without alignment", blocks)
+
+
+def _pixel_section(folder: Path, figures: Mapping[str, Any]) -> Section:
+    names = {"mean": "mean", "median": "median", "p95": "95th percentile", "max": "largest"}
+    rows = {
+        name: f"{figures[f'{key}_px']:.3f} px, {figures[f'{key}_mm']:.4f} mm across the sight line"
+        for key, name in names.items()
+    }
+    rows["mean shift to the right and down"] = ", ".join(f"{shift:.3f} px" for shift in figures["mean_shift_px"])
+    rows["tracks compared"] = f"{figures['n_tracks_compared']} of {figures['n_tracks']}"
+    rows["frames compared"] = str(len(figures["frames_compared"]))
+    rows["frames tracked"] = f"{figures['n_frames_tracked']} of {figures['n_frames']}"
+    worst = [
+        (name, *(f"{of[key]:.3f}" for key in ("mean_px", "max_px", "mean_mm")), str(of["n_frames"]))
+        for name, of in ((name, figures["per_track"][name]) for name in figures["worst_tracks"])
+    ]
+    captions = {
+        "pixel_evaluation.png": "Pixel error over the tracks of each frame.",
+        "pixel_error_map.png": "Mean error across the sight line where each track lies on the undeformed object.",
+    }
+    table = Table(worst, ("largest errors: track", "mean px", "largest px", "mean mm", "frames"))
+    blocks = [Table.of(rows), *_warnings(pixel_remarks(figures)), *_pictures(folder, captions), table]
+    return Section("Error of tracks in the images, without alignment", blocks)
+
+
+def _warnings(lines: Sequence[str]) -> list[Text]:
+    return [Text(line, warning=True) for line in lines]
+
+
+def _pictures(folder: Path, captions: Mapping[str, str]) -> list[Picture]:
+    return [Picture.read(folder / name, caption) for name, caption in captions.items()]
+
+
+#: What each file with figures adds to the report.
+_EVALUATIONS = {"evaluation.json": _error_section, "pixel_evaluation.json": _pixel_section}
+
+
+def _evaluations(folder: Path) -> list[Section]:
+    files = [(folder / name, make) for name, make in _EVALUATIONS.items()]
+    return [make(folder, _content(path)) for path, make in files if path.is_file()]
 
 
 def _video_section(folder: Path, run: Run) -> Section:
@@ -215,21 +271,21 @@ def _lost_section(run: Run) -> Section:
     return Section("Frames that were not tracked", [Table(rows, ("frame", "status", "reason"))] if rows else [])
 
 
-def _summary(path: Path) -> dict[str, Any]:
-    """The content of a run's summary, none where there is no file; raises EvaluationError if damaged."""
+def _content(path: Path) -> dict[str, Any]:
+    """The figures in a file of the run, none where there is no file; raises EvaluationError if damaged."""
     if not path.is_file():
         return {}
     try:
         content = json.loads(path.read_text())
     except ValueError as error:
-        raise EvaluationError(f"{path} is damaged ({error}): restore it, or track again") from error
+        raise EvaluationError(f"{path} is damaged ({error}): restore or delete it") from error
     if not isinstance(content, dict):
-        raise EvaluationError(f"{path} is not the summary of a run: restore it, or track again")
+        raise EvaluationError(f"{path} does not hold figures of a run: restore or delete it")
     return content
 
 
 def _tracking_sections(folder: Path) -> list[Section]:
-    summary = _summary(folder / "summary.json")
+    summary = _content(folder / "summary.json")
     flags = [Text(str(flag), warning=True) for flag in summary.pop("flags", [])]
     background = {key: summary.pop(key) for key in ("inputs", "settings", "versions") if key in summary}
     facts = flatten({key: value for key, value in summary.items() if key not in _SHOWN_ABOVE})
@@ -240,11 +296,11 @@ def _tracking_sections(folder: Path) -> list[Section]:
     ]
 
 
-def write_run_report(folder: Path, run: Run, figures: Mapping[str, Any]) -> Path:
-    """Write ``report.html`` into a run folder; ``figures`` are those of ``evaluation.json``."""
+def write_run_report(folder: Path, run: Run) -> Path:
+    """Write ``report.html`` into a run folder, with every evaluation whose figures are in it."""
     tracking, settings = _tracking_sections(folder)
     sections = [
-        _error_section(folder, figures),
+        *_evaluations(folder),
         _video_section(folder, run),
         _lost_section(run),
         tracking,

@@ -1,7 +1,14 @@
 """The blocks of a report page, and the lines that sum up a run and its evaluation."""
 
 from morph_dslam.evaluation.depth import distances_to_surface as distances_to_surface
+from morph_dslam.evaluation.evaluate import evaluate_pixels as evaluate_pixels
 from morph_dslam.evaluation.model_summary import summarise_model as summarise_model
+from morph_dslam.evaluation.pixels import (
+    PixelTracks as PixelTracks,
+    load_tracks as load_tracks,
+    pixel_line as pixel_line,
+    pixel_remarks as pixel_remarks,
+)
 from morph_dslam.evaluation.points import PointTruth as PointTruth, load_truth as load_truth
 from morph_dslam.evaluation.report import (
     KeyFigures as KeyFigures,

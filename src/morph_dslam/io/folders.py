@@ -8,7 +8,7 @@ from morph_dslam.errors import TrackingError
 
 
 def make_run_folder(folder: Path, overwrite: bool, sign: str = "result.h5") -> None:
-    """Make a run folder and those above it.
+    """Make a run folder and those above it; evaluations of a run that is to be overwritten are deleted.
 
     Parameters
     ----------
@@ -29,3 +29,6 @@ def make_run_folder(folder: Path, overwrite: bool, sign: str = "result.h5") -> N
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise TrackingError(f"cannot write the run to {folder}: {error.strerror}") from error
+    # They would stand in the report of the new run.
+    for old in folder.glob("*evaluation.json"):
+        old.unlink()
