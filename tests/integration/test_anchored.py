@@ -202,8 +202,18 @@ def test_a_tracker_knows_from_the_scene_what_an_object_looks_like_and_where_it_i
         assert result.estimate.state.parameters[0] == pytest.approx(truth["parameters"][frame.index, 0], abs=0.5e-3)
         assert np.linalg.norm(result.pose.translation - true_pose(truth, frame.index).translation) < MAP_ERROR
     assert len(scene.points) == n_points  # what can move was taken out of a copy
-    with pytest.raises(TrackingError, match="outline"):
-        md.Tracker(model, camera, registration, md.TrackerOptions(use_outline=True))
+
+
+def test_the_outline_counts_where_only_keyframes_show_what_the_object_looks_like(recording):
+    """They hold no grey values, so how bright the object is inside is learnt from the first frame."""
+    folder, truth = recording
+    model, camera = md.load_model(folder / "sheet.morph"), md.load_camera(folder / "sequence" / "camera.yaml")
+    registration = md.load_registration(folder / "registration.json", model, md.load_scene(folder / "map.h5", camera))
+    tracker = md.Tracker(model, camera, registration, md.TrackerOptions(use_outline=True))
+    for frame in frames_of(folder, 44, 47):
+        result = tracker.track(frame)
+        assert result.estimate.state.parameters[0] == pytest.approx(truth["parameters"][frame.index, 0], abs=0.5e-3)
+        assert (tracker.last_measured.weights[len(tracker.reference.points) :] > 0.0).sum() > 50
 
 
 def test_a_live_run_keeps_the_pace_and_everything_it_found(recording, tmp_path):

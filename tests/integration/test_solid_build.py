@@ -173,8 +173,11 @@ def test_a_solid_is_filmed_and_tracked(built, filmed):
     assert figures["mean_mm"] < 0.5
 
 
-def test_a_closed_surface_has_no_outline_to_track(built, filmed, refused):
-    assert "is closed and has no rim" in refused("track", *filmed, "--outline", "-o", built / "outlined")
+def test_the_outline_of_a_closed_surface_counts_beside_its_texture(built, filmed):
+    assert cli.main(["track", *filmed, "--outline", "--no-video", "-o", str(built / "outlined")]) == 0
+    points = ["--points", str(built / "seq" / "truth.npz"), "--bind-frame", "0"]
+    assert cli.main(["evaluate", str(built / "outlined"), *points]) == 0
+    assert json.loads((built / "outlined" / "evaluation.json").read_text())["mean_mm"] < 0.5
 
 
 def test_uniaxial_stretch_reaches_the_closed_form_through_the_whole_chain(tmp_path):

@@ -166,6 +166,37 @@ def rasterise(
     return buffers
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def draw_depth(pixels, depths, triangles, closed, height, width):
+    """The nearest triangle (h, w) int32 of each pixel, -1 for none, and its depth (h, w) float32.
+
+    As `rasterise`, which says what the parameters are, without the weights: half of its time.
+    """
+    triangle_ids = np.full((height, width), -1, np.int32)
+    depth = np.full((height, width), np.float32(np.inf), np.float32)
+    u, v, q = np.empty(3), np.empty(3), np.empty(3)
+    for t in range(triangles.shape[0]):
+        area = load_triangle(pixels, depths, triangles, t, closed, u, v, q)
+        if area == 0.0:
+            continue
+        left, right, top, bottom = pixel_window(u, v, height, width)
+        if left > right or top > bottom:
+            continue
+        step0, step1 = weight_steps(v, area)
+        for row in range(top, bottom + 1):
+            first0, first1 = weights_at(u, v, area, left, row)
+            for column in range(left, right + 1):
+                b0, b1 = first0 + (column - left) * step0, first1 + (column - left) * step1
+                b2 = 1.0 - b0 - b1
+                if not is_inside(b0, b1, b2):
+                    continue
+                z = np.float32(1.0 / (b0 * q[0] + b1 * q[1] + b2 * q[2]))
+                if z < depth[row, column]:
+                    depth[row, column] = z
+                    triangle_ids[row, column] = t
+    return triangle_ids, depth
+
+
 def image_region(pixels: Array, height: int, width: int, margin: int = 0) -> tuple[slice, slice] | None:
     """Rows and columns of an image that a projected mesh (n, 2) may cover; None if it is out of sight.
 

@@ -9,7 +9,6 @@ from morph_dslam.errors import TrackingError
 from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.drawing import shown_field
 from morph_dslam.tracking.options import NO_DISCREPANCY
-from morph_dslam.tracking.outline import rim
 from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
 from morph_dslam.tracking.setup import TrackedObject
 
@@ -129,15 +128,10 @@ def check_depth(run: TrackOptions, objects: Sequence[TrackedObject], source: obj
 
 def _unsuited(run: TrackOptions, part: TrackedObject) -> Iterable[str]:
     """What of the options does not suit an object."""
-    if part.options.use_outline and not len(rim(part.model.triangles)):
-        yield f"the surface of '{part.model.name}' is closed and has no rim: track it without the outline"
     if not isinstance(part.start, Registration):
         return
     if run.live and not part.keyframes:
-        yield (
-            "a registration needs the map that it was made in, to know what the object looks like: give --map, and "
-            "leave out --outline"
-        )
+        yield "a registration needs the map that it was made in, to know what the object looks like: give --map"
     if run.reference_frame is not None and run.other_cameras and not (part.keyframes and part.scene):
         yield "without its map a registration brings its own reference frame: leave out --reference-frame"
 

@@ -22,7 +22,6 @@ from morph_dslam.model.discrepancy import Discrepancy, DiscrepancyBasis, farthes
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.estimator import Estimator
 from morph_dslam.tracking.noise import Observations
-from morph_dslam.tracking.outline import Outline
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.state import BoundPoints, State
 
@@ -236,11 +235,7 @@ class Reference:
 
 
 def refine_discrepancy(
-    fit: DiscrepancyFit,
-    estimator: Estimator,
-    reference: Reference,
-    keyframes: Sequence[Keyframe],
-    outline: Outline | None = None,
+    fit: DiscrepancyFit, estimator: Estimator, reference: Reference, keyframes: Sequence[Keyframe]
 ) -> Discrepancy:
     """The discrepancy in the reference view that explains landmarks and keyframes best.
 
@@ -250,10 +245,9 @@ def refine_discrepancy(
 
     Parameters
     ----------
-    fit : of the same model
-    outline : of the object, if the keyframes saw it.
+    fit : of the same model.
     """
-    adjustment = _Adjustment(fit, estimator, reference, keyframes, outline)
+    adjustment = _Adjustment(fit, estimator, reference, keyframes)
     for _ in range(STEPS):
         adjustment.step()
     return Discrepancy(fit.basis, adjustment.values)
@@ -285,12 +279,7 @@ class _Frame:
 
 class _Adjustment:
     def __init__(
-        self,
-        fit: DiscrepancyFit,
-        estimator: Estimator,
-        reference: Reference,
-        keyframes: Sequence[Keyframe],
-        outline: Outline | None,
+        self, fit: DiscrepancyFit, estimator: Estimator, reference: Reference, keyframes: Sequence[Keyframe]
     ) -> None:
         self._fit, self._reference, self._estimator = fit, reference, estimator
         model, camera = estimator.model, estimator.camera
@@ -298,7 +287,7 @@ class _Adjustment:
         self._points = BoundPoints.from_surface(model, surface)
         self.values = np.zeros((len(fit.basis.centres), 3))
         self._along = self._moves_along_surface()
-        self._frames = [self._frame(keyframe, outline) for keyframe in keyframes]
+        self._frames = [self._frame(keyframe) for keyframe in keyframes]
 
     def _moves_along_surface(self) -> Array:
         """By how much a displacement slides the points (p, 2, 3) along two edges of their triangles.
@@ -317,8 +306,8 @@ class _Adjustment:
         corners = nodes[model.triangles[self._points.surface.triangles]]
         return np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=2)
 
-    def _frame(self, keyframe: Keyframe, outline: Outline | None) -> _Frame:
-        points, pixels, weights, normals = keyframe.measured(self._points, self._met, outline)
+    def _frame(self, keyframe: Keyframe) -> _Frame:
+        points, pixels, weights, normals = keyframe.measured(self._points, self._met)
         state = self._estimator.estimate(points, pixels, weights, keyframe.state, normals).state
         sliding = np.zeros((len(points), 3, 3))
         sliding[: len(self._points)] = self._edges(state) @ self._along

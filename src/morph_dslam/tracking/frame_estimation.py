@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
 
 from morph_dslam.errors import TrackingError
@@ -18,13 +19,15 @@ from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis
 from morph_dslam.tracking.measurement import PATCH_WINDOW, Measurement
-from morph_dslam.tracking.noise import Observations, PointNoise, RigObservations, window_correlation
+from morph_dslam.tracking.noise import Correlation, Observations, PointNoise, RigObservations, window_correlation
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE
 from morph_dslam.tracking.options import TrackerOptions
-from morph_dslam.tracking.outline import OUTLINE_WEIGHT, REACH_PX
+from morph_dslam.tracking.outline import REACH_PX, OutlineMeasurement
+from morph_dslam.tracking.outline_weight import OutlineBalance
 from morph_dslam.tracking.reference import ReferenceView
 from morph_dslam.tracking.sequence_filter import Fitter, SequenceFilter
 
+Array = NDArray[np.float64]
 #: Share of the cost below which another shape is a better explanation and not the same one.
 CLEARLY_BETTER = 0.95
 #: The least spread of residuals, pixels, that is believed when they are weighed against depths.
@@ -101,7 +104,7 @@ class FrameEstimation:
 
     def __init__(self, estimator: Estimator, reference: ReferenceView, options: TrackerOptions) -> None:
         self._estimator, self._reference, self._options = estimator, reference, options
-        self._noise = PointNoise()
+        self._noise, self._balance = PointNoise(), OutlineBalance()
         self._search = ShapeSearch(estimator.model, options.searches)
         brief = replace(options.estimation, max_iterations=10, tolerance=1e-3)
         self._scout = Estimator(estimator.model, estimator.camera, brief)
@@ -168,19 +171,51 @@ class FrameEstimation:
         outline = self._reference.outline
         if outline is None:
             return attempt
-        estimate, count, seen = attempt.estimate, len(self._reference.points), None
+        estimate, balance = attempt.estimate, self._balance
+        if picture.has_grey and not outline.knows_brightness:
+            outline.take_brightness(picture.grey, estimate.state)
+        seen = outline.measure(picture.grey, estimate.state, REACH_PX, picture.occluder_depth)
+        if balance.weight == 0.0:
+            balance.learn_texture(*self._supporting(attempt, estimate))
+            offsets = self._estimator.camera.project(seen.points.in_camera(estimate.state)) - seen.pixels
+            balance.learn_outline(seen, offsets, 0.0)
         # After the first search the state only says where to look the second time: it need not be exact.
-        for reach, estimator in ((REACH_PX, self._scout), (REACH_PX // 2, self._estimator)):
-            seen = outline.measure(picture.grey, estimate.state, reach)
-            estimate = estimator.estimate(
-                self._reference.all_points,
-                np.concatenate([attempt.measurement.pixels, seen.pixels]),
-                np.concatenate([attempt.weights, np.where(seen.valid, OUTLINE_WEIGHT, 0.0)]),
-                estimate.state,
-                np.concatenate([np.zeros((count, 2)), seen.normals]),
-                attempt.prior,
-            )
-        return replace(attempt, estimate=estimate, outline=seen)
+        estimate = self._with_outline(self._scout, attempt, seen.weighted(balance.weight), estimate.state)
+        seen = outline.measure(picture.grey, estimate.state, REACH_PX // 2, picture.occluder_depth)
+        seen = seen.weighted(balance.weight)
+        estimate = self._with_outline(self._estimator, attempt, seen, estimate.state)
+        agreeing = seen.weighted(balance.weight, balance.agreeing(estimate.residuals[-len(seen.weights) :]))
+        balance.learn_outline(seen, estimate.residuals[-len(seen.weights) :], self._taken(attempt, seen, estimate))
+        balance.learn_texture(*self._supporting(attempt, estimate))
+        estimate = self._with_outline(self._estimator, attempt, agreeing, estimate.state)
+        return replace(attempt, estimate=estimate, outline=agreeing)
+
+    def _supporting(self, attempt: PoseHypothesis, estimate: Estimate) -> tuple[Array, Array, float]:
+        """Pixels and residuals (p, 2) of the texture's points that support an estimate, and their spread."""
+        rows = attempt.inliers
+        return attempt.measurement.pixels[rows], estimate.residuals[: len(rows)][rows], estimate.sigma_px
+
+    def _with_outline(
+        self, estimator: Estimator, attempt: PoseHypothesis, seen: OutlineMeasurement, start: State
+    ) -> Estimate:
+        """The estimate from the supporting points and the outline together."""
+        together = self.measured(replace(attempt, outline=seen, depths=None), correlated=False)
+        return estimator.fit(together, start, attempt.prior)
+
+    def _taken(self, attempt: PoseHypothesis, seen: OutlineMeasurement, estimate: Estimate) -> float:
+        """How many of the outline's numbers an estimate with them takes up: the trace of H^-1 H_outline."""
+        together = self.measured(replace(attempt, outline=seen, depths=None), correlated=False)
+        own = replace(
+            together, weights=np.where(np.arange(len(together.weights)) < len(attempt.inliers), 0.0, together.weights)
+        )
+        whole, part = (
+            self._estimator.evaluate(
+                m.points, m.pixels, m.weights, estimate.state, m.normals, attempt.prior if m is together else None
+            )[1]
+            for m in (together, own)
+        )
+        scale = np.outer(self._estimator.scale, self._estimator.scale)
+        return float(np.trace(np.linalg.pinv(whole * scale, 1e-12, True) @ (part * scale)))
 
     def fit_depths(self, picture: Image, attempt: PoseHypothesis) -> PoseHypothesis:
         """Estimate with the depths of the supporting points too, if a depth camera saw them."""
@@ -199,15 +234,24 @@ class FrameEstimation:
         )
         return replace(attempt, estimate=estimate)
 
-    def measured(self, attempt: PoseHypothesis) -> Observations:
-        """All that an attempt was made from, the outline's points after the others."""
-        pixels, weights = attempt.measurement.pixels, attempt.weights
+    def measured(self, attempt: PoseHypothesis, correlated: bool = True) -> Observations:
+        """All that an attempt was made from, the outline's points after the others.
+
+        ``correlated`` : whether their errors' correlation is wanted; it takes time.
+        """
+        points, pixels, weights = self._reference.points, attempt.measurement.pixels, attempt.weights
         normals, seen = np.zeros_like(pixels), attempt.outline
+        correlation: Correlation = np.zeros((0, 0))
+        if correlated:
+            correlation = window_correlation(pixels, PATCH_WINDOW)
         if seen is not None:
+            points = points.joined(seen.points)
             pixels, normals = np.concatenate([pixels, seen.pixels]), np.concatenate([normals, seen.normals])
-            weights = np.concatenate([weights, np.where(seen.valid, OUTLINE_WEIGHT, 0.0)])
-        correlation = window_correlation(pixels, PATCH_WINDOW)
-        return Observations(self._reference.all_points, pixels, weights, normals, correlation, attempt.depths)
+            weights = np.concatenate([weights, seen.weights])
+            if correlated:
+                blocks = [correlation, scipy.sparse.csr_array(self._balance.correlation(seen))]
+                correlation = scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))
+        return Observations(points, pixels, weights, normals, correlation, attempt.depths)
 
 
 # What frames have to do with each other, by choice: parameters that are kept, that walk, and the start.

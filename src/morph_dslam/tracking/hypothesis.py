@@ -37,6 +37,11 @@ class Image:
     depth: NDArray[np.float32] | None = None
     occluder_depth: NDArray[np.float32] | None = None
 
+    @property
+    def has_grey(self) -> bool:
+        """Whether it has grey values; a keyframe of a map has normalized contrast alone."""
+        return self.grey is not self.normalized
+
 
 @dataclass(frozen=True)
 class PoseHypothesis:

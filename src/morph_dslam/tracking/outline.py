@@ -1,36 +1,42 @@
 """The object's outline in the image: evidence where the surface has no texture, out to its very edge.
 
-Points on the rim of the surface are searched for along the outline's normal, as in Drummond and Cipolla's
-edge tracking (PAMI 24, 2002). An outline point may slide along the outline, so it counts only across it.
+Points on the visible contour of the surface (`contours`) are searched for along its normal, as in Drummond and
+Cipolla's edge tracking (PAMI 24, 2002). A point may slide along the contour, so it counts only across it: to first
+order a smooth surface's contour moves across itself as the material there does.
+
+How much it counts beside texture is in `outline_weight`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel, SurfacePoints
+from morph_dslam.render.rasteriser import draw_depth
+from morph_dslam.tracking.binding import DrawnSurface, View, view_of
+from morph_dslam.tracking.contours import Contour, SurfaceEdges, find_contour
 from morph_dslam.tracking.estimator import BoundPoints, State
 
 Array = NDArray[np.float64]
-#: Points on the rim, evenly spread.
-N_POINTS = 120
+#: Points on the contour, at most.
+N_POINTS = 160
 #: How far the outline is searched for to either side of where the estimate shows it, pixels.
 REACH_PX = 14
 #: Pixels averaged on each side of a candidate.
 SIDE_PX = 4
 #: Grey levels by which the two sides must differ.
 LEAST_CONTRAST = 10.0
-#: Largest difference of the inner side from its brightness in the reference view, relative to that; shading
+#: Largest difference of the inner side from its brightness in the first picture, relative to that; shading
 #: changes it as the surface bends.
 BRIGHTNESS_TOLERANCE = 0.35
-#: Weight of an outline point relative to a texture point: it gives one number, not two, and stands for all of
-#: the bare margin behind it.
-OUTLINE_WEIGHT = 2.0
+#: Where, pixels inwards, the brightness of the inner side is looked up.
+INNER_PX = 3.5
 
 
 @dataclass(frozen=True)
@@ -39,142 +45,219 @@ class OutlineMeasurement:
 
     Attributes
     ----------
+    points : (p,) on the contour as it was expected; always `N_POINTS`, those that are not needed at any place.
     pixels : (p, 2) on the outline, each on the normal of its point
     normals : (p, 2) outwards.
-    valid : (p,) which were found.
+    expected : (p,) which points there are.
+    weights : (p,) relative to a point of the texture; zero for those that were not found or do not agree.
     """
 
+    points: BoundPoints
     pixels: Array
     normals: Array
-    valid: NDArray[np.bool_]
+    expected: NDArray[np.bool_]
+    weights: Array
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Which points (p,) were found."""
+        return self.weights > 0.0
+
+    def weighted(self, weight: float, agreeing: NDArray[np.bool_] | None = None) -> OutlineMeasurement:
+        """The same, with this weight for all that were found, or of them for those that agree (p,)."""
+        counts = self.valid if agreeing is None else self.valid & agreeing
+        return replace(self, weights=np.where(counts, weight, 0.0))
 
 
-def rim(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Edges (k, 2) that only one triangle has, each with the surface on its left."""
-    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    _, first, count = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
-    return edges[first[count == 1]]
+@dataclass(frozen=True)
+class _Picture:
+    """What the object looked like once.
+
+    Attributes
+    ----------
+    grey : (h, w) smoothed
+    nodes : (n, 3) of the drawn surface in the camera frame.
+    depth : (h, w) of it.
+    """
+
+    grey: NDArray[np.uint8]
+    nodes: Array
+    depth: NDArray[np.float32]
 
 
 class Outline:
-    """The rim of a model's surface and what lies inside it in the reference view.
+    """The contour of a model's surface, and how bright the surface was inside of it once.
 
     Parameters
     ----------
-    grey : (h, w) undistorted reference image
-    state : the object in it.
+    surface : what of the model is drawn.
     """
 
-    def __init__(self, model: ReducedModel, camera: Camera, grey: NDArray[np.uint8], state: State) -> None:
-        self._camera = camera
-        edges = _spread(model.nodes, rim(model.triangles), N_POINTS)
-        self.points = BoundPoints.from_surface(model, _on_edges(model.triangles, edges))
-        # The direction along the rim comes from the edge's own ends; evaluated with the points at once.
-        ends = [BoundPoints.from_surface(model, _at_nodes(model.triangles, edges[:, k])) for k in range(2)]
-        self._with_ends = self.points.joined(ends[0]).joined(ends[1])
-        pixels, normals = self._predict(state)
-        self._brightness = _inner_brightness(grey, pixels, normals)
+    def __init__(self, model: ReducedModel, camera: Camera, surface: DrawnSurface) -> None:
+        self._model, self._camera, self._surface = model, camera, surface
+        self._triangles = np.ascontiguousarray(surface.model.triangles, dtype=np.int64)
+        self._edges = SurfaceEdges.of(self._triangles)
+        self._size = float(np.linalg.norm(np.ptp(surface.model.nodes, axis=0)))
+        self._slots = SurfacePoints(np.zeros(N_POINTS, dtype=np.int64), np.tile([1.0, 0.0, 0.0], (N_POINTS, 1)))
+        self._used = np.zeros(N_POINTS, dtype=bool)
+        self._picture: _Picture | None = None
 
-    def _predict(self, state: State) -> tuple[Array, Array]:
-        """Pixels (p, 2) of the rim points and outward normals (p, 2); NaN behind the camera."""
-        seen = self._camera.project(self._with_ends.in_camera(state))
-        pixels, start, end = seen.reshape(3, -1, 2)
-        along = end - start
-        length = np.maximum(np.linalg.norm(along, axis=1), 1e-9)
-        normals = np.column_stack([along[:, 1], -along[:, 0]]) / length[:, None]
-        # The image's y axis points down, so whether the surface lies left or right depends on the side seen.
-        centre = np.nanmean(pixels, axis=0)
-        outward = np.nansum(normals * (pixels - centre)) >= 0.0
-        return pixels, normals if outward else -normals
+    @property
+    def points(self) -> BoundPoints:
+        """Where it was looked for last (`N_POINTS`,)."""
+        return BoundPoints.from_surface(self._model, self._slots)
 
-    def measure(self, grey: NDArray[np.uint8], state: State, reach: int) -> OutlineMeasurement:
+    @property
+    def knows_brightness(self) -> bool:
+        """Whether a picture of the object was given."""
+        return self._picture is not None
+
+    def take_brightness(self, grey: NDArray[np.uint8], state: State, seen: NDArray[np.bool_] | None = None) -> None:
+        """Remember how bright the object is in an undistorted image (h, w).
+
+        Parameters
+        ----------
+        state : of the object in it.
+        seen : (h, w) where it shows the object; None where it is all that it covers.
+        """
+        view, (_, depth) = self._drawn(state)
+        if seen is not None:
+            depth = np.where(seen, depth, np.float32(np.inf))
+        self._picture = _Picture(cv2.blur(grey, (3, 3)), view.nodes, depth)  # type: ignore[arg-type]
+
+    def measure(
+        self, grey: NDArray[np.uint8], state: State, reach: int, occluder_depth: NDArray[np.float32] | None = None
+    ) -> OutlineMeasurement:
         """Search for the outline around where ``state`` shows it.
 
         Parameters
         ----------
         grey : (h, w) undistorted image
         reach : how far to search to either side, pixels.
+        occluder_depth : (h, w) of other objects, metres, infinite where there are none.
         """
-        pixels, normals = self._predict(state)
+        view, (ids, depth) = self._drawn(state)
+        focal = 0.5 * (self._camera.fx + self._camera.fy)
+        contour = find_contour(self._edges, view.nodes, view.pixels, depth, focal, self._size, N_POINTS, occluder_depth)
+        brightness = self._brightness(contour, view, ids)
         offsets = search_outline(
-            grey, pixels, normals, self._brightness, reach, SIDE_PX, LEAST_CONTRAST, BRIGHTNESS_TOLERANCE
+            grey, contour.pixels, contour.normals, brightness, reach, SIDE_PX, LEAST_CONTRAST, BRIGHTNESS_TOLERANCE
         )
-        valid = np.isfinite(offsets)
-        moved = pixels + np.where(valid, offsets, 0.0)[:, None] * normals
-        return OutlineMeasurement(np.nan_to_num(moved), np.nan_to_num(normals), valid)
+        return self._in_slots(contour, np.asarray(offsets), state)
+
+    def _drawn(self, state: State) -> tuple[View, tuple[NDArray[np.int32], NDArray[np.float32]]]:
+        """The mesh in a state, and the triangle and the depth that each pixel sees."""
+        camera, surface = self._camera, self._surface
+        view = view_of(surface.model, camera, state)
+        depths = np.ascontiguousarray(view.nodes[:, 2])
+        return view, draw_depth(view.pixels, depths, self._triangles, surface.closed, camera.height, camera.width)
+
+    def _brightness(self, contour: Contour, view: View, ids: NDArray[np.int32]) -> Array:
+        """Grey (k,) just inside each point in the picture that is known; NaN where that does not show it."""
+        known = self._picture
+        if known is None:
+            return np.full(len(contour), np.nan)
+        inside = contour.pixels - INNER_PX * contour.normals
+        return look_up(
+            inside, ids, self._triangles, view.nodes, known.nodes, known.depth, known.grey, self._camera.intrinsics
+        )
+
+    def _in_slots(self, contour: Contour, offsets: Array, state: State) -> OutlineMeasurement:
+        """Points stay in the places of those that were near them last: what one errs by is then known as the same."""
+        slots = self._assigned(contour, state)
+        triangles, weights = self._slots.triangles.copy(), self._slots.weights.copy()
+        triangles[slots], weights[slots] = contour.points.triangles, contour.points.weights
+        self._slots, self._used = SurfacePoints(triangles, weights), np.zeros(N_POINTS, dtype=bool)
+        self._used[slots] = True
+        found = np.zeros(N_POINTS)
+        found[slots] = np.isfinite(offsets)
+        pixels, normals = np.zeros((N_POINTS, 2)), np.zeros((N_POINTS, 2))
+        normals[:, 0] = 1.0  # of points that are not there; they count as ones of an outline all the same
+        pixels[slots] = contour.pixels + np.nan_to_num(offsets)[:, None] * contour.normals
+        normals[slots] = contour.normals
+        return OutlineMeasurement(self.points, pixels, normals, self._used, found)
+
+    def _assigned(self, contour: Contour, state: State) -> NDArray[np.int64]:
+        """The place of each point (k,): that of the one before it is nearest to, or a free one."""
+        slots = np.full(len(contour), -1)
+        if self._used.any() and len(contour):
+            before = np.flatnonzero(self._used)
+            points = BoundPoints.from_surface(self._model, self._slots.take(before))
+            places = np.nan_to_num(self._camera.project(points.in_camera(state)), nan=1e9)
+            squared = sum((a[:, None] - b[None]) ** 2 for a, b in zip(contour.pixels.T, places.T, strict=True))
+            nearest = np.asarray(squared).argmin(axis=1)
+            mutual = np.asarray(squared).argmin(axis=0)[nearest] == np.arange(len(contour))
+            slots[mutual] = before[nearest[mutual]]
+        free = np.setdiff1d(np.arange(N_POINTS), slots)
+        slots[slots < 0] = free[: (slots < 0).sum()]
+        return slots
 
 
-def _spread(nodes: Array, edges: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """About ``count`` of the edges, evenly spread in number along the rim."""
-    step = max(1, round(len(edges) / count))
-    middles = nodes[edges].mean(axis=1)
-    angle = np.arctan2(middles[:, 1] - nodes[:, 1].mean(), middles[:, 0] - nodes[:, 0].mean())
-    return edges[np.argsort(angle)][::step]
+@njit(cache=True, nogil=True)
+def look_up(pixels, ids, triangles, nodes, known_nodes, known_depth, known_grey, intrinsics):
+    """Grey (k,) in a known picture of the surface points that pixels (k, 2) see; NaN where it is not shown there.
 
-
-def _on_edges(triangles: NDArray[np.int64], edges: NDArray[np.int64]) -> SurfacePoints:
-    """The middles of edges, as surface points."""
-    start, end = (_at_nodes(triangles, edges[:, 0], edges[:, 1]), _at_nodes(triangles, edges[:, 1], edges[:, 0]))
-    return SurfacePoints(start.triangles, 0.5 * (start.weights + end.weights))
-
-
-def _at_nodes(
-    triangles: NDArray[np.int64], nodes: NDArray[np.int64], partners: NDArray[np.int64] | None = None
-) -> SurfacePoints:
-    """Nodes as surface points, on a triangle that has the partner node too."""
-    chosen, weights = np.zeros(len(nodes), dtype=np.int64), np.zeros((len(nodes), 3))
-    for row, node in enumerate(nodes):
-        has = (triangles == node).any(axis=1)
-        if partners is not None:
-            has &= (triangles == partners[row]).any(axis=1)
-        chosen[row] = np.flatnonzero(has)[0]
-        weights[row] = triangles[chosen[row]] == node
-    return SurfacePoints(chosen, weights)
-
-
-def _inner_brightness(grey: NDArray[np.uint8], pixels: Array, normals: Array) -> Array:
-    """Mean grey (p,) of the `SIDE_PX` pixels just inside each rim point; NaN outside the image."""
-    height, width = grey.shape
-    total = np.zeros(len(pixels))
-    for depth in range(2, SIDE_PX + 2):
-        x, y = np.round(pixels - depth * normals).T
-        with np.errstate(invalid="ignore"):
-            inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-        values = grey[np.where(inside, y, 0).astype(int), np.where(inside, x, 0).astype(int)].astype(float)
-        total += np.where(inside, values, np.nan)
-    return total / SIDE_PX
+    Parameters
+    ----------
+    ids : (h, w) the triangle that each pixel sees, -1 for none.
+    nodes, known_nodes : (n, 3) in the camera frame now and in the picture.
+    known_depth, known_grey : (h, w) of the picture.
+    """
+    height, width = ids.shape
+    result = np.full(len(pixels), np.nan)
+    ray, there = np.empty(3), np.empty(3)
+    for j in range(len(pixels)):
+        column, row = int(np.rint(pixels[j, 0])), int(np.rint(pixels[j, 1]))
+        if column < 0 or row < 0 or column >= width or row >= height or ids[row, column] < 0:
+            continue
+        a, b, c = triangles[ids[row, column]]
+        ray[0], ray[1] = (column - intrinsics[2]) / intrinsics[0], (row - intrinsics[3]) / intrinsics[1]
+        ray[2] = 1.0
+        # Where the ray meets the plane: a combination of the corners whose weights add up to 1.
+        p, q, s = nodes[a], nodes[b], nodes[c]
+        weights = np.array([np.dot(ray, np.cross(q, s)), np.dot(ray, np.cross(s, p)), np.dot(ray, np.cross(p, q))])
+        total = weights.sum()
+        if not abs(total) > 0.0:
+            continue
+        weights /= total
+        for k in range(3):
+            there[k] = weights[0] * known_nodes[a, k] + weights[1] * known_nodes[b, k] + weights[2] * known_nodes[c, k]
+        if not there[2] > 0.0:
+            continue
+        x = int(np.rint(intrinsics[0] * there[0] / there[2] + intrinsics[2]))
+        y = int(np.rint(intrinsics[1] * there[1] / there[2] + intrinsics[3]))
+        if 0 <= x < width and 0 <= y < height and 0.99 < there[2] / known_depth[y, x] < 1.01:
+            result[j] = known_grey[y, x]
+    return result
 
 
 @njit(cache=True, nogil=True)
 def search_outline(grey, pixels, normals, brightness, reach, side, least_contrast, tolerance):
     """Signed distances (p,) along the normals to the strongest step whose inner side looks right, or NaN.
 
-    A candidate's inner side must be as bright as in the reference view within the tolerance, the contrast of
-    its two sides is its score, and the step is refined to a fraction of a pixel by the parabola through the
-    scores beside it.
+    A candidate's inner side must be as bright as it was within the tolerance, where that is known (not NaN). The
+    contrast of its two sides is its score, which halves at half the reach: what is near is more likely the outline.
+    The step is refined to a fraction of a pixel by the parabola through the contrasts beside it.
     """
     height, width = grey.shape
     length = 2 * (reach + side) + 1
     profile = np.empty(length)
-    scores = np.empty(2 * reach + 1)
+    steps, scores = np.empty(2 * reach + 1), np.empty(2 * reach + 1)
     result = np.full(len(pixels), np.nan)
     for j in range(len(pixels)):
-        if not (np.isfinite(pixels[j, 0]) and np.isfinite(brightness[j])):
+        if not np.isfinite(pixels[j, 0]):
             continue
-        inside = True
         for k in range(length):
             x = pixels[j, 0] + (k - reach - side) * normals[j, 0]
             y = pixels[j, 1] + (k - reach - side) * normals[j, 1]
+            profile[k] = np.nan
             if x < 0.0 or y < 0.0 or x >= width - 1 or y >= height - 1:
-                inside = False
-                break
+                continue
             x0, y0 = int(x), int(y)
             a, b = x - x0, y - y0
             above = (1.0 - a) * grey[y0, x0] + a * grey[y0, x0 + 1]
             below = (1.0 - a) * grey[y0 + 1, x0] + a * grey[y0 + 1, x0 + 1]
             profile[k] = (1.0 - b) * above + b * below
-        if not inside:
-            continue
         best = -1
         for k in range(2 * reach + 1):
             inner, outer = 0.0, 0.0
@@ -182,14 +265,21 @@ def search_outline(grey, pixels, normals, brightness, reach, side, least_contras
                 inner += profile[k + side - i]
                 outer += profile[k + side + i]
             inner, outer = inner / side, outer / side
-            scores[k] = abs(inner - outer)
-            if abs(inner - brightness[j]) > tolerance * brightness[j]:
-                scores[k] = 0.0
-            if scores[k] > least_contrast and (best < 0 or scores[k] > scores[best]):
+            steps[k] = abs(inner - outer)
+            if not np.isfinite(steps[k]):
+                steps[k] = 0.0  # beyond the border of the image
+            away = 2.0 * (k - reach) / reach
+            scores[k] = steps[k] / (1.0 + away * away)
+            if abs(inner - brightness[j]) > tolerance * brightness[j] + least_contrast:
+                scores[k] = steps[k] = 0.0
+            if steps[k] > least_contrast and (best < 0 or scores[k] > scores[best]):
                 best = k
+        # The nearest one may be on the slope of a step: its top is where the step is.
+        while 0 < best < 2 * reach and max(steps[best - 1], steps[best + 1]) > steps[best]:
+            best += 1 if steps[best + 1] > steps[best - 1] else -1
         if best <= 0 or best >= 2 * reach:
             continue
-        bend = scores[best - 1] - 2.0 * scores[best] + scores[best + 1]
-        shift = 0.5 * (scores[best - 1] - scores[best + 1]) / bend if bend < 0.0 else 0.0
+        bend = steps[best - 1] - 2.0 * steps[best] + steps[best + 1]
+        shift = 0.5 * (steps[best - 1] - steps[best + 1]) / bend if bend < 0.0 else 0.0
         result[j] = best - reach + min(max(shift, -0.5), 0.5)
     return result

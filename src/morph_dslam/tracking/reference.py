@@ -188,7 +188,7 @@ class ReferenceView:
     points : p of them, bound in the views.
     parts : which of them in which view, in order.
     pixels : (p, 2) where they are in the first view, hidden or not.
-    outline : the object's rim, None where it is not used.
+    outline : the object's contour, None where it is not used.
     all_points : with those of the outline.
     correlation : of the errors of all points' measurements.
 
@@ -232,10 +232,12 @@ class ReferenceView:
             ]
         )
         self._mask, self._mesh = masks[0], meshes[0]
-        self.outline, self.all_points = None, self.points
+        self.outline: Outline | None = None
         if options.use_outline:
-            self.outline = Outline(model, camera, first.picture.grey, self.state)
-            self.all_points = self.points.joined(self.outline.points)
+            self.outline = Outline(model, camera, self.surface)
+            if first.picture.has_grey:
+                self.outline.take_brightness(first.picture.grey, self.state, first.seen)
+        self.all_points = self.points if self.outline is None else self.points.joined(self.outline.points)
         self.correlation = self._correlation()
 
     def take_features(self) -> None:
@@ -359,10 +361,10 @@ class ReferenceView:
 
     def _correlation(self) -> Correlation:
         """Of the points' errors (p, p): those of one picture share what their windows do."""
-        camera, window, blocks = self._estimator.camera, PATCH_WINDOW, []
-        ends = [*(part.rows.stop for part in self.parts[:-1]), len(self.all_points)]
-        for part, end in zip(self.parts, ends, strict=True):
-            rows = slice(part.rows.start, end)
-            places = camera.project(self.all_points.in_camera(part.state)[rows])
-            blocks.append(window_correlation(places, window))
-        return scipy.sparse.csr_array(scipy.sparse.block_diag([scipy.sparse.csr_array(block) for block in blocks]))
+        camera, blocks = self._estimator.camera, []
+        for part in self.parts:
+            places = camera.project(self.points.in_camera(part.state)[part.rows])
+            blocks.append(window_correlation(places, PATCH_WINDOW))
+        if self.outline is not None:
+            blocks.append(scipy.sparse.eye_array(len(self.outline.points)))
+        return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))

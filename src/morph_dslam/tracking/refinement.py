@@ -20,7 +20,7 @@ from morph_dslam.errors import RegistrationError
 from morph_dslam.tracking.binding import bind_pixels, draw_view, view_of
 from morph_dslam.tracking.depth import SIGMA_AT_1M, PointDepths
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOptions, Estimator, State, moved
-from morph_dslam.tracking.outline import OUTLINE_WEIGHT, Outline, OutlineMeasurement
+from morph_dslam.tracking.outline import OutlineMeasurement
 
 Array = NDArray[np.float64]
 
@@ -44,9 +44,7 @@ class Keyframe:
     sigma_px: float
     outline: OutlineMeasurement | None = None
 
-    def measured(
-        self, points: BoundPoints, met: NDArray[np.bool_], outline: Outline | None
-    ) -> tuple[BoundPoints, Array, Array, Array]:
+    def measured(self, points: BoundPoints, met: NDArray[np.bool_]) -> tuple[BoundPoints, Array, Array, Array]:
         """All that was measured, of ``points`` (those of the reference view that ``met``) and of the outline.
 
         Returns
@@ -58,11 +56,11 @@ class Keyframe:
         """
         pixels, weights = self.pixels[met], self.weights[met].astype(np.float64)
         normals = np.zeros_like(pixels)
-        if outline is not None and self.outline is not None:
+        if self.outline is not None:
             seen = self.outline
-            points = points.joined(outline.points)
+            points = points.joined(seen.points)
             pixels = np.concatenate([pixels, seen.pixels])
-            weights = np.concatenate([weights, np.where(seen.valid, OUTLINE_WEIGHT, 0.0)])
+            weights = np.concatenate([weights, seen.weights])
             normals = np.concatenate([normals, seen.normals])
         return points, pixels, weights, normals
 
@@ -91,7 +89,6 @@ def refine_reference(
     reference_pixels: Array,
     start: State,
     keyframes: Sequence[Keyframe],
-    outline: Outline | None = None,
     landmark_px: float = LANDMARK_PX,
 ) -> State:
     """The reference state that explains the landmarks and the keyframes best.
@@ -100,8 +97,7 @@ def refine_reference(
     ----------
     landmarks, landmark_pixels : (k) as registered; pixels (k, 2) undistorted.
     reference_pixels : (p, 2) of the followed points in the reference view.
-    start : the registered state
-    outline : of the object, if the keyframes saw it.
+    start : the registered state.
     """
     model, camera = estimator.model, estimator.camera
     inner = Estimator(model, camera, EstimationOptions(max_iterations=8, tolerance=1e-5))
@@ -120,7 +116,7 @@ def refine_reference(
         surface, met = bind_pixels(model, camera, view_of(model, camera, state), reference_pixels)
         points = BoundPoints.from_surface(model, surface)
         for frame in keyframes:
-            parts.append(_frame_residuals(inner, points, met, frame, outline))
+            parts.append(_frame_residuals(inner, points, met, frame))
         return np.concatenate(parts)
 
     bounds = np.full((2, d + 6), np.inf) * [[-1.0], [1.0]]
@@ -132,11 +128,9 @@ def refine_reference(
     return reference(found.x)
 
 
-def _frame_residuals(
-    inner: Estimator, points: BoundPoints, met: NDArray[np.bool_], frame: Keyframe, outline: Outline | None
-) -> Array:
+def _frame_residuals(inner: Estimator, points: BoundPoints, met: NDArray[np.bool_], frame: Keyframe) -> Array:
     """Scaled residuals of a keyframe at its best state, with Huber weights; 0 for points unused."""
-    points, pixels, weights, normals = frame.measured(points, met, outline)
+    points, pixels, weights, normals = frame.measured(points, met)
     estimate = inner.estimate(points, pixels, weights, frame.state, normals)
     length = np.linalg.norm(estimate.residuals, axis=1)
     huber = np.minimum(1.0, inner.options.huber_px / np.maximum(length, 1e-12))

@@ -132,7 +132,7 @@ def _load_object(name: str, part: ObjectOptions, run: TrackOptions, scene_of: Ca
     if path is not None:
         registration = in_scene(registration, scene_of(path))
     # A free object is not where the map has it, but looks as in the map's keyframes.
-    keyframes = registered_keyframes(registration, options)
+    keyframes = registered_keyframes(registration)
     return TrackedObject(name, model, registration, options, inner, keyframes, again, click_px=run.click_px)
 
 

@@ -261,17 +261,15 @@ def _refined(part: PlacedObject, keyframes: list[Keyframe]) -> PlacedObject:
     landmark_px = max(sigma, 0.1) if np.isfinite(sigma) else LANDMARK_PX
     bound = bind_landmarks(part.model, landmarks.points)
     seen, pixels = part.camera.undistort_pixels(landmarks.pixels), tracker.reference.pixels
-    chosen, outline = choose_keyframes(keyframes), tracker.reference.outline
+    chosen = choose_keyframes(keyframes)
     if not part.options.use_discrepancy:
-        state = refine_reference(
-            tracker.estimator, bound, seen, pixels, registration.state, chosen, outline, landmark_px
-        )
+        state = refine_reference(tracker.estimator, bound, seen, pixels, registration.state, chosen, landmark_px)
         refined = replace(registration, state=state, covariance=None)
     else:
         # What the state is wrong by counts with the discrepancy: both at once would be the same twice.
         known = Reference(registration.state, pixels, bound, seen, landmark_px)
         fit = DiscrepancyFit(part.model, part.camera, part.options.discrepancy)
-        found = refine_discrepancy(fit, tracker.estimator, known, chosen, outline)
+        found = refine_discrepancy(fit, tracker.estimator, known, chosen)
         refined = replace(registration, discrepancy=found, covariance=None)
     return replace(part, registration=refined)
 

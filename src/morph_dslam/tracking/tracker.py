@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import TrackingError
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.sources import Frame
@@ -105,8 +104,7 @@ class Tracker:
     RegistrationError
         If the object shows too few corners in the reference frame, or its place in the scene has no covariance.
     TrackingError
-        If a per-sequence parameter, or one that walks, is not in the model; or the outline is asked for without a
-        reference frame, since keyframes hold no grey values.
+        If a per-sequence parameter, or one that walks, is not in the model.
     """
 
     def __init__(
@@ -195,9 +193,7 @@ class Tracker:
     def _from_scene(self) -> Image:
         """Take what the scene shows of the object, and its map, and return the reference image."""
         known, options = self._registration, self.options
-        keyframes = {frame: image_of(view) for frame, view in registered_keyframes(known, options).items()}
-        if known.frame not in keyframes:
-            raise TrackingError("keyframes of a scene hold no grey values to look for the outline in: give reference")
+        keyframes = {frame: image_of(view) for frame, view in registered_keyframes(known).items()}
         if self._keyframes is None and options.further_views and len(known.views) > 1:
             first, *others = registered_images(known, keyframes)
             self._keyframes = choose_keyframe_views(self.estimator, first, others, options)

@@ -137,13 +137,12 @@ class KeyframeViews:
     views: tuple[PosedImage, ...] = ()
 
 
-def registered_keyframes(registration: Registration, options: TrackerOptions) -> dict[int, Keyframe]:
+def registered_keyframes(registration: Registration) -> dict[int, Keyframe]:
     """The keyframes of the scene by frame, if that of the registration can be the reference view.
 
-    Keyframes have contrast-normalized images only. The outline is looked for in grey values: then a frame has to
-    be the reference.
+    Keyframes have contrast-normalized images only.
     """
-    if registration.scene is None or options.use_outline:
+    if registration.scene is None:
         return {}
     return {keyframe.index: keyframe for keyframe in registration.scene.map.keyframes}
 

@@ -1,0 +1,151 @@
+"""How much the outline counts beside texture, and which of its points agree.
+
+The errors of either have a variance, and are alike in neighbours. Both are learnt from the frames as components of one
+fit (Rao, J. Multivariate Analysis 1, 257, 1971): residuals are larger than they seem by what the estimate has taken
+up of them. The ratio of what one independent number of each is worth is the outline's weight. Clutter that it is
+mistaken for thus lowers its weight, and texture that agrees badly with the model raises it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from morph_dslam.tracking.outline import OutlineMeasurement
+
+Array = NDArray[np.float64]
+#: Share of the latest frame in what is learnt.
+LEARNING_RATE = 0.1
+#: Errors of points within so many pixels of each other are compared.
+NEAR_PX = 40.0
+#: The outline is known no better than by this, pixels: where a rounded edge turns away is no line.
+LEAST_SPREAD_PX = 0.1
+#: Standard deviations beyond which a point does not agree, and the least such limit, pixels.
+AGREEING_SIGMAS, LEAST_LIMIT_PX = 3.0, 0.5
+#: The median of the absolute value of a Gaussian number, in standard deviations.
+MEDIAN_OF_NUMBER = 0.6745
+#: Fewer points do not tell how exact they are.
+LEAST_POINTS = 12
+
+
+#: Pairs are made of no more points than these.
+MOST_COMPARED = 100
+#: What an estimate leaves of the numbers is at least this share of them.
+LEAST_LEFT = 0.25
+
+
+class ErrorComponent:
+    """How large the errors of one kind of measurement are, and how alike those of neighbours; learnt from frames.
+
+    Attributes
+    ----------
+    variance : of a number, squared pixels; NaN until something was learnt.
+    redundancy : how many points count as one.
+    """
+
+    def __init__(self) -> None:
+        self.variance, self.redundancy = np.nan, 1.0
+        self._alike, self._apart = 0.0, NEAR_PX
+
+    def learn(self, pixels: Array, residuals: Array, variance: float) -> None:
+        """Take in a frame.
+
+        Parameters
+        ----------
+        pixels : (p, 2) of the points that agree
+        residuals : (p, k) their errors.
+        variance : of a number, that they show.
+        """
+        if len(pixels) < LEAST_POINTS or not np.isfinite(variance):
+            return
+        compared = np.unique(np.linspace(0, len(pixels) - 1, MOST_COMPARED).astype(np.int64))
+        some = pixels[compared]
+        alike, apart = near_products(some, residuals[compared], NEAR_PX)
+        alike /= max(float(np.mean(residuals**2)), 1e-300)
+        rate = 1.0 if np.isnan(self.variance) else LEARNING_RATE
+        self.variance = variance if rate == 1.0 else self.variance + rate * (variance - self.variance)
+        self._alike += rate * (alike - self._alike)
+        self._apart += rate * (apart - self._apart)
+        count = 1.0 + (len(pixels) - 1) * float(mean_correlation(some, self.length))
+        self.redundancy += rate * (count - self.redundancy)
+
+    @property
+    def length(self) -> float:
+        """Over which the errors are alike, pixels, by a factor e: as of a Markov process."""
+        return -self._apart / float(np.log(np.clip(self._alike, 1e-9, 0.98)))
+
+
+class OutlineBalance:
+    """What is learnt of texture and outline.
+
+    Attributes
+    ----------
+    texture, outline : of either.
+    """
+
+    def __init__(self) -> None:
+        self.texture, self.outline = ErrorComponent(), ErrorComponent()
+
+    @property
+    def weight(self) -> float:
+        """Of a point of the outline, one of the texture being 1; zero until something was learnt of both."""
+        if np.isnan(self.texture.variance) or np.isnan(self.outline.variance):
+            return 0.0
+        ours = self.outline.redundancy * max(self.outline.variance, LEAST_SPREAD_PX**2)
+        return self.texture.redundancy * self.texture.variance / ours
+
+    def correlation(self, seen: OutlineMeasurement) -> Array:
+        """Of the errors (p, p) of the outline's points; those that do not count have none in common."""
+        apart = sum((a[:, None] - a[None]) ** 2 for a in seen.pixels.T)
+        alike = np.exp(-np.sqrt(np.asarray(apart)) / self.outline.length)
+        return np.where(np.outer(seen.valid, seen.valid), alike, np.eye(len(alike)))
+
+    def agreeing(self, residuals: Array) -> NDArray[np.bool_]:
+        """Which of the outline's points (p,) agree with an estimate that leaves these residuals (p, 2)."""
+        spread = LEAST_SPREAD_PX if np.isnan(self.outline.variance) else float(np.sqrt(self.outline.variance))
+        limit = max(AGREEING_SIGMAS * spread, LEAST_LIMIT_PX)
+        return np.hypot(*residuals.T) < limit
+
+    def learn_outline(self, seen: OutlineMeasurement, residuals: Array, taken: float) -> None:
+        """Take in the residuals (p, 2) of the outline; ``taken`` is how many numbers the estimate takes up."""
+        used = seen.valid
+        across = np.einsum("pk,pk->p", residuals, seen.normals)[used]
+        if not len(across):
+            return
+        left = max(len(across) - self.outline.redundancy * taken, LEAST_LEFT * len(across))
+        robust = np.median(np.abs(across)) / MEDIAN_OF_NUMBER
+        near = np.abs(across) < AGREEING_SIGMAS * max(robust, LEAST_SPREAD_PX)
+        variance = robust**2 * len(across) / left
+        self.outline.learn(seen.pixels[used][near], across[near, None], float(variance))
+
+    def learn_texture(self, pixels: Array, residuals: Array, sigma_px: float) -> None:
+        """Take in the residuals (p, 2) of the points at ``pixels`` (p, 2) that agree, and their robust spread."""
+        self.texture.learn(pixels, residuals, sigma_px**2)
+
+
+@njit(cache=True, nogil=True)
+def near_products(pixels, residuals, near):
+    """Mean product, by number, of residuals (p, k) of points within ``near`` pixels, and their mean distance."""
+    total, apart, pairs = 0.0, 0.0, 0
+    for i in range(len(pixels)):
+        for j in range(i):
+            distance = np.hypot(pixels[i, 0] - pixels[j, 0], pixels[i, 1] - pixels[j, 1])
+            if distance < near:
+                pairs += 1
+                apart += distance
+                for k in range(residuals.shape[1]):
+                    total += residuals[i, k] * residuals[j, k]
+    if pairs == 0:
+        return 0.0, near
+    return total / (pairs * residuals.shape[1]), max(apart / pairs, 1.0)
+
+
+@njit(cache=True, nogil=True)
+def mean_correlation(pixels, length):
+    """Mean of exp(-d / length) over all pairs of different points (p, 2)."""
+    total, count = 0.0, len(pixels)
+    for i in range(count):
+        for j in range(i):
+            total += np.exp(-np.hypot(pixels[i, 0] - pixels[j, 0], pixels[i, 1] - pixels[j, 1]) / length)
+    return total / max(0.5 * count * (count - 1), 1.0)
