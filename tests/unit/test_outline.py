@@ -40,7 +40,7 @@ def drawn(model, state, inner=210, outer=70) -> np.ndarray:
 
 def outline_of(model, image=None, state=None):
     outline = Outline(model, CAMERA, DrawnSurface.of(model))
-    if image is not None:
+    if image is not None and state is not None:
         outline.take_brightness(image, state)
     return outline
 

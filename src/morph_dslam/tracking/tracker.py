@@ -199,6 +199,7 @@ class Tracker:
             self._keyframes = choose_keyframe_views(self.estimator, first, others, options)
         if self.anchor is None and options.pose != "free":
             self.anchor = Anchor.of({self.model.name: known}, self.camera)
+        assert known.frame is not None
         return keyframes[known.frame]
 
     # -- the steps of a frame -----------------------------------------------------------------------------
