@@ -131,7 +131,8 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
         reregister_at=frames_of(""),
         tracker=replace(
             tracker,
-            use_outline=arguments.outline,
+            use_outline=arguments.outline or arguments.no_texture,
+            use_texture=not arguments.no_texture,
             per_sequence=tuple(arguments.per_sequence),
             random_walk=_random_walk(arguments),
         ),
@@ -182,6 +183,7 @@ def add_tracking_arguments(command: argparse.ArgumentParser) -> None:
     add_output(command, "RUN", "run folder to write")
     add_flag(command, "--overwrite", "replace a run that is in the run folder")
     add_flag(command, "--outline", "let the object's outline count too, where it stands out from the background")
+    add_flag(command, "--no-texture", "follow the object by its outline alone")
     add_flag(
         command,
         "--discrepancy",

@@ -161,10 +161,11 @@ def huber_covariance(hessian, residuals, weights, numbers, huber_px, scale):
         psi_squared += weights[j] * (factor * length[j]) ** 2
         slopes += 0.5 * (factor + (1.0 if length[j] <= huber_px else 0.0))
         factors += factor
-    # The length of a Gaussian pair has the median 1.1774 sigma (Rayleigh).
-    sigma = np.inf
+    # The length of a Gaussian pair has the median 1.1774 sigma (Rayleigh), that of a number 0.6745 sigma.
     if is_pair.any():
         sigma = np.median((np.sqrt(weights) * length)[is_pair]) / 1.1774 * np.sqrt(count / freedom)
+    else:
+        sigma = np.median(np.sqrt(weights) * length) / 0.6745 * np.sqrt(count / freedom)
     mean_slope = max(slopes / len(numbers), 1e-3)
     variance = psi_squared / freedom * (factors / len(numbers)) / mean_slope**2
     values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))

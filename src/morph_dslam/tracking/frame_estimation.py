@@ -17,7 +17,7 @@ from morph_dslam.registration.landmarks import shape_starts
 from morph_dslam.timing import stage
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
-from morph_dslam.tracking.hypothesis import Image, PoseHypothesis
+from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.measurement import PATCH_WINDOW, Measurement
 from morph_dslam.tracking.noise import Correlation, Observations, PointNoise, RigObservations, window_correlation
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE
@@ -26,8 +26,11 @@ from morph_dslam.tracking.outline import REACH_PX, OutlineMeasurement
 from morph_dslam.tracking.outline_weight import OutlineBalance
 from morph_dslam.tracking.reference import ReferenceView
 from morph_dslam.tracking.sequence_filter import Fitter, SequenceFilter
+from morph_dslam.tracking.systematic_errors import Unexplained
 
 Array = NDArray[np.float64]
+#: How far an outline that is alone is searched for, pixels: the first after a loss only.
+REACHES = (28, 14, 7, 7)
 #: Share of the cost below which another shape is a better explanation and not the same one.
 CLEARLY_BETTER = 0.95
 #: The least spread of residuals, pixels, that is believed when they are weighed against depths.
@@ -145,12 +148,23 @@ class FrameEstimation:
 
     def learn(self, attempt: PoseHypothesis) -> None:
         """Take in how well the points agreed in a frame that is believed."""
+        if attempt.outline_alone and attempt.outline is not None:
+            taken = self._taken(attempt, attempt.outline, attempt.estimate)
+            self._balance.learn_outline(attempt.outline, attempt.estimate.residuals, taken)
+            return
         residuals = attempt.estimate.residuals[: len(attempt.inliers)]
         self._noise.learn(attempt.measurement.spread, residuals, attempt.inliers)
 
+    def left_by_outline(self, attempt: PoseHypothesis) -> Unexplained:
+        """What the model leaves of an outline that is alone."""
+        assert attempt.outline is not None
+        across = attempt.estimate.residuals[attempt.outline.valid]
+        common = self._balance.in_common(attempt.outline, attempt.estimate.residuals)
+        return Unexplained(common, float(np.sqrt(np.mean(np.sum(across**2, axis=1)))))
+
     def search_other_shapes(self, attempt: PoseHypothesis) -> PoseHypothesis:
         """The attempt, or a clearly better explanation of its measurements reached from another shape."""
-        if not attempt.estimate.sigma_px < np.inf:
+        if attempt.outline_alone or not attempt.estimate.sigma_px < np.inf:
             return attempt
         starts = self._search.starts(attempt.estimate, attempt.estimate.sigma_px > self._options.search_above_px)
         return self.best_of(attempt, starts) if starts else attempt
@@ -169,7 +183,7 @@ class FrameEstimation:
     def fit_outline(self, picture: Image, attempt: PoseHypothesis) -> PoseHypothesis:
         """Estimate from the supporting points and the outline together; searched far first, then near."""
         outline = self._reference.outline
-        if outline is None:
+        if outline is None or attempt.outline_alone:
             return attempt
         estimate, balance = attempt.estimate, self._balance
         if picture.has_grey and not outline.knows_brightness:
@@ -189,6 +203,43 @@ class FrameEstimation:
         balance.learn_texture(*self._supporting(attempt, estimate))
         estimate = self._with_outline(self._estimator, attempt, agreeing, estimate.state)
         return replace(attempt, estimate=estimate, outline=agreeing)
+
+    def by_outline(self, picture: Image, start: State, prior: Prior | None, lost: bool) -> PoseHypothesis:
+        """Estimate from the outline alone: searched for far first, then nearer, from one state to the next.
+
+        After a loss it is searched for farther off, and other shapes than the last are tried in turn.
+        """
+        best = self._along_contour(picture, start, prior, REACHES[0] if lost else REACHES[1])
+        if lost and reject(best, self._options) is not None:
+            for other in self._search.starts(best.estimate, anywhere=True):
+                moved = replace(other, camera_from_object=start.camera_from_object)
+                found = self._along_contour(picture, moved, prior, REACHES[0])
+                if found.counts[1] > best.counts[1]:
+                    best = found
+        return best
+
+    def _along_contour(self, picture: Image, start: State, prior: Prior | None, reach: int) -> PoseHypothesis:
+        """The outline searched for from ``start``, at most ``reach`` pixels off."""
+        outline, state = self._reference.outline, start
+        assert outline is not None
+        if picture.has_grey and not outline.knows_brightness:
+            outline.take_brightness(picture.grey, state)
+        empty = np.zeros((0, 2))
+        nothing = Measurement(empty, np.zeros(0, dtype=bool), np.zeros(0, dtype=bool), np.zeros(0))
+        reaches = [r for r in REACHES if r <= reach]
+        attempt = None
+        for number, far in enumerate(reaches):
+            last = number == len(reaches) - 1
+            estimator = self._estimator if last else self._scout
+            seen = outline.measure(picture.grey, state, far, picture.occluder_depth)
+            for _ in range(2):  # the second time without what does not agree
+                together = Observations(seen.points, seen.pixels, seen.weights, seen.normals, np.zeros((0, 0)))
+                estimate = estimator.fit(together, state, prior)
+                attempt = PoseHypothesis(estimate, np.zeros(0, dtype=bool), nothing, np.zeros(0), prior, seen)
+                state = estimate.state
+                seen = seen.weighted(1.0, self._balance.agreeing_alone(seen, estimate.residuals, last))
+        assert attempt is not None
+        return attempt
 
     def _supporting(self, attempt: PoseHypothesis, estimate: Estimate) -> tuple[Array, Array, float]:
         """Pixels and residuals (p, 2) of the texture's points that support an estimate, and their spread."""
@@ -219,7 +270,7 @@ class FrameEstimation:
 
     def fit_depths(self, picture: Image, attempt: PoseHypothesis) -> PoseHypothesis:
         """Estimate with the depths of the supporting points too, if a depth camera saw them."""
-        if picture.depth is None:
+        if picture.depth is None or attempt.outline_alone:
             return attempt
         # Points whose windows overlap err alike in the image, and each counts for less than its depth does.
         squared_px = self._reference.redundancy * max(attempt.estimate.sigma_px, LEAST_SIGMA_PX) ** 2

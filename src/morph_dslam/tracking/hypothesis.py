@@ -17,6 +17,9 @@ from morph_dslam.tracking.outline import OutlineMeasurement
 
 #: Where less than this share of all points agree, they must agree closely.
 MOST_AGREE = 0.5
+#: Of the contour's points so many must be found, and this share of them. Their residuals must spread less than this,
+#: pixels, or than this share of its extent in the image: a body that is elsewhere leaves its contour by more.
+LEAST_OF_CONTOUR, CONTOUR_SHARE, CONTOUR_PX, EXTENT_SHARE = 20, 0.4, 3.0, 0.004
 Array = NDArray[np.float64]
 
 
@@ -69,8 +72,20 @@ class PoseHypothesis:
     discrepancy: Discrepancy | None = None
 
     @property
+    def outline_alone(self) -> bool:
+        """Whether it was made from the outline, without any texture."""
+        return not len(self.inliers) and self.outline is not None
+
+    @property
+    def supporting(self) -> NDArray[np.bool_]:
+        """Which of the residuals (p,) are of measurements that support it; the outline's where that is alone."""
+        return self.outline.valid if self.outline_alone and self.outline is not None else self.inliers
+
+    @property
     def counts(self) -> tuple[int, int]:
         """Points that the object itself does not occlude, and those that support the estimate."""
+        if self.outline_alone and self.outline is not None:
+            return int(self.outline.expected.sum()), int(self.outline.valid.sum())
         return int(self.measurement.visible.sum()), int(self.inliers.sum())
 
 
@@ -82,6 +97,8 @@ def reject(hypothesis: PoseHypothesis, options: TrackerOptions) -> Rejection | N
     agree closely then, and be most of those that were found.
     """
     visible, count = hypothesis.counts
+    if hypothesis.outline_alone:
+        return _reject_outline(hypothesis, visible, count)
     needed = min(options.least_inliers, int(np.ceil(options.least_share * len(hypothesis.inliers))))
     spread = hypothesis.estimate.sigma_px
     if count >= needed:
@@ -96,3 +113,15 @@ def reject(hypothesis: PoseHypothesis, options: TrackerOptions) -> Rejection | N
     if spread < options.few_sigma_px and count >= options.anchored_share * found:
         return None
     return Rejection(RejectionReason.NO_COMMON_SHAPE, count, found, spread_px=spread)
+
+
+def _reject_outline(hypothesis: PoseHypothesis, visible: int, count: int) -> Rejection | None:
+    """Why a hypothesis from the outline alone is not accepted."""
+    needed = max(LEAST_OF_CONTOUR, int(np.ceil(CONTOUR_SHARE * visible)))
+    if count < needed:
+        return Rejection(RejectionReason.FEW_POINTS, count, visible, needed)
+    assert hypothesis.outline is not None
+    extent = float(np.linalg.norm(np.ptp(hypothesis.outline.pixels[hypothesis.outline.valid], axis=0)))
+    if not hypothesis.estimate.sigma_px < max(CONTOUR_PX, EXTENT_SHARE * extent):
+        return Rejection(RejectionReason.LOOSE_AGREEMENT, count, visible, spread_px=hypothesis.estimate.sigma_px)
+    return None

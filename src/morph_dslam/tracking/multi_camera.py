@@ -87,6 +87,10 @@ class RigCamera:
         return np.asarray(scipy.linalg.block_diag(np.eye(n_parameters), rotation, rotation))
 
 
+#: Why several cameras refuse an object whose outline is all there is.
+NO_TEXTURE = "the object shows too few corners, and its outline alone is followed with one camera: leave out --with"
+
+
 class RigEstimator:
     """Finds states from what several cameras measured at the same time; as `Estimator` for one.
 
@@ -272,6 +276,8 @@ class RigTracker:
                 )
             except RegistrationError as error:
                 raise RegistrationError(f"camera {number}: {error}") from error
+            if tracker.reference.outline_alone:
+                raise RegistrationError(f"camera {number}: {NO_TEXTURE}")
             self.trackers.append(tracker)
         self.trackers[0].anchor = anchor
         self._filter = new_filter(self.estimator, self.options)

@@ -79,6 +79,8 @@ def window_correlation(pixels: Array, window: int) -> scipy.sparse.csr_array:
 
     ``window`` is the side of the square that is compared, in pixels. Points at NaN have no window.
     """
+    if not len(pixels):
+        return scipy.sparse.csr_array((0, 0))
     return scipy.sparse.csr_array(_overlaps(pixels, float(window)), shape=(len(pixels), len(pixels)))
 
 

@@ -91,7 +91,7 @@ class MultiObjectTracker:
     def _expected(self, name: str, where: CameraLocalization) -> State:
         """Where an object may be in the next frame: where it was last, or where the map has it."""
         state, last = self.trackers[name].state, self._last.get(name)
-        if where.pose_prior is None or (last is not None and last.pose_from is PoseSource.POINTS):
+        if where.pose_prior is None or (last is not None and last.pose_from in (PoseSource.POINTS, PoseSource.OUTLINE)):
             return state
         return replace(state, camera_from_object=where.pose_prior.pose)
 

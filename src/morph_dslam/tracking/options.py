@@ -39,7 +39,9 @@ class TrackerOptions:
     moved_share, moved_sigmas, moved_patience : an anchored object has moved when its points show it farther
         off than this share of its size, and than so many standard deviations, in so many frames on end.
     look_every : a hidden object is looked for elsewhere in every so many frames.
-    use_outline : whether the object's outline counts too; it needs a background that it stands out from.
+    use_outline : whether the object's outline counts too; it needs a background that it stands out from. An object
+        with too little texture is followed by it alone.
+    use_texture : whether texture counts where the outline does.
     use_depth : whether the depth images of frames that have them count too.
     depth_sigma : standard deviation of one pixel's depth at 1 m, metres; it grows with the distance squared.
     use_discrepancy : whether to look for what the object's shape has beyond the model's.
@@ -70,6 +72,7 @@ class TrackerOptions:
     search_above_px: float = 0.25
     searches: int = 2
     use_outline: bool = False
+    use_texture: bool = True
     use_depth: bool = False
     use_discrepancy: bool = False
     per_sequence: tuple[str, ...] = ()

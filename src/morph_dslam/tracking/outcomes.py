@@ -37,6 +37,8 @@ class PoseSource(StrEnum):
 
     POINTS = "points"
     POINTS_AND_MAP = "points and map"
+    OUTLINE = "outline"
+    OUTLINE_AND_MAP = "outline and map"
     MAP = "map"
     NONE = ""
 

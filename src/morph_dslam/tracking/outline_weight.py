@@ -23,6 +23,10 @@ NEAR_PX = 40.0
 LEAST_SPREAD_PX = 0.1
 #: Standard deviations beyond which a point does not agree, and the least such limit, pixels.
 AGREEING_SIGMAS, LEAST_LIMIT_PX = 3.0, 0.5
+#: The same limit where the outline is alone: as long as the state is wrong all of it is off.
+LEAST_ALONE_PX = 1.0
+#: How many times its usual spread that of an outline that is alone may be.
+MOST_UNUSUAL = 1.5
 #: The median of the absolute value of a Gaussian number, in standard deviations.
 MEDIAN_OF_NUMBER = 0.6745
 #: Fewer points do not tell how exact they are.
@@ -106,6 +110,25 @@ class OutlineBalance:
         spread = LEAST_SPREAD_PX if np.isnan(self.outline.variance) else float(np.sqrt(self.outline.variance))
         limit = max(AGREEING_SIGMAS * spread, LEAST_LIMIT_PX)
         return np.hypot(*residuals.T) < limit
+
+    def agreeing_alone(self, seen: OutlineMeasurement, residuals: Array, near: bool) -> NDArray[np.bool_]:
+        """Which of the outline's points (p,) agree with the others, in a frame without texture.
+
+        Parameters
+        ----------
+        residuals : (p, 2) what an estimate from them leaves.
+        near : whether it is nearly right: then they spread as usual, or something else is seen beside the object.
+        """
+        away = np.hypot(*residuals.T)
+        spread = float(np.median(away[seen.valid])) / MEDIAN_OF_NUMBER if seen.valid.any() else 0.0
+        if near and not np.isnan(self.outline.variance):
+            spread = min(spread, MOST_UNUSUAL * float(np.sqrt(self.outline.variance)))
+        return away < max(AGREEING_SIGMAS * spread, LEAST_ALONE_PX)
+
+    def in_common(self, seen: OutlineMeasurement, residuals: Array) -> float:
+        """Root mean product of what neighbours on the outline are off by together, pixels."""
+        across = np.einsum("pk,pk->p", residuals, seen.normals)[seen.valid]
+        return float(np.sqrt(max(near_products(seen.pixels[seen.valid], across[:, None], NEAR_PX)[0], 0.0)))
 
     def learn_outline(self, seen: OutlineMeasurement, residuals: Array, taken: float) -> None:
         """Take in the residuals (p, 2) of the outline; ``taken`` is how many numbers the estimate takes up."""

@@ -48,10 +48,12 @@ from morph_dslam.tracking.measurement import (
 from morph_dslam.tracking.noise import Correlation, Observations, window_correlation
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outline import Outline
-from morph_dslam.tracking.patches import interior, spread_corners
+from morph_dslam.tracking.patches import interior, spread_corners, weaker_slope
 from morph_dslam.tracking.relocalization import Relocalizer
 
 Array = NDArray[np.float64]
+#: Slope of the image, grey levels a pixel, that tells texture from noise and shading; see `weaker_slope`.
+LEAST_SLOPE = 1.0
 #: Samples of the surface: a share is then known to about three per cent.
 N_SAMPLES = 600
 #: Of the area in a frame that a reference view must show something with: a half in each direction.
@@ -189,13 +191,14 @@ class ReferenceView:
     parts : which of them in which view, in order.
     pixels : (p, 2) where they are in the first view, hidden or not.
     outline : the object's contour, None where it is not used.
+    outline_alone : whether the object shows too few corners to count, so that its outline is all there is.
     all_points : with those of the outline.
     correlation : of the errors of all points' measurements.
 
     Raises
     ------
     RegistrationError
-        If the object shows too few corners.
+        If the object shows too few corners, and its outline is not used.
     """
 
     def __init__(
@@ -233,6 +236,7 @@ class ReferenceView:
         )
         self._mask, self._mesh = masks[0], meshes[0]
         self.outline: Outline | None = None
+        self.outline_alone = not len(self.points)
         if options.use_outline:
             self.outline = Outline(model, camera, self.surface)
             if first.picture.has_grey:
@@ -349,13 +353,19 @@ class ReferenceView:
         bound = []
         for view, mesh, mask, count in zip(self._views, meshes, masks, counts, strict=True):
             corners = spread_corners(view.picture.normalized, mask, max(round(count), 1))
+            if self._options.use_outline:  # where there is no texture, noise makes corners too
+                corners = corners[weaker_slope(view.picture.normalized, corners, PATCH_WINDOW) > LEAST_SLOPE]
             surface, _ = bind_pixels(self.surface.model, camera, mesh, corners)
             bound.append(BoundPoints.from_surface(model, surface))
         found = sum(len(points) for points in bound)
+        needed = max(2 * (len(model.parameters) + 6), self._options.least_inliers)
+        if self._options.use_outline and (found < needed or not self._options.use_texture):
+            none = SurfacePoints(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
+            return [BoundPoints.from_surface(model, none) for _ in bound]
         if found < 2 * (len(model.parameters) + 6):
             raise RegistrationError(
                 f"the object shows only {found} corners in the reference frame, too few to follow it: "
-                "take a sharper reference frame, or give the object a printed texture"
+                "take a sharper reference frame, give the object a printed texture, or use its outline"
             )
         return bound
 

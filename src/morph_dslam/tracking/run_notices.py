@@ -10,7 +10,7 @@ import numpy as np
 
 from morph_dslam.notices import Notice
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE, statement, unobservable_in_run
-from morph_dslam.tracking.outcomes import ModelDoesNotExplain, ObjectMoved, Status
+from morph_dslam.tracking.outcomes import ModelDoesNotExplain, ObjectMoved, PoseSource, Status
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE
 
@@ -22,6 +22,10 @@ class RunWarning(StrEnum):
     HIDDEN = (
         "the object was hidden in {count} of {n_frames} frames: its pose there is the map's, its parameters are not "
         "known"
+    )
+    BY_OUTLINE = (
+        "the object was followed by its outline alone in {count} of {n_frames} frames: what moves along the outline, "
+        "or inside of it, is not seen"
     )
     MOVED = (
         "the object has moved from its place in the map in {count} frames, first in frame {first}: there its points "
@@ -86,6 +90,9 @@ def notices_of(run: RunResults) -> list[RunNotice]:
         found.append(of(RunWarning.LOST, count=lost, n_frames=n_frames))
     if run.hidden.any():
         found.append(of(RunWarning.HIDDEN, count=int(run.hidden.sum()), n_frames=n_frames))
+    by_outline = sum(r.pose_from in (PoseSource.OUTLINE, PoseSource.OUTLINE_AND_MAP) for r in run.results)
+    if by_outline:
+        found.append(of(RunWarning.BY_OUTLINE, count=by_outline, n_frames=n_frames))
     moved = [frame for frame, r in zip(run.frames, run.results, strict=True) if r.warning(ObjectMoved)]
     if moved:
         found.append(of(RunWarning.MOVED, count=len(moved), first=moved[0]))

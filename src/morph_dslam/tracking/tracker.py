@@ -222,7 +222,7 @@ class Tracker:
 
     def _follow(self, image: Image, prior: Prior | None) -> Measurement | None:
         """Follow the points that supported the previous frame's estimate from there; None after a loss."""
-        if self._lost:
+        if self._lost or self.reference.outline_alone:
             return None
         with stage("flow"):
             rows = np.flatnonzero(self._supported)
@@ -235,6 +235,9 @@ class Tracker:
     def _match(self, image: Image, followed: Measurement | None, prior: Prior | None) -> PoseHypothesis:
         """Compare with the rendered reference view and solve for pose and parameters."""
         estimation = self._view.estimation
+        if self.reference.outline_alone:
+            start = self._last if self._lost else self._start
+            return estimation.by_outline(image, start if prior is None else prior.placed(start), prior, self._lost)
         if followed is None:
             start = self._last if prior is None else prior.placed(self._last)
             hypothesis = estimation.correct(image, start, None, prior)
@@ -254,7 +257,7 @@ class Tracker:
 
     def _check_map(self, image: Image, hypothesis: PoseHypothesis, camera: CameraLocalization) -> PoseHypothesis:
         """Go by the points alone where they are not where the map has the object."""
-        if camera.pose_prior is None or hypothesis.prior is None:
+        if camera.pose_prior is None or hypothesis.prior is None or hypothesis.outline_alone:
             return hypothesis
         rejected = reject(hypothesis, self.options) is not None
         if rejected and self._lost:
@@ -266,14 +269,18 @@ class Tracker:
 
     def _gate(self, hypothesis: PoseHypothesis) -> tuple[FoundBy, Rejection | None]:
         """Whether to accept the hypothesis; after a loss more is demanded."""
-        if self._lost:
+        if self._lost and not hypothesis.outline_alone:
             return FoundBy.LAST_STATE, self._view.recovery.reject(hypothesis)
+        if self._lost:
+            return FoundBy.LAST_STATE, reject(hypothesis, self.options)
         return FoundBy.FLOW, reject(hypothesis, self.options)
 
     def _relocalize(
         self, image: Image, hypothesis: PoseHypothesis, rejection: Rejection, camera: CameraLocalization
     ) -> tuple[PoseHypothesis, FoundBy, Rejection | None]:
         """Look for the object by its features; a hidden one, whose place is known, only now and then."""
+        if hypothesis.outline_alone:
+            return hypothesis, FoundBy.LAST_STATE, rejection
         if self._placed_by_map(camera) is not None and self._n_lost % self.options.look_every:
             return hypothesis, FoundBy.FEATURES, rejection
         found, why = self._view.recovery.recover(image, self._last.parameters, rejection)
@@ -289,14 +296,15 @@ class Tracker:
         with stage("fuse"):
             self.last_measured = measured = estimation.measured(hypothesis)
             estimate = self._filter.fuse(measured, hypothesis.estimate, hypothesis.prior)
-            estimate = replace(estimate, residuals=estimate.residuals[: len(hypothesis.inliers)])
+            if not hypothesis.outline_alone:
+                estimate = replace(estimate, residuals=estimate.residuals[: len(hypothesis.inliers)])
             hypothesis = replace(hypothesis, estimate=estimate)
         if self._discrepancy is not None:
             with stage("discrepancy"):
                 last = None if self._lost else self._beyond
                 self._beyond = self._discrepancy.fit(self.last_measured, hypothesis.estimate.state, last)
                 hypothesis = replace(hypothesis, discrepancy=self._beyond)
-        if camera.pose_prior is not None:
+        if camera.pose_prior is not None and not hypothesis.outline_alone:
             self._anchoring.note(self._anchoring.contradicts(camera.pose_prior, hypothesis))
         return hypothesis
 
@@ -337,19 +345,19 @@ class Tracker:
                 view=self._view.number,
             )
         estimate, unexplained_px, more = self._with_systematic_errors(hypothesis)
-        residuals = hypothesis.estimate.residuals[hypothesis.inliers]
+        residuals, systematic = hypothesis.estimate.residuals[hypothesis.supporting], self._view.systematic
         return FrameResult(
             self.model,
             Status.TRACKED,
             estimate,
             found_by,
             warnings=(*warnings, *more),
-            pose_from=PoseSource.POINTS if hypothesis.prior is None else PoseSource.POINTS_AND_MAP,
+            pose_from=_pose_source(hypothesis),
             n_points=n_points,
             n_inliers=n_inliers,
             residual_rms_px=float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))),
             unexplained_px=unexplained_px,
-            reference_factor=self._view.systematic.reference_factor,
+            reference_factor=1.0 if systematic is None else systematic.reference_factor,
             view=self._view.number,
             discrepancy=hypothesis.discrepancy,
         )
@@ -369,6 +377,9 @@ class Tracker:
     def _with_systematic_errors(self, hypothesis: PoseHypothesis) -> tuple[Estimate, float, list[TrackingWarning]]:
         """The estimate with errors that do not average out in its covariance, and what that says of it."""
         systematic, recovery = self._view.systematic, self._view.recovery
+        if systematic is None:  # what is measured refers to no other image
+            left = self._view.estimation.left_by_outline(hypothesis)
+            return hypothesis.estimate, left.px, [ModelDoesNotExplain(left.px)] if left.is_failure else []
         left = systematic.unexplained(hypothesis.estimate, hypothesis.inliers)
         doubt_px, whole = recovery.doubt(hypothesis), not recovery.partly_hidden(hypothesis)
         common_px = max(left.px, doubt_px)
@@ -466,7 +477,14 @@ class Tracker:
             return None
         self._filter.change_points(self._views.point_change(change.view, self._unfiltered))
         self._unfiltered = np.zeros_like(self._unfiltered)
-        change.view.systematic.forget_frames()
+        if change.view.systematic is not None:
+            change.view.systematic.forget_frames()
         self._views.active, self._anchoring.reference = change.view, change.view.reference
         self._supported, self._pixels = change.supported, change.pixels
         return change
+
+
+def _pose_source(hypothesis: PoseHypothesis) -> PoseSource:
+    if hypothesis.outline_alone:
+        return PoseSource.OUTLINE if hypothesis.prior is None else PoseSource.OUTLINE_AND_MAP
+    return PoseSource.POINTS if hypothesis.prior is None else PoseSource.POINTS_AND_MAP

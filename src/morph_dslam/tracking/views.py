@@ -256,7 +256,7 @@ class ActiveView:
     reference: ReferenceView
     estimation: FrameEstimation
     recovery: Recovery
-    systematic: SystematicErrors
+    systematic: SystematicErrors | None
     error: float = 0.0
 
     @classmethod
@@ -271,7 +271,9 @@ class ActiveView:
         """A view that is to be followed from now on, with these numbers."""
         estimation = FrameEstimation(estimator, reference, options)
         recovery = Recovery(estimator.model, estimator.camera, reference, estimation, options)
-        systematic = SystematicErrors(estimator, reference.points, reference.parts, PATCH_WINDOW)
+        systematic = None
+        if not reference.outline_alone:
+            systematic = SystematicErrors(estimator, reference.points, reference.parts, PATCH_WINDOW)
         return cls(number, reference, estimation, recovery, systematic, error)
 
 
@@ -334,7 +336,8 @@ class ViewSet:
         self._n_made, self._n_frames, self._pause = 0, 0, 0
         self._followed = self.active
         self._begun: _BegunView | None = None
-        self.active.reference.take_features()
+        if not reference.outline_alone:
+            self.active.reference.take_features()
 
     def point_change(self, taken: ActiveView, besides: Array) -> PointChange:
         """What the filter must know when ``taken`` is gone over to; ``besides``: see `PointChange`."""
@@ -355,7 +358,7 @@ class ViewSet:
         unexplained_px : see `new_view.is_known_well`.
         """
         self._n_frames, self._pause = self._n_frames + 1, max(self._pause - 1, 0)
-        if not self._options.new_views:
+        if not self._options.new_views or self.active.reference.outline_alone:
             return None
         if self._begun is not None or self._n_frames % CHECK_EVERY:
             with stage("views"):

@@ -1,0 +1,125 @@
+"""A plain block that moves, bends and twists before a plain background, followed by its outline alone."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+import morph_dslam as md
+from morph_dslam.camera import Camera
+from morph_dslam.errors import RegistrationError
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.registration.registration import Registration
+from morph_dslam.render.rasteriser import rasterise
+from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
+from tests.support.rendered_sequence import CAMERA, UPRIGHT, colours, mean_error
+from tests.support.turning_block import turning_block
+
+FINE = 4
+FINER = Camera(
+    FINE * CAMERA.width, FINE * CAMERA.height, FINE * CAMERA.fx, FINE * CAMERA.fy,
+    FINE * CAMERA.cx + 1.5, FINE * CAMERA.cy + 1.5,
+)  # fmt: skip
+TIMES = np.linspace(0.0, 1.0, 31)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return turning_block()[0]
+
+
+def state(time) -> State:
+    parameters = np.array([0.012 * np.sin(6.0 * time), np.radians(10) * np.sin(4.0 * time)])
+    turn = rotation_exp(np.array([0.3 + 0.05 * time, 0.25 * time + 0.4, 0.1]))
+    return State(parameters, RigidTransform(turn @ UPRIGHT, np.array([0.01 * np.sin(3.0 * time), 0.0, 0.4])))
+
+
+def plain(model, time, rng, inner=90.0, outer=180.0):
+    """A frame (h, w, 3) with antialiased edges and noise of two grey levels."""
+    there = state(time)
+    nodes = there.camera_from_object.apply(model.positions(there.parameters))
+    covered = rasterise(FINER.project(nodes), nodes[:, 2], model.triangles, FINER.height, FINER.width).covered
+    image = np.where(covered, inner, outer)
+    image = cv2.resize(image, (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_AREA)
+    return colours(cv2.GaussianBlur(image, (0, 0), 0.6) + 2.0 * rng.standard_normal(image.shape))
+
+
+def new_tracker(model, first, **options):
+    known = Registration(model, state(0.0))
+    return md.Tracker(model, CAMERA, known, md.TrackerOptions(use_outline=True, **options), reference=first)
+
+
+@pytest.mark.parametrize(("inner", "outer"), [(90.0, 180.0), (170.0, 60.0)])
+def test_a_body_without_texture_is_followed_by_its_outline(model, inner, outer):
+    rng = np.random.default_rng(0)
+    tracker = new_tracker(model, plain(model, 0.0, rng, inner, outer))
+    errors, away = [], []
+    for time in TIMES:
+        result = tracker.track(plain(model, time, rng, inner, outer))
+        assert (result.status, result.pose_from) == (md.Status.TRACKED, "outline")
+        assert result.n_inliers > 0.9 * result.n_points > 90
+        errors.append(mean_error(model, result.estimate.state, state(time)))
+        off = result.estimate.state.parameters - state(time).parameters
+        away.append(np.abs(off) / result.estimate.parameter_std)
+    assert np.mean(errors) < 0.15e-3
+    assert np.mean(np.array(away) < 3.0) > 0.9
+
+
+def test_it_is_found_again_after_it_was_hidden(model):
+    rng = np.random.default_rng(1)
+    tracker = new_tracker(model, plain(model, 0.0, rng))
+    for time in TIMES:
+        image = plain(model, time, rng)
+        if 0.3 < time < 0.4:
+            image[:] = 128
+        result = tracker.track(image)
+        assert result.status == (md.Status.LOST if 0.3 < time < 0.4 else md.Status.TRACKED)
+    assert mean_error(model, result.estimate.state, state(TIMES[-1])) < 0.2e-3
+
+
+def test_what_is_before_the_object_and_known_does_not_count(model):
+    rng = np.random.default_rng(2)
+    tracker = new_tracker(model, plain(model, 0.0, rng))
+    before = np.full((CAMERA.height, CAMERA.width), np.inf, dtype=np.float32)
+    before[:, :300] = 0.1
+    for time in TIMES[:5]:
+        image = plain(model, time, rng)
+        image[:, :300] = 128
+        result = tracker.track(image, occluder_depth=before)
+        assert result.status == md.Status.TRACKED
+        assert tracker.last_measured.pixels[tracker.last_measured.weights > 0.0][:, 0].min() > 298.0
+        assert mean_error(model, result.estimate.state, state(time)) < 1e-3
+
+
+def test_what_turns_inside_its_outline_is_unobservable():
+    """Of a ball, which way it is turned."""
+    rows, columns = np.mgrid[0:480, 0:640]
+    model = turning_block(32)[0]
+    nodes = 0.05 * model.nodes / np.linalg.norm(model.nodes, axis=1)[:, None]
+    still = model.displacement.with_modes(np.zeros_like(model.displacement.modes))
+    ball = md.ReducedModel("ball", nodes, model.triangles, model.parameters, still)
+    there = State(np.zeros(2), RigidTransform(UPRIGHT, np.array([0.0, 0.0, 0.4])))
+    radius = 528.0 * 0.05 / np.sqrt(0.4**2 - 0.05**2)
+    disc = 180.0 - 90.0 * np.clip(radius - np.hypot(columns - 320.0, rows - 240.0) + 0.5, 0.0, 1.0)
+    options = md.TrackerOptions(use_outline=True)
+    tracker = md.Tracker(ball, CAMERA, Registration(ball, there), options, reference=colours(disc))
+    for _ in range(3):
+        result = tracker.track(colours(disc + np.random.default_rng(0).standard_normal(disc.shape)))
+    turn, place = result.estimate.pose_std[:3], result.estimate.pose_std[3:]
+    np.testing.assert_allclose(result.estimate.state.camera_from_object.translation, [0.0, 0.0, 0.4], atol=0.5e-3)
+    assert np.all(turn > 0.05)
+    assert np.all(place < 0.5e-3)
+    assert np.all(result.estimate.parameter_std > 0.5 * (ball.upper - ball.lower))
+
+
+def test_several_cameras_need_texture(model):
+    image, rig = (
+        plain(model, 0.0, np.random.default_rng(3)),
+        [RigCamera(CAMERA, RigidTransform(np.eye(3), np.zeros(3)))] * 2,
+    )
+    with pytest.raises(RegistrationError, match="leave out --with"):
+        RigTracker(
+            model, rig, Registration(model, state(0.0)), md.TrackerOptions(use_outline=True), references=[image, image]
+        )
