@@ -23,6 +23,8 @@ STEP_PX, BORDER_PX = 2.0, 2.0
 OUTSIDE_PX, INSIDE_PX = (1.5, 3.0), 3.0
 #: What is behind must be farther off than by this share of the object's size, and by so many pixels at its distance.
 JUMP_SHARE, JUMP_PX = 0.01, 2.0
+#: Cosine of the angle between two triangles' normals across an edge that is only the mesh's and not the body's.
+SMOOTH = 0.75
 #: Points of nearly parallel stretches of the contour count as neighbours: cosine of the angle between their normals.
 PARALLEL = 0.5
 
@@ -121,6 +123,28 @@ def _side(pixels, start, end, other):
 
 
 @njit(cache=True, nogil=True)
+def _normal(edge, nodes, nx, ny):
+    """Outward normal in the image of the contour at an edge whose own normal is (nx, ny).
+
+    Where a smooth surface turns away, edges run zigzag along its contour. There the plane that touches the surface
+    holds the sight line, and its trace in the image is the contour's tangent.
+    """
+    if edge[3] < 0:
+        return nx, ny
+    a, b = nodes[edge[0]], nodes[edge[1]]
+    first, second = np.cross(b - a, nodes[edge[2]] - a), np.cross(a - b, nodes[edge[3]] - b)
+    sizes = np.sqrt(np.dot(first, first)), np.sqrt(np.dot(second, second))
+    if not min(sizes) > 0.0 or np.dot(first, second) < SMOOTH * sizes[0] * sizes[1]:
+        return nx, ny
+    x, y = first[0] / sizes[0] + second[0] / sizes[1], first[1] / sizes[0] + second[1] / sizes[1]
+    along, length = x * nx + y * ny, np.hypot(x, y)
+    if not abs(along) > PARALLEL * length:
+        return nx, ny
+    length = np.copysign(length, along)
+    return x / length, y / length
+
+
+@njit(cache=True, nogil=True)
 def _is_seen(x, y, nx, ny, z, jump, depth, occluders):
     """Whether a point of the object's edge at depth z is before something farther off, with the object inside."""
     height, width = depth.shape
@@ -161,7 +185,7 @@ def _candidates(edges, nodes, pixels, depth, occluders, focal, size):
             continue
         # The side of the opposite node is inside.
         turn = -1.0 if side > 0.0 else 1.0
-        nx, ny = -turn * dy / length, turn * dx / length
+        nx, ny = _normal(edges[e], nodes, -turn * dy / length, turn * dx / length)
         along = left
         while along < length:
             share = along / length
