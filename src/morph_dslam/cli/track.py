@@ -37,6 +37,14 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help="frame that the landmarks, or another start, belong to (default: the first one tracked); with "
         "--registration and --with: one in which the object is undeformed",
     )
+    command.add_argument(
+        "--refine-camera",
+        action="append",
+        default=[],
+        choices=("focal", "radial"),
+        help="with --still: estimate the focal length, or one radial term of the lens, over the recording too; may be "
+        "repeated",
+    )
     add_flag(command, "--refine", "refine the reference state over the whole sequence and track once more")
     add_repeated(
         command,
@@ -56,6 +64,7 @@ def run(arguments: argparse.Namespace) -> None:
         frames=arguments.frames,
         reference_frame=arguments.reference_frame,
         refine_reference=arguments.refine,
+        refine_camera=tuple(dict.fromkeys(arguments.refine_camera)),
         other_cameras=tuple(vars(arguments)["with"]),  # a keyword of the language
     )
     track(options, print_summary)
@@ -173,12 +182,20 @@ def add_tracking_arguments(command: argparse.ArgumentParser) -> None:
         "with --registration: the map that the camera is found in (default: the one that was registered in)",
         "H5",
     )
-    command.add_argument(
+    pose = command.add_mutually_exclusive_group()
+    pose.add_argument(
         "--pose",
         choices=("map", "fixed", "free"),
         default="map",
         help="the object's pose with --registration: by map and points together, by the map alone, or by its points "
         "alone (default: %(default)s)",
+    )
+    pose.add_argument(
+        "--still",
+        dest="pose",
+        action="store_const",
+        const="still",
+        help="camera and support stand still: the pose is one over the sequence, estimated from all frames",
     )
     add_output(command, "RUN", "run folder to write")
     add_flag(command, "--overwrite", "replace a run that is in the run folder")

@@ -38,6 +38,14 @@ OF_OBJECT: tuple[tuple[Callable[[ObjectOptions], bool], str], ...] = (
         "a pose is held fixed by a map: give the object's registration in it, --registration",
     ),
     (
+        lambda part: part.tracker.pose == "still" and part.registration is not None,
+        "an object that is registered in a map stands still in it already: leave out --still",
+    ),
+    (
+        lambda part: part.tracker.pose == "still" and bool(part.reregister_at),
+        "what stands still is not registered anew: leave out --still or --reregister-at",
+    ),
+    (
         lambda part: not _has_initializer(part) and any(path is None for _, path in part.reregister_at),
         "to register the object anew give landmarks of that frame (--reregister-at N=FILE), or start from a board, "
         "a picture or a guess, which are looked for there again",
@@ -74,6 +82,15 @@ OF_RUN: tuple[tuple[Callable[[TrackOptions], bool], str], ...] = (
         lambda run: run.refine_reference and any(part.reregister_at for part in run.objects),
         "a reference refined over the whole sequence cannot be changed in mid-sequence: leave out --refine or "
         "--reregister-at",
+    ),
+    (
+        lambda run: bool(run.other_cameras) and any(part.tracker.pose == "still" for part in run.objects),
+        "a pose that is one over the sequence is estimated from one camera: leave out --still or --with",
+    ),
+    (
+        lambda run: bool(run.refine_camera) and (run.live or run.tracker.pose != "still" or bool(run.others)),
+        "the camera is estimated with the one pose of one object over a recording: give --still, or leave out "
+        "--refine-camera",
     ),
     (
         lambda run: run.refine_reference and bool(run.other_cameras),

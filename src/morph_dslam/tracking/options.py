@@ -9,8 +9,9 @@ from morph_dslam.tracking.depth import SIGMA_AT_1M
 from morph_dslam.tracking.discrepancy import DiscrepancyOptions
 from morph_dslam.tracking.estimator import EstimationOptions
 
-#: How an object's pose is found: by the map and its points, by the map alone, by its points alone.
-PoseFrom = Literal["map", "fixed", "free"]
+#: How an object's pose is found: by the map and its points, by the map alone, by its points alone, or once for the
+#: whole sequence.
+PoseFrom = Literal["map", "fixed", "free", "still"]
 #: Where the search for a frame's state starts.
 StartFrom = Literal["previous", "constant-velocity"]
 
@@ -35,7 +36,8 @@ class TrackerOptions:
     least_anchored, anchored_share : where the map tells the pose, fewer points will do: at least this many,
         if they are this share of the points found and agree as closely as few must.
     pose : of an object in a map: "map", the camera is found in the map and the object with it; "fixed", and the
-        map's pose is taken as exact; "free", it may be anywhere.
+        map's pose is taken as exact; "free", it may be anywhere; "still", camera and object stand still, so that
+        the registration's pose is that of every frame (`track` estimates it from all of them).
     moved_share, moved_sigmas, moved_patience : an anchored object has moved when its points show it farther
         off than this share of its size, and than so many standard deviations, in so many frames on end.
     look_every : a hidden object is looked for elsewhere in every so many frames.

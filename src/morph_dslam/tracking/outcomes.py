@@ -37,6 +37,7 @@ class PoseSource(StrEnum):
 
     POINTS = "points"
     POINTS_AND_MAP = "points and map"
+    SEQUENCE = "sequence"
     OUTLINE = "outline"
     OUTLINE_AND_MAP = "outline and map"
     MAP = "map"

@@ -72,6 +72,10 @@ class RunFolder:
         """Take in a frame."""
         self.results.add(tracked.frame.index, tracked.frame.timestamp, tracked.results[self.name])
 
+    def start_again(self, results: RunResults, camera: Camera) -> None:
+        """Take in the frames of another pass in place of those so far, by the camera as it is known now."""
+        self.results, self._camera = results, camera
+
     def write(self, facts: dict[str, Any] | None = None, notices: Sequence[Notice] = ()) -> dict[str, Any]:
         """Write tables, summary, plots, model and camera; returns the summary.
 

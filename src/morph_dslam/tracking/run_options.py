@@ -9,6 +9,7 @@ from morph_dslam.registration.initialization import InitializerFiles
 from morph_dslam.registration.landmarks import CLICK_PX
 from morph_dslam.tracking.drawing import DrawOptions
 from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.still import CameraTerm
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +54,7 @@ class TrackOptions(ObjectOptions):
         of a registered object before several cameras one in which it is undeformed.
     click_px : standard deviation of a landmark's pixel.
     refine_reference : whether to refine the reference state over the whole sequence, and track once more.
+    refine_camera : terms of the camera to estimate with a pose that is one over the sequence.
     live : whether frames are dropped that come faster than they are tracked.
     seconds : after which a live run ends.
     serve : port at which browsers on this computer see a live run; 0 for any.
@@ -72,6 +74,7 @@ class TrackOptions(ObjectOptions):
     reference_frame: int | None = None
     click_px: float = CLICK_PX
     refine_reference: bool = False
+    refine_camera: tuple[CameraTerm, ...] = ()
     live: bool = False
     seconds: float | None = None
     serve: int | None = None
@@ -83,6 +86,12 @@ class TrackOptions(ObjectOptions):
     def objects(self) -> tuple[ObjectOptions, ...]:
         """All of them, the first one first."""
         return (self, *(part for _, part in self.others))
+
+    @property
+    def in_two_passes(self) -> bool:
+        """Whether the recording is tracked again with what all of its frames tell."""
+        still = any(part.tracker.pose == "still" for part in self.objects)
+        return self.refine_reference or (still and not self.live)
 
     @property
     def folders(self) -> tuple[Path, ...]:

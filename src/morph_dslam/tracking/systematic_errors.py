@@ -146,14 +146,17 @@ class SystematicErrors:
     points : (p) the texture's points
     parts : the reference images that they were bound in
     window : side of the square that is compared around a point, pixels
+    still : whether the reference view's pose is that of every frame, with the same error
     """
 
-    def __init__(self, estimator: Estimator, points: BoundPoints, parts: Sequence[BoundPart], window: int) -> None:
-        self._estimator, self._points = estimator, points
+    def __init__(
+        self, estimator: Estimator, points: BoundPoints, parts: Sequence[BoundPart], window: int, still: bool = False
+    ) -> None:
+        self._estimator, self._points, self._still = estimator, points, still
         self._misfit = ReferenceMisfit()
         self._corners = _corners(estimator, points)
         self._edges = _by_parts(parts, lambda state: _edges(estimator.camera, self._corners, state))
-        self._moved = self._by_error_factors(parts)
+        self._moved, self._factors = self._by_error_factors(parts), parts[0].error_factors
         self._common = SharedErrors(self._places(parts[0].state), window)
         self.forget_frames()
 
@@ -223,7 +226,14 @@ class SystematicErrors:
         if self._moved is not None:
             moved = self._warps(estimate.state) @ self._moved
             by_reference = gain @ (frame.products(moved) + past @ self._by_reference)
-            if learns:
+            if self._still and self._factors is not None:
+                # The pose's error moves the points on the surface, and the object with them: both count together.
+                d = len(estimate.state.parameters)
+                by_pose = frame.jacobian[:, :, d:] @ self._factors[d:]
+                by_reference = gain @ (frame.products(moved - by_pose) + past @ self._by_reference)
+                by_reference[d:] = self._factors[d:]
+            # A pose that is one over the sequence comes from all frames, with a covariance by what they leave.
+            if learns and not self._still:
                 self._learn_reference(frame, frame.left(moved, by_reference))
             covariance += self._misfit.factor * by_reference @ by_reference.T
         gradients = self._common.gradients(frame.weighted_jacobian)

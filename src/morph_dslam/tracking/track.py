@@ -44,6 +44,7 @@ from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.session import Session, SynchronizedFrames
 from morph_dslam.tracking.setup import TrackedObject, load_cameras, load_objects
 from morph_dslam.tracking.sinks import BrowserSink, LivePicture, LiveTimes, Sink, TrackedFrame, VideoSink
+from morph_dslam.tracking.still_run import Sharpening, with_pose, with_still_pose
 from morph_dslam.tracking.tracker import Tracker
 
 Tell = Callable[[Path, dict[str, Any]], object]
@@ -183,14 +184,17 @@ class _Job:
             RunFolder(folder, part.name, part.new_results(), part.camera, part.inner, run.overwrite)
             for folder, part in zip(run.folders, placed, strict=True)
         ]
-        self._again = {part.name: Reregistration(part) for part in placed}
+        sharpens = {part.name: run.live and part.options.pose == "still" for part in placed}
+        self._again = {p.name: Sharpening(p) if sharpens[p.name] else Reregistration(p) for p in placed}
         self._times, self._seen = LiveTimes(), {part.name: [] for part in placed}
         sinks: list[Sink] = [*self._folders]
         screens = self._screens(stack) if run.live else []
         if run.live:
             sinks += [self._times, *screens]
-        if run.refine_reference:
+        if run.in_two_passes:
             sinks.append(self._keep_seen)
+            # By its own points in each frame, which shows more of them as long as the one pose is not known well.
+            placed = [with_pose(part, "free") if part.options.pose == "still" else part for part in placed]
         views = {part.name: view for part, view in zip(placed, self._views, strict=True)}
         picture = LivePicture(placed[0].camera, views) if screens else None
         self._session = new_session(placed, source, sinks, picture=picture, reregistration=self._again)
@@ -201,11 +205,12 @@ class _Job:
         if run.live:
             print(f"tracking {self._source.name} (Ctrl-C ends it)", file=sys.stderr)
         self._session.run(run.seconds, progress=not run.live)
-        if run.refine_reference:
-            print("refining the reference state over the sequence ...", file=sys.stderr)
-            self._placed = [_refined(part, self._seen[part.name]) for part in self._placed]
+        if run.in_two_passes:
+            print("refining what is one over the sequence ...", file=sys.stderr)
+            self._placed = [_refined(part, self._seen[part.name], run) for part in self._placed]
             for folder, part in zip(self._folders, self._placed, strict=True):
-                folder.results = part.new_results(refined=isinstance(part.object.start, Landmarks))
+                folder.start_again(part.new_results(refined=isinstance(part.object.start, Landmarks)), part.camera)
+            self._views = [AugmentedView(part.model, part.camera, run.drawing, part.inner) for part in self._placed]
             new_session(self._placed, self._source, self._folders).run(progress=True)
 
     def write(self, number: int, tell: Tell) -> dict[str, Any]:
@@ -249,8 +254,10 @@ class _Job:
                 self._seen[name].append(tracker.last_seen)
 
 
-def _refined(part: PlacedObject, keyframes: list[Keyframe]) -> PlacedObject:
-    """An object with its reference state refined over the sequence; how well it is known then is not known."""
+def _refined(part: PlacedObject, keyframes: list[Keyframe], run: TrackOptions) -> PlacedObject:
+    """An object with its reference state refined over the sequence; how well a moving one is known is not known."""
+    if part.options.pose == "still":
+        return with_still_pose(part, keyframes, run.refine_camera)
     landmarks, registration = part.object.start, part.registration
     if not isinstance(landmarks, Landmarks):
         return part
@@ -292,6 +299,6 @@ def _facts(run: TrackOptions, files: ObjectOptions, part: PlacedObject, results:
         "outline_used": options.use_outline,
         "depth_used": options.use_depth,
         "discrepancy_used": options.use_discrepancy,
-        "pose": "free" if scene is None else options.pose,
+        "pose": options.pose if scene is not None or options.pose == "still" else "free",
         "settings": {"click_px": run.click_px, "tracker": asdict(options)},
     }

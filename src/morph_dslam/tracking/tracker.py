@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
+from morph_dslam.errors import TrackingError
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.sources import Frame
@@ -42,6 +43,7 @@ from morph_dslam.tracking.patches import follow, normalize_contrast
 from morph_dslam.tracking.reference import PosedImage, ReferenceView
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.result import STAGES, FrameResult
+from morph_dslam.tracking.still import held
 from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE, error_factors_of
 from morph_dslam.tracking.views import (
     ActiveView,
@@ -129,6 +131,7 @@ class Tracker:
         self._discrepancy = DiscrepancyFit(self.model, camera, sought) if use else None
         self._filter = new_filter(self.estimator, self.options)
         self._unfiltered = np.zeros((len(self.model.parameters) + 6,) * 2)
+        self._still = self._held_pose(registration)
         if registration.scene is not None and reference is None:
             reference, in_sequence = self._from_scene(), False
         self._lost, self._n_lost = not in_sequence, 0
@@ -202,6 +205,20 @@ class Tracker:
         assert known.frame is not None
         return keyframes[known.frame]
 
+    def _held_pose(self, known: Registration) -> Prior | None:
+        """The pose that is one over the sequence, if it is; raises TrackingError where a map has it."""
+        if self.options.pose != "still":
+            return None
+        if known.scene is not None:
+            raise TrackingError(
+                "an object in a mapped scene stands still in its map already, and the camera need not: take the pose "
+                "'map' or 'fixed' in place of 'still'"
+            )
+        prior, factors = held(known.state, self.estimator), error_factors_of(known.covariance, self.estimator.scale)
+        if not self.options.use_outline or factors is None:
+            return prior
+        return replace(prior, lasting=factors[len(self.model.parameters) :])
+
     # -- the steps of a frame -----------------------------------------------------------------------------
 
     def _prepare(self, frame: Frame | NDArray[np.uint8], occluder_depth: NDArray[np.float32] | None) -> Image:
@@ -217,7 +234,9 @@ class Tracker:
             return image
 
     def _predict(self, camera: CameraLocalization) -> Prior | None:
-        """What the map says of the object's pose, as a term of the estimator's cost."""
+        """What is known of the object's pose, by the map or for the whole sequence, as a term of the cost."""
+        if self.options.pose == "still":
+            return self._still
         return self._anchoring.prior(camera.pose_prior)
 
     def _follow(self, image: Image, prior: Prior | None) -> Measurement | None:
@@ -352,7 +371,7 @@ class Tracker:
             estimate,
             found_by,
             warnings=(*warnings, *more),
-            pose_from=_pose_source(hypothesis),
+            pose_from=_pose_source(hypothesis, self.options.pose == "still"),
             n_points=n_points,
             n_inliers=n_inliers,
             residual_rms_px=float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))),
@@ -440,7 +459,7 @@ class Tracker:
     def _expected_motion(self, prior: Prior | None) -> Array:
         """Image motion (p, 2) by the map, or at the velocity of two frames; only a first guess."""
         last = self.reference.projected(self._last)
-        if prior is not None:
+        if prior is not None and prior is not self._still:
             return np.nan_to_num(self.reference.projected(prior.placed(self._last)) - last)
         return np.nan_to_num(last - self.reference.projected(self._velocity_base))
 
@@ -484,7 +503,9 @@ class Tracker:
         return change
 
 
-def _pose_source(hypothesis: PoseHypothesis) -> PoseSource:
+def _pose_source(hypothesis: PoseHypothesis, still: bool) -> PoseSource:
+    if still:
+        return PoseSource.SEQUENCE
     if hypothesis.outline_alone:
         return PoseSource.OUTLINE if hypothesis.prior is None else PoseSource.OUTLINE_AND_MAP
     return PoseSource.POINTS if hypothesis.prior is None else PoseSource.POINTS_AND_MAP

@@ -273,7 +273,9 @@ class ActiveView:
         recovery = Recovery(estimator.model, estimator.camera, reference, estimation, options)
         systematic = None
         if not reference.outline_alone:
-            systematic = SystematicErrors(estimator, reference.points, reference.parts, PATCH_WINDOW)
+            systematic = SystematicErrors(
+                estimator, reference.points, reference.parts, PATCH_WINDOW, options.pose == "still" and not number
+            )
         return cls(number, reference, estimation, recovery, systematic, error)
 
 

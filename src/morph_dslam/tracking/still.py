@@ -1,0 +1,284 @@
+"""One pose over a sequence, for a camera and a support that stand still, estimated from all frames together.
+
+The pose places the reference view's points on the mesh and is that of every other frame too. In the reference view
+any pose explains these points; in a deformed one only the right pose does. So the pose, what else is one over the
+sequence and, on request, terms of the camera are found as the minimum of the landmarks' residuals and those of
+keyframes, each keyframe at its own best parameters (variable projection; Golub and Pereyra 1973).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from morph_dslam.camera import Camera
+from morph_dslam.geometry import rotation_log
+from morph_dslam.model import ReducedModel
+from morph_dslam.tracking.binding import bind_pixels, view_of
+from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, State, moved
+from morph_dslam.tracking.levenberg_marquardt import bounded_step
+from morph_dslam.tracking.refinement import Keyframe
+from morph_dslam.tracking.state import Prior
+
+Array = NDArray[np.float64]
+#: Terms of the camera that can be estimated with the pose.
+CameraTerm = Literal["focal", "radial"]
+#: Standard deviations of the terms before anything is measured: of the focal length's logarithm, and of the shift
+#: by the radial term in the image's corner, as a share of the radius there.
+TERM_STD: dict[CameraTerm, float] = {"focal": 0.3, "radial": 0.05}
+#: How many independent points all keyframes together count for: what the model leaves is alike over wide parts of
+#: the surface and over many frames.
+EFFECTIVE_POINTS = 300.0
+#: Residuals smaller than this, pixels, say no more.
+LEAST_SIGMA_PX = 0.3
+#: Rounds with weights by the residuals of the round before; steps of a keyframe's own parameters.
+ROUNDS, STEPS = 2, 6
+#: Residual of a landmark behind the camera, and the least variance of a scaled unknown that is believed.
+UNSEEN, LEAST_VARIANCE = 1e3, 1e-12
+#: How much more than by a frame's own points a pose counts that is one over the sequence.
+HELD = 1e4
+
+
+@dataclass(frozen=True)
+class LandmarkTerm:
+    """What landmarks say of the reference state.
+
+    Attributes
+    ----------
+    points : k of them, bound.
+    recorded : (k, 2) pixels as recorded.
+    sigma_px : standard deviation of each.
+    """
+
+    points: BoundPoints
+    recorded: Array
+    sigma_px: float
+
+    def residuals(self, camera: Camera, state: State) -> Array:
+        """(2 k,) in standard deviations."""
+        away = camera.project(self.points.in_camera(state)) - camera.undistort_pixels(self.recorded)
+        return np.nan_to_num(away / self.sigma_px, nan=UNSEEN).ravel()
+
+
+@dataclass(frozen=True)
+class StateTerm:
+    """What another registration says of the reference state.
+
+    Attributes
+    ----------
+    state : as registered.
+    covariance : (d + 6, d + 6) of it.
+    scale : (d + 6,) of the unknowns.
+    """
+
+    state: State
+    covariance: Array
+    scale: Array
+
+    def residuals(self, camera: Camera, state: State) -> Array:
+        """(d + 6,) in standard deviations; the camera does not matter."""
+        pose, before = state.camera_from_object, self.state.camera_from_object
+        turn = rotation_log(pose.rotation @ before.rotation.T)
+        away = np.concatenate([state.parameters - self.state.parameters, turn, pose.translation - before.translation])
+        values, vectors = np.linalg.eigh(self.covariance / np.outer(self.scale, self.scale))
+        return np.asarray((vectors.T @ (away / self.scale)) / np.sqrt(np.maximum(values, LEAST_VARIANCE)))
+
+
+@dataclass(frozen=True)
+class StillFit:
+    """What is one over the sequence.
+
+    Attributes
+    ----------
+    state : parameters in the reference frame, and the pose.
+    covariance : (d + 6, d + 6) of ``state``.
+    camera : with its terms as estimated.
+    terms : of the camera, each value with its standard deviation: the focal length in pixels, the radial
+        coefficient.
+    """
+
+    state: State
+    covariance: Array
+    camera: Camera
+    terms: dict[str, tuple[float, float]]
+
+
+def held(state: State, estimator: Estimator) -> Prior:
+    """The pose of ``state`` as a term of a frame's cost by which the frame cannot move it."""
+    d, size = len(state.parameters), estimator.scale[-1]
+    px_per_metre = estimator.camera.fx / max(float(state.camera_from_object.translation[2]), 1e-6)
+    information = HELD * px_per_metre**2 * np.diag([size**2] * 3 + [1.0] * 3)
+    return Prior(np.zeros(d), np.zeros((d, d)), state.camera_from_object, information)
+
+
+class StillProblem:
+    """The residuals of a sequence as a function of what is one over it.
+
+    Parameters
+    ----------
+    model : the object.
+    camera : as given; its terms are changed.
+    start : the registered state in the reference frame.
+    reference_pixels : (p, 2) of the followed points in the reference view, undistorted by ``camera``.
+    keyframes : where these points were seen in other frames.
+    known : what the registration rests on.
+    constant : indices of the parameters that are one over the sequence.
+    terms : of the camera that are estimated.
+    """
+
+    def __init__(
+        self,
+        model: ReducedModel,
+        camera: Camera,
+        start: State,
+        reference_pixels: Array,
+        keyframes: Sequence[Keyframe],
+        known: LandmarkTerm | StateTerm,
+        constant: Sequence[int] = (),
+        terms: Sequence[CameraTerm] = (),
+    ) -> None:
+        self._model, self._camera, self._start, self._known = model, camera, start, known
+        self._constant, self._terms, d = list(constant), tuple(terms), len(model.parameters)
+        self._free = np.setdiff1d(np.arange(d), self._constant)
+        half_ranges = 0.5 * (model.upper - model.lower)
+        self._scale = np.concatenate([0.05 * half_ranges, np.full(3, 0.01), np.full(3, 0.005)])
+        # As recorded, so that another lens can undistort them.
+        self._reference = camera.distort_pixels(reference_pixels)
+        self._recorded = [_with_pixels(frame, camera.distort_pixels) for frame in keyframes]
+        self._own = [frame.state.parameters for frame in keyframes]
+        self._sigmas = np.ones(len(keyframes))
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return len(self._scale) + len(self._terms)
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Of the unknowns: the parameters stay in their ranges."""
+        d, model = len(self._model.parameters), self._model
+        lower, upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
+        lower[:d] = (model.lower - self._start.parameters) / self._scale[:d] - 1e-6
+        upper[:d] = (model.upper - self._start.parameters) / self._scale[:d] + 1e-6
+        return lower, upper
+
+    def state(self, unknowns: Array) -> State:
+        """The reference state."""
+        state = moved(self._start, unknowns[: len(self._scale)] * self._scale)
+        return replace(state, parameters=np.clip(state.parameters, self._model.lower, self._model.upper))
+
+    def camera(self, unknowns: Array) -> Camera:
+        """The camera with its terms, which are zero in ``unknowns`` where it is as given."""
+        camera = self._camera
+        by_name = dict(zip(self._terms, unknowns[len(self._scale) :], strict=True))
+        if "focal" in by_name:
+            factor = float(np.exp(TERM_STD["focal"] * by_name["focal"]))
+            camera = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
+        if "radial" in by_name:
+            first, *others = camera.distortion or (0.0,) * 4
+            change = float(TERM_STD["radial"] * by_name["radial"]) / corner_radius(camera) ** 2
+            camera = replace(camera, distortion=(first + change, *others))
+        return camera
+
+    def residuals(self, unknowns: Array) -> Array:
+        """Of landmarks, camera terms and keyframes, each in its standard deviations."""
+        state, camera = self.state(unknowns), self.camera(unknowns)
+        estimator = Estimator(self._model, camera, EstimationOptions())
+        surface, met = bind_pixels(
+            self._model, camera, view_of(self._model, camera, state), camera.undistort_pixels(self._reference)
+        )
+        points = BoundPoints.from_surface(self._model, surface)
+        parts = [self._known.residuals(camera, state), unknowns[len(self._scale) :]]
+        return np.concatenate([*parts, *self._of_keyframes(estimator, points, met, state)])
+
+    def _of_keyframes(
+        self, estimator: Estimator, points: BoundPoints, met: NDArray[np.bool_], state: State
+    ) -> Iterator[Array]:
+        """The scaled residuals of each keyframe; 0 for points of the reference view that met nothing."""
+        share = EFFECTIVE_POINTS / max(len(self._recorded), 1)
+        for number, recorded in enumerate(self._recorded):
+            frame = _with_pixels(recorded, estimator.camera.undistort_pixels)
+            found, left, weights = self._fitted(estimator, frame.measured(points, met), state, self._own[number])
+            self._own[number] = found
+            huber = np.minimum(1.0, estimator.options.huber_px / np.maximum(np.linalg.norm(left, axis=1), 1e-12))
+            left *= np.sqrt(weights * huber * share / max(weights.sum(), 1.0))[:, None] / self._sigmas[number]
+            scaled, n_met = np.zeros((len(met) + len(left) - int(met.sum()), 2)), int(met.sum())
+            scaled[: len(met)][met], scaled[len(met) :] = left[:n_met], left[n_met:]
+            yield scaled.ravel()
+
+    def weigh(self, residuals: Array) -> None:
+        """Take the keyframes' standard deviations from what ``residuals`` left of them."""
+        share, end = EFFECTIVE_POINTS / max(len(self._recorded), 1), len(residuals)
+        for number in reversed(range(len(self._recorded))):
+            frame = self._recorded[number]
+            size = 2 * (len(frame.pixels) + (0 if frame.outline is None else len(frame.outline.pixels)))
+            rms = np.sqrt(np.sum(residuals[end - size : end] ** 2) / (2.0 * share))
+            self._sigmas[number] = max(self._sigmas[number] * rms, LEAST_SIGMA_PX)
+            end -= size
+
+    def _fitted(
+        self, estimator: Estimator, measured: tuple[BoundPoints, Array, Array, Array], state: State, own: Array
+    ) -> tuple[Array, Array, Array]:
+        """A keyframe's parameters (d,) in the pose of ``state``, what they leave (p, 2), pixels, and weights (p,)."""
+        points, pixels, weights, normals = measured
+        own = own.copy()
+        own[self._constant] = state.parameters[self._constant]
+        model, free, left = self._model, self._free, np.zeros_like(pixels)
+        for step in range(STEPS + 1):
+            at = replace(state, parameters=own)
+            _, hessian, gradient, left = estimator.evaluate(points, pixels, weights, at, normals)
+            if step == STEPS or not len(free):
+                break
+            block = hessian[np.ix_(free, free)]
+            block = block + 1e-9 * max(float(np.trace(block)), 1e-30) * np.eye(len(free))
+            change = bounded_step(block, gradient[free], (model.lower - own)[free], (model.upper - own)[free])
+            own[free] += change
+            if np.abs(change / (model.upper - model.lower)[free]).max() < 1e-6:
+                break
+        return own, np.nan_to_num(left), weights
+
+    def fitted(self, unknowns: Array, jacobian: Array) -> StillFit:
+        """The result at the minimum, with the residuals' ``jacobian`` (r, n) there."""
+        n, state, camera = len(self._scale), self.state(unknowns), self.camera(unknowns)
+        values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
+        inverse = (vectors / np.maximum(values, 1e-9 * max(values[-1], 1e-30))) @ vectors.T
+        covariance = inverse[:n, :n] * np.outer(self._scale, self._scale)
+        by_unknown = np.sqrt(np.diag(inverse)[n:])
+        terms: dict[str, tuple[float, float]] = {}
+        for term, std in zip(self._terms, by_unknown, strict=True):
+            if term == "focal":
+                terms[term] = (camera.fx, camera.fx * TERM_STD[term] * float(std))
+            else:
+                terms[term] = (camera.distortion[0], TERM_STD[term] * float(std) / corner_radius(camera) ** 2)
+        return StillFit(state, covariance, camera, terms)
+
+
+def _with_pixels(frame: Keyframe, change: Callable[[Array], Array]) -> Keyframe:
+    """A keyframe with all its pixels changed."""
+    outline = None if frame.outline is None else replace(frame.outline, pixels=change(frame.outline.pixels))
+    return replace(frame, pixels=change(frame.pixels), outline=outline)
+
+
+def corner_radius(camera: Camera) -> float:
+    """Radius of the image's farthest corner from the principal point, at unit focal length."""
+    x = max(camera.cx, camera.width - camera.cx) / camera.fx
+    y = max(camera.cy, camera.height - camera.cy) / camera.fy
+    return float(np.hypot(x, y))
+
+
+def fit_still(problem: StillProblem) -> StillFit:
+    """What is one over the sequence, as landmarks and keyframes have it together."""
+    unknowns, found = np.zeros(problem.size), None
+    for number in range(ROUNDS + 1):
+        found = least_squares(
+            problem.residuals, unknowns, bounds=problem.bounds(), diff_step=1e-2, max_nfev=12, ftol=1e-4, x_scale=1.0
+        )
+        unknowns = found.x
+        if number < ROUNDS:
+            problem.weigh(problem.residuals(unknowns))
+    assert found is not None
+    return problem.fitted(unknowns, found.jac)

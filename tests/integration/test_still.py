@@ -1,0 +1,124 @@
+"""A camera and a support that stand still: one pose over the sequence, with a camera known badly."""
+
+from dataclasses import replace
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+import morph_dslam as md
+from morph_dslam.camera import Camera
+from morph_dslam.evaluation.run_folder import load_run
+from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
+from morph_dslam.io.camera_files import load_camera, save_camera
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
+from morph_dslam.tracking.estimator import State
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.rendered_sequence import UPRIGHT, SheetFilm, mean_error, write_recording
+
+#: A long lens with a radial term that shifts the corners by some 17 pixels.
+CAMERA = Camera(640, 480, 1500.0, 1500.0, 320.0, 240.0, (0.6, 0.0, 0.0, 0.0))
+POSE = RigidTransform(rotation_exp(np.array([0.10, -0.15, 0.02])) @ UPRIGHT, np.array([0.005, -0.004, 1.25]))
+TIMES = np.linspace(0.0, 1.0, 16)
+
+
+def state(time):
+    parameters = [0.05 * np.sin(3.0 * time), 0.4 * np.sin(4.0 * time), np.radians(15) * np.sin(2.0 * time)]
+    return State(np.array(parameters), POSE)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """Frames of a sheet that bends in one pose, and landmarks set to 0.7 pixels."""
+    folder = tmp_path_factory.mktemp("still")
+    model = bent_sheet_model(43, 31)
+    film = SheetFilm(model, replace(CAMERA, distortion=()))
+    film.background[:] = 128
+    images = [recorded(film.frame(state(time))) for time in TIMES]
+    write_recording(folder, dict(enumerate(images)), model)
+    save_camera(folder / "camera.yaml", CAMERA)
+    rng = np.random.default_rng(3)
+    nodes = rng.choice(len(model.nodes), 24, replace=False)
+    pixels = CAMERA.distort_pixels(CAMERA.project(POSE.apply(model.nodes[nodes])))
+    save_landmarks(
+        folder / "landmarks.csv", Landmarks(model.nodes[nodes], pixels + 0.7 * rng.standard_normal(pixels.shape))
+    )
+    return folder
+
+
+def recorded(image):
+    """A pinhole's image (h, w, 3) as the lens gives it."""
+    rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width].astype(float)
+    ideal = CAMERA.undistort_pixels(np.column_stack([columns.ravel(), rows.ravel()])).astype(np.float32)
+    x, y = ideal.reshape(CAMERA.height, CAMERA.width, 2).transpose(2, 0, 1)
+    return cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+
+def track(recording, output, pose, camera="camera.yaml", **options):
+    md.track(
+        md.TrackOptions(
+            frames=recording / "frames",
+            model=recording / "sheet.morph",
+            camera=recording / camera,
+            landmarks=recording / "landmarks.csv",
+            output=output,
+            video=False,
+            tracker=md.TrackerOptions(pose=pose),
+            **options,
+        )
+    )
+    return load_run(output)
+
+
+def errors(run):
+    """Mean distance of the nodes from the truth in each frame, metres."""
+    states = [
+        State(p, RigidTransform(m[:3, :3], m[:3, 3]))
+        for p, m in zip(run.parameters, run.camera_from_object, strict=True)
+    ]
+    return np.array([mean_error(run.model, found, state(t)) for found, t in zip(states, TIMES, strict=True)])
+
+
+def away(run):
+    """Rotation vector (rad) and translation (m) of the run's pose from the true one (6,)."""
+    pose = run.camera_from_object[0]
+    return np.concatenate([rotation_log(pose[:3, :3] @ POSE.rotation.T), pose[:3, 3] - POSE.translation])
+
+
+def test_one_pose_from_all_frames_is_nearer_to_the_truth(recording, tmp_path):
+    free, still = track(recording, tmp_path / "free", "free"), track(recording, tmp_path / "still", "still")
+    assert np.ptp(still.camera_from_object, axis=0).max() < 1e-4
+    assert errors(still).mean() < 0.5 * errors(free).mean()
+    assert errors(still).mean() < 1.0e-3
+    with h5py.File(tmp_path / "still" / "result.h5") as file:
+        spread = file["pose_std"][-1]
+    assert (np.abs(away(still)) < 3.5 * spread).all()
+
+
+def test_a_lens_that_is_not_known_is_estimated(recording, tmp_path):
+    save_camera(recording / "plain.yaml", replace(CAMERA, distortion=()))
+    run = track(recording, tmp_path / "run", "still", "plain.yaml", refine_camera=("radial",))
+    k1 = load_camera(tmp_path / "run" / "camera.yaml").distortion[0]
+    assert k1 == pytest.approx(0.6, rel=0.2)
+    assert errors(run).mean() < 2.5e-3  # nearly all of it along the sight line, as a longer lens would be
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            {"tracker": md.TrackerOptions(pose="still"), "registration": "r.json", "landmarks": None},
+            "leave out --still",
+        ),
+        ({"refine_camera": ("focal",)}, "give --still"),
+        ({"tracker": md.TrackerOptions(pose="still"), "reregister_at": ((3, "l.csv"),)}, "not registered anew"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(recording, tmp_path, arguments, message):
+    options = {
+        "frames": recording / "frames", "model": recording / "sheet.morph", "camera": recording / "camera.yaml",
+        "landmarks": recording / "landmarks.csv", "output": tmp_path / "run",
+    }  # fmt: skip
+    with pytest.raises(md.MorphError, match=message):
+        md.track(md.TrackOptions(**options | arguments))
