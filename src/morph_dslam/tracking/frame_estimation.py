@@ -29,8 +29,9 @@ from morph_dslam.tracking.sequence_filter import Fitter, SequenceFilter
 from morph_dslam.tracking.systematic_errors import Unexplained
 
 Array = NDArray[np.float64]
-#: How far an outline that is alone is searched for, pixels: the first after a loss only.
-REACHES = (28, 14, 7, 7)
+#: How far an outline that is alone is searched for, pixels: the first after a loss only. That is for an object of this
+#: extent in the image, pixels; where it is larger, so are its motion and what the model leaves, up to this factor.
+REACHES, USUAL_EXTENT_PX, MOST_LARGER = (28, 14, 7, 4), 250.0, 2.5
 #: Share of the cost below which another shape is a better explanation and not the same one.
 CLEARLY_BETTER = 0.95
 #: The least spread of residuals, pixels, that is believed when they are weighed against depths.
@@ -146,11 +147,13 @@ class FrameEstimation:
         weights = self._noise.weights(measurement.spread, used)
         return self._estimator.estimate(self._reference.points, measurement.pixels, weights, start, prior=prior)
 
-    def learn(self, attempt: PoseHypothesis) -> None:
+    def learn(self, attempt: PoseHypothesis, picture: Image) -> None:
         """Take in how well the points agreed in a frame that is believed."""
         if attempt.outline_alone and attempt.outline is not None:
             taken = self._taken(attempt, attempt.outline, attempt.estimate)
             self._balance.learn_outline(attempt.outline, attempt.estimate.residuals, taken)
+            if picture.has_grey and self._reference.outline is not None:
+                self._reference.outline.take_brightness(picture.grey, attempt.estimate.state)
             return
         residuals = attempt.estimate.residuals[: len(attempt.inliers)]
         self._noise.learn(attempt.measurement.spread, residuals, attempt.inliers)
@@ -226,7 +229,8 @@ class FrameEstimation:
             outline.take_brightness(picture.grey, state)
         empty = np.zeros((0, 2))
         nothing = Measurement(empty, np.zeros(0, dtype=bool), np.zeros(0, dtype=bool), np.zeros(0))
-        reaches = [r for r in REACHES if r <= reach]
+        larger = np.clip(np.sqrt(outline.extent(start) / USUAL_EXTENT_PX), 1.0, MOST_LARGER)
+        reaches = [int(larger * r) for r in REACHES if r <= reach]
         attempt = None
         for number, far in enumerate(reaches):
             last = number == len(reaches) - 1

@@ -30,13 +30,17 @@ N_POINTS = 160
 REACH_PX = 14
 #: Pixels averaged on each side of a candidate.
 SIDE_PX = 4
+#: How far from the candidate the steepest place is looked for, pixels.
+STEEPEST_PX = 3
 #: Grey levels by which the two sides must differ.
 LEAST_CONTRAST = 10.0
 #: Largest difference of the inner side from its brightness in the first picture, relative to that; shading
 #: changes it as the surface bends.
 BRIGHTNESS_TOLERANCE = 0.35
-#: Where, pixels inwards, the brightness of the inner side is looked up.
-INNER_PX = 3.5
+#: Where, pixels from the contour, the brightness of either side is looked up.
+BESIDE_PX = 3.5
+#: Grey levels by which a side may differ from it until the candidate's score halves.
+LIKELY_LEVELS = 12.0
 
 
 @dataclass(frozen=True)
@@ -112,6 +116,12 @@ class Outline:
         """Whether a picture of the object was given."""
         return self._picture is not None
 
+    def extent(self, state: State) -> float:
+        """Diagonal of the object in the image, pixels; 0 where it is behind the camera."""
+        pixels = view_of(self._surface.model, self._camera, state).pixels
+        seen = pixels[np.isfinite(pixels).all(axis=1)]
+        return float(np.linalg.norm(np.ptp(seen, axis=0))) if len(seen) else 0.0
+
     def take_brightness(self, grey: NDArray[np.uint8], state: State, seen: NDArray[np.bool_] | None = None) -> None:
         """Remember how bright the object is in an undistorted image (h, w).
 
@@ -153,14 +163,16 @@ class Outline:
         return view, draw_depth(view.pixels, depths, self._triangles, surface.closed, camera.height, camera.width)
 
     def _brightness(self, contour: Contour, view: View, ids: NDArray[np.int32]) -> Array:
-        """Grey (k,) just inside each point in the picture that is known; NaN where that does not show it."""
+        """Grey (k, 2) of the object just inside and outside of each point, in the picture that is known.
+
+        NaN where that does not show it, or the object is not there.
+        """
         known = self._picture
         if known is None:
-            return np.full(len(contour), np.nan)
-        inside = contour.pixels - INNER_PX * contour.normals
-        return look_up(
-            inside, ids, self._triangles, view.nodes, known.nodes, known.depth, known.grey, self._camera.intrinsics
-        )
+            return np.full((len(contour), 2), np.nan)
+        sides = [contour.pixels + away * contour.normals for away in (-BESIDE_PX, BESIDE_PX)]
+        args = ids, self._triangles, view.nodes, known.nodes, known.depth, known.grey, self._camera.intrinsics
+        return np.column_stack([look_up(side, *args) for side in sides])
 
     def _in_slots(self, contour: Contour, offsets: Array, state: State) -> OutlineMeasurement:
         """Points stay in the places of those that were near them last: what one errs by is then known as the same."""
@@ -237,15 +249,15 @@ def search_outline(grey, pixels, normals, brightness, reach, side, least_contras
 
     A candidate's inner side must be as bright as it was within the tolerance, where that is known (not NaN). The
     contrast of its two sides is its score, which halves at half the reach: what is near is more likely the outline.
-    The step is refined to a fraction of a pixel by the parabola through the contrasts beside it.
+    It is refined to the steepest place nearby, to a fraction of a pixel by the parabola through the slopes beside it.
     """
     height, width = grey.shape
     length = 2 * (reach + side) + 1
-    profile = np.empty(length)
+    profile, slopes = np.empty(length), np.empty(length)
     steps, scores = np.empty(2 * reach + 1), np.empty(2 * reach + 1)
     result = np.full(len(pixels), np.nan)
     for j in range(len(pixels)):
-        if not np.isfinite(pixels[j, 0]):
+        if not np.isfinite(pixels[j, 0]) or abs(brightness[j, 0] - brightness[j, 1]) < least_contrast:
             continue
         for k in range(length):
             x = pixels[j, 0] + (k - reach - side) * normals[j, 0]
@@ -270,8 +282,12 @@ def search_outline(grey, pixels, normals, brightness, reach, side, least_contras
                 steps[k] = 0.0  # beyond the border of the image
             away = 2.0 * (k - reach) / reach
             scores[k] = steps[k] / (1.0 + away * away)
-            if abs(inner - brightness[j]) > tolerance * brightness[j] + least_contrast:
+            if abs(inner - brightness[j, 0]) > tolerance * brightness[j, 0] + least_contrast:
                 scores[k] = steps[k] = 0.0
+            if np.isfinite(brightness[j, 0]):
+                scores[k] /= 1.0 + ((inner - brightness[j, 0]) / LIKELY_LEVELS) ** 2
+            if np.isfinite(brightness[j, 1]):
+                scores[k] /= 1.0 + ((outer - brightness[j, 1]) / LIKELY_LEVELS) ** 2
             if steps[k] > least_contrast and (best < 0 or scores[k] > scores[best]):
                 best = k
         # The nearest one may be on the slope of a step: its top is where the step is.
@@ -279,7 +295,15 @@ def search_outline(grey, pixels, normals, brightness, reach, side, least_contras
             best += 1 if steps[best + 1] > steps[best - 1] else -1
         if best <= 0 or best >= 2 * reach:
             continue
-        bend = steps[best - 1] - 2.0 * steps[best] + steps[best + 1]
-        shift = 0.5 * (steps[best - 1] - steps[best + 1]) / bend if bend < 0.0 else 0.0
-        result[j] = best - reach + min(max(shift, -0.5), 0.5)
+        # Shading inside shifts the largest difference of both sides; the steepest place is the contour's.
+        middle, top = best + side, -1
+        for k in range(max(middle - STEEPEST_PX, 1), min(middle + STEEPEST_PX, length - 2) + 1):
+            slopes[k] = abs(profile[k + 1] - profile[k - 1])
+            if np.isfinite(slopes[k]) and (top < 0 or slopes[k] > slopes[top]):
+                top = k
+        if not middle - STEEPEST_PX < top < middle + STEEPEST_PX:
+            continue
+        bend = slopes[top - 1] - 2.0 * slopes[top] + slopes[top + 1]
+        shift = 0.5 * (slopes[top - 1] - slopes[top + 1]) / bend if bend < 0.0 else 0.0
+        result[j] = top - side - reach + min(max(shift, -0.5), 0.5)
     return result

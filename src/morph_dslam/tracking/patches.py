@@ -286,7 +286,8 @@ def weaker_slope(normalized: NDArray[np.uint8], points: Array, window: int) -> A
     smooth = cv2.GaussianBlur(normalized.astype(np.float32), (0, 0), TEXTURE_SCALE_PX)
     x, y = (cv2.Sobel(smooth, cv2.CV_32F, *order) / 8.0 for order in ((1, 0), (0, 1)))
     columns, rows = np.rint(points).astype(int).reshape(-1, 2).T
-    xx, xy, yy = (cv2.blur(product, (window, window))[rows, columns] for product in (x * x, x * y, y * y))
+    products = np.stack([x * x, x * y, y * y], axis=2, dtype=np.float32)
+    xx, xy, yy = cv2.blur(products, (window, window))[rows, columns].T
     least = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
     return np.sqrt(np.maximum(least, 0.0)).astype(np.float64)
 

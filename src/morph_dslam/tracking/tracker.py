@@ -332,7 +332,7 @@ class Tracker:
     ) -> None:
         """Keep what the next frame starts from; a lost frame keeps the last known shape."""
         if rejection is None:
-            self._learn(hypothesis)
+            self._learn(image, hypothesis)
         else:
             self.last_measured = self.reference.nothing_measured
             placed = self._placed_by_map(camera)
@@ -463,7 +463,7 @@ class Tracker:
             return np.nan_to_num(self.reference.projected(prior.placed(self._last)) - last)
         return np.nan_to_num(last - self.reference.projected(self._velocity_base))
 
-    def _learn(self, hypothesis: PoseHypothesis) -> None:
+    def _learn(self, image: Image, hypothesis: PoseHypothesis) -> None:
         """Take in an accepted frame."""
         estimate, inliers, pixels = hypothesis.estimate, hypothesis.inliers, hypothesis.measurement.pixels
         self.last_seen = None
@@ -478,7 +478,7 @@ class Tracker:
         self._supported = inliers
         self._pixels = np.where(inliers[:, None], pixels, self.reference.projected(self._last))
         self._anchoring.learn(estimate.sigma_px, self.last_measured.redundancy)
-        self._view.estimation.learn(hypothesis)
+        self._view.estimation.learn(hypothesis, image)
         if not self._lost:
             self._view.recovery.learn(hypothesis)
 
