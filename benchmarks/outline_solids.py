@@ -15,6 +15,7 @@ that of examples/boot_seal (`python examples/boot_seal/run.py`); recordings and 
 from __future__ import annotations
 
 import argparse
+import csv
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -161,11 +162,13 @@ def printed(folder: Path, use_outline: bool) -> Errors:
     )
     found = seal.errors(run, folder / "recording", MODEL)
     rows = seal.deformed_frames(found, folder / "recording")
-    table = np.genfromtxt(run / "frames.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
-    stated = np.radians(table["lever_std_deg"][np.isin(table["frame"], found.frames[rows])])
-    lever = found.lever[rows]
-    n_frames = int((np.load(folder / "recording" / "truth.npz")["parameters"][table["frame"], 0] > seal.BEGUN).sum())
-    return Errors(lever, np.abs(lever) / stated, found.nodes[rows].mean(axis=1), summary["median_ms"], n_frames)
+    with (run / "frames.csv").open() as file:
+        stated = {int(row["frame"]): np.radians(float(row["lever_std_deg"])) for row in csv.DictReader(file)}
+    lever, deviations = found.lever[rows], np.array([stated[frame] for frame in found.frames[rows]])
+    levers = np.load(folder / "recording" / "truth.npz")["parameters"][list(stated), 0]
+    n_frames = int((levers > seal.BEGUN).sum())
+    nodes = found.nodes[rows].mean(axis=1)
+    return Errors(lever, np.abs(lever) / deviations, nodes, summary["median_ms"], n_frames)
 
 
 def hidden_share() -> float:

@@ -37,8 +37,6 @@ LEAST_CONTRAST = 10.0
 #: Largest difference of the inner side from its brightness in the first picture, relative to that; shading
 #: changes it as the surface bends.
 BRIGHTNESS_TOLERANCE = 0.35
-#: Where, pixels from the contour, the brightness of either side is looked up.
-BESIDE_PX = 3.5
 #: Grey levels by which a side may differ from it until the candidate's score halves.
 LIKELY_LEVELS = 12.0
 
@@ -163,16 +161,17 @@ class Outline:
         return view, draw_depth(view.pixels, depths, self._triangles, surface.closed, camera.height, camera.width)
 
     def _brightness(self, contour: Contour, view: View, ids: NDArray[np.int32]) -> Array:
-        """Grey (k, 2) of the object just inside and outside of each point, in the picture that is known.
+        """Grey (k, 2, `SIDE_PX`) of the object inside and outside of each point, in the picture that is known.
 
-        NaN where that does not show it, or the object is not there.
+        So many pixels from the contour, from one on; NaN where that does not show it, or the object is not there.
         """
         known = self._picture
         if known is None:
-            return np.full((len(contour), 2), np.nan)
-        sides = [contour.pixels + away * contour.normals for away in (-BESIDE_PX, BESIDE_PX)]
+            return np.full((len(contour), 2, SIDE_PX), np.nan)
+        away = np.outer([-1.0, 1.0], np.arange(1, SIDE_PX + 1)).ravel()
+        places = contour.pixels[:, None] + away[None, :, None] * contour.normals[:, None]
         args = ids, self._triangles, view.nodes, known.nodes, known.depth, known.grey, self._camera.intrinsics
-        return np.column_stack([look_up(side, *args) for side in sides])
+        return look_up(places.reshape(-1, 2), *args).reshape(len(contour), 2, SIDE_PX)
 
     def _in_slots(self, contour: Contour, offsets: Array, state: State) -> OutlineMeasurement:
         """Points stay in the places of those that were near them last: what one errs by is then known as the same."""
@@ -254,10 +253,13 @@ def search_outline(grey, pixels, normals, brightness, reach, side, least_contras
     height, width = grey.shape
     length = 2 * (reach + side) + 1
     profile, slopes = np.empty(length), np.empty(length)
+    known = np.empty(2)
     steps, scores = np.empty(2 * reach + 1), np.empty(2 * reach + 1)
     result = np.full(len(pixels), np.nan)
     for j in range(len(pixels)):
-        if not np.isfinite(pixels[j, 0]) or abs(brightness[j, 0] - brightness[j, 1]) < least_contrast:
+        for which in range(2):
+            known[which] = np.mean(brightness[j, which, 1:])
+        if not np.isfinite(pixels[j, 0]) or abs(known[0] - known[1]) < least_contrast:
             continue
         for k in range(length):
             x = pixels[j, 0] + (k - reach - side) * normals[j, 0]
@@ -282,12 +284,17 @@ def search_outline(grey, pixels, normals, brightness, reach, side, least_contras
                 steps[k] = 0.0  # beyond the border of the image
             away = 2.0 * (k - reach) / reach
             scores[k] = steps[k] / (1.0 + away * away)
-            if abs(inner - brightness[j, 0]) > tolerance * brightness[j, 0] + least_contrast:
+            if abs(inner - known[0]) > tolerance * known[0] + least_contrast:
                 scores[k] = steps[k] = 0.0
-            if np.isfinite(brightness[j, 0]):
-                scores[k] /= 1.0 + ((inner - brightness[j, 0]) / LIKELY_LEVELS) ** 2
-            if np.isfinite(brightness[j, 1]):
-                scores[k] /= 1.0 + ((outer - brightness[j, 1]) / LIKELY_LEVELS) ** 2
+            for which in range(2):
+                differs, count = 0.0, 0
+                for i in range(1, side):  # what is right at the contour is blurred with the other side
+                    there = brightness[j, which, i]
+                    if np.isfinite(there):
+                        differs += abs(profile[k + side + (2 * which - 1) * (i + 1)] - there)
+                        count += 1
+                if count:
+                    scores[k] /= 1.0 + (differs / count / LIKELY_LEVELS) ** 2
             if steps[k] > least_contrast and (best < 0 or scores[k] > scores[best]):
                 best = k
         # The nearest one may be on the slope of a step: its top is where the step is.
