@@ -4,8 +4,9 @@
 
 The scene is that of examples/boot_seal/scene.toml: a scan, then the lever turns to 51 degrees and back. `plain` is
 the seal in one grey, so that its outline is all there is; its place in the map of the scene, which has texture, is
-known with 0.3 mm and 1 mrad, as from a board. `printed` is the example's, `hidden` the same behind a disc that covers
-about 60 % of it while the lever turns; both are registered in the map by the example's chain, with an unknown side.
+the one that its true poses in the keyframes give, stated with 0.3 mm and 1 mrad. `printed` is the example's, `hidden`
+the same behind a disc that covers about 60 % of it while the lever turns; both are registered in the map by the
+example's chain, with an unknown side.
 
 A line for each: mean and largest error of the lever and mean error of the solid's nodes, in the frames in which it is
 deformed, how many of its stated deviations the lever is off by in 95 % of them, and the time of a frame. The model is

@@ -180,6 +180,14 @@ def test_the_outline_of_a_closed_surface_counts_beside_its_texture(built, filmed
     assert json.loads((built / "outlined" / "evaluation.json").read_text())["mean_mm"] < 0.5
 
 
+def test_a_solid_is_tracked_by_its_outline_alone_on_request(built, filmed):
+    assert cli.main(["track", *filmed, "--no-texture", "--no-video", "-o", str(built / "plain")]) == 0
+    summary = json.loads((built / "plain" / "summary.json").read_text())
+    assert summary["n_tracked"] == summary["n_frames"]
+    assert any("outline alone" in flag for flag in summary["flags"])
+    assert set(load_run(built / "plain").status) == {"tracked"}
+
+
 def test_uniaxial_stretch_reaches_the_closed_form_through_the_whole_chain(tmp_path):
     """E = 3 MPa, nu = 0.45, stretch 1.5: lateral stretch 0.830679, nominal stress 1.075843 MPa."""
     text = BLOCK[: BLOCK.index("[[supports]]")] + sliding(("x_min", "x"), ("y_min", "y"), ("z_min", "z"))

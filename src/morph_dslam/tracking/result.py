@@ -49,6 +49,7 @@ class FrameResult:
     rejection : why it was not; None when tracked.
     warnings : what a reader must know of this result.
     pose_from : what the pose comes from.
+    by_outline : whether the outline is all that was seen of the object.
     pose_prior : the pose by the map, where that alone gives it.
     n_points : number of points that the object itself does not occlude.
     n_inliers : number of those that support the estimate.
@@ -69,6 +70,7 @@ class FrameResult:
     rejection: Rejection | None = None
     warnings: tuple[TrackingWarning, ...] = ()
     pose_from: PoseSource = PoseSource.NONE
+    by_outline: bool = False
     pose_prior: PosePrior | None = None
     n_points: int = 0
     n_inliers: int = 0

@@ -10,7 +10,7 @@ import numpy as np
 
 from morph_dslam.notices import Notice
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE, statement, unobservable_in_run
-from morph_dslam.tracking.outcomes import ModelDoesNotExplain, ObjectMoved, PoseSource, Status
+from morph_dslam.tracking.outcomes import ModelDoesNotExplain, ObjectMoved, Status
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE
 
@@ -90,7 +90,7 @@ def notices_of(run: RunResults) -> list[RunNotice]:
         found.append(of(RunWarning.LOST, count=lost, n_frames=n_frames))
     if run.hidden.any():
         found.append(of(RunWarning.HIDDEN, count=int(run.hidden.sum()), n_frames=n_frames))
-    by_outline = sum(r.pose_from in (PoseSource.OUTLINE, PoseSource.OUTLINE_AND_MAP) for r in run.results)
+    by_outline = sum(result.by_outline for result in run.results)
     if by_outline:
         found.append(of(RunWarning.BY_OUTLINE, count=by_outline, n_frames=n_frames))
     moved = [frame for frame, r in zip(run.frames, run.results, strict=True) if r.warning(ObjectMoved)]

@@ -372,6 +372,7 @@ class Tracker:
             found_by,
             warnings=(*warnings, *more),
             pose_from=_pose_source(hypothesis, self.options.pose == "still"),
+            by_outline=hypothesis.outline_alone,
             n_points=n_points,
             n_inliers=n_inliers,
             residual_rms_px=float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))),

@@ -210,6 +210,8 @@ def _agreed(
 ) -> list[PosedImage]:
     """The views, each with what other ``pictures`` agree with in ``seen``."""
     reference = ReferenceView(estimator, views, options)
+    if reference.outline_alone:
+        return [views[0]]
     agreed = np.zeros((len(pictures), len(reference.points)), dtype=bool)
     for row, picture in enumerate(pictures):
         agreed[row] = reference.measure(_as_frame(picture), picture.state, None).valid
