@@ -1,11 +1,12 @@
 """Registration by landmarks: exact recovery, every way in which it can be wrong, and the files of landmarks."""
 
+import cv2
 import numpy as np
 import pytest
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
-from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
 from morph_dslam.io.landmarks import Landmarks, load_landmarks, save_landmarks
 from morph_dslam.registration.landmarks import register_landmarks, shape_starts, solve_pnp
 from morph_dslam.registration.messages import Ambiguity, Ambiguous, AtBound, Underdetermined
@@ -150,3 +151,24 @@ def test_wrong_files_are_refused(tmp_path, content, named):
         path.write_text(content)
     with pytest.raises(RegistrationError, match=named):
         load_landmarks(path)
+
+
+def test_an_object_at_rest_has_the_pose_that_opencv_finds():
+    model = bent_sheet_model(15, 11)
+    pose = RigidTransform(
+        rotation_exp(np.array([0.3, -0.2, 0.1])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.02, 0, 0.8])
+    )
+    camera = Camera(640, 480, 600.0, 600.0, 320.0, 240.0)
+    points = model.nodes[::7]
+    pixels = camera.project(pose.apply(points)) + 0.5 * np.random.default_rng(2).standard_normal((len(points), 2))
+    found = register_landmarks(model, camera, Landmarks(points, pixels), at_rest=True)
+    _, rotation, translation = cv2.solvePnP(points, pixels, camera.matrix, None)
+    state, d = found.state, len(model.parameters)
+    assert state.parameters == pytest.approx(model.default, abs=1e-12)
+    assert np.rad2deg(
+        rotation_log(state.camera_from_object.rotation @ rotation_exp(rotation.ravel()).T)
+    ) == pytest.approx(np.zeros(3), abs=0.02)
+    assert state.camera_from_object.translation == pytest.approx(translation.ravel(), abs=2e-4)
+    assert not found.covariance[:d].any()
+    away = state.camera_from_object.translation - pose.translation
+    assert (np.abs(away) < 4.0 * np.sqrt(np.diag(found.covariance)[d + 3 :])).all()

@@ -8,6 +8,7 @@ like one away from it) is reported and not chosen by accident.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import permutations, product
 from pathlib import Path
 
@@ -64,6 +65,7 @@ def register_landmarks(
     click_px: float = CLICK_PX,
     depth: NDArray[np.float32] | None = None,
     depth_sigma: float = SIGMA_AT_1M,
+    at_rest: bool = False,
 ) -> Registration:
     """The object in the frame in which the landmarks were set.
 
@@ -76,6 +78,7 @@ def register_landmarks(
         ambiguous.
     depth : (h, w) of the frame, metres, NaN where unknown; None without a depth camera.
     depth_sigma : standard deviation of a pixel's depth at 1 m, metres.
+    at_rest : whether the object is known to be undeformed in the frame, its parameters at their defaults.
 
     Raises
     ------
@@ -89,13 +92,22 @@ def register_landmarks(
     _check_pixels(camera, landmarks.pixels)
     pixels = np.ascontiguousarray(camera.undistort_pixels(landmarks.pixels))
     estimator = Estimator(model, camera, EstimationOptions(huber_px=3.0, max_iterations=60))
-    found = estimator.estimate_from(bound, pixels, np.ones(len(bound)), list(_starts(model, camera, bound, pixels)))
+    shapes = shape_starts(model)
+    if at_rest or 2 * len(bound) < len(model.parameters) + 6:
+        # Too few landmarks leave the shape at its default; the damped iteration departs no more than it must.
+        shapes = [model.default]
+    if at_rest:
+        estimator.box = replace(estimator.box, lower=model.default, upper=model.default)
+    starts = list(_starts(shapes, camera, bound, pixels))
+    found = estimator.estimate_from(bound, pixels, np.ones(len(bound)), starts)
     found = [estimate for estimate in found if np.isfinite(estimate.residuals).all()]
     if not found:
         raise RegistrationError(
             "no pose of the object explains the landmarks: check that points and pixels belong together",
             RegistrationFailure.LANDMARKS_DO_NOT_FIT,
         )
+    if at_rest:
+        found = [_of_pose_alone(estimator, bound, pixels, estimate) for estimate in found]
     best, n_alternatives = _distinct_minima(model, found, click_px)
     rms = float(np.sqrt(np.mean(np.sum(best.residuals**2, axis=1))))
     _check_residual(best, rms, RESIDUAL_SHARE * float(np.hypot(camera.width, camera.height)))
@@ -112,8 +124,12 @@ def register_landmarks(
     if depth is not None:
         # How well the landmarks fit shows how carefully they were set, where they are enough to show it.
         sigma = max(best.sigma_px, LEAST_PX) if np.isfinite(best.sigma_px) else UNKNOWN_PX
-        best = refine_by_depth(Estimator(model, camera), bound, pixels, best.state, sigma, depth, depth_sigma)
+        precise = Estimator(model, camera)
+        precise.box = estimator.box
+        best = refine_by_depth(precise, bound, pixels, best.state, sigma, depth, depth_sigma)
         facts["along_the_sight_line"], covariance = "by depth", best.covariance
+        if at_rest:
+            covariance = _without_parameters(covariance)
     return Registration(model, best.state, covariance, facts=facts, warnings=warnings)
 
 
@@ -198,14 +214,27 @@ def shape_starts(model: ReducedModel, largest: int = 243) -> list[Array]:
     return [default, *grid]
 
 
-def _starts(model: ReducedModel, camera: Camera, bound: BoundPoints, pixels: Array) -> Iterator[State]:
-    """PnP poses of every start shape.
+def _of_pose_alone(estimator: Estimator, bound: BoundPoints, pixels: Array, found: Estimate) -> Estimate:
+    """An estimate whose parameters were known, with the covariance of the pose alone."""
+    d, covariance = len(estimator.model.parameters), np.zeros_like(found.covariance)
+    _, hessian, _, _ = estimator.evaluate(bound, pixels, np.ones(len(bound)), found.state)
+    freedom = max(2 * len(bound) - 6, 1)
+    variance = max(2.0 * found.cost / freedom, LEAST_PX**2)
+    scale = estimator.scale[d:]
+    covariance[d:, d:] = variance * np.outer(scale, scale) * np.linalg.pinv(hessian[d:, d:] * np.outer(scale, scale))
+    return replace(found, covariance=covariance, at_bound=np.zeros(d, dtype=bool), sigma_px=float(np.sqrt(variance)))
 
-    Too few landmarks to determine all unknowns leave the shape at its default, from which the damped
-    iteration departs no more than it must.
-    """
-    determined = 2 * len(bound) >= len(model.parameters) + 6
-    for parameters in shape_starts(model) if determined else [model.default]:
+
+def _without_parameters(covariance: Array) -> Array:
+    """A covariance (d + 6, d + 6) of a state whose parameters are known."""
+    known, d = np.zeros_like(covariance), len(covariance) - 6
+    known[d:, d:] = covariance[d:, d:]
+    return known
+
+
+def _starts(shapes: list[Array], camera: Camera, bound: BoundPoints, pixels: Array) -> Iterator[State]:
+    """PnP poses of every start shape."""
+    for parameters in shapes:
         for pose in solve_pnp(bound.rest + bound.field.value(parameters), pixels, camera):
             yield State(parameters, pose)
 

@@ -38,6 +38,10 @@ OF_OBJECT: tuple[tuple[Callable[[ObjectOptions], bool], str], ...] = (
         "a pose is held fixed by a map: give the object's registration in it, --registration",
     ),
     (
+        lambda part: part.at_rest and part.landmarks is None,
+        "the frame of the landmarks shows the object at rest: start from landmarks, or leave out --at-rest",
+    ),
+    (
         lambda part: part.tracker.pose == "still" and part.registration is not None,
         "an object that is registered in a map stands still in it already: leave out --still",
     ),
@@ -73,6 +77,10 @@ OF_RUN: tuple[tuple[Callable[[TrackOptions], bool], str], ...] = (
     (
         lambda run: not run.live and (run.serve, run.seconds) != (None, None),
         "--serve and --seconds are for live runs: leave them out, or use `morph live`",
+    ),
+    (
+        lambda run: run.refine_reference and any(p.at_rest and p.tracker.pose != "still" for p in run.objects),
+        "the reference state is not refined where it is known: leave out --refine or --at-rest, or add --still",
     ),
     (
         lambda run: run.refine_reference and all(part.landmarks is None for part in run.objects),

@@ -22,6 +22,7 @@ class ObjectOptions:
     landmarks : points of the object and their pixels in the reference frame.
     registration : registration.json of `morph register`.
     initializer : a board, a picture of its print or a guess, which find it in the reference frame.
+    at_rest : whether the object is undeformed in the frame of its landmarks, its parameters at their defaults.
     reregister_at : frames in which to register it anew, with landmarks there, or None for the initializer.
     inner : structures inside of it (`morph inner`), whose positions are written and drawn.
     tracker : what is measured, and what earlier frames add.
@@ -30,6 +31,7 @@ class ObjectOptions:
     model: Path
     landmarks: Path | None = None
     registration: Path | None = None
+    at_rest: bool = False
     initializer: InitializerFiles = field(default_factory=InitializerFiles)
     reregister_at: tuple[tuple[int, Path | None], ...] = ()
     inner: tuple[Path, ...] = ()

@@ -128,6 +128,7 @@ class StillProblem:
     keyframes : where these points were seen in other frames.
     known : what the registration rests on.
     constant : indices of the parameters that are one over the sequence.
+    known_at_first : indices of the parameters that are known in the reference frame, which shows the object at rest.
     terms : of the camera that are estimated.
     """
 
@@ -140,6 +141,7 @@ class StillProblem:
         keyframes: Sequence[Keyframe],
         known: LandmarkTerm | StateTerm,
         constant: Sequence[int] = (),
+        known_at_first: Sequence[int] = (),
         terms: Sequence[CameraTerm] = (),
     ) -> None:
         self._model, self._camera, self._start, self._known = model, camera, start, known
@@ -147,6 +149,7 @@ class StillProblem:
         self._free = np.setdiff1d(np.arange(d), self._constant)
         half_ranges = 0.5 * (model.upper - model.lower)
         self._scale = np.concatenate([0.05 * half_ranges, np.full(3, 0.01), np.full(3, 0.005)])
+        self._columns = np.setdiff1d(np.arange(d + 6), known_at_first)
         # As recorded, so that another lens can undistort them.
         self._reference = camera.distort_pixels(reference_pixels)
         self._recorded = [_with_pixels(frame, camera.distort_pixels) for frame in keyframes]
@@ -156,25 +159,28 @@ class StillProblem:
     @property
     def size(self) -> int:
         """Number of unknowns."""
-        return len(self._scale) + len(self._terms)
+        return len(self._columns) + len(self._terms)
 
     def bounds(self) -> tuple[Array, Array]:
         """Of the unknowns: the parameters stay in their ranges."""
         d, model = len(self._model.parameters), self._model
-        lower, upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
+        lower, upper = np.full(d + 6, -np.inf), np.full(d + 6, np.inf)
         lower[:d] = (model.lower - self._start.parameters) / self._scale[:d] - 1e-6
         upper[:d] = (model.upper - self._start.parameters) / self._scale[:d] + 1e-6
-        return lower, upper
+        free = np.full(len(self._terms), np.inf)
+        return np.concatenate([lower[self._columns], -free]), np.concatenate([upper[self._columns], free])
 
     def state(self, unknowns: Array) -> State:
         """The reference state."""
-        state = moved(self._start, unknowns[: len(self._scale)] * self._scale)
+        step = np.zeros(len(self._scale))
+        step[self._columns] = unknowns[: len(self._columns)]
+        state = moved(self._start, step * self._scale)
         return replace(state, parameters=np.clip(state.parameters, self._model.lower, self._model.upper))
 
     def camera(self, unknowns: Array) -> Camera:
         """The camera with its terms, which are zero in ``unknowns`` where it is as given."""
         camera = self._camera
-        by_name = dict(zip(self._terms, unknowns[len(self._scale) :], strict=True))
+        by_name = dict(zip(self._terms, unknowns[len(self._columns) :], strict=True))
         if "focal" in by_name:
             factor = float(np.exp(TERM_STD["focal"] * by_name["focal"]))
             camera = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
@@ -192,7 +198,7 @@ class StillProblem:
             self._model, camera, view_of(self._model, camera, state), camera.undistort_pixels(self._reference)
         )
         points = BoundPoints.from_surface(self._model, surface)
-        parts = [self._known.residuals(camera, state), unknowns[len(self._scale) :]]
+        parts = [self._known.residuals(camera, state), unknowns[len(self._columns) :]]
         return np.concatenate([*parts, *self._of_keyframes(estimator, points, met, state)])
 
     def _of_keyframes(
@@ -243,10 +249,12 @@ class StillProblem:
 
     def fitted(self, unknowns: Array, jacobian: Array) -> StillFit:
         """The result at the minimum, with the residuals' ``jacobian`` (r, n) there."""
-        n, state, camera = len(self._scale), self.state(unknowns), self.camera(unknowns)
+        n, state, camera = len(self._columns), self.state(unknowns), self.camera(unknowns)
         values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
         inverse = (vectors / np.maximum(values, 1e-9 * max(values[-1], 1e-30))) @ vectors.T
-        covariance = inverse[:n, :n] * np.outer(self._scale, self._scale)
+        covariance = np.zeros((len(self._scale),) * 2)
+        covariance[np.ix_(self._columns, self._columns)] = inverse[:n, :n]
+        covariance *= np.outer(self._scale, self._scale)
         by_unknown = np.sqrt(np.diag(inverse)[n:])
         terms: dict[str, tuple[float, float]] = {}
         for term, std in zip(self._terms, by_unknown, strict=True):

@@ -42,6 +42,7 @@ def with_still_pose(part: PlacedObject, keyframes: Sequence[Keyframe], terms: Se
     registration, tracker = part.registration, part.new_tracker()
     assert isinstance(tracker, Tracker)
     names = [parameter.name for parameter in part.model.parameters]
+    constant = [names.index(name) for name in part.options.per_sequence]
     problem = StillProblem(
         part.model,
         part.camera,
@@ -49,7 +50,8 @@ def with_still_pose(part: PlacedObject, keyframes: Sequence[Keyframe], terms: Se
         tracker.reference.pixels,
         choose_keyframes(keyframes),
         _known(part, tracker),
-        [names.index(name) for name in part.options.per_sequence],
+        constant,
+        [n for n in range(len(names)) if part.object.at_rest and n not in constant],
         terms,
     )
     found = fit_still(problem)
