@@ -159,7 +159,7 @@ def test_an_object_at_rest_has_the_pose_that_opencv_finds():
         rotation_exp(np.array([0.3, -0.2, 0.1])) @ np.diag([1.0, -1.0, -1.0]), np.array([0.02, 0, 0.8])
     )
     camera = Camera(640, 480, 600.0, 600.0, 320.0, 240.0)
-    points = model.nodes[::7]
+    points = np.ascontiguousarray(model.nodes[::7])
     pixels = camera.project(pose.apply(points)) + 0.5 * np.random.default_rng(2).standard_normal((len(points), 2))
     found = register_landmarks(model, camera, Landmarks(points, pixels), at_rest=True)
     _, rotation, translation = cv2.solvePnP(points, pixels, camera.matrix, None)
