@@ -1,0 +1,248 @@
+"""Pull real rubber until it breaks, and compare what is tracked with measurements that share no code with it.
+
+The recordings (slslesarenko/jupyterWSM, 2019) are not part of the project. Four printed specimens, 48 x 24 x 2.5 mm,
+are stretched by up to 46 % before a camera with a long lens whose intrinsics nobody knows: three with speckles, one of
+them with 43 stiff discs, and a black one without any texture. Camera and right clamp stand still, so the pose is one
+over the sequence.
+
+What the models rest on: the drawings; the rubber's two constants, fitted to the force curves of both notched specimens
+(`material.csv` of the report has the factors that are left); the discs' diameter, 1.8 mm, where their brightness in the
+first picture reaches that of the rubber (jetted materials mix at their boundary: 1.5 mm are drawn).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import cv2
+import numpy as np
+from baselines import polynomial_errors
+from measure import Tracks, disc_tracks, pictures, speckle_tracks
+from numpy.typing import NDArray
+from specimen import Shape, write_mesh
+
+import morph_dslam as md
+from morph_dslam.extend import run_and_report_errors
+from support import data_folder, keep
+
+Array = NDArray[np.float64]
+HERE = Path(__file__).resolve().parent
+OUTPUT = HERE / "output"
+#: Pixels of a millimetre at rest, and where the specimen's middle is, about: to find the discs, and for the baselines.
+PX_PER_MM, MIDDLE = 30.8, (1126.5, 640.0)
+#: Frames through which the stroke is a straight line, from when the clamp moves evenly.
+EVEN_FROM = 5
+#: Radius that is painted over a disc, pixels, softly, so that the paint has no edge to follow.
+PAINTED = 34
+#: Columns a frame by which the specimen's middle moves left while the clamp moves by twice that.
+MIDDLE_SPEED = 2.57
+#: Grey level of the paint over a disc and over the hidden half.
+DISC_GREY, HALF_GREY = 75, 128
+
+
+@dataclass(frozen=True)
+class Specimen:
+    """One recording.
+
+    Attributes
+    ----------
+    notch : length of a notch in the drawing, mm.
+    last : frame to end with.
+    reference_frame : the frame of its landmarks.
+    stroke : largest stroke of the model, mm.
+    discs : whether it has the 43 discs.
+    outline : whether its outline is all there is.
+    at_rest : whether it is undeformed in the reference frame; the notched ones take up slack until frame 6.
+    force : its column in force_stroke.csv; empty if its force was not measured.
+    """
+
+    notch: float
+    last: int
+    reference_frame: int
+    stroke: float
+    discs: bool = False
+    outline: bool = False
+    at_rest: bool = False
+    force: str = ""
+
+
+SPECIMENS = {
+    "manyincs": Specimen(6.0, 105, 0, 21.0, discs=True, at_rest=True),
+    "notch_7.2mm": Specimen(7.2, 102, 6, 18.0, force="notch_7.2mm_N"),
+    "notch_3.6mm": Specimen(3.6, 130, 6, 23.0, force="notch_3.6mm_N"),
+    "black_notch_3.6mm": Specimen(3.6, 126, 3, 23.0, outline=True, force="black_notch_3.6mm_N"),
+}
+#: Frames up to which the notched specimens are compared: then a crack grows.
+SOUND_UNTIL = {"notch_7.2mm": 80, "notch_3.6mm": 100}
+
+
+def disc_positions(data: Path) -> Array:
+    """Middles of the discs (43, 2), mm, x along the load and y downwards in the pictures; the file is turned."""
+    listed = np.loadtxt(data / "inclusions_mm.txt")
+    return np.column_stack([listed[:, 1], -listed[:, 0]])
+
+
+def study(mesh: Path, specimen: Specimen) -> dict[str, Any]:
+    """The strip between a still clamp and one that moves."""
+    materials = {"rubber": {"law": "mooney_rivlin", "c10": "0.068 MPa", "c01": "0.045 MPa", "bulk": "22.6 MPa"}}
+    if specimen.discs:
+        materials["rubber"]["on"] = "rubber"
+        # Stiff beside the rubber; more would only spoil the equations.
+        materials["discs"] = {"law": "neo_hookean", "on": "discs", "young": "300 MPa", "poisson": "0.4"}
+    return {
+        "name": mesh.stem,
+        "mesh": {"file": mesh.name, "unit": "mm"},
+        "materials": materials,
+        "supports": [
+            {"kind": "fixed", "on": "right"},
+            {"kind": "displacement", "on": "left", "x": "-1 * stroke", "y": "0 mm", "z": "0 mm"},
+        ],
+        "parameters": {
+            "stroke": {"range": ["-0.5 mm", f"{specimen.stroke} mm"], "description": "way of the left clamp"}
+        },
+        "solver": {"formulation": "mixed"},
+        "sampling": {"scheme": "even", "training": 15, "held_out": 4},
+        "reduction": {"method": "pod", "tolerance": 1e-4},
+    }
+
+
+def build(name: str, specimen: Specimen, data: Path) -> Path:
+    """The specimen's model, built once."""
+    mesh, model = OUTPUT / f"{name}.inp", OUTPUT / f"{name}.morph"
+    OUTPUT.mkdir(exist_ok=True)
+    discs = disc_positions(data) if specimen.discs else np.zeros((0, 2))
+    write_mesh(mesh, Shape(specimen.notch, discs))
+    keep(model, [mesh, HERE / "run.py"], lambda: md.build(md.make_study(study(mesh, specimen), OUTPUT), model))
+    return model
+
+
+def paint(video: Path, discs: Array, folder: Path, hide_left: bool, last: int) -> None:
+    """Write the pictures with the discs painted over, and with the left half if that is asked for."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, picture in enumerate(pictures(video, last)):
+        mask = np.zeros(picture.shape, dtype=np.float32)
+        for u, v in discs[number][np.isfinite(discs[number, :, 0])]:
+            cv2.circle(mask, (round(u), round(v)), PAINTED, 1.0, -1)
+        mask = cv2.GaussianBlur(mask, (0, 0), 3.0)
+        painted = (1.0 - mask) * picture + mask * DISC_GREY
+        if hide_left:
+            painted[:, : int(MIDDLE[0] - MIDDLE_SPEED * max(number - 3, 0))] = HALF_GREY
+        cv2.imwrite(str(folder / f"{number:06}.png"), painted.astype(np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+
+
+def track(name: str, specimen: Specimen, frames: Path, model: Path, output: Path) -> md.Run:
+    """Track a recording, camera and right clamp standing still."""
+    md.track(
+        md.TrackOptions(
+            frames=frames,
+            model=model,
+            camera=HERE / "camera.yaml",
+            landmarks=HERE / "landmarks" / f"{name}.csv",
+            output=output,
+            first=0 if not specimen.outline else specimen.reference_frame,
+            last=specimen.last,
+            reference_frame=specimen.reference_frame,
+            at_rest=specimen.at_rest,
+            refine_camera=("radial",),
+            tracker=md.TrackerOptions(
+                pose="still", use_outline=specimen.outline, use_texture=not specimen.outline, new_views=False
+            ),
+            overwrite=True,
+        )
+    )
+    return md.load_run(output)
+
+
+def stroke_line(run: md.Run, until: int) -> dict[str, float]:
+    """The stroke as a straight line through the frames in which the clamp moves evenly, mm."""
+    used = run.tracked & (run.frames >= EVEN_FROM) & (run.frames <= until)
+    frames, stroke = run.frames[used], 1e3 * run.parameters[used, 0]
+    line = np.polyfit(frames, stroke, 1)
+    return {
+        "stroke_mm_per_frame": float(line[0]),
+        "stroke_scatter_mm": float(np.std(stroke - np.polyval(line, frames))),
+    }
+
+
+def stated_deviation(folder: Path, until: int) -> float:
+    """Median stated standard deviation of the stroke, mm."""
+    table = np.genfromtxt(folder / "frames.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
+    used = (table["frame"] >= EVEN_FROM) & (table["frame"] <= until)
+    return float(np.nanmedian(table["stroke_std_mm"][used].astype(float)))
+
+
+def errors(folder: Path, tracks: Tracks, name: str, specimen: Specimen) -> dict[str, Any]:
+    """The run against tracks, bound in the reference frame."""
+    path = folder.parent / f"{name}.csv"
+    tracks.write(path)
+    return md.evaluate_pixels(folder, path, specimen.reference_frame)
+
+
+def discs(name: str, specimen: Specimen, data: Path, model: Path) -> dict[str, float]:
+    """The specimen with discs: all of it seen, and its left half hidden."""
+    video, found = data / f"{name}.mp4", {}
+    truth = disc_tracks(video, np.array(MIDDLE) + PX_PER_MM * disc_positions(data), specimen.last)
+    at_rest = truth.pixels[:3]
+    print(f"discs: repeated to {np.std(at_rest - at_rest.mean(axis=0)) / PX_PER_MM:.4f} mm in three frames at rest")
+    for what, hide in (("all", False), ("left_hidden", True)):
+        paint(video, truth.pixels, OUTPUT / f"{name}_{what}", hide, specimen.last)
+        folder = OUTPUT / f"run_{name}_{what}"
+        run = track(name, specimen, OUTPUT / f"{name}_{what}", model, folder)
+        left = disc_positions(data)[:, 0] < 0.0
+        if not hide:
+            of_all = errors(folder, truth, "discs", specimen)
+            found |= {"mean_mm": of_all["mean_mm"], "p95_mm": of_all["p95_mm"]} | stroke_line(run, specimen.last)
+            found["stroke_std_mm"] = stated_deviation(folder, specimen.last)
+            counts = (int(run.tracked.sum()), len(run.frames))
+        else:
+            hidden = Tracks(truth.pixels[:, left])
+            found["hidden_mm"] = errors(folder, hidden, "hidden_discs", specimen)["mean_mm"]
+            half = np.zeros((1216, 1936), dtype=bool)
+            half[:, : round(MIDDLE[0])] = True
+            seen = speckle_tracks(video, specimen.last, half)
+            without = polynomial_errors(seen.pixels, hidden.pixels, PX_PER_MM)
+            print("hidden half without physics: " + ", ".join(f"{n} {mm:.2f} mm" for n, mm in without.items()))
+    return found | {"tracked": counts[0], "frames": counts[1]}
+
+
+def notched(name: str, specimen: Specimen, data: Path, model: Path) -> dict[str, float]:
+    """A specimen without discs."""
+    video, folder = data / f"{name}.mp4", OUTPUT / f"run_{name}"
+    run = track(name, specimen, video, model, folder)
+    until, found = SOUND_UNTIL.get(name, specimen.last), {}
+    if not specimen.outline:
+        figures = errors(folder, speckle_tracks(video, until), f"{name}_speckles", specimen)
+        found = {"mean_mm": figures["mean_mm"], "p95_mm": figures["p95_mm"]}
+    found |= stroke_line(run, until) | {"stroke_std_mm": stated_deviation(folder, until)}
+    return found | {"tracked": int(run.tracked.sum()), "frames": len(run.frames)}
+
+
+def run(arguments: argparse.Namespace) -> None:
+    specimen, data = SPECIMENS[arguments.specimen], arguments.data
+    video = data / f"{arguments.specimen}.mp4"
+    if not video.is_file():
+        raise md.MorphError(f"there is no recording {video}: give the folder that holds it with --data")
+    model = build(arguments.specimen, specimen, data)
+    found = (discs if specimen.discs else notched)(arguments.specimen, specimen, data, model)
+    order = ("mean_mm", "p95_mm", "hidden_mm", "stroke_mm_per_frame", "stroke_scatter_mm", "stroke_std_mm")
+    line = " ".join(f"{key}={found[key]:.4f}" for key in order if key in found)
+    print(f"{line} tracked={found['tracked']}/{found['frames']}")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--specimen", choices=sorted(SPECIMENS), default="manyincs", help="which one (%(default)s)")
+    parser.add_argument(
+        "--data", type=Path, default=data_folder("rubber_tension"), help="folder of the recordings (%(default)s)"
+    )
+    return run_and_report_errors(run, parser.parse_args(), "what was built and tracked so far is kept")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
