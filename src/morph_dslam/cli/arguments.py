@@ -103,6 +103,14 @@ def named_value(text: str) -> tuple[str, float]:
     return name, value
 
 
+def file_and_column(text: str) -> tuple[Path, str | None]:
+    """A path, and the column after a colon: "curve.csv", "curve.csv:force_N"; "C:\\curve.csv" is a path."""
+    name, colon, column = text.rpartition(":")
+    if colon and not set(column) & set("/\\"):
+        return Path(name), column
+    return Path(text), None
+
+
 def frame_and_file(text: str) -> tuple[str, int, Path | None]:
     """An object's name, a frame number, and a file that belongs to it: "120", "120=landmarks.csv", "lid:120"."""
     before, equals, name = text.partition("=")

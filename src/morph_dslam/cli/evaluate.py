@@ -2,10 +2,10 @@
 
 import argparse
 
-from morph_dslam.cli.arguments import add_file
+from morph_dslam.cli.arguments import add_file, file_and_column
 from morph_dslam.errors import EvaluationError
 
-HELP = "compare a run with measured points, tracks in images or depth images, or its camera path with the true one"
+HELP = "compare a run with measured points, tracks in images, depth or forces, or its camera path with the true one"
 KEPT = "the run is unchanged"
 
 
@@ -14,6 +14,12 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     truth = command.add_mutually_exclusive_group(required=True)
     add_file(truth, "--points", "truth file, .npz (docs/run-folder.md)", "TRUTH")
     add_file(truth, "--pixels", "points followed in the images, CSV with frame,id,u,v", "TRACKS")
+    truth.add_argument(
+        "--force",
+        type=file_and_column,
+        metavar="CURVE[:COLUMN]",
+        help="measured forces, CSV by frame or by a parameter such as stroke_mm",
+    )
     add_file(truth, "--trajectory", "true camera path (TUM, KITTI, COLMAP or 7-Scenes)", "TRUTH")
     add_file(
         truth, "--depth", "depth.h5 of a simulation, a recording with depth, or a folder of 16-bit images", "DEPTH"
@@ -30,6 +36,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         metavar="N",
         help="with --points and --pixels: frame whose pixels bind the points to the mesh",
     )
+    command.add_argument(
+        "--reaction", metavar="SET[:AXIS]", help="with --force: the support, and x, -x, y ... of the object frame"
+    )
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -38,7 +47,10 @@ def run(arguments: argparse.Namespace) -> None:
     from morph_dslam.extend.reports import (
         alignment_line,
         depth_line,
+        evaluate_force,
         evaluate_pixels,
+        force_line,
+        force_remarks,
         pixel_line,
         pixel_remarks,
         remarks,
@@ -59,6 +71,12 @@ def run(arguments: argparse.Namespace) -> None:
         _print_notes(pixel_remarks(figures))
         print(f"wrote {folder / 'pixel_evaluation.json'} and {folder / 'report.html'}")
         print(pixel_line(figures))
+    elif arguments.force is not None:
+        curve, column = arguments.force
+        figures = evaluate_force(folder, curve, column, arguments.reaction)
+        _print_notes(force_remarks(figures))
+        print(f"wrote {folder / 'force_evaluation.json'} and {folder / 'report.html'}")
+        print(force_line(figures))
     else:
         figures = evaluate(folder, arguments.points, arguments.bind_frame)
         _print_notes(remarks(figures))
@@ -78,5 +96,7 @@ def _check(arguments: argparse.Namespace) -> None:
         raise EvaluationError("--base-frame and --depth-per-metre go with --depth: leave them out")
     if arguments.points is None and arguments.pixels is None and arguments.bind_frame is not None:
         raise EvaluationError("--bind-frame goes with --points and --pixels: leave it out")
+    if arguments.force is None and arguments.reaction is not None:
+        raise EvaluationError("--reaction goes with --force: leave it out")
     if arguments.points is not None and arguments.bind_frame is None:
         raise EvaluationError("--points needs --bind-frame N, the frame whose pixels bind the points to the mesh")

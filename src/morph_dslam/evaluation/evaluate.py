@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.evaluation.depth import depth_error, read_depths, summarise_depth
+from morph_dslam.evaluation.force import ForceCurve, force_error, load_curve, summarise_force
 from morph_dslam.evaluation.pixels import PixelTracks, load_tracks, pixel_error, summarise_pixels
 from morph_dslam.evaluation.points import PointTruth, load_truth, material_error, summarise
 from morph_dslam.evaluation.run_folder import Run, load_run
@@ -19,6 +20,7 @@ from morph_dslam.evaluation.run_report import (
     plot_depth_errors_by_frame,
     plot_error_map,
     plot_errors_by_frame,
+    plot_force,
     plot_pixel_error_map,
     plot_pixel_errors_by_frame,
     write_run_report,
@@ -141,6 +143,43 @@ def evaluate_pixels(
         (folder / "pixel_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
         plot_pixel_errors_by_frame(folder / "pixel_evaluation.png", error)
         plot_pixel_error_map(folder / "pixel_error_map.png", error, tracked.model)
+        write_run_report(folder, tracked)
+    return figures
+
+
+def evaluate_force(
+    run: str | Path | Run, curve: str | Path | ForceCurve, column: str | None = None, reaction: str | None = None
+) -> dict[str, Any]:
+    """Compare a measured force with the reaction of the model: the factor between them, an offset, and what is left.
+
+    Of a run folder, ``force_evaluation.json``, a picture and ``report.html`` are written into it.
+
+    Parameters
+    ----------
+    run : a run folder, or a run in memory.
+    curve : a file, see `load_curve`, or a curve in memory.
+    column : of the file, where it has several columns of forces.
+    reaction : "SET", "SET:x" or "SET:-x", support and direction; see `force_error` for what is taken without them.
+
+    Returns
+    -------
+    The content of ``force_evaluation.json``, newtons. ``factor`` times the model's force plus ``offset_N`` fits the
+    measured one best; ``relative_rms`` is what is left over the range of the measured force.
+
+    Raises
+    ------
+    EvaluationError
+        If the run and the curve cannot be read or do not fit together, or the model holds no reactions.
+    """
+    tracked = run if isinstance(run, Run) else load_run(run)
+    measured = curve if isinstance(curve, ForceCurve) else load_curve(curve, tracked.model, column)
+    error = force_error(tracked, measured, reaction)
+    path = None if isinstance(curve, ForceCurve) else str(curve)
+    figures = {**summarise_force(error), "curve": path, **_counts(tracked)}
+    if not isinstance(run, Run):
+        folder = Path(run)
+        (folder / "force_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
+        plot_force(folder / "force_evaluation.png", error)
         write_run_report(folder, tracked)
     return figures
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import EvaluationError
 from morph_dslam.evaluation.depth import DepthError
+from morph_dslam.evaluation.force import ForceError
 from morph_dslam.evaluation.model_summary import flatten, summarise_model
 from morph_dslam.evaluation.pixels import PixelError, pixel_remarks
 from morph_dslam.evaluation.points import MaterialError
@@ -119,6 +120,27 @@ def _plot_by_frame(
     figure.savefig(path, dpi=DPI)
 
 
+def plot_force(path: Path, error: ForceError) -> None:
+    """The measured force and the model's, as it is and fitted, by frame or by the parameter's value."""
+    curve, order = error.curve, np.argsort(error.places)
+    by_frame = curve.against == "frame"
+    scale, label = (1.0, "frame") if by_frame else error.axis
+    figure = Figure(figsize=(9.0, 4.2), layout="constrained")
+    axes = figure.add_subplot()
+    places = scale * error.places[order]
+    measured = np.argsort(curve.places)
+    axes.plot(scale * curve.places[measured], curve.forces[measured], color=MEAN, linewidth=1.4, label="measured")
+    axes.plot(places, error.modelled[order], color="#8fb3d9", linewidth=1.2, label="model")
+    fitted = (error.measured + error.residuals)[order]
+    name = f"{error.factor:.4g} x model {error.offset:+.3g} N"
+    axes.plot(places, fitted, color=MEDIAN, linewidth=1.4, linestyle="--", label=name)
+    axes.set_xlabel(label)
+    axes.set_ylabel(f"force on {error.support}, direction {error.direction} [N]")
+    axes.set_title(f"rms {np.sqrt(np.mean(error.residuals**2)):.3g} N after the fit", fontsize=10)
+    axes.legend(fontsize=8, frameon=False)
+    figure.savefig(path, dpi=DPI)
+
+
 def outline_edges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
     """Edges (e, 2) that belong to one triangle only."""
     edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
@@ -138,7 +160,9 @@ def plot_pixel_error_map(path: Path, error: PixelError, model: ReducedModel) -> 
     """Mean error across the sight line of each track where its point lies on the undeformed object."""
     measured = np.isfinite(error.across).any(axis=0)
     rest = model.rest_positions(error.points)[measured]
-    _plot_map(path, rest, np.nanmean(error.across[:, measured], axis=0), model, "mean error across the sight line [mm]")
+    _plot_map(
+        path, rest, np.nanmean(error.across[:, measured], axis=0), model, "mean error across\nthe sight line [mm]"
+    )
 
 
 def plot_depth_error_map(path: Path, error: DepthError, model: ReducedModel) -> None:
@@ -238,6 +262,19 @@ def _pixel_section(folder: Path, figures: Mapping[str, Any]) -> Section:
     return Section("Error of tracks in the images, without alignment", blocks)
 
 
+def _force_section(folder: Path, figures: Mapping[str, Any]) -> Section:
+    rows = {
+        "reaction": f"force on '{figures['support']}', direction {figures['direction']} of the object frame",
+        "factor": f"{figures['factor']:.4f}, standard deviation {figures['factor_std']:.4f}",
+        "offset": f"{figures['offset_N']:.4g} N",
+        "rms after the fit": f"{figures['rms_N']:.4g} N, {100.0 * figures['relative_rms']:.2f} % of the measured range",
+        "rms without it": f"{figures['rms_without_fit_N']:.4g} N",
+        "frames compared": f"{len(figures['frames_compared'])} of {figures['n_frames']}",
+    }
+    plot = _pictures(folder, {"force_evaluation.png": f"Measured force ({figures['column']}) and the model's."})
+    return Section("Force", [Table.of(rows), *plot])
+
+
 def _warnings(lines: Sequence[str]) -> list[Text]:
     return [Text(line, warning=True) for line in lines]
 
@@ -247,7 +284,11 @@ def _pictures(folder: Path, captions: Mapping[str, str]) -> list[Picture]:
 
 
 #: What each file with figures adds to the report.
-_EVALUATIONS = {"evaluation.json": _error_section, "pixel_evaluation.json": _pixel_section}
+_EVALUATIONS = {
+    "evaluation.json": _error_section,
+    "pixel_evaluation.json": _pixel_section,
+    "force_evaluation.json": _force_section,
+}
 
 
 def _evaluations(folder: Path) -> list[Section]:

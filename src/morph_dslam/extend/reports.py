@@ -1,7 +1,13 @@
 """The blocks of a report page, and the lines that sum up a run and its evaluation."""
 
 from morph_dslam.evaluation.depth import distances_to_surface as distances_to_surface
-from morph_dslam.evaluation.evaluate import evaluate_pixels as evaluate_pixels
+from morph_dslam.evaluation.evaluate import evaluate_force as evaluate_force, evaluate_pixels as evaluate_pixels
+from morph_dslam.evaluation.force import (
+    ForceCurve as ForceCurve,
+    force_line as force_line,
+    force_remarks as force_remarks,
+    load_curve as load_curve,
+)
 from morph_dslam.evaluation.model_summary import summarise_model as summarise_model
 from morph_dslam.evaluation.pixels import (
     PixelTracks as PixelTracks,

@@ -1,0 +1,162 @@
+"""Forces against closed forms: curves that are a known factor times the model's force and a known offset."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import morph_dslam as md
+from morph_dslam.cli.app import main
+from morph_dslam.errors import EvaluationError
+from morph_dslam.extend.reports import ForceCurve, evaluate_force
+from morph_dslam.model import SeparatedField
+from morph_dslam.model.functions import ParameterFunctions
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.rendered_sequence import CAMERA
+from tests.support.run_folders import FRAMES, states, write_run
+
+LARGEST = 0.060
+
+
+def reaction(force):
+    """A force (3,) N times X + (2 X² - 1) / 4 with X = arch / 60 mm, in Chebyshev polynomials T1 + T2 / 4."""
+    powers, shares = np.array([[1, 0, 0], [2, 0, 0]]), np.array([[1.0], [0.25]])
+    upper = bent_sheet_model(3, 3).upper
+    return SeparatedField(np.array([[force]], dtype=float), ParameterFunctions(-upper, upper, powers, shares))
+
+
+def pull(arch):
+    """The closed form of the force on "clamp" against x, newtons."""
+    x = np.asarray(arch) / LARGEST
+    return 5.0 * (x + 0.25 * (2.0 * x**2 - 1.0))
+
+
+def model():
+    held = {"force_clamp": reaction([-5.0, 0.5, 0.0]), "force_foot": reaction([2.0, 0.0, 1.0])}
+    return replace(bent_sheet_model(22, 16), reactions=held)
+
+
+ARCHES = np.linspace(0.005, 0.050, 10)
+
+
+def pulled_run(arches=ARCHES):
+    parameters = np.column_stack([arches, np.zeros((len(arches), 2))])
+    poses, words = np.tile(np.eye(4), (len(arches), 1, 1)), ("tracked",) * len(arches)
+    return md.Run(model(), CAMERA, np.arange(len(arches)), words, words, poses, parameters, {"total": np.ones(2)})
+
+
+def test_factor_and_offset_are_those_of_the_curve():
+    figures = evaluate_force(pulled_run(), ForceCurve("frame", np.arange(10.0), 1.3 * pull(ARCHES) + 0.7))
+    assert figures["factor"] == pytest.approx(1.3, abs=1e-9)
+    assert figures["offset_N"] == pytest.approx(0.7, abs=1e-9)
+    assert figures["rms_N"] < 1e-9
+    assert (figures["support"], figures["direction"]) == ("clamp", "-x"), "its largest force, as the measured one grows"
+    expected = np.sqrt(np.mean((0.3 * pull(ARCHES) + 0.7) ** 2))
+    assert figures["rms_without_fit_N"] == pytest.approx(expected)
+
+
+def test_what_the_fit_leaves_is_the_noise():
+    """Least squares by numpy's polynomial fit; the range of the measured force is that of the noisy curve."""
+    noise = 0.1 * np.array([1, -1, 1, 1, -1, -1, 1, -1, 1, -1])
+    measured = 2.0 * pull(ARCHES) + noise
+    figures = evaluate_force(pulled_run(), ForceCurve("frame", np.arange(10.0), measured))
+    (slope, offset), covariance = np.polyfit(pull(ARCHES), measured, 1, cov=True)
+    assert (figures["factor"], figures["offset_N"]) == pytest.approx((slope, offset))
+    assert figures["factor_std"] == pytest.approx(np.sqrt(covariance[0, 0]))
+    left = np.sqrt(np.mean((slope * pull(ARCHES) + offset - measured) ** 2))
+    assert figures["rms_N"] == pytest.approx(left)
+    assert figures["relative_rms"] == pytest.approx(left / (measured.max() - measured.min()))
+
+
+def test_a_curve_by_a_parameter_is_read_between_its_points():
+    """Straight between 0 and 32 mm; frames beyond are not compared."""
+    run = pulled_run()
+    curve = ForceCurve("arch", np.array([0.0, 0.016, 0.032]), np.array([0.0, 1.6, 3.2]))
+    figures = evaluate_force(run, curve)
+    assert figures["frames_compared"] == [0, 1, 2, 3, 4, 5]
+    assert figures["tracked_frames_off_the_curve"] == [6, 7, 8, 9]
+    measured = [figures["per_frame"][str(frame)]["measured_N"] for frame in range(6)]
+    np.testing.assert_allclose(measured, 100.0 * ARCHES[:6])
+
+
+@pytest.mark.parametrize(
+    ("asked", "factor", "direction"),
+    [("clamp:x", 1.0, "-x"), ("clamp:+x", -1.0, "x"), ("clamp:y", 10.0, "y"), ("foot", 2.5, "x"), ("foot:z", 5.0, "z")],
+)
+def test_support_and_direction_may_be_named(asked, factor, direction):
+    figures = evaluate_force(pulled_run(), ForceCurve("frame", np.arange(10.0), pull(ARCHES)), reaction=asked)
+    assert figures["factor"] == pytest.approx(factor)
+    assert figures["direction"] == direction
+
+
+@pytest.mark.parametrize(
+    ("places", "asked", "message"),
+    [
+        (np.arange(10.0), "lid", "no force on 'lid'; it has those on clamp, foot"),
+        (np.arange(10.0), "clamp:z", "the same in all frames"),
+        (np.arange(10.0) + 8, None, "only 2 tracked frames lie on the curve"),
+        (np.arange(10.0) % 5, None, "more than once"),
+    ],
+)
+def test_what_cannot_be_compared(places, asked, message):
+    with pytest.raises(EvaluationError, match=message):
+        evaluate_force(pulled_run(), ForceCurve("frame", places, pull(ARCHES)), reaction=asked)
+
+
+def test_a_model_without_reactions_says_so():
+    run = replace(pulled_run(), model=bent_sheet_model(22, 16))
+    with pytest.raises(EvaluationError, match="holds no reaction of a support"):
+        evaluate_force(run, ForceCurve("frame", np.arange(10.0), pull(ARCHES)))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A run folder whose frame 12 was lost, and its curve in millinewtons beside another column."""
+    write_run(tmp_path / "run", ["tracked", "tracked", "lost", "tracked", "tracked", "tracked"])
+    md.save_model(tmp_path / "run" / "model.morph", model())
+    arches = states(len(FRAMES))[0][:, 0]
+    lines = [f"{n},{1e3 * (1.3 * pull(a) - 0.2):.9f},0" for n, a in zip(FRAMES, arches, strict=True)]
+    (tmp_path / "curve.csv").write_text("\n".join(["frame,pull_mN,other_N", *lines, "99,,1"]) + "\n")
+    return tmp_path
+
+
+def test_the_command_writes_figures_a_plot_and_a_section_of_the_report(folder, capsys):
+    run = folder / "run"
+    assert main(["evaluate", str(run), "--force", f"{folder / 'curve.csv'}:pull_mN", "--reaction", "clamp"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    # Modes are kept in single precision.
+    assert lines[-1].startswith("factor=1.3000 offset=-0.2000 rms=0.0000 relative_rms=0.0000 frames=5/6 tracked=5/6")
+    assert lines[0] == "note: the force on 'clamp' in direction -x of the object frame"
+    assert json.loads((run / "force_evaluation.json").read_text())["frames_compared"] == [10, 11, 13, 14, 15]
+    assert (run / "force_evaluation.png").read_bytes().startswith(b"\x89PNG")
+    page = (run / "report.html").read_text()
+    assert "1.3000, standard deviation 0.0000" in page
+    assert page.count("data:image/png;base64,") == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "column", "message"),
+    [
+        ("frame,a_N,b_N\n1,2,3\n", "", "several columns of forces"),
+        ("frame,a_N\n1,2\n", ":c_N", "no column 'c_N'"),
+        ("", "", "the first column is ''"),
+        ("arch,force_N\n1,2\n", "", "arch_mm"),
+        ("arch_deg,force_N\n1,2\n", "", "arch_mm"),
+        ("frame,force_N\n1,x\n", "", "'1,x' is not a place"),
+        ("frame,force_N\n1,2\n2,3\n", "", "has 2 forces"),
+    ],
+)
+def test_a_file_that_cannot_be_meant_is_one_message(folder, refused, text, column, message):
+    (folder / "curve.csv").write_text(text)
+    assert message in refused("evaluate", folder / "run", "--force", f"{folder / 'curve.csv'}{column}")
+
+
+def test_a_curve_by_a_parameter_has_its_unit_in_the_header(folder, capsys):
+    places = np.linspace(-60.0, 60.0, 241)
+    lines = [f"{x},{1.3 * pull(1e-3 * x):.9f}" for x in places if x > -15.0]  # above, the force grows with the arch
+    (folder / "curve.csv").write_text("\n".join(["arch_mm,force", *lines]) + "\n")
+    assert main(["evaluate", str(folder / "run"), "--force", str(folder / "curve.csv")]) == 0
+    values = dict(part.split("=") for part in capsys.readouterr().out.splitlines()[-1].split())
+    # The file is straight between points 0.5 mm apart.
+    assert float(values["factor"]) == pytest.approx(1.3, rel=1e-3)
