@@ -10,6 +10,7 @@ import pytest
 
 from morph_dslam import make_study
 from morph_dslam.errors import StudyError
+from morph_dslam.extend.reports import load_tracks
 from morph_dslam.io.camera_files import load_camera
 from morph_dslam.io.export import StateChoice
 from morph_dslam.io.landmarks import load_landmarks
@@ -38,6 +39,8 @@ def test_every_sample_file_is_read_by_a_test_here():
         ("cameras", "yaml"): 1,
         ("certificate", "csv"): 1,
         ("export", "csv"): 1,
+        ("record-your-own", "toml"): 1,
+        ("record-your-own", "csv"): 1,
         ("registration-aids", "toml"): 3,
         ("scene-file", "toml"): 2,
         ("registration-aids", "csv"): 1,
@@ -95,6 +98,35 @@ def test_study_of_a_sheet():
     study = make_study(tomllib.loads(samples("study-file", "toml")[0]))
     assert isinstance(study, SheetStudy)
     assert study.sheet.length == pytest.approx(0.420)
+
+
+def test_a_recording_of_your_own(tmp_path, monkeypatch):
+    """Study and landmarks are read; the program follows dots in a video to a tenth of a pixel."""
+    study = make_study(tomllib.loads(samples("record-your-own", "toml")[0]))
+    assert isinstance(study, SolidStudy)
+    assert [parameter.name for parameter in study.model_parameters()] == ["stroke"]
+    (tmp_path / "landmarks.csv").write_text(samples("record-your-own", "csv")[0])
+    landmarks = load_landmarks(tmp_path / "landmarks.csv")
+    scale = np.linalg.norm(np.diff(landmarks.pixels[:2], axis=0)) / np.linalg.norm(
+        np.diff(landmarks.points[:2], axis=0)
+    )
+    assert scale == pytest.approx(13_670.0, rel=1e-3)  # pixels a metre
+    monkeypatch.chdir(tmp_path)
+    centres = np.array([[40.3, 50.6], [100.8, 52.1], [70.4, 110.9]])
+    rows, columns = np.mgrid[:160, :240]
+    video = cv2.VideoWriter("pull.mp4", cv2.VideoWriter.fourcc(*"mp4v"), 30.0, (240, 160))
+    for frame in range(5):
+        moved = centres + np.array([3.37 * frame, 0.0])
+        distance = np.min([np.hypot(columns - u, rows - v) for u, v in moved], axis=0)
+        image = (30 + 190 * np.clip(distance - 7.0 + 0.5, 0.0, 1.0)).astype(np.uint8)  # radius 7 px
+        video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    video.release()
+    exec(compile(samples("record-your-own", "python")[0], "record-your-own", "exec"), {})
+    tracks = load_tracks("tracks.csv")
+    assert tracks.pixels.shape == (5, 3, 2)
+    order = np.linalg.norm(tracks.pixels[0][:, None] - centres, axis=2).argmin(axis=1)
+    expected = centres[order] + np.arange(5)[:, None, None] * [3.37, 0.0]
+    assert np.abs(tracks.pixels - expected).max() < 0.1
 
 
 def test_values_of_a_solids_study():
@@ -177,6 +209,7 @@ def test_every_program_is_run_by_a_test():
         "materials": 1,
         "meshes": 1,
         "model-file": 2,
+        "record-your-own": 1,
         "run-folder": 1,
         "scene-file": 1,
         "slam": 2,
