@@ -6,13 +6,15 @@ them with 43 stiff discs, and a black one without any texture. Camera and right 
 over the sequence.
 
 What the models rest on: the drawings; the rubber's two constants, fitted to the force curves of both notched specimens
-(`material.csv` of the report has the factors that are left); the discs' diameter, 1.8 mm, where their brightness in the
+(it prints the factor that is left); the discs' diameter, 1.8 mm, where their brightness in the
 first picture reaches that of the rubber (jetted materials mix at their boundary: 1.5 mm are drawn).
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,10 +27,20 @@ import numpy as np
 from baselines import polynomial_errors
 from measure import Tracks, disc_tracks, pictures, speckle_tracks
 from numpy.typing import NDArray
+from report import draw_errors, draw_points, write_page
 from specimen import Shape, write_mesh
 
 import morph_dslam as md
 from morph_dslam.extend import run_and_report_errors
+from morph_dslam.extend.reports import (
+    PixelError,
+    evaluate_force,
+    evaluate_pixels,
+    force_line,
+    load_tracks,
+    pixel_error,
+    pixel_line,
+)
 from support import data_folder, keep
 
 Array = NDArray[np.float64]
@@ -118,7 +130,9 @@ def build(name: str, specimen: Specimen, data: Path) -> Path:
     OUTPUT.mkdir(exist_ok=True)
     discs = disc_positions(data) if specimen.discs else np.zeros((0, 2))
     write_mesh(mesh, Shape(specimen.notch, discs))
-    keep(model, [mesh, HERE / "run.py"], lambda: md.build(md.make_study(study(mesh, specimen), OUTPUT), model))
+    content, recipe = study(mesh, specimen), OUTPUT / f"{name}.json"
+    recipe.write_text(json.dumps(content, indent=1))
+    keep(model, [mesh, recipe], lambda: md.build(md.make_study(content, OUTPUT), model))
     return model
 
 
@@ -172,55 +186,87 @@ def stroke_line(run: md.Run, until: int) -> dict[str, float]:
 
 def stated_deviation(folder: Path, until: int) -> float:
     """Median stated standard deviation of the stroke, mm."""
-    table = np.genfromtxt(folder / "frames.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
-    used = (table["frame"] >= EVEN_FROM) & (table["frame"] <= until)
-    return float(np.nanmedian(table["stroke_std_mm"][used].astype(float)))
+    with (folder / "frames.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["status"] == "tracked"]
+    stated = [float(row["stroke_std_mm"]) for row in rows if EVEN_FROM <= int(row["frame"]) <= until]
+    return float(np.median(stated))
 
 
-def errors(folder: Path, tracks: Tracks, name: str, specimen: Specimen) -> dict[str, Any]:
-    """The run against tracks, bound in the reference frame."""
-    path = folder.parent / f"{name}.csv"
-    tracks.write(path)
-    return md.evaluate_pixels(folder, path, specimen.reference_frame)
+@dataclass
+class Comparison:
+    """What a specimen's runs gave.
+
+    Attributes
+    ----------
+    figures : by name.
+    errors : by what was seen.
+    pictures : by caption.
+    without : errors of polynomials, mm, by name.
+    tracked : frames tracked of all.
+    """
+
+    figures: dict[str, float]
+    errors: dict[str, PixelError]
+    pictures: dict[str, Path]
+    without: dict[str, float]
+    tracked: tuple[int, int] = (0, 0)
+
+    def add(self, folder: Path, tracks: Tracks, what: str, specimen: Specimen) -> dict[str, Any]:
+        """Compare a run with tracks, bound in the reference frame; returns the figures."""
+        path = OUTPUT / f"{folder.name}_{what.replace(' ', '_')}.csv"
+        tracks.write(path)
+        figures = evaluate_pixels(folder, path, specimen.reference_frame)
+        print(f"{what}: {pixel_line(figures)}")
+        run, points = md.load_run(folder), load_tracks(path)
+        self.errors[what] = pixel_error(run, points, specimen.reference_frame)
+        self.pictures[what] = path.with_suffix(".png")
+        draw_points(self.pictures[what], run, self.errors[what], points, what)
+        return figures
 
 
-def discs(name: str, specimen: Specimen, data: Path, model: Path) -> dict[str, float]:
+def with_discs(name: str, specimen: Specimen, data: Path, model: Path) -> Comparison:
     """The specimen with discs: all of it seen, and its left half hidden."""
-    video, found = data / f"{name}.mp4", {}
+    video, left = data / f"{name}.mp4", disc_positions(data)[:, 0] < 0.0
     truth = disc_tracks(video, np.array(MIDDLE) + PX_PER_MM * disc_positions(data), specimen.last)
     at_rest = truth.pixels[:3]
     print(f"discs: repeated to {np.std(at_rest - at_rest.mean(axis=0)) / PX_PER_MM:.4f} mm in three frames at rest")
-    for what, hide in (("all", False), ("left_hidden", True)):
-        paint(video, truth.pixels, OUTPUT / f"{name}_{what}", hide, specimen.last)
-        folder = OUTPUT / f"run_{name}_{what}"
-        run = track(name, specimen, OUTPUT / f"{name}_{what}", model, folder)
-        left = disc_positions(data)[:, 0] < 0.0
-        if not hide:
-            of_all = errors(folder, truth, "discs", specimen)
-            found |= {"mean_mm": of_all["mean_mm"], "p95_mm": of_all["p95_mm"]} | stroke_line(run, specimen.last)
-            found["stroke_std_mm"] = stated_deviation(folder, specimen.last)
-            counts = (int(run.tracked.sum()), len(run.frames))
-        else:
-            hidden = Tracks(truth.pixels[:, left])
-            found["hidden_mm"] = errors(folder, hidden, "hidden_discs", specimen)["mean_mm"]
-            half = np.zeros((1216, 1936), dtype=bool)
-            half[:, : round(MIDDLE[0])] = True
-            seen = speckle_tracks(video, specimen.last, half)
-            without = polynomial_errors(seen.pixels, hidden.pixels, PX_PER_MM)
-            print("hidden half without physics: " + ", ".join(f"{n} {mm:.2f} mm" for n, mm in without.items()))
-    return found | {"tracked": counts[0], "frames": counts[1]}
+    half = np.zeros((1216, 1936), dtype=bool)
+    half[:, : round(MIDDLE[0])] = True
+    seen, hidden = speckle_tracks(video, specimen.last, half), Tracks(truth.pixels[:, left])
+    found = Comparison({}, {}, {}, polynomial_errors(seen.pixels, hidden.pixels, PX_PER_MM))
+    print("hidden half without physics: " + ", ".join(f"{n} {mm:.2f} mm" for n, mm in found.without.items()))
+    for hide in (False, True):
+        what = "left half hidden" if hide else "all seen"
+        frames, folder = (
+            OUTPUT / f"{name}_{'half' if hide else 'all'}",
+            OUTPUT / f"run_{name}_{'half' if hide else 'all'}",
+        )
+        paint(video, truth.pixels, frames, hide, specimen.last)
+        run = track(name, specimen, frames, model, folder)
+        figures = found.add(folder, hidden if hide else truth, what, specimen)
+        if hide:
+            found.figures["hidden_mm"] = figures["mean_mm"]
+            continue
+        found.figures |= {"mean_mm": figures["mean_mm"], "p95_mm": figures["p95_mm"]}
+        found.figures |= stroke_line(run, specimen.last) | {"stroke_std_mm": stated_deviation(folder, specimen.last)}
+        found.tracked = (int(run.tracked.sum()), len(run.frames))
+    return found
 
 
-def notched(name: str, specimen: Specimen, data: Path, model: Path) -> dict[str, float]:
-    """A specimen without discs."""
+def without_discs(name: str, specimen: Specimen, data: Path, model: Path) -> Comparison:
+    """A specimen without discs: its speckles, and its force."""
     video, folder = data / f"{name}.mp4", OUTPUT / f"run_{name}"
     run = track(name, specimen, video, model, folder)
-    until, found = SOUND_UNTIL.get(name, specimen.last), {}
+    until, found = SOUND_UNTIL.get(name, specimen.last), Comparison({}, {}, {}, {})
     if not specimen.outline:
-        figures = errors(folder, speckle_tracks(video, until), f"{name}_speckles", specimen)
-        found = {"mean_mm": figures["mean_mm"], "p95_mm": figures["p95_mm"]}
-    found |= stroke_line(run, until) | {"stroke_std_mm": stated_deviation(folder, until)}
-    return found | {"tracked": int(run.tracked.sum()), "frames": len(run.frames)}
+        figures = found.add(folder, speckle_tracks(video, until), "speckles", specimen)
+        found.figures |= {"mean_mm": figures["mean_mm"], "p95_mm": figures["p95_mm"]}
+    force = evaluate_force(folder, data / "force_stroke.csv", specimen.force)
+    print(force_line(force))
+    found.pictures["force on the clamp"] = folder / "force_evaluation.png"
+    found.figures |= stroke_line(run, until) | {"stroke_std_mm": stated_deviation(folder, until)}
+    found.tracked = (int(run.tracked.sum()), len(run.frames))
+    return found
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -229,10 +275,16 @@ def run(arguments: argparse.Namespace) -> None:
     if not video.is_file():
         raise md.MorphError(f"there is no recording {video}: give the folder that holds it with --data")
     model = build(arguments.specimen, specimen, data)
-    found = (discs if specimen.discs else notched)(arguments.specimen, specimen, data, model)
+    found = (with_discs if specimen.discs else without_discs)(arguments.specimen, specimen, data, model)
+    if found.errors:
+        found.pictures["mean distance in each frame"] = OUTPUT / f"{arguments.specimen}_errors.png"
+        draw_errors(found.pictures["mean distance in each frame"], found.errors, found.without)
+    page = OUTPUT / f"{arguments.specimen}.html"
+    write_page(page, f"Rubber specimen {arguments.specimen}", found.figures, found.pictures, found.without)
+    print(f"report  {page}")
     order = ("mean_mm", "p95_mm", "hidden_mm", "stroke_mm_per_frame", "stroke_scatter_mm", "stroke_std_mm")
-    line = " ".join(f"{key}={found[key]:.4f}" for key in order if key in found)
-    print(f"{line} tracked={found['tracked']}/{found['frames']}")
+    line = " ".join(f"{key}={found.figures[key]:.4f}" for key in order if key in found.figures)
+    print(f"{line} tracked={found.tracked[0]}/{found.tracked[1]}")
 
 
 def main() -> int:

@@ -10,13 +10,16 @@ from morph_dslam.evaluation.force import (
 )
 from morph_dslam.evaluation.model_summary import summarise_model as summarise_model
 from morph_dslam.evaluation.pixels import (
+    PixelError as PixelError,
     PixelTracks as PixelTracks,
     load_tracks as load_tracks,
+    pixel_error as pixel_error,
     pixel_line as pixel_line,
     pixel_remarks as pixel_remarks,
 )
 from morph_dslam.evaluation.points import PointTruth as PointTruth, load_truth as load_truth
 from morph_dslam.evaluation.report import (
+    Block as Block,
     KeyFigures as KeyFigures,
     Link as Link,
     Picture as Picture,

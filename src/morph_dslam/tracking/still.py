@@ -22,7 +22,7 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, State, moved
 from morph_dslam.tracking.levenberg_marquardt import bounded_step
-from morph_dslam.tracking.refinement import Keyframe
+from morph_dslam.tracking.refinement import EFFECTIVE_POINTS, Keyframe
 from morph_dslam.tracking.state import Prior
 
 Array = NDArray[np.float64]
@@ -31,9 +31,6 @@ CameraTerm = Literal["focal", "radial"]
 #: Standard deviations of the terms before anything is measured: of the focal length's logarithm, and of the shift
 #: by the radial term in the image's corner, as a share of the radius there.
 TERM_STD: dict[CameraTerm, float] = {"focal": 0.3, "radial": 0.05}
-#: How many independent points all keyframes together count for: what the model leaves is alike over wide parts of
-#: the surface and over many frames.
-EFFECTIVE_POINTS = 300.0
 #: Residuals smaller than this, pixels, say no more.
 LEAST_SIGMA_PX = 0.3
 #: Rounds with weights by the residuals of the round before; steps of a keyframe's own parameters.
@@ -205,24 +202,25 @@ class StillProblem:
         self, estimator: Estimator, points: BoundPoints, met: NDArray[np.bool_], state: State
     ) -> Iterator[Array]:
         """The scaled residuals of each keyframe; 0 for points of the reference view that met nothing."""
-        share = EFFECTIVE_POINTS / max(len(self._recorded), 1)
         for number, recorded in enumerate(self._recorded):
             frame = _with_pixels(recorded, estimator.camera.undistort_pixels)
             found, left, weights = self._fitted(estimator, frame.measured(points, met), state, self._own[number])
             self._own[number] = found
             huber = np.minimum(1.0, estimator.options.huber_px / np.maximum(np.linalg.norm(left, axis=1), 1e-12))
-            left *= np.sqrt(weights * huber * share / max(weights.sum(), 1.0))[:, None] / self._sigmas[number]
+            left *= (
+                np.sqrt(weights * huber * EFFECTIVE_POINTS / max(weights.sum(), 1.0))[:, None] / self._sigmas[number]
+            )
             scaled, n_met = np.zeros((len(met) + len(left) - int(met.sum()), 2)), int(met.sum())
             scaled[: len(met)][met], scaled[len(met) :] = left[:n_met], left[n_met:]
             yield scaled.ravel()
 
     def weigh(self, residuals: Array) -> None:
         """Take the keyframes' standard deviations from what ``residuals`` left of them."""
-        share, end = EFFECTIVE_POINTS / max(len(self._recorded), 1), len(residuals)
+        end = len(residuals)
         for number in reversed(range(len(self._recorded))):
             frame = self._recorded[number]
             size = 2 * (len(frame.pixels) + (0 if frame.outline is None else len(frame.outline.pixels)))
-            rms = np.sqrt(np.sum(residuals[end - size : end] ** 2) / (2.0 * share))
+            rms = np.sqrt(np.sum(residuals[end - size : end] ** 2) / (2.0 * EFFECTIVE_POINTS))
             self._sigmas[number] = max(self._sigmas[number] * rms, LEAST_SIGMA_PX)
             end -= size
 
