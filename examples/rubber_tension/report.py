@@ -53,7 +53,7 @@ def draw_points(path: Path, run: md.Run, error: PixelError, tracks: PixelTracks,
     draw_stress(axes, run, row, f"{title}, frame {frame}")
     axes.scatter(*measured.T, s=70, facecolors="none", edgecolors="white", label="measured")
     axes.scatter(*predicted.T, s=8, color="red", label="predicted")
-    axes.legend(loc="lower right")
+    axes.legend(loc="lower right", facecolor="0.6")
     figure.tight_layout()
     figure.savefig(path, dpi=110)
     plt.close(figure)

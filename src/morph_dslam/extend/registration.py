@@ -1,6 +1,10 @@
 """Registration from files to files, landmarks, and other ways to find an object in a frame."""
 
-from morph_dslam.io.landmarks import Landmarks as Landmarks, load_landmarks as load_landmarks
+from morph_dslam.io.landmarks import (
+    Landmarks as Landmarks,
+    load_landmarks as load_landmarks,
+    save_landmarks as save_landmarks,
+)
 from morph_dslam.registration.board import (
     FiducialBoard as FiducialBoard,
     load_board as load_board,

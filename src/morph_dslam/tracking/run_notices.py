@@ -32,13 +32,13 @@ class RunWarning(StrEnum):
         "alone give its pose; register it again to use the map"
     )
     MODEL_FAILS = (
-        "the model does not explain the images in {count} of {n_frames} frames: up to {largest_px:.1f} px are left "
-        "that neighbouring points have in common; it may be a model of something else, or too stiff, or a wrong "
-        "camera file"
+        "the model leaves up to {largest_px:.1f} px that neighbouring points have in common in {count} of {n_frames} "
+        "frames: there the object deforms otherwise, as by another law, support or shape, a crack or a slip, or the "
+        "camera is another one"
     )
     REFERENCE_CONTRADICTED = (
-        "the frames contradict the reference state: {factor:.1f} times its stated deviation, and all deviations are "
-        "that much wider; check the landmarks and whether the object has the model's dimensions"
+        "the frames show the reference state to be {factor:.1f} times less certain than its registration states, and "
+        "all deviations are that much wider"
     )
     AT_BOUND = (
         "parameter '{parameter}' is at the {side} bound of its range ({bound}) in {count} frames: the object may be "
