@@ -122,3 +122,23 @@ def test_what_makes_no_sense_is_refused(recording, tmp_path, arguments, message)
     }  # fmt: skip
     with pytest.raises(md.MorphError, match=message):
         md.track(md.TrackOptions(**options | arguments))
+
+
+def test_live_the_pose_is_estimated_anew_from_more_frames(recording, tmp_path):
+    summary = md.track(
+        md.TrackOptions(
+            frames=recording / "frames",
+            model=recording / "sheet.morph",
+            camera=recording / "camera.yaml",
+            landmarks=recording / "landmarks.csv",
+            output=tmp_path / "run",
+            video=False,
+            live=True,
+            tracker=md.TrackerOptions(pose="still"),
+        )
+    )
+    assert summary["pose"] == "still"
+    run = load_run(tmp_path / "run")
+    assert run.tracked.all()
+    # What landmarks set to 0.7 pixels leave, or better.
+    assert np.linalg.norm(away(run)[3:]) < 10e-3

@@ -227,7 +227,7 @@ def estimated(model, pictures):
         for own, end, (_, taken, error_factors) in zip(every, ends, pictures, strict=True):
             seen = None if error_factors is None else part.chain(len(model.parameters)) @ error_factors
             parts.append(BoundPart(slice(end - len(own), end), part.seen(taken), seen))
-        reference = SimpleNamespace(points=points, parts=parts)
+        reference = SimpleNamespace(points=points, parts=parts, outline_alone=False)
         trackers.append(SimpleNamespace(estimator=single, reference=reference, options=TrackerOptions()))
     seen = RigObservations(tuple(views))
     return estimator.fit(seen, LATER), seen, trackers

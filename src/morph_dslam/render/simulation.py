@@ -310,6 +310,7 @@ class SimulatedSequence:
                 both = np.minimum(world.depth_image(nodes), world.surroundings_depth(number))
                 occluded = world.occluded(number, *pixel_axes(self.camera.height, self.camera.width))
                 measured = world.measured_depth(number, both, occluded)
+                assert measured is not None
                 depth = np.where(measured > 0, measured / np.float32(VALUES_PER_METRE), np.float32(np.nan))
             yield Frame(number, number / self.fps, world.image(number, nodes, renderer), depth=depth)
 
