@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -42,29 +43,50 @@ def draw_stress(axes: Axes, run: md.Run, row: int, title: str) -> None:
     axes.set(title=title, xlim=(0, run.camera.width), ylim=(run.camera.height, 0), aspect="equal", xticks=[], yticks=[])
 
 
-def draw_points(path: Path, run: md.Run, error: PixelError, tracks: PixelTracks, title: str) -> None:
-    """Predicted and measured points in the last frame that has both, over the predicted stress."""
-    frame = int(error.frames[-1])
-    row, at = run.row(frame), int(np.flatnonzero(tracks.frames == frame)[0])
-    columns = [tracks.ids.index(name) for name in error.ids]
-    measured = tracks.pixels[at, columns]
-    predicted = measured + error.pixels[-1]
-    figure, axes = plt.subplots(figsize=(9.0, 4.8))
-    draw_stress(axes, run, row, f"{title}, frame {frame}")
-    axes.scatter(*measured.T, s=70, facecolors="none", edgecolors="white", label="measured")
-    axes.scatter(*predicted.T, s=8, color="red", label="predicted")
-    axes.legend(loc="lower right", facecolor="0.6")
+@dataclass(frozen=True)
+class Compared:
+    """A run beside the points that were measured.
+
+    Attributes
+    ----------
+    title : what the tracker saw.
+    run : what it found.
+    error : of the points.
+    tracks : where they were measured.
+    """
+
+    title: str
+    run: md.Run
+    error: PixelError
+    tracks: PixelTracks
+
+
+def draw_points(path: Path, runs: Sequence[Compared], frame: int | None = None) -> None:
+    """Predicted and measured points over the predicted stress, side by side, in the last frame by default."""
+    figure, places = plt.subplots(1, len(runs), figsize=(6.5 * len(runs), 3.9), squeeze=False)
+    for axes, compared in zip(places[0], runs, strict=True):
+        run, error, tracks = compared.run, compared.error, compared.tracks
+        shown = int(error.frames[-1]) if frame is None else frame
+        row = run.row(shown)
+        columns = [tracks.ids.index(name) for name in error.ids]
+        measured = tracks.pixels[tracks.frames == shown][0, columns]
+        predicted = measured + error.pixels[error.frames == shown][0]
+        draw_stress(axes, run, row, f"{compared.title}, stroke {1e3 * run.parameters[row, 0]:.1f} mm")
+        axes.scatter(*measured.T, s=60, facecolors="none", edgecolors="white", label="measured")
+        axes.scatter(*predicted.T, s=7, color="red", label="predicted")
+        axes.legend(loc="lower right", facecolor="0.6", fontsize=8)
     figure.tight_layout()
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=80)
     plt.close(figure)
 
 
-def draw_errors(path: Path, errors: Mapping[str, PixelError], without: Mapping[str, float]) -> None:
+def draw_errors(path: Path, runs: Sequence[Compared], without: Mapping[str, float]) -> None:
     """Mean distances in each frame, mm, beside those of polynomials in the hidden half."""
     figure, axes = plt.subplots(figsize=(7.0, 4.0))
-    for name, error in errors.items():
-        across = 1e3 * error.across
-        axes.plot(error.frames, np.nanmean(across, axis=1), label=f"{name} ({np.nanmean(across):.3f} mm)")
+    for compared in runs:
+        across = 1e3 * compared.error.across
+        label = f"{compared.title} ({np.nanmean(across):.3f} mm)"
+        axes.plot(compared.error.frames, np.nanmean(across, axis=1), label=label)
     for number, (name, value) in enumerate(without.items()):
         axes.axhline(value, color=f"C{number + 4}", linestyle="--", label=f"{name}, hidden half ({value:.2f} mm)")
     axes.set(xlabel="frame", ylabel="mean distance, mm", yscale="log")

@@ -27,20 +27,12 @@ import numpy as np
 from baselines import polynomial_errors
 from measure import Tracks, disc_tracks, pictures, speckle_tracks
 from numpy.typing import NDArray
-from report import draw_errors, draw_points, write_page
+from report import Compared, draw_errors, draw_points, write_page
 from specimen import Shape, write_mesh
 
 import morph_dslam as md
 from morph_dslam.extend import run_and_report_errors
-from morph_dslam.extend.reports import (
-    PixelError,
-    evaluate_force,
-    evaluate_pixels,
-    force_line,
-    load_tracks,
-    pixel_error,
-    pixel_line,
-)
+from morph_dslam.extend.reports import evaluate_force, evaluate_pixels, force_line, load_tracks, pixel_error, pixel_line
 from support import data_folder, keep
 
 Array = NDArray[np.float64]
@@ -90,6 +82,8 @@ SPECIMENS = {
     "notch_3.6mm": Specimen(3.6, 130, 6, 23.0, force="notch_3.6mm_N"),
     "black_notch_3.6mm": Specimen(3.6, 126, 3, 23.0, outline=True, force="black_notch_3.6mm_N"),
 }
+#: The frame that the picture of all runs shows.
+SHOWN_FRAME = 80
 #: Frames up to which the notched specimens are compared: then a crack grows.
 SOUND_UNTIL = {"notch_7.2mm": 80, "notch_3.6mm": 100}
 
@@ -199,14 +193,14 @@ class Comparison:
     Attributes
     ----------
     figures : by name.
-    errors : by what was seen.
+    runs : each beside what was measured.
     pictures : by caption.
     without : errors of polynomials, mm, by name.
     tracked : frames tracked of all.
     """
 
     figures: dict[str, float]
-    errors: dict[str, PixelError]
+    runs: list[Compared]
     pictures: dict[str, Path]
     without: dict[str, float]
     tracked: tuple[int, int] = (0, 0)
@@ -218,9 +212,9 @@ class Comparison:
         figures = evaluate_pixels(folder, path, specimen.reference_frame)
         print(f"{what}: {pixel_line(figures)}")
         run, points = md.load_run(folder), load_tracks(path)
-        self.errors[what] = pixel_error(run, points, specimen.reference_frame)
+        self.runs.append(Compared(what, run, pixel_error(run, points, specimen.reference_frame), points))
         self.pictures[what] = path.with_suffix(".png")
-        draw_points(self.pictures[what], run, self.errors[what], points, what)
+        draw_points(self.pictures[what], self.runs[-1:])
         return figures
 
 
@@ -233,7 +227,7 @@ def with_discs(name: str, specimen: Specimen, data: Path, model: Path) -> Compar
     half = np.zeros((1216, 1936), dtype=bool)
     half[:, : round(MIDDLE[0])] = True
     seen, hidden = speckle_tracks(video, specimen.last, half), Tracks(truth.pixels[:, left])
-    found = Comparison({}, {}, {}, polynomial_errors(seen.pixels, hidden.pixels, PX_PER_MM))
+    found = Comparison({}, [], {}, polynomial_errors(seen.pixels, hidden.pixels, PX_PER_MM))
     print("hidden half without physics: " + ", ".join(f"{n} {mm:.2f} mm" for n, mm in found.without.items()))
     for hide in (False, True):
         what = "left half hidden" if hide else "all seen"
@@ -257,7 +251,7 @@ def without_discs(name: str, specimen: Specimen, data: Path, model: Path) -> Com
     """A specimen without discs: its speckles, and its force."""
     video, folder = data / f"{name}.mp4", OUTPUT / f"run_{name}"
     run = track(name, specimen, video, model, folder)
-    until, found = SOUND_UNTIL.get(name, specimen.last), Comparison({}, {}, {}, {})
+    until, found = SOUND_UNTIL.get(name, specimen.last), Comparison({}, [], {}, {})
     if not specimen.outline:
         figures = found.add(folder, speckle_tracks(video, until), "speckles", specimen)
         found.figures |= {"mean_mm": figures["mean_mm"], "p95_mm": figures["p95_mm"]}
@@ -276,9 +270,10 @@ def run(arguments: argparse.Namespace) -> None:
         raise md.MorphError(f"there is no recording {video}: give the folder that holds it with --data")
     model = build(arguments.specimen, specimen, data)
     found = (with_discs if specimen.discs else without_discs)(arguments.specimen, specimen, data, model)
-    if found.errors:
+    if found.runs:
         found.pictures["mean distance in each frame"] = OUTPUT / f"{arguments.specimen}_errors.png"
-        draw_errors(found.pictures["mean distance in each frame"], found.errors, found.without)
+        draw_errors(found.pictures["mean distance in each frame"], found.runs, found.without)
+        draw_points(OUTPUT / f"{arguments.specimen}.png", found.runs, SHOWN_FRAME)
     page = OUTPUT / f"{arguments.specimen}.html"
     write_page(page, f"Rubber specimen {arguments.specimen}", found.figures, found.pictures, found.without)
     print(f"report  {page}")
