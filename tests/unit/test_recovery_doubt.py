@@ -16,7 +16,9 @@ def attempt(share, sigma_px, prior=None, visible=1.0) -> Any:
     measurement = SimpleNamespace(visible=seen, valid=inliers)
     estimate = SimpleNamespace(sigma_px=sigma_px)
     counts = int(seen.sum()), int(inliers.sum())
-    return SimpleNamespace(inliers=inliers, estimate=estimate, prior=prior, measurement=measurement, counts=counts)
+    return SimpleNamespace(
+        inliers=inliers, estimate=estimate, prior=prior, measurement=measurement, counts=counts, outline_alone=False
+    )
 
 
 def new() -> Recovery:
