@@ -6,8 +6,8 @@ them with 43 stiff discs, and a black one without any texture. Camera and right 
 over the sequence.
 
 What the models rest on: the drawings; the rubber's two constants, fitted to the force curves of both notched specimens
-(it prints the factor that is left); the discs' diameter, 1.8 mm, where their brightness in the
-first picture reaches that of the rubber (jetted materials mix at their boundary: 1.5 mm are drawn).
+(each run prints the factor that is left); the discs' diameter, 1.8 mm, where their brightness in the first picture
+reaches that of the rubber (jetted materials mix at their boundary: 1.5 mm are drawn).
 """
 
 from __future__ import annotations
@@ -205,45 +205,45 @@ class Comparison:
     without: dict[str, float]
     tracked: tuple[int, int] = (0, 0)
 
-    def add(self, folder: Path, tracks: Tracks, what: str, specimen: Specimen) -> dict[str, Any]:
-        """Compare a run with tracks, bound in the reference frame; returns the figures."""
+    def add(self, run: md.Run, folder: Path, tracks: Tracks, what: str, specimen: Specimen) -> dict[str, Any]:
+        """Compare a run, in its folder, with tracks, bound in the reference frame; returns the figures."""
         path = OUTPUT / f"{folder.name}_{what.replace(' ', '_')}.csv"
         tracks.write(path)
         figures = evaluate_pixels(folder, path, specimen.reference_frame)
         print(f"{what}: {pixel_line(figures)}")
-        run, points = md.load_run(folder), load_tracks(path)
+        points = load_tracks(path)
         self.runs.append(Compared(what, run, pixel_error(run, points, specimen.reference_frame), points))
         self.pictures[what] = path.with_suffix(".png")
         draw_points(self.pictures[what], self.runs[-1:])
         return figures
 
+    def take(self, run: md.Run, folder: Path, until: int, figures: dict[str, Any]) -> None:
+        """Keep what a run says of the stroke up to a frame, and of points where they were compared."""
+        self.figures |= {key: figures[key] for key in ("mean_mm", "p95_mm") if key in figures}
+        self.figures |= stroke_line(run, until) | {"stroke_std_mm": stated_deviation(folder, until)}
+        self.tracked = (int(run.tracked.sum()), len(run.frames))
+
 
 def with_discs(name: str, specimen: Specimen, data: Path, model: Path) -> Comparison:
     """The specimen with discs: all of it seen, and its left half hidden."""
-    video, left = data / f"{name}.mp4", disc_positions(data)[:, 0] < 0.0
-    truth = disc_tracks(video, np.array(MIDDLE) + PX_PER_MM * disc_positions(data), specimen.last)
+    video, drawn = data / f"{name}.mp4", disc_positions(data)
+    truth = disc_tracks(video, np.array(MIDDLE) + PX_PER_MM * drawn, specimen.last)
     at_rest = truth.pixels[:3]
     print(f"discs: repeated to {np.std(at_rest - at_rest.mean(axis=0)) / PX_PER_MM:.4f} mm in three frames at rest")
     half = np.zeros((1216, 1936), dtype=bool)
     half[:, : round(MIDDLE[0])] = True
-    seen, hidden = speckle_tracks(video, specimen.last, half), Tracks(truth.pixels[:, left])
+    seen, hidden = speckle_tracks(video, specimen.last, half), Tracks(truth.pixels[:, drawn[:, 0] < 0.0])
     found = Comparison({}, [], {}, polynomial_errors(seen.pixels, hidden.pixels, PX_PER_MM))
     print("hidden half without physics: " + ", ".join(f"{n} {mm:.2f} mm" for n, mm in found.without.items()))
-    for hide in (False, True):
-        what = "left half hidden" if hide else "all seen"
-        frames, folder = (
-            OUTPUT / f"{name}_{'half' if hide else 'all'}",
-            OUTPUT / f"run_{name}_{'half' if hide else 'all'}",
-        )
+    for part, what in (("all", "all seen"), ("half", "left half hidden")):
+        frames, folder, hide = OUTPUT / f"{name}_{part}", OUTPUT / f"run_{name}_{part}", part == "half"
         paint(video, truth.pixels, frames, hide, specimen.last)
         run = track(name, specimen, frames, model, folder)
-        figures = found.add(folder, hidden if hide else truth, what, specimen)
+        figures = found.add(run, folder, hidden if hide else truth, what, specimen)
         if hide:
             found.figures["hidden_mm"] = figures["mean_mm"]
-            continue
-        found.figures |= {"mean_mm": figures["mean_mm"], "p95_mm": figures["p95_mm"]}
-        found.figures |= stroke_line(run, specimen.last) | {"stroke_std_mm": stated_deviation(folder, specimen.last)}
-        found.tracked = (int(run.tracked.sum()), len(run.frames))
+        else:
+            found.take(run, folder, specimen.last, figures)
     return found
 
 
@@ -251,15 +251,13 @@ def without_discs(name: str, specimen: Specimen, data: Path, model: Path) -> Com
     """A specimen without discs: its speckles, and its force."""
     video, folder = data / f"{name}.mp4", OUTPUT / f"run_{name}"
     run = track(name, specimen, video, model, folder)
-    until, found = SOUND_UNTIL.get(name, specimen.last), Comparison({}, [], {}, {})
+    until, found, figures = SOUND_UNTIL.get(name, specimen.last), Comparison({}, [], {}, {}), {}
     if not specimen.outline:
-        figures = found.add(folder, speckle_tracks(video, until), "speckles", specimen)
-        found.figures |= {"mean_mm": figures["mean_mm"], "p95_mm": figures["p95_mm"]}
+        figures = found.add(run, folder, speckle_tracks(video, until), "speckles", specimen)
+    found.take(run, folder, until, figures)
     force = evaluate_force(folder, data / "force_stroke.csv", specimen.force)
     print(force_line(force))
     found.pictures["force on the clamp"] = folder / "force_evaluation.png"
-    found.figures |= stroke_line(run, until) | {"stroke_std_mm": stated_deviation(folder, until)}
-    found.tracked = (int(run.tracked.sum()), len(run.frames))
     return found
 
 
