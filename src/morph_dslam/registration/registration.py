@@ -20,7 +20,7 @@ from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.notices import Notice
 from morph_dslam.registration.messages import Ambiguous, AngleOpen, OutlineElsewhere, read_warning
 from morph_dslam.slam.pose import PoseEstimate
-from morph_dslam.tracking.state import Prior, State
+from morph_dslam.tracking.state import Prior, State, pose_increment
 
 if TYPE_CHECKING:
     from morph_dslam.slam.scene import Scene
@@ -73,8 +73,7 @@ class PosePrior:
 
     def away(self, pose: RigidTransform) -> Array:
         """The increment (6,) from this pose to another."""
-        turn = rotation_log(pose.rotation @ self.pose.rotation.T)
-        return np.concatenate([turn, pose.translation - self.pose.translation])
+        return pose_increment(self.pose, pose)
 
 
 @dataclass(frozen=True)

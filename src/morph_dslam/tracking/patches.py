@@ -198,7 +198,7 @@ def compare_patches(first, second, first_points, second_points, half):
 
 #: Grey level of a pixel that equals its neighbourhood's mean.
 NEUTRAL = 128
-#: What is finer than this, pixels, is smoothed away where texture is told from noise.
+#: What is finer than this, pixels, is smoothed away where texture is distinguished from noise.
 TEXTURE_SCALE_PX = 1.5
 #: Lucas-Kanade's window, pixels, and pyramid levels above the image itself.
 FLOW_WINDOW, LEVELS = 17, 3

@@ -72,8 +72,13 @@ EFFECTIVE_POINTS = 30.0
 LEAST_SIGMA_PX = 0.3
 #: Keyframes used, spread over the sequence.
 N_KEYFRAMES = 25
-#: Standard deviation of a landmark, pixels, where the registration does not say it.
-LANDMARK_PX = 0.5
+#: Standard deviation of a landmark, pixels, where the registration does not say it, and the least that is believed.
+LANDMARK_PX, LEAST_LANDMARK_PX = 0.5, 0.1
+
+
+def landmark_deviation(fitted_px: float) -> float:
+    """Standard deviation of a landmark, pixels: how well they fit shows it, where they are enough."""
+    return max(fitted_px, LEAST_LANDMARK_PX) if np.isfinite(fitted_px) else LANDMARK_PX
 
 
 def choose_keyframes(keyframes: Sequence[Keyframe], count: int = N_KEYFRAMES) -> list[Keyframe]:

@@ -68,6 +68,11 @@ def moved(state: State, step: Array) -> State:
     return State(state.parameters + step[:d], RigidTransform(rotation, pose.translation + step[d + 3 :]))
 
 
+def pose_increment(before: RigidTransform, pose: RigidTransform) -> Array:
+    """The increment (6,) that `moved` applies to the pose ``before`` to make it ``pose``."""
+    return np.concatenate([rotation_log(pose.rotation @ before.rotation.T), pose.translation - before.translation])
+
+
 @dataclass(frozen=True)
 class Prior:
     """What is known of the parameters, and of the pose, beforehand, as one more term of the cost.
@@ -100,11 +105,9 @@ class Prior:
         hessian[:d, :d], gradient[:d] = self.information, self.information @ away
         cost = 0.5 * float(away @ gradient[:d])
         if self.pose is not None and self.pose_information is not None:
-            pose = state.camera_from_object
-            turn = rotation_log(pose.rotation @ self.pose.rotation.T)
-            away = np.concatenate([turn, pose.translation - self.pose.translation])
+            away = pose_increment(self.pose, state.camera_from_object)
             slope = np.eye(6)
-            slope[:3, :3] = _log_slope(turn)
+            slope[:3, :3] = _log_slope(away[:3])
             push = self.pose_information @ away
             hessian[d:, d:], gradient[d:] = slope.T @ self.pose_information @ slope, slope.T @ push
             cost += 0.5 * float(away @ push)

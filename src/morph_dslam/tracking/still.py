@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from morph_dslam.camera import Camera
-from morph_dslam.geometry import rotation_log
 from morph_dslam.model import ReducedModel
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, State, moved
 from morph_dslam.tracking.levenberg_marquardt import bounded_step
 from morph_dslam.tracking.refinement import EFFECTIVE_POINTS, Keyframe
-from morph_dslam.tracking.state import Prior
+from morph_dslam.tracking.state import Prior, pose_increment
 
 Array = NDArray[np.float64]
 #: Terms of the camera that can be estimated with the pose.
@@ -79,9 +78,8 @@ class StateTerm:
 
     def residuals(self, camera: Camera, state: State) -> Array:
         """(d + 6,) in standard deviations; the camera does not matter."""
-        pose, before = state.camera_from_object, self.state.camera_from_object
-        turn = rotation_log(pose.rotation @ before.rotation.T)
-        away = np.concatenate([state.parameters - self.state.parameters, turn, pose.translation - before.translation])
+        turned = pose_increment(self.state.camera_from_object, state.camera_from_object)
+        away = np.concatenate([state.parameters - self.state.parameters, turned])
         values, vectors = np.linalg.eigh(self.covariance / np.outer(self.scale, self.scale))
         return np.asarray((vectors.T @ (away / self.scale)) / np.sqrt(np.maximum(values, LEAST_VARIANCE)))
 

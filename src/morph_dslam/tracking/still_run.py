@@ -11,18 +11,19 @@ import numpy as np
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.registration.landmarks import bind_landmarks
 from morph_dslam.sources import Frame
+from morph_dslam.tracking.levenberg_marquardt import Box
 from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
 from morph_dslam.tracking.options import PoseFrom
 from morph_dslam.tracking.placement import PlacedObject
-from morph_dslam.tracking.refinement import LANDMARK_PX, Keyframe, choose_keyframes
+from morph_dslam.tracking.refinement import N_KEYFRAMES, Keyframe, choose_keyframes, landmark_deviation
 from morph_dslam.tracking.reregistration import Reregistration
 from morph_dslam.tracking.still import CameraTerm, LandmarkTerm, StateTerm, StillProblem, fit_still
 from morph_dslam.tracking.tracker import Tracker
 
 #: Live, the pose is estimated anew after so many frames, and whenever there are twice as many.
 FIRST_TIME = 10
-#: The least standard deviation of a landmark that is believed, pixels.
-LEAST_LANDMARK_PX = 0.1
+#: Frames that are kept for it; then every second one is dropped.
+MOST_KEPT = 4 * N_KEYFRAMES
 
 
 def with_pose(part: PlacedObject, pose: PoseFrom) -> PlacedObject:
@@ -30,7 +31,9 @@ def with_pose(part: PlacedObject, pose: PoseFrom) -> PlacedObject:
     return replace(part, object=replace(part.object, options=replace(part.object.options, pose=pose)))
 
 
-def with_still_pose(part: PlacedObject, keyframes: Sequence[Keyframe], terms: Sequence[CameraTerm]) -> PlacedObject:
+def with_still_pose(
+    part: PlacedObject, keyframes: Sequence[Keyframe], terms: Sequence[CameraTerm] = (), estimated: bool = False
+) -> PlacedObject:
     """The object in the one pose that all frames have together, and its camera with the terms asked for.
 
     Parameters
@@ -38,6 +41,7 @@ def with_still_pose(part: PlacedObject, keyframes: Sequence[Keyframe], terms: Se
     part : the object in its reference frame.
     keyframes : where its points were seen.
     terms : of the camera to estimate.
+    estimated : whether the object's registration is such an estimate already, from earlier frames and the landmarks.
     """
     registration, tracker = part.registration, part.new_tracker()
     assert isinstance(tracker, Tracker)
@@ -49,7 +53,7 @@ def with_still_pose(part: PlacedObject, keyframes: Sequence[Keyframe], terms: Se
         registration.state,
         tracker.reference.pixels,
         choose_keyframes(keyframes),
-        _known(part, tracker),
+        _state_term(part) if estimated else _known(part),
         constant,
         [n for n in range(len(names)) if part.object.at_rest and n not in constant],
         terms,
@@ -64,22 +68,28 @@ def with_still_pose(part: PlacedObject, keyframes: Sequence[Keyframe], terms: Se
     return with_pose(replace(part, registration=registration, cameras=cameras), "still")
 
 
-def _known(part: PlacedObject, tracker: Tracker) -> LandmarkTerm | StateTerm:
+def _known(part: PlacedObject) -> LandmarkTerm | StateTerm:
     """What the registration rests on."""
-    landmarks, registration, d = part.object.start, part.registration, len(part.model.parameters)
-    if isinstance(landmarks, Landmarks):
-        sigma = float(registration.facts["sigma_px"])
-        sigma = max(sigma, LEAST_LANDMARK_PX) if np.isfinite(sigma) else LANDMARK_PX
-        return LandmarkTerm(bind_landmarks(part.model, landmarks.points), landmarks.pixels, sigma)
-    scale, covariance = tracker.estimator.scale, registration.covariance
+    landmarks = part.object.start
+    if not isinstance(landmarks, Landmarks):
+        return _state_term(part)
+    sigma = landmark_deviation(part.registration.facts["sigma_px"])
+    return LandmarkTerm(bind_landmarks(part.model, landmarks.points), landmarks.pixels, sigma)
+
+
+def _state_term(part: PlacedObject) -> StateTerm:
+    """The registration's state, as well as it is known."""
+    scale, covariance = Box.of(part.model).scale, part.registration.covariance
     if covariance is None or not np.isfinite(covariance).all():
         covariance = np.diag(scale**2)
-    assert covariance.shape == (d + 6, d + 6)
-    return StateTerm(registration.state, covariance, scale)
+    return StateTerm(part.registration.state, covariance, scale)
 
 
 class Sharpening(Reregistration):
     """Estimates the one pose anew while frames come, in a thread of its own.
+
+    A tracker in another pose may follow other points of the reference frame. So each estimate rests on the one before
+    it, with its covariance, and on the frames of the tracker that this made.
 
     Parameters
     ----------
@@ -88,26 +98,37 @@ class Sharpening(Reregistration):
 
     def __init__(self, placed: PlacedObject) -> None:
         super().__init__(placed)
-        self._start, self._seen, self._due_at = placed, list[Keyframe](), FIRST_TIME
+        self._part, self._estimated = placed, False
+        self._seen, self._every, self._count, self._due_at = list[Keyframe](), 1, 0, FIRST_TIME
+        self._last_seen: Keyframe | None = None
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="still pose")
-        self._running: Future[Tracker | RigTracker] | None = None
+        self._running: Future[tuple[PlacedObject, Tracker | RigTracker]] | None = None
 
     def tracker(self, frames: Sequence[Frame], current: Tracker | RigTracker) -> Tracker | RigTracker:
         """The tracker for the next frames: the current one, or one with a pose from more frames."""
-        if not isinstance(current, Tracker):
-            return current
-        if current.last_seen is not None and (not self._seen or current.last_seen is not self._seen[-1]):
-            self._seen.append(current.last_seen)
+        assert isinstance(current, Tracker)
+        if current.last_seen is not None and current.last_seen is not self._last_seen:
+            self._take(current.last_seen)
         if self._running is not None and self._running.done():
-            done, self._running = self._running, None
-            new = done.result()
+            self._part, new = self._running.result()
             assert isinstance(new, Tracker)
+            self._running, self._estimated = None, True
+            self._seen, self._every = [], 1
             new.continue_from(replace(current.state, camera_from_object=new.state.camera_from_object))
             return new
-        if self._running is None and len(self._seen) >= self._due_at:
-            self._due_at = 2 * len(self._seen)
+        if self._running is None and self._count >= self._due_at:
+            self._due_at = 2 * self._count
             self._running = self._executor.submit(self._sharpened, tuple(self._seen))
         return current
 
-    def _sharpened(self, keyframes: Sequence[Keyframe]) -> Tracker | RigTracker:
-        return with_still_pose(self._start, keyframes, ()).new_tracker()
+    def _take(self, keyframe: Keyframe) -> None:
+        """Take in a frame; as many are kept as a choice of them needs, however long the run."""
+        self._last_seen, self._count = keyframe, self._count + 1
+        if self._count % self._every == 0:
+            self._seen.append(keyframe)
+        if len(self._seen) > MOST_KEPT:
+            self._seen, self._every = self._seen[::2], 2 * self._every
+
+    def _sharpened(self, keyframes: Sequence[Keyframe]) -> tuple[PlacedObject, Tracker | RigTracker]:
+        part = with_still_pose(self._part, keyframes, estimated=self._estimated)
+        return part, part.new_tracker()

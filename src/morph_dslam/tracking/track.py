@@ -36,7 +36,7 @@ from morph_dslam.tracking.placement import (
     place_by_map,
     with_other_images,
 )
-from morph_dslam.tracking.refinement import LANDMARK_PX, Keyframe, choose_keyframes, refine_reference
+from morph_dslam.tracking.refinement import Keyframe, choose_keyframes, landmark_deviation, refine_reference
 from morph_dslam.tracking.reregistration import Reregistration
 from morph_dslam.tracking.run_folder import RunFolder
 from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
@@ -263,9 +263,7 @@ def _refined(part: PlacedObject, keyframes: list[Keyframe], run: TrackOptions) -
         return part
     tracker = part.new_tracker()
     assert isinstance(tracker, Tracker)
-    # How well the landmarks fit shows how carefully they were set, where they are enough.
-    sigma = registration.facts["sigma_px"]
-    landmark_px = max(sigma, 0.1) if np.isfinite(sigma) else LANDMARK_PX
+    landmark_px = landmark_deviation(registration.facts["sigma_px"])
     bound = bind_landmarks(part.model, landmarks.points)
     seen, pixels = part.camera.undistort_pixels(landmarks.pixels), tracker.reference.pixels
     chosen = choose_keyframes(keyframes)

@@ -131,7 +131,12 @@ class Tracker:
         self._discrepancy = DiscrepancyFit(self.model, camera, sought) if use else None
         self._filter = new_filter(self.estimator, self.options)
         self._unfiltered = np.zeros((len(self.model.parameters) + 6,) * 2)
-        self._still = self._held_pose(registration)
+        if registration.scene is not None and self.options.pose == "still":
+            raise TrackingError(
+                "an object in a mapped scene stands still in its map already, and the camera need not: take the pose "
+                "'map' or 'fixed' in place of 'still'"
+            )
+        self._still: Prior | None = None
         if registration.scene is not None and reference is None:
             reference, in_sequence = self._from_scene(), False
         self._lost, self._n_lost = not in_sequence, 0
@@ -204,20 +209,6 @@ class Tracker:
             self.anchor = Anchor.of({self.model.name: known}, self.camera)
         assert known.frame is not None
         return keyframes[known.frame]
-
-    def _held_pose(self, known: Registration) -> Prior | None:
-        """The pose that is one over the sequence, if it is; raises TrackingError where a map has it."""
-        if self.options.pose != "still":
-            return None
-        if known.scene is not None:
-            raise TrackingError(
-                "an object in a mapped scene stands still in its map already, and the camera need not: take the pose "
-                "'map' or 'fixed' in place of 'still'"
-            )
-        prior, factors = held(known.state, self.estimator), error_factors_of(known.covariance, self.estimator.scale)
-        if not self.options.use_outline or factors is None:
-            return prior
-        return replace(prior, lasting=factors[len(self.model.parameters) :])
 
     # -- the steps of a frame -----------------------------------------------------------------------------
 
@@ -442,6 +433,11 @@ class Tracker:
         keyframes = self._keyframes or KeyframeViews(error_factors_of(known.covariance, self.estimator.scale))
         first = PosedImage(image, known.state, keyframes.error_factors, self._seen, known.discrepancy)
         view = ReferenceView(self.estimator, [first, *keyframes.views], options)
+        if options.pose == "still":
+            # Where there are points, their places on the mesh have this error too: `SystematicErrors` adds both.
+            factors = keyframes.error_factors if view.outline_alone else None
+            lasting = None if factors is None else factors[len(self.model.parameters) :]
+            self._still = replace(held(known.state, self.estimator), lasting=lasting)
         self._views = ViewSet(self.estimator, view, options)
         self._anchoring = Anchoring(self.estimator, view, options)
         self.last_measured = view.nothing_measured
