@@ -186,6 +186,12 @@ def stated_deviation(folder: Path, until: int) -> float:
     return float(np.median(stated))
 
 
+def crack_frame(folder: Path) -> int | None:
+    """The frame from which on a run names a crack; None if it names none."""
+    notices = json.loads((folder / "summary.json").read_text())["notices"]
+    return next((notice["first"] for notice in notices if notice["kind"] == "surface_jumps"), None)
+
+
 @dataclass
 class Comparison:
     """What a specimen's runs gave.
@@ -197,6 +203,7 @@ class Comparison:
     pictures : by caption.
     without : errors of polynomials, mm, by name.
     tracked : frames tracked of all.
+    crack : frame from which on a crack is named; None if none is.
     """
 
     figures: dict[str, float]
@@ -204,6 +211,7 @@ class Comparison:
     pictures: dict[str, Path]
     without: dict[str, float]
     tracked: tuple[int, int] = (0, 0)
+    crack: int | None = None
 
     def add(self, run: md.Run, folder: Path, tracks: Tracks, what: str, specimen: Specimen) -> dict[str, Any]:
         """Compare a run, in its folder, with tracks, bound in the reference frame; returns the figures."""
@@ -221,7 +229,7 @@ class Comparison:
         """Keep what a run says of the stroke up to a frame, and of points where they were compared."""
         self.figures |= {key: figures[key] for key in ("mean_mm", "p95_mm") if key in figures}
         self.figures |= stroke_line(run, until) | {"stroke_std_mm": stated_deviation(folder, until)}
-        self.tracked = (int(run.tracked.sum()), len(run.frames))
+        self.tracked, self.crack = (int(run.tracked.sum()), len(run.frames)), crack_frame(folder)
 
 
 def with_discs(name: str, specimen: Specimen, data: Path, model: Path) -> Comparison:
@@ -277,7 +285,8 @@ def run(arguments: argparse.Namespace) -> None:
     print(f"report  {page}")
     order = ("mean_mm", "p95_mm", "hidden_mm", "stroke_mm_per_frame", "stroke_scatter_mm", "stroke_std_mm")
     line = " ".join(f"{key}={found.figures[key]:.4f}" for key in order if key in found.figures)
-    print(f"{line} tracked={found.tracked[0]}/{found.tracked[1]}")
+    crack = "none" if found.crack is None else found.crack
+    print(f"{line} crack_frame={crack} tracked={found.tracked[0]}/{found.tracked[1]}")
 
 
 def main() -> int:

@@ -87,3 +87,12 @@ def test_real_discs_are_predicted_where_they_are_and_where_they_are_hidden():
     assert float(found["hidden_mm"]) <= 0.10
     assert float(found["stroke_mm_per_frame"]) == pytest.approx(0.167, rel=0.015)
     assert float(found["stroke_std_mm"]) <= 0.03
+
+
+@pytest.mark.slow
+def test_a_real_crack_is_named_when_it_grows():
+    done = run_example("rubber_tension", "--specimen", "notch_7.2mm", "--data", str(real_data("rubber_tension")))
+    assert done.returncode == 0, done.stderr[-2000:]
+    found = dict(re.findall(r"(\w+)=(-?[\d.]+)", done.stdout.splitlines()[-1]))
+    # Seen by eye in the pictures, and the force falls after the last of these frames.
+    assert 82 <= int(found["crack_frame"]) <= 98

@@ -13,7 +13,10 @@ from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
 from morph_dslam.io.camera_files import load_camera, save_camera
 from morph_dslam.io.landmarks import Landmarks, save_landmarks
+from morph_dslam.registration.landmarks import bind_landmarks
 from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.refinement import Keyframe
+from morph_dslam.tracking.still import LandmarkTerm, StillProblem, fit_still
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import UPRIGHT, SheetFilm, mean_error, write_recording
 
@@ -102,6 +105,31 @@ def test_a_lens_that_is_not_known_is_estimated(recording, tmp_path):
     k1 = load_camera(tmp_path / "run" / "camera.yaml").distortion[0]
     assert k1 == pytest.approx(0.6, rel=0.2)
     assert errors(run).mean() < 2.5e-3  # nearly all of it along the sight line, as a longer lens would be
+
+
+def test_deformed_frames_decide_which_way_a_plane_is_tilted():
+    # From afar the landmarks of a flat sheet fit both tilts; its bent states fit one.
+    model, camera = bent_sheet_model(43, 31), Camera(640, 480, 15000.0, 15000.0, 320.0, 240.0)
+    place = np.array([0.0, 0.0, 12.5])
+    tilted, mirrored = (
+        RigidTransform(rotation_exp(turn * np.array([0.2, -0.1, 0.0])) @ UPRIGHT, place) for turn in (1.0, -1.0)
+    )
+    rows, rng = np.arange(0, len(model.nodes), 7), np.random.default_rng(2)
+
+    def seen(parameters):
+        pixels = camera.project(tilted.apply(model.positions(parameters)[rows]))
+        return pixels + 0.1 * rng.standard_normal(pixels.shape)
+
+    shapes = [State(state(time).parameters, tilted) for time in np.linspace(0.2, 1.0, 5)]
+    landmarks = Landmarks(model.nodes[rows[::9]], seen(model.default)[::9])
+    known = LandmarkTerm(bind_landmarks(model, landmarks.points), landmarks.pixels, 0.5)
+    frames = [Keyframe(seen(shape.parameters), np.ones(len(rows)), shape, 0.3) for shape in shapes]
+    for start, other in ((tilted, mirrored), (mirrored, tilted)):
+        problem = StillProblem(model, camera, State(model.default, start), seen(model.default), frames, known)
+        found = fit_still(problem, [State(model.default, other)])
+        assert found.decided
+        turned = rotation_log(found.state.camera_from_object.rotation @ tilted.rotation.T)
+        assert np.linalg.norm(turned) < np.radians(1.0)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import matplotlib
 import numpy as np
 import pytest
 
-from morph_dslam.render.overlay import BarSide, draw_overlay, paint_surface
+from morph_dslam.render.overlay import BarPlace, Panel, draw_overlay, paint_surface
 from morph_dslam.render.shading import colour_bar, colour_table, lambert, vertex_normals
 from tests.support.bent_sheet import LENGTH, bent_sheet_model
 
@@ -24,6 +24,11 @@ def test_opaque_surface_has_the_colour_of_its_value(value, position):
     image = overlay([value] * 4, alpha=1.0, colour_map="viridis")
     expected = np.array(matplotlib.colormaps["viridis"](position)[:3])[::-1] * 255
     assert np.abs(image[60:120, 40:100].astype(float) - expected).max() <= 3
+
+
+def test_a_surface_without_a_value_is_grey():
+    image = overlay([1.0, np.nan, np.nan, 1.0], alpha=1.0)
+    assert np.ptp(image[60:120, 40:100].astype(int), axis=2).max() == 0
 
 
 def test_transparency_mixes_and_brightness_dims():
@@ -55,14 +60,15 @@ def test_colour_bar_runs_from_high_at_the_top_to_low_at_the_bottom():
 
 
 def test_the_colour_bar_makes_room_for_the_object_and_does_not_jump():
-    side, bar, found = BarSide(), np.zeros((140, 60, 3), dtype=np.uint8), []
-    for left, right in ((100, 200), (100, 310), (30, 310), (200, 310), (20, 120)):
+    place, upright, flat = BarPlace(), np.zeros((140, 60, 3), dtype=np.uint8), np.zeros((20, 160, 3), dtype=np.uint8)
+    panels, found = [Panel(upright, 5, 255), Panel(upright, 5, 5), Panel(flat, 215, 155)], []
+    for left, right in ((100, 200), (100, 310), (70, 310), (30, 310), (5, 310), (20, 120), (200, 310)):
         picture = np.zeros((240, 320, 3), dtype=np.uint8)
         corners = np.array([[left, 20.0], [right, 20.0], [right, 200.0], [left, 200.0]])
         painted = paint_surface(picture, corners, np.ones(4), TRIANGLES, np.zeros(4), np.zeros((256, 3)))
-        found.append(side.column(painted, bar, 5, 320))
-    # In the middle; on the right; on both sides, where it stays; on the right; on the left.
-    assert found == [255, 5, 5, 5, 255]
+        found.append(place.choose(painted, panels).left)
+    # In the middle; on the right, twice; on both sides; below it then stays.
+    assert found == [255, 5, 5, 155, 155, 155, 155]
 
 
 def test_surface_out_of_sight_and_flat_range_still_draw():

@@ -83,6 +83,7 @@ def print_summary(folder: Path, summary: dict[str, Any]) -> None:
         print(value_line(figures))
     print(f"wrote {folder}")
     line = f"tracked={summary['n_tracked']}/{summary['n_frames']}"
+    line += "".join(f" {kind}={summary[f'n_{kind}']}" for kind in ("hidden", "lost", "skipped") if summary[f"n_{kind}"])
     if "live" in summary:
         figures = summary["live"]
         line += f" fps={figures['fps']:.1f} dropped={figures['n_dropped']}"

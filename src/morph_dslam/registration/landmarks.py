@@ -38,8 +38,9 @@ from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOpti
 from morph_dslam.tracking.refinement import refine_by_depth
 
 Array = NDArray[np.float64]
-#: Standard deviation of a carefully set landmark, pixels. Those that fit so many times worse are flagged.
-CLICK_PX, POOR_FIT = 0.5, 2.0
+#: Standard deviation of a carefully set landmark, pixels. Those that fit so many times worse, and worse than this share
+#: of the image's diagonal, are flagged; deviations are as wide as the fit asks for anyway.
+CLICK_PX, POOR_FIT, POOR_SHARE = 0.5, 2.0, 0.002
 #: Standard deviation of landmarks' pixels where they are too few to show it, and the least that is believed.
 UNKNOWN_PX, LEAST_PX = 2.0, 0.1
 #: Shares of the object's size: least extent of the landmarks, how far one may lie off the undeformed surface,
@@ -108,17 +109,19 @@ def register_landmarks(
         )
     if at_rest:
         found = [_of_pose_alone(estimator, bound, pixels, estimate) for estimate in found]
-    best, n_alternatives = _distinct_minima(model, found, click_px)
+    best, alternatives = _distinct_minima(model, found, click_px)
     rms = float(np.sqrt(np.mean(np.sum(best.residuals**2, axis=1))))
-    _check_residual(best, rms, RESIDUAL_SHARE * float(np.hypot(camera.width, camera.height)))
+    diagonal = float(np.hypot(camera.width, camera.height))
+    _check_residual(best, rms, RESIDUAL_SHARE * diagonal)
     facts = {
         "from": "landmarks",
         "residual_rms_px": rms,
         "sigma_px": best.sigma_px,
         "n_landmarks": len(best.residuals),
-        "n_alternatives": n_alternatives,
+        "n_alternatives": len(alternatives),
     }
-    warnings = _warnings(model, best, n_alternatives, landmarks.points, click_px)
+    poor_px = max(POOR_FIT * click_px, POOR_SHARE * diagonal)
+    warnings = _warnings(model, best, len(alternatives), landmarks.points, click_px, poor_px)
     # A few landmarks that happen to fit well, or that a wrong model fits, are not exact for that.
     covariance = best.covariance * max(1.0, (click_px / max(best.sigma_px, 1e-12)) ** 2)
     if depth is not None:
@@ -130,7 +133,7 @@ def register_landmarks(
         facts["along_the_sight_line"], covariance = "by depth", best.covariance
         if at_rest:
             covariance = _without_parameters(covariance)
-    return Registration(model, best.state, covariance, facts=facts, warnings=warnings)
+    return Registration(model, best.state, covariance, facts=facts, warnings=warnings, alternatives=alternatives)
 
 
 def bind_landmarks(model: ReducedModel, points: Array) -> BoundPoints:
@@ -263,20 +266,21 @@ def solve_pnp(points: Array, pixels: Array, camera: Camera) -> list[RigidTransfo
     return poses
 
 
-def _distinct_minima(model: ReducedModel, found: list[Estimate], click_px: float) -> tuple[Estimate, int]:
-    """The best minimum, and how many different ones landmarks of the stated accuracy cannot exclude."""
+def _distinct_minima(model: ReducedModel, found: list[Estimate], click_px: float) -> tuple[Estimate, tuple[State, ...]]:
+    """The best minimum, and different ones that landmarks of the stated accuracy cannot exclude."""
     limit = DISTINCT_SHARE * _extent(model.nodes)
     best = found[0]
     freedom = max(2 * len(best.residuals) - len(best.covariance), 1)
     variance = max(click_px**2, 2.0 * best.cost / freedom)
     # Twice the log-likelihood ratio of two minima; 9 is the three-sigma level.
     plausible = [e for e in found if 2.0 * (e.cost - best.cost) < 9.0 * variance]
-    shapes = [_mesh_in_camera(model, best.state)]
+    shapes, states = [_mesh_in_camera(model, best.state)], []
     for estimate in plausible:
         shape = _mesh_in_camera(model, estimate.state)
         if all(np.linalg.norm(shape - other, axis=1).mean() > limit for other in shapes):
             shapes.append(shape)
-    return best, len(shapes) - 1
+            states.append(estimate.state)
+    return best, tuple(states)
 
 
 def _mesh_in_camera(model: ReducedModel, state: State) -> Array:
@@ -296,13 +300,13 @@ def _check_residual(best: Estimate, rms: float, limit: float) -> None:
 
 
 def _warnings(
-    model: ReducedModel, best: Estimate, n_alternatives: int, points: Array, click_px: float
+    model: ReducedModel, best: Estimate, n_alternatives: int, points: Array, click_px: float, poor_px: float
 ) -> tuple[RegistrationWarning, ...]:
     warnings: list[RegistrationWarning] = []
     numbers, unknowns, size = 2 * len(points), len(model.parameters) + 6, _extent(model.nodes)
     if numbers <= unknowns:
         warnings.append(Underdetermined(numbers, unknowns, unknowns // 2 + 3))
-    elif best.sigma_px > POOR_FIT * click_px:
+    elif best.sigma_px > poor_px:
         warnings.append(PoorFit(best.sigma_px, click_px))
     if not SIZES[0] < size < SIZES[1]:
         warnings.append(UnusualSize(size))

@@ -190,6 +190,7 @@ class Registration:
     axis : of revolution; None if the object has none.
     discrepancy : what the object's shape has beyond the model's in the frame; None where it is not known.
     scene : whose map it is registered in; None where there is none, or only its file is known.
+    alternatives : other states that what it was registered by does not exclude, where they are known.
     """
 
     model: ReducedModel
@@ -204,6 +205,7 @@ class Registration:
     axis: Axis | None = None
     discrepancy: Discrepancy | None = None
     scene: Scene | None = field(default=None, repr=False, compare=False)
+    alternatives: tuple[State, ...] = ()
 
     @property
     def ambiguous(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -10,11 +11,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.render.rasteriser import image_region, rasterise
-from morph_dslam.render.shading import colour_bar, colour_table, text_patch
+from morph_dslam.render.shading import colour_bar, colour_table, flat_colour_bar, text_patch
 
 Array = NDArray[np.float64]
-#: The colour bar changes sides where more than this share of it would lie on the object.
+#: The colour bar goes elsewhere where more than this share of it would lie on the object.
 MOST_UNDER_BAR = 0.02
+#: Grey level of a surface where the field has no value.
+NO_VALUE = 130.0
 
 
 @njit(cache=True, nogil=True)
@@ -25,7 +28,7 @@ def blend_surface(image, triangle_ids, weights, triangles, levels, brightness, t
     ----------
     image : (h, w, 3) uint8.
     triangle_ids, weights : from `rasterise`, of ``triangles`` (m, 3).
-    levels : (n,) node values scaled to 0-255.
+    levels : (n,) node values scaled to 0-255; grey around a node where it is NaN.
     brightness : (n,) factor on the colour.
     table : (256, 3) colours.
     alpha : opacity.
@@ -41,9 +44,10 @@ def blend_surface(image, triangle_ids, weights, triangles, levels, brightness, t
                 node = triangles[t, corner]
                 level += weights[row, column, corner] * levels[node]
                 light += weights[row, column, corner] * brightness[node]
-            entry = int(min(max(level, 0.0), 255.0) + 0.5)
+            known = not np.isnan(level)
+            entry = int(min(max(level, 0.0), 255.0) + 0.5) if known else 0
             for channel in range(3):
-                colour = min(light * table[entry, channel], 255.0)
+                colour = min(light * (table[entry, channel] if known else NO_VALUE), 255.0)
                 mixed = (1.0 - alpha) * image[row, column, channel] + alpha * colour
                 image[row, column, channel] = np.uint8(mixed + 0.5)
 
@@ -126,23 +130,44 @@ def paint_surface(
     return _Painted(buffers.covered, corner)
 
 
-class BarSide:
-    """On which side of the image the colour bar stands: on the right, until the object is there and not on the left.
+@dataclass(frozen=True)
+class Panel:
+    """A panel (h, w, 3) uint8 and where it would stand in an image."""
+
+    image: NDArray[np.uint8]
+    top: int
+    left: int
+
+
+class BarPlace:
+    """Where the colour bar stands: on the right, until the object is there and elsewhere is more room for it.
 
     One of them serves a whole video, so that the bar does not jump to and fro.
     """
 
     def __init__(self) -> None:
-        self.is_left = False
+        self._chosen = 0
 
-    def column(self, painted: _Painted, bar: NDArray[np.uint8], top: int, width: int) -> int:
-        """The first column of the bar in an image of a width, ``top`` pixels away from its edges."""
-        left, right = top, width - top - bar.shape[1]
-        on_left, on_right = painted.share(top, left, bar), painted.share(top, right, bar)
-        here, there = (on_left, on_right) if self.is_left else (on_right, on_left)
-        if here > MOST_UNDER_BAR and there < 0.5 * here:
-            self.is_left = not self.is_left
-        return left if self.is_left else right
+    def choose(self, painted: _Painted, panels: Sequence[Panel]) -> Panel:
+        """The panel to draw, of the same places in each image."""
+        shares = [painted.share(panel.top, panel.left, panel.image) for panel in panels]
+        best = next((k for k, share in enumerate(shares) if share <= MOST_UNDER_BAR), int(np.argmin(shares)))
+        if shares[self._chosen] > MOST_UNDER_BAR and shares[best] < 0.5 * shares[self._chosen]:
+            self._chosen = best
+        return panels[self._chosen]
+
+
+def _bar_panels(size: tuple[int, int], margin: int, upright: NDArray[np.uint8], flat: NDArray[np.uint8]) -> list[Panel]:
+    """A colour bar at the right and left edge of an image of a size (h, w), and at its upper and lower one."""
+    height, width = size
+    right, low = width - margin - upright.shape[1], height - margin - flat.shape[0]
+    across = max(width - margin - flat.shape[1], 0)
+    return [
+        Panel(upright, margin, right),
+        Panel(upright, margin, margin),
+        Panel(flat, margin, across),
+        Panel(flat, low, across),
+    ]
 
 
 def draw_overlay(
@@ -159,7 +184,7 @@ def draw_overlay(
     brightness: Array | None = None,
     caption: str = "",
     closed: bool = False,
-    side: BarSide | None = None,
+    bar: BarPlace | None = None,
 ) -> NDArray[np.uint8]:
     """Draw a surface coloured by a field over an image.
 
@@ -168,7 +193,8 @@ def draw_overlay(
     image : (h, w, 3) uint8, blue, green, red; not changed.
     pixels, depths : (n, 2) and (n,) projected nodes, NaN where not in front of the camera.
     triangles : (m, 3) node indices.
-    node_values : (n,) the field in the unit that ``label`` names, for example von Mises stress in MPa.
+    node_values : (n,) the field in the unit that ``label`` names, for example von Mises stress in MPa; NaN where it
+        has no value, which is drawn grey.
     value_range : values at the ends of the colour map; values beyond them take its end colours.
     label : name and unit of the field, for example "von Mises stress [MPa]".
     colour_map : a matplotlib colour map.
@@ -176,7 +202,7 @@ def draw_overlay(
     brightness : (n,) factor on the colour at each node, for example from `shading.lambert`; 1 by default.
     caption : a line of text for the lower left corner.
     closed : see `rasterise`.
-    side : of the colour bar, kept from frame to frame; chosen by this image alone if None.
+    bar : place of the colour bar, kept from frame to frame; chosen by this image alone if None.
 
     Returns
     -------
@@ -190,8 +216,10 @@ def draw_overlay(
     painted = paint_surface(result, pixels, depths, triangles, levels, table, alpha, brightness, closed)
     _draw_outline(result, painted)
     margin = round(0.02 * height)
-    bar = colour_bar(round(0.6 * height), float(low), float(high), label, colour_map, scale)
-    _blend_panel(result, bar, margin, (side or BarSide()).column(painted, bar, margin, width))
+    upright = colour_bar(round(0.6 * height), float(low), float(high), label, colour_map, scale)
+    flat = flat_colour_bar(round(0.5 * width), float(low), float(high), label, colour_map, scale)
+    panel = (bar or BarPlace()).choose(painted, _bar_panels((height, width), margin, upright, flat))
+    _blend_panel(result, panel.image, panel.top, panel.left)
     if caption:
         line = text_patch(caption, scale)
         _blend_panel(result, line, height - margin - line.shape[0], margin)

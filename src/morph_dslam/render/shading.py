@@ -94,8 +94,7 @@ def colour_bar(height: int, low: float, high: float, label: str, colour_map: str
     low, high : values at the bar's ends, in the unit that ``label`` names.
     scale : size of the text, as OpenCV's ``fontScale``.
     """
-    ticks = [tick for tick in MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high) if low <= tick <= high]
-    numbers = [text_patch(f"{tick:.6g}", scale) for tick in ticks]
+    ticks, numbers = _ticks(low, high, scale)
     label_patch = np.rot90(text_patch(label, scale))
     margin, bar_width = round(14 * scale), round(34 * scale)
     bar_left = label_patch.shape[1] + 2 * margin
@@ -111,3 +110,34 @@ def colour_bar(height: int, low: float, high: float, label: str, colour_map: str
         _paste(panel, number, max(row - number.shape[0] // 2, 0), number_left)
     _paste(panel, label_patch, max((height - label_patch.shape[0]) // 2, 0), margin)
     return panel
+
+
+def flat_colour_bar(
+    width: int, low: float, high: float, label: str, colour_map: str, scale: float
+) -> NDArray[np.uint8]:
+    """A panel (height, width, 3) with a horizontal colour bar, its label above and its numbers below it.
+
+    Parameters are those of `colour_bar`, but for its least ``width`` in pixels.
+    """
+    ticks, numbers = _ticks(low, high, scale)
+    label_patch, margin, bar_height = text_patch(label, scale), round(10 * scale), round(24 * scale)
+    bar_top = label_patch.shape[0] + 2 * margin
+    number_top = bar_top + bar_height + margin
+    inset = margin + max(number.shape[1] for number in numbers) // 2
+    width = max(width, label_patch.shape[1] + 2 * inset)
+    panel = np.full((number_top + numbers[0].shape[0] + margin, width, 3), BACKGROUND, dtype=np.uint8)
+    left, right = inset, width - 1 - inset
+    ramp = np.linspace(0, 255, right - left + 1).round().astype(int)
+    panel[bar_top : bar_top + bar_height, left : right + 1] = colour_table(colour_map)[ramp][None]
+    for tick, number in zip(ticks, numbers, strict=True):
+        column = round(left + (tick - low) / (high - low) * (right - left))
+        panel[bar_top + bar_height : number_top, column] = 250
+        _paste(panel, number, number_top, max(column - number.shape[1] // 2, 0))
+    _paste(panel, label_patch, margin, inset)
+    return panel
+
+
+def _ticks(low: float, high: float, scale: float) -> tuple[list[float], list[NDArray[np.uint8]]]:
+    """Round values from ``low`` to ``high``, and each as text."""
+    ticks = [tick for tick in MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high) if low <= tick <= high]
+    return ticks, [text_patch(f"{tick:.6g}", scale) for tick in ticks]

@@ -21,10 +21,11 @@ from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.inner_structure import CarriedStructure
 from morph_dslam.model.reduced_model import MaterialPoints, von_mises
-from morph_dslam.render.overlay import BarSide, draw_inner_surface, draw_overlay
+from morph_dslam.render.overlay import BarPlace, draw_inner_surface, draw_overlay
 from morph_dslam.render.shading import lambert, text_patch, vertex_normals
 from morph_dslam.sources import FrameSource
 from morph_dslam.tracking.binding import DrawnSurface, View, facing
+from morph_dslam.tracking.displacement_jumps import DisplacementJump, near_jumps
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.run_results import RunResults
 
@@ -206,7 +207,7 @@ class AugmentedView:
         inner: Sequence[CarriedStructure] = (),
     ) -> None:
         options = options or DrawOptions()
-        self._camera, self._inner, self._model, self._side = camera, inner, model, BarSide()
+        self._camera, self._inner, self._model, self._bar = camera, inner, model, BarPlace()
         self.show = shown_field(model, options.show)
         self._points, self._triangles = _drawn_mesh(model, options.section)
         self._closed = options.section is None and DrawnSurface.of(model).closed
@@ -280,28 +281,33 @@ class AugmentedView:
         limits: tuple[float, float],
         caption: str,
         discrepancy: Discrepancy | None = None,
+        jumps: Sequence[DisplacementJump] = (),
     ) -> NDArray[np.uint8]:
         """An undistorted frame (h, w, 3) with the object over it, and in it its inner structures.
 
-        The object is drawn where ``discrepancy`` has it beyond the model; stress and strain are the model's.
+        The object is drawn where ``discrepancy`` has it beyond the model; stress and strain are the model's, and
+        grey near ``jumps``.
         """
         displacement = self._displacement.value(state.parameters)
         if discrepancy is not None:
             displacement = displacement + discrepancy.displacement(self._rest)
         view = self._view(state, displacement)
+        values = self._values(state.parameters, displacement, view)
+        if self.show != "displacement":
+            values = np.where(near_jumps(jumps, self._rest), np.nan, values)
         drawn = draw_overlay(
             image,
             view.pixels,
             view.nodes[:, 2],
             self._triangles,
-            self._values(state.parameters, displacement, view),
+            values,
             limits,
             label=self.label,
             alpha=self._alpha,
             brightness=lambert(vertex_normals(view.nodes, self._triangles), LIGHT, AMBIENT),
             caption=caption,
             closed=self._closed,
-            side=self._side,
+            bar=self._bar,
         )
         for number, structure in enumerate(self._inner):
             nodes = structure.nodes(state.parameters)
@@ -387,4 +393,4 @@ def write_video(path: Path, source: FrameSource, camera: Camera, run: RunResults
             if state is None:
                 video.write(with_caption(image, f"frame {frame.index}: {result.reason}"))
             else:
-                video.write(view.draw(image, state, limits, f"frame {frame.index}", result.discrepancy))
+                video.write(view.draw(image, state, limits, f"frame {frame.index}", result.discrepancy, result.jumps))

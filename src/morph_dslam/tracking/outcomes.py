@@ -130,15 +130,28 @@ class ModelDoesNotExplain(TrackingWarning):
 
 
 @dataclass(frozen=True)
-class ReferenceContradicted(TrackingWarning):
-    """The frames show that the reference state is worse known than the registration states.
+class SurfaceJumps(TrackingWarning):
+    """The surface opens or slips along a line, and the model does not: stress near the line does not hold.
+
+    Attributes
+    ----------
+    where : how far and where it opens most.
+    """
+
+    template: ClassVar[str] = "the surface opens or slips along a line, as at a crack, by {where}"
+    where: str
+
+
+@dataclass(frozen=True)
+class ReferenceWidened(TrackingWarning):
+    """The frames show that the reference state is worse known than the registration states, and deviations follow.
 
     Attributes
     ----------
     factor : by which its deviations are widened.
     """
 
-    template: ClassVar[str] = "the frames contradict the reference state: {factor:.1f} times its stated deviation"
+    template: ClassVar[str] = "deviations widened {factor:.1f} times, as the frames ask for"
     factor: float
 
 

@@ -12,6 +12,7 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.registration.registration import PosePrior
+from morph_dslam.tracking.displacement_jumps import DisplacementJump, near_jumps
 from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.observability import displacement_std, von_mises_std
 from morph_dslam.tracking.outcomes import FoundBy, PoseSource, Rejection, Status, TrackingWarning, reason_text
@@ -59,6 +60,7 @@ class FrameResult:
     view : number of the reference view that the frame was compared with, 0 for the first.
     made_view : whether the frame became a reference view itself.
     discrepancy : what the object's shape has beyond the model's; None where it was not estimated.
+    jumps : where the surface was found to open or slip along a line, in this frame or before; as at a crack.
     timings_ms : by stage, milliseconds.
     total_ms : of the whole frame, milliseconds.
     """
@@ -80,6 +82,7 @@ class FrameResult:
     view: int = 0
     made_view: bool = False
     discrepancy: Discrepancy | None = None
+    jumps: tuple[DisplacementJump, ...] = ()
     timings_ms: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
     total_ms: float = 0.0
 
@@ -172,6 +175,10 @@ class FrameResult:
         if not places:
             raise KeyError(f"the model '{self.model.name}' holds no stress")
         return np.maximum.reduce([self.model.von_mises(self._mu, at) for at in places])
+
+    def near_jumps(self) -> NDArray[np.bool_]:
+        """Nodes (n,) near which the surface opens or slips along a line: strain and stress do not hold there."""
+        return near_jumps(self.jumps, self.model.nodes)
 
     def von_mises_std(self, place: str) -> Array:
         """Standard deviation (n,) of the von Mises stress of every node, pascals."""

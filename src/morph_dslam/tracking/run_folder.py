@@ -170,6 +170,7 @@ def summarise(run: RunResults, notices: Sequence[Notice] = ()) -> dict[str, Any]
         "n_tracked": int(tracked.sum()),
         "n_hidden": int(run.hidden.sum()),
         "n_lost": int((~tracked & ~run.hidden).sum()),
+        "n_skipped": run.frames[-1] - run.frames[0] + 1 - len(run),
         "n_recovered": sum(result.recovered for result in run.results),
         "first_frame": run.frames[0],
         "last_frame": run.frames[-1],

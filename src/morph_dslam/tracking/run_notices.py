@@ -36,9 +36,12 @@ class RunWarning(StrEnum):
         "frames: there the object deforms otherwise, as by another law, support or shape, a crack or a slip, or the "
         "camera is another one"
     )
-    REFERENCE_CONTRADICTED = (
-        "the frames show the reference state to be {factor:.1f} times less certain than its registration states, and "
-        "all deviations are that much wider"
+    SURFACE_JUMPS = (
+        "from frame {first} on the surface opens or slips along a line, as at a crack, which the model does not have: "
+        "by up to {where}; stress near it does not hold and is drawn grey (plots/jumps.png)"
+    )
+    REFERENCE_WIDENED = (
+        "deviations are {factor:.1f} times wider than the registration alone would have them: the frames ask for that"
     )
     AT_BOUND = (
         "parameter '{parameter}' is at the {side} bound of its range ({bound}) in {count} frames: the object may be "
@@ -100,9 +103,13 @@ def notices_of(run: RunResults) -> list[RunNotice]:
     if failed:
         largest = float(np.nanmax(run.unexplained_px()))
         found.append(of(RunWarning.MODEL_FAILS, count=failed, n_frames=n_frames, largest_px=largest))
+    torn = [(frame, r) for frame, r in zip(run.frames, run.results, strict=True) if r.jumps]
+    if torn:
+        largest = max(torn[-1][1].jumps, key=lambda jump: jump.size)
+        found.append(of(RunWarning.SURFACE_JUMPS, first=torn[0][0], where=largest.text))
     factor = max((result.reference_factor for result in run.results), default=1.0)
     if factor > CLEARLY_WORSE:
-        found.append(of(RunWarning.REFERENCE_CONTRADICTED, factor=factor))
+        found.append(of(RunWarning.REFERENCE_WIDENED, factor=factor))
     return [*found, *_at_bound(run), *_unobservable(run)]
 
 

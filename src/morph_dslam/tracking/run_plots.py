@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
 from morph_dslam.tracking.result import STAGES
@@ -18,12 +19,14 @@ MOST_STAGES, LEAST_SHARE = 10, 0.005
 
 
 def write_plots(folder: Path, run: RunResults) -> None:
-    """Write ``parameters.png``, ``confidence.png``, ``residual.png`` and ``timings.png``."""
+    """Write ``parameters.png``, ``confidence.png``, ``residual.png``, ``timings.png``, and ``jumps.png`` if any are."""
     folder.mkdir(exist_ok=True)
     plot_confidence(folder / "confidence.png", run)
     plot_parameters(folder / "parameters.png", run)
     plot_residual(folder / "residual.png", run)
     plot_timings(folder / "timings.png", run)
+    if any(result.jumps for result in run.results):
+        plot_jumps(folder / "jumps.png", run)
 
 
 def _shade_lost(axes: Axes, run: RunResults) -> None:
@@ -125,4 +128,25 @@ def plot_timings(path: Path, run: RunResults) -> None:
     axes.set_title(f"median {np.median(times[:, -1]):.1f} ms", fontsize=10)
     axes.set_ylim(0.0, max(36.0, 1.1 * float(np.percentile(times[:, -1], 98))))
     axes.legend(loc="upper right", fontsize=8, ncols=4)
+    figure.savefig(path, dpi=DPI)
+
+
+def plot_jumps(path: Path, run: RunResults) -> None:
+    """Where the undeformed surface opened or slipped along a line, seen from where it is broadest."""
+    nodes = 1e3 * run.model.nodes[np.unique(run.model.triangles)]
+    jumps = next(result.jumps for result in reversed(run.results) if result.jumps)
+    across = int(np.ptp(nodes, axis=0).argmin())
+    u, v = (axis for axis in range(3) if axis != across)
+    figure = Figure(figsize=(9.0, 6.0), layout="constrained")
+    axes = figure.add_subplot()
+    axes.plot(nodes[:, u], nodes[:, v], ".", color="#c5ccd3", markersize=2.0)
+    for jump in jumps:
+        axes.add_patch(Circle(1e3 * jump.place[[u, v]], 1e3 * jump.reach, facecolor="#d9534f", alpha=0.12))
+    places, sizes = np.array([1e3 * jump.place for jump in jumps]), [1e3 * jump.size for jump in jumps]
+    drawn = axes.scatter(places[:, u], places[:, v], c=sizes, cmap="viridis", vmin=0.0, s=45, zorder=3)
+    figure.colorbar(drawn, ax=axes, label="largest jump [mm]")
+    axes.set_aspect("equal")
+    axes.set_xlabel(f"{'xyz'[u]} [mm]")
+    axes.set_ylabel(f"{'xyz'[v]} [mm]")
+    axes.set_title("where the surface opens or slips and the model does not; stress in the shade does not hold")
     figure.savefig(path, dpi=DPI)

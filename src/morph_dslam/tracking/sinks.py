@@ -122,12 +122,12 @@ class LivePicture:
         if len(missing) == len(results):
             return with_caption(image, caption)
         found = [
-            (self._views[name], result.estimate.state, result.discrepancy)
+            (self._views[name], result.estimate.state, result)
             for name, result in results.items()
             if result.estimate is not None
         ]
-        for view, state, discrepancy in sorted(found, key=lambda one: -one[0].distance(one[1])):
-            image = view.draw(image, state, self._limits, caption, discrepancy)
+        for view, state, result in sorted(found, key=lambda one: -one[0].distance(one[1])):
+            image = view.draw(image, state, self._limits, caption, result.discrepancy, result.jumps)
         return image
 
 

@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 
 from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel
@@ -36,6 +36,8 @@ LEAST_SIGMA_PX = 0.3
 ROUNDS, STEPS = 2, 6
 #: Residual of a landmark behind the camera, and the least variance of a scaled unknown that is believed.
 UNSEEN, LEAST_VARIANCE = 1e3, 1e-12
+#: Unknowns closer than this, scaled, are the same minimum; twice the log-likelihood ratio that excludes another one.
+SAME, EXCLUDED = 1.0, 9.0
 #: How much more than by a frame's own points a pose counts that is one over the sequence.
 HELD = 1e4
 
@@ -95,12 +97,14 @@ class StillFit:
     camera : with its terms as estimated.
     terms : of the camera, each value with its standard deviation: the focal length in pixels, the radial
         coefficient.
+    decided : whether other starts were excluded.
     """
 
     state: State
     covariance: Array
     camera: Camera
     terms: dict[str, tuple[float, float]]
+    decided: bool = True
 
 
 def held(state: State, estimator: Estimator) -> Prior:
@@ -171,6 +175,12 @@ class StillProblem:
         step[self._columns] = unknowns[: len(self._columns)]
         state = moved(self._start, step * self._scale)
         return replace(state, parameters=np.clip(state.parameters, self._model.lower, self._model.upper))
+
+    def unknowns(self, state: State) -> Array:
+        """Those of another reference state, with the camera as given."""
+        turned = pose_increment(self._start.camera_from_object, state.camera_from_object)
+        step = np.concatenate([state.parameters - self._start.parameters, turned]) / self._scale
+        return np.concatenate([step[self._columns], np.zeros(len(self._terms))])
 
     def camera(self, unknowns: Array) -> Camera:
         """The camera with its terms, which are zero in ``unknowns`` where it is as given."""
@@ -274,15 +284,29 @@ def corner_radius(camera: Camera) -> float:
     return float(np.hypot(x, y))
 
 
-def fit_still(problem: StillProblem) -> StillFit:
-    """What is one over the sequence, as landmarks and keyframes have it together."""
-    unknowns, found = np.zeros(problem.size), None
-    for number in range(ROUNDS + 1):
-        found = least_squares(
-            problem.residuals, unknowns, bounds=problem.bounds(), diff_step=1e-2, max_nfev=12, ftol=1e-4, x_scale=1.0
-        )
-        unknowns = found.x
-        if number < ROUNDS:
-            problem.weigh(problem.residuals(unknowns))
-    assert found is not None
-    return problem.fitted(unknowns, found.jac)
+def fit_still(problem: StillProblem, alternatives: Sequence[State] = ()) -> StillFit:
+    """What is one over the sequence, as landmarks and keyframes have it together.
+
+    Parameters
+    ----------
+    alternatives : reference states to start from too, such as a plane tilted the other way.
+    """
+    found = _minimum(problem, np.zeros(problem.size))
+    for _ in range(ROUNDS):
+        problem.weigh(problem.residuals(found.x))
+        found = _minimum(problem, found.x)
+    minima = [found, *(_minimum(problem, problem.unknowns(state)) for state in alternatives)]
+    best = min(minima, key=lambda one: one.cost)
+    if best is not found:  # its own residuals say what they weigh
+        problem.weigh(problem.residuals(best.x))
+        minima = [_minimum(problem, one.x) for one in minima]
+        best = min(minima, key=lambda one: one.cost)
+    apart = [one for one in minima if np.abs(one.x - best.x).max() > SAME]
+    decided = all(2.0 * (one.cost - best.cost) > EXCLUDED for one in apart)
+    return replace(problem.fitted(best.x, best.jac), decided=decided)
+
+
+def _minimum(problem: StillProblem, start: Array) -> OptimizeResult:
+    return least_squares(
+        problem.residuals, start, bounds=problem.bounds(), diff_step=1e-2, max_nfev=12, ftol=1e-4, x_scale=1.0
+    )

@@ -10,6 +10,7 @@ import numpy as np
 
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.registration.landmarks import bind_landmarks
+from morph_dslam.registration.messages import Ambiguity, Ambiguous
 from morph_dslam.sources import Frame
 from morph_dslam.tracking.levenberg_marquardt import Box
 from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
@@ -58,11 +59,16 @@ def with_still_pose(
         [n for n in range(len(names)) if part.object.at_rest and n not in constant],
         terms,
     )
-    found = fit_still(problem)
+    found = fit_still(problem, registration.alternatives)
     facts = registration.facts | {"pose": f"one over the sequence, from {len(keyframes)} frames"}
     if found.terms:
         facts["camera"] = {term: {"value": value, "std": std} for term, (value, std) in found.terms.items()}
-    registration = replace(registration, state=found.state, covariance=found.covariance, facts=facts)
+    warnings = registration.warnings
+    if found.decided:
+        warnings = tuple(w for w in warnings if not (isinstance(w, Ambiguous) and w.why is Ambiguity.SHAPES))
+    registration = replace(
+        registration, state=found.state, covariance=found.covariance, facts=facts, warnings=warnings, alternatives=()
+    )
     first, *others = part.cameras
     cameras = (RigCamera(found.camera, first.camera_from_rig), *others)
     return with_pose(replace(part, registration=registration, cameras=cameras), "still")

@@ -21,6 +21,7 @@ from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import Anchor, Anchoring
 from morph_dslam.tracking.discrepancy import DiscrepancyFit
+from morph_dslam.tracking.displacement_jumps import JumpDetector
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
 from morph_dslam.tracking.frame_estimation import at_constant_velocity, new_filter, with_unobservable_at_default
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
@@ -34,9 +35,10 @@ from morph_dslam.tracking.outcomes import (
     ObjectMoved,
     OtherReferenceView,
     PoseSource,
-    ReferenceContradicted,
+    ReferenceWidened,
     Rejection,
     Status,
+    SurfaceJumps,
     TrackingWarning,
 )
 from morph_dslam.tracking.patches import follow, normalize_contrast
@@ -371,6 +373,7 @@ class Tracker:
             reference_factor=1.0 if systematic is None else systematic.reference_factor,
             view=self._view.number,
             discrepancy=hypothesis.discrepancy,
+            jumps=self._jumps.jumps,
         )
 
     def _placed_by_map(self, camera: CameraLocalization) -> PosePrior | None:
@@ -379,6 +382,8 @@ class Tracker:
 
     def _warnings_of_place(self, camera: CameraLocalization) -> list[TrackingWarning]:
         warnings: list[TrackingWarning] = [ObjectMoved()] if self._anchoring.has_moved else []
+        if self._jumps.jumps:
+            warnings.append(SurfaceJumps(max(self._jumps.jumps, key=lambda jump: jump.size).text))
         if self._view.number:
             warnings.append(OtherReferenceView(self._view.number))
         if camera.why_lost:
@@ -404,7 +409,7 @@ class Tracker:
         if left.is_failure:
             warnings.append(ModelDoesNotExplain(left.px))
         if systematic.reference_factor > CLEARLY_WORSE:
-            warnings.append(ReferenceContradicted(systematic.reference_factor))
+            warnings.append(ReferenceWidened(systematic.reference_factor))
         return estimate, left.px, warnings
 
     # -- reference views and state ------------------------------------------------------------------------
@@ -439,6 +444,7 @@ class Tracker:
             lasting = None if factors is None else factors[len(self.model.parameters) :]
             self._still = replace(held(known.state, self.estimator), lasting=lasting)
         self._views = ViewSet(self.estimator, view, options)
+        self._jumps = JumpDetector(view.points.rest, float(np.linalg.norm(np.ptp(self.model.nodes, axis=0))))
         self._anchoring = Anchoring(self.estimator, view, options)
         self.last_measured = view.nothing_measured
         self._image, self._pixels = image, view.pixels
@@ -467,6 +473,10 @@ class Tracker:
         if not self._view.number:
             weights = inliers.astype(float)
             self.last_seen = Keyframe(pixels, weights, estimate.state, estimate.sigma_px, hypothesis.outline)
+            if not hypothesis.outline_alone:
+                shape = self.reference.points.field.value(estimate.state.parameters)
+                depth = float(np.median(self.reference.points.in_camera(estimate.state)[:, 2]))
+                self._jumps.learn(estimate.residuals, inliers, shape, depth / self.camera.fx)
         self._velocity_base = estimate.state if self._lost else self._last
         self._last = estimate.state
         self._start = with_unobservable_at_default(self.model, estimate)

@@ -1,0 +1,198 @@
+"""Where the surface opens or slips along a line and the model does not: a crack that grows, a part that comes off.
+
+Around places spread over the surface a plane is fitted to the residuals of the points nearby, with a step across a
+line through the place, in several directions. A law, load or shape that differs from the model's leaves residuals
+that are smooth over the surface and has no step; a step where the model itself is cut, as by a notch, follows the
+deformation. So a jump is a step that differs from those of earlier frames in which the object had nearly the same
+shape, by many of its deviations and by a share of the object's size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from morph_dslam.model.discrepancy import farthest_points
+
+Array = NDArray[np.float64]
+#: Places, as many as there may be, and how far the points of one reach, as a share of the object's diagonal.
+PLACES, REACH = 350, 0.08
+#: Directions of the line.
+DIRECTIONS = 6
+#: Points on each side of the line.
+LEAST_POINTS = 5
+#: A jump is so many deviations of the step, and this share of the diagonal, and so many pixels.
+LEAST_DEVIATIONS, LEAST_SHARE, LEAST_PX = 6.0, 0.005, 2.0
+#: A shape is nearly the same at a distance between these shares of the largest displacement so far; so many are needed.
+LIKE, LEAST_LIKE = (0.08, 0.25), 5
+#: The object is looked at again when it has moved by this share of the largest displacement so far.
+AGAIN = 0.01
+#: So many times in turn a place must show a jump.
+IN_TURN = 5
+#: Earlier frames that are kept, and those of them that a frame is compared with.
+KEPT, COMPARED = 256, 9
+#: Points by whose displacement shapes are compared.
+SAMPLES = 40
+
+
+@dataclass(frozen=True)
+class DisplacementJump:
+    """A place of the surface that opens or slips along a line.
+
+    Attributes
+    ----------
+    place : (3,) of the undeformed object, metres.
+    size : of the jump, as it has grown since earlier frames of nearly the same shape, metres in the image's plane.
+    reach : distance from the place within which points were compared, metres.
+    """
+
+    place: Array
+    size: float
+    reach: float
+
+    @property
+    def text(self) -> str:
+        """For people: how large it is, and where."""
+        x, y, z = 1e3 * self.place
+        return f"{1e3 * self.size:.2g} mm near x = {x:.1f}, y = {y:.1f}, z = {z:.1f} mm"
+
+
+def near_jumps(jumps: Sequence[DisplacementJump], points: Array) -> NDArray[np.bool_]:
+    """Which points (n, 3) of the undeformed object are within reach of a jump: stress does not hold there."""
+    near = np.zeros(len(points), dtype=bool)
+    for jump in jumps:
+        near |= np.linalg.norm(points - jump.place, axis=1) < jump.reach
+    return near
+
+
+class JumpDetector:
+    """Looks for jumps in the displacement of a surface, frame after frame.
+
+    Parameters
+    ----------
+    rest : (p, 3) points on the undeformed surface, metres.
+    diagonal : of the undeformed object, metres.
+    """
+
+    def __init__(self, rest: Array, diagonal: float) -> None:
+        self._limit, self._reach = LEAST_SHARE * diagonal, REACH * diagonal
+        self._places, self._rows, self._first, self._plane = _surroundings(rest, self._reach)
+        apart = np.linalg.norm(self._places[:, None] - self._places, axis=2)
+        self._near = (apart < self._reach).astype(int)
+        self._samples = farthest_points(rest, SAMPLES) if len(rest) else np.zeros(0, dtype=np.int64)
+        self._shapes: list[Array] = []
+        self._steps: list[Array] = []
+        self._largest = 0.0
+        self._in_turn = np.zeros(len(self._places), dtype=int)
+        self._sizes = np.zeros(len(self._places))
+
+    @property
+    def jumps(self) -> tuple[DisplacementJump, ...]:
+        """Those found so far, each with its largest size: a crack does not heal."""
+        rows = np.flatnonzero(self._sizes)
+        return tuple(DisplacementJump(self._places[k], float(self._sizes[k]), self._reach) for k in rows)
+
+    def learn(self, residuals: Array, used: NDArray[np.bool_], displacement: Array, px: float) -> None:
+        """Take in a frame.
+
+        Parameters
+        ----------
+        residuals : (p, 2) of the points, pixels.
+        used : (p,) those that support the estimate.
+        displacement : (p, 3) by the model, metres.
+        px : metres that a pixel is wide at the object.
+        """
+        if not len(self._places):
+            return
+        shape = displacement[self._samples]
+        away = np.linalg.norm(np.array(self._shapes).reshape(-1, *shape.shape) - shape, axis=2).mean(axis=1)
+        if len(away):
+            self._largest = max(self._largest, float(away[0]))
+            if away[-1] < AGAIN * self._largest:
+                return
+        usable = used & np.isfinite(residuals).all(axis=1)
+        values = np.where(usable[:, None], residuals, 0.0)
+        steps, deviations = _fit_steps(self._rows, self._first, self._plane, values, usable, DIRECTIONS, LEAST_POINTS)
+        steps, deviations = px * steps, px * deviations
+        like = self._like(away)
+        if len(like) >= LEAST_LIKE:
+            before = np.median(like, axis=0)
+            # The deviation of a median is 1.25 times that of a mean, and the median distance 1.18 deviations.
+            spread = 1.25 / 1.18 * np.median(np.linalg.norm(like - before, axis=3), axis=0) / np.sqrt(len(like))
+            self._compare(np.linalg.norm(steps - before, axis=2), np.hypot(deviations, spread), px)
+        self._shapes.append(shape)
+        self._steps.append(steps)
+        if len(self._shapes) > KEPT:  # the first shape stays: it is what displacements are measured from
+            del self._shapes[1::2], self._steps[1::2]
+
+    def _like(self, away: Array) -> Array:
+        """The steps (f, k, d, 2) in earlier frames with nearly this shape, by how far ``away`` (h,) theirs are."""
+        rows = np.flatnonzero((away > LIKE[0] * self._largest) & (away < LIKE[1] * self._largest))
+        chosen = np.unique(np.linspace(0, len(rows) - 1, min(COMPARED, len(rows))).astype(int))
+        return np.array([self._steps[k] for k in rows[chosen]])
+
+    def _compare(self, change: Array, deviations: Array, px: float) -> None:
+        """Note the places at which steps have changed (k, d) by more than steps of these ``deviations`` do."""
+        least = max(self._limit, LEAST_PX * px)
+        with np.errstate(invalid="ignore"):
+            sizes = np.where(change > LEAST_DEVIATIONS * deviations, change, 0.0).max(axis=1)
+        # A line has several places along it, at which the step is about as large.
+        jumps = np.where((sizes > least) & (self._near @ (sizes > 0.5 * least) > 1), sizes, 0.0)
+        self._in_turn = np.where(self._near @ (jumps > 0.0) > 0, self._in_turn + 1, 0)
+        found = (self._in_turn >= IN_TURN) & (jumps > 0.0)
+        self._sizes[found] = np.maximum(self._sizes[found], jumps[found])
+
+
+def _surroundings(rest: Array, reach: float) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array]:
+    """Places (k, 3) with enough points around them, the points of all (m,), where each begins (k + 1,), and the
+    points' coordinates (m, 2) in the plane of those around a place, in reaches."""
+    places, rows, plane = [], [], []
+    for place in rest[:PLACES] if len(rest) <= PLACES else rest[farthest_points(rest, PLACES)]:
+        near = np.flatnonzero(np.linalg.norm(rest - place, axis=1) < reach)
+        if len(near) < 2 * LEAST_POINTS + 2:
+            continue
+        axes = np.linalg.svd(rest[near] - rest[near].mean(axis=0), full_matrices=False)[2]
+        places.append(place)
+        rows.append(near)
+        plane.append((rest[near] - place) @ axes[:2].T / reach)
+    first = np.cumsum([0, *(len(near) for near in rows)])
+    if not places:
+        return np.zeros((0, 3)), np.zeros(0, dtype=np.int64), first, np.zeros((0, 2))
+    return np.array(places), np.concatenate(rows), first, np.concatenate(plane)
+
+
+@njit(cache=True, nogil=True)
+def _fit_steps(rows, first, plane, values, usable, directions, least):
+    """Steps (k, d, 2) of ``values`` (p, 2) across lines through places, and their deviations (k, d); NaN where there
+    are too few points. Each is from the least squares fit of a plane and a step; what the plane takes of the step's
+    own pattern is taken from that first (Frisch and Waugh, Econometrica 1, 1933)."""
+    count = len(first) - 1
+    steps, deviations = np.full((count, directions, 2), np.nan), np.full((count, directions), np.nan)
+    for k in range(count):
+        near = np.array([m for m in range(first[k], first[k + 1]) if usable[rows[m]]])
+        n = len(near)
+        if n < 2 * least + 2:
+            continue
+        design, target = np.ones((n, 3)), np.empty((n, 2))
+        for i in range(n):
+            design[i, 1:] = plane[near[i]]
+            target[i] = values[rows[near[i]]]
+        to_plane = np.linalg.inv(design.T @ design + 1e-9 * np.eye(3)) @ design.T
+        left = target - design @ (to_plane @ target)
+        squares = np.sum(left * left)
+        for d in range(directions):
+            angle = np.pi * d / directions
+            side = np.where(design[:, 1] * np.cos(angle) + design[:, 2] * np.sin(angle) > 0.0, 0.5, -0.5)
+            if 0.5 * n - abs(side.sum()) < least:
+                continue
+            pattern = side - design @ (to_plane @ side)
+            size = np.sum(pattern * pattern)
+            step = pattern @ left / size
+            steps[k, d] = step
+            unexplained = max(squares - size * np.sum(step * step), 0.0) / (2 * (n - 4))
+            deviations[k, d] = np.sqrt(unexplained / size)
+    return steps, deviations

@@ -1,0 +1,96 @@
+"""A crack is found by the step that it makes in the residuals; smooth misfits, noise and rigid parts make none."""
+
+import numpy as np
+import pytest
+
+from morph_dslam.tracking.displacement_jumps import JumpDetector, near_jumps
+
+#: Half a width and half a height of a plate, metres; a pixel is as wide at it.
+HALF, PX = np.array([0.05, 0.03]), 1e-4
+FRAMES, BEGINS = 80, 50
+
+
+@pytest.fixture
+def plate():
+    points = np.random.default_rng(7).uniform(-1.0, 1.0, (350, 2)) * HALF
+    return np.column_stack([points, np.zeros(350)])
+
+
+def detected(plate, residuals_of, used=None, seed=0):
+    """The detector after a test in which the plate is stretched from left to right, and the frame of its first find."""
+    noise, first = np.random.default_rng(seed), None
+    detector = JumpDetector(plate, float(np.linalg.norm(np.ptp(plate, axis=0))))
+    for frame in range(FRAMES):
+        stretch = 0.4 * frame / FRAMES
+        displacement = np.column_stack([stretch * (plate[:, 0] + HALF[0]), np.zeros((350, 2))])
+        residuals = residuals_of(frame, plate / PX) + noise.normal(0.0, 0.3, (350, 2))
+        detector.learn(residuals, np.ones(350, dtype=bool) if used is None else used(frame), displacement, PX)
+        if detector.jumps and first is None:
+            first = frame
+    return detector, first
+
+
+def crack(frame, pixels):
+    """Opens by 1 px a frame across x = 0 in the upper half, fading over the plate's width."""
+    opening = max(frame - BEGINS, 0) * 0.5 * np.sign(pixels[:, 0]) * (pixels[:, 1] > 0.0)
+    return np.column_stack([opening * np.exp(-np.abs(pixels[:, 0]) / 300.0), np.zeros(len(pixels))])
+
+
+def smooth(frame, pixels):
+    """Up to 20 px over the plate: a strain of 4 per cent and a bending that the model has not."""
+    x, y = (pixels * PX / HALF.max())[:, :2].T
+    return frame / FRAMES * np.column_stack([20.0 * x + 10.0 * x * y, 15.0 * x**2])
+
+
+def test_a_crack_is_found_where_and_when_it_opens(plate):
+    detector, first = detected(plate, crack)
+    # Half a per cent of the diagonal is 5.8 px; five looks in turn take more frames.
+    assert BEGINS + 6 <= first <= BEGINS + 16
+    places = np.array([jump.place for jump in detector.jumps])
+    assert np.abs(places[:, 0]).max() < 0.01
+    assert places[:, 1].min() > -0.006
+    largest = max(jump.size for jump in detector.jumps)
+    # It is the growth since earlier frames of nearly the same shape, which show a part of the opening.
+    assert 0.25 * (FRAMES - BEGINS) * PX < largest < (FRAMES - BEGINS) * PX
+    near = near_jumps(detector.jumps, plate)
+    assert near[np.linalg.norm(plate - [0.0, 0.015, 0.0], axis=1) < 0.003].all()
+    assert not near[np.abs(plate[:, 0]) > 0.02].any()
+
+
+def test_a_crack_is_found_beside_a_smooth_misfit(plate):
+    detector, first = detected(plate, lambda frame, pixels: crack(frame, pixels) + smooth(frame, pixels))
+    assert BEGINS + 6 <= first <= BEGINS + 20
+    assert all(abs(jump.place[0]) < 0.01 for jump in detector.jumps)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_smooth_misfit_noise_and_outliers_are_no_crack(plate, seed):
+    wrong = np.random.default_rng(100 + seed)
+
+    def with_outliers(frame, pixels):
+        found = smooth(frame, pixels)
+        found[wrong.choice(len(pixels), 15, replace=False)] += wrong.normal(0.0, 15.0, (15, 2))
+        return found
+
+    assert detected(plate, with_outliers, seed=seed)[1] is None
+
+
+def test_a_step_that_follows_the_deformation_is_no_crack(plate):
+    # A notch that the model draws a little too short opens in proportion from the beginning.
+    def notch(frame, pixels):
+        return np.column_stack([0.05 * frame * np.sign(pixels[:, 0]) * (pixels[:, 1] > 0.0), np.zeros(len(pixels))])
+
+    assert detected(plate, notch)[1] is None
+
+
+def test_points_that_do_not_count_say_nothing(plate):
+    def away_from_the_crack(frame):
+        return np.abs(plate[:, 0]) > 0.008
+
+    assert detected(plate, crack, away_from_the_crack)[1] is None
+
+
+def test_a_few_points_are_not_looked_at():
+    detector = JumpDetector(np.random.default_rng(1).uniform(-1.0, 1.0, (9, 3)), 2.0)
+    detector.learn(np.full((9, 2), np.nan), np.ones(9, dtype=bool), np.zeros((9, 3)), 1e-3)
+    assert detector.jumps == ()
