@@ -25,6 +25,8 @@ Maps = tuple[NDArray, NDArray]
 #: Newton stops when the image point is met to this distance at unit focal length, 1e-7 px at 1000 px.
 TOLERANCE = 1e-10
 MOST_ITERATIONS = 50
+#: A longer readout time is a mistake of units, seconds.
+LONGEST_READOUT_S = 0.5
 #: Numbers of coefficients of each lens model.
 COUNTS: dict[str, tuple[int, ...]] = {"radial-tangential": (4, 5, 8), "fisheye": (4,)}
 
@@ -135,8 +137,11 @@ class Camera:
     distortion : k1, k2, p1, p2[, k3[, k4, k5, k6]] of a radial-tangential lens, empty for none; k1, k2, k3, k4 of a
         fisheye
     lens_model : "radial-tangential", or "fisheye" for the equidistant model
+    readout_s : seconds from the first row to the last of a rolling shutter, 0 for a global one; negative where the
+        last row comes first
 
-    Raises CameraError if the lens model is unknown or takes another number of coefficients.
+    Raises CameraError if the lens model is unknown or takes another number of coefficients, or the readout time is
+    longer than `LONGEST_READOUT_S`.
     """
 
     width: int
@@ -147,6 +152,7 @@ class Camera:
     cy: float
     distortion: tuple[float, ...] = ()
     lens_model: LensModel = "radial-tangential"
+    readout_s: float = 0.0
 
     def __post_init__(self) -> None:
         model, counts, n = self.lens_model, COUNTS.get(self.lens_model), len(self.distortion)
@@ -156,6 +162,11 @@ class Camera:
         if n not in counts and (n or not may_be_none):
             known = " or ".join(str(count) for count in counts) + (", or none" if may_be_none else "")
             raise CameraError(f"{model} distortion has {n} values; give {known}")
+        if not abs(self.readout_s) <= LONGEST_READOUT_S:
+            raise CameraError(
+                f"readout_s is {self.readout_s:g}: give the seconds from the first row of an image to its last, at "
+                f"most {LONGEST_READOUT_S:g}; usual are 0.01 to 0.035"
+            )
 
     @cached_property
     def _lens(self) -> _RadialTangential | _Fisheye | None:

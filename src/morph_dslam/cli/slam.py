@@ -5,6 +5,7 @@ import argparse
 from morph_dslam.cli.arguments import add_file, add_flag, add_output, add_range, frame_number
 
 HELP = "find the path of a camera through a rigid scene, and a map of the scene"
+TERMS = ("focal", "centre", "radial", "readout")
 KEPT = "the frames tracked so far and their map are kept in the run folder"
 
 
@@ -40,6 +41,16 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add_flag(
         command, "--freeze-when-deforming", "keep the map from when a part of the scene begins to move or to deform"
     )
+    command.add_argument(
+        "--refine-camera",
+        action="append",
+        default=[],
+        nargs="?",
+        const="all",
+        choices=(*TERMS, "all"),
+        help="estimate the focal length, the principal point, radial terms of the lens, the readout time of a rolling "
+        "shutter, or all of them first, and write camera.yaml into the run folder; may be repeated",
+    )
     add_flag(command, "--no-depth", "leave the depth images of the recording aside")
     add_flag(command, "--overwrite", "replace a run that is in the run folder")
     add_flag(command, "--no-video", "do not draw the video with tracked points")
@@ -64,9 +75,14 @@ def run(arguments: argparse.Namespace) -> None:
         map_path=arguments.map,
         trajectory=arguments.trajectory,
         images=arguments.images,
+        refine=TERMS if "all" in arguments.refine_camera else tuple(dict.fromkeys(arguments.refine_camera)),
         video=not arguments.no_video,
         overwrite=arguments.overwrite,
     )
+    for term, found in summary.get("refined_camera", {}).items():
+        given, values, std = (", ".join(f"{v:.4g}" for v in found[key]) for key in ("given", "estimated", "std"))
+        kept = "" if found["is_observable"] else "; unobservable here, kept as given"
+        print(f"{term}: {values} (standard deviation {std}), was {given}{kept}")
     for flag in summary["flags"]:
         print(f"note: {flag}")
     print(f"wrote {arguments.output}")

@@ -1,8 +1,8 @@
 """Camera files: a small YAML of intrinsics, and the calibrations of other programs.
 
-The keys of our own are width, height, fx, fy, cx, cy, optionally distortion ([k1, k2, p1, p2, k3], OpenCV's order) and
-lens (radial-tangential, or fisheye with k1, k2, k3, k4). Formats of other programs are recognised by the keys that only
-they have, and translated to these.
+The keys of our own are width, height, fx, fy, cx, cy, optionally distortion ([k1, k2, p1, p2, k3], OpenCV's order),
+lens (radial-tangential, or fisheye with k1, k2, k3, k4) and readout_s (seconds, of a rolling shutter). Formats of other
+programs are recognised by the keys that only they have, and translated to these.
 """
 
 from __future__ import annotations
@@ -51,6 +51,7 @@ class _CameraFile(Section):
     cy: float = Field(gt=-LARGEST_PX, lt=LARGEST_PX)
     distortion: list[FiniteFloat] = Field(default_factory=list)
     lens: str = "radial-tangential"
+    readout_s: FiniteFloat = 0.0
 
 
 class _Loader(yaml.SafeLoader):
@@ -133,11 +134,11 @@ def parse_camera(content: object, where: str) -> Camera:
     except ValidationError as error:
         raise CameraError(
             f"{where}: {explain(_CameraFile, error)}; a camera file has width, height, fx, fy, cx, cy "
-            "and optionally distortion [k1, k2, p1, p2, k3] and lens"
+            "and optionally distortion [k1, k2, p1, p2, k3], lens and readout_s"
         ) from error
     intrinsics = (values.width, values.height, values.fx, values.fy, values.cx, values.cy)
     try:
-        return Camera(*intrinsics, tuple(values.distortion), cast(LensModel, values.lens))
+        return Camera(*intrinsics, tuple(values.distortion), cast(LensModel, values.lens), values.readout_s)
     except CameraError as error:
         raise CameraError(f"{where}: {error}") from error
 
@@ -148,6 +149,8 @@ def save_camera(path: Path, camera: Camera) -> None:
     content["distortion"] = list(camera.distortion)
     if camera.distortion:
         content["lens"] = camera.lens_model
+    if camera.readout_s:
+        content["readout_s"] = camera.readout_s
     path.write_text(yaml.safe_dump(content, sort_keys=False))
 
 

@@ -284,6 +284,11 @@ class FrameImages:
             self.camera, self._maps, self._right_maps = camera, camera.undistortion_maps(), None
             self.baseline_px = camera.fx * VIRTUAL_BASELINE if with_depth else 0.0
 
+    @property
+    def is_stereo(self) -> bool:
+        """Whether frames come in rectified pairs."""
+        return self._right_maps is not None
+
     def undistort(self, image: Image) -> Image:
         """The image (h, w[, 3]) as ``camera`` would have seen it."""
         return self._remapped(image, self._maps)

@@ -17,8 +17,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from morph_dslam.camera import Camera
 from morph_dslam.errors import MapError
-from morph_dslam.io.camera_files import load_camera_or_pair
+from morph_dslam.io.camera_files import load_camera_or_pair, save_camera
 from morph_dslam.io.colmap import ColmapImage, ColmapModel, read_colmap_model, write_colmap_model
 from morph_dslam.io.folders import make_run_folder
 from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
@@ -27,8 +28,9 @@ from morph_dslam.slam.frame_images import FrameImages
 from morph_dslam.slam.options import SlamOptions
 from morph_dslam.slam.result import STAGES, SlamFrame
 from morph_dslam.slam.rigid_map import GOOD
-from morph_dslam.slam.scene import Scene, finish_scene, load_scene, start_slam, track_frames
-from morph_dslam.sources import open_source, open_stream
+from morph_dslam.slam.scene import Scene, finish_scene, load_scene, refine_camera, start_slam, track_frames
+from morph_dslam.slam.self_calibration import CameraEstimate, CameraTerm
+from morph_dslam.sources import FrameSource, open_source, open_stream
 from morph_dslam.sources.live import LiveStream
 
 Array = NDArray[np.float64]
@@ -49,6 +51,7 @@ def run_slam(
     map_path: Path | None = None,
     trajectory: Path | None = None,
     images: Path | None = None,
+    refine: Sequence[CameraTerm] = (),
     video: bool = True,
     overwrite: bool = False,
     progress: bool = True,
@@ -68,6 +71,7 @@ def run_slam(
     map_path : map of an earlier run with the same camera, or folder of a COLMAP model; a new map by default
     trajectory : file of poses to make the map with instead
     images : recording that the model or the trajectory belongs to; the source by default
+    refine : terms of the camera to estimate before; the camera goes into the run folder, ``camera.yaml``
     video : draw the video with the points followed
     overwrite : replace a run that is there already
     progress : whether to show a bar
@@ -86,10 +90,19 @@ def run_slam(
         raise MapError("a map comes either from --map or from --trajectory, not from both")
     if images is not None and trajectory is None and not is_model:
         raise MapError("--images says what a COLMAP model (--map MODEL) or poses (--trajectory) are of")
+    if refine and (map_path is not None or trajectory is not None):
+        raise MapError("--refine-camera makes a new map: leave out --map and --trajectory")
     one_or_two, stream = load_camera_or_pair(camera), open_stream(source, first, last)
     with stream if isinstance(stream, LiveStream) else nullcontext():
         make_run_folder(output, overwrite, "trajectory.txt")
         known: Scene | Trajectory | ColmapModel | None = None
+        refined: CameraEstimate | None = None
+        if refine:
+            if not isinstance(stream, FrameSource) or not isinstance(one_or_two, Camera):
+                raise MapError("--refine-camera needs a recording of one camera, no live camera and no stereo pair")
+            refined = refine_camera(stream, one_or_two, refine, options, progress)
+            one_or_two = refined.camera
+            save_camera(output / "camera.yaml", one_or_two)
         if trajectory is not None:
             known = load_trajectory(trajectory)
         elif map_path is not None:
@@ -107,6 +120,8 @@ def run_slam(
                     frames.append(frame)
         finally:
             more: dict[str, Any] = {"inputs": {"source": str(source), "camera": str(camera)}}
+            if refined is not None:
+                more["refined_camera"] = {term: found.facts() for term, found in refined.terms.items()}
             if isinstance(stream, LiveStream):
                 more["n_dropped"] = stream.dropped - n_before
             summary = write_run(output, finish_scene(slam, frames), more) if frames else {}

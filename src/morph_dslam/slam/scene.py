@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence, Sized
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,32 +14,36 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from morph_dslam.camera import Camera, StereoCamera
-from morph_dslam.errors import SourceError
+from morph_dslam.errors import MapError, SourceError
 from morph_dslam.io.colmap import ColmapModel
 from morph_dslam.io.trajectory import Trajectory
+from morph_dslam.slam import rolling_shutter
 from morph_dslam.slam.bundle_adjustment import Observations, adjust
 from morph_dslam.slam.frame_images import least_distances, orientations
-from morph_dslam.slam.local_map import gather
 from morph_dslam.slam.map_files import load_map_and_trajectory, map_from_colmap, map_from_trajectory, save_map
 from morph_dslam.slam.options import SlamOptions
 from morph_dslam.slam.pose import inverse, refine_pose
 from morph_dslam.slam.relocalization import bit_counts
 from morph_dslam.slam.result import STAGES, SlamFrame, SlamStatus
-from morph_dslam.slam.rigid_map import Keyframe, RigidMap
+from morph_dslam.slam.rigid_map import Followed, Keyframe, RigidMap
+from morph_dslam.slam.self_calibration import (
+    TERMS,
+    CameraEstimate,
+    CameraTerm,
+    camera_notes,
+    estimate_camera,
+    with_terms_of,
+)
 from morph_dslam.slam.slam import Slam
-from morph_dslam.sources import FrameSource, FrameStream, open_stream
+from morph_dslam.sources import FrameSource, FrameStream, open_source, open_stream
 from morph_dslam.sources.frames import has_registered_depth
 from morph_dslam.sources.live import LiveStream
 from morph_dslam.threads import threads_side_by_side
 from morph_dslam.tracking.patches import patch_correlation
 
 Array = NDArray[np.float64]
-#: Factors of the focal length that are tried; the ends mean that it may lie beyond.
-FACTORS = np.exp(np.linspace(np.log(0.7), np.log(1.43), 9))
-#: Keyframes that are adjusted, and the fewest that say anything.
-MOST_KEYFRAMES, LEAST_KEYFRAMES = 12, 5
-#: The cost with the best factor has to be this part of the given one's, and the factor this far from 1.
-MOST_COST, LEAST_DEVIATION = 0.7, 0.04
+#: Maps that a camera is estimated from, each made with the estimate before.
+REFINING_RUNS = 2
 #: What is called with each undistorted image (h, w[, 3]) and what it gave.
 Watch = Callable[[NDArray[np.uint8], SlamFrame], None]
 
@@ -79,6 +83,16 @@ class Scene:
     def is_metric(self) -> bool:
         """Whether lengths are metres."""
         return self.map.is_metric
+
+    def camera_estimate(self, terms: Sequence[CameraTerm] = TERMS) -> CameraEstimate | None:
+        """The camera as the recording shows it.
+
+        None where nothing tells: too few frames or points, a map that was kept as it is, or a stereo pair.
+        """
+        if self.slam is None or self.slam.frame_images.is_stereo:
+            return None
+        seen = _seen(self.slam, self.frames, self.trajectory)
+        return estimate_camera(self.map, self.camera, self.trajectory, seen, terms)
 
     def save(self, path: str | Path) -> None:
         """Write map and path into one file, which `load_scene` and the commands read."""
@@ -174,21 +188,80 @@ def track_frames(
             result = slam.process_frame(frame.image, frame.index, frame.timestamp, frame.depth, frame.right)
             if watch is not None:
                 watch(slam.undistort(frame.image), result)
-            yield result.record(is_final=slam.is_frozen)
+            yield result.record(is_final=slam.is_frozen and not slam.camera.readout_s)
 
 
 def finish_scene(slam: Slam, frames: Sequence[SlamFrame]) -> Scene:
     """Refine the map, once the sequence is over, and the path by it."""
     slam.refine_map()
-    return Scene(slam.camera, slam.map, trajectory_of(slam, frames), tuple(frames), slam)
+    trajectory = trajectory_of(slam, frames)
+    for _ in range(rolling_shutter.ROUNDS if slam.camera.readout_s and not slam.is_frozen else 0):
+        rolling_shutter.correct_map(slam.map, slam.camera, trajectory)
+        trajectory = trajectory_of(slam, frames)
+    return Scene(slam.camera, slam.map, trajectory, tuple(frames), slam)
 
 
 def trajectory_of(slam: Slam, frames: Sequence[SlamFrame]) -> Trajectory:
-    """The camera's path through all frames that have a pose, by what the map knows now."""
+    """The camera's path through all frames that have a pose, by what the map knows now.
+
+    With a rolling shutter, whose readout time the camera has, poses are those of the middle rows' instants.
+    """
     posed = [(frame, slam.camera_from_world(frame)) for frame in frames]
-    found = [(frame.index, frame.timestamp, inverse(pose)) for frame, pose in posed if pose is not None]
-    indices, times, poses = zip(*found, strict=True) if found else ((), (), ())
-    return Trajectory(np.array(times), np.array(poses).reshape(-1, 4, 4), np.array(indices, dtype=np.int64))
+    found = [(frame, inverse(pose)) for frame, pose in posed if pose is not None]
+    times, indices = [frame.timestamp for frame, _ in found], [frame.index for frame, _ in found]
+    poses = np.array([pose for _, pose in found]).reshape(-1, 4, 4)
+    path = Trajectory(np.array(times), poses, np.array(indices, dtype=np.int64))
+    if not slam.camera.readout_s:
+        return path
+    return rolling_shutter.correct_path(slam.map, slam.camera, path, _seen(slam, frames, path))
+
+
+def _seen(slam: Slam, frames: Sequence[SlamFrame], path: Trajectory) -> list[Followed]:
+    """The map points that the frames of a path saw."""
+    by_index = {frame.index: frame for frame in frames}
+    return [slam.map.good_of(by_index[index].points) for index in path.indices.tolist()]
+
+
+def refine_camera(
+    source: FrameSource | str | Path,
+    camera: Camera,
+    terms: Sequence[CameraTerm] = TERMS,
+    options: SlamOptions | None = None,
+    progress: bool = False,
+) -> CameraEstimate:
+    """A camera's intrinsics, lens and readout time from a recording of a rigid scene.
+
+    The scene is mapped, the camera estimated, and both once more with what was found. Terms that the recording does not
+    show stay as given.
+
+    Parameters
+    ----------
+    source : a recording, or what `open_source` opens
+    camera : as it was taken to be
+    terms : to estimate; the others are taken to be right
+    options : of the maps
+    progress : whether to show bars
+
+    Raises MapError if the recording gives too small a map.
+    """
+    opened = open_source(source) if isinstance(source, str | Path) else source
+    estimates, refined, free = list[CameraEstimate](), camera, tuple(terms)
+    for _ in range(REFINING_RUNS):
+        estimate = map_scene(opened, refined, options, progress).camera_estimate(free)
+        if estimate is None:
+            raise MapError(
+                f"the camera cannot be estimated from {opened.name}: too few frames have a pose, or too few points "
+                "are seen in several; film a textured, rigid scene, or leave out --refine-camera"
+            )
+        hidden = [term for term, found in estimate.terms.items() if not found.is_observable]
+        estimates.append(estimate)
+        refined = with_terms_of(refined, estimate.camera, [term for term in free if term not in hidden])
+        free = tuple(term for term in free if term not in hidden)
+        if not free:
+            break
+    last = {term: found for estimate in estimates for term, found in estimate.terms.items()}
+    first = estimates[0].terms
+    return CameraEstimate(refined, {t: replace(found, given=first[t].given) for t, found in last.items()})
 
 
 def _summary_of_run(scene: Scene, slam: Slam) -> dict[str, Any]:
@@ -198,7 +271,7 @@ def _summary_of_run(scene: Scene, slam: Slam) -> dict[str, Any]:
     times = np.array([frame.total_ms for frame in after] or [0.0])
     waits = np.array([frame.waited_ms for frame in after] or [0.0])
     errors = [frame.pose.rms_px for frame in found if frame.pose is not None]
-    factor = suspected_focal_factor(slam.map, slam.camera.intrinsics)
+    estimate = scene.camera_estimate()
     return {
         "n_frames": len(scene.frames),
         "start_frame": found[0].index if found else None,
@@ -208,7 +281,7 @@ def _summary_of_run(scene: Scene, slam: Slam) -> dict[str, Any]:
         "map_frozen": slam.is_frozen,
         "frozen_by_itself_at": slam.frozen_at,
         "n_loops_closed": slam.n_loops,
-        "suspected_focal_factor": factor,
+        "camera": {term: found.facts() for term, found in estimate.terms.items()} if estimate else None,
         "median_rms_px": float(np.median(errors)) if errors else None,
         "median_ms": float(np.median(times)),
         "p95_ms": float(np.percentile(times, 95)),
@@ -216,70 +289,19 @@ def _summary_of_run(scene: Scene, slam: Slam) -> dict[str, Any]:
         "longest_wait_for_mapper_ms": float(np.max(waits)),
         "p99_wait_for_mapper_ms": float(np.percentile(waits, 99)),
         "settings": asdict(slam.options),
-        "flags": list(_flags(scene, slam, after, factor)),
+        "flags": [*_flags(scene, slam, after), *(camera_notes(estimate) if estimate else ())],
     }
 
 
-def _flags(scene: Scene, slam: Slam, after: Sequence[SlamFrame], focal_factor: float | None) -> Iterator[str]:
+def _flags(scene: Scene, slam: Slam, after: Sequence[SlamFrame]) -> Iterator[str]:
     """What a reader of the summary must know."""
     n_lost = sum(frame.status is SlamStatus.LOST for frame in after)
     if n_lost:
         yield f"{n_lost} frames after the start were lost: frames.csv says why"
     if slam.n_restarts:
         yield f"{slam.n_restarts} young maps were lost for too long and given up, with their poses"
-    if focal_factor is not None:
-        yield (
-            f"a focal length {focal_factor:.2f} times that of the camera file would explain the map clearly "
-            "better: check the calibration"
-        )
     if not len(scene.trajectory) and scene.frames:
         yield f"no map was begun: {scene.frames[-1].reason}"
-
-
-def suspected_focal_factor(rigid_map: RigidMap, intrinsics: Array) -> float | None:
-    """By what the focal length would have to be multiplied; None where the given one is as good as any.
-
-    Keyframes and points are adjusted once more for each of some focal lengths. A wrong one leaves more error where the
-    camera turned and moved; where it hardly turned, any fits about as well.
-
-    Parameters
-    ----------
-    intrinsics : (4,) fx, fy, cx, cy that the map was made with.
-    """
-    if len(rigid_map.keyframes) < LEAST_KEYFRAMES:
-        return None
-    costs = np.array([_cost(rigid_map, intrinsics, factor) for factor in (1.0, *FACTORS)])
-    given, tried = costs[0], costs[1:]
-    best = int(tried.argmin())
-    if tried[best] > MOST_COST * given:
-        return None
-    factor = float(FACTORS[best])
-    if 0 < best < len(FACTORS) - 1:
-        # The factor at the bottom of the parabola through the three costs around the least, over equal steps.
-        left, middle, right = tried[best - 1 : best + 2]
-        shift = 0.5 * (left - right) / (left - 2.0 * middle + right)
-        factor *= float((FACTORS[1] / FACTORS[0]) ** shift)
-    return factor if abs(factor - 1.0) > LEAST_DEVIATION else None
-
-
-def _cost(rigid_map: RigidMap, intrinsics: Array, factor: float) -> float:
-    """Huber cost, px^2, of keyframes spread over the map after adjustment with another focal length."""
-    kept = rigid_map.kept_keyframes
-    chosen = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), MOST_KEYFRAMES)).astype(int))
-    problem = gather(rigid_map, intrinsics, kept[chosen], kept[:0], iterations=25)
-    seen, scaled = problem.observations, intrinsics * [factor, factor, 1.0, 1.0]
-    twice = np.bincount(seen.point_idx)[seen.point_idx] >= 2
-    observations = Observations(seen.camera_idx[twice], seen.point_idx[twice], seen.pixels[twice])
-    return adjust(
-        problem.camera_from_world,
-        problem.positions,
-        observations,
-        scaled,
-        problem.held,
-        huber_px=1.0,
-        iterations=problem.iterations,
-        tolerance=1e-4,
-    ).cost
 
 
 def warm_up() -> None:

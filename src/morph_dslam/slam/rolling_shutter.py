@@ -1,0 +1,142 @@
+"""Rolling shutter: the rows of an image are recorded one after the other, while the camera moves on.
+
+A pose is that of the middle row's instant. Around it the camera keeps its velocity, which follows from the frames
+before and after (Hedborg et al., Rolling Shutter Bundle Adjustment, 2012, with central differences instead of an
+interpolation). A point's pixel is moved to where it would be at the middle row's instant; every method for a global
+shutter then applies.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from morph_dslam.camera import Camera
+from morph_dslam.io.trajectory import Trajectory
+from morph_dslam.slam.local_map import gather
+from morph_dslam.slam.options import INLIER_PX, LEAST_INLIERS
+from morph_dslam.slam.pose import inverse, refine_pose
+from morph_dslam.slam.rigid_map import Followed, RigidMap
+
+Array = NDArray[np.float64]
+#: Frames farther apart say nothing of the velocity in between, seconds.
+MOST_GAP_S = 0.15
+#: Rounds in which pixels are moved with the poses of the round before.
+ROUNDS = 3
+
+
+def velocities(timestamps: Array, camera_from_world: Array) -> Array:
+    """Twists (n, 6) of cameras per second, by the frames before and after each.
+
+    Rotation (rad/s), then translation, from the left: the camera's own axes. NaN where no other frame is near.
+
+    Parameters
+    ----------
+    timestamps : (n,) seconds, ascending
+    camera_from_world : (n, 4, 4)
+    """
+    n = len(timestamps)
+    result = np.full((n, 6), np.nan)
+    for k in range(n):
+        near = [j for j in (k - 1, k, k + 1) if 0 <= j < n and abs(timestamps[j] - timestamps[k]) < MOST_GAP_S]
+        first, last = near[0], near[-1]
+        if first != last:
+            moved = camera_from_world[last] @ inverse(camera_from_world[first])
+            twist = np.concatenate([Rotation.from_matrix(moved[:3, :3]).as_rotvec(), moved[:3, 3]])
+            result[k] = twist / (timestamps[last] - timestamps[first])
+    return result
+
+
+def row_times(rows: Array, camera: Camera) -> Array:
+    """Instants (n,) of rows (n,) of the recorded image, in readout times after the middle row's."""
+    return (rows - 0.5 * (camera.height - 1)) / camera.height
+
+
+def after(points: Array, twists: Array, seconds: Array) -> Array:
+    """Points (n, 3) in the axes of cameras that have moved on by twists (n, 6) for some time (n,)."""
+    turned = Rotation.from_rotvec(twists[:, :3] * seconds[:, None]).apply(points)
+    return turned + twists[:, 3:] * seconds[:, None]
+
+
+def middle_row_pixels(camera: Camera, camera_from_world: Array, twist: Array, points: Array, pixels: Array) -> Array:
+    """Undistorted pixels (n, 2) at the middle row's instant of points (n, 3), which were seen at ``pixels`` (n, 2).
+
+    Parameters
+    ----------
+    camera : with its readout time
+    camera_from_world : (4, 4) at the middle row's instant
+    twist : (6,) the camera's velocity, NaN if unknown: then the pixels stay
+    """
+    if not camera.readout_s or not np.isfinite(twist).all() or not len(points):
+        return pixels
+    local = points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+    seconds = camera.readout_s * row_times(camera.distort_pixels(pixels)[:, 1], camera)
+    moved = after(local, np.broadcast_to(twist, (len(local), 6)), seconds)
+    return pixels + np.nan_to_num(camera.project(local) - camera.project(moved))
+
+
+def correct_path(rigid_map: RigidMap, camera: Camera, trajectory: Trajectory, seen: list[Followed]) -> Trajectory:
+    """The path at the middle rows' instants.
+
+    Parameters
+    ----------
+    trajectory : as of a global shutter
+    seen : map points in each of its frames
+    """
+    poses = np.linalg.inv(trajectory.world_from_camera)
+    for _ in range(ROUNDS if camera.readout_s and len(poses) else 0):
+        twists = velocities(trajectory.timestamps, poses)
+        for row, points in enumerate(seen):
+            if len(points.ids) >= LEAST_INLIERS:
+                poses[row] = _refined(rigid_map, camera, poses[row], twists[row], points)
+    return Trajectory(trajectory.timestamps, np.linalg.inv(poses), trajectory.indices)
+
+
+def _refined(rigid_map: RigidMap, camera: Camera, pose: Array, twist: Array, seen: Followed) -> Array:
+    positions = rigid_map.positions[seen.ids]
+    pixels = middle_row_pixels(camera, pose, twist, positions, seen.pixels)
+    estimate = refine_pose(
+        pose,
+        positions,
+        pixels,
+        camera.intrinsics,
+        inlier_px=INLIER_PX,
+        right=seen.right + pixels[:, 0] - seen.pixels[:, 0],  # disparities stay what they were
+        baseline_px=rigid_map.baseline_px,
+    )
+    return estimate.camera_from_world if estimate.inliers.sum() >= LEAST_INLIERS else pose
+
+
+def correct_map(rigid_map: RigidMap, camera: Camera, trajectory: Trajectory) -> None:
+    """Adjust keyframes and points to the middle rows' instants.
+
+    Keyframes whose velocity the path does not tell take no part; they follow where the points have gone.
+    """
+    rows = {index: row for row, index in enumerate(trajectory.indices.tolist())}
+    twists = velocities(trajectory.timestamps, np.linalg.inv(trajectory.world_from_camera))
+    kept = rigid_map.kept_keyframes
+    row_of = np.array([rows.get(rigid_map.keyframes[k].index, -1) for k in kept])
+    known = row_of >= 0
+    known[known] = np.isfinite(twists[row_of[known]]).all(axis=1)
+    if known.sum() < 2:
+        return
+    problem = gather(rigid_map, camera.intrinsics, kept[known], kept[:0], iterations=25)
+    observations = problem.observations
+    for number, row in enumerate(row_of[known]):
+        own = observations.camera_idx == number
+        points = problem.positions[observations.point_idx[own]]
+        pose, pixels = problem.camera_from_world[number], observations.pixels[own]
+        observations.pixels[own] = middle_row_pixels(camera, pose, twists[row], points, pixels)
+        if observations.right_columns is not None:
+            observations.right_columns[own] += observations.pixels[own, 0] - pixels[:, 0]
+    result = problem.solve()
+    rigid_map.positions[problem.ids] = result.points
+    for k, pose in zip(problem.numbers, result.camera_from_world, strict=True):
+        rigid_map.keyframes[k].camera_from_world = pose
+    for k in kept[~known]:
+        keyframe = rigid_map.keyframes[k]
+        seen = rigid_map.good_of(keyframe.seen)
+        if len(seen.ids) >= LEAST_INLIERS:
+            nowhere = np.full(6, np.nan)
+            keyframe.camera_from_world = _refined(rigid_map, camera, keyframe.camera_from_world, nowhere, seen)
