@@ -10,8 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
+from morph_dslam.camera import Camera
 from morph_dslam.cli.app import main
 from morph_dslam.errors import CameraError, MapError
+from morph_dslam.evaluation.trajectory import absolute_error, match
+from morph_dslam.io.camera_files import load_camera
 from morph_dslam.io.trajectory import load_trajectory
 from morph_dslam.slam.map_files import save_map
 from morph_dslam.slam.mapping import Mapper
@@ -21,7 +24,7 @@ from morph_dslam.slam.rigid_map import RigidMap
 from morph_dslam.slam.scene import finish_scene, load_scene, map_scene, trajectory_of
 from morph_dslam.slam.slam import Slam
 from morph_dslam.sources.live import PacedRecording
-from tests.support.real_data import ROOT
+from tests.support.real_data import ROOT, real_data
 from tests.support.rendered_room import (
     CAMERA,
     SHEET_NODES,
@@ -36,6 +39,7 @@ from tests.support.rendered_room import (
     room_with_sheet,
     to_truth,
     wall,
+    write_film,
 )
 
 WAITING, TRACKED, RELOCALIZED, LOST = SlamStatus
@@ -72,7 +76,8 @@ def test_the_path_through_a_room_is_found_and_the_map_lies_on_its_walls(room_sce
     assert not room_scene.is_metric
     summary = room_scene.summary()
     assert (summary["n_frames"], summary["start_frame"], summary["n_tracked"]) == (80, start, 80 - start)
-    assert summary["suspected_focal_factor"] is None
+    assert not any(term["is_wrong"] for term in summary["camera"].values())
+    assert not summary["flags"]
     assert summary["n_keyframes"] == len(room_scene.keyframes) > 4
 
 
@@ -163,11 +168,59 @@ def test_the_camera_is_found_in_no_other_room(small_map):
     assert {frame.reason for frame in frames[1:]} == {NoPose(SlamReason.NO_SIMILAR_KEYFRAME)}
 
 
-@pytest.mark.parametrize("scale", [0.85, 1.2])
-def test_a_wrong_focal_length_is_found_out(room_film, scale):
-    summary = map_scene(Film(room_film[0]), replace(CAMERA, fx=scale * 525.0, fy=scale * 525.0)).summary()
-    assert summary["suspected_focal_factor"] == pytest.approx(1.0 / scale, rel=0.02)
+@pytest.mark.parametrize(
+    ("term", "given"), [("focal", {"fx": 577.5, "fy": 577.5}), ("centre", {"cx": 349.5})], ids=["focal", "centre"]
+)
+def test_a_wrong_camera_is_found_out(room_film, term, given):
+    summary = map_scene(Film(room_film[0]), replace(CAMERA, **given)).summary()
+    assert {name for name, found in summary["camera"].items() if found["is_wrong"]} == {term}
+    assert summary["camera"]["focal"]["estimated"][0] == pytest.approx(525.0, rel=0.015)
     assert len(summary["flags"]) == 1
+
+
+def test_the_camera_is_refined_and_the_map_is_of_the_refined_one(tmp_path, room_film, capsys):
+    write_film(tmp_path, room_film[0], replace(CAMERA, fx=577.5, fy=577.5))
+    run, camera = tmp_path / "run", tmp_path / "camera.yaml"
+    command = ["slam", str(tmp_path / "film"), "--camera", str(camera), "-o", str(run), "--no-video"]
+    assert main([*command, "--refine-camera", "focal"]) == 0
+    assert "focal: 52" in capsys.readouterr().out
+    refined = load_camera(run / "camera.yaml")
+    assert refined == replace(CAMERA, fx=refined.fx, fy=refined.fy)
+    assert refined.fx == pytest.approx(525.0, rel=0.01)
+    summary = json.loads((run / "summary.json").read_text())
+    assert summary["refined_camera"]["focal"]["given"] == [577.5]
+    assert not summary["flags"]
+    assert np.median(path_errors(load_scene(run / "map.h5", refined).trajectory, room_film[1])) < 0.005
+
+
+@pytest.mark.parametrize(
+    ("more", "message"), [(["--map", "map.h5"], "leave out --map"), (["--trajectory", "t.txt"], "leave out --map")]
+)
+def test_no_camera_is_refined_in_a_known_map(tmp_path, room_folder, capsys, more, message):
+    command = ["slam", str(room_folder / "film"), "--camera", str(room_folder / "camera.yaml"), "--refine-camera"]
+    assert main([*command, *more, "-o", str(tmp_path / "run")]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_real_rolling_shutter_is_named_and_estimated(tmp_path):
+    """The truth's own readout times are about a frame interval (`rbt_scene`); its poses are good to a few mm."""
+    folder = real_data("rbt_scene")
+    scene = map_scene(folder / "rgb", load_camera(folder / "camera.yaml"))
+    estimate = scene.camera_estimate()
+    assert [term for term, found in estimate.terms.items() if found.is_wrong] == ["readout"]
+    readout = scene.camera_estimate(["readout"]).camera.readout_s
+    assert readout == pytest.approx(1.0 / 30.0, rel=0.15)
+    truth = load_trajectory(folder / "tags_shutter_corrected.txt")
+    corrected = map_scene(folder / "rgb", replace(scene.camera, readout_s=readout))
+    errors = [absolute_error(*match(s.trajectory, truth), with_scale=True).distances for s in (scene, corrected)]
+    before, after = (1e3 * np.sqrt(np.mean(distances**2)) for distances in errors)
+    assert after < 6.5 < before
+
+
+def test_the_usual_focal_length_of_a_real_recording_is_not_called_wrong():
+    scene = map_scene(real_data("7scenes_redkitchen"), Camera(640, 480, 525.0, 525.0, 320.0, 240.0))
+    wrong = [term for term, found in scene.camera_estimate().terms.items() if found.is_wrong]
+    assert wrong in ([], ["readout"])  # the recording's colour camera has a rolling shutter
 
 
 def test_the_command_writes_a_run_that_evaluate_reads(tmp_path, room_folder, capsys):

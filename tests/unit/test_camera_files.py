@@ -110,6 +110,17 @@ def test_a_handwritten_file_is_read(tmp_path):
     assert load_camera(tmp_path / "camera.yaml") == Camera(640, 480, 528.0, 527.5, 320.0, 239.5)
 
 
+def test_the_readout_time_of_a_rolling_shutter_is_read_and_written(tmp_path):
+    path = tmp_path / "camera.yaml"
+    path.write_text(GOOD + "readout_s: 0.0333\n")
+    camera = load_camera(path)
+    assert camera == Camera(640, 480, 528.0, 527.5, 320.0, 239.5, readout_s=0.0333)
+    save_camera(path, camera)
+    assert load_camera(path) == camera
+    path.write_text(ROS + "readout_s: -0.02\n")
+    assert load_camera(path).readout_s == -0.02
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -200,6 +211,7 @@ def test_a_camera_chosen_from_a_colmap_model(tmp_path):
         ("- 1\n- 2\n", "holds no camera"),
         ("width: [640\n", "not a YAML file"),
         (GOOD.replace("fx: 528.0\n", ""), "fx is missing"),
+        (GOOD + "readout_s: 33.3\n", "readout_s is 33.3: give the seconds"),
         (GOOD + "focal: 3\n", "unknown key focal; known here: width, height, fx"),
         (GOOD.replace("528.0", "wide"), "fx: Input should be a valid number"),
         (GOOD.replace("528.0", ".nan"), "fx: Input should be"),

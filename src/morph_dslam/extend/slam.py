@@ -9,5 +9,6 @@ from morph_dslam.slam.result import (
     SlamStatus as SlamStatus,
 )
 from morph_dslam.slam.run import run_slam as run_slam
-from morph_dslam.slam.scene import trajectory_of as trajectory_of, warm_up as warm_up
+from morph_dslam.slam.scene import refine_camera as refine_camera, trajectory_of as trajectory_of, warm_up as warm_up
+from morph_dslam.slam.self_calibration import CameraEstimate as CameraEstimate, TermEstimate as TermEstimate
 from morph_dslam.slam.slam import Slam as Slam

@@ -2,7 +2,7 @@
 
 The keys of our own are width, height, fx, fy, cx, cy, optionally distortion ([k1, k2, p1, p2, k3], OpenCV's order),
 lens (radial-tangential, or fisheye with k1, k2, k3, k4) and readout_s (seconds, of a rolling shutter). Formats of other
-programs are recognised by the keys that only they have, and translated to these.
+programs are recognised by the keys that only they have, and translated to these; readout_s may be added to them.
 """
 
 from __future__ import annotations
@@ -87,7 +87,11 @@ def load_camera(path: str | Path) -> Camera:
     elif name is not None:
         raise CameraError(f"{path} holds one camera only: leave out #{name}")
     translate = _translator_of(content) if isinstance(content, dict) else None
-    return parse_camera(content if translate is None else translate(cast(dict, content), where), where)
+    if translate is not None:
+        given = cast(dict, content)
+        # Other programs have no key for the readout time: ours may be added to their files.
+        content = translate(given, where) | {key: given[key] for key in ("readout_s",) if key in given}
+    return parse_camera(content, where)
 
 
 def load_camera_or_pair(path: str | Path) -> Camera | StereoCamera:

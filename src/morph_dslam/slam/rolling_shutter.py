@@ -84,13 +84,15 @@ def correct_path(rigid_map: RigidMap, camera: Camera, trajectory: Trajectory, se
     trajectory : as of a global shutter
     seen : map points in each of its frames
     """
-    poses = np.linalg.inv(trajectory.world_from_camera)
+    poses = trajectory.camera_from_world
     for _ in range(ROUNDS if camera.readout_s and len(poses) else 0):
         twists = velocities(trajectory.timestamps, poses)
         for row, points in enumerate(seen):
             if len(points.ids) >= LEAST_INLIERS:
                 poses[row] = _refined(rigid_map, camera, poses[row], twists[row], points)
-    return Trajectory(trajectory.timestamps, np.linalg.inv(poses), trajectory.indices)
+    return Trajectory(
+        trajectory.timestamps, np.array([inverse(pose) for pose in poses]).reshape(-1, 4, 4), trajectory.indices
+    )
 
 
 def _refined(rigid_map: RigidMap, camera: Camera, pose: Array, twist: Array, seen: Followed) -> Array:
@@ -114,7 +116,7 @@ def correct_map(rigid_map: RigidMap, camera: Camera, trajectory: Trajectory) -> 
     Keyframes whose velocity the path does not tell take no part; they follow where the points have gone.
     """
     rows = {index: row for row, index in enumerate(trajectory.indices.tolist())}
-    twists = velocities(trajectory.timestamps, np.linalg.inv(trajectory.world_from_camera))
+    twists = velocities(trajectory.timestamps, trajectory.camera_from_world)
     kept = rigid_map.kept_keyframes
     row_of = np.array([rows.get(rigid_map.keyframes[k].index, -1) for k in kept])
     known = row_of >= 0

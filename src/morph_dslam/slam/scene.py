@@ -30,6 +30,7 @@ from morph_dslam.slam.self_calibration import (
     TERMS,
     CameraEstimate,
     CameraTerm,
+    TermEstimate,
     camera_notes,
     estimate_camera,
     with_terms_of,
@@ -245,7 +246,8 @@ def refine_camera(
     Raises MapError if the recording gives too small a map.
     """
     opened = open_source(source) if isinstance(source, str | Path) else source
-    estimates, refined, free = list[CameraEstimate](), camera, tuple(terms)
+    terms_found, refined = dict[CameraTerm, TermEstimate](), camera
+    free: list[CameraTerm] = list(terms)
     for _ in range(REFINING_RUNS):
         estimate = map_scene(opened, refined, options, progress).camera_estimate(free)
         if estimate is None:
@@ -253,15 +255,14 @@ def refine_camera(
                 f"the camera cannot be estimated from {opened.name}: too few frames have a pose, or too few points "
                 "are seen in several; film a textured, rigid scene, or leave out --refine-camera"
             )
-        hidden = [term for term, found in estimate.terms.items() if not found.is_observable]
-        estimates.append(estimate)
-        refined = with_terms_of(refined, estimate.camera, [term for term in free if term not in hidden])
-        free = tuple(term for term in free if term not in hidden)
+        for term, found in estimate.terms.items():
+            terms_found[term] = replace(found, given=terms_found[term].given if term in terms_found else found.given)
+        hidden = [term for term in free if not estimate.terms[term].is_observable]
+        free = [term for term in free if term not in hidden]
+        refined = with_terms_of(with_terms_of(refined, estimate.camera, free), camera, hidden)
         if not free:
             break
-    last = {term: found for estimate in estimates for term, found in estimate.terms.items()}
-    first = estimates[0].terms
-    return CameraEstimate(refined, {t: replace(found, given=first[t].given) for t, found in last.items()})
+    return CameraEstimate(refined, terms_found)
 
 
 def _summary_of_run(scene: Scene, slam: Slam) -> dict[str, Any]:

@@ -35,11 +35,11 @@ N_UNKNOWNS = 6
 #: Standard deviations of the unknowns before anything is measured, the principal point's in image widths.
 PRIOR_STD = np.array([0.3, 0.1, 0.1, 0.3, 0.3, 0.03])
 #: Frames and points that are adjusted, spread over the recording and the most often seen; the fewest that say anything.
-MOST_FRAMES, MOST_POINTS, LEAST_FRAMES, LEAST_POINTS = 40, 1500, 8, 40
+MOST_FRAMES, MOST_POINTS, LEAST_FRAMES, LEAST_POINTS = 30, 800, 8, 40
 #: A point counts from so many frames on.
 LEAST_VIEWS = 3
 #: Rounds with the velocities of the round before; iterations in each, which end with a gain below this part.
-ROUNDS, ITERATIONS, LEAST_GAIN = 3, 15, 1e-5
+ROUNDS, ITERATIONS, LEAST_GAIN = 3, 15, 1e-4
 #: Width of the Huber cost while poses and points are fitted to another camera.
 START_HUBER_PX = 20.0
 #: Steps of the numerical derivatives: of a point, in depths, and of the camera's unknowns.
@@ -326,7 +326,7 @@ class _Recording:
 
     def __init__(self, rigid_map: RigidMap, camera: Camera, path: Trajectory, seen: Sequence[Followed]) -> None:
         self._camera, self._times, self._seen = camera, path.timestamps, seen
-        self._poses = np.linalg.inv(path.world_from_camera)
+        self._poses = path.camera_from_world.copy()
         self._positions = rigid_map.positions.copy()
         rows = np.flatnonzero([len(points.ids) > 0 for points in seen])
         self._rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_FRAMES)).astype(int))]
@@ -466,7 +466,7 @@ def _effects(camera: Camera, views: _Views) -> dict[CameraTerm, Array]:
 
 def camera_notes(estimate: CameraEstimate) -> Iterator[str]:
     """What a reader of a run must know of its camera, whose terms were all estimated."""
-    wrong = [term for term, found in estimate.terms.items() if found.is_wrong and found.is_observable]
+    wrong: list[CameraTerm] = [term for term, found in estimate.terms.items() if found.is_wrong and found.is_observable]
     named = [f"{_NAMES[term]} {_described(term, estimate.terms[term])}" for term in wrong if term != "readout"]
     if named:
         yield (
@@ -478,7 +478,9 @@ def camera_notes(estimate: CameraEstimate) -> Iterator[str]:
             f"the camera has a rolling shutter: readout_s {_described('readout', estimate.terms['readout'])}. Write it "
             "into the camera file, or estimate it with --refine-camera readout"
         )
-    hidden = [term for term, found in estimate.terms.items() if not found.is_observable and term != "readout"]
+    hidden: list[CameraTerm] = [
+        term for term, found in estimate.terms.items() if not found.is_observable and term != "readout"
+    ]
     if hidden:
         named = [f"{_NAMES[term]} {_described(term, estimate.terms[term])}" for term in hidden]
         yield f"this recording cannot check the camera file: unobservable here: {'; '.join(named)}"

@@ -1,0 +1,149 @@
+"""Cameras estimated from points that a moving camera saw; pixels are OpenCV's projections of an exact motion."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from morph_dslam.camera import Camera
+from morph_dslam.io.trajectory import Trajectory
+from morph_dslam.slam.rigid_map import GOOD, Followed, RigidMap
+from morph_dslam.slam.rolling_shutter import correct_path
+from morph_dslam.slam.self_calibration import camera_notes, estimate_camera
+
+CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+LENS = (-0.28, 0.07, 0.0, 0.0)
+FPS, N_FRAMES = 30.0, 60
+
+
+def pose_at(time, reach):
+    """camera_from_world (4, 4) of a camera that sways before points 2 to 4 m away."""
+    result = np.eye(4)
+    result[:3, :3] = Rotation.from_rotvec(0.5 * reach * np.sin([1.3 * time, 2.0 * time + 1.0, 1.1 * time])).as_matrix()
+    result[:3, 3] = reach * np.array([np.sin(2.2 * time), 0.5 * np.sin(1.7 * time + 0.5), 0.4 * np.sin(1.4 * time)])
+    return result
+
+
+def project(camera, points, pose):
+    """OpenCV's pixels (n, 2) of points (n, 3)."""
+    turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
+    return cv2.projectPoints(points, turn, pose[:3, 3], camera.matrix, np.array(camera.distortion or (0.0,) * 4))[0][
+        :, 0
+    ]
+
+
+def recorded_pixels(camera, points, time, reach):
+    """Where the shutter records points (n, 3): the row decides when a rolling one does, which decides the row."""
+    pixels = project(camera, points, pose_at(time, reach))
+    for _ in range(3 if camera.readout_s else 0):
+        times = time + camera.readout_s * (pixels[:, 1] - 239.5) / 480.0
+        pixels = np.concatenate(
+            [project(camera, point[None], pose_at(t, reach)) for point, t in zip(points, times, strict=True)]
+        )
+    return pixels
+
+
+def recording(true, given, seed=0, reach=0.4, n_points=150, n_frames=N_FRAMES):
+    """Map, path and sightings as a map of the ``given`` camera has them: rough points and poses, undistorted pixels."""
+    rng, rigid_map = np.random.default_rng(seed), RigidMap()
+    points = rng.uniform([-1.6, -1.2, 2.0], [1.6, 1.2, 4.0], (n_points, 3))
+    rigid_map.add_points(points + 0.02 * rng.standard_normal(points.shape), np.zeros((n_points, 2)), 0, GOOD)
+    times, poses, seen = np.arange(n_frames) / FPS, [], []
+    for time in times:
+        pixels = recorded_pixels(true, points, time, reach)
+        local = points @ pose_at(time, reach)[:3, :3].T + pose_at(time, reach)[:3, 3]
+        inside = (local[:, 2] > 0.5) & (pixels > 5).all(axis=1) & (pixels < [635, 475]).all(axis=1)
+        ids = np.flatnonzero(inside)
+        noisy = pixels[ids] + 0.2 * rng.standard_normal((len(ids), 2))
+        undistorted = given.undistort_pixels(noisy)
+        good = np.isfinite(undistorted).all(axis=1)
+        seen.append(Followed(ids[good], undistorted[good]))
+        pose = pose_at(time, reach)
+        pose[:3, 3] += 0.003 * rng.standard_normal(3)
+        poses.append(np.linalg.inv(pose))
+    return rigid_map, given, Trajectory(times, np.array(poses), np.arange(n_frames)), seen
+
+
+@pytest.mark.parametrize(
+    ("true", "given", "wrong"),
+    [
+        (CAMERA, CAMERA, set()),
+        (replace(CAMERA, distortion=LENS), replace(CAMERA, distortion=LENS), set()),
+        (CAMERA, replace(CAMERA, fx=577.5, fy=577.5), {"focal"}),
+        (CAMERA, replace(CAMERA, fx=472.5, fy=472.5), {"focal"}),
+        (CAMERA, replace(CAMERA, cx=349.5), {"centre"}),
+        (CAMERA, replace(CAMERA, cy=209.5), {"centre"}),
+        (replace(CAMERA, distortion=LENS), CAMERA, {"radial"}),
+        (replace(CAMERA, distortion=LENS), replace(CAMERA, distortion=(0.28, -0.07, 0.0, 0.0)), {"radial"}),
+    ],
+    ids=["right", "right lens", "long", "short", "centre x", "centre y", "no lens", "wrong sign"],
+)
+def test_a_wrong_camera_is_named_and_a_right_one_is_not(true, given, wrong):
+    estimate = estimate_camera(*recording(true, given))
+    assert {term for term, found in estimate.terms.items() if found.is_wrong} == wrong
+    assert all(found.is_observable for found in estimate.terms.values())
+    assert estimate.camera.fx == pytest.approx(525.0, rel=0.01)
+    assert [estimate.camera.cx, estimate.camera.cy] == pytest.approx([319.5, 239.5], abs=6.0)
+    assert (estimate.camera.distortion or (0.0, 0.0))[:2] == pytest.approx((true.distortion or LENS[2:])[:2], abs=0.02)
+    assert bool(list(camera_notes(estimate))) == bool(wrong)
+
+
+def test_deviations_are_those_of_repeated_recordings():
+    errors = []
+    for seed in range(12):
+        terms = estimate_camera(*recording(CAMERA, CAMERA, seed, n_points=100, n_frames=30)).terms
+        errors.append([(terms[t].estimated[0] - terms[t].given[0]) / terms[t].std[0] for t in ("focal", "radial")])
+    assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.5
+
+
+def test_errors_that_are_alike_in_many_images_of_a_point_count_once():
+    """An error of each point that swings slowly over the frames is no noise that many frames average out."""
+    errors = []
+    for seed in range(8):
+        rigid_map, given, path, seen = recording(CAMERA, CAMERA, seed, n_points=100, n_frames=30)
+        bias = 0.5 * np.random.default_rng(100 + seed).standard_normal((100, 2))
+        swinging = [np.sin(k / 5.0 + np.arange(100))[:, None] * bias for k in range(30)]
+        seen = [Followed(f.ids, f.pixels + shift[f.ids]) for f, shift in zip(seen, swinging, strict=True)]
+        found = estimate_camera(rigid_map, given, path, seen).terms["focal"]
+        errors.append((found.estimated[0] - 525.0) / found.std[0])
+    assert np.sqrt(np.mean(np.square(errors))) < 1.6
+
+
+def test_a_small_motion_shows_no_focal_length():
+    found = estimate_camera(*recording(CAMERA, replace(CAMERA, fx=577.5, fy=577.5), reach=0.012)).terms["focal"]
+    assert not found.is_observable
+    assert not found.is_wrong
+    assert found.estimated[0] - 3.0 * found.std[0] < 525.0 < found.estimated[0] + 3.0 * found.std[0]
+
+
+def test_too_little_gives_no_estimate():
+    assert estimate_camera(*recording(CAMERA, CAMERA, n_points=30)) is None
+    assert estimate_camera(*recording(CAMERA, CAMERA, n_frames=5)) is None
+
+
+@pytest.mark.parametrize("readout_s", [0.03, -0.02])
+def test_the_readout_time_of_a_rolling_shutter(readout_s):
+    true = replace(CAMERA, readout_s=readout_s)
+    rigid_map, given, path, seen = recording(true, CAMERA, n_points=80, n_frames=30)
+    estimate = estimate_camera(rigid_map, given, path, seen)
+    assert estimate.terms["readout"].is_wrong
+    assert estimate.camera.readout_s == pytest.approx(readout_s, rel=0.06)
+    assert not any(estimate.terms[term].is_wrong for term in ("focal", "centre", "radial"))
+    only = estimate_camera(rigid_map, given, path, seen, ["readout"])
+    assert only.camera == replace(CAMERA, readout_s=only.camera.readout_s)
+    assert only.camera.readout_s == pytest.approx(readout_s, rel=0.06)
+
+
+def test_poses_are_of_the_middle_rows():
+    true = replace(CAMERA, readout_s=0.03)
+    rigid_map, _, path, seen = recording(true, CAMERA, n_points=80, n_frames=30)
+    rigid_map.positions = np.random.default_rng(0).uniform([-1.6, -1.2, 2.0], [1.6, 1.2, 4.0], (80, 3))
+    truth = np.array([np.linalg.inv(pose_at(time, 0.4))[:3, 3] for time in path.timestamps])
+    errors = [
+        np.linalg.norm(correct_path(rigid_map, camera, path, seen).positions - truth, axis=1)[1:-1]
+        for camera in (true, replace(true, readout_s=1e-9))
+    ]
+    assert np.median(errors[0]) < 0.0015
+    assert np.median(errors[1]) > 0.004
