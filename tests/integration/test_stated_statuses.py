@@ -69,7 +69,7 @@ def test_a_sheet_of_another_format_is_mostly_not_sure_of_itself(factors):
     found = tracked(scene, moving(scene, 80)[::4], drawn_out(scene.model, factors))
     assert found.largest_error > 15e-3
     assert found.n_wrong <= 3
-    said = ("the frames show the reference state", "the model leaves up to")
+    said = ("deviations are", "the model leaves up to")
     assert all(any(line.startswith(what) for line in found.said) for what in said)
 
 

@@ -40,7 +40,7 @@ from morph_dslam.tracking.refinement import refine_by_depth
 Array = NDArray[np.float64]
 #: Standard deviation of a carefully set landmark, pixels. Those that fit so many times worse, and worse than this share
 #: of the image's diagonal, are flagged; deviations are as wide as the fit asks for anyway.
-CLICK_PX, POOR_FIT, POOR_SHARE = 0.5, 2.0, 0.002
+CLICK_PX, POOR_FIT, POOR_SHARE = 0.5, 2.0, 1.0 / 800.0
 #: Standard deviation of landmarks' pixels where they are too few to show it, and the least that is believed.
 UNKNOWN_PX, LEAST_PX = 2.0, 0.1
 #: Shares of the object's size: least extent of the landmarks, how far one may lie off the undeformed surface,
