@@ -171,11 +171,14 @@ def test_the_camera_is_found_in_no_other_room(small_map):
 @pytest.mark.parametrize(
     ("term", "given"), [("focal", {"fx": 577.5, "fy": 577.5}), ("centre", {"cx": 349.5})], ids=["focal", "centre"]
 )
-def test_a_wrong_camera_is_found_out(room_film, term, given):
-    summary = map_scene(Film(room_film[0]), replace(CAMERA, **given)).summary()
+def test_a_wrong_camera_is_found_out(tmp_path, room_film, term, given):
+    scene = map_scene(Film(room_film[0]), replace(CAMERA, **given))
+    summary = scene.summary()
     assert {name for name, found in summary["camera"].items() if found["is_wrong"]} == {term}
     assert summary["camera"]["focal"]["estimated"][0] == pytest.approx(525.0, rel=0.015)
     assert len(summary["flags"]) == 1
+    scene.save(tmp_path / "map.h5")  # the other commands repeat what the map's file says
+    assert list(load_scene(tmp_path / "map.h5", scene.camera).camera_notes) == summary["flags"]
 
 
 def test_the_camera_is_refined_and_the_map_is_of_the_refined_one(tmp_path, room_film, capsys):

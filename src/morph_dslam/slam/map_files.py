@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import h5py
@@ -108,6 +109,7 @@ def save_map(path: Path, rigid_map: RigidMap, camera: Camera, trajectory: Trajec
     """Write points, keyframes with their contrast-normalized images, their camera, and its path, as HDF5."""
     with written_with_checksum(path, FORMAT) as file:
         file.attrs.update({"format": FORMAT, "version": VERSION, "usual_rms_px": rigid_map.usual_rms_px})
+        file.attrs["camera_notes"] = json.dumps(rigid_map.camera_notes)
         file.attrs["baseline_px"] = rigid_map.baseline_px
         file.attrs.update({"intrinsics": camera.intrinsics, "size": (camera.width, camera.height)})
         kept = rigid_map.kept_keyframes
@@ -163,6 +165,7 @@ def _read(path: Path, file: h5py.File, camera: Camera) -> RigidMap:
         raise MapError(f"{path} is empty: the run that wrote it never began a map")
     rigid_map = RigidMap(float(np.asarray(file.attrs["baseline_px"])))
     rigid_map.usual_rms_px = float(np.asarray(file.attrs["usual_rms_px"]))
+    rigid_map.camera_notes = tuple(json.loads(str(file.attrs.get("camera_notes", "[]"))))
     for name in POINT_ARRAYS:
         setattr(rigid_map, name, np.asarray(file[f"points/{name}"]))
     rigid_map.merged_into = np.arange(len(rigid_map.state))

@@ -221,12 +221,14 @@ class RigidMap:
     baseline_px : focal length times the baseline that right columns refer to, px m; 0 where no depth is
         measured, and lengths are in map units instead of metres.
     passing : frames that are not kept, but tell which candidates move.
+    camera_notes : what its recording showed to be wrong with its camera, for people.
     """
 
     def __init__(self, baseline_px: float = 0.0) -> None:
         self.baseline_px = baseline_px
         self.keyframes: list[Keyframe] = []
         self.usual_rms_px = FIRST_RMS_PX
+        self.camera_notes: tuple[str, ...] = ()
         self.passing = PassingViews()
         self.positions = np.empty((0, 3))
         self.state = np.empty(0, dtype=np.int8)

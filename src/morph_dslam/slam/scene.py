@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence, Sized
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,11 @@ class Scene:
     slam: Slam | None = None
     path: Path | None = None
 
+    @cached_property
+    def _estimates(self) -> dict[tuple[CameraTerm, ...], CameraEstimate | None]:
+        """Of the camera, by terms: each takes seconds."""
+        return {}
+
     @property
     def points(self) -> Array:
         """Map points (n, 3), metres, or in units of the first view's median depth."""
@@ -92,11 +98,21 @@ class Scene:
         """
         if self.slam is None or self.slam.frame_images.is_stereo:
             return None
-        seen = _seen(self.slam, self.frames, self.trajectory)
-        return estimate_camera(self.map, self.camera, self.trajectory, seen, terms)
+        key = tuple(terms)
+        if key not in self._estimates:
+            seen = _seen(self.slam, self.frames, self.trajectory)
+            self._estimates[key] = estimate_camera(self.map, self.camera, self.trajectory, seen, key)
+        return self._estimates[key]
+
+    @property
+    def camera_notes(self) -> tuple[str, ...]:
+        """What the recording of the map shows to be wrong with its camera, or does not show."""
+        estimate = self.camera_estimate()
+        return tuple(camera_notes(estimate)) if estimate else self.map.camera_notes
 
     def save(self, path: str | Path) -> None:
         """Write map and path into one file, which `load_scene` and the commands read."""
+        self.map.camera_notes = self.camera_notes
         save_map(Path(path), self.map, self.camera, self.trajectory)
 
     def summary(self) -> dict[str, Any]:
@@ -257,7 +273,7 @@ def refine_camera(
             )
         for term, found in estimate.terms.items():
             terms_found[term] = replace(found, given=terms_found[term].given if term in terms_found else found.given)
-        hidden = [term for term in free if not estimate.terms[term].is_observable]
+        hidden: list[CameraTerm] = [term for term in free if not estimate.terms[term].is_observable]
         free = [term for term in free if term not in hidden]
         refined = with_terms_of(with_terms_of(refined, estimate.camera, free), camera, hidden)
         if not free:
@@ -290,7 +306,7 @@ def _summary_of_run(scene: Scene, slam: Slam) -> dict[str, Any]:
         "longest_wait_for_mapper_ms": float(np.max(waits)),
         "p99_wait_for_mapper_ms": float(np.percentile(waits, 99)),
         "settings": asdict(slam.options),
-        "flags": [*_flags(scene, slam, after), *(camera_notes(estimate) if estimate else ())],
+        "flags": [*_flags(scene, slam, after), *scene.camera_notes],
     }
 
 

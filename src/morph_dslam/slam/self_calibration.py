@@ -471,12 +471,12 @@ def camera_notes(estimate: CameraEstimate) -> Iterator[str]:
     if named:
         yield (
             f"the camera file does not fit this recording: {'; '.join(named)}. Calibrate the camera again, or estimate "
-            "it with --refine-camera"
+            "it with morph slam --refine-camera"
         )
     if "readout" in wrong:
         yield (
             f"the camera has a rolling shutter: readout_s {_described('readout', estimate.terms['readout'])}. Write it "
-            "into the camera file, or estimate it with --refine-camera readout"
+            "into the camera file, or estimate it with morph slam --refine-camera readout"
         )
     hidden: list[CameraTerm] = [
         term for term, found in estimate.terms.items() if not found.is_observable and term != "readout"

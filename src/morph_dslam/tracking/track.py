@@ -16,6 +16,7 @@ import numpy as np
 from morph_dslam.errors import SourceError
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.io.video import VideoWriter
+from morph_dslam.notices import Remark
 from morph_dslam.registration.landmarks import bind_landmarks
 from morph_dslam.registration.registration import Registration
 from morph_dslam.sources import Frame, open_live, open_source, open_stream
@@ -221,6 +222,8 @@ class _Job:
             return {}
         facts = _facts(run, run.objects[number], part, folder.results)
         notices = [*part.registration.warnings, *self._again[part.name].notices]
+        if part.object.scene is not None:
+            notices += [Remark(note) for note in part.object.scene.camera_notes]
         if isinstance(self._source, SynchronizedFrames):
             notices += self._source.notices(len(folder.results))
         if run.live:
