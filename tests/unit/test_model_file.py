@@ -192,7 +192,7 @@ FAULTS = [
     ("tucker", set_attribute("/", "parameters", PARAMETERS % (1.0, -1.0)), "has the lower end"),
     ("tucker", set_attribute("/", "parameters", PARAMETERS % (-1.0, "NaN")), "has the lower end"),
     ("tucker", set_attribute("/", "parameters", PARAMETERS % (-1.0, '"b"')), "not numbers"),
-    ("tucker", set_attribute("/", "parameters", "[]"), "names are missing"),
+    ("tucker", set_attribute("/", "parameters", "[]"), "'core' holds"),
     ("tucker", set_attribute("/", "parameters", "["), "damaged"),
     ("tucker", set_attribute("/", "certificate", 3), "'certificate' is not a text"),
 ]  # fmt: skip

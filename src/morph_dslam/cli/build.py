@@ -1,17 +1,20 @@
-"""`morph build`: a study becomes a model file and a report."""
+"""`morph build`: a study becomes a model file and a report, or a surface the model file of a rigid object."""
 
 import argparse
 import warnings
+from pathlib import Path
 
 from morph_dslam.cli.arguments import add_file, add_output, positive_integer
 from morph_dslam.errors import StudyError
 
-HELP = "solve a study over its parameters and compress the solutions in a model file"
+HELP = "solve a study over its parameters and compress the solutions in a model file, or make one of a rigid surface"
 KEPT = "the solutions found so far are kept, and the same command goes on from there"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    add_file(command, "study", "study file (docs/study-file.md)")
+    command.add_argument("study", type=Path, nargs="?", help="study file (docs/study-file.md)")
+    add_file(command, "--rigid", ".stl, .obj or .ply file of a rigid object, in place of a study", "SURFACE")
+    command.add_argument("--unit", choices=("m", "cm", "mm"), help="unit of that file's coordinates")
     add_output(command, "MODEL", "model file to write")
     command.add_argument(
         "--workers", type=positive_integer, metavar="N", help="processes to solve in (default: one a core)"
@@ -25,15 +28,26 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Build the model and write its report."""
+    """Build the model, and write its report if it has a study."""
+    if (arguments.study is None) == (arguments.rigid is None):
+        raise StudyError("give a study file, or --rigid with the surface of a rigid object: one of both")
+    if arguments.output.is_dir():
+        raise StudyError(f"{arguments.output} is a folder: give the name of the model file to write")
+    if arguments.rigid is None:
+        _build_study(arguments)
+    else:
+        _build_rigid(arguments)
+
+
+def _build_study(arguments: argparse.Namespace) -> None:
     from morph_dslam import build, write_build_report
     from morph_dslam.extend.mechanics import NearlyIncompressibleWarning
     from morph_dslam.extend.reduction import read_reference_curve, report_path
     from morph_dslam.extend.studies import build_warnings
 
+    if arguments.unit is not None:
+        raise StudyError("--unit is of a surface (--rigid); a study file states its units itself")
     output = arguments.output
-    if output.is_dir():
-        raise StudyError(f"{output} is a folder: give the name of the model file to write")
     reference = None if arguments.reference_curve is None else read_reference_curve(arguments.reference_curve)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NearlyIncompressibleWarning)  # printed once, at the end
@@ -42,3 +56,21 @@ def run(arguments: argparse.Namespace) -> None:
     print(f"wrote {output} and {report_path(output)}")
     for line in build_warnings(model.certificate):
         print(f"warning: {line}")
+
+
+def _build_rigid(arguments: argparse.Namespace) -> None:
+    from morph_dslam.extend.studies import build_rigid
+
+    if arguments.unit is None:
+        raise StudyError(f"say in which unit {arguments.rigid} was drawn: --unit m, cm or mm")
+    if arguments.workers is not None or arguments.reference_curve is not None:
+        raise StudyError("--workers and --reference-curve are for studies; leave them out with --rigid")
+    model = build_rigid(arguments.rigid, arguments.unit, arguments.output)
+    extent = " x ".join(
+        f"{1e3 * (high - low):.4g}" for low, high in zip(model.nodes.min(axis=0), model.nodes.max(axis=0), strict=True)
+    )
+    print(f"wrote {arguments.output}: rigid, {len(model.triangles)} triangles, {extent} mm")
+    for name, count in model.provenance["repairs"].items():
+        print(f"repair: {count} {name}")
+    if not model.provenance["repairs"]:
+        print("the surface is closed and needed no repair")

@@ -123,7 +123,7 @@ def _write_functions(group: h5py.Group, functions: Functions) -> None:
     if isinstance(functions, ParameterFunctions):
         group.attrs["format"] = "polynomial"
         degrees = functions.multi_indices
-        group.create_dataset("multi_indices", data=degrees.astype(np.min_scalar_type(int(degrees.max()))))
+        group.create_dataset("multi_indices", data=degrees.astype(np.min_scalar_type(int(degrees.max(initial=0)))))
         group.create_dataset("coefficients", data=functions.coefficients)
         return
     if isinstance(functions, ProductFunctions):

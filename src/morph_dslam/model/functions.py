@@ -159,7 +159,7 @@ class ParameterFunctions(Functions):
             raise ValueError(f"ranges, degrees and coefficients of shapes {shapes} do not fit together")
         if not (np.asarray(self.lower) < self.upper).all():
             raise ValueError(f"the ranges must grow, not go from {self.lower} to {self.upper}")
-        if np.min(self.multi_indices) < 0:
+        if np.min(self.multi_indices, initial=0) < 0:
             raise ValueError("a polynomial cannot be of negative degree")
 
     @property

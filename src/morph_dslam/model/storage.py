@@ -48,7 +48,7 @@ def check_model(model: ReducedModel) -> None:
 def check_parameters(parameters: tuple[Parameter, ...]) -> None:
     """Raise ValueError where names are not distinct, units not known or a default not in its range."""
     names = [p.name for p in parameters]
-    if not names or "" in names or len(set(names)) != len(names):
+    if "" in names or len(set(names)) != len(names):
         raise ValueError(f"its parameters' names are missing or not distinct: {names}")
     for p in parameters:
         if p.unit not in FACTORS.get(p.quantity, {}):

@@ -19,7 +19,7 @@ from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.studies.study import Study
 
 #: Packages whose release may change a model; one that is not installed is left out.
-PACKAGES = ("morph-dslam", "ngsolve", "pypardiso", "mkl", "numba", "numpy", "scipy")
+PACKAGES = ("morph-dslam", "ngsolve", "pypardiso", "mkl", "numba", "numpy", "scipy", "trimesh")
 
 
 def mesh_hash(model: ReducedModel) -> str:
@@ -43,11 +43,12 @@ def provenance(study_text: str, study: Study, model: ReducedModel) -> dict[str, 
         "study": study_text,
         "mesh_sha256": mesh_hash(model),
         "linear_solver": linear_solver(study),
-        "versions": _versions(),
+        "versions": versions(),
     }
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
+    """Releases of what makes a model, by package."""
     found = {"python": platform.python_version()}
     for package in PACKAGES:
         try:

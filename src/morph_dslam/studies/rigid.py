@@ -1,0 +1,56 @@
+"""Rigid objects: models of a surface alone, without parameters, study or solutions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from morph_dslam.errors import StudyError
+from morph_dslam.meshing.netgen_meshing import read_surface
+from morph_dslam.meshing.surface_repair import repaired_surface
+from morph_dslam.model import ReducedModel, SeparatedField, save_model
+from morph_dslam.model.functions import ParameterFunctions
+from morph_dslam.studies.provenance import mesh_hash, versions
+from morph_dslam.units import to_si
+
+
+def build_rigid(surface: str | Path, unit: str, output: str | Path | None = None) -> ReducedModel:
+    """The model of a rigid object, of which tracking estimates the pose alone.
+
+    Its frame is the file's. What was mended in the surface is in ``provenance["repairs"]``, counts by name.
+
+    Parameters
+    ----------
+    surface : .stl, .obj or .ply file.
+    unit : of its coordinates: "m", "cm", "mm" or "um".
+    output : the model file to write; None to write none.
+
+    Raises
+    ------
+    StudyError
+        If the file cannot be read, describes no surface, or the unit is not one of length.
+    """
+    path, scale = Path(surface), to_si(1.0, unit, "length")
+    found = read_surface(path)
+    try:
+        points, triangles, repairs = repaired_surface(found.points, found.triangles)
+    except StudyError as error:
+        raise StudyError(f"{path} describes no surface: {error}; save it again as a triangulated surface") from error
+    none = np.empty(0)
+    constant = ParameterFunctions(none, none, np.zeros((1, 0), dtype=np.int64), np.ones((1, 1)))
+    model = ReducedModel(
+        name=path.stem,
+        nodes=scale * points,
+        triangles=triangles,
+        parameters=(),
+        displacement=SeparatedField(np.zeros((1, len(points), 3)), constant),
+        provenance={"surface": path.name, "unit": unit, "repairs": repairs},
+    )
+    model.provenance.update(mesh_sha256=mesh_hash(model), versions=versions())
+    if output is not None:
+        output = Path(output)
+        if not output.parent.is_dir():
+            raise StudyError(f"the folder {output.parent} for the model file does not exist: make it first")
+        save_model(output, model)
+    return model
