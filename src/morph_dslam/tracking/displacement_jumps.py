@@ -170,29 +170,53 @@ def _fit_steps(rows, first, plane, values, usable, directions, least):
     """Steps (k, d, 2) of ``values`` (p, 2) across lines through places, and their deviations (k, d); NaN where there
     are too few points. Each is from the least squares fit of a plane and a step; what the plane takes of the step's
     own pattern is taken from that first (Frisch and Waugh, Econometrica 1, 1933)."""
-    count = len(first) - 1
+    count, most = len(first) - 1, np.max(np.diff(first))
     steps, deviations = np.full((count, directions, 2), np.nan), np.full((count, directions), np.nan)
+    # A column of ones, the place's two coordinates, its two values, then the pattern of a step.
+    work = np.empty((most, 6))
     for k in range(count):
-        near = np.array([m for m in range(first[k], first[k + 1]) if usable[rows[m]]])
-        n = len(near)
+        n = 0
+        for m in range(first[k], first[k + 1]):
+            if usable[rows[m]]:
+                work[n, 0], work[n, 1], work[n, 2] = 1.0, plane[m, 0], plane[m, 1]
+                work[n, 3], work[n, 4] = values[rows[m], 0], values[rows[m], 1]
+                n += 1
         if n < 2 * least + 2:
             continue
-        design, target = np.ones((n, 3)), np.empty((n, 2))
+        inverse = np.linalg.inv(work[:n, :3].T.copy() @ work[:n, :3].copy() + 1e-9 * np.eye(3))
+        _take_plane(work, n, inverse, 3)
+        _take_plane(work, n, inverse, 4)
+        squares = 0.0
         for i in range(n):
-            design[i, 1:] = plane[near[i]]
-            target[i] = values[rows[near[i]]]
-        to_plane = np.linalg.inv(design.T @ design + 1e-9 * np.eye(3)) @ design.T
-        left = target - design @ (to_plane @ target)
-        squares = np.sum(left * left)
+            squares += work[i, 3] ** 2 + work[i, 4] ** 2
         for d in range(directions):
-            angle = np.pi * d / directions
-            side = np.where(design[:, 1] * np.cos(angle) + design[:, 2] * np.sin(angle) > 0.0, 0.5, -0.5)
-            if 0.5 * n - abs(side.sum()) < least:
+            cosine, sine, ahead = np.cos(np.pi * d / directions), np.sin(np.pi * d / directions), 0
+            for i in range(n):
+                in_front = work[i, 1] * cosine + work[i, 2] * sine > 0.0
+                work[i, 5] = 0.5 if in_front else -0.5
+                ahead += in_front
+            if min(ahead, n - ahead) < least:
                 continue
-            pattern = side - design @ (to_plane @ side)
-            size = np.sum(pattern * pattern)
-            step = pattern @ left / size
-            steps[k, d] = step
-            unexplained = max(squares - size * np.sum(step * step), 0.0) / (2 * (n - 4))
+            _take_plane(work, n, inverse, 5)
+            size, along_u, along_v = 0.0, 0.0, 0.0
+            for i in range(n):
+                size += work[i, 5] ** 2
+                along_u += work[i, 5] * work[i, 3]
+                along_v += work[i, 5] * work[i, 4]
+            steps[k, d, 0], steps[k, d, 1] = along_u / size, along_v / size
+            unexplained = max(squares - (along_u**2 + along_v**2) / size, 0.0) / (2 * (n - 4))
             deviations[k, d] = np.sqrt(unexplained / size)
     return steps, deviations
+
+
+@njit(cache=True, nogil=True)
+def _take_plane(work, n, inverse, column):
+    """Take the plane through the first ``n`` rows of a ``column`` from it, by the plane's inverse matrix (3, 3)."""
+    moments = np.zeros(3)
+    for i in range(n):
+        for a in range(3):
+            moments[a] += work[i, a] * work[i, column]
+    for i in range(n):
+        for a in range(3):
+            for b in range(3):
+                work[i, column] -= work[i, a] * inverse[a, b] * moments[b]
