@@ -120,7 +120,8 @@ class Sharpening(Reregistration):
             assert isinstance(new, Tracker)
             self._running, self._estimated = None, True
             self._seen, self._every = [], 1
-            new.continue_from(replace(current.state, camera_from_object=new.state.camera_from_object))
+            state = replace(current.state, camera_from_object=new.state.camera_from_object)
+            new.continue_from(state, current.jumps)
             return new
         if self._running is None and self._count >= self._due_at:
             self._due_at = 2 * self._count

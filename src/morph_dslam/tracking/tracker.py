@@ -7,6 +7,7 @@ changes: the previous frames only say where to start.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -21,7 +22,7 @@ from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import Anchor, Anchoring
 from morph_dslam.tracking.discrepancy import DiscrepancyFit
-from morph_dslam.tracking.displacement_jumps import JumpDetector
+from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetector
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
 from morph_dslam.tracking.frame_estimation import at_constant_velocity, new_filter, with_unobservable_at_default
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
@@ -144,6 +145,7 @@ class Tracker:
         self._lost, self._n_lost = not in_sequence, 0
         self.last_seen: Keyframe | None = None
         self._views: ViewSet | None = None
+        self._jumps_before: tuple[DisplacementJump, ...] = ()
         if reference is not None:
             self._begin(reference if isinstance(reference, Image) else self._prepared(reference))
 
@@ -373,7 +375,7 @@ class Tracker:
             reference_factor=1.0 if systematic is None else systematic.reference_factor,
             view=self._view.number,
             discrepancy=hypothesis.discrepancy,
-            jumps=self._jumps.jumps,
+            jumps=self.jumps,
         )
 
     def _placed_by_map(self, camera: CameraLocalization) -> PosePrior | None:
@@ -382,8 +384,8 @@ class Tracker:
 
     def _warnings_of_place(self, camera: CameraLocalization) -> list[TrackingWarning]:
         warnings: list[TrackingWarning] = [ObjectMoved()] if self._anchoring.has_moved else []
-        if self._jumps.jumps:
-            warnings.append(SurfaceJumps(max(self._jumps.jumps, key=lambda jump: jump.size).text))
+        if self.jumps:
+            warnings.append(SurfaceJumps(max(self.jumps, key=lambda jump: jump.size).text))
         if self._view.number:
             warnings.append(OtherReferenceView(self._view.number))
         if camera.why_lost:
@@ -427,8 +429,17 @@ class Tracker:
     def state(self) -> State:
         return self._last
 
-    def continue_from(self, state: State) -> None:
-        """Go on from a state of the last frame that is known better from elsewhere, also when it is lost."""
+    @property
+    def jumps(self) -> tuple[DisplacementJump, ...]:
+        """Where the surface was found to open or slip along a line so far."""
+        return (*self._jumps_before, *self._jumps.jumps)
+
+    def continue_from(self, state: State, jumps: Sequence[DisplacementJump] = ()) -> None:
+        """Go on from a state of the last frame that is known better from elsewhere, also when it is lost.
+
+        What another tracker found of cracks in the frames before, ``jumps``, stays.
+        """
+        self._jumps_before = tuple(jumps)
         self._last = self._start = state
         self._pixels = np.where(self._supported[:, None], self._pixels, self.reference.projected(state))
 
