@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from morph_dslam.camera import Camera
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam.rigid_map import GOOD, Followed, RigidMap
-from morph_dslam.slam.rolling_shutter import correct_path
+from morph_dslam.slam.rolling_shutter import RowPoses, correct_path
 from morph_dslam.slam.self_calibration import camera_notes, estimate_camera
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -123,6 +123,23 @@ def test_too_little_gives_no_estimate():
     assert estimate_camera(*recording(CAMERA, CAMERA, n_frames=5)) is None
 
 
+def test_frames_that_share_few_points_with_the_others_take_no_part():
+    rigid_map, given, path, seen = recording(CAMERA, CAMERA)
+    few = [frame[frame.ids < 3] if k % 3 == 0 else frame for k, frame in enumerate(seen)]
+    estimate = estimate_camera(rigid_map, given, path, few)
+    assert estimate.terms["focal"].is_observable
+    assert estimate.camera.fx == pytest.approx(525.0, rel=0.01)
+
+
+def test_of_a_long_recording_a_part_whose_frames_share_points_counts():
+    """No frame shares a point with one that is 60 frames away."""
+    rigid_map, given, path, seen = recording(CAMERA, CAMERA, n_frames=300, n_points=600)
+    passing = [frame[np.abs(frame.ids - 2 * k) < 60] for k, frame in enumerate(seen)]
+    estimate = estimate_camera(rigid_map, given, path, passing)
+    assert not any(found.is_wrong for found in estimate.terms.values())
+    assert estimate.camera.fx == pytest.approx(525.0, rel=0.03)
+
+
 @pytest.mark.parametrize("readout_s", [0.03, -0.02])
 def test_the_readout_time_of_a_rolling_shutter(readout_s):
     true = replace(CAMERA, readout_s=readout_s)
@@ -147,3 +164,20 @@ def test_poses_are_of_the_middle_rows():
     ]
     assert np.median(errors[0]) < 0.0015
     assert np.median(errors[1]) > 0.004
+
+
+def test_a_point_is_where_the_pose_of_its_row_has_it():
+    true, points = (
+        replace(CAMERA, readout_s=0.03),
+        np.random.default_rng(0).uniform([-1.6, -1.2, 2.0], [1.6, 1.2, 4.0], (80, 3)),
+    )
+    rigid_map, _, path, seen = recording(true, CAMERA, n_points=80, n_frames=20)
+    rigid_map.positions = points
+    rows, misses = RowPoses(rigid_map, true), []
+    for time, pose, followed in zip(path.timestamps, path.camera_from_world, seen, strict=True):
+        rows.add(time, pose, followed)
+        for point, pixel in zip(points[followed.ids], followed.pixels, strict=True):
+            misses.append([project(true, point[None], p)[0] - pixel for p in (rows.where_seen(point), pose)])
+    by_row, by_frame = np.sqrt(np.mean(np.sum(np.square(misses[200:]), axis=2), axis=0))
+    assert by_row < 0.8
+    assert by_frame > 2.0 * by_row

@@ -76,6 +76,42 @@ def middle_row_pixels(camera: Camera, camera_from_world: Array, twist: Array, po
     return pixels + np.nan_to_num(camera.project(local) - camera.project(moved))
 
 
+class RowPoses:
+    """Poses of a camera at the instants of single rows, frame by frame: its velocity is that since the frame before.
+
+    Parameters
+    ----------
+    rigid_map : of points that stand still
+    camera : with its readout time
+    """
+
+    def __init__(self, rigid_map: RigidMap, camera: Camera) -> None:
+        self._map, self._camera = rigid_map, camera
+        self._time, self._pose, self._twist = -np.inf, np.eye(4), np.zeros(6)
+
+    def add(self, timestamp: float, pose: Array, seen: Followed) -> None:
+        """Take in the next frame, its pose (4, 4) as of a global shutter, and where it saw map points."""
+        gap, before = timestamp - self._time, inverse(self._pose)
+        self._twist = np.zeros(6)
+        for _ in range(ROUNDS if 0.0 < gap < MOST_GAP_S and len(seen.ids) >= LEAST_INLIERS else 0):
+            moved = pose @ before
+            self._twist = np.concatenate([Rotation.from_matrix(moved[:3, :3]).as_rotvec(), moved[:3, 3]]) / gap
+            pose = _refined(self._map, self._camera, pose, self._twist, seen)
+        self._time, self._pose = timestamp, pose
+
+    def where_seen(self, point: Array) -> Array:
+        """The newest pose (4, 4), at the instant of the row that shows a point (3,) of the map."""
+        result, local = self._pose.copy(), self._pose[:3, :3] @ point + self._pose[:3, 3]
+        row = self._camera.project_recorded(local[None])[0, 1]
+        if np.isfinite(row):
+            row = float(np.clip(row, 0, self._camera.height - 1))
+            seconds = self._camera.readout_s * row_times(np.array([row]), self._camera)[0]
+            turn = Rotation.from_rotvec(self._twist[:3] * seconds).as_matrix()
+            result[:3] = turn @ result[:3]
+            result[:3, 3] += self._twist[3:] * seconds
+        return result
+
+
 def correct_path(rigid_map: RigidMap, camera: Camera, trajectory: Trajectory, seen: list[Followed]) -> Trajectory:
     """The path at the middle rows' instants.
 

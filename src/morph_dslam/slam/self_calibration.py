@@ -36,8 +36,9 @@ N_UNKNOWNS = 6
 PRIOR_STD = np.array([0.3, 0.1, 0.1, 0.3, 0.3, 0.03])
 #: Frames and points that are adjusted, spread over the recording and the most often seen; the fewest that say anything.
 MOST_FRAMES, MOST_POINTS, LEAST_FRAMES, LEAST_POINTS = 30, 800, 8, 40
-#: A point counts from so many frames on.
-LEAST_VIEWS = 3
+#: A point counts from so many frames on, a frame from so many of these points on; and the share of the frames chosen
+#: that has to count.
+LEAST_VIEWS, LEAST_SEEN, LEAST_CONNECTED = 3, 20, 0.8
 #: Rounds with the velocities of the round before; iterations in each, which end with a gain below this part.
 ROUNDS, ITERATIONS, LEAST_GAIN = 3, 15, 1e-4
 #: Width of the Huber cost while poses and points are fitted to another camera.
@@ -328,18 +329,27 @@ class _Recording:
         self._camera, self._times, self._seen = camera, path.timestamps, seen
         self._poses = path.camera_from_world.copy()
         self._positions = rigid_map.positions.copy()
-        rows = np.flatnonzero([len(points.ids) > 0 for points in seen])
-        self._rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_FRAMES)).astype(int))]
-        n_views = np.bincount(
-            np.concatenate([seen[row].ids for row in self._rows] or [np.empty(0, dtype=np.int64)]),
-            minlength=len(rigid_map.state),
-        )
-        self._ids = np.argsort(-n_views, kind="stable")[:MOST_POINTS]
-        self._ids = np.sort(self._ids[n_views[self._ids] >= LEAST_VIEWS])
+        rows = np.flatnonzero([len(points.ids) >= LEAST_SEEN for points in seen])
+        self._rows, self._ids = self._chosen(rows, len(rigid_map.state))
+        # Frames far apart have few points in common: then those in the middle of the recording have to do.
+        while len(rows) > 2 * MOST_FRAMES and len(self._rows) < LEAST_CONNECTED * MOST_FRAMES:
+            rows = rows[len(rows) // 4 : -(len(rows) // 4)]
+            self._rows, self._ids = self._chosen(rows, len(rigid_map.state))
         beside = np.setdiff1d(np.union1d(self._rows - 1, self._rows + 1), self._rows)
         self._beside = beside[(beside >= 0) & (beside < len(seen))]
         used = np.union1d(self._rows, self._beside).tolist()
         self._recorded = {row: camera.distort_pixels(seen[row].pixels) for row in used}
+
+    def _chosen(self, rows: Indices, n_points: int) -> tuple[Indices, Indices]:
+        """Some of the frames, spread, and the points that most of them saw; no frame that saw few of these."""
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_FRAMES)).astype(int))]
+        n_views = np.zeros(n_points, dtype=np.int64)
+        for row in rows:
+            n_views[self._seen[row].ids] += 1
+        ids = np.argsort(-n_views, kind="stable")[:MOST_POINTS]
+        ids = np.sort(ids[n_views[ids] >= LEAST_VIEWS])
+        n_seen = np.array([np.isin(self._seen[row].ids, ids).sum() for row in rows], dtype=np.int64)
+        return rows[n_seen >= LEAST_SEEN], ids
 
     @property
     def is_enough(self) -> bool:
@@ -393,10 +403,13 @@ def estimate_camera(
     if not recording.is_enough:
         return None
     free = np.array(sorted(column for term in terms for column in COLUMNS[term]))
-    solution = _start(recording.views(), camera, "radial" in terms)
-    for _ in range(ROUNDS):
-        recording.take_over(solution.views, changed(camera, solution.unknowns))
-        solution = _solve(recording.views(), camera, solution.unknowns, free)
+    try:
+        solution = _start(recording.views(), camera, "radial" in terms)
+        for _ in range(ROUNDS):
+            recording.take_over(solution.views, changed(camera, solution.unknowns))
+            solution = _solve(recording.views(), camera, solution.unknowns, free)
+    except np.linalg.LinAlgError:
+        return None  # a check must not end a run: what the frames have in common determines nothing
     return _estimate(camera, solution, free, terms)
 
 

@@ -8,6 +8,7 @@ deformation does not draw the camera along; what cannot stays with the scene.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -23,6 +24,7 @@ from morph_dslam.registration.landmarks import shape_starts
 from morph_dslam.registration.registration import MapRegistration, PosePrior, Registration
 from morph_dslam.slam.result import SlamFrame
 from morph_dslam.slam.rigid_map import RigidMap
+from morph_dslam.slam.rolling_shutter import RowPoses
 from morph_dslam.slam.slam import Slam
 from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR
 from morph_dslam.tracking.estimator import Estimator, Prior, moved
@@ -95,6 +97,7 @@ class Anchor:
         still.remove(good[taken])
         self.slam = Slam(camera)
         self.slam.use_map(still)
+        self._rows = RowPoses(still, camera) if camera.readout_s else None
 
     @classmethod
     def of(cls, registrations: Mapping[str, Registration], camera: Camera) -> Anchor:
@@ -116,7 +119,14 @@ class Anchor:
         frame = self.slam.process_frame(image, index, timestamp)
         if frame.pose is None:
             return {}, frame
-        return {name: place.pose_prior(frame.pose) for name, place in self._places.items()}, frame
+        poses = dict.fromkeys(self._places, frame.pose)
+        if self._rows is not None:
+            self._rows.add(timestamp, frame.pose.camera_from_world, frame.points)
+            for name, place in self._places.items():
+                # All of an object counts as seen with the row of its middle.
+                seen_at = self._rows.where_seen(place.world_from_object.apply(place.centre))
+                poses[name] = replace(frame.pose, camera_from_world=seen_at)
+        return {name: place.pose_prior(poses[name]) for name, place in self._places.items()}, frame
 
 
 def _check_places(movable: Mapping[str, NDArray[np.bool_]]) -> None:
