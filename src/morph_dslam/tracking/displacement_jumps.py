@@ -112,7 +112,7 @@ class JumpDetector:
         away = np.linalg.norm(np.array(self._shapes).reshape(-1, *shape.shape) - shape, axis=2).mean(axis=1)
         if len(away):
             self._largest = max(self._largest, float(away[0]))
-            if away[-1] < AGAIN * self._largest:
+            if away[-1] <= AGAIN * self._largest:
                 return
         usable = used & np.isfinite(residuals).all(axis=1)
         values = np.where(usable[:, None], residuals, 0.0)
