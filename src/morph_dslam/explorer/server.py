@@ -15,7 +15,6 @@ from urllib.parse import parse_qs, urlsplit
 import matplotlib
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from morph_dslam.errors import ExploreError
 from morph_dslam.io.local_server import LocalHandler, LocalServer, local_server
@@ -84,8 +83,7 @@ class _ModelSurface:
     def fields(self) -> tuple[_ColourField, ...]:
         """The fields to choose from, with one range of colours for the whole box."""
         model = self._model
-        sobol = qmc.Sobol(len(model.parameters), scramble=False).random(_SAMPLES)
-        samples = [model.default, *(model.lower + sobol * (model.upper - model.lower))]
+        samples = model.spread_parameters(_SAMPLES)
         names = {"displacement": "displacement"}
         names |= {place: label for place, label in _PLACES.items() if place in self._stresses}
         result = []
@@ -160,7 +158,7 @@ class _Answers:
         if url.path == "/shape.bin":
             return "application/octet-stream", self._shape
         if url.path == "/state.bin":
-            query = {name: values[-1] for name, values in parse_qs(url.query).items()}
+            query = {name: values[-1] for name, values in parse_qs(url.query, keep_blank_values=True).items()}
             return "application/octet-stream", self._state(query)
         return None
 
@@ -174,7 +172,7 @@ class _Answers:
         """The values (d,) of "1.5,20" in the parameters' units as SI, within their ranges."""
         model = self._model
         try:
-            given = zip(model.parameters, text.split(","), strict=True)
+            given = zip(model.parameters, text.split(",") if text else [], strict=True)
             mu = np.array([to_si(float(value), p.unit, p.quantity) for p, value in given])
         except ValueError as error:
             raise _BadRequest(f"'{text}' is not {len(model.parameters)} numbers") from error

@@ -176,3 +176,32 @@ def _smallest_patch(points: Array, loop: Indices) -> tuple[Indices, float]:
             patch.append((i, k, j))
             open_spans += [(i, k), (k, j)]
     return loop[np.array(patch, dtype=np.int64)], float(costs[0, n - 1])
+
+
+#: Triangles (of corners 0 to 2, middles 3 of edge 01, 4 of 12 and 5 of 20) in place of one, by the sum of 1, 2 and 4
+#: for the edges that are halved.
+_CUTS = {
+    0: [[0, 1, 2]],
+    1: [[0, 3, 2], [3, 1, 2]],
+    2: [[1, 4, 0], [4, 2, 0]],
+    4: [[2, 5, 1], [5, 0, 1]],
+    3: [[3, 1, 4], [0, 3, 4], [0, 4, 2]],
+    6: [[4, 2, 5], [1, 4, 5], [1, 5, 0]],
+    5: [[5, 0, 3], [2, 5, 3], [2, 3, 1]],
+    7: [[0, 3, 5], [1, 4, 3], [2, 5, 4], [3, 4, 5]],
+}
+
+
+def refined_surface(points: Array, triangles: Indices, longest: float) -> tuple[Array, Indices]:
+    """The same surface (n, 3), (m, 3) with edges of at most ``longest``: others are halved in both triangles."""
+    while True:
+        edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        edges, numbers = np.unique(edges, axis=0, return_inverse=True)
+        ends = points[edges]
+        long = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > longest
+        if not long.any():
+            return points, triangles
+        middles = np.where(long, len(points) + np.cumsum(long) - 1, -1)[numbers.reshape(-1, 3)]
+        points = np.concatenate([points, ends[long].mean(axis=1)])
+        corners, kind = np.hstack([triangles, middles]), (middles >= 0) @ np.array([1, 2, 4])
+        triangles = np.concatenate([corners[kind == k][:, cut].reshape(-1, 3) for k, cut in _CUTS.items()])

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import qmc
 
 from morph_dslam.errors import ParameterError
 from morph_dslam.model.separated import Outside, SeparatedField
@@ -169,6 +170,12 @@ class ReducedModel:
     def at(self, parameters: ParameterValues, outside: Outside = "bounded") -> DeformedState:
         """The object at some parameters: its displacement, strain, stress and reactions."""
         return DeformedState(self, self.vector(parameters), outside)
+
+    def spread_parameters(self, count: int) -> Array:
+        """The default and ``count`` Sobol samples of the box (1 + count, d); without parameters the default."""
+        d = len(self.parameters)
+        shares = qmc.Sobol(d, scramble=False).random(count) if d else np.empty((0, 0))
+        return np.vstack([self.default, self.lower + shares * (self.upper - self.lower)])
 
     def inside(self, parameters: ParameterValues) -> NDArray[np.bool_]:
         """Which parameters (d,) lie in their range; elsewhere see `separated.Outside`."""

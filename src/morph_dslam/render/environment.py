@@ -252,7 +252,8 @@ def _parameter_tracks(model: ReducedModel, keys: list[ParameterKeyFrame], frames
                 raise SceneError(
                     f"unknown parameter '{name}' in key frame {key.frame}; the model has {', '.join(known)}"
                 )
-    return np.column_stack([_parameter_track(parameter, keys, frames) for parameter in model.parameters])
+    tracks = [_parameter_track(parameter, keys, frames) for parameter in model.parameters]
+    return np.array(tracks).reshape(len(tracks), len(frames)).T
 
 
 def _pose_track(keys: list[PoseKeyFrame], frames: NDArray, upright: Vector) -> list[RigidTransform]:

@@ -34,7 +34,8 @@ from morph_dslam.sources.frames import Frame
 
 Array = NDArray[np.float64]
 N_TRUTH_POINTS = 300
-MIN_LANDMARKS = 8
+#: Landmarks of an object that deforms, and of a rigid one.
+MIN_LANDMARKS, MIN_LANDMARKS_RIGID = 8, 4
 #: A point so far behind the depth buffer is hidden; less may be the surface's own slope within a pixel.
 HIDDEN_BY = 3e-3
 
@@ -170,9 +171,10 @@ def _landmarks(world: _World) -> Landmarks:
     positions = world.node_positions(0)
     depth = np.minimum(world.depth_image(positions), world.surroundings_depth(0))
     nodes = nodes[world.visible(0, positions[nodes], depth)]
-    if len(nodes) < MIN_LANDMARKS:
+    least = MIN_LANDMARKS if world.model.parameters else MIN_LANDMARKS_RIGID
+    if len(nodes) < least:
         raise SceneError(
-            f"frame 0 shows {len(nodes)} landmarks of the object, and a tracker needs {MIN_LANDMARKS}: "
+            f"frame 0 shows {len(nodes)} landmarks of the object, and a tracker needs {least}: "
             "let the first key frames show all of it, without the occluder"
         )
     return Landmarks(world.model.nodes[nodes], world.camera.project(positions[nodes]))

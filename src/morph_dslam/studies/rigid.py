@@ -8,17 +8,21 @@ import numpy as np
 
 from morph_dslam.errors import StudyError
 from morph_dslam.meshing.netgen_meshing import read_surface
-from morph_dslam.meshing.surface_repair import repaired_surface
+from morph_dslam.meshing.surface_repair import refined_surface, repaired_surface
 from morph_dslam.model import ReducedModel, SeparatedField, save_model
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.studies.provenance import mesh_hash, versions
 from morph_dslam.units import to_si
 
+#: Edges of the model are at most this share of the diagonal long: a picture is drawn as flat within each triangle.
+LONGEST_EDGE = 1.0 / 24.0
+
 
 def build_rigid(surface: str | Path, unit: str, output: str | Path | None = None) -> ReducedModel:
     """The model of a rigid object, of which tracking estimates the pose alone.
 
-    Its frame is the file's. What was mended in the surface is in ``provenance["repairs"]``, counts by name.
+    Its frame is the file's. Long edges are halved until none is longer than a 24th of the diagonal. What was mended in
+    the surface is in ``provenance["repairs"]``, counts by name.
 
     Parameters
     ----------
@@ -37,6 +41,7 @@ def build_rigid(surface: str | Path, unit: str, output: str | Path | None = None
         points, triangles, repairs = repaired_surface(found.points, found.triangles)
     except StudyError as error:
         raise StudyError(f"{path} describes no surface: {error}; save it again as a triangulated surface") from error
+    points, triangles = refined_surface(points, triangles, LONGEST_EDGE * float(np.linalg.norm(np.ptp(points, axis=0))))
     none = np.empty(0)
     constant = ParameterFunctions(none, none, np.zeros((1, 0), dtype=np.int64), np.ones((1, 1)))
     model = ReducedModel(

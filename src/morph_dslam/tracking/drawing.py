@@ -11,7 +11,6 @@ from typing import Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 from tqdm import tqdm
 
 from morph_dslam.camera import Camera
@@ -267,8 +266,7 @@ class AugmentedView:
     def range_of_box(self) -> tuple[float, float]:
         """One range of colours for all states of the parameter box, known before any is seen."""
         model = self._model
-        shares = qmc.Sobol(len(model.parameters), scramble=False).random(SAMPLES)
-        shapes = [model.default, *(model.lower + shares * (model.upper - model.lower))]
+        shapes = model.spread_parameters(SAMPLES)
         return self._range([self._values(mu, self._displacement.value(mu), None) for mu in shapes])
 
     def _range(self, fields: list[Array]) -> tuple[float, float]:
