@@ -89,7 +89,7 @@ class _ModelSurface:
         result = []
         for key, label in names.items():
             top = float(np.percentile([self.values(mu, key) for mu in samples], _PERCENTILE))
-            result.append(_ColourField(key, label, "mm" if key == "displacement" else "MPa", _round_up(top)))
+            result.append(_ColourField(key, label, "mm" if key == "displacement" else "MPa", _round_up(top or 1.0)))
         return tuple(result)
 
     def description(self) -> dict[str, Any]:

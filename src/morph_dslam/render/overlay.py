@@ -196,7 +196,7 @@ def draw_overlay(
     node_values : (n,) the field in the unit that ``label`` names, for example von Mises stress in MPa; NaN where it
         has no value, which is drawn grey.
     value_range : values at the ends of the colour map; values beyond them take its end colours.
-    label : name and unit of the field, for example "von Mises stress [MPa]".
+    label : name and unit of the field, for example "von Mises stress [MPa]"; no colour bar if empty.
     colour_map : a matplotlib colour map.
     alpha : opacity of the surface, 0 to 1.
     brightness : (n,) factor on the colour at each node, for example from `shading.lambert`; 1 by default.
@@ -216,10 +216,11 @@ def draw_overlay(
     painted = paint_surface(result, pixels, depths, triangles, levels, table, alpha, brightness, closed)
     _draw_outline(result, painted)
     margin = round(0.02 * height)
-    upright = colour_bar(round(0.6 * height), float(low), float(high), label, colour_map, scale)
-    flat = flat_colour_bar(round(0.5 * width), float(low), float(high), label, colour_map, scale)
-    panel = (bar or BarPlace()).choose(painted, _bar_panels((height, width), margin, upright, flat))
-    _blend_panel(result, panel.image, panel.top, panel.left)
+    if label:
+        upright = colour_bar(round(0.6 * height), float(low), float(high), label, colour_map, scale)
+        flat = flat_colour_bar(round(0.5 * width), float(low), float(high), label, colour_map, scale)
+        panel = (bar or BarPlace()).choose(painted, _bar_panels((height, width), margin, upright, flat))
+        _blend_panel(result, panel.image, panel.top, panel.left)
     if caption:
         line = text_patch(caption, scale)
         _blend_panel(result, line, height - margin - line.shape[0], margin)

@@ -221,7 +221,9 @@ class AugmentedView:
 
     @property
     def label(self) -> str:
-        """Name and unit of the field."""
+        """Name and unit of the field; empty for a rigid object, which is drawn grey."""
+        if not self._model.parameters:
+            return ""
         return {
             "stress": "von Mises stress [MPa]",
             "strain": "equivalent strain [%]",
@@ -245,6 +247,8 @@ class AugmentedView:
         return self._values(state.parameters, self._displacement.value(state.parameters), self.view(state))
 
     def _values(self, parameters: Array, displacement: Array, view: View | None) -> Array:
+        if not self._model.parameters:
+            return np.full(len(displacement), np.nan)
         if self.show == "displacement":
             return 1e3 * np.linalg.norm(displacement, axis=1)
         if self.show == "strain":
@@ -270,6 +274,8 @@ class AugmentedView:
         return self._range([self._values(mu, self._displacement.value(mu), None) for mu in shapes])
 
     def _range(self, fields: list[Array]) -> tuple[float, float]:
+        if not self._model.parameters:
+            return 0.0, 1.0
         return 0.0, max(float(np.percentile(np.stack(fields), PERCENTILE)), 1e-6)
 
     def draw(

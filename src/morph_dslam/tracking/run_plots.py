@@ -19,10 +19,12 @@ MOST_STAGES, LEAST_SHARE = 10, 0.005
 
 
 def write_plots(folder: Path, run: RunResults) -> None:
-    """Write ``parameters.png``, ``confidence.png``, ``residual.png``, ``timings.png``, and ``jumps.png`` if any are."""
+    """Write ``residual.png``, ``timings.png``, of objects that deform ``parameters.png`` and ``confidence.png``, and
+    ``jumps.png`` if any are."""
     folder.mkdir(exist_ok=True)
-    plot_confidence(folder / "confidence.png", run)
-    plot_parameters(folder / "parameters.png", run)
+    if run.model.parameters:
+        plot_confidence(folder / "confidence.png", run)
+        plot_parameters(folder / "parameters.png", run)
     plot_residual(folder / "residual.png", run)
     plot_timings(folder / "timings.png", run)
     if any(result.jumps for result in run.results):
