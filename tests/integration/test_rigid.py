@@ -55,6 +55,7 @@ def test_the_pose_alone_is_tracked(folder, use_outline):
         assert result.tracked
         assert result.parameters == {}
         assert not result.displacement().any()
+        assert result.pose is not None
         errors.append(np.linalg.norm(result.pose.apply(nodes) - true.apply(nodes), axis=1).max())
     # A third of a pixel is 0.25 mm at 300 mm.
     assert max(errors) < 0.25e-3
