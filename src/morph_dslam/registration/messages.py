@@ -90,8 +90,8 @@ class PoorFit(RegistrationWarning):
     """
 
     template: ClassVar[str] = (
-        "registration poor: the landmarks fit to {sigma_px:.1f} px, carefully set ones to {expected_px:g} px; check "
-        "them, the camera file, and whether this is the model of this object"
+        "the landmarks fit to {sigma_px:.1f} px, where carefully set ones on an exact mesh fit to {expected_px:g} px: "
+        "the part and its drawing, or what else was given, differ by about as much; the stated deviations allow for it"
     )
     sigma_px: float
     expected_px: float
