@@ -51,8 +51,8 @@ CASES: list[Case] = [
     ("rolling", ROLLING, PLAIN, "readout", room, 0.5),
     ("plane", PLAIN, PLAIN, "", wall, 0.5),
     ("plane_focal", PLAIN, replace(PLAIN, fx=577.5, fy=577.5), "focal", wall, 0.5),
-    ("small_motion", PLAIN, PLAIN, "", room, 0.08),
-    ("small_motion_focal", PLAIN, replace(PLAIN, fx=577.5, fy=577.5), "focal", room, 0.08),
+    ("small_motion", PLAIN, PLAIN, "", room, 0.2),
+    ("small_motion_focal", PLAIN, replace(PLAIN, fx=577.5, fy=577.5), "focal", room, 0.2),
 ]
 
 

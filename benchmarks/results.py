@@ -201,6 +201,15 @@ BENCHMARKS = {
         "2 grey levels",
         10,
     ),
+    "camera_check": Benchmark(
+        "Camera tracking",
+        "Right and wrong cameras",
+        "python benchmarks/camera_check.py --seeds 3",
+        "simulated: exact camera",
+        "2 grey levels",
+        12,
+        "`no_map` counts films with too few frames for a check.",
+    ),
     "slam_long": Benchmark(
         "Camera tracking",
         "Long recordings",
