@@ -13,12 +13,13 @@ from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_exp
 from morph_dslam.io.camera_files import save_camera
+from morph_dslam.io.trajectory import load_trajectory
 from morph_dslam.model import SurfacePoints, save_model
-from morph_dslam.registration.board import FiducialBoard, load_board
+from morph_dslam.registration.board import BoardFile, FiducialBoard, load_board
 from morph_dslam.registration.board_registration import BoardInitializer, locate_board
 from morph_dslam.registration.guess import GuessFile, GuessInitializer
 from morph_dslam.registration.initialization import InitializerFiles
-from morph_dslam.registration.messages import Ambiguous, AssumedUndeformed
+from morph_dslam.registration.messages import Ambiguity, Ambiguous, AssumedUndeformed
 from morph_dslam.registration.picture import PictureInitializer, load_picture
 from morph_dslam.registration.registration import load_registration
 from morph_dslam.slam.map_files import save_map
@@ -28,6 +29,7 @@ from morph_dslam.tracking.patches import normalize_contrast
 from morph_dslam.tracking.relocalization import LEAST_MATCHES, state_from_matches
 from morph_dslam.tracking.state import BoundPoints, State
 from tests.support.bent_sheet import LENGTH, WIDTH
+from tests.support.real_data import real_data
 from tests.support.rendered_sequence import CAMERA, mean_error, write_landmarks, write_recording
 from tests.support.staged_scenes import SCENES, aside
 
@@ -88,12 +90,78 @@ def test_a_board_tells_its_pose_within_half_a_millimetre(tmp_path, text):
     assert found is not None
     assert found.n_corners >= 6
     assert found.rms_px < 0.3
-    assert not found.ambiguous
+    assert found.ambiguity is None
     corners = np.array([[0, 0, 0], [*board.size, 0.0]])
     off = found.camera_from_board.apply(corners) - BOARD_POSE.apply(corners)
     assert 1e3 * np.linalg.norm(off, axis=1).max() < 1.0
     away = found.camera_from_board.translation - BOARD_POSE.translation
     assert (np.abs(away) < 5.0 * np.sqrt(np.diag(found.covariance)[3:])).all()
+
+
+def turned_tags(board: FiducialBoard) -> FiducialBoard:
+    """The board with each of its tags printed turned by 180 degrees, as AprilTag and ViSP have them."""
+
+    class Turned(FiducialBoard):
+        def image(self, pixels_per_metre):
+            whole = board.image(pixels_per_metre)
+            side, pitch = (round(length * pixels_per_metre) for length in (0.03, board.pitch))
+            for row, column in np.ndindex(board.description.rows, board.description.columns):
+                place = np.s_[row * pitch : row * pitch + side, column * pitch : column * pitch + side]
+                whole[place] = whole[place][::-1, ::-1].copy()
+            return whole
+
+    return Turned(board.description)
+
+
+def test_tags_turned_as_apriltag_prints_them_are_read_too(tmp_path):
+    board = load_board(written(tmp_path, GRID))
+    picture = picture_of(turned_tags(board), BOARD_POSE)
+    found = locate_board(board, CAMERA, picture)
+    assert found is not None
+    assert found.rms_px < 0.3
+    assert found.ambiguity is None
+    corners = np.array([[0, 0, 0], [*board.size, 0.0]])
+    off = found.camera_from_board.apply(corners) - BOARD_POSE.apply(corners)
+    assert 1e3 * np.linalg.norm(off, axis=1).max() < 1.0
+    # One that is said to be OpenCV's is not read in the other order.
+    said = load_board(written(tmp_path, GRID.replace("gap_mm = 9", 'gap_mm = 9\ntag_corners = "opencv"')))
+    with pytest.raises(RegistrationError) as caught:
+        locate_board(said, CAMERA, picture)
+    assert caught.value.reason is RegistrationFailure.BOARD_DOES_NOT_FIT
+
+
+@pytest.mark.parametrize(("said", "ambiguity"), [("", Ambiguity.BOARD_TAGS), ('tag_corners = "opencv"', None)])
+def test_one_tag_alone_does_not_tell_the_order_of_its_corners(tmp_path, said, ambiguity):
+    text = (
+        GRID.replace("columns = 4", "columns = 1")
+        .replace("rows = 3", f"rows = 1\n{said}")
+        .replace("30\ngap", "80\ngap")
+    )
+    board = load_board(written(tmp_path, text))
+    found = locate_board(board, CAMERA, picture_of(board, BOARD_POSE))
+    assert found is not None
+    assert found.ambiguity is ambiguity
+
+
+def test_a_real_board_of_the_other_order_is_read():
+    """Tags 96 mm wide; the camera's motion since frame 0 against poses from the same tags by another program."""
+    folder = real_data("rbt_scene")
+    sizes = {"columns": 4, "rows": 3, "marker_mm": 96.0, "gap_mm": 24.2}
+    board = FiducialBoard(BoardFile(kind="grid", dictionary="apriltag_36h11", **sizes))
+    camera, true = md.load_camera(folder / "camera.yaml"), load_trajectory(folder / "tags_raw.txt")
+    first, *others = (
+        locate_board(board, camera, cv2.imread(str(folder / f"rgb/{frame:04}.jpg"), cv2.IMREAD_GRAYSCALE))
+        for frame in (0, 12, 24, 36)
+    )
+    assert first is not None
+    for frame, found in zip((12, 24, 36), others, strict=True):
+        assert found is not None
+        assert found.rms_px < 1.0
+        assert found.ambiguity is None
+        motion = (first.camera_from_board @ found.camera_from_board.inverse).matrix
+        expected = true.camera_from_world[0] @ np.linalg.inv(true.camera_from_world[frame])
+        assert np.linalg.norm(motion[:3, 3] - expected[:3, 3]) < 4e-3  # of up to 102 mm
+        assert np.degrees((Rotation.from_matrix(motion[:3, :3].T @ expected[:3, :3])).magnitude()) < 0.25
 
 
 def test_an_object_on_a_board_is_where_the_file_says(tmp_path, scene):
@@ -151,8 +219,9 @@ def test_a_board_is_printed_in_its_size(tmp_path, suffix, capsys):
         assert apart == pytest.approx(dots, rel=0.005)
 
 
-def test_a_board_in_a_map_tells_the_unit_and_the_place(tmp_path, scene):
-    board = load_board(written(tmp_path, GRID))
+@pytest.mark.parametrize("printed", [lambda board: board, turned_tags], ids=["OpenCV's tags", "AprilTag's"])
+def test_a_board_in_a_map_tells_the_unit_and_the_place(tmp_path, scene, printed):
+    board = printed(load_board(written(tmp_path, GRID)))
     world = SimilarityTransform(3.7, rotation_exp(np.array([0.4, -0.9, 1.3])), np.array([0.5, -1.2, 2.0]))
     rigid_map = RigidMap()
     rigid_map.add_points(np.zeros((1, 3)), np.zeros((1, 2)), 0, GOOD)

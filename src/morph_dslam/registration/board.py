@@ -101,7 +101,9 @@ class BoardFile(Section):
     """A board file.
 
     A "grid" has ``columns`` x ``rows`` markers of ``marker_mm``, ``gap_mm`` apart; a "charuco" board has so
-    many chessboard squares of ``square_mm`` with markers of ``marker_mm`` in the white ones.
+    many chessboard squares of ``square_mm`` with markers of ``marker_mm`` in the white ones. ``tag_corners`` says whose
+    picture of a tag is upright on a grid of AprilTags: OpenCV's is turned by 180 degrees against AprilTag's and ViSP's;
+    without it the poses decide.
     """
 
     kind: Literal["grid", "charuco"] = "grid"
@@ -111,6 +113,7 @@ class BoardFile(Section):
     marker_mm: Positive
     gap_mm: Positive | None = None
     square_mm: Positive | None = None
+    tag_corners: Literal["opencv", "apriltag"] | None = None
     object: Place | None = None
 
     @model_validator(mode="after")
@@ -126,10 +129,17 @@ class BoardFile(Section):
         other = "square_mm" if self.kind == "grid" else "gap_mm"
         if getattr(self, other) is not None:
             raise ValueError(f"{other} is for the other kind of board: leave it out of a {self.kind}")
+        if self.tag_corners and not self.has_two_orders:
+            raise ValueError("tag_corners is for grids of AprilTags: leave it out")
         pitch = self.marker_mm + (self.gap_mm or 0.0) if self.kind == "grid" else self.square_mm or 0.0
         if 1e-3 * pitch * max(self.columns, self.rows) > LARGEST_SIDE:
             raise ValueError(f"the board would be more than {LARGEST_SIDE:g} m long; sizes are in millimetres")
         return self
+
+    @property
+    def has_two_orders(self) -> bool:
+        """Whether the board's tags come with their corners in one of two orders."""
+        return self.kind == "grid" and self.dictionary.lower().startswith("apriltag")
 
 
 @dataclass(frozen=True)
@@ -190,6 +200,13 @@ class FiducialBoard:
             np.asarray(points, dtype=np.float64).reshape(-1, 3),
             np.asarray(pixels, dtype=np.float64).reshape(-1, 2),
         )
+
+    def orders(self, points: Array) -> list[Array]:
+        """The corners (k, 3) that `find` gives, as OpenCV orders them, for each order that the tags may have."""
+        if not self.description.has_two_orders:
+            return [points]
+        turned = np.roll(points.reshape(-1, 4, 3), 2, axis=1).reshape(-1, 3)
+        return {"opencv": [points], "apriltag": [turned], None: [points, turned]}[self.description.tag_corners]
 
     def image(self, pixels_per_metre: float) -> NDArray[np.uint8]:
         """The print (h, w) without a margin, 0 black."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -48,15 +48,20 @@ class BoardPose:
     camera_from_board : metres.
     covariance : (6, 6) of its increment, see `state.moved`.
     n_corners : number of corners found.
-    rms_px : root mean square of their residuals' lengths, pixels.
-    ambiguous : whether another tilt fits nearly as well.
+    cost : sum of their squared residuals, squared pixels.
+    ambiguity : what else fits nearly as well, another tilt or the other order of the tags' corners; None if nothing.
     """
 
     camera_from_board: RigidTransform
     covariance: Array
     n_corners: int
-    rms_px: float
-    ambiguous: bool
+    cost: float
+    ambiguity: Ambiguity | None
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square of the residuals' lengths, pixels."""
+        return float(np.sqrt(self.cost / self.n_corners))
 
     def of_object(self, board_from_object: RigidTransform) -> tuple[RigidTransform, Array]:
         """camera_from_object, and the covariance (6, 6) of its increment."""
@@ -67,27 +72,47 @@ class BoardPose:
 
 
 def locate_board(board: FiducialBoard, camera: Camera, grey: NDArray[np.uint8]) -> BoardPose | None:
-    """The board in an undistorted image (h, w); None where too little of it is seen."""
+    """The board in an undistorted image (h, w); None where too little of it is seen.
+
+    Raises
+    ------
+    RegistrationError
+        If the corners do not lie as the board file says, in neither order of its tags' corners.
+    """
     points, pixels = board.find(grey)
     if len(points) < FEWEST_CORNERS:
         return None
-    fits = sorted(
-        (_refined(start, points, pixels, camera) for start in solve_pnp(points, pixels, camera)), key=lambda fit: fit[1]
-    )
-    if not fits:
+    orders = [found for order in board.orders(points) if (found := _locate(order, pixels, camera))]
+    if not orders:
         return None
-    pose, cost, information = fits[0]
-    rms = float(np.sqrt(cost / len(points)))
-    if rms > LARGEST_RESIDUAL_PX:
+    best, *others = sorted(orders, key=lambda found: found.rms_px)
+    if best.rms_px > LARGEST_RESIDUAL_PX:
         raise RegistrationError(
-            f"the corners of the board do not lie as they should: they are {rms:.1f} px off; check the board "
+            f"the corners of the board do not lie as they should: they are {best.rms_px:.1f} px off; check the board "
             "file (sizes, columns and rows), that the print is flat, and the camera file",
             RegistrationFailure.BOARD_DOES_NOT_FIT,
         )
+    if any(_fits_as_well(found.cost, best.cost) for found in others):
+        return replace(best, ambiguity=Ambiguity.BOARD_TAGS)
+    return best
+
+
+def _fits_as_well(cost: float, best: float) -> bool:
+    """Whether a pose with squared residuals ``cost`` is ambiguous with the best."""
+    return cost < AMBIGUOUS * best + 1.0
+
+
+def _locate(points: Array, pixels: Array, camera: Camera) -> BoardPose | None:
+    """The best pose of corners (k, 3) seen at pixels (k, 2); None where there is none."""
+    found = (_refined(start, points, pixels, camera) for start in solve_pnp(points, pixels, camera))
+    fits = sorted((fit for fit in found if np.isfinite(fit[1])), key=lambda fit: fit[1])
+    if not fits:
+        return None
+    pose, cost, information = fits[0]
     variance = max(cost / max(2 * len(points) - 6, 1), LEAST_CORNER_PX**2)
-    ambiguous = any(_angle(pose, other) > 0.05 and c < AMBIGUOUS * cost + 1.0 for other, c, _ in fits[1:])
+    tilted = any(_angle(pose, other) > 0.05 and _fits_as_well(c, cost) for other, c, _ in fits[1:])
     covariance = np.asarray(variance * np.linalg.pinv(information), dtype=np.float64)
-    return BoardPose(pose, covariance, len(points), rms, ambiguous)
+    return BoardPose(pose, covariance, len(points), cost, Ambiguity.BOARD_TILT if tilted else None)
 
 
 def _refined(
@@ -151,8 +176,8 @@ class BoardInitializer:
         pose, of_pose = found.of_object(on_board)
         covariance = state_covariance(of_pose, len(model.parameters))
         warnings: list[RegistrationWarning] = [AssumedUndeformed()]
-        if found.ambiguous:
-            warnings.append(Ambiguous(Ambiguity.BOARD_TILT))
+        if found.ambiguity:
+            warnings.append(Ambiguous(found.ambiguity))
         facts = {"from": "board", "n_corners": found.n_corners, "residual_rms_px": found.rms_px}
         return Registration(model, State(model.default, pose), covariance, facts=facts, warnings=tuple(warnings))
 
@@ -168,6 +193,7 @@ class _BoardInMap:
     centre : (3,) of the board, metres.
     n_views : number of keyframes that show it.
     rms_px : root mean square of its corners' residuals, pixels.
+    open_order : whether the other order of its tags' corners fits nearly as well.
     """
 
     world_from_board: SimilarityTransform
@@ -175,6 +201,7 @@ class _BoardInMap:
     centre: Array
     n_views: int
     rms_px: float
+    open_order: bool
 
 
 def register_board(scene: Scene, model: ReducedModel, board: FiducialBoard | str | Path) -> Registration:
@@ -216,18 +243,15 @@ def register_board(scene: Scene, model: ReducedModel, board: FiducialBoard | str
     }
     keyframes = [KeyframePose(view.frame, camera_from_object(view, placed)) for view in views]
     in_map = MapRegistration(placed, mean_node, _about(found.covariance, arm))
-    return registration_in_map(model, in_map, keyframes, facts, scene=scene)
+    warnings = [Ambiguous(Ambiguity.BOARD_TAGS)] if found.open_order else []
+    return registration_in_map(model, in_map, keyframes, facts, warnings, scene=scene)
 
 
 def _find_in_map(board: FiducialBoard, views: Sequence[View], camera: Camera) -> _BoardInMap:
     """The similarity with which all keyframes see the board's corners where they are."""
-    seen, poses = [], []
-    for view in views:
-        points, pixels = board.find(view.normalized)
-        pose = locate_board(board, camera, view.normalized) if len(points) >= FEWEST_CORNERS else None
-        if pose is not None:
-            seen.append((view, points, pixels))
-            poses.append(pose.camera_from_board)
+    best, *others = _seen_in_orders(board, views, camera)
+    seen = [(view, points, pixels) for view, points, pixels, _ in best]
+    poses = [pose.camera_from_board for *_, pose in best]
     if len(seen) < 2:
         raise RegistrationError(
             f"the board is seen in {len(seen)} keyframes of the map, two at least are needed: film it from "
@@ -255,7 +279,28 @@ def _find_in_map(board: FiducialBoard, views: Sequence[View], camera: Camera) ->
         )
     variance = max(float(misfit @ misfit) / max(len(misfit) - 7, 1), LEAST_CORNER_PX**2)
     covariance = variance * np.linalg.pinv(found.jac.T @ found.jac) * np.outer(units, units)
-    return _BoardInMap(moved_similarity(start, found.x * units, centre), covariance, centre, len(seen), rms)
+    open_order = any(_fits_as_well(_total_cost(other), _total_cost(best)) for other in others)
+    world = moved_similarity(start, found.x * units, centre)
+    return _BoardInMap(world, covariance, centre, len(seen), rms, open_order)
+
+
+#: The views that show the board, its corners, their pixels, and its pose.
+_Seen = list[tuple[View, Array, Array, BoardPose]]
+
+
+def _seen_in_orders(board: FiducialBoard, views: Sequence[View], camera: Camera) -> list[_Seen]:
+    """The views in each order of the tags' corners, that which all of them together suit best first."""
+    orders: list[_Seen] = [[] for _ in board.orders(np.empty((0, 3)))]
+    for view in views:
+        points, pixels = board.find(view.normalized)
+        for seen, order in zip(orders, board.orders(points), strict=True):
+            pose = _locate(order, pixels, camera) if len(points) >= FEWEST_CORNERS else None
+            seen += [] if pose is None else [(view, order, pixels, pose)]
+    return sorted(orders, key=lambda seen: (-len(seen), _total_cost(seen)))
+
+
+def _total_cost(seen: _Seen) -> float:
+    return sum(pose.cost for *_, pose in seen)
 
 
 def _start(views: Sequence[View], poses: Sequence[RigidTransform], centre: Array) -> SimilarityTransform:

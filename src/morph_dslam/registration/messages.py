@@ -20,6 +20,7 @@ class Ambiguity(StrEnum):
 
     SHAPES = "shapes"
     BOARD_TILT = "board_tilt"
+    BOARD_TAGS = "board_tags"
     TWO_PRINTS = "two_prints"
     SECOND_PLACE = "second_place"
     UNCONFIRMED = "unconfirmed"
@@ -30,6 +31,8 @@ _AMBIGUITIES = {
     Ambiguity.SHAPES: "{value:.0f} different shapes fit the landmarks equally well; add landmarks away from the "
     "object's outline, or take a reference frame that shows it bent",
     Ambiguity.BOARD_TILT: "the board can be tilted the other way; show it larger or aslant",
+    Ambiguity.BOARD_TAGS: "each of the board's tags may be turned by 180 degrees, as OpenCV's are against AprilTag's; "
+    "show more of them, or say tag_corners in the board file",
     Ambiguity.TWO_PRINTS: "the print is in two places; the second one has {value:.0%} of the first one's features",
     Ambiguity.SECOND_PLACE: "another place in the map scores {value:.0%} of this one; look at registration.jpg, "
     "and give landmarks if it is wrong",
