@@ -72,5 +72,10 @@ def test_command_line_tracks_draws_and_writes_what_a_rigid_object_has(folder, ca
     assert {path.name for path in (run / "plots").iterdir()} == {"residual.png", "timings.png"}
     assert (run / "augmented.mp4").stat().st_size > 1000
     capsys.readouterr()
-    assert main([*command, "--show", "stress", "-o", str(folder / "other")]) == 2
-    assert "holds no stress to show" in capsys.readouterr().err
+    for option, message in (
+        (["--show", "stress"], "holds no stress to show"),
+        (["--per-sequence", "lever"], "'lever' cannot be one over the sequence: the model's parameters are none"),
+        (["--section", "x=20"], "it has no inside to show in a section"),
+    ):
+        assert main([*command, *option, "-o", str(folder / "other")]) == 2
+        assert message in capsys.readouterr().err

@@ -16,6 +16,7 @@ import pytest
 import morph_dslam as md
 from morph_dslam.errors import ExploreError
 from morph_dslam.explorer.server import make_server
+from morph_dslam.extend.studies import build_rigid
 from morph_dslam.io.local_server import HOST
 from morph_dslam.model import save_model
 from tests.support.bent_sheet import bent_sheet_model
@@ -154,6 +155,17 @@ def test_only_this_computer_is_answered(serve):
     get = serve(stretched_block_model())
     for host, status in (("localhost:8765", 200), ("127.0.0.1", 200), ("example.org:8765", 403)):
         assert get("/model.json", host=host)[0] == status
+
+
+def test_a_model_without_parameters_is_shown_as_it_is(serve, tmp_path):
+    (tmp_path / "corner.obj").write_text("v 0 0 0\nv 9 0 0\nv 0 9 0\nv 0 0 9\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    model = build_rigid(tmp_path / "corner.obj", "mm")
+    get = serve(model)
+    description = json.loads(get("/model.json")[2])
+    assert (description["parameters"], [field["key"] for field in description["fields"]]) == ([], ["displacement"])
+    status, _, state = get("/state.bin?mu=&field=displacement")
+    assert status == 200
+    np.testing.assert_array_equal(np.frombuffer(state, dtype="<f4"), np.zeros(4 * len(model.nodes)))
 
 
 def test_a_port_that_is_taken():

@@ -75,7 +75,7 @@ def test_points_outside_and_sheets_are_refused():
         StudyError, match=r"'rib' does not fit into 'block': 1 of 4 points lie outside .* reaches from \(0.0, "
     ):
         place_inner_structure(affine_block(), "rib", NODES + np.array([0.0, 0.0, 0.03]), TRIANGLES)
-    with pytest.raises(StudyError, match="the model of a sheet: it has no inside for 'rib'"):
+    with pytest.raises(StudyError, match="the model of a surface: it has no inside for 'rib'"):
         place_inner_structure(bent_sheet_model(3, 3), "rib", NODES, TRIANGLES)
 
 

@@ -123,7 +123,7 @@ def test_what_cannot_be_drawn_is_said():
         SectionPlane.parse("x>3")
     with pytest.raises(TrackingError, match=r"misses the object: .* reaches from 0.0 to 100.0 mm"):
         AugmentedView(model, CAMERA, DrawOptions(None, SectionPlane.parse("x=130")))
-    with pytest.raises(TrackingError, match="is a sheet: it has no inside"):
+    with pytest.raises(TrackingError, match="is the model of a surface: it has no inside"):
         AugmentedView(bent_sheet_model(5, 5), CAMERA, DrawOptions(None, SectionPlane.parse("x=3")))
     with pytest.raises(TrackingError, match="holds no strain to show; it has: stress, displacement"):
         AugmentedView(bent_sheet_model(5, 5), CAMERA, DrawOptions("strain"))

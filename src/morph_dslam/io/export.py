@@ -41,7 +41,7 @@ _QUARTER = 6
 def _index(model: ReducedModel, name: str) -> int:
     names = [p.name for p in model.parameters]
     if name not in names:
-        raise ExportError(f"the model has no parameter '{name}'; it has {', '.join(names)}")
+        raise ExportError(f"the model has no parameter '{name}'; it has {', '.join(names) or 'none'}")
     return names.index(name)
 
 

@@ -156,7 +156,7 @@ class ReducedModel:
         if isinstance(parameters, Mapping):
             if unknown := [str(name) for name in parameters if name not in names]:
                 raise ParameterError(
-                    f"the model '{self.name}' has no parameter '{unknown[0]}'; it has {', '.join(names)}"
+                    f"the model '{self.name}' has no parameter '{unknown[0]}'; it has {', '.join(names) or 'none'}"
                 )
             return np.array([parameters.get(p.name, p.default) for p in self.parameters], dtype=np.float64)
         mu = np.asarray(parameters, dtype=np.float64)

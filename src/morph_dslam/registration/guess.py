@@ -72,7 +72,9 @@ class GuessInitializer:
         names = [parameter.name for parameter in model.parameters]
         for name, value in self.guess.parameters.items():
             if name not in names:
-                raise RegistrationError(f"the guess has '{name}', the model's parameters are {', '.join(names)}")
+                raise RegistrationError(
+                    f"the guess has '{name}', the model's parameters are {', '.join(names) or 'none'}"
+                )
             k = names.index(name)
             shown = model.parameters[k].display(1.0)  # of one SI unit
             values[k] = np.clip(value / shown, model.lower[k], model.upper[k])

@@ -250,7 +250,7 @@ def _parameter_tracks(model: ReducedModel, keys: list[ParameterKeyFrame], frames
         for name in key.__pydantic_extra__:
             if name not in known:
                 raise SceneError(
-                    f"unknown parameter '{name}' in key frame {key.frame}; the model has {', '.join(known)}"
+                    f"unknown parameter '{name}' in key frame {key.frame}; the model has {', '.join(known) or 'none'}"
                 )
     tracks = [_parameter_track(parameter, keys, frames) for parameter in model.parameters]
     return np.array(tracks).reshape(len(tracks), len(frames)).T

@@ -28,7 +28,7 @@ def place_inner_structure(model: ReducedModel, name: str, nodes: Array, triangle
     triangles : (m, 3) its surface, node indices.
     """
     if not model.cells:
-        raise StudyError(f"'{model.name}' is the model of a sheet: it has no inside for '{name}'")
+        raise StudyError(f"'{model.name}' is the model of a surface: it has no inside for '{name}'")
     try:
         points = material_points(model, nodes)
     except StudyError as error:

@@ -81,10 +81,10 @@ def cut(model: ReducedModel, plane: SectionPlane) -> tuple[MaterialPoints, NDArr
     Raises
     ------
     TrackingError
-        If the model is a sheet's, or the plane misses the object.
+        If the model is a sheet's or a rigid object's, or the plane misses the object.
     """
     if not model.cells:
-        raise TrackingError(f"'{model.name}' is a sheet: it has no inside to show in a section")
+        raise TrackingError(f"'{model.name}' is the model of a surface: it has no inside to show in a section")
     tetrahedra, depth = _tetrahedra(model), _depth(model, plane)
     below = depth[tetrahedra] < 0.0
     count = below.sum(axis=1)

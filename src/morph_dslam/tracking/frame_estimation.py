@@ -327,7 +327,7 @@ def new_filter(estimator: Fitter[Frame], options: TrackerOptions) -> SequenceFil
     walking = dict(options.random_walk)
     for name, what in [(n, "be one over the sequence") for n in options.per_sequence] + [(n, "walk") for n in walking]:
         if name not in names:
-            raise TrackingError(f"'{name}' cannot {what}: the model's parameters are " + ", ".join(names))
+            raise TrackingError(f"'{name}' cannot {what}: the model's parameters are " + (", ".join(names) or "none"))
     for name, step in walking.items():
         if name in options.per_sequence:
             raise TrackingError(f"'{name}' is one over the sequence, so it cannot walk: leave out one of both")
