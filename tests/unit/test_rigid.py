@@ -52,25 +52,17 @@ def test_stl_with_a_hole_a_flipped_face_and_doubled_points_is_mended(tmp_path):
 
 def test_hole_that_is_not_convex_is_closed_in_its_plane(tmp_path):
     # A plate of 6 x 4 cells, 1 high, on whose top side an L of five cells is missing.
-    nx, ny = 6, 4
-    grid = [[x, y, z] for z in (0, 1) for y in range(ny + 1) for x in range(nx + 1)]
-    at = {tuple(point): number for number, point in enumerate(grid)}
     quads = []
-    for x in range(nx):
-        for y in range(ny):
-            bottom = [(x, y), (x, y + 1), (x + 1, y + 1), (x + 1, y)]
-            quads.append([at[i, j, 0] for i, j in bottom])
-            if (x, y) not in {(1, 1), (2, 1), (3, 1), (3, 2), (1, 2)}:
-                quads.append([at[i, j, 1] for i, j in bottom[::-1]])
-    for x in range(nx):
-        quads += [[at[i, y, z] for i, z in ring] for y, ring in (
-            (0, [(x, 0), (x + 1, 0), (x + 1, 1), (x, 1)]), (ny, [(x, 1), (x + 1, 1), (x + 1, 0), (x, 0)]),
-        )]  # fmt: skip
-    for y in range(ny):
-        quads += [[at[x, j, z] for j, z in ring] for x, ring in (
-            (0, [(y, 1), (y + 1, 1), (y + 1, 0), (y, 0)]), (nx, [(y, 0), (y + 1, 0), (y + 1, 1), (y, 1)]),
-        )]  # fmt: skip
-    model = build_rigid(written_obj(tmp_path / "plate.obj", grid, quads), "mm")
+    for x, y in np.ndindex(6, 4):
+        cell = [(x, y), (x + 1, y), (x + 1, y + 1), (x, y + 1)]
+        quads.append([(*corner, 0) for corner in cell[::-1]])
+        if (x, y) not in {(1, 1), (2, 1), (3, 1), (3, 2), (1, 2)}:
+            quads.append([(*corner, 1) for corner in cell])
+    ring = [(x, 0) for x in range(6)] + [(6, y) for y in range(4)]
+    ring += [(6 - x, 4 - y) for x, y in ring]
+    quads += [[(*a, 0), (*b, 0), (*b, 1), (*a, 1)] for a, b in zip(ring, [*ring[1:], ring[0]], strict=True)]
+    path = written_obj(tmp_path / "plate.obj", np.concatenate(quads), np.arange(4 * len(quads)).reshape(-1, 4))
+    model = build_rigid(path, "mm")
     assert volume_and_area(model) == pytest.approx((24.0, 2 * 24.0 + 2 * 10.0))
     assert model.provenance["repairs"] == {"holes closed": 1}
 
