@@ -209,3 +209,16 @@ def _damped_solution(matrix: Array, right: Array, prior: Array) -> Array:
     step[free] = np.linalg.solve(matrix[np.ix_(free, free)] + np.diag(prior[free]), right[free])
     step[:4] = np.clip(step[:4], -0.3, 0.3)
     return step
+
+
+#: Two places are one if the surfaces are this near to each other, over their size.
+SAME_PLACE = 0.05
+
+
+def same_place(a: SimilarityTransform, b: SimilarityTransform, surface: Surface) -> bool:
+    """Whether two similarities lay the surface, as a set of points, in the same place."""
+    between = b.inverse @ a
+    if not abs(np.log(between.scale)) < 0.1:
+        return False
+    distances, _ = surface.tree.query(between.apply(surface.points[::20]))
+    return float(distances.mean()) < SAME_PLACE * surface.size

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import SimilarityTransform
-from morph_dslam.registration.icp import Surface, fit_surface
+from morph_dslam.registration.icp import Surface, fit_surface, same_place
 from morph_dslam.registration.keyframe_adjustment import AdjustedKeyframes, KeyframeAdjustment, similarity_of_path
 from morph_dslam.registration.messages import (
     Ambiguity,
@@ -57,8 +57,6 @@ FINE = np.array([0.05, 0.04, 0.04, 0.03, 0.03, 0.025, 0.025, 0.02, 0.02, 0.02])
 TOLERANCE = 0.015
 #: A lower score is no evidence.
 FEWEST_EXPLAINED = 20
-#: Two places are one if the surfaces are this near to each other, over their size.
-SAME_PLACE = 0.05
 #: The runner-up's score over the best's above which they are ambiguous.
 AMBIGUOUS = 0.8
 #: So many of the best places are compared by the images on them, if they score at least this part of the
@@ -279,7 +277,7 @@ def _searched(points: MapPoints, surface: Surface, starts_in: list[Array], metri
         fits.append(fit_surface(some, surface, begun, MIDDLE * surface.size * begun.scale, metric, False))
     chosen: list[SimilarityTransform] = []
     for place in _by_weight(fits):
-        if len(chosen) < N_SCORED and all(not _same_place(place, other, surface) for other in chosen):
+        if len(chosen) < N_SCORED and all(not same_place(place, other, surface) for other in chosen):
             chosen.append(place)
     return chosen
 
@@ -287,15 +285,6 @@ def _searched(points: MapPoints, surface: Surface, starts_in: list[Array], metri
 def _by_weight(fits: list[tuple[SimilarityTransform, Array]]) -> list[SimilarityTransform]:
     """The fits without their weights, those of most weight first."""
     return [transform for transform, _ in sorted(fits, key=lambda fit: -float(fit[1].sum()))]
-
-
-def _same_place(a: SimilarityTransform, b: SimilarityTransform, surface: Surface) -> bool:
-    """Whether two similarities lay the surface, as a set of points, in the same place."""
-    between = b.inverse @ a
-    if not abs(np.log(between.scale)) < 0.1:
-        return False
-    distances, _ = surface.tree.query(between.apply(surface.points[::20]))
-    return float(distances.mean()) < SAME_PLACE * surface.size
 
 
 def _distinct(places: list[_Place], n_points: int, surface: Surface) -> list[_Place]:
@@ -309,7 +298,7 @@ def _distinct(places: list[_Place], n_points: int, surface: Surface) -> list[_Pl
         )
     kept: list[_Place] = []
     for place in places:
-        if all(not _same_place(place.transform, other.transform, surface) for other in kept):
+        if all(not same_place(place.transform, other.transform, surface) for other in kept):
             kept.append(place)
     return kept
 
@@ -343,7 +332,7 @@ def _chosen(
     best, place = compared[row].evidence, moved[row]
     others = [other.evidence.score for other in candidates[len(compared) :]]
     for other, there, misfit in zip(compared, moved, misfits, strict=True):
-        if misfit <= MUCH_WORSE * misfits[row] and not _same_place(there, place, surface):
+        if misfit <= MUCH_WORSE * misfits[row] and not same_place(there, place, surface):
             others.append(other.evidence.score)
     return MeshRegistration(
         place,

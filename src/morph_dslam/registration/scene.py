@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,7 +79,16 @@ def spread_views(views: Sequence[View], most: int) -> list[View]:
     return [views[index] for index in chosen]
 
 
-def camera_from_object(view: View, world_from_object: SimilarityTransform) -> RigidTransform:
+class HasPose(Protocol):
+    """What has a camera's pose in the map."""
+
+    @property
+    def camera_from_world(self) -> RigidTransform:
+        """The pose."""
+        ...
+
+
+def camera_from_object(view: HasPose, world_from_object: SimilarityTransform) -> RigidTransform:
     """The object's pose in a view, metres."""
     camera, placed = view.camera_from_world, world_from_object
     return RigidTransform(camera.rotation @ placed.rotation, camera.apply(placed.translation) / placed.scale)

@@ -1,0 +1,373 @@
+"""An object laid by its edges: the outline, and where its surface is bent sharply, against the edges of keyframes.
+
+Points of the mesh's visible edges are searched along their normals for the edge of the image (Harris, Tracking with
+rigid models, 1992; Drummond & Cipolla, Real-time visual tracking of complex structures, 2002). One similarity is fitted
+to all keyframes; each may be shifted a little by itself, because the camera path of a map has errors of its own.
+
+A cluttered image has edges everywhere. So an edge counts as much as it says more than chance: its likelihood where
+the mesh has an edge, over that of an edge as near in the same image a little to the sides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from morph_dslam.camera import Camera
+from morph_dslam.geometry import RigidTransform, SimilarityTransform
+from morph_dslam.registration.increments import moved_similarity, pose_jacobian, similarity_jacobian
+from morph_dslam.registration.scene import View, camera_from_object
+from morph_dslam.render.rasteriser import draw_depth
+
+Array = NDArray[np.float64]
+#: Cosine of the angle between two triangles from which their edge is seen, points along the edges of the size of the
+#: object, and the factor by which depth is drawn smaller.
+SHARP, SPACING, SHRINK = 0.85, 80, 2
+#: Change of grey in a pixel that is an edge, and cosine to the direction expected.
+LEAST_EDGE, PARALLEL = 3.0, 0.8
+#: How far to either side edges are searched in turn, pixels.
+REACHES = (16, 12, 10, 8, 6, 5, 4, 3, 3, 3)
+#: Standard deviation of an edge's place and of a keyframe's own shift, pixels.
+EDGE_PX, SHIFT_PX = 1.0, 2.0
+#: Standard deviation of a landmark that was clicked, pixels.
+CLICK_PX = 2.0
+#: An edge is where it is expected if it is as near, pixels; chance is asked this far to the sides.
+NEAR_PX, ASIDE_PX = 2.0, (8.0, 12.0, 16.0)
+#: Fewer points of edges in the images are no evidence.
+FEWEST = 30
+
+
+@dataclass(frozen=True)
+class VisibleEdges:
+    """Edges of a mesh that a view sees.
+
+    Attributes
+    ----------
+    points : (p, 3) object frame, metres.
+    pixels : (p, 2) where they are seen.
+    normals : (p, 2) across them in the image.
+    outline : (p,) whether something else is seen behind, and not another side of the object.
+    """
+
+    points: Array
+    pixels: Array
+    normals: Array
+    outline: NDArray[np.bool_]
+
+
+class MeshEdges:
+    """Points along the edges of a mesh.
+
+    Parameters
+    ----------
+    nodes : (n, 3) metres.
+    triangles : (m, 3) node indices.
+    """
+
+    def __init__(self, nodes: Array, triangles: NDArray[np.int64]) -> None:
+        self.nodes, self.triangles = nodes, triangles
+        self.size = float(np.linalg.norm(np.ptp(nodes, axis=0)))
+        sides = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        owner = np.repeat(np.arange(len(triangles)), 3)
+        keys = np.sort(sides, axis=1)
+        order = np.lexsort((keys[:, 1], keys[:, 0]))
+        _, first, uses = np.unique(keys[order], axis=0, return_index=True, return_counts=True)
+        ends, one = keys[order][first], owner[order[first]]
+        other = np.where(uses == 2, owner[order[np.minimum(first + 1, len(order) - 1)]], -1)
+        normals = np.cross(nodes[triangles[:, 1]] - nodes[triangles[:, 0]], nodes[triangles[:, 2]] - nodes[triangles[:, 0]])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        self._of_edge = np.stack([normals[one], np.where(other[:, None] >= 0, normals[other], -normals[one])], axis=1)
+        self._sharp = np.einsum("ex,ex->e", *self._of_edge.transpose(1, 0, 2)) < SHARP
+        length = np.linalg.norm(nodes[ends[:, 1]] - nodes[ends[:, 0]], axis=1)
+        self._edge, share = _spaced(length, self.size / SPACING)
+        start, along = nodes[ends[self._edge, 0]], (nodes[ends[:, 1]] - nodes[ends[:, 0]])[self._edge]
+        self._points = start + share[:, None] * along
+        self._along = along
+
+    def visible(self, pose: RigidTransform, camera: Camera) -> VisibleEdges:
+        """What a camera sees of them; ``pose`` is camera_from_object, metres."""
+        eye = pose.inverse.translation
+        facing = np.einsum("pkx,px->pk", self._of_edge[self._edge], eye - self._points) > 0.0
+        turns = facing[:, 0] != facing[:, 1]
+        rows = np.flatnonzero(turns | (self._sharp[self._edge] & facing.any(axis=1)))
+        local = pose.apply(self._points[rows])
+        pixels = camera.project(local)
+        seen = self._seen(pose, camera, local, pixels)
+        rows, local, pixels = rows[seen], local[seen], pixels[seen]
+        return VisibleEdges(self._points[rows], pixels, self._normals(rows, pose, camera, local), turns[rows])
+
+    def _normals(self, rows: NDArray[np.int64], pose: RigidTransform, camera: Camera, local: Array) -> Array:
+        """Across the edges, (p, 2). Where a smooth surface turns away, its own normal is across the outline."""
+        ahead = np.einsum("pij,pj->pi", camera.projection_jacobian(local), self._along[rows] @ pose.rotation.T)
+        across = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+        smooth = ~self._sharp[self._edge[rows]]
+        of_surface = self._of_edge[self._edge[rows]].sum(axis=1) @ pose.rotation.T
+        across[smooth] = of_surface[smooth, :2]
+        return across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
+
+    def _seen(self, pose: RigidTransform, camera: Camera, local: Array, pixels: Array) -> NDArray[np.bool_]:
+        """Which points (p,) are in the image, and not behind the object."""
+        nodes = pose.apply(self.nodes)
+        if nodes[:, 2].min() <= 0.0:
+            return np.zeros(len(local), dtype=bool)
+        drawn = (camera.project(nodes) + 0.5) / SHRINK - 0.5
+        size = camera.height // SHRINK, camera.width // SHRINK
+        _, depth = draw_depth(np.ascontiguousarray(drawn), nodes[:, 2].copy(), self.triangles, False, *size)
+        farthest = cv2.dilate(np.where(np.isfinite(depth), depth, 1e9).astype(np.float32), np.ones((3, 3), np.uint8))
+        column, row = np.rint((np.nan_to_num(pixels, nan=-9.0) + 0.5) / SHRINK - 0.5).astype(np.int64).T
+        inside = (column >= 2) & (row >= 2) & (column < size[1] - 2) & (row < size[0] - 2)
+        seen = np.zeros(len(local), dtype=bool)
+        seen[inside] = local[inside, 2] <= farthest[row[inside], column[inside]] + 0.01 * self.size
+        return seen
+
+
+def _spaced(lengths: Array, spacing: float) -> tuple[NDArray[np.int64], Array]:
+    """Edges (p,) and shares of their lengths (p,) at equal distances along all of them, one after the other."""
+    total = np.concatenate([[0.0], np.cumsum(lengths)])
+    places = np.arange(0.5 * spacing, total[-1], spacing)
+    edges = np.searchsorted(total, places, side="right") - 1
+    return edges, (places - total[edges]) / np.maximum(lengths[edges], 1e-300)
+
+
+@njit(cache=True, nogil=True)
+def find_edges(slope_x, slope_y, pixels, normals, reach, least):
+    """The strongest edge (p,) near each of some points, in pixels along the normal; NaN where there is none.
+
+    Parameters
+    ----------
+    slope_x : (h, w) change of grey to the right in a pixel.
+    slope_y : (h, w) downwards.
+    pixels : (p, 2) where to search.
+    normals : (p, 2) along which.
+    reach : pixels to either side; nearer edges are preferred.
+    least : change of grey of an edge.
+    """
+    height, width = slope_x.shape
+    n = int(2 * reach) * 2 + 1
+    offsets, strengths = np.full(len(pixels), np.nan), np.zeros(n)
+    for p in range(len(pixels)):
+        best, nx, ny = 0.0, normals[p, 0], normals[p, 1]
+        for k in range(n):
+            away = 0.5 * k - int(2 * reach) * 0.5
+            x, y = pixels[p, 0] + away * nx, pixels[p, 1] + away * ny
+            column, row = int(np.floor(x)), int(np.floor(y))
+            strengths[k] = 0.0
+            if column < 1 or row < 1 or column >= width - 2 or row >= height - 2:
+                continue
+            a, b = x - column, y - row
+            gx = (1 - b) * ((1 - a) * slope_x[row, column] + a * slope_x[row, column + 1]) + b * (
+                (1 - a) * slope_x[row + 1, column] + a * slope_x[row + 1, column + 1]
+            )
+            gy = (1 - b) * ((1 - a) * slope_y[row, column] + a * slope_y[row, column + 1]) + b * (
+                (1 - a) * slope_y[row + 1, column] + a * slope_y[row + 1, column + 1]
+            )
+            along = abs(gx * nx + gy * ny)
+            if along > PARALLEL * np.sqrt(gx * gx + gy * gy):
+                strengths[k] = along
+        for k in range(1, n - 1):
+            if strengths[k] < least or strengths[k] < strengths[k - 1] or strengths[k] <= strengths[k + 1]:
+                continue
+            away = 0.5 * k - int(2 * reach) * 0.5
+            weight = min(strengths[k], 20.0) * np.exp(-2.0 * (away / reach) ** 2)
+            if weight > best:
+                best = weight
+                bend = strengths[k - 1] - 2.0 * strengths[k] + strengths[k + 1]
+                offsets[p] = away + 0.25 * (strengths[k - 1] - strengths[k + 1]) / min(bend, -1e-9)
+    return offsets
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """Points of an object and where a camera in the map sees them.
+
+    Attributes
+    ----------
+    frame : number of the frame.
+    camera_from_world : the camera's pose.
+    points : (k, 3) object frame, metres.
+    pixels : (k, 2) undistorted.
+    """
+
+    frame: int
+    camera_from_world: RigidTransform
+    points: Array
+    pixels: Array
+
+
+def add_clicks(
+    matrix: Array, right: Array, click: Sighting, place: SimilarityTransform, centre: Array, camera: Camera
+) -> None:
+    """Add landmarks to the normal equations (7, 7) and (7,) of a place's step; each has `CLICK_PX`."""
+    pose = camera_from_object(click, place)
+    points = pose.apply(click.points)
+    by_pose = camera.projection_jacobian(points) @ pose_jacobian(points, pose)
+    rows = (by_pose @ similarity_jacobian(pose, place, centre)).reshape(-1, 7)
+    misses = (click.pixels - camera.project(points)).ravel()
+    weights = 1.0 / (1.0 + (misses / (3.0 * CLICK_PX)) ** 2) ** 2 / CLICK_PX**2
+    matrix += rows.T @ (weights[:, None] * rows)
+    right += rows.T @ (weights * misses)
+
+
+@dataclass(frozen=True)
+class EdgeEvidence:
+    """How much of an object's edges keyframes show where it is.
+
+    Attributes
+    ----------
+    share : of the points of its outline, those on edges.
+    chance : the same, where the outline is not.
+    inner : as ``share``, of the sharp edges inside of the outline.
+    inner_chance : likewise.
+    count : number of points of the outline.
+    n_inner : of the inner edges.
+    """
+
+    share: float
+    chance: float
+    inner: float
+    inner_chance: float
+    count: int
+    n_inner: int = 0
+
+    @property
+    def total(self) -> float:
+        """As `gain`, of all edges."""
+        every = max(self.count + self.n_inner, 1)
+        share = (self.count * self.share + self.n_inner * self.inner) / every
+        chance = (self.count * self.chance + self.n_inner * self.inner_chance) / every
+        return (share - chance) / max(1.0 - chance, 1e-9)
+
+    @property
+    def gain(self) -> float:
+        """How much more of the outline than by chance is on edges, of what could be."""
+        return (self.share - self.chance) / max(1.0 - self.chance, 1e-9)
+
+
+class EdgeImages:
+    """Edges of the keyframes of a map.
+
+    Parameters
+    ----------
+    views : keyframes.
+    camera : of the views, without distortion.
+    """
+
+    def __init__(self, views: Sequence[View], camera: Camera) -> None:
+        self.views, self.camera = list(views), camera
+
+    @cached_property
+    def slopes(self) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+        """Change of grey in a pixel to the right and downwards, (h, w) each, of every view."""
+        smooth = [cv2.GaussianBlur(view.normalized, (0, 0), 1.0).astype(np.float32) for view in self.views]
+        pairs = [(cv2.Sobel(image, cv2.CV_32F, 1, 0), cv2.Sobel(image, cv2.CV_32F, 0, 1)) for image in smooth]
+        return [(np.asarray(x / 8.0, np.float32), np.asarray(y / 8.0, np.float32)) for x, y in pairs]
+
+    def refine(
+        self,
+        edges: MeshEdges,
+        start: SimilarityTransform,
+        metric: bool,
+        reaches: Sequence[float] = REACHES,
+        clicks: Sequence[Sighting] = (),
+    ) -> tuple[SimilarityTransform, Array]:
+        """The place near ``start`` that has its edges on those of the images.
+
+        Parameters
+        ----------
+        edges : of the object.
+        start : metres to the map's unit.
+        metric : keep the scale.
+        reaches : pixels to search, in turn.
+        clicks : landmarks, which keep the place near to where they were set.
+
+        Returns
+        -------
+        The place, and the covariance (7, 7) of log scale, rotation vector and translation about the mean node.
+        """
+        centre, place = edges.nodes.mean(axis=0), start
+        units = np.array([1.0] * 4 + [edges.size * start.scale] * 3)
+        free = slice(1 if metric else 0, None)
+        covariance = np.zeros((7, 7))
+        for reach in reaches:
+            matrix, right = self._equations(edges, place, reach, centre)
+            for click in clicks:
+                add_clicks(matrix, right, click, place, centre, self.camera)
+            matrix, right = matrix * np.outer(units, units), right * units
+            # What the edges leave open stays.
+            damped = matrix[free, free] + np.diag(1e-4 * np.diag(matrix[free, free]) + 1e-6)
+            step = np.zeros(7)
+            step[free] = np.clip(np.linalg.solve(damped, right[free]), -0.15, 0.15)
+            covariance = np.zeros((7, 7))
+            covariance[free, free] = np.linalg.inv(damped)
+            place = moved_similarity(place, step * units, centre)
+        return place, covariance * np.outer(units, units)
+
+    def _equations(
+        self, edges: MeshEdges, place: SimilarityTransform, reach: float, centre: Array
+    ) -> tuple[Array, Array]:
+        """Normal matrix (7, 7) and right side (7,), the keyframes' own shifts eliminated."""
+        matrix, right = np.zeros((7, 7)), np.zeros(7)
+        for view, slopes in zip(self.views, self.slopes, strict=True):
+            pose = camera_from_object(view, place)
+            seen = edges.visible(pose, self.camera)
+            if len(seen.points) < FEWEST:
+                continue
+            offsets = find_edges(*slopes, seen.pixels, seen.normals, float(reach), LEAST_EDGE)
+            found = np.isfinite(offsets)
+            if found.sum() < FEWEST:
+                continue
+            points, normals, away = pose.apply(seen.points[found]), seen.normals[found], offsets[found]
+            by_pose = self.camera.projection_jacobian(points) @ pose_jacobian(points, pose)
+            rows = np.einsum("pi,pij->pj", normals, by_pose) @ similarity_jacobian(pose, place, centre)
+            width = max(0.5 * reach, 1.5)
+            weights = 1.0 / (1.0 + (away / width) ** 2) ** 2 / EDGE_PX**2
+            # Neighbours share their errors: a view's edges count as so many independent points.
+            weights *= min(1.0, 40.0 / len(away))
+            a, b = rows.T @ (weights[:, None] * rows), rows.T @ (weights[:, None] * normals)
+            d = normals.T @ (weights[:, None] * normals) + np.eye(2) / SHIFT_PX**2
+            gone = b @ np.linalg.inv(d)
+            matrix += a - gone @ b.T
+            right += rows.T @ (weights * away) - gone @ (normals.T @ (weights * away))
+        return matrix, right
+
+    def evidence(self, edges: MeshEdges, place: SimilarityTransform) -> EdgeEvidence:
+        """How much of the object's edges the keyframes show at a place."""
+        on, chance, outline = [], [], []
+        for view, slopes in zip(self.views, self.slopes, strict=True):
+            seen = edges.visible(camera_from_object(view, place), self.camera)
+            if len(seen.points) < FEWEST:
+                continue
+            shift = _own_shift(find_edges(*slopes, seen.pixels, seen.normals, 4.0, LEAST_EDGE), seen.normals)
+            pixels = seen.pixels + shift
+            aside = [side * away for away in ASIDE_PX for side in (-1.0, 1.0)]
+
+            def near(away: float, pixels: Array = pixels, seen: VisibleEdges = seen, slopes: tuple = slopes) -> Array:
+                places = pixels + away * seen.normals
+                return np.isfinite(find_edges(*slopes, places, seen.normals, NEAR_PX, LEAST_EDGE))
+
+            on.append(near(0.0))
+            chance.append(np.mean([near(away) for away in aside], axis=0))
+            outline.append(seen.outline)
+        if not on:
+            return EdgeEvidence(0.0, 0.0, 0.0, 0.0, 0)
+        found, by_chance, rim = np.concatenate(on), np.concatenate(chance), np.concatenate(outline)
+        parts = [float(np.mean(values[rows])) if rows.any() else 0.0 for rows in (rim, ~rim) for values in (found, by_chance)]
+        return EdgeEvidence(*parts, int(rim.sum()), int((~rim).sum()))
+
+
+def _own_shift(offsets: Array, normals: Array) -> Array:
+    """The shift (2,) of all points that brings most of them onto the edges found, within `SHIFT_PX` or so."""
+    found = np.isfinite(offsets)
+    shift, away, across = np.zeros(2), offsets[found], normals[found]
+    for _ in range(5):
+        left = away - across @ shift
+        weights = 1.0 / (1.0 + (left / 1.5) ** 2) ** 2
+        matrix = across.T @ (weights[:, None] * across) + np.eye(2) * 20.0 / SHIFT_PX**2
+        shift = np.linalg.solve(matrix, across.T @ (weights * away))
+    return shift

@@ -1,0 +1,249 @@
+"""Registration of a mesh by its edges in keyframes, with or without hints of where it is.
+
+One keyframe is searched for the object's edges, or landmarks say where it is in a frame. The points of the map on each
+hypothesis give the map's unit and speak for it; the best ones are fitted to the edges of all keyframes, and these decide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import Camera
+from morph_dslam.errors import RegistrationError, RegistrationFailure
+from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_exp
+from morph_dslam.registration.edges import EdgeEvidence, EdgeImages, MeshEdges, Sighting
+from morph_dslam.registration.icp import Surface, same_place
+from morph_dslam.registration.landmarks import solve_pnp
+from morph_dslam.registration.scene import MapPoints, View, spread_views, views_of
+from morph_dslam.registration.search_space import plane_points
+from morph_dslam.registration.view_search import (
+    EdgeDrawings,
+    InView,
+    hypotheses,
+    map_unit,
+    placed,
+    sizes_and_places,
+)
+
+Array = NDArray[np.float64]
+#: A hypothesis needs so many points of the map that agree on a unit, and this share of those in its outline.
+FEWEST_AGREEING, AGREEING_SHARE = 8, 0.6
+#: A metric map's unit may be off by this part where points on the object show it: its depths have errors.
+UNIT_ERROR = 0.12
+#: Sums of log likelihoods: for a point that agrees, and against one that does not.
+AGREES, DISAGREES = 0.5, 1.0
+#: Hypotheses fitted to few keyframes, keyframes for it, and those fitted to more of them.
+N_FITTED, FEW_VIEWS, N_FINE, MORE_VIEWS = 80, 4, 8, 12
+#: Pixels searched in turn for them.
+ROUGH, FINE = (12, 8, 6, 4, 3), (8, 6, 5, 4, 3, 3, 3)
+#: So many points must lie on the object outside of the one plane that holds most: a flat face fits on any print.
+FEWEST_SOLID = 6
+#: A point lies on the object if its depth is that of the surface, over the object's size.
+ON_SURFACE = 0.06
+#: Factor by which a rough distance may be off.
+ROUGH_FACTOR = 1.5
+
+
+@dataclass(frozen=True)
+class Hints:
+    """What is known of where the object is in a map, each alone or together.
+
+    Attributes
+    ----------
+    clicks : landmarks in frames whose camera is known.
+    distance : rough distance of the object from the camera in the keyframes, metres.
+    region : number of a keyframe, and left, top, right and bottom of a box around the object in it, pixels.
+    """
+
+    clicks: tuple[Sighting, ...] = ()
+    distance: float | None = None
+    region: tuple[int, tuple[float, float, float, float]] | None = None
+
+
+@dataclass(frozen=True)
+class EdgeRegistration:
+    """An object laid by its edges.
+
+    Attributes
+    ----------
+    place : metres to the map's unit.
+    covariance : (7, 7) of log scale, rotation vector and translation about the mean node.
+    edges : how much of its edges the keyframes show there.
+    n_explained : points of the map on it.
+    n_solid : those outside of the one plane that holds most.
+    """
+
+    place: SimilarityTransform
+    covariance: Array
+    edges: EdgeEvidence
+    n_explained: int
+    n_solid: int
+
+
+class EdgeSearch:
+    """Finds an object by its edges.
+
+    Parameters
+    ----------
+    nodes : (n, 3) metres.
+    triangles : (m, 3) node indices.
+    points : of the map.
+    views : keyframes of the map.
+    camera : of the views, without distortion.
+    metric : whether the map's unit is the metre.
+    """
+
+    def __init__(
+        self,
+        nodes: Array,
+        triangles: NDArray[np.int64],
+        points: MapPoints,
+        views: Sequence[View],
+        camera: Camera,
+        metric: bool,
+    ) -> None:
+        self.edges, self._surface = MeshEdges(nodes, triangles), Surface.of_mesh(nodes, triangles)
+        self._points, self._views, self._camera, self._metric = points, list(views), camera, metric
+
+    def search(self, hints: Hints) -> list[EdgeRegistration]:
+        """Distinct places, the best first; none where nothing resembles the object.
+
+        Raises RegistrationError if a hint names what is not there.
+        """
+        starts = self._by_clicks(hints.clicks) if hints.clicks else self._in_keyframe(hints)
+        few = EdgeImages(spread_views(self._views, FEW_VIEWS), self._camera)
+        rough = [few.refine(self.edges, start, self._metric, ROUGH, hints.clicks)[0] for start in starts]
+        gains = np.array([few.evidence(self.edges, place).total for place in rough])
+        found: list[EdgeRegistration] = []
+        for row in np.argsort(-gains):
+            if len(found) < N_FINE and all(not same_place(rough[row], f.place, self._surface) for f in found):
+                found.append(self.refined(rough[row], hints.clicks))
+        found.sort(key=lambda each: -each.edges.total)
+        kept: list[EdgeRegistration] = []
+        for each in found:
+            solid = bool(hints.clicks) or each.n_solid >= FEWEST_SOLID
+            if solid and all(not same_place(each.place, other.place, self._surface) for other in kept):
+                kept.append(each)
+        return kept
+
+    def refined(self, start: SimilarityTransform, clicks: Sequence[Sighting] = ()) -> EdgeRegistration:
+        """The place near ``start`` that has its edges on those of the keyframes that see it."""
+        views = views_of(self.edges.nodes, start, self._views, self._camera, MORE_VIEWS)
+        images = EdgeImages(views, self._camera)
+        place, covariance = images.refine(self.edges, start, self._metric, FINE, clicks)
+        # What the mesh's edges are off is the same in all keyframes.
+        covariance = covariance * max(1, len(views))
+        return EdgeRegistration(place, covariance, images.evidence(self.edges, place), *self._on_surface(place))
+
+    def evidence(self, place: SimilarityTransform) -> EdgeEvidence:
+        """How much of the object's edges the keyframes show at a place."""
+        views = views_of(self.edges.nodes, place, self._views, self._camera, MORE_VIEWS)
+        return EdgeImages(views, self._camera).evidence(self.edges, place)
+
+    def _on_surface(self, place: SimilarityTransform) -> tuple[int, int]:
+        """How many points of the map lie on the object, and of them outside of one plane."""
+        local = place.inverse.apply(self._points.positions)
+        near = self._surface.tree.query(local)[0] < ON_SURFACE / 2.0 * self._surface.size
+        if near.sum() < 3:
+            return int(near.sum()), 0
+        flat = plane_points(local[near], ON_SURFACE / 2.0 * self._surface.size, np.random.default_rng(0))
+        return int(near.sum()), int((~flat).sum())
+
+    def _in_keyframe(self, hints: Hints) -> list[SimilarityTransform]:
+        """Where one keyframe may show the object, and the map has points that agree."""
+        view, camera = self._searched(hints), self._camera
+        if not np.ptp(view.normalized) > 0:
+            return []
+        pixels = view.pixels
+        if hints.region is not None:
+            left, top, right, bottom = hints.region[1]
+            inside = ((pixels > [left, top]) & (pixels < [right, bottom])).all(axis=1)
+            pixels = pixels[inside]
+        sizes, places = sizes_and_places(camera, pixels)
+        if hints.distance is not None:
+            apart = np.abs(np.log(self.edges.size * camera.fx / sizes / hints.distance))
+            sizes = sizes[apart < np.log(ROUGH_FACTOR)]
+        if hints.region is not None:
+            # The box's diagonal is that of the drawn outline, which is that of the mesh or less.
+            across = float(np.hypot(right - left, bottom - top))
+            sizes = sizes[(sizes > 0.8 * across) & (sizes < 1.5 * across)]
+            places = places[((places > [left, top]) & (places < [right, bottom])).all(axis=1)]
+        drawings = EdgeDrawings.of(self.edges)
+        if not len(drawings.rotations) or not len(places):
+            return []
+        return self._agreeing(hypotheses(drawings, self.edges, view, camera, sizes, places), view)
+
+    def _searched(self, hints: Hints) -> View:
+        """The keyframe to search: that of the region, or the one that sees most points."""
+        if hints.region is None:
+            return self._views[len(self._views) // 2]
+        for view in self._views:
+            if view.frame == hints.region[0]:
+                return view
+        numbers = ", ".join(str(view.frame) for view in self._views)
+        raise RegistrationError(f"frame {hints.region[0]} is no keyframe of the map: give the region in one of {numbers}")
+
+    def _agreeing(self, found: list[InView], view: View) -> list[SimilarityTransform]:
+        """The best of the hypotheses by their edges and by the points of the map in their outline."""
+        ranked = self._ranked(found, view)[:N_FITTED]
+        return [placed(each.pose, view, unit, self._metric) for _, each, unit in ranked]
+
+    def _ranked(self, found: Sequence[InView], view: View) -> list[tuple[float, InView, float]]:
+        """Hypotheses with which the map agrees: what speaks for them, the best first, and the map's unit by them."""
+        ranked = []
+        for each in found:
+            unit, agreeing, inside = map_unit(each.pose, self.edges, view, self._points, self._camera)
+            if agreeing < FEWEST_AGREEING or agreeing < AGREEING_SHARE * inside:
+                continue
+            if self._metric and abs(np.log(unit)) > UNIT_ERROR:
+                continue
+            ranked.append((each.gain + AGREES * agreeing - DISAGREES * (inside - agreeing), each, unit))
+        return sorted(ranked, key=lambda entry: -entry[0])
+
+    def _by_clicks(self, clicks: Sequence[Sighting]) -> list[SimilarityTransform]:
+        """Where landmarks in single frames have the object, in every unit that the points on it allow."""
+        starts = []
+        for click in clicks:
+            if len(click.points) < 3:
+                continue
+            view = min(self._views, key=lambda view: abs(view.frame - click.frame))
+            for pose in poses_of_clicks(click, self._camera):
+                # The points are known where a keyframe sees them; the object stands still.
+                near = RigidTransform.from_matrix(
+                    view.camera_from_world.matrix @ np.linalg.inv(click.camera_from_world.matrix)
+                )
+                unit = 1.0
+                for _ in range(3):
+                    between = RigidTransform(near.rotation, near.translation / unit)
+                    found = map_unit(between @ pose, self.edges, view, self._points, self._camera)[0]
+                    unit = found if found > 0.0 else unit
+                starts.append(placed(pose, click, unit, self._metric))
+        if not starts:
+            raise RegistrationError(
+                "no pose of the object explains the landmarks: give three or more in one frame, and check that points "
+                "and pixels belong together",
+                RegistrationFailure.LANDMARKS_DO_NOT_FIT,
+            )
+        return starts
+
+
+def poses_of_clicks(click: Sighting, camera: Camera) -> list[RigidTransform]:
+    """Poses (camera_from_object) with which a camera sees landmarks where they were clicked; up to four of three.
+
+    Of three points by P3P (Ding et al., Revisiting the P3P problem, 2023, as in OpenCV), of more by `solve_pnp`.
+    """
+    if len(click.points) > 3:
+        return solve_pnp(click.points, click.pixels, camera)
+    _, rotations, translations = cv2.solveP3P(
+        click.points, np.ascontiguousarray(click.pixels), camera.matrix, None, flags=cv2.SOLVEPNP_P3P
+    )
+    poses = [
+        RigidTransform(rotation_exp(np.asarray(r, float).ravel()), np.asarray(t, float).ravel())
+        for r, t in zip(rotations, translations, strict=True)
+    ]
+    return [pose for pose in poses if (pose.apply(click.points)[:, 2] > 0.0).all()]

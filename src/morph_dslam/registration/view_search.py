@@ -1,0 +1,256 @@
+"""Where one keyframe may show an object: its edges, drawn from many sides, compared with those of the image.
+
+The mesh is metric, so every apparent size is a distance, and the map's unit follows from the map's points on the
+object. Drawings of the edges from sides spread over the sphere are laid over the image, turned and in several sizes
+(Ulrich, Wiedemann & Steger, Combining scale-space and similarity-based aspect graphs for fast 3D object recognition,
+2012). A point that meets an edge of its direction counts by how much likelier that is on the object than by chance in
+this part of the image (Olson & Huttenlocher, Automatic target recognition by matching oriented edge pixels, 1997), so
+that a cluttered print does not win by its many edges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from morph_dslam.camera import Camera
+from morph_dslam.geometry import RigidTransform, SimilarityTransform
+from morph_dslam.registration.edges import LEAST_EDGE, MeshEdges
+from morph_dslam.registration.scene import HasPose, MapPoints, View
+from morph_dslam.render.rasteriser import draw_depth
+
+Array = NDArray[np.float64]
+#: Sides from which the edges are drawn, turns of each drawing in the image, points compared, and directions of edges.
+N_SIDES, N_TURNS, N_POINTS, N_DIRECTIONS = 160, 24, 32, 8
+#: The image is halved; a point meets an edge within so many of these pixels, and the drawing moves by so many.
+HALF, TOLERANCE, STEP = 2, 2.0, 4
+#: Share of the object's edges that an image shows, and window over which chance is measured, pixels of the halved image.
+SHOWN, WINDOW = 0.8, 65
+#: Apparent diameters tried, over the image's height, and the factor from one to the next.
+SMALLEST, LARGEST, FACTOR = 0.12, 0.9, 1.2
+#: Points of the map are this near to the object's middle, over the image's height.
+NEAR = 0.125
+#: Distance at which the edges are drawn, over the object's size.
+DRAWN_AT = 4.0
+#: Hypotheses kept, and side of the squares and part of the sizes of which only the best one is, pixels.
+MOST, MOST_OF_SIDE, CELL = 1000, 400, 12
+#: Points of the map on the object have distances alike to this part, and at least so many give the map's unit.
+ALIKE, FEWEST_POINTS = 0.03, 4
+
+
+@dataclass(frozen=True)
+class EdgeDrawings:
+    """The edges of an object from many sides, over its diameter.
+
+    Attributes
+    ----------
+    rotations : (s, 3, 3) camera from object.
+    offsets : (s, N_POINTS, 2) from the object's middle, in parts of its size times focal length over distance.
+    normals : (s, N_POINTS) direction across the edge in the image, rad.
+    """
+
+    rotations: Array
+    offsets: Array
+    normals: Array
+
+    @classmethod
+    def of(cls, edges: MeshEdges) -> EdgeDrawings:
+        """Draw the edges of a mesh from sides spread evenly over the sphere (Fibonacci's spiral)."""
+        number = np.arange(N_SIDES) + 0.5
+        up, turn = 1.0 - 2.0 * number / N_SIDES, np.pi * (1.0 + 5.0**0.5) * number
+        flat = np.sqrt(1.0 - up**2)
+        sights = np.column_stack([flat * np.cos(turn), flat * np.sin(turn), up])
+        focal = 100.0 * DRAWN_AT
+        camera = Camera(256, 256, focal, focal, 127.5, 127.5)
+        centre = 0.5 * (edges.nodes.min(axis=0) + edges.nodes.max(axis=0))
+        rng = np.random.default_rng(0)
+        rotations, offsets, normals = [], [], []
+        for sight in sights:
+            rotation = Rotation.align_vectors([[0.0, 0.0, 1.0]], [sight])[0].as_matrix()
+            pose = RigidTransform(rotation, np.array([0.0, 0.0, DRAWN_AT * edges.size]) - rotation @ centre)
+            seen = edges.visible(pose, camera)
+            chosen = rng.permutation(len(seen.pixels))[:N_POINTS]
+            if len(chosen) == N_POINTS:
+                rotations.append(rotation)
+                offsets.append((seen.pixels[chosen] - 127.5) / 100.0)
+                normals.append(np.arctan2(seen.normals[chosen, 1], seen.normals[chosen, 0]))
+        return cls(np.array(rotations), np.array(offsets), np.array(normals))
+
+
+def edge_gains(view: View) -> NDArray[np.float32]:
+    """By how much an edge of each direction speaks for the object at each pixel (`N_DIRECTIONS`, h / 2, w / 2).
+
+    The log of the likelihood of what is seen there, an edge of that direction or none, on an edge of the object over
+    that in the image around.
+    """
+    small = cv2.resize(view.normalized, None, fx=1 / HALF, fy=1 / HALF, interpolation=cv2.INTER_AREA)
+    smooth = cv2.GaussianBlur(small, (0, 0), 0.8).astype(np.float32)
+    gx, gy = cv2.Sobel(smooth, cv2.CV_32F, 1, 0) / 8.0, cv2.Sobel(smooth, cv2.CV_32F, 0, 1) / 8.0
+    strength, angle = np.hypot(gx, gy), np.arctan2(gy, gx)
+    gains = []
+    for k in range(N_DIRECTIONS):
+        apart = np.abs((angle - np.pi * k / N_DIRECTIONS + np.pi / 2) % np.pi - np.pi / 2)
+        is_edge = (strength > LEAST_EDGE) & (apart < 0.75 * np.pi / N_DIRECTIONS)
+        away = cv2.distanceTransform((~is_edge).astype(np.uint8), cv2.DIST_L2, 3)
+        hit = (away <= TOLERANCE).astype(np.float32)
+        chance = np.clip(cv2.blur(hit, (WINDOW, WINDOW)), 0.05, 0.95)
+        shown = np.maximum(SHOWN, chance)
+        gains.append(np.where(hit > 0, np.log(shown / chance), np.log((1.0 - shown) / (1.0 - chance))))
+    return np.asarray(gains, dtype=np.float32)
+
+
+@njit(cache=True, nogil=True)
+def lay_over(gains, offsets, normals, turns, size, columns, rows, best, which):
+    """Lay all drawings, turned, over places of an image, and keep the best of each side at each place.
+
+    Parameters
+    ----------
+    gains : (d, h, w) of `edge_gains`.
+    offsets : (s, p, 2) of the drawings.
+    normals : (s, p) of the drawings.
+    turns : number of turns.
+    size : of the object, pixels.
+    columns : (k,) of the places.
+    rows : (k,) likewise.
+    best : (k, s) sums of gains, filled.
+    which : (k, s) int16 the turn that gives it, filled.
+    """
+    n_directions, height, width = gains.shape
+    n_sides, n_points = offsets.shape[:2]
+    x, y, direction = np.empty(n_points, np.int64), np.empty(n_points, np.int64), np.empty(n_points, np.int64)
+    for side in range(n_sides):
+        for turn in range(turns):
+            angle = 2.0 * np.pi * turn / turns
+            c, s = np.cos(angle), np.sin(angle)
+            for p in range(n_points):
+                u, v = size * offsets[side, p, 0], size * offsets[side, p, 1]
+                x[p], y[p] = int(np.rint(c * u - s * v)), int(np.rint(s * u + c * v))
+                direction[p] = int(np.rint((normals[side, p] + angle) / np.pi * n_directions)) % n_directions
+            for place in range(len(columns)):
+                total = 0.0
+                for p in range(n_points):
+                    column, row = columns[place] + x[p], rows[place] + y[p]
+                    if 0 <= column < width and 0 <= row < height:
+                        total += gains[direction[p], row, column]
+                    if (p == 5 and total < 0.0) or (p == 11 and total < 3.0):
+                        break
+                if total > best[place, side]:
+                    best[place, side], which[place, side] = total, turn
+
+
+@dataclass(frozen=True)
+class InView:
+    """A hypothesis: the object in one view.
+
+    Attributes
+    ----------
+    pose : camera_from_object, metres.
+    gain : of its edges there.
+    """
+
+    pose: RigidTransform
+    gain: float
+
+
+def hypotheses(
+    drawings: EdgeDrawings, edges: MeshEdges, view: View, camera: Camera, sizes: Sequence[float], places: Array
+) -> list[InView]:
+    """Where a view may show the object, the best first.
+
+    Parameters
+    ----------
+    drawings : of the object.
+    edges : of the object.
+    view : to search.
+    camera : of the view.
+    sizes : apparent diameters to try, pixels.
+    places : (k, 2) pixels at which its middle may be.
+    """
+    gains = edge_gains(view)
+    centre = 0.5 * (edges.nodes.min(axis=0) + edges.nodes.max(axis=0))
+    columns, rows = np.rint((places + 0.5) / HALF - 0.5).astype(np.int64).T
+    found: list[tuple[float, float, int, int, Array]] = []
+    for size in sizes:
+        best = np.zeros((len(places), len(drawings.rotations)), np.float32)
+        which = np.zeros(best.shape, np.int16)
+        lay_over(gains, drawings.offsets, drawings.normals, N_TURNS, size / HALF, columns, rows, best, which)
+        # The best of each side in each square.
+        of_size: list[tuple[float, float, int, int, Array]] = []
+        cells = rows // CELL * 10000 + columns // CELL
+        order = np.argsort(-best, axis=0)
+        for side in range(best.shape[1]):
+            ranked = order[:MOST_OF_SIDE, side]
+            _, first = np.unique(cells[ranked], return_index=True)
+            of_size += [(float(best[r, side]), size, side, int(which[r, side]), places[r]) for r in ranked[first]]
+        of_size.sort(key=lambda hypothesis: -hypothesis[0])
+        found += of_size[:MOST]
+    found.sort(key=lambda hypothesis: -hypothesis[0])
+    result = []
+    for gain, size, side, turn, place in found:
+        ray = camera.rays(place[None])[0]
+        distance = edges.size * camera.fx / size
+        about = Rotation.from_rotvec([0.0, 0.0, 2.0 * np.pi * turn / N_TURNS])
+        towards = Rotation.align_vectors([ray / np.linalg.norm(ray)], [[0.0, 0.0, 1.0]])[0]
+        rotation = (towards * about).as_matrix() @ drawings.rotations[side]
+        result.append(InView(RigidTransform(rotation, distance * ray - rotation @ centre), gain))
+    return result
+
+
+def sizes_and_places(camera: Camera, pixels: Array) -> tuple[Array, Array]:
+    """Apparent diameters (s,), pixels, and places (k, 2) for the object's middle.
+
+    Those with points of the map, seen at pixels (p, 2), near.
+    """
+    count = int(np.log(LARGEST / SMALLEST) / np.log(FACTOR)) + 1
+    sizes = SMALLEST * camera.height * FACTOR ** np.arange(count)
+    step, near = STEP * HALF, NEAR * camera.height
+    grid = np.stack(np.meshgrid(np.arange(step, camera.width, step), np.arange(step, camera.height, step)), axis=-1)
+    places = grid.reshape(-1, 2).astype(float)
+    apart = np.linalg.norm(places[:, None] - pixels[None], axis=2)
+    return sizes, places[(apart < near).sum(axis=1) >= FEWEST_POINTS]
+
+
+def map_unit(
+    pose: RigidTransform, edges: MeshEdges, view: View, points: MapPoints, camera: Camera
+) -> tuple[float, int, int]:
+    """The map's units per metre by its points on an object at a pose in a view.
+
+    Returns
+    -------
+    The unit, of how many points it is, and how many points there are in the object's outline; 0 without any.
+    """
+    local = pose.apply(edges.nodes)
+    if local[:, 2].min() <= 0.0:
+        return 0.0, 0, 0
+    factor = 4
+    drawn = (camera.project(local) + 0.5) / factor - 0.5
+    size = camera.height // factor, camera.width // factor
+    _, depth = draw_depth(np.ascontiguousarray(drawn), local[:, 2].copy(), edges.triangles, False, *size)
+    column, row = np.rint((view.pixels + 0.5) / factor - 0.5).astype(np.int64).T
+    inside = (column >= 0) & (row >= 0) & (column < size[1]) & (row < size[0])
+    there = np.full(len(column), np.inf)
+    there[inside] = depth[row[inside], column[inside]]
+    seen = np.isfinite(there)
+    if seen.sum() < FEWEST_POINTS:
+        return 0.0, 0, int(seen.sum())
+    ratios = np.sort(view.camera_from_world.apply(points.positions[view.point_ids[seen]])[:, 2] / there[seen])
+    # The unit that most points agree on.
+    last = np.searchsorted(ratios, ratios * (1.0 + 2.0 * ALIKE), side="right")
+    first = int((last - np.arange(len(ratios))).argmax())
+    return float(np.median(ratios[first : last[first]])), int(last[first] - first), len(ratios)
+
+
+def placed(pose: RigidTransform, view: HasPose, unit: float, metric: bool) -> SimilarityTransform:
+    """The world_from_object of an object at a pose, metres, in a view of a map of so many units per metre.
+
+    In a metric map the object keeps its size, and is moved along the sight line to where its points are.
+    """
+    world = view.camera_from_world.inverse
+    scale = 1.0 if metric else unit
+    return SimilarityTransform(scale, world.rotation @ pose.rotation, world.apply(unit * pose.translation))
