@@ -118,3 +118,17 @@ def frame_and_file(text: str) -> tuple[str, int, Path | None]:
     if not number.isdecimal() or (equals and not name):
         raise argparse.ArgumentTypeError(f"'{text}' is not a frame, or a frame and a file, such as 120=new.csv")
     return of, int(number), Path(name) if name else None
+
+
+def region(text: str) -> tuple[int, tuple[float, float, float, float]]:
+    """A box in a frame, "N:LEFT,TOP,RIGHT,BOTTOM"."""
+    number, _, box = text.partition(":")
+    try:
+        left, top, right, bottom = (float(value) for value in box.split(","))
+        frame = int(number)
+    except ValueError:
+        left = right = top = bottom = 0.0
+        frame = -1
+    if frame < 0 or not (left < right and top < bottom):
+        raise argparse.ArgumentTypeError(f"'{text}' is not N:LEFT,TOP,RIGHT,BOTTOM, a frame and a box of pixels in it")
+    return frame, (left, top, right, bottom)

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from morph_dslam.cli.arguments import add_file, add_output, add_repeated
+from morph_dslam.cli.arguments import add_file, add_output, add_repeated, positive_number, region
 
 HELP = "find an undeformed object in the map of a scene, and the size of the map's unit"
 KEPT = "nothing was written"
@@ -16,6 +16,16 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add_output(command, "FOLDER", "folder to write")
     add_file(
         command, "--board", "register the object, and find the map's unit, by a board that stands in the scene", "TOML"
+    )
+    add_file(command, "--landmarks", "points of the object clicked in frames of the scan, three or more in one", "CSV")
+    command.add_argument(
+        "--distance",
+        type=positive_number,
+        metavar="METRES",
+        help="rough distance of the object from the camera in the scan; it may be off by half",
+    )
+    command.add_argument(
+        "--region", type=region, metavar="N:LEFT,TOP,RIGHT,BOTTOM", help="box around the object in keyframe N, pixels"
     )
     add_repeated(
         command,
@@ -32,7 +42,15 @@ def run(arguments: argparse.Namespace) -> None:
     from morph_dslam.extend.registration import registration_line, run_registration
 
     registration = run_registration(
-        arguments.map, arguments.model, arguments.camera, arguments.output, arguments.beside, arguments.board
+        arguments.map,
+        arguments.model,
+        arguments.camera,
+        arguments.output,
+        arguments.beside,
+        arguments.board,
+        landmarks=arguments.landmarks,
+        distance=arguments.distance,
+        region=arguments.region,
     )
     camera_notes = load_scene(arguments.map, load_camera(arguments.camera)).camera_notes
     for note in [*(warning.text for warning in registration.warnings), *camera_notes]:

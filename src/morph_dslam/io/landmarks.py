@@ -1,6 +1,7 @@
 """Landmark files: points of the undeformed object and where they are seen in the reference frame.
 
 Such a file is CSV, in millimetres and pixels: a first line ``x_mm,y_mm,z_mm,u_px,v_px``, then a line for each point.
+Landmarks in the map of a scene have the number of their frame before it, in a first column ``frame``.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from morph_dslam.io.text import read_text
 
 #: No millimetres or pixels are meant by what is larger.
 LARGEST = 1e7
+FRAME = "frame"
 HEADER = ("x_mm", "y_mm", "z_mm", "u_px", "v_px")
 
 
@@ -28,10 +30,12 @@ class Landmarks:
     ----------
     points : (k, 3) on the undeformed object in its frame, metres
     pixels : (k, 2) in the image as recorded
+    frames : (k,) numbers of the frames in which they were set; None where all are of the reference frame
     """
 
     points: NDArray[np.float64]
     pixels: NDArray[np.float64]
+    frames: NDArray[np.int64] | None = None
 
 
 def load_landmarks(path: Path) -> Landmarks:
@@ -42,21 +46,25 @@ def load_landmarks(path: Path) -> Landmarks:
     """
     lines = read_text(path, "landmarks", RegistrationError).splitlines()
     rows = [row for row in csv.reader(lines) if any(cell.strip() for cell in row)]
-    if not rows or tuple(cell.strip() for cell in rows[0]) != HEADER:
-        raise RegistrationError(f"{path}: the first line of a landmark file is {','.join(HEADER)}")
-    values = np.array([_values(path, number, row) for number, row in enumerate(rows[1:], start=1)])
-    values = values.reshape(-1, len(HEADER))
-    return Landmarks(1e-3 * values[:, :3], np.ascontiguousarray(values[:, 3:]))
+    header = tuple(cell.strip() for cell in rows[0]) if rows else ()
+    if header not in (HEADER, (FRAME, *HEADER)):
+        raise RegistrationError(
+            f"{path}: the first line of a landmark file is {','.join(HEADER)}, with {FRAME} before it in a map"
+        )
+    values = np.array([_values(path, number, row, header) for number, row in enumerate(rows[1:], start=1)])
+    values = values.reshape(-1, len(header))
+    frames = values[:, 0].astype(np.int64) if header[0] == FRAME else None
+    return Landmarks(1e-3 * values[:, -5:-2], np.ascontiguousarray(values[:, -2:]), frames)
 
 
-def _values(path: Path, number: int, row: list[str]) -> list[float]:
+def _values(path: Path, number: int, row: list[str], header: tuple[str, ...]) -> list[float]:
     try:
         values = [float(cell) for cell in row]
     except ValueError:
         values = []
-    if len(values) != len(HEADER) or not (np.abs(values) < LARGEST).all():
+    if len(values) != len(header) or not (np.abs(values) < LARGEST).all():
         raise RegistrationError(
-            f"{path}: landmark {number} is '{','.join(row)}'; give {len(HEADER)} numbers: {','.join(HEADER)}"
+            f"{path}: landmark {number} is '{','.join(row)}'; give {len(header)} numbers: {','.join(header)}"
         )
     return values
 
@@ -67,4 +75,8 @@ def save_landmarks(path: Path, landmarks: Landmarks) -> None:
         ",".join([*(f"{1e3 * x:.6g}" for x in point), *(f"{x:.4f}" for x in pixel)])
         for point, pixel in zip(landmarks.points, landmarks.pixels, strict=True)
     ]
-    path.write_text("\n".join([",".join(HEADER), *lines]) + "\n")
+    header = ",".join(HEADER)
+    if landmarks.frames is not None:
+        header = f"{FRAME},{header}"
+        lines = [f"{frame},{line}" for frame, line in zip(landmarks.frames, lines, strict=True)]
+    path.write_text("\n".join([header, *lines]) + "\n")

@@ -80,7 +80,9 @@ class MeshEdges:
         _, first, uses = np.unique(keys[order], axis=0, return_index=True, return_counts=True)
         ends, one = keys[order][first], owner[order[first]]
         other = np.where(uses == 2, owner[order[np.minimum(first + 1, len(order) - 1)]], -1)
-        normals = np.cross(nodes[triangles[:, 1]] - nodes[triangles[:, 0]], nodes[triangles[:, 2]] - nodes[triangles[:, 0]])
+        normals = np.cross(
+            nodes[triangles[:, 1]] - nodes[triangles[:, 0]], nodes[triangles[:, 2]] - nodes[triangles[:, 0]]
+        )
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         self._of_edge = np.stack([normals[one], np.where(other[:, None] >= 0, normals[other], -normals[one])], axis=1)
         self._sharp = np.einsum("ex,ex->e", *self._of_edge.transpose(1, 0, 2)) < SHARP
@@ -357,7 +359,9 @@ class EdgeImages:
         if not on:
             return EdgeEvidence(0.0, 0.0, 0.0, 0.0, 0)
         found, by_chance, rim = np.concatenate(on), np.concatenate(chance), np.concatenate(outline)
-        parts = [float(np.mean(values[rows])) if rows.any() else 0.0 for rows in (rim, ~rim) for values in (found, by_chance)]
+        parts = [
+            float(np.mean(values[rows])) if rows.any() else 0.0 for rows in (rim, ~rim) for values in (found, by_chance)
+        ]
         return EdgeEvidence(*parts, int(rim.sum()), int((~rim).sum()))
 
 

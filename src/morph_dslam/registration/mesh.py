@@ -19,6 +19,7 @@ from tqdm import tqdm
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import SimilarityTransform
+from morph_dslam.registration.edges import EdgeEvidence
 from morph_dslam.registration.icp import Surface, fit_surface, same_place
 from morph_dslam.registration.keyframe_adjustment import AdjustedKeyframes, KeyframeAdjustment, similarity_of_path
 from morph_dslam.registration.messages import (
@@ -33,6 +34,7 @@ from morph_dslam.registration.registration import Axis
 from morph_dslam.registration.scene import MapPoints, View, spread_views
 from morph_dslam.registration.search_space import attitudes, candidate_regions, find_planes, plane_points
 from morph_dslam.registration.texture import TextureComparison
+from morph_dslam.registration.view_registration import EdgeRegistration, EdgeSearch, Hints
 from morph_dslam.render.rasteriser import rasterise
 
 Array = NDArray[np.float64]
@@ -59,6 +61,11 @@ TOLERANCE = 0.015
 FEWEST_EXPLAINED = 20
 #: The runner-up's score over the best's above which they are ambiguous.
 AMBIGUOUS = 0.8
+#: An object laid by its edges is confirmed if so much of its outline is on edges, of what chance does not put there.
+#: Its images are believed before its edges unless they lose more than this part of them.
+CONFIRMED, LOST_EDGES = 0.6, 0.05
+#: The same where landmarks have it there, and below which the edges speak against a place found by points.
+CONFIRMED_BY_CLICKS, AGAINST = 0.5, 0.25
 #: So many of the best places are compared by the images on them, if they score at least this part of the
 #: best. Images that differ by more than this, pixels, or so many times as much as on another place, speak
 #: against a place.
@@ -163,11 +170,19 @@ class MeshRegistration:
     keyframes: AdjustedKeyframes | None = None
     outline: OutlineFit = field(default_factory=OutlineFit)
     unconfirmed: bool = False
+    edges: EdgeEvidence | None = None
+    by_clicks: bool = False
 
     @property
     def warnings(self) -> tuple[RegistrationWarning, ...]:
         """What a reader must know."""
         warnings: list[RegistrationWarning] = []
+        if self.edges is not None:
+            if self.edges.gain < (CONFIRMED_BY_CLICKS if self.by_clicks else CONFIRMED):
+                warnings.append(OutlineElsewhere(self.edges.share))
+            elif self.runner_up > AMBIGUOUS * self.score:
+                warnings.append(Ambiguous(Ambiguity.SECOND_PLACE, self.runner_up / self.score))
+            return tuple(warnings if self.rms_px is not None else [*warnings, TooLittleTexture()])
         if self.outline.contradicts:
             warnings.append(OutlineElsewhere(self.outline.share))
         elif self.unconfirmed:
@@ -200,6 +215,7 @@ def register_mesh(
     camera: Camera,
     metric: bool = False,
     progress: bool = False,
+    hints: Hints | None = None,
 ) -> MeshRegistration:
     """Find an undeformed object in a map.
 
@@ -212,7 +228,75 @@ def register_mesh(
     camera : of the views, without distortion.
     metric : whether the map's unit is the metre.
     progress : whether to show a progress bar.
+    hints : what is known of where the object is.
+
+    Raises
+    ------
+    RegistrationError
+        If the object is not found, or a hint names what is not there.
     """
+    search = EdgeSearch(nodes, triangles, points, views, camera, metric)
+    places = search.search(hints or Hints())
+    if places:
+        by_edges = _by_edges(places, search, points, views, metric, bool(hints and hints.clicks))
+        if hints is not None or not by_edges.ambiguous:
+            return by_edges
+    elif hints is not None:
+        raise RegistrationError(
+            "no keyframe shows the object's edges where the hints have it: check them and the unit of the mesh, or "
+            "give three landmarks",
+            RegistrationFailure.NOT_FOUND,
+        )
+    found = _by_points(nodes, triangles, points, views, camera, metric, progress)
+    edges = search.evidence(found.world_from_object)
+    return replace(found, edges=edges) if edges.count and edges.gain < AGAINST else found
+
+
+def _by_edges(
+    places: list[EdgeRegistration],
+    search: EdgeSearch,
+    points: MapPoints,
+    views: Sequence[View],
+    metric: bool,
+    by_clicks: bool,
+) -> MeshRegistration:
+    """The best of the places, refined by the images on it where its edges stay; the others are its rivals."""
+    best, nodes, triangles = places[0], search.edges.nodes, search.edges.triangles
+    axis = search.surface.axis_of_revolution
+    found = MeshRegistration(
+        best.place,
+        best.covariance,
+        100.0 * best.edges.total,
+        max([0.0, *(100.0 * other.edges.total for other in places[1:])]),
+        best.n_explained,
+        None,
+        axis,
+        edges=best.edges,
+        by_clicks=by_clicks,
+    )
+    aligned = TextureComparison(nodes, triangles, search.camera).refine(best.place, views, metric)
+    if aligned is None:
+        return found
+    adjustment = KeyframeAdjustment(nodes, triangles, search.camera, points, views, axis)
+    adjusted = _adjusted(
+        replace(found, world_from_object=aligned[0], rms_px=aligned[1]), adjustment, nodes.mean(axis=0), metric
+    )
+    edges = search.evidence(adjusted.world_from_object)
+    if adjusted.keyframes is None or edges.total < best.edges.total - LOST_EDGES or aligned[1] > POOR_AGREEMENT_PX:
+        return found
+    return replace(adjusted, edges=edges)
+
+
+def _by_points(
+    nodes: Array,
+    triangles: NDArray[np.int64],
+    points: MapPoints,
+    views: Sequence[View],
+    camera: Camera,
+    metric: bool,
+    progress: bool,
+) -> MeshRegistration:
+    """The object found by the points of the map on it; parameters as of `register_mesh`."""
     rough, surface = Surface.of_mesh(nodes, triangles, ROUGH_SAMPLES), Surface.of_mesh(nodes, triangles)
     planes = find_planes(points.positions)
     starts_in = attitudes(surface.axis_of_revolution, planes.largest_normal(points.positions))
@@ -353,15 +437,16 @@ def register_in_unit(
     camera: Camera,
     metric: bool,
     progress: bool = False,
+    hints: Hints | None = None,
 ) -> MeshRegistration:
     """As `register_mesh`; an object that a metric map does not hold is looked for in other sizes.
 
     A monocular map has no unit: there an object of another size is found, with another map_units_per_metre.
     """
     try:
-        return register_mesh(nodes, triangles, points, views, camera, metric, progress)
+        return register_mesh(nodes, triangles, points, views, camera, metric, progress, hints)
     except RegistrationError as error:
-        if not metric:
+        if not metric or hints is not None:
             raise
         try:
             found = register_mesh(nodes, triangles, points, views, camera, False, progress)

@@ -12,9 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import RegistrationError
+from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.camera_files import load_camera
+from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.registration.board_registration import register_board
+from morph_dslam.registration.edges import Sighting
 from morph_dslam.registration.mesh import MeshRegistration, register_in_unit
 from morph_dslam.registration.registration import (
     KeyframePose,
@@ -25,6 +28,7 @@ from morph_dslam.registration.registration import (
     registration_in_map,
 )
 from morph_dslam.registration.scene import MapPoints, View, camera_from_object, points_and_views, spread_views
+from morph_dslam.registration.view_registration import Hints
 from morph_dslam.render.overlay import draw_overlay
 from morph_dslam.render.shading import lambert, vertex_normals
 from morph_dslam.slam.scene import Scene, load_scene
@@ -35,9 +39,18 @@ N_PICTURES = 3
 
 
 def register(
-    scene: Scene, model: ReducedModel, beside: Sequence[Registration] = (), progress: bool = False
+    scene: Scene,
+    model: ReducedModel,
+    beside: Sequence[Registration] = (),
+    progress: bool = False,
+    *,
+    landmarks: Landmarks | str | Path | None = None,
+    distance: float | None = None,
+    region: tuple[int, tuple[float, float, float, float]] | None = None,
 ) -> Registration:
-    """Find a model's undeformed object in a mapped scene by its shape and its texture.
+    """Find a model's undeformed object in a mapped scene by its edges, its shape and its texture.
+
+    Hints of where it is help, each alone or together.
 
     Parameters
     ----------
@@ -45,15 +58,22 @@ def register(
     model : of the object.
     beside : other objects in this map, to which the points on them are left.
     progress : whether to show a progress bar.
+    landmarks : three or more points of the object in one frame of the map's recording, or more in several frames; or
+        the file that has them. They have frame numbers.
+    distance : rough distance of the object from the camera, metres; it may be off by half.
+    region : number of a keyframe, and left, top, right and bottom of a box around the object in it, pixels.
 
     Raises
     ------
     RegistrationError
-        If the object is not found.
+        If the object is not found, or a hint names a frame without a pose.
     """
+    clicks = () if landmarks is None else _sightings(landmarks, scene)
+    given = landmarks is not None or distance is not None or region is not None
+    hints = Hints(clicks, distance, region) if given else None
     points, views = without_points_on(beside, *points_and_views(scene))
     nodes = model.positions(model.default)
-    found = register_in_unit(nodes, model.triangles, points, views, scene.camera, scene.is_metric, progress)
+    found = register_in_unit(nodes, model.triangles, points, views, scene.camera, scene.is_metric, progress, hints)
     facts = {
         "from": "map",
         "score": found.score,
@@ -61,10 +81,38 @@ def register(
         "n_explained": found.n_explained,
         "rms_px": found.rms_px,
         "map_units_per_metre": found.world_from_object.scale,
-        "outline_share": found.outline.share if found.outline.count else None,
+        "outline_share": _outline_share(found),
     }
     in_map = MapRegistration(found.world_from_object, nodes.mean(axis=0), found.covariance)
     return registration_in_map(model, in_map, _keyframes(found, views), facts, found.warnings, found.axis, scene)
+
+
+def _outline_share(found: MeshRegistration) -> float | None:
+    if found.edges is not None:
+        return found.edges.share
+    return found.outline.share if found.outline.count else None
+
+
+def _sightings(landmarks: Landmarks | str | Path, scene: Scene) -> tuple[Sighting, ...]:
+    """Landmarks by frames, with the camera's pose in each."""
+    given = landmarks if isinstance(landmarks, Landmarks) else load_landmarks(Path(landmarks))
+    if given.frames is None:
+        raise RegistrationError("landmarks in a map need the numbers of their frames: a first column 'frame'")
+    path = scene.trajectory
+    poses = {int(k): np.linalg.inv(m) for k, m in zip(path.indices, path.world_from_camera, strict=True)}
+    poses |= {keyframe.index: keyframe.camera_from_world for keyframe in scene.keyframes}
+    pixels = np.ascontiguousarray(scene.camera.undistort_pixels(given.pixels))
+    sightings = []
+    for frame in np.unique(given.frames).tolist():
+        if frame not in poses:
+            raise RegistrationError(
+                f"frame {frame} has no pose in the map, which has frames {min(poses)}-{max(poses)}: set the landmarks "
+                "in one of these"
+            )
+        rows = given.frames == frame
+        pose = RigidTransform.from_matrix(poses[frame])
+        sightings.append(Sighting(frame, pose, given.points[rows], np.ascontiguousarray(pixels[rows])))
+    return tuple(sightings)
 
 
 def without_points_on(
@@ -107,6 +155,10 @@ def run_registration(
     output: Path,
     beside: Sequence[Path] = (),
     board: Path | None = None,
+    *,
+    landmarks: Path | None = None,
+    distance: float | None = None,
+    region: tuple[int, tuple[float, float, float, float]] | None = None,
 ) -> Registration:
     """Register an object from files to files: ``registration.json``, and ``registration.jpg`` without a board.
 
@@ -118,6 +170,7 @@ def run_registration(
     output : the folder to write.
     beside : files of registrations of other objects in this map, to which the points on them are left.
     board : file of a board that stands in the scene, to register by; by the mesh if None.
+    landmarks, distance, region : hints, as of `register`.
 
     Raises
     ------
@@ -127,15 +180,16 @@ def run_registration(
     MapError, ModelFileError, CameraError
         If an input cannot be read.
     """
-    if board is not None and beside:
-        raise RegistrationError("a board says where the object is: leave out --beside")
+    if board is not None and (beside or landmarks is not None or distance is not None or region is not None):
+        raise RegistrationError("a board says where the object is: leave out --beside and the hints")
     camera, model = load_camera(camera_path), load_model(model_path)
     others = [_load_beside(path, map_path) for path in beside]
     scene = load_scene(map_path, camera)
     if board is not None:
         registration = register_board(scene, model, board)
     else:
-        registration = register(scene, model, others, progress=True)
+        hints: dict[str, Any] = {"landmarks": landmarks, "distance": distance, "region": region}
+        registration = register(scene, model, others, progress=True, **hints)
     registration.save(output / "registration.json", map_path, model_path)
     if board is None:
         cv2.imwrite(str(output / "registration.jpg"), draw_registration(registration, scene))

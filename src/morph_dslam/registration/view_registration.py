@@ -1,7 +1,7 @@
 """Registration of a mesh by its edges in keyframes, with or without hints of where it is.
 
-One keyframe is searched for the object's edges, or landmarks say where it is in a frame. The points of the map on each
-hypothesis give the map's unit and speak for it; the best ones are fitted to the edges of all keyframes, and these decide.
+One keyframe is searched for the object's edges, or landmarks say where it is in a frame. The map's points on each
+hypothesis give the unit and speak for it; the best ones are fitted to the edges of all keyframes, and these decide.
 """
 
 from __future__ import annotations
@@ -21,14 +21,7 @@ from morph_dslam.registration.icp import Surface, same_place
 from morph_dslam.registration.landmarks import solve_pnp
 from morph_dslam.registration.scene import MapPoints, View, spread_views, views_of
 from morph_dslam.registration.search_space import plane_points
-from morph_dslam.registration.view_search import (
-    EdgeDrawings,
-    InView,
-    hypotheses,
-    map_unit,
-    placed,
-    sizes_and_places,
-)
+from morph_dslam.registration.view_search import EdgeDrawings, InView, hypotheses, map_unit, placed, sizes_and_places
 
 Array = NDArray[np.float64]
 #: A hypothesis needs so many points of the map that agree on a unit, and this share of those in its outline.
@@ -107,8 +100,8 @@ class EdgeSearch:
         camera: Camera,
         metric: bool,
     ) -> None:
-        self.edges, self._surface = MeshEdges(nodes, triangles), Surface.of_mesh(nodes, triangles)
-        self._points, self._views, self._camera, self._metric = points, list(views), camera, metric
+        self.edges, self.surface = MeshEdges(nodes, triangles), Surface.of_mesh(nodes, triangles)
+        self._points, self._views, self.camera, self._metric = points, list(views), camera, metric
 
     def search(self, hints: Hints) -> list[EdgeRegistration]:
         """Distinct places, the best first; none where nothing resembles the object.
@@ -116,25 +109,25 @@ class EdgeSearch:
         Raises RegistrationError if a hint names what is not there.
         """
         starts = self._by_clicks(hints.clicks) if hints.clicks else self._in_keyframe(hints)
-        few = EdgeImages(spread_views(self._views, FEW_VIEWS), self._camera)
+        few = EdgeImages(spread_views(self._views, FEW_VIEWS), self.camera)
         rough = [few.refine(self.edges, start, self._metric, ROUGH, hints.clicks)[0] for start in starts]
         gains = np.array([few.evidence(self.edges, place).total for place in rough])
         found: list[EdgeRegistration] = []
         for row in np.argsort(-gains):
-            if len(found) < N_FINE and all(not same_place(rough[row], f.place, self._surface) for f in found):
+            if len(found) < N_FINE and all(not same_place(rough[row], f.place, self.surface) for f in found):
                 found.append(self.refined(rough[row], hints.clicks))
         found.sort(key=lambda each: -each.edges.total)
         kept: list[EdgeRegistration] = []
         for each in found:
             solid = bool(hints.clicks) or each.n_solid >= FEWEST_SOLID
-            if solid and all(not same_place(each.place, other.place, self._surface) for other in kept):
+            if solid and all(not same_place(each.place, other.place, self.surface) for other in kept):
                 kept.append(each)
         return kept
 
     def refined(self, start: SimilarityTransform, clicks: Sequence[Sighting] = ()) -> EdgeRegistration:
         """The place near ``start`` that has its edges on those of the keyframes that see it."""
-        views = views_of(self.edges.nodes, start, self._views, self._camera, MORE_VIEWS)
-        images = EdgeImages(views, self._camera)
+        views = views_of(self.edges.nodes, start, self._views, self.camera, MORE_VIEWS)
+        images = EdgeImages(views, self.camera)
         place, covariance = images.refine(self.edges, start, self._metric, FINE, clicks)
         # What the mesh's edges are off is the same in all keyframes.
         covariance = covariance * max(1, len(views))
@@ -142,21 +135,21 @@ class EdgeSearch:
 
     def evidence(self, place: SimilarityTransform) -> EdgeEvidence:
         """How much of the object's edges the keyframes show at a place."""
-        views = views_of(self.edges.nodes, place, self._views, self._camera, MORE_VIEWS)
-        return EdgeImages(views, self._camera).evidence(self.edges, place)
+        views = views_of(self.edges.nodes, place, self._views, self.camera, MORE_VIEWS)
+        return EdgeImages(views, self.camera).evidence(self.edges, place)
 
     def _on_surface(self, place: SimilarityTransform) -> tuple[int, int]:
         """How many points of the map lie on the object, and of them outside of one plane."""
         local = place.inverse.apply(self._points.positions)
-        near = self._surface.tree.query(local)[0] < ON_SURFACE / 2.0 * self._surface.size
+        near = self.surface.tree.query(local)[0] < ON_SURFACE / 2.0 * self.surface.size
         if near.sum() < 3:
             return int(near.sum()), 0
-        flat = plane_points(local[near], ON_SURFACE / 2.0 * self._surface.size, np.random.default_rng(0))
+        flat = plane_points(local[near], ON_SURFACE / 2.0 * self.surface.size, np.random.default_rng(0))
         return int(near.sum()), int((~flat).sum())
 
     def _in_keyframe(self, hints: Hints) -> list[SimilarityTransform]:
         """Where one keyframe may show the object, and the map has points that agree."""
-        view, camera = self._searched(hints), self._camera
+        view, camera = self._searched(hints), self.camera
         if not np.ptp(view.normalized) > 0:
             return []
         pixels = view.pixels
@@ -186,7 +179,9 @@ class EdgeSearch:
             if view.frame == hints.region[0]:
                 return view
         numbers = ", ".join(str(view.frame) for view in self._views)
-        raise RegistrationError(f"frame {hints.region[0]} is no keyframe of the map: give the region in one of {numbers}")
+        raise RegistrationError(
+            f"frame {hints.region[0]} is no keyframe of the map: give the region in one of {numbers}"
+        )
 
     def _agreeing(self, found: list[InView], view: View) -> list[SimilarityTransform]:
         """The best of the hypotheses by their edges and by the points of the map in their outline."""
@@ -197,7 +192,7 @@ class EdgeSearch:
         """Hypotheses with which the map agrees: what speaks for them, the best first, and the map's unit by them."""
         ranked = []
         for each in found:
-            unit, agreeing, inside = map_unit(each.pose, self.edges, view, self._points, self._camera)
+            unit, agreeing, inside = map_unit(each.pose, self.edges, view, self._points, self.camera)
             if agreeing < FEWEST_AGREEING or agreeing < AGREEING_SHARE * inside:
                 continue
             if self._metric and abs(np.log(unit)) > UNIT_ERROR:
@@ -212,7 +207,7 @@ class EdgeSearch:
             if len(click.points) < 3:
                 continue
             view = min(self._views, key=lambda view: abs(view.frame - click.frame))
-            for pose in poses_of_clicks(click, self._camera):
+            for pose in poses_of_clicks(click, self.camera):
                 # The points are known where a keyframe sees them; the object stands still.
                 near = RigidTransform.from_matrix(
                     view.camera_from_world.matrix @ np.linalg.inv(click.camera_from_world.matrix)
@@ -220,7 +215,7 @@ class EdgeSearch:
                 unit = 1.0
                 for _ in range(3):
                     between = RigidTransform(near.rotation, near.translation / unit)
-                    found = map_unit(between @ pose, self.edges, view, self._points, self._camera)[0]
+                    found = map_unit(between @ pose, self.edges, view, self._points, self.camera)[0]
                     unit = found if found > 0.0 else unit
                 starts.append(placed(pose, click, unit, self._metric))
         if not starts:

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 N_SIDES, N_TURNS, N_POINTS, N_DIRECTIONS = 160, 24, 32, 8
 #: The image is halved; a point meets an edge within so many of these pixels, and the drawing moves by so many.
 HALF, TOLERANCE, STEP = 2, 2.0, 4
-#: Share of the object's edges that an image shows, and window over which chance is measured, pixels of the halved image.
+#: Share of the object's edges that an image shows; window over which chance is measured, pixels of the halved image.
 SHOWN, WINDOW = 0.8, 65
 #: Apparent diameters tried, over the image's height, and the factor from one to the next.
 SMALLEST, LARGEST, FACTOR = 0.12, 0.9, 1.2
