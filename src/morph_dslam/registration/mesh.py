@@ -64,8 +64,9 @@ AMBIGUOUS = 0.8
 #: An object laid by its edges is confirmed if so much of its outline is on edges, of what chance does not put there.
 #: Its images are believed before its edges unless they lose more than this part of them.
 CONFIRMED, LOST_EDGES = 0.6, 0.05
-#: The same where landmarks have it there, and below which the edges speak against a place found by points.
-CONFIRMED_BY_CLICKS, AGAINST = 0.5, 0.25
+#: The same where landmarks have it there, and below which the edges speak against a place found by
+#: points, if chance puts less than this on edges.
+CONFIRMED_BY_CLICKS, AGAINST, TELLING_CHANCE = 0.5, 0.25, 0.5
 #: So many of the best places are compared by the images on them, if they score at least this part of the
 #: best. Images that differ by more than this, pixels, or so many times as much as on another place, speak
 #: against a place.
@@ -249,7 +250,9 @@ def register_mesh(
         )
     found = _by_points(nodes, triangles, points, views, camera, metric, progress)
     edges = search.evidence(found.world_from_object)
-    return replace(found, edges=edges) if edges.count and edges.gain < AGAINST else found
+    # On a dense texture, edges are everywhere and say nothing.
+    informative = 0.0 < edges.chance < TELLING_CHANCE
+    return replace(found, edges=edges) if informative and edges.gain < AGAINST else found
 
 
 def _by_edges(

@@ -7,7 +7,7 @@ hypothesis give the unit and speak for it; the best ones are fitted to the edges
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_exp
-from morph_dslam.registration.edges import EdgeEvidence, EdgeImages, MeshEdges, Sighting
+from morph_dslam.registration.edges import CLICK_PX, EdgeEvidence, EdgeImages, MeshEdges, Sighting
 from morph_dslam.registration.icp import Surface, same_place
 from morph_dslam.registration.landmarks import solve_pnp
-from morph_dslam.registration.scene import MapPoints, View, spread_views, views_of
+from morph_dslam.registration.scene import MapPoints, View, camera_from_object, spread_views, views_of
 from morph_dslam.registration.search_space import plane_points
 from morph_dslam.registration.view_search import EdgeDrawings, InView, hypotheses, map_unit, placed, sizes_and_places
 
@@ -38,6 +38,8 @@ ROUGH, FINE = (12, 8, 6, 4, 3), (8, 6, 5, 4, 3, 3, 3)
 FEWEST_SOLID = 6
 #: A point lies on the object if its depth is that of the surface, over the object's size.
 ON_SURFACE = 0.06
+#: Fewer landmarks than this in a frame are tried in so many other places, too.
+MANY_CLICKS, N_MEANT = 6, 12
 #: Factor by which a rough distance may be off.
 ROUGH_FACTOR = 1.5
 
@@ -114,15 +116,21 @@ class EdgeSearch:
         gains = np.array([few.evidence(self.edges, place).total for place in rough])
         found: list[EdgeRegistration] = []
         for row in np.argsort(-gains):
-            if len(found) < N_FINE and all(not same_place(rough[row], f.place, self.surface) for f in found):
+            if len(found) < N_FINE and not any(self._same(rough[row], f.place) for f in found):
                 found.append(self.refined(rough[row], hints.clicks))
         found.sort(key=lambda each: -each.edges.total)
         kept: list[EdgeRegistration] = []
         for each in found:
             solid = bool(hints.clicks) or each.n_solid >= FEWEST_SOLID
-            if solid and all(not same_place(each.place, other.place, self.surface) for other in kept):
+            if solid and not any(self._same(each.place, other.place) for other in kept):
                 kept.append(each)
         return kept
+
+    def _same(self, a: SimilarityTransform, b: SimilarityTransform) -> bool:
+        """Whether two places are one as a camera sees them; the map's unit may differ."""
+        view = self._views[len(self._views) // 2]
+        poses = [camera_from_object(view, place) for place in (a, b)]
+        return same_place(*(SimilarityTransform(1.0, p.rotation, p.translation) for p in poses), self.surface)
 
     def refined(self, start: SimilarityTransform, clicks: Sequence[Sighting] = ()) -> EdgeRegistration:
         """The place near ``start`` that has its edges on those of the keyframes that see it."""
@@ -207,7 +215,13 @@ class EdgeSearch:
             if len(click.points) < 3:
                 continue
             view = min(self._views, key=lambda view: abs(view.frame - click.frame))
-            for pose in poses_of_clicks(click, self.camera):
+            # Of few points, a pixel may turn the pose far: start from what the clicks may have meant, too.
+            rng = np.random.default_rng(0)
+            meant = [click] + [
+                replace(click, pixels=click.pixels + CLICK_PX * rng.normal(size=click.pixels.shape))
+                for _ in range(N_MEANT if len(click.points) < MANY_CLICKS else 0)
+            ]
+            for pose in (pose for each in meant for pose in poses_of_clicks(each, self.camera)):
                 # The points are known where a keyframe sees them; the object stands still.
                 near = RigidTransform.from_matrix(
                     view.camera_from_world.matrix @ np.linalg.inv(click.camera_from_world.matrix)

@@ -1,0 +1,100 @@
+"""An object laid by its edges: from near, by three landmarks, by a rough distance; and none where nothing is seen."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from morph_dslam.errors import RegistrationError
+from morph_dslam.geometry import SimilarityTransform
+from morph_dslam.io.landmarks import Landmarks, load_landmarks, save_landmarks
+from morph_dslam.registration.edges import EdgeImages, MeshEdges, Sighting
+from morph_dslam.registration.scene import camera_from_object
+from morph_dslam.registration.view_registration import EdgeSearch, Hints
+from morph_dslam.render.rasteriser import rasterise
+from morph_dslam.tracking.patches import normalize_contrast
+from tests.support.rendered_object import CAMERA, scanned, wedge
+
+WORLD = SimilarityTransform(3.7, Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix(), np.array([0.5, -1.2, 2.0]))
+NODES, TRIANGLES, _ = wedge()
+#: Three corners of the wedge, metres.
+CORNERS = np.array([[0.01, 0.05, 0.07], [0.05, 0.05, 0.045], [0.09, 0.0, 0.0]])
+
+
+def apart(found, true):
+    """Largest distance of any node between two placings, metres."""
+    return np.linalg.norm((true.inverse @ found).apply(NODES) - NODES, axis=1).max()
+
+
+@pytest.fixture(scope="module")
+def scan():
+    """A wedge whose faces have a grey each, before a grey table, with a little noise."""
+    points, views = scanned(WORLD)
+    rng, corners = np.random.default_rng(0), NODES[TRIANGLES]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    grey = 120.0 + normals @ [60.0, 35.0, 20.0]
+    shaded = []
+    for view in views:
+        local = camera_from_object(view, WORLD).apply(NODES)
+        drawn = rasterise(CAMERA.project(local), local[:, 2], TRIANGLES, CAMERA.height, CAMERA.width, closed=True)
+        image = np.where(drawn.covered, grey[drawn.triangle_ids], 200.0) + rng.normal(0.0, 2.0, drawn.covered.shape)
+        image = cv2.GaussianBlur(image, (0, 0), 0.7)
+        shaded.append(replace(view, normalized=normalize_contrast(image.clip(0, 255).astype(np.uint8))))
+    return points, shaded
+
+
+def test_edges_lay_an_object_from_near(scan):
+    _, views = scan
+    off = SimilarityTransform(1.02, Rotation.from_rotvec([0.0, 0.02, 0.01]).as_matrix(), np.array([1e-3, -1e-3, 5e-4]))
+    images, edges = EdgeImages(views, CAMERA), MeshEdges(NODES, TRIANGLES)
+    found, covariance = images.refine(edges, WORLD @ off, metric=False)
+    assert apart(found, WORLD) < 1e-3
+    assert found.scale == pytest.approx(WORLD.scale, rel=0.01)
+    assert np.linalg.eigvalsh(covariance).min() > 0.0
+    assert images.evidence(edges, found).gain > 0.8
+    beside = SimilarityTransform(1.0, np.eye(3), np.array([0.02, 0.0, 0.0]))
+    assert images.evidence(edges, WORLD @ beside).gain < 0.5
+
+
+def test_three_landmarks_in_one_frame_place_an_object_and_give_the_unit(scan):
+    points, views = scan
+    pixels = CAMERA.project(camera_from_object(views[2], WORLD).apply(CORNERS))
+    clicks = Sighting(
+        views[2].frame, views[2].camera_from_world, CORNERS, pixels + np.array([[1.5, -1], [-1.5, 1], [0.5, 1.5]])
+    )
+    best = EdgeSearch(NODES, TRIANGLES, points, views, CAMERA, metric=False).search(Hints(clicks=(clicks,)))[0]
+    assert apart(best.place, WORLD) < 1.5e-3
+    assert best.place.scale == pytest.approx(WORLD.scale, rel=0.01)
+
+
+@pytest.mark.slow
+def test_a_rough_distance_is_enough(scan):
+    points, views = scan
+    search = EdgeSearch(NODES, TRIANGLES, points, views, CAMERA, metric=False)
+    best = search.search(Hints(distance=0.4))[0]
+    assert apart(best.place, WORLD) < 1.5e-3
+    assert best.edges.gain > 0.6
+
+
+def test_nothing_is_found_in_blank_images(scan):
+    points, views = scan
+    blank = [replace(view, normalized=np.full_like(view.normalized, 128)) for view in views]
+    assert EdgeSearch(NODES, TRIANGLES, points, blank, CAMERA, metric=False).search(Hints()) == []
+
+
+def test_a_region_in_a_frame_that_is_no_keyframe_is_refused(scan):
+    points, views = scan
+    search = EdgeSearch(NODES, TRIANGLES, points, views, CAMERA, metric=False)
+    with pytest.raises(RegistrationError, match="no keyframe"):
+        search.search(Hints(region=(99, (10.0, 10.0, 90.0, 90.0))))
+
+
+def test_landmark_files_keep_the_frames(tmp_path):
+    path = tmp_path / "landmarks.csv"
+    save_landmarks(path, Landmarks(CORNERS, np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), np.array([7, 7, 9])))
+    read = load_landmarks(path)
+    np.testing.assert_array_equal(read.frames, [7, 7, 9])
+    np.testing.assert_allclose(read.points, CORNERS)
