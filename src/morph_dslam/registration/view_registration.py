@@ -32,6 +32,9 @@ UNIT_ERROR = 0.12
 AGREES, DISAGREES = 0.5, 1.0
 #: Hypotheses fitted to few keyframes, keyframes for it, and those fitted to more of them.
 N_FITTED, FEW_VIEWS, N_FINE, MORE_VIEWS = 80, 4, 8, 12
+#: Of these so many are fitted again from so many places around, turned by so much (rad) and moved by such a part of the
+#: size: standard deviations.
+N_AGAIN, N_AROUND, TURNED, MOVED = 12, 10, 0.08, 0.05
 #: Pixels searched in turn for them.
 ROUGH, FINE = (12, 8, 6, 4, 3), (8, 6, 5, 4, 3, 3, 3)
 #: So many points must lie on the object outside of the one plane that holds most: a flat face fits on any print.
@@ -112,12 +115,20 @@ class EdgeSearch:
         """
         starts = self._by_clicks(hints.clicks) if hints.clicks else self._in_keyframe(hints)
         few = EdgeImages(spread_views(self._views, FEW_VIEWS), self.camera)
-        rough = [few.refine(self.edges, start, self._metric, ROUGH, hints.clicks)[0] for start in starts]
-        gains = np.array([few.evidence(self.edges, place).total for place in rough])
+
+        def fitted(starts: Sequence[SimilarityTransform]) -> list[tuple[float, SimilarityTransform]]:
+            places = [few.refine(self.edges, start, self._metric, ROUGH, hints.clicks)[0] for start in starts]
+            gains = [few.evidence(self.edges, place).total for place in places]
+            return sorted(zip(gains, places, strict=True), key=lambda pair: -pair[0])
+
+        first = fitted(starts)
+        # A print has edges beside those of the object, which hold a fit that starts a little off.
+        best = [place for _, place in first[:N_AGAIN]]
+        rough = sorted([*first, *fitted(self._around(best))], key=lambda pair: -pair[0])
         found: list[EdgeRegistration] = []
-        for row in np.argsort(-gains):
-            if len(found) < N_FINE and not any(self._same(rough[row], f.place) for f in found):
-                found.append(self.refined(rough[row], hints.clicks))
+        for _, place in rough:
+            if len(found) < N_FINE and not any(self._same(place, other.place) for other in found):
+                found.append(self.refined(place, hints.clicks))
         found.sort(key=lambda each: -each.edges.total)
         kept: list[EdgeRegistration] = []
         for each in found:
@@ -125,6 +136,21 @@ class EdgeSearch:
             if solid and not any(self._same(each.place, other.place) for other in kept):
                 kept.append(each)
         return kept
+
+    def _around(self, places: Sequence[SimilarityTransform]) -> list[SimilarityTransform]:
+        """Places a little off: turned, moved and, along the sight lines, scaled."""
+        rng, centre = np.random.default_rng(0), self.edges.nodes.mean(axis=0)
+        eye = self._views[len(self._views) // 2].camera_from_world.inverse.translation
+        near = []
+        for place in places:
+            for _ in range(N_AROUND):
+                turn = rotation_exp(TURNED * rng.normal(size=3)) @ place.rotation
+                middle = place.apply(centre) + MOVED * self.edges.size * place.scale * rng.normal(size=3)
+                farther = float(np.exp(0.0 if self._metric else MOVED * rng.normal()))
+                middle = eye + farther * (middle - eye)
+                scale = place.scale * farther
+                near.append(SimilarityTransform(scale, turn, middle - scale * turn @ centre))
+        return near
 
     def _same(self, a: SimilarityTransform, b: SimilarityTransform) -> bool:
         """Whether two places are one as a camera sees them; the map's unit may differ."""

@@ -27,7 +27,7 @@ from morph_dslam.render.rasteriser import draw_depth
 
 Array = NDArray[np.float64]
 #: Sides from which the edges are drawn, turns of each drawing in the image, points compared, and directions of edges.
-N_SIDES, N_TURNS, N_POINTS, N_DIRECTIONS = 160, 24, 32, 8
+N_SIDES, N_TURNS, N_POINTS, N_DIRECTIONS = 160, 24, 48, 8
 #: The image is halved; a point meets an edge within so many of these pixels, and the drawing moves by so many.
 HALF, TOLERANCE, STEP = 2, 2.0, 4
 #: Share of the object's edges that an image shows; window over which chance is measured, pixels of the halved image.
