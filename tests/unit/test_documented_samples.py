@@ -43,6 +43,7 @@ def test_every_sample_file_is_read_by_a_test_here():
         ("record-your-own", "csv"): 1,
         ("registration-aids", "toml"): 3,
         ("scene-file", "toml"): 2,
+        ("registration", "csv"): 1,
         ("registration-aids", "csv"): 1,
         ("solid-study", "csv"): 1,
         ("solid-study", "toml"): 3,
@@ -84,6 +85,8 @@ def test_landmarks_and_curves(tmp_path):
     (tmp_path / "landmarks.csv").write_text(samples("registration-aids", "csv")[0])
     landmarks = load_landmarks(tmp_path / "landmarks.csv")
     np.testing.assert_allclose(landmarks.points[0], [-0.210, 0.1485, 0.0])
+    (tmp_path / "clicks.csv").write_text(samples("registration", "csv")[0])
+    assert load_landmarks(tmp_path / "clicks.csv").frames.tolist() == [12, 12, 12]
     (tmp_path / "curve.csv").write_text(samples("certificate", "csv")[0])
     assert read_reference_curve(tmp_path / "curve.csv").label == "the paper"
 

@@ -53,7 +53,7 @@ def load_landmarks(path: Path) -> Landmarks:
         )
     values = np.array([_values(path, number, row, header) for number, row in enumerate(rows[1:], start=1)])
     values = values.reshape(-1, len(header))
-    frames = values[:, 0].astype(np.int64) if header[0] == FRAME else None
+    frames = values[:, 0].astype(np.int64) if len(header) > len(HEADER) else None
     return Landmarks(1e-3 * values[:, -5:-2], np.ascontiguousarray(values[:, -2:]), frames)
 
 

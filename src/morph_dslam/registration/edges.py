@@ -320,7 +320,7 @@ class EdgeImages:
             seen = edges.visible(pose, self.camera)
             if len(seen.points) < FEWEST:
                 continue
-            offsets = find_edges(*slopes, seen.pixels, seen.normals, float(reach), LEAST_EDGE)
+            offsets = find_edges(slopes[0], slopes[1], seen.pixels, seen.normals, float(reach), LEAST_EDGE)
             found = np.isfinite(offsets)
             if found.sum() < FEWEST:
                 continue
@@ -345,13 +345,20 @@ class EdgeImages:
             seen = edges.visible(camera_from_object(view, place), self.camera)
             if len(seen.points) < FEWEST:
                 continue
-            shift = _own_shift(find_edges(*slopes, seen.pixels, seen.normals, 4.0, LEAST_EDGE), seen.normals)
+            shift = _own_shift(
+                find_edges(slopes[0], slopes[1], seen.pixels, seen.normals, 4.0, LEAST_EDGE), seen.normals
+            )
             pixels = seen.pixels + shift
             aside = [side * away for away in ASIDE_PX for side in (-1.0, 1.0)]
 
-            def near(away: float, pixels: Array = pixels, seen: VisibleEdges = seen, slopes: tuple = slopes) -> Array:
+            def near(
+                away: float,
+                pixels: Array = pixels,
+                seen: VisibleEdges = seen,
+                slopes: tuple[NDArray[np.float32], NDArray[np.float32]] = slopes,
+            ) -> Array:
                 places = pixels + away * seen.normals
-                return np.isfinite(find_edges(*slopes, places, seen.normals, NEAR_PX, LEAST_EDGE))
+                return np.isfinite(find_edges(slopes[0], slopes[1], places, seen.normals, NEAR_PX, LEAST_EDGE))
 
             on.append(near(0.0))
             chance.append(np.mean([near(away) for away in aside], axis=0))
@@ -373,5 +380,5 @@ def _own_shift(offsets: Array, normals: Array) -> Array:
         left = away - across @ shift
         weights = 1.0 / (1.0 + (left / 1.5) ** 2) ** 2
         matrix = across.T @ (weights[:, None] * across) + np.eye(2) * 20.0 / SHIFT_PX**2
-        shift = np.linalg.solve(matrix, across.T @ (weights * away))
+        shift = np.asarray(np.linalg.solve(matrix, across.T @ (weights * away)), dtype=np.float64)
     return shift

@@ -237,17 +237,15 @@ def register_mesh(
         If the object is not found, or a hint names what is not there.
     """
     search = EdgeSearch(nodes, triangles, points, views, camera, metric)
-    places = search.search(hints or Hints())
-    if places:
-        by_edges = _by_edges(places, search, points, views, metric, bool(hints and hints.clicks))
-        if hints is not None or not by_edges.ambiguous:
-            return by_edges
-    elif hints is not None:
-        raise RegistrationError(
-            "no keyframe shows the object's edges where the hints have it: check them and the unit of the mesh, or "
-            "give three landmarks",
-            RegistrationFailure.NOT_FOUND,
-        )
+    if hints is not None:
+        places = search.search(hints)
+        if not places:
+            raise RegistrationError(
+                "no keyframe shows the object's edges where the hints have it: check them and the unit of the mesh, or "
+                "give three landmarks",
+                RegistrationFailure.NOT_FOUND,
+            )
+        return _by_edges(places, search, points, views, metric, bool(hints.clicks))
     found = _by_points(nodes, triangles, points, views, camera, metric, progress)
     edges = search.evidence(found.world_from_object)
     # On a dense texture, edges are everywhere and say nothing.

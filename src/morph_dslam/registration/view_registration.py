@@ -123,7 +123,7 @@ class EdgeSearch:
 
         first = fitted(starts)
         # A print has edges beside those of the object, which hold a fit that starts a little off.
-        best = [place for _, place in first[:N_AGAIN]]
+        best = [place for _, place in first[: 0 if hints.clicks else N_AGAIN]]
         rough = sorted([*first, *fitted(self._around(best))], key=lambda pair: -pair[0])
         found: list[EdgeRegistration] = []
         for _, place in rough:
@@ -155,8 +155,12 @@ class EdgeSearch:
     def _same(self, a: SimilarityTransform, b: SimilarityTransform) -> bool:
         """Whether two places are one as a camera sees them; the map's unit may differ."""
         view = self._views[len(self._views) // 2]
-        poses = [camera_from_object(view, place) for place in (a, b)]
-        return same_place(*(SimilarityTransform(1.0, p.rotation, p.translation) for p in poses), self.surface)
+        one, other = (camera_from_object(view, place) for place in (a, b))
+        return same_place(
+            SimilarityTransform(1.0, one.rotation, one.translation),
+            SimilarityTransform(1.0, other.rotation, other.translation),
+            self.surface,
+        )
 
     def refined(self, start: SimilarityTransform, clicks: Sequence[Sighting] = ()) -> EdgeRegistration:
         """The place near ``start`` that has its edges on those of the keyframes that see it."""
@@ -186,12 +190,10 @@ class EdgeSearch:
         view, camera = self._searched(hints), self.camera
         if not np.ptp(view.normalized) > 0:
             return []
-        pixels = view.pixels
-        if hints.region is not None:
-            left, top, right, bottom = hints.region[1]
-            inside = ((pixels > [left, top]) & (pixels < [right, bottom])).all(axis=1)
-            pixels = pixels[inside]
-        sizes, places = sizes_and_places(camera, pixels)
+        frame_size = (0.0, 0.0, float(camera.width), float(camera.height))
+        left, top, right, bottom = frame_size if hints.region is None else hints.region[1]
+        inside = ((view.pixels > [left, top]) & (view.pixels < [right, bottom])).all(axis=1)
+        sizes, places = sizes_and_places(camera, view.pixels[inside])
         if hints.distance is not None:
             apart = np.abs(np.log(self.edges.size * camera.fx / sizes / hints.distance))
             sizes = sizes[apart < np.log(ROUGH_FACTOR)]

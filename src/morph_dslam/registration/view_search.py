@@ -10,7 +10,6 @@ that a cluttered print does not win by its many edges.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -159,7 +158,7 @@ class InView:
 
 
 def hypotheses(
-    drawings: EdgeDrawings, edges: MeshEdges, view: View, camera: Camera, sizes: Sequence[float], places: Array
+    drawings: EdgeDrawings, edges: MeshEdges, view: View, camera: Camera, sizes: Array, places: Array
 ) -> list[InView]:
     """Where a view may show the object, the best first.
 
@@ -208,7 +207,7 @@ def sizes_and_places(camera: Camera, pixels: Array) -> tuple[Array, Array]:
     Those with points of the map, seen at pixels (p, 2), near.
     """
     count = int(np.log(LARGEST / SMALLEST) / np.log(FACTOR)) + 1
-    sizes = SMALLEST * camera.height * FACTOR ** np.arange(count)
+    sizes = np.asarray(SMALLEST * camera.height * FACTOR ** np.arange(count), dtype=np.float64)
     step, near = STEP * HALF, NEAR * camera.height
     grid = np.stack(np.meshgrid(np.arange(step, camera.width, step), np.arange(step, camera.height, step)), axis=-1)
     places = grid.reshape(-1, 2).astype(float)
