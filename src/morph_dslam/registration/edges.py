@@ -366,10 +366,18 @@ class EdgeImages:
         if not on:
             return EdgeEvidence(0.0, 0.0, 0.0, 0.0, 0)
         found, by_chance, rim = np.concatenate(on), np.concatenate(chance), np.concatenate(outline)
-        parts = [
-            float(np.mean(values[rows])) if rows.any() else 0.0 for rows in (rim, ~rim) for values in (found, by_chance)
-        ]
-        return EdgeEvidence(*parts, int(rim.sum()), int((~rim).sum()))
+
+        def mean(values: NDArray, rows: NDArray[np.bool_]) -> float:
+            return float(np.mean(values[rows])) if rows.any() else 0.0
+
+        return EdgeEvidence(
+            mean(found, rim),
+            mean(by_chance, rim),
+            mean(found, ~rim),
+            mean(by_chance, ~rim),
+            int(rim.sum()),
+            int((~rim).sum()),
+        )
 
 
 def _own_shift(offsets: Array, normals: Array) -> Array:
