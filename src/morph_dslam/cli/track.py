@@ -83,14 +83,15 @@ def print_summary(folder: Path, summary: dict[str, Any]) -> None:
         print(value_line(figures))
     print(f"wrote {folder}")
     line = f"tracked={summary['n_tracked']}/{summary['n_frames']}"
-    line += "".join(f" {kind}={summary[f'n_{kind}']}" for kind in ("hidden", "lost", "skipped") if summary[f"n_{kind}"])
     if "live" in summary:
         figures = summary["live"]
         line += f" fps={figures['fps']:.1f} dropped={figures['n_dropped']}"
         line += f" latency_median_ms={figures['latency_median_ms']:.1f} latency_p95_ms={figures['latency_p95_ms']:.1f}"
     else:
         line += f" median_ms={summary['median_ms']:.2f} p95_ms={summary['p95_ms']:.2f}"
-    print(line)
+    # Of a live stream, frames that are skipped are those that were dropped.
+    kinds = ("hidden", "lost") if "live" in summary else ("hidden", "lost", "skipped")
+    print(line + "".join(f" {kind}={summary[f'n_{kind}']}" for kind in kinds if summary[f"n_{kind}"]))
 
 
 def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
