@@ -143,7 +143,8 @@ def plot_jumps(path: Path, run: RunResults) -> None:
     axes = figure.add_subplot()
     axes.plot(nodes[:, u], nodes[:, v], ".", color="#c5ccd3", markersize=2.0)
     for jump in jumps:
-        axes.add_patch(Circle(1e3 * jump.place[[u, v]], 1e3 * jump.reach, facecolor="#d9534f", alpha=0.12))
+        middle = (1e3 * float(jump.place[u]), 1e3 * float(jump.place[v]))
+        axes.add_patch(Circle(middle, 1e3 * jump.reach, facecolor="#d9534f", alpha=0.12))
     places, sizes = np.array([1e3 * jump.place for jump in jumps]), [1e3 * jump.size for jump in jumps]
     drawn = axes.scatter(places[:, u], places[:, v], c=sizes, cmap="viridis", vmin=0.0, s=45, zorder=3)
     figure.colorbar(drawn, ax=axes, label="largest jump [mm]")
