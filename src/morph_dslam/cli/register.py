@@ -38,7 +38,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Register the object and print how well it fits."""
-    from morph_dslam import load_camera, load_scene
     from morph_dslam.extend.registration import registration_line, run_registration
 
     registration = run_registration(
@@ -52,8 +51,8 @@ def run(arguments: argparse.Namespace) -> None:
         distance=arguments.distance,
         region=arguments.region,
     )
-    camera_notes = load_scene(arguments.map, load_camera(arguments.camera)).camera_notes
-    for note in [*(warning.text for warning in registration.warnings), *camera_notes]:
+    assert registration.scene is not None
+    for note in [*(warning.text for warning in registration.warnings), *registration.scene.camera_notes]:
         print(f"note: {note}")
     picture = "" if arguments.board else " and registration.jpg"
     print(f"wrote {arguments.output / 'registration.json'}{picture}")

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, SimilarityTransform
+from morph_dslam.model.reduced_model import triangle_normals
 from morph_dslam.registration.increments import moved_similarity, pose_jacobian, similarity_jacobian
 from morph_dslam.registration.scene import View, camera_from_object
 from morph_dslam.render.rasteriser import draw_depth
@@ -80,9 +81,7 @@ class MeshEdges:
         _, first, uses = np.unique(keys[order], axis=0, return_index=True, return_counts=True)
         ends, one = keys[order][first], owner[order[first]]
         other = np.where(uses == 2, owner[order[np.minimum(first + 1, len(order) - 1)]], -1)
-        normals = np.cross(
-            nodes[triangles[:, 1]] - nodes[triangles[:, 0]], nodes[triangles[:, 2]] - nodes[triangles[:, 0]]
-        )
+        normals = triangle_normals(nodes, triangles)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         self._of_edge = np.stack([normals[one], np.where(other[:, None] >= 0, normals[other], -normals[one])], axis=1)
         self._sharp = np.einsum("ex,ex->e", *self._of_edge.transpose(1, 0, 2)) < SHARP
@@ -243,12 +242,17 @@ class EdgeEvidence:
         every = max(self.count + self.n_inner, 1)
         share = (self.count * self.share + self.n_inner * self.inner) / every
         chance = (self.count * self.chance + self.n_inner * self.inner_chance) / every
-        return (share - chance) / max(1.0 - chance, 1e-9)
+        return _beyond_chance(share, chance)
 
     @property
     def gain(self) -> float:
         """How much more of the outline than by chance is on edges, of what could be."""
-        return (self.share - self.chance) / max(1.0 - self.chance, 1e-9)
+        return _beyond_chance(self.share, self.chance)
+
+
+def _beyond_chance(share: float, chance: float) -> float:
+    """How much a share exceeds that by chance, of what it could."""
+    return (share - chance) / max(1.0 - chance, 1e-9)
 
 
 class EdgeImages:

@@ -7,10 +7,11 @@ like one away from it) is reported and not chosen by accident.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import permutations, product
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -246,8 +247,13 @@ def solve_pnp(points: Array, pixels: Array, camera: Camera) -> list[RigidTransfo
     """Poses (camera from object) that put points (k, 3) in front of the camera near their pixels (k, 2).
 
     SQPNP (Terzakis & Lourakis 2020) for any shape, and both poses of IPPE (Collins & Bartoli 2014) where the
-    points lie in a plane.
+    points lie in a plane; of three points up to four poses by P3P (Ding et al., Revisiting the P3P problem, 2023, as in
+    OpenCV).
     """
+    if len(points) == 3:
+        pixels = np.ascontiguousarray(pixels)
+        _, rotations, translations = cv2.solveP3P(points, pixels, camera.matrix, None, flags=cv2.SOLVEPNP_P3P)
+        return _in_front(points, rotations, translations)
     centred = points - points.mean(axis=0)
     spread = np.linalg.svd(centred, compute_uv=False)
     methods = [cv2.SOLVEPNP_SQPNP]
@@ -259,11 +265,17 @@ def solve_pnp(points: Array, pixels: Array, camera: Camera) -> list[RigidTransfo
             _, rotations, translations, _ = cv2.solvePnPGeneric(points, pixels, camera.matrix, None, flags=method)
         except cv2.error:
             continue  # a degenerate configuration for this method; the others decide
-        for rotation, translation in zip(rotations, translations, strict=True):
-            pose = RigidTransform(rotation_exp(rotation.ravel()), np.asarray(translation, dtype=float).ravel())
-            if (pose.apply(points)[:, 2] > 0.0).all():
-                poses.append(pose)
+        poses += _in_front(points, rotations, translations)
     return poses
+
+
+def _in_front(points: Array, rotations: Sequence[Any], translations: Sequence[Any]) -> list[RigidTransform]:
+    """OpenCV's poses as transforms, those that have all points in front of the camera."""
+    poses = [
+        RigidTransform(rotation_exp(np.asarray(r, dtype=float).ravel()), np.asarray(t, dtype=float).ravel())
+        for r, t in zip(rotations, translations, strict=True)
+    ]
+    return [pose for pose in poses if (pose.apply(points)[:, 2] > 0.0).all()]
 
 
 def _distinct_minima(model: ReducedModel, found: list[Estimate], click_px: float) -> tuple[Estimate, tuple[State, ...]]:

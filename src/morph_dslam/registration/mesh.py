@@ -246,7 +246,7 @@ def register_mesh(
                 RegistrationFailure.NOT_FOUND,
             )
         return _by_edges(places, search, points, views, metric, bool(hints.clicks))
-    found = _by_points(nodes, triangles, points, views, camera, metric, progress)
+    found = _by_points(search.surface, nodes, triangles, points, views, camera, metric, progress)
     edges = search.evidence(found.world_from_object)
     # On a dense texture, edges are everywhere and say nothing.
     informative = 0.0 < edges.chance < TELLING_CHANCE
@@ -289,6 +289,7 @@ def _by_edges(
 
 
 def _by_points(
+    surface: Surface,
     nodes: Array,
     triangles: NDArray[np.int64],
     points: MapPoints,
@@ -297,8 +298,8 @@ def _by_points(
     metric: bool,
     progress: bool,
 ) -> MeshRegistration:
-    """The object found by the points of the map on it; parameters as of `register_mesh`."""
-    rough, surface = Surface.of_mesh(nodes, triangles, ROUGH_SAMPLES), Surface.of_mesh(nodes, triangles)
+    """The object found by the points of the map on its ``surface``; other parameters as of `register_mesh`."""
+    rough = Surface.of_mesh(nodes, triangles, ROUGH_SAMPLES)
     planes = find_planes(points.positions)
     starts_in = attitudes(surface.axis_of_revolution, planes.largest_normal(points.positions))
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -249,7 +248,7 @@ class EdgeSearch:
                 replace(click, pixels=click.pixels + CLICK_PX * rng.normal(size=click.pixels.shape))
                 for _ in range(N_MEANT if len(click.points) < MANY_CLICKS else 0)
             ]
-            for pose in (pose for each in meant for pose in poses_of_clicks(each, self.camera)):
+            for pose in (pose for each in meant for pose in solve_pnp(each.points, each.pixels, self.camera)):
                 # The points are known where a keyframe sees them; the object stands still.
                 near = RigidTransform.from_matrix(
                     view.camera_from_world.matrix @ np.linalg.inv(click.camera_from_world.matrix)
@@ -267,20 +266,3 @@ class EdgeSearch:
                 RegistrationFailure.LANDMARKS_DO_NOT_FIT,
             )
         return starts
-
-
-def poses_of_clicks(click: Sighting, camera: Camera) -> list[RigidTransform]:
-    """Poses (camera_from_object) with which a camera sees landmarks where they were clicked; up to four of three.
-
-    Of three points by P3P (Ding et al., Revisiting the P3P problem, 2023, as in OpenCV), of more by `solve_pnp`.
-    """
-    if len(click.points) > 3:
-        return solve_pnp(click.points, click.pixels, camera)
-    _, rotations, translations = cv2.solveP3P(
-        click.points, np.ascontiguousarray(click.pixels), camera.matrix, None, flags=cv2.SOLVEPNP_P3P
-    )
-    poses = [
-        RigidTransform(rotation_exp(np.asarray(r, float).ravel()), np.asarray(t, float).ravel())
-        for r, t in zip(rotations, translations, strict=True)
-    ]
-    return [pose for pose in poses if (pose.apply(click.points)[:, 2] > 0.0).all()]

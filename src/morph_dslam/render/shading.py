@@ -112,6 +112,7 @@ def colour_bar(height: int, low: float, high: float, label: str, colour_map: str
     return panel
 
 
+@lru_cache
 def flat_colour_bar(
     width: int, low: float, high: float, label: str, colour_map: str, scale: float
 ) -> NDArray[np.uint8]:

@@ -43,9 +43,13 @@ def velocities(timestamps: Array, camera_from_world: Array) -> Array:
         first, last = near[0], near[-1]
         if first != last:
             moved = camera_from_world[last] @ inverse(camera_from_world[first])
-            twist = np.concatenate([Rotation.from_matrix(moved[:3, :3]).as_rotvec(), moved[:3, 3]])
-            result[k] = twist / (timestamps[last] - timestamps[first])
+            result[k] = _twist(moved) / (timestamps[last] - timestamps[first])
     return result
+
+
+def _twist(moved: Array) -> Array:
+    """Rotation vector and translation (6,) of a motion (4, 4)."""
+    return np.concatenate([Rotation.from_matrix(moved[:3, :3]).as_rotvec(), moved[:3, 3]])
 
 
 def row_times(rows: Array, camera: Camera) -> Array:
@@ -94,8 +98,7 @@ class RowPoses:
         gap, before = timestamp - self._time, inverse(self._pose)
         self._twist = np.zeros(6)
         for _ in range(ROUNDS if 0.0 < gap < MOST_GAP_S and len(seen.ids) >= LEAST_INLIERS else 0):
-            moved = pose @ before
-            self._twist = np.concatenate([Rotation.from_matrix(moved[:3, :3]).as_rotvec(), moved[:3, 3]]) / gap
+            self._twist = _twist(pose @ before) / gap
             pose = _refined(self._map, self._camera, pose, self._twist, seen)
         self._time, self._pose = timestamp, pose
 

@@ -69,6 +69,11 @@ def near_jumps(jumps: Sequence[DisplacementJump], points: Array) -> NDArray[np.b
     return near
 
 
+def largest_jump(jumps: Sequence[DisplacementJump]) -> DisplacementJump:
+    """The one that a reader is told of."""
+    return max(jumps, key=lambda jump: jump.size)
+
+
 class JumpDetector:
     """Looks for jumps in the displacement of a surface, frame after frame.
 
@@ -83,7 +88,7 @@ class JumpDetector:
         self._places, self._rows, self._first, self._plane = _surroundings(rest, self._reach)
         apart = np.linalg.norm(self._places[:, None] - self._places, axis=2)
         self._near = (apart < self._reach).astype(int)
-        self._samples = farthest_points(rest, SAMPLES) if len(rest) else np.zeros(0, dtype=np.int64)
+        self._samples = _spread(rest, SAMPLES)
         self._shapes: list[Array] = []
         self._steps: list[Array] = []
         self._largest = 0.0
@@ -147,11 +152,16 @@ class JumpDetector:
         self._sizes[found] = np.maximum(self._sizes[found], jumps[found])
 
 
+def _spread(points: Array, most: int) -> NDArray[np.int64]:
+    """Rows of as many of the points (p, 3) as there may be, far apart; of an outline alone there are none."""
+    return np.arange(len(points)) if len(points) <= most else farthest_points(points, most)
+
+
 def _surroundings(rest: Array, reach: float) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array]:
     """Places (k, 3) with enough points around them, the points of all (m,), where each begins (k + 1,), and the
     points' coordinates (m, 2) in the plane of those around a place, in reaches."""
     places, rows, plane = [], [], []
-    for place in rest[:PLACES] if len(rest) <= PLACES else rest[farthest_points(rest, PLACES)]:
+    for place in rest[_spread(rest, PLACES)]:
         near = np.flatnonzero(np.linalg.norm(rest - place, axis=1) < reach)
         if len(near) < 2 * LEAST_POINTS + 2:
             continue

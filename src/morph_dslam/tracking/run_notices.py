@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from morph_dslam.notices import Notice
+from morph_dslam.tracking.displacement_jumps import largest_jump
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE, statement, unobservable_in_run
 from morph_dslam.tracking.outcomes import ModelDoesNotExplain, ObjectMoved, Status
 from morph_dslam.tracking.run_results import RunResults
@@ -105,8 +106,7 @@ def notices_of(run: RunResults) -> list[RunNotice]:
         found.append(of(RunWarning.MODEL_FAILS, count=failed, n_frames=n_frames, largest_px=largest))
     torn = [(frame, r) for frame, r in zip(run.frames, run.results, strict=True) if r.jumps]
     if torn:
-        largest = max(torn[-1][1].jumps, key=lambda jump: jump.size)
-        found.append(of(RunWarning.SURFACE_JUMPS, first=torn[0][0], where=largest.text))
+        found.append(of(RunWarning.SURFACE_JUMPS, first=torn[0][0], where=largest_jump(torn[-1][1].jumps).text))
     factor = max((result.reference_factor for result in run.results), default=1.0)
     if factor > CLEARLY_WORSE:
         found.append(of(RunWarning.REFERENCE_WIDENED, factor=factor))

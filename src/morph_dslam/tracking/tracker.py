@@ -22,7 +22,7 @@ from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import Anchor, Anchoring
 from morph_dslam.tracking.discrepancy import DiscrepancyFit
-from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetector
+from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetector, largest_jump
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
 from morph_dslam.tracking.frame_estimation import at_constant_velocity, new_filter, with_unobservable_at_default
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
@@ -385,7 +385,7 @@ class Tracker:
     def _warnings_of_place(self, camera: CameraLocalization) -> list[TrackingWarning]:
         warnings: list[TrackingWarning] = [ObjectMoved()] if self._anchoring.has_moved else []
         if self.jumps:
-            warnings.append(SurfaceJumps(max(self.jumps, key=lambda jump: jump.size).text))
+            warnings.append(SurfaceJumps(largest_jump(self.jumps).text))
         if self._view.number:
             warnings.append(OtherReferenceView(self._view.number))
         if camera.why_lost:
