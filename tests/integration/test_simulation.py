@@ -13,7 +13,7 @@ from morph_dslam.model import load_model
 from morph_dslam.render.simulation import simulate
 from morph_dslam.sources import open_source
 from tests.support.bent_sheet import LENGTH, WIDTH
-from tests.support.scenes import MOTION, write_scene
+from tests.support.scenes import CAMERA, MOTION, write_scene
 
 
 @pytest.fixture(scope="module")
@@ -173,6 +173,69 @@ def test_lambert_light_from_the_side(tmp_path):
     picture, _, inside = flat_picture(tmp_path, rotation="[0, 0, 0]", light=light)
     # 0.25 + 0.75 cos, with the light 0.8 along the normal.
     np.testing.assert_allclose(picture[inside].mean(axis=0), 0.85 * np.array([218, 224, 226]), atol=0.6)
+
+
+LENS = (-0.25, 0.08, 0.002, -0.001)
+
+
+def smooth_film(folder, tail, camera=CAMERA, top="frames = 1\n"):
+    """Frames of a flat sheet face on with a smooth print, as floats, and their camera."""
+    x, y = np.meshgrid((np.arange(840) + 0.5) / 840 - 0.5, 0.5 - (np.arange(594) + 0.5) / 594)
+    cv2.imwrite(str(folder / "smooth.png"), np.rint(print_value(x, y)).astype(np.uint8))
+    scene = write_scene(folder, top, f"{tail}[light]\nambient = 1.0\n", camera, "smooth.png")
+    simulate(scene, folder / "sequence", progress=False)
+    frames = [frame.image.astype(float) for frame in open_source(folder / "sequence" / "frames")]
+    return frames, load_camera(folder / "sequence" / "camera.yaml")
+
+
+def shown(camera, rays, shift=0.0):
+    """The print's grey values (h, w, 1) along rays (h, w, 2), and which (h, w) are well inside the sheet."""
+    x, y = (0.6 * rays[..., 0] - shift) / LENGTH, -0.6 * rays[..., 1] / WIDTH
+    return print_value(x, y)[:, :, None], (np.abs(x) < 0.46) & (np.abs(y) < 0.46)
+
+
+def test_a_lens_bends_the_picture_as_opencv_has_it(tmp_path):
+    lens = CAMERA.replace("121.0", f"121.0, distortion = {list(LENS)}")
+    (picture,), camera = smooth_film(tmp_path, "[[pose]]\nframe = 0\nposition_mm = [0, 0, 600]\n", lens)
+    rows, columns = np.indices((240, 320))
+    pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2).astype(float)
+    rays = cv2.undistortPoints(pixels, camera.matrix, np.array(LENS)).reshape(240, 320, 2)
+    expected, inside = shown(camera, rays)
+    assert np.abs((picture - expected)[inside]).max() < 2.5
+    assert abs((picture - expected)[inside].mean()) < 0.4
+    truth = np.load(tmp_path / "sequence" / "truth.npz")
+    points, _ = cv2.projectPoints(truth["points_mm"][0], np.zeros(3), np.zeros(3), camera.matrix, np.array(LENS))
+    np.testing.assert_allclose(truth["pixels"][0], points[:, 0], atol=1e-9)
+
+
+def test_rows_of_a_rolling_shutter_see_their_own_instants(tmp_path):
+    rolling = CAMERA.replace("121.0", "121.0, readout_s = 0.02")
+    tail = "[[pose]]\nframe = 0\nposition_mm = [0, 0, 600]\n[[pose]]\nframe = 2\nposition_mm = [60, 0, 600]\n"
+    frames, camera = smooth_film(tmp_path, tail, rolling, "frames = 3\nfps = 30\n")
+    rows, columns = np.indices((240, 320))
+    rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy], axis=-1)
+    time = (1.0 + 30.0 * 0.02 * (rows - 119.5) / 240) / 2.0  # 0 to 1 from key frame to key frame
+    expected, inside = shown(camera, rays, 0.06 * (3.0 * time**2 - 2.0 * time**3))
+    # A band of 24 rows is of one instant, 0.3 px from that of its rim, where the print has 5 grey levels a pixel.
+    assert np.abs((frames[1] - expected)[inside]).max() < 4.0
+    at_once, inside = shown(camera, rays, 0.03)
+    assert np.abs((frames[1] - at_once)[inside]).max() > 12.0
+
+
+def test_exposure_multiplies_and_saturates_and_jpeg_is_opencvs(tmp_path):
+    pose = "[[pose]]\nframe = 0\nposition_mm = [0, 0, 600]\n"
+    gains = "[[exposure]]\nframe = 0\ngain = 0.5\n[[exposure]]\nframe = 2\ngain = 2.0\n"
+    (dark, middle, bright), camera = smooth_film(tmp_path, pose + gains, top="frames = 3\n")
+    rows, columns = np.indices((240, 320))
+    rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy], axis=-1)
+    expected, inside = shown(camera, rays)
+    for picture, gain in ((dark, 0.5), (middle, 1.0), (bright, 2.0)):  # halfway, the logarithm's mean
+        assert np.abs((picture - np.minimum(gain * expected, 255.0))[inside]).max() < 2.0 * max(gain, 1.0)
+    plain = (tmp_path / "scene.toml").read_text()
+    (tmp_path / "scene.toml").write_text(plain.replace('image_format = "png"', "jpeg_quality = 40"))
+    simulate(tmp_path / "scene.toml", tmp_path / "jpeg", progress=False)
+    encoded = cv2.imencode(".jpg", middle.astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 40])[1]
+    assert (tmp_path / "jpeg" / "frames" / "000001.jpg").read_bytes() == encoded.tobytes()
 
 
 def test_outline_is_antialiased_at_the_right_place(tmp_path):

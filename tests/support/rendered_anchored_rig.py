@@ -21,7 +21,7 @@ from morph_dslam.model import ReducedModel, load_model, save_model
 from morph_dslam.render.environment import Motion, StaticScene, plan_motion
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.scene_file import Scene, load_scene_file
-from morph_dslam.render.scene_renderer import SceneRenderer, supersampled
+from morph_dslam.render.scene_renderer import Instant, SceneRenderer, supersampled
 from morph_dslam.slam.map_files import save_map
 from morph_dslam.slam.slam import Slam
 from morph_dslam.tracking.multi_camera import RigCamera
@@ -257,8 +257,8 @@ def _film(folder, parts, part, frames):
     alone = SceneRenderer(wedge.scene, wedge.model, part.camera, folder, 0.3)
     for frame in frames:
         nodes = {name: one.nodes(part, frame) for name, one in parts.items()}
-        behind = with_table.render(nodes["sheet"], frame, None, poses[frame])
-        before = alone.render(nodes["wedge"], frame, None, poses[frame])
+        behind = with_table.render([Instant(nodes["sheet"], None, poses[frame])], frame)
+        before = alone.render([Instant(nodes["wedge"], None, poses[frame])], frame)
         depth = {name: _depth(part.camera, nodes[name], parts[name].model) for name in parts}
         rest = np.minimum(depth["sheet"], around.buffers(poses[frame], part.camera).depth)
         yield frame, np.where((depth["wedge"] < rest)[:, :, None], before, behind)

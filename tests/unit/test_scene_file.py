@@ -135,8 +135,12 @@ def test_files_that_it_names(tmp_path):
     assert "none.yaml" in message_of(tmp_path, CameraError, camera='camera = "none.yaml"\n')
     broken = CAMERA.replace("fx = 260.0, ", "")
     assert "camera: fx" in message_of(tmp_path, CameraError, camera=broken)
+    folded = CAMERA.replace("121.0", "121.0, distortion = [-1.0, 0, 0, 0]")
+    assert "give a weaker distortion" in message_of(tmp_path, camera=folded)
     lens = CAMERA.replace("121.0", "121.0, distortion = [0.1, 0, 0, 0]")
-    assert "without lens distortion" in message_of(tmp_path, camera=lens)
+    assert "a depth sensor's images are those of an ideal pinhole" in message_of(
+        tmp_path, camera=lens, tail=f"{POSE}[depth_sensor]\n"
+    )
     path = write_scene(tmp_path)
     (tmp_path / "sheet.morph").write_bytes(b"no model")
     with pytest.raises(ModelFileError):

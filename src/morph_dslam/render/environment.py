@@ -224,7 +224,7 @@ def _check_parameter(parameter: Parameter, frames: NDArray, values: Array, remed
             f"{parameter.display(float(x)):.6g}" for x in (values[first], parameter.lower, parameter.upper)
         )
         raise SceneError(
-            f"parameter '{parameter.name}' is {value} {parameter.unit} in frame {frames[first]}, "
+            f"parameter '{parameter.name}' is {value} {parameter.unit} in frame {frames[first]:g}, "
             f"outside the model's range {low} to {high}: {remedy}"
         )
 
@@ -275,7 +275,7 @@ def _camera_track(keys: list[CameraKeyFrame], frames: NDArray) -> list[RigidTran
         distance = float(np.linalg.norm(ahead))
         if np.hypot(*ahead[:2]) <= 1e-3 * distance:
             raise SceneError(
-                f"camera_path: in frame {frame} the camera looks straight up or down, or stands in its "
+                f"camera_path: in frame {frame:g} the camera looks straight up or down, or stands in its "
                 "target, so that nothing is upright: move it aside"
             )
         poses.append(looking_at(target, ahead, distance))
@@ -289,9 +289,9 @@ def _occluder_track(occluder: Occluder | None, frames: NDArray) -> Array | None:
     return interpolate_key_frames(numbers, np.array([key.centre_px for key in occluder.path]), frames)
 
 
-def plan_motion(scene: Scene, model: ReducedModel) -> Motion:
-    """The motion of every frame."""
-    frames = np.arange(scene.frames)
+def plan_motion(scene: Scene, model: ReducedModel, frames: NDArray | None = None) -> Motion:
+    """The motion at ``frames`` (T,), which may lie between two; at every frame if absent."""
+    frames = np.arange(scene.frames) if frames is None else frames
     if scene.camera_path:
         in_world = _pose_track(scene.pose or [_AT_ORIGIN], frames, (0.0, 0.0, 0.0))
         camera_from_world = _camera_track(scene.camera_path, frames)

@@ -124,6 +124,13 @@ class CameraKeyFrame(Section):
     target_mm: Vector
 
 
+class ExposureKeyFrame(Section):
+    """By what the exposure multiplies grey values; what exceeds 255 saturates."""
+
+    frame: FrameNumber
+    gain: float = Field(ge=0.01, le=100.0)
+
+
 class Rectangle(Section):
     """A textured rectangle: its centre and its whole edges to the right and down, world."""
 
@@ -191,6 +198,7 @@ class Scene(Section):
     fps: float = Field(default=30.0, ge=1e-3, le=LARGEST)
     seed: int = Field(default=0, ge=0)
     image_format: Literal["jpg", "png"] = "jpg"
+    jpeg_quality: int = Field(default=95, ge=1, le=100)
     supersampling: int = Field(default=2, ge=1, le=4)
     surface: Surface
     background: Background = Background()
@@ -199,6 +207,7 @@ class Scene(Section):
     parameters: list[ParameterKeyFrame] = Field(default_factory=list)
     pose: list[PoseKeyFrame] = Field(default_factory=list)
     camera_path: list[CameraKeyFrame] = Field(default_factory=list)
+    exposure: list[ExposureKeyFrame] = Field(default_factory=list)
     environment: Environment | None = None
     depth_sensor: DepthSensor | None = None
     occluder: Occluder | None = None
@@ -214,6 +223,7 @@ class Scene(Section):
     @model_validator(mode="after")
     def _key_frames_are_ordered(self) -> Scene:
         lists = {"parameters": self.parameters, "pose": self.pose, "camera_path": self.camera_path}
+        lists |= {"exposure": self.exposure}
         if self.occluder:
             lists["occluder.path"] = self.occluder.path
         for name, keys in lists.items():

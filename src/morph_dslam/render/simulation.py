@@ -2,7 +2,8 @@
 
 The folder written holds `frames/`, `camera.yaml`, `landmarks.csv`, `truth.npz` and `depth.h5`; where the
 camera moves also `groundtruth.txt`, and with a depth sensor `depth/` and the lists of a TUM RGB-D recording.
-The truth is computed from the model, never read off the images.
+The truth is computed from the model, never read off the images. With a rolling shutter it is that of the middle
+row's instant. Depth is that of an ideal pinhole's image.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from morph_dslam.model import ReducedModel, SurfacePoints, load_model
 from morph_dslam.model.reduced_model import spread_over
 from morph_dslam.render.environment import VALUES_PER_METRE, Motion, StaticScene, plan_motion, sensor_depth
 from morph_dslam.render.rasteriser import rasterise, visible_points
-from morph_dslam.render.scene_file import Scene, load_scene_file
-from morph_dslam.render.scene_renderer import SceneRenderer, in_disc, pixel_axes, supersampled
+from morph_dslam.render.scene_file import Scene, interpolate_key_frames, load_scene_file
+from morph_dslam.render.scene_renderer import Instant, SceneRenderer, band_seconds, in_disc, pixel_axes, supersampled
 from morph_dslam.render.texture import is_sheet, landmark_nodes, regular_points, spread_nodes
 from morph_dslam.sources.frames import Frame
 
@@ -42,13 +43,22 @@ HIDDEN_BY = 3e-3
 
 @dataclass(frozen=True)
 class _World:
-    """A scene with everything that it names read and checked."""
+    """A scene with everything that it names read and checked.
+
+    Attributes
+    ----------
+    motion : in every frame, at the middle row's instant.
+    between : at the instant of each band of rows, frame by frame.
+    gains : (T,) of the exposure.
+    """
 
     scene: Scene
     folder: Path
     model: ReducedModel
     camera: Camera
     motion: Motion
+    between: Motion
+    gains: Array
     surroundings: StaticScene | None
 
     def node_positions(self, frame: int) -> Array:
@@ -84,17 +94,25 @@ class _World:
         """
         pixels = self.camera.project(points)
         seen = visible_points(pixels, points[:, 2], depth, HIDDEN_BY)
-        return seen & ~self.occluded(frame, pixels[:, 0], pixels[:, 1])
+        return seen & ~self.occluded(frame, *self.camera.project_recorded(points).T)
 
     def renderer(self) -> SceneRenderer:
         """What makes the images."""
         return SceneRenderer(self.scene, self.model, self.camera, self.folder, self.nearest_depth(), self.surroundings)
 
-    def image(self, frame: int, nodes: Array, renderer: SceneRenderer) -> NDArray[np.uint8]:
-        """The image (h, w, 3) of a frame, with the object's nodes (n, 3) in the camera frame."""
-        centres, cameras = self.motion.occluder_centres, self.motion.camera_from_world
-        return renderer.render(
-            nodes, frame, None if centres is None else centres[frame], None if cameras is None else cameras[frame]
+    def image(self, frame: int, renderer: SceneRenderer) -> NDArray[np.uint8]:
+        """The image (h, w, 3) of a frame."""
+        count = len(self.between.parameters) // self.scene.frames
+        seen = [self._instant(k) for k in range(count * frame, count * (frame + 1))]
+        return renderer.render(seen, frame, self.gains[frame])
+
+    def _instant(self, number: int) -> Instant:
+        """What a band of rows sees, counted from the first of frame 0."""
+        motion = self.between
+        nodes = motion.camera_from_object[number].apply(self.model.positions(motion.parameters[number]))
+        centres, cameras = motion.occluder_centres, motion.camera_from_world
+        return Instant(
+            nodes, None if centres is None else centres[number], None if cameras is None else cameras[number]
         )
 
     def measured_depth(
@@ -116,15 +134,20 @@ def _load_world(scene_path: Path) -> _World:
         camera = load_camera(folder / scene.camera)
     else:
         camera = parse_camera(scene.camera, f"{scene_path}: camera")
-    if any(camera.distortion) or camera.lens_model == "fisheye":
-        raise SceneError(f"{scene_path}: scenes are rendered without lens distortion; leave it out of the camera")
+    if scene.depth_sensor is not None and (any(camera.distortion) or camera.readout_s):
+        raise SceneError(
+            f"{scene_path}: a depth sensor's images are those of an ideal pinhole with a global shutter; leave "
+            "distortion and readout_s out of the camera, or the depth sensor out of the scene"
+        )
     model = load_model(folder / scene.model)
     try:
         motion = plan_motion(scene, model)
+        instants = np.arange(scene.frames)[:, None] + scene.fps * band_seconds(camera)
+        between = plan_motion(scene, model, instants.ravel())
         surroundings = _surroundings(scene, folder, camera, motion)
     except SceneError as error:
         raise SceneError(f"{scene_path}: {error}") from error
-    world = _World(scene, folder, model, camera, motion, surroundings)
+    world = _World(scene, folder, model, camera, motion, between, _gains(scene), surroundings)
     for frame in range(scene.frames):
         points = world.node_positions(frame)
         if points[:, 2].min() <= 0.0:
@@ -133,6 +156,14 @@ def _load_world(scene_path: Path) -> _World:
                 f"{1e3 * points[:, 2].min():.4g} mm): move it ahead with the pose's position_mm"
             )
     return world
+
+
+def _gains(scene: Scene) -> Array:
+    """Of the exposure in every frame (T,), on a spline through the logarithms of the key frames."""
+    if not scene.exposure:
+        return np.ones(scene.frames)
+    logs = np.log([key.gain for key in scene.exposure])
+    return np.exp(interpolate_key_frames([key.frame for key in scene.exposure], logs, np.arange(scene.frames)))
 
 
 def _surroundings(scene: Scene, folder: Path, camera: Camera, motion: Motion) -> StaticScene | None:
@@ -177,7 +208,7 @@ def _landmarks(world: _World) -> Landmarks:
             f"frame 0 shows {len(nodes)} landmarks of the object, and a tracker needs {least}: "
             "let the first key frames show all of it, without the occluder"
         )
-    return Landmarks(world.model.nodes[nodes], world.camera.project(positions[nodes]))
+    return Landmarks(world.model.nodes[nodes], world.camera.project_recorded(positions[nodes]))
 
 
 def _truth_points(model: ReducedModel) -> SurfacePoints:
@@ -205,7 +236,7 @@ def _write_truth(path: Path, world: _World, positions: Array, visible: NDArray[n
         path,
         frame=np.arange(world.scene.frames),
         points_mm=positions * 1e3,
-        pixels=np.stack([world.camera.project(frame) for frame in positions]),
+        pixels=np.stack([world.camera.project_recorded(frame) for frame in positions]),
         visible=visible,
         parameters=world.motion.parameters,
         camera_from_object=np.stack([pose.matrix for pose in world.motion.camera_from_object]),
@@ -227,8 +258,8 @@ def _create_depth(file: h5py.File, world: _World) -> h5py.Dataset:
     return dataset
 
 
-def _write_image(path: Path, image: NDArray[np.uint8]) -> None:
-    options = {".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95], ".png": [cv2.IMWRITE_PNG_COMPRESSION, 3]}
+def _write_image(path: Path, image: NDArray[np.uint8], quality: int) -> None:
+    options = {".jpg": [cv2.IMWRITE_JPEG_QUALITY, quality], ".png": [cv2.IMWRITE_PNG_COMPRESSION, 3]}
     if not cv2.imwrite(str(path), image, options[path.suffix]):
         raise SceneError(f"cannot write {path}: is the disk full?")
 
@@ -244,7 +275,8 @@ def _render_frames(
         depths = _create_depth(file, world)
         for frame in tqdm(range(scene.frames), desc="rendering", unit="frame", disable=not progress):
             nodes = world.node_positions(frame)
-            _write_image(output / "frames" / f"{frame:06}.{scene.image_format}", world.image(frame, nodes, renderer))
+            path = output / "frames" / f"{frame:06}.{scene.image_format}"
+            _write_image(path, world.image(frame, renderer), scene.jpeg_quality)
             depth, behind = world.depth_image(nodes), world.surroundings_depth(frame)
             both, occluded = np.minimum(depth, behind), world.occluded(frame, columns, rows)
             visible[frame] = world.visible(frame, truth[frame], both)
@@ -314,7 +346,7 @@ class SimulatedSequence:
                 measured = world.measured_depth(number, both, occluded)
                 assert measured is not None
                 depth = np.where(measured > 0, measured / np.float32(VALUES_PER_METRE), np.float32(np.nan))
-            yield Frame(number, number / self.fps, world.image(number, nodes, renderer), depth=depth)
+            yield Frame(number, number / self.fps, world.image(number, renderer), depth=depth)
 
 
 def simulate(scene_path: str | Path, output: str | Path, progress: bool = True) -> None:
