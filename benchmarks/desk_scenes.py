@@ -7,15 +7,21 @@ the rolling shutter of the camera. benchmarks/rendered_desks.py registers the ob
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import meshio
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
+
+import morph_dslam as md
+from morph_dslam.extend.models import SeparatedField
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -24,6 +30,8 @@ PICTURES = ("chelsea", "rocket", "coffee", "astronaut")
 N_FRAMES, KEY_FRAMES_APART = 81, 8
 #: Boxes whose proportions differ by less than this (natural logarithm) are alike where a map has no scale.
 ALIKE = 0.2
+#: Faces that meet at a larger angle have a sharp edge, rad.
+SHARP = 0.5
 
 
 @dataclass(frozen=True)
@@ -146,7 +154,7 @@ def _marked(rng: Rng, size: int = 480) -> Image:
     """The object's print: one colour with a few larger marks, so that few points can be followed on it."""
     ground = _colour(rng, 90, 210, 0.7)
     image = np.full((size, size, 3), ground, dtype=np.uint8)
-    for _ in range(rng.integers(7, 11)):
+    for _ in range(rng.integers(12, 17)):
         centre = tuple(int(x) for x in rng.uniform(0.08, 0.92, 2) * size)
         half = tuple(int(x) for x in rng.uniform(0.03, 0.08, 2) * size)
         colour = tuple(float(x) for x in _colour(rng, 20, 245))
@@ -197,13 +205,26 @@ def _speckled(rng: Rng, size: int = 900) -> Image:
     return np.clip(_colour(rng, share=0.4) + 90.0 * soft[..., None], 0, 255).astype(np.uint8)
 
 
+def with_sharp_edges(model: md.ReducedModel) -> md.ReducedModel:
+    """The model with each sharp edge's nodes once for either face, so that no shade runs over the edge."""
+    mesh = trimesh.Trimesh(model.nodes, model.triangles, process=False)
+    smooth = mesh.face_adjacency[mesh.face_adjacency_angles < SHARP]
+    n = len(model.triangles)
+    faces = connected_components(coo_array((np.ones(len(smooth)), smooth.T), shape=(n, n)))[1]
+    keys = np.stack([model.triangles, np.broadcast_to(faces[:, None], (n, 3))], axis=-1).reshape(-1, 2)
+    used, triangles = np.unique(keys, axis=0, return_inverse=True)
+    still = SeparatedField(np.zeros((1, len(used), 3)), model.displacement.functions)
+    nodes = model.nodes[used[:, 0]]
+    return replace(model, nodes=nodes, triangles=triangles.reshape(-1, 3).astype(np.int64), displacement=still)
+
+
 def write_desk(seed: int, folder: Path) -> list[Path]:
     """Write a seed's object, its pictures and its scene file; of the same seed always the same.
 
     Returns
     -------
     The files written: ``object.stl``, pictures, ``camera.yaml`` and ``scene.toml``, the model of which,
-    ``object.morph``, is still to be built of the first.
+    ``sharp.morph``, is still to be made of the first (`with_sharp_edges`).
     """
     folder.mkdir(parents=True, exist_ok=True)
     rng, shape = np.random.default_rng([16, seed]), shapes()[shape_of(seed)]
@@ -220,7 +241,7 @@ def write_desk(seed: int, folder: Path) -> list[Path]:
     )
     light = rng.uniform([-0.8, -0.9], [0.8, -0.2])
     lines = [
-        f'model = "object.morph"\ncamera = "camera.yaml"\nframes = {N_FRAMES}\nseed = {seed}\njpeg_quality = 93\n',
+        f'model = "sharp.morph"\ncamera = "camera.yaml"\nframes = {N_FRAMES}\nseed = {seed}\njpeg_quality = 93\n',
         '[surface]\ntexture = "marks.png"\n',
         f"[light]\ndirection = [{light[0]:.3f}, {light[1]:.3f}, 1.0]\n",
         "[sensor]\nblur_px = 0.5\nnoise = 2.0\n",

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import morph_dslam as md
-from desk_scenes import Shape, shape_of, shapes, write_desk
+from desk_scenes import Shape, shape_of, shapes, with_sharp_edges, write_desk
 from morph_dslam.extend.geometry import RigidTransform, SimilarityTransform, fit_similarity
 from morph_dslam.extend.registration import Landmarks, draw_registration
 from morph_dslam.extend.slam import run_slam
@@ -113,11 +113,17 @@ class Attempt:
         )
 
 
+def build_models(surface: Path) -> None:
+    """The object as a user would build it, and for pictures with sharp edges."""
+    model = build_rigid(surface, "mm", surface.with_suffix(".morph"))
+    md.save_model(surface.with_name("sharp.morph"), with_sharp_edges(model))
+
+
 def made(seed: int, cache: Path, again: bool) -> Path:
     """The folder of a seed with its recording and its map; each is made unless it was made of the same desk."""
     folder = cache / f"{seed:02}"
     desk = write_desk(seed, folder)
-    keep(folder / "object.morph", desk[:1], lambda: build_rigid(desk[0], "mm", folder / "object.morph"))
+    keep(folder / "sharp.morph", desk[:1], lambda: build_models(desk[0]))
     recording, scan = folder / "recording", folder / "scan"
     keep(recording, desk, partial(md.simulate, desk[-1], recording, progress=False))
     (recording / "depth.h5").unlink(missing_ok=True)
