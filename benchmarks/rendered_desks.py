@@ -149,7 +149,7 @@ def load_desk(seed: int, folder: Path) -> Desk:
     in_map = [RigidTransform.from_matrix(keyframe.camera_from_world) for keyframe in keyframes]
     true = [RigidTransform.from_matrix(poses[keyframe.index]) for keyframe in keyframes]
     centres = [np.array([pose.inverse.translation for pose in path]) for path in (true, in_map)]
-    place = fit_similarity(*centres)
+    place = fit_similarity(centres[0], centres[1])
     # The path alone leaves a turn about itself open: attitude and place are those of the first keyframe.
     seen = in_map[0].inverse
     place = SimilarityTransform(
