@@ -236,6 +236,15 @@ def test_points_inside_of_cells_follow_the_interpolated_field():
         material_points(model, np.array([[0.05, 0.05, 0.05], [0.12, 0.0, 0.0]]))
 
 
+def test_points_just_outside_are_drawn_to_the_solid():
+    model = block_model("tucker")  # a cube of 100 mm
+    positions = np.array([[0.1004, 0.03, 0.05], [-0.0003, 0.1002, 0.07], [0.02, 0.03, 0.04]])
+    points = material_points(model, positions, reach=5e-4)
+    np.testing.assert_allclose(model.rest_positions(points), np.clip(positions, 0.0, 0.1), atol=1e-12)
+    with pytest.raises(StudyError, match=r"1 of 3 points lie outside of the solid, the first at \(100.4, 30, 50\)"):
+        material_points(model, positions, reach=3.9e-4)
+
+
 def test_interpolated_functions_are_those_of_one_parameter():
     """A mixture of functions of one parameter needs no mixing matrix."""
     nodes = np.linspace(0.0, 1.0, 6)

@@ -58,14 +58,28 @@ def _inverse_map(kind: CellType, corners: Array, points: Array) -> Array:
     return reference
 
 
-def locate(mesh: Mesh, points: Array) -> LocatedPoints:
-    """The cells that points (p, 3) of the undeformed solid, m, lie in; StudyError if one lies outside."""
+def _nearest_inside(shape: str, reference: Array) -> Array:
+    """Points (p, 3), of which some lie outside of a reference cell, drawn to its faces."""
+    result = np.clip(reference, 0.0, 1.0)
+    if shape != "hex":  # the slanting face of a tetrahedron or of a prism's base
+        axes = 3 if shape == "tet" else 2
+        result[:, :axes] /= np.maximum(result[:, :axes].sum(axis=1), 1.0)[:, None]
+    return result
+
+
+def locate(mesh: Mesh, points: Array, reach: float = 0.0) -> LocatedPoints:
+    """The cells that points (p, 3) of the undeformed solid, m, lie in.
+
+    Points outside, but not farther than about ``reach`` (m) from a cell, are drawn to its faces. Raises StudyError if
+    one is farther outside.
+    """
     points = np.atleast_2d(np.asarray(points, dtype=float))
     centres = np.concatenate([mesh.nodes[b.connectivity].mean(axis=1) for b in mesh.blocks])
     starts = mesh.block_starts()
     _, near = KDTree(centres).query(points, k=min(CANDIDATES, len(centres)))
     near = near.reshape(len(points), -1)
     cells, reference = np.full(len(points), -1, dtype=np.int64), np.zeros((len(points), 3))
+    beside, drawn, gaps = cells.copy(), reference.copy(), np.full(len(points), reach)
     for candidate in near.T:
         for block, start, stop in zip(mesh.blocks, starts[:-1], starts[1:], strict=True):
             rows = np.flatnonzero((cells < 0) & (candidate >= start) & (candidate < stop))
@@ -76,6 +90,16 @@ def locate(mesh: Mesh, points: Array) -> LocatedPoints:
             inside = _outside_by(block.type.shape, found) < TOLERANCE
             cells[rows[inside]] = candidate[rows[inside]]
             reference[rows[inside]] = found[inside]
+            if reach > 0.0:
+                moved = _nearest_inside(block.type.shape, found)
+                gap = np.linalg.norm(
+                    np.einsum("pk,pkx->px", block.type.shape_functions(moved), nodes) - points[rows], axis=1
+                )
+                nearer = gap < gaps[rows]
+                chosen = rows[nearer]
+                beside[chosen], drawn[chosen], gaps[chosen] = candidate[chosen], moved[nearer], gap[nearer]
+    outside = cells < 0
+    cells[outside], reference[outside] = beside[outside], drawn[outside]
     if (cells < 0).any():
         lost = points[np.flatnonzero(cells < 0)[0]]
         raise StudyError(
@@ -85,14 +109,15 @@ def locate(mesh: Mesh, points: Array) -> LocatedPoints:
     return LocatedPoints(cells, reference)
 
 
-def material_points(model: ReducedModel, positions: Array) -> MaterialPoints:
+def material_points(model: ReducedModel, positions: Array, reach: float = 0.0) -> MaterialPoints:
     """The points at ``positions`` (p, 3) of the undeformed solid, m, as nodes of their cells and shape functions.
 
-    `ReducedModel.restrict` takes them. Raises StudyError if a point lies outside of the solid.
+    `ReducedModel.restrict` takes them. Points outside by at most about ``reach``, m, are drawn to the solid, as those
+    of another mesh of the same body are. Raises StudyError if a point lies farther outside.
     """
     blocks = tuple(CellBlock(name, connectivity) for name, connectivity in model.cells.items())
     mesh = Mesh(model.nodes, blocks)
-    located, starts = locate(mesh, positions), mesh.block_starts()
+    located, starts = locate(mesh, positions, reach), mesh.block_starts()
     width = max(block.connectivity.shape[1] for block in blocks)
     corners, weights = np.zeros((len(positions), width), dtype=np.int64), np.zeros((len(positions), width))
     for block, start, stop in zip(blocks, starts[:-1], starts[1:], strict=True):
