@@ -44,11 +44,16 @@ def _outside_by(shape: str, reference: Array) -> Array:
     return np.max(bounds, axis=0)
 
 
+def _positions(kind: CellType, corners: Array, reference: Array) -> Array:
+    """Points (p, 3) at reference coordinates (p, 3) of cells with nodes (p, k, 3)."""
+    return np.einsum("pk,pkx->px", kind.shape_functions(reference), corners)
+
+
 def _inverse_map(kind: CellType, corners: Array, points: Array) -> Array:
     """Reference coordinates (p, 3) of points (p, 3) in cells with nodes (p, k, 3), by Newton's method."""
     reference = np.tile(kind.nodes[: kind.corners].mean(axis=0), (len(points), 1))
     for _ in range(NEWTON_STEPS):
-        gap = points - np.einsum("pk,pkx->px", kind.shape_functions(reference), corners)
+        gap = points - _positions(kind, corners, reference)
         jacobian = np.einsum("pka,pkx->pxa", kind.shape_gradients(reference), corners)
         jacobian[np.abs(np.linalg.det(jacobian)) < 1e-300] = np.eye(3)
         step = np.linalg.solve(jacobian, gap[:, :, None])[:, :, 0]
@@ -87,14 +92,15 @@ def locate(mesh: Mesh, points: Array, reach: float = 0.0) -> LocatedPoints:
                 continue
             nodes = mesh.nodes[block.connectivity[candidate[rows] - start]]
             found = _inverse_map(block.type, nodes, points[rows])
-            inside = _outside_by(block.type.shape, found) < TOLERANCE
+            # In a bent cell Newton's method may end nowhere, by chance within the reference cell.
+            missed = np.linalg.norm(_positions(block.type, nodes, found) - points[rows], axis=1)
+            met = missed < TOLERANCE * np.ptp(nodes, axis=1).max(axis=1)
+            inside = met & (_outside_by(block.type.shape, found) < TOLERANCE)
             cells[rows[inside]] = candidate[rows[inside]]
             reference[rows[inside]] = found[inside]
             if reach > 0.0:
                 moved = _nearest_inside(block.type.shape, found)
-                gap = np.linalg.norm(
-                    np.einsum("pk,pkx->px", block.type.shape_functions(moved), nodes) - points[rows], axis=1
-                )
+                gap = np.linalg.norm(_positions(block.type, nodes, moved) - points[rows], axis=1)
                 nearer = gap < gaps[rows]
                 chosen = rows[nearer]
                 beside[chosen], drawn[chosen], gaps[chosen] = candidate[chosen], moved[nearer], gap[nearer]
