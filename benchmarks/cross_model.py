@@ -170,7 +170,7 @@ def followed(folder: Path, run: Path, refine: bool, video: bool) -> Path:
 def path_error(scene: md.Scene, truth: Array) -> float:
     """How far the camera is off after a similarity of its path, mean, mm; truth (T, 4, 4) of the object's poses."""
     path = scene.trajectory
-    true = np.array([np.linalg.inv(truth[k])[:3, 3] for k in path.indices])
+    true = np.asarray([np.linalg.inv(truth[k])[:3, 3] for k in path.indices], dtype=np.float64)
     found = np.asarray(path.world_from_camera)[:, :3, 3]
     return float(distances(fit_similarity(found, true).apply(found), true).mean())
 
@@ -252,12 +252,12 @@ def stress_sums(twins: Twins, run: Run, row: int, best: Array) -> Array:
 
 def figures(run: Run, twins: Twins) -> dict[str, float]:
     """Errors against the foreign model, means over the frames that show the seal deformed."""
-    deformed = np.flatnonzero(run.parameters[:, 0] > BEGUN)
+    deformed = np.flatnonzero(run.parameters[:, 0] > BEGUN).tolist()
     bests = np.array([twins.best(run.parameters[row]) for row in deformed])
     errors = [frame_errors(twins, run, row, best) for row, best in zip(deformed, bests, strict=True)]
     result = {name: float(np.mean([error[name] for error in errors])) for name in errors[0]}
     result["p95_mm"] = float(np.percentile([error["mean_mm"] for error in errors], 95))
-    before = np.setdiff1d(np.arange(len(run.placed)), deformed)
+    before = sorted(set(range(len(run.placed))) - set(deformed))
     undeformed = [frame_errors(twins, run, row, np.zeros(2))["mean_mm"] for row in before]
     result["undeformed_mm"] = float(np.mean(undeformed))
     for name, states in (("", run.states[deformed]), ("best_", bests)):
@@ -315,15 +315,14 @@ def main() -> int:
 def last_line(found: list[dict[str, dict[str, float]]]) -> str:
     """Means over the scenes."""
     mean = lambda name, key: float(np.mean([scene[name][key] for scene in found]))  # noqa: E731
-    parts = []
-    for name in ("disturbed", "undisturbed"):
-        best = mean(name, "best_mm")
-        parts.append(f"{name}_mm={mean(name, 'mean_mm'):.3f} {name}_limit_mm={BEST_FACTOR * best + MORE[name]:.3f}")
-    parts.insert(1, f"p95_mm={mean('disturbed', 'p95_mm'):.3f} best_mm={mean('disturbed', 'best_mm'):.3f}")
+    limit = {name: BEST_FACTOR * mean(name, "best_mm") + more for name, more in MORE.items()}
     counts = [int(sum(scene["disturbed"][key] for scene in found)) for key in ("tracked", "frames")]
-    return " ".join(
-        [*parts, f"von_mises_percent={mean('disturbed', 'von_mises_percent'):.1f}", f"tracked={counts[0]}/{counts[1]}"]
-    )
+    parts = [f"disturbed_mm={mean('disturbed', 'mean_mm'):.3f}", f"p95_mm={mean('disturbed', 'p95_mm'):.3f}"]
+    parts += [f"best_mm={mean('disturbed', 'best_mm'):.3f}", f"disturbed_limit_mm={limit['disturbed']:.3f}"]
+    parts += [f"undisturbed_mm={mean('undisturbed', 'mean_mm'):.3f}"]
+    parts += [f"undisturbed_limit_mm={limit['undisturbed']:.3f}"]
+    parts += [f"von_mises_percent={mean('disturbed', 'von_mises_percent'):.1f}", f"tracked={counts[0]}/{counts[1]}"]
+    return " ".join(parts)
 
 
 if __name__ == "__main__":
