@@ -65,7 +65,7 @@ def test_three_landmarks_in_one_frame_place_an_object_and_give_the_unit(scan):
     clicks = Sighting(
         views[2].frame, views[2].camera_from_world, CORNERS, pixels + np.array([[1.5, -1], [-1.5, 1], [0.5, 1.5]])
     )
-    best = EdgeSearch(NODES, TRIANGLES, points, views, CAMERA, metric=False).search(Hints(clicks=(clicks,)))[0]
+    best = EdgeSearch(NODES, TRIANGLES, points, views, CAMERA, False, Hints(clicks=(clicks,))).search()[0]
     assert apart(best.place, WORLD) < 1.5e-3
     assert best.place.scale == pytest.approx(WORLD.scale, rel=0.01)
 
@@ -73,8 +73,7 @@ def test_three_landmarks_in_one_frame_place_an_object_and_give_the_unit(scan):
 @pytest.mark.slow
 def test_a_rough_distance_is_enough(scan):
     points, views = scan
-    search = EdgeSearch(NODES, TRIANGLES, points, views, CAMERA, metric=False)
-    best = search.search(Hints(distance=0.4))[0]
+    best = EdgeSearch(NODES, TRIANGLES, points, views, CAMERA, False, Hints(distance=0.4)).search()[0]
     assert apart(best.place, WORLD) < 1.5e-3
     assert best.edges.gain > 0.6
 
@@ -82,14 +81,14 @@ def test_a_rough_distance_is_enough(scan):
 def test_nothing_is_found_in_blank_images(scan):
     points, views = scan
     blank = [replace(view, normalized=np.full_like(view.normalized, 128)) for view in views]
-    assert EdgeSearch(NODES, TRIANGLES, points, blank, CAMERA, metric=False).search(Hints()) == []
+    assert EdgeSearch(NODES, TRIANGLES, points, blank, CAMERA, metric=False).search() == []
 
 
 def test_a_region_in_a_frame_that_is_no_keyframe_is_refused(scan):
     points, views = scan
-    search = EdgeSearch(NODES, TRIANGLES, points, views, CAMERA, metric=False)
+    hints = Hints(region=(99, (10.0, 10.0, 90.0, 90.0)))
     with pytest.raises(RegistrationError, match="no keyframe"):
-        search.search(Hints(region=(99, (10.0, 10.0, 90.0, 90.0))))
+        EdgeSearch(NODES, TRIANGLES, points, views, CAMERA, False, hints).search()
 
 
 def test_landmark_files_keep_the_frames(tmp_path):

@@ -11,7 +11,7 @@ the mesh has an edge, over that of an edge as near in the same image a little to
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, SimilarityTransform
 from morph_dslam.model.reduced_model import triangle_normals
+from morph_dslam.registration.dense_points import PointsOnSurface
 from morph_dslam.registration.increments import moved_similarity, pose_jacobian, similarity_jacobian
 from morph_dslam.registration.scene import View, camera_from_object
 from morph_dslam.render.rasteriser import draw_depth
@@ -40,6 +41,8 @@ EDGE_PX, SHIFT_PX = 1.0, 2.0
 CLICK_PX = 2.0
 #: An edge is where it is expected if it is as near, pixels; chance is asked this far to the sides.
 NEAR_PX, ASIDE_PX = 2.0, (8.0, 12.0, 16.0)
+#: Which edges are seen is asked anew after so many steps of a fit.
+SEEN_FOR = 1
 #: Fewer points of edges in the images are no evidence.
 FEWEST = 30
 
@@ -54,12 +57,14 @@ class VisibleEdges:
     pixels : (p, 2) where they are seen.
     normals : (p, 2) across them in the image.
     outline : (p,) whether something else is seen behind, and not another side of the object.
+    rows : (p,) which of the mesh's points along edges they are.
     """
 
     points: Array
     pixels: Array
     normals: Array
     outline: NDArray[np.bool_]
+    rows: NDArray[np.int64]
 
 
 class MeshEdges:
@@ -83,43 +88,55 @@ class MeshEdges:
         other = np.where(uses == 2, owner[order[np.minimum(first + 1, len(order) - 1)]], -1)
         normals = triangle_normals(nodes, triangles)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-        self._of_edge = np.stack([normals[one], np.where(other[:, None] >= 0, normals[other], -normals[one])], axis=1)
-        self._sharp = np.einsum("ex,ex->e", *self._of_edge.transpose(1, 0, 2)) < SHARP
         length = np.linalg.norm(nodes[ends[:, 1]] - nodes[ends[:, 0]], axis=1)
-        self._edge, share = _spaced(length, self.size / SPACING)
-        start, along = nodes[ends[self._edge, 0]], (nodes[ends[:, 1]] - nodes[ends[:, 0]])[self._edge]
-        self._points = start + share[:, None] * along
-        self._along = along
+        edge, share = _spaced(length, self.size / SPACING)
+        start, self._along = nodes[ends[edge, 0]], (nodes[ends[:, 1]] - nodes[ends[:, 0]])[edge]
+        self._points = start + share[:, None] * self._along
+        one, other = one[edge], other[edge]
+        #: Normals (2, p, 3) of the triangles on both sides, their sum, and how far their planes are from the origin.
+        self._sides = np.stack([normals[one], np.where(other[:, None] >= 0, normals[other], -normals[one])])
+        self._sum, self._away = self._sides.sum(axis=0), np.einsum("kpx,px->kp", self._sides, self._points)
+        self._sharp = np.einsum("px,px->p", *self._sides) < SHARP
 
     def visible(self, pose: RigidTransform, camera: Camera) -> VisibleEdges:
         """What a camera sees of them; ``pose`` is camera_from_object, metres."""
         eye = pose.inverse.translation
-        facing = np.einsum("pkx,px->pk", self._of_edge[self._edge], eye - self._points) > 0.0
-        turns = facing[:, 0] != facing[:, 1]
-        rows = np.flatnonzero(turns | (self._sharp[self._edge] & facing.any(axis=1)))
+        facing = self._sides @ eye > self._away
+        turns = facing[0] != facing[1]
+        rows = np.flatnonzero(turns | (self._sharp & facing.any(axis=0)))
         local = pose.apply(self._points[rows])
         pixels = camera.project(local)
         seen = self._seen(pose, camera, local, pixels)
         rows, local, pixels = rows[seen], local[seen], pixels[seen]
-        return VisibleEdges(self._points[rows], pixels, self._normals(rows, pose, camera, local), turns[rows])
+        return VisibleEdges(self._points[rows], pixels, self._normals(rows, pose, camera, local), turns[rows], rows)
+
+    def moved(self, seen: VisibleEdges, pose: RigidTransform, camera: Camera) -> VisibleEdges:
+        """The same points of edges at a pose near that at which they were seen."""
+        local = pose.apply(seen.points)
+        return replace(seen, pixels=camera.project(local), normals=self._normals(seen.rows, pose, camera, local))
 
     def _normals(self, rows: NDArray[np.int64], pose: RigidTransform, camera: Camera, local: Array) -> Array:
         """Across the edges, (p, 2). Where a smooth surface turns away, its own normal is across the outline."""
         ahead = np.einsum("pij,pj->pi", camera.projection_jacobian(local), self._along[rows] @ pose.rotation.T)
         across = np.column_stack([-ahead[:, 1], ahead[:, 0]])
-        smooth = ~self._sharp[self._edge[rows]]
-        of_surface = self._of_edge[self._edge[rows]].sum(axis=1) @ pose.rotation.T
-        across[smooth] = of_surface[smooth, :2]
+        smooth = ~self._sharp[rows]
+        across[smooth] = (self._sum[rows[smooth]] @ pose.rotation.T)[:, :2]
         return across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
+
+    def depth(self, pose: RigidTransform, camera: Camera, shrink: int = 1) -> Array:
+        """The object's depth in every pixel of a camera with so many times fewer of them; inf beside it."""
+        nodes = pose.apply(self.nodes)
+        size = camera.height // shrink, camera.width // shrink
+        if nodes[:, 2].min() <= 0.0:
+            return np.full(size, np.inf)
+        drawn = (camera.project(nodes) + 0.5) / shrink - 0.5
+        depth = draw_depth(np.ascontiguousarray(drawn), nodes[:, 2].copy(), self.triangles, False, *size)[1]
+        return np.asarray(depth, dtype=np.float64)
 
     def _seen(self, pose: RigidTransform, camera: Camera, local: Array, pixels: Array) -> NDArray[np.bool_]:
         """Which points (p,) are in the image, and not behind the object."""
-        nodes = pose.apply(self.nodes)
-        if nodes[:, 2].min() <= 0.0:
-            return np.zeros(len(local), dtype=bool)
-        drawn = (camera.project(nodes) + 0.5) / SHRINK - 0.5
-        size = camera.height // SHRINK, camera.width // SHRINK
-        _, depth = draw_depth(np.ascontiguousarray(drawn), nodes[:, 2].copy(), self.triangles, False, *size)
+        depth = self.depth(pose, camera, SHRINK)
+        size = depth.shape
         farthest = cv2.dilate(np.where(np.isfinite(depth), depth, 1e9).astype(np.float32), np.ones((3, 3), np.uint8))
         column, row = np.rint((np.nan_to_num(pixels, nan=-9.0) + 0.5) / SHRINK - 0.5).astype(np.int64).T
         inside = (column >= 2) & (row >= 2) & (column < size[1] - 2) & (row < size[0] - 2)
@@ -281,6 +298,7 @@ class EdgeImages:
         metric: bool,
         reaches: Sequence[float] = REACHES,
         clicks: Sequence[Sighting] = (),
+        points: PointsOnSurface | None = None,
     ) -> tuple[SimilarityTransform, Array]:
         """The place near ``start`` that has its edges on those of the images.
 
@@ -291,6 +309,7 @@ class EdgeImages:
         metric : keep the scale.
         reaches : pixels to search, in turn.
         clicks : landmarks, which keep the place near to where they were set.
+        points : of the map, which are to lie on the object.
 
         Returns
         -------
@@ -299,11 +318,21 @@ class EdgeImages:
         centre, place = edges.nodes.mean(axis=0), start
         units = np.array([1.0] * 4 + [edges.size * start.scale] * 3)
         free = slice(1 if metric else 0, None)
+        near = None if points is None else points.near(start)
         covariance = np.zeros((7, 7))
-        for reach in reaches:
-            matrix, right = self._equations(edges, place, reach, centre)
+        seen: list[VisibleEdges] = []
+        for step_number, reach in enumerate(reaches):
+            poses = [camera_from_object(view, place) for view in self.views]
+            if step_number % SEEN_FOR == 0:
+                seen = [edges.visible(pose, self.camera) for pose in poses]
+            else:
+                seen = [edges.moved(each, pose, self.camera) for each, pose in zip(seen, poses, strict=True)]
+            matrix, right = self._equations(seen, poses, place, reach, centre)
             for click in clicks:
                 add_clicks(matrix, right, click, place, centre, self.camera)
+            if near is not None:
+                of_points = near.equations(place, centre, reach)
+                matrix, right = matrix + of_points[0], right + of_points[1]
             matrix, right = matrix * np.outer(units, units), right * units
             # What the edges leave open stays.
             damped = matrix[free, free] + np.diag(1e-4 * np.diag(matrix[free, free]) + 1e-6)
@@ -315,13 +344,16 @@ class EdgeImages:
         return place, covariance * np.outer(units, units)
 
     def _equations(
-        self, edges: MeshEdges, place: SimilarityTransform, reach: float, centre: Array
+        self,
+        visible: Sequence[VisibleEdges],
+        poses: Sequence[RigidTransform],
+        place: SimilarityTransform,
+        reach: float,
+        centre: Array,
     ) -> tuple[Array, Array]:
         """Normal matrix (7, 7) and right side (7,), the keyframes' own shifts eliminated."""
         matrix, right = np.zeros((7, 7)), np.zeros(7)
-        for view, slopes in zip(self.views, self.slopes, strict=True):
-            pose = camera_from_object(view, place)
-            seen = edges.visible(pose, self.camera)
+        for seen, pose, slopes in zip(visible, poses, self.slopes, strict=True):
             if len(seen.points) < FEWEST:
                 continue
             offsets = find_edges(slopes[0], slopes[1], seen.pixels, seen.normals, float(reach), LEAST_EDGE)

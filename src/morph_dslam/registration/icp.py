@@ -147,13 +147,8 @@ def fit_surface(
     """
     transform = start
     for width in widths:
-        inverse = transform.inverse
-        nearest = surface.nearest(inverse.apply(points.positions), inverse.apply(points.viewpoints))
-        arms = transform.scale * (surface.points[nearest] - surface.centre) @ transform.rotation.T
-        normals = surface.normals[nearest] @ transform.rotation.T
+        matrix, right, weights = surface_equations(points, surface, transform, surface.centre, width, to_planes)
         centre = transform.apply(surface.centre)
-        gaps = points.positions - centre - arms
-        matrix, right, weights = normal_equations(gaps, arms, normals, width, to_planes)
         size = surface.radius * transform.scale
         prior = PRIOR * max(weights.sum(), 1.0) * np.array([size**2] * 4 + [1.0] * 3)
         if metric:
@@ -164,6 +159,27 @@ def fit_surface(
         translation = centre + step[4:] - scale * rotation @ surface.centre
         transform = SimilarityTransform(scale, rotation, translation)
     return transform, weights
+
+
+def surface_equations(
+    points: MapPoints, surface: Surface, place: SimilarityTransform, about: Array, width: float, to_planes: bool = True
+) -> tuple[Array, Array, Array]:
+    """Gauss-Newton's matrix (7, 7) and right side (7,) of points on a surface, and their weights (n,), 0 to 1.
+
+    Parameters
+    ----------
+    points : of the map.
+    surface : on which they are to lie.
+    place : world_from_object.
+    about : (3,) the point, object frame, about which the similarity's step scales and turns.
+    width : points farther from the surface than this do not count, world unit.
+    to_planes : as of `fit_surface`.
+    """
+    inverse = place.inverse
+    nearest = surface.nearest(inverse.apply(points.positions), inverse.apply(points.viewpoints))
+    arms = place.scale * (surface.points[nearest] - about) @ place.rotation.T
+    gaps = points.positions - place.apply(about) - arms
+    return normal_equations(gaps, arms, surface.normals[nearest] @ place.rotation.T, width, to_planes)
 
 
 @njit(cache=True, nogil=True)

@@ -1,9 +1,11 @@
-"""Registration of a mesh in a sparse map: where the object is, how large the map's unit is, and how sure that is.
+"""Registration of a mesh in a map: where the object is, how large the map's unit is, and how sure that is.
 
-Regions of the map that stand out of its planes are tried in turn. In each the surface starts in many attitudes and
-sizes, is laid through the points by scaled robust ICP, and every result is scored by the keyframes: points that it
-explains count for it, points that it would occlude against it. The best and the best other one are kept, and the
-best is refined by comparing the keyframes' images on it. Last, these are asked whether they show its outline there.
+The object is looked for by its edges in the keyframes and by points of their stereo (`EdgeSearch`). Where these show
+no clear place, as in pictures full of texture, it is looked for by the points of the map alone. There, regions of the
+map that stand out of its planes are tried in turn. In each the surface starts in many attitudes and sizes, is laid
+through the points by scaled robust ICP, and every result is scored by the keyframes: points that it explains count for
+it, points that it would occlude against it. The best place is refined by comparing the keyframes' images on it. Last,
+these are asked whether they show its outline there.
 """
 
 from __future__ import annotations
@@ -30,18 +32,14 @@ from morph_dslam.registration.messages import (
     TooLittleTexture,
 )
 from morph_dslam.registration.outline_fit import OutlineFit, outline_fit
+from morph_dslam.registration.point_evidence import PointEvidence, gather_evidence
 from morph_dslam.registration.registration import Axis
 from morph_dslam.registration.scene import MapPoints, View, spread_views
-from morph_dslam.registration.search_space import attitudes, candidate_regions, find_planes, plane_points
+from morph_dslam.registration.search_space import attitudes, candidate_regions, find_planes
 from morph_dslam.registration.texture import TextureComparison
-from morph_dslam.registration.view_registration import EdgeRegistration, EdgeSearch, Hints
-from morph_dslam.render.rasteriser import rasterise
+from morph_dslam.registration.view_registration import NO_HINTS, Claimed, EdgeRegistration, EdgeSearch, Hints
 
 Array = NDArray[np.float64]
-#: A point that the object would occlude counts against it as much as so many that it explains.
-VIOLATION = 2.0
-#: The views are drawn this much smaller.
-SHRINK = 4
 #: Sizes at which the surface starts, over that of the region.
 START_SIZES = (0.85, 1.1, 1.45)
 #: How far its middle starts behind that of the points, which lie on the filmed side; over their spread.
@@ -61,84 +59,16 @@ TOLERANCE = 0.015
 FEWEST_EXPLAINED = 20
 #: The runner-up's score over the best's above which they are ambiguous.
 AMBIGUOUS = 0.8
-#: An object laid by its edges is confirmed if so much of its outline is on edges, of what chance does not put there.
-#: Its images are believed before its edges unless they lose more than this part of them.
-CONFIRMED, LOST_EDGES = 0.6, 0.05
-#: The same where landmarks have it there, and below which the edges speak against a place found by
-#: points, if chance puts less than this on edges.
-CONFIRMED_BY_CLICKS, AGAINST, TELLING_CHANCE = 0.5, 0.25, 0.5
+#: An object laid by its edges is confirmed from this score on; where landmarks have it there, if so much of its outline
+#: is on edges, of what chance does not put there. Its images are believed before its edges unless they lose more than
+#: this part of the score.
+CONFIRMED, CONFIRMED_BY_CLICKS, LOST = 15.0, 0.5, 5.0
+#: The edges speak against a place found by points below this, if chance puts less than that on edges.
+AGAINST, TELLING_CHANCE = 0.25, 0.5
 #: So many of the best places are compared by the images on them, if they score at least this part of the
 #: best. Images that differ by more than this, pixels, or so many times as much as on another place, speak
 #: against a place.
 N_COMPARED, WORTH_COMPARING, POOR_AGREEMENT_PX, MUCH_WORSE = 4, 0.5, 0.35, 2.0
-
-
-@dataclass(frozen=True)
-class _Evidence:
-    """What speaks for a place.
-
-    Attributes
-    ----------
-    explained : (n,) points that lie on the visible side of the object.
-    occluded : (n,) points that it would occlude.
-    solid : (n,) points explained without those of the one plane that holds most of them. Any flat face fits
-        on any table or wall, in any size.
-    """
-
-    explained: NDArray[np.bool_]
-    occluded: NDArray[np.bool_]
-    solid: NDArray[np.bool_]
-
-    @property
-    def score(self) -> float:
-        """Points explained, but for one plane, less those occluded, these `VIOLATION` times."""
-        return float(self.solid.sum() - VIOLATION * self.occluded.sum())
-
-
-def gather_evidence(
-    world_from_object: SimilarityTransform,
-    nodes: Array,
-    triangles: NDArray[np.int64],
-    positions: Array,
-    views: Sequence[View],
-    camera: Camera,
-    tolerance: float,
-) -> _Evidence:
-    """Draw the object into every view and compare its depth with that of the points (p, 3) seen there.
-
-    ``tolerance`` is how far from the surface a point may lie that it explains, world unit.
-    """
-    votes = np.zeros((2, len(positions)), dtype=np.int64)
-    small = _shrunk(camera)
-    world = world_from_object.apply(nodes)
-    for view in views:
-        local = view.camera_from_world.apply(world)
-        buffers = rasterise(small.project(local), local[:, 2], triangles, small.height, small.width)
-        depth = view.camera_from_world.apply(positions[view.point_ids])[:, 2]
-        columns, rows = np.rint((view.pixels + 0.5) / SHRINK - 0.5).astype(np.int64).T
-        inside = (columns >= 0) & (columns < small.width) & (rows >= 0) & (rows < small.height)
-        drawn = np.full(len(depth), np.inf)
-        drawn[inside] = buffers.depth[rows[inside], columns[inside]]
-        # A grazing surface changes its depth within a pixel: what is occluded must be so by more.
-        votes[0, view.point_ids] += np.abs(depth - drawn) <= 2.0 * tolerance
-        votes[1, view.point_ids] += drawn < depth - 4.0 * tolerance
-    explained, occluded = votes[0] > votes[1], votes[1] > votes[0]
-    solid = explained.copy()
-    found = np.flatnonzero(explained)
-    if len(found) >= 3:
-        solid[found] = ~plane_points(positions[found], tolerance, np.random.default_rng(0))
-    return _Evidence(explained, occluded, solid)
-
-
-def _shrunk(camera: Camera) -> Camera:
-    return Camera(
-        camera.width // SHRINK,
-        camera.height // SHRINK,
-        camera.fx / SHRINK,
-        camera.fy / SHRINK,
-        (camera.cx + 0.5) / SHRINK - 0.5,
-        (camera.cy + 0.5) / SHRINK - 0.5,
-    )
 
 
 @dataclass(frozen=True)
@@ -150,7 +80,8 @@ class MeshRegistration:
     world_from_object : metres to the map's unit.
     covariance : (7, 7) of log scale, rotation vector and translation about the mean node, world; None if there
         was too little to compare.
-    score : points explained outside of one plane, less twice those it would occlude.
+    score : what speaks for it: with ``edges``, percent; else the points explained outside of one plane, less twice
+        those it would occlude.
     runner_up : the score of the next best place.
     n_explained : points on the surface.
     rms_px : how far the keyframes' images of the surface agree; None if there was too little to compare.
@@ -159,6 +90,8 @@ class MeshRegistration:
     outline : how much of its outline the keyframes show where it is.
     unconfirmed : whether there are images, but nothing on the object could be compared in them: a floor and a
         wall, say, that have its shape in another size.
+    edges : how much of its edges the keyframes show, if it was found by these or they contradict the points.
+    by_clicks : whether landmarks say where it is.
     """
 
     world_from_object: SimilarityTransform
@@ -178,14 +111,8 @@ class MeshRegistration:
     def warnings(self) -> tuple[RegistrationWarning, ...]:
         """What a reader must know."""
         warnings: list[RegistrationWarning] = []
-        if self.edges is not None:
-            if self.edges.gain < (CONFIRMED_BY_CLICKS if self.by_clicks else CONFIRMED):
-                warnings.append(OutlineElsewhere(self.edges.share))
-            elif self.runner_up > AMBIGUOUS * self.score:
-                warnings.append(Ambiguous(Ambiguity.SECOND_PLACE, self.runner_up / self.score))
-            return tuple(warnings if self.rms_px is not None else [*warnings, TooLittleTexture()])
-        if self.outline.contradicts:
-            warnings.append(OutlineElsewhere(self.outline.share))
+        if self.outline.contradicts or self._lacks_edges:
+            warnings.append(OutlineElsewhere(self.outline.share if self.edges is None else self.edges.share))
         elif self.unconfirmed:
             warnings.append(Ambiguous(Ambiguity.UNCONFIRMED))
         elif self.rms_px is not None and self.rms_px > POOR_AGREEMENT_PX:
@@ -197,6 +124,11 @@ class MeshRegistration:
         return tuple(warnings)
 
     @property
+    def _lacks_edges(self) -> bool:
+        """Whether the keyframes show too little of its edges."""
+        return self.edges is not None and self.edges.gain < (CONFIRMED_BY_CLICKS if self.by_clicks else AGAINST)
+
+    @property
     def ambiguous(self) -> bool:
         """Whether another place is nearly as good, or the images contradict this one or do not confirm it."""
         return any(isinstance(warning, Ambiguous | OutlineElsewhere) for warning in self.warnings)
@@ -205,7 +137,7 @@ class MeshRegistration:
 @dataclass(frozen=True)
 class _Place:
     transform: SimilarityTransform
-    evidence: _Evidence
+    evidence: PointEvidence
 
 
 def register_mesh(
@@ -216,7 +148,8 @@ def register_mesh(
     camera: Camera,
     metric: bool = False,
     progress: bool = False,
-    hints: Hints | None = None,
+    hints: Hints = NO_HINTS,
+    claimed: Claimed | None = None,
 ) -> MeshRegistration:
     """Find an undeformed object in a map.
 
@@ -230,15 +163,16 @@ def register_mesh(
     metric : whether the map's unit is the metre.
     progress : whether to show a progress bar.
     hints : what is known of where the object is.
+    claimed : takes points on other objects out of a map.
 
     Raises
     ------
     RegistrationError
         If the object is not found, or a hint names what is not there.
     """
-    search = EdgeSearch(nodes, triangles, points, views, camera, metric)
-    if hints is not None:
-        places = search.search(hints)
+    search = EdgeSearch(nodes, triangles, points, views, camera, metric, hints, claimed)
+    places = search.search()
+    if hints != NO_HINTS:
         if not places:
             raise RegistrationError(
                 "no keyframe shows the object's edges where the hints have it: check them and the unit of the mesh, or "
@@ -246,11 +180,20 @@ def register_mesh(
                 RegistrationFailure.NOT_FOUND,
             )
         return _by_edges(places, search, points, views, metric, bool(hints.clicks))
+    if _clear([place.rank for place in places]):
+        return _by_edges(places, search, points, views, metric)
     found = _by_points(search.surface, nodes, triangles, points, views, camera, metric, progress)
-    edges = search.evidence(found.world_from_object)
+    there = search.at(found.world_from_object)
+    if places and 100.0 * places[0].rank >= CONFIRMED and there.rank < AMBIGUOUS * places[0].rank:
+        return _by_edges(places, search, points, views, metric)
     # On a dense texture, edges are everywhere and say nothing.
-    informative = 0.0 < edges.chance < TELLING_CHANCE
-    return replace(found, edges=edges) if informative and edges.gain < AGAINST else found
+    informative = 0.0 < there.edges.chance < TELLING_CHANCE
+    return replace(found, edges=there.edges) if informative and there.edges.gain < AGAINST else found
+
+
+def _clear(ranks: list[float]) -> bool:
+    """Whether the first of the places, the best first, is one and the next one is much worse."""
+    return 100.0 * ranks[0] >= CONFIRMED and max([0.0, *ranks[1:]]) <= AMBIGUOUS * ranks[0] if ranks else False
 
 
 def _by_edges(
@@ -259,33 +202,35 @@ def _by_edges(
     points: MapPoints,
     views: Sequence[View],
     metric: bool,
-    by_clicks: bool,
+    by_clicks: bool = False,
 ) -> MeshRegistration:
     """The best of the places, refined by the images on it where its edges stay; the others are its rivals."""
     best, nodes, triangles = places[0], search.edges.nodes, search.edges.triangles
-    axis = search.surface.axis_of_revolution
+    axis, score = search.surface.axis_of_revolution, 100.0 * best.rank
     found = MeshRegistration(
         best.place,
         best.covariance,
-        100.0 * best.edges.total,
-        max([0.0, *(100.0 * other.edges.total for other in places[1:])]),
-        best.n_explained,
+        score,
+        max([0.0, *(100.0 * other.rank for other in places[1:])]),
+        int(best.points.explained.sum()),
         None,
         axis,
+        outline=outline_fit(best.place, nodes, triangles, spread_views(views, MOST_ASKED), search.camera),
+        unconfirmed=not by_clicks and score < CONFIRMED,
         edges=best.edges,
         by_clicks=by_clicks,
     )
     aligned = TextureComparison(nodes, triangles, search.camera).refine(best.place, views, metric)
-    if aligned is None:
+    if aligned is None or aligned[1] > POOR_AGREEMENT_PX:
         return found
     adjustment = KeyframeAdjustment(nodes, triangles, search.camera, points, views, axis)
     adjusted = _adjusted(
         replace(found, world_from_object=aligned[0], rms_px=aligned[1]), adjustment, nodes.mean(axis=0), metric
     )
-    edges = search.evidence(adjusted.world_from_object)
-    if adjusted.keyframes is None or edges.total < best.edges.total - LOST_EDGES or aligned[1] > POOR_AGREEMENT_PX:
+    there = search.at(adjusted.world_from_object)
+    if adjusted.keyframes is None or 100.0 * there.rank < score - LOST:
         return found
-    return replace(adjusted, edges=edges)
+    return replace(adjusted, edges=there.edges)
 
 
 def _by_points(
@@ -439,19 +384,20 @@ def register_in_unit(
     camera: Camera,
     metric: bool,
     progress: bool = False,
-    hints: Hints | None = None,
+    hints: Hints = NO_HINTS,
+    claimed: Claimed | None = None,
 ) -> MeshRegistration:
     """As `register_mesh`; an object that a metric map does not hold is looked for in other sizes.
 
     A monocular map has no unit: there an object of another size is found, with another map_units_per_metre.
     """
     try:
-        return register_mesh(nodes, triangles, points, views, camera, metric, progress, hints)
+        return register_mesh(nodes, triangles, points, views, camera, metric, progress, hints, claimed)
     except RegistrationError as error:
-        if not metric or hints is not None:
+        if not metric or hints != NO_HINTS:
             raise
         try:
-            found = register_mesh(nodes, triangles, points, views, camera, False, progress)
+            found = register_mesh(nodes, triangles, points, views, camera, False, progress, NO_HINTS, claimed)
         except RegistrationError:
             raise error from None
         if found.ambiguous:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -69,11 +70,12 @@ def register(
         If the object is not found, or a hint names a frame without a pose.
     """
     clicks = () if landmarks is None else _sightings(landmarks, scene)
-    given = landmarks is not None or distance is not None or region is not None
-    hints = Hints(clicks, distance, region) if given else None
-    points, views = without_points_on(beside, *points_and_views(scene))
+    hints, claimed = Hints(clicks, distance, region), partial(without_points_on, beside)
+    points, views = claimed(*points_and_views(scene))
     nodes = model.positions(model.default)
-    found = register_in_unit(nodes, model.triangles, points, views, scene.camera, scene.is_metric, progress, hints)
+    found = register_in_unit(
+        nodes, model.triangles, points, views, scene.camera, scene.is_metric, progress, hints, claimed
+    )
     facts = {
         "from": "map",
         "score": found.score,

@@ -15,6 +15,8 @@ from morph_dslam.registration.registration import Axis
 Array = NDArray[np.float64]
 #: A plane holds at least this part of the map; at most so many are taken out.
 PLANE_SHARE, MOST_PLANES = 0.12, 4
+#: A large plane of a map by stereo of its keyframes holds at least this part of it.
+LARGE_SHARE = 0.1
 #: Planes are this thick, in units of the map's usual spacing between points.
 PLANE_THICKNESS = 0.15
 #: Points of one piece are joined over so many times the usual spacing, each in turn.
@@ -44,8 +46,20 @@ def plane_points(points: Array, thickness: float, rng: np.random.Generator) -> N
     if best.sum() < 3:
         return np.zeros(len(points), dtype=bool)
     centre = points[best].mean(axis=0)
-    normal = np.linalg.svd(points[best] - centre)[2][-1]
+    normal = np.linalg.svd(points[best] - centre, full_matrices=False)[2][-1]
     return np.abs((points - centre) @ normal) <= thickness
+
+
+def on_large_planes(points: Array, thickness: float) -> NDArray[np.bool_]:
+    """Which points (n, 3) lie on a plane that holds many of them, as a table, a board or a wall does."""
+    rng, left, on_plane = np.random.default_rng(0), np.arange(len(points)), np.zeros(len(points), dtype=bool)
+    for _ in range(MOST_PLANES):
+        found = plane_points(points[left], thickness, rng) if len(left) >= FEWEST_POINTS else np.zeros(0, dtype=bool)
+        if found.sum() < LARGE_SHARE * len(points):
+            break
+        on_plane[left[found]] = True
+        left = left[~found]
+    return on_plane
 
 
 @dataclass(frozen=True)
@@ -68,7 +82,7 @@ class Planes:
         if not self.taken_out:
             return None
         flat = points[self.taken_out[0]]
-        return np.linalg.svd(flat - flat.mean(axis=0))[2][-1]
+        return np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)[2][-1]
 
 
 def find_planes(points: Array, seed: int = 0) -> Planes:

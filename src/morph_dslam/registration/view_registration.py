@@ -1,45 +1,54 @@
 """Registration of a mesh by its edges in keyframes, with or without hints of where it is.
 
-One keyframe is searched for the object's edges, or landmarks say where it is in a frame. The map's points on each
-hypothesis give the unit and speak for it; the best ones are fitted to the edges of all keyframes, and these decide.
+One keyframe is searched for the object's edges, or landmarks say where it is in a frame. Points by stereo on each
+hypothesis give the unit and speak for it. The best ones are fitted to points and edges of all keyframes: a place that
+is right has its edges on theirs and their points on its surface, and a chance place seldom has both.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
-from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_exp
+from morph_dslam.geometry import RigidTransform, SimilarityTransform
+from morph_dslam.registration.dense_points import DEPTH_NOISE, PointsOnSurface, with_dense_points
 from morph_dslam.registration.edges import CLICK_PX, EdgeEvidence, EdgeImages, MeshEdges, Sighting
 from morph_dslam.registration.icp import Surface, same_place
 from morph_dslam.registration.landmarks import solve_pnp
+from morph_dslam.registration.point_evidence import PointEvidence, gather_evidence
 from morph_dslam.registration.scene import MapPoints, View, camera_from_object, spread_views, views_of
-from morph_dslam.registration.search_space import plane_points
-from morph_dslam.registration.view_search import EdgeDrawings, InView, hypotheses, map_unit, placed, sizes_and_places
+from morph_dslam.registration.search_space import on_large_planes
+from morph_dslam.registration.view_search import InView, hypotheses, map_unit, placed, sizes_and_places
 
 Array = NDArray[np.float64]
-#: A hypothesis needs so many points of the map that agree on a unit, and this share of those in its outline.
-FEWEST_AGREEING, AGREEING_SHARE = 8, 0.6
+#: A hypothesis needs so many points of the map that agree on a unit; where those of planes count, too, this share of
+#: the points in its outline, and points that do not agree count twice.
+FEWEST_AGREEING, AGREEING_SHARE = 6, 0.6
 #: A metric map's unit may be off by this part where points on the object show it: its depths have errors.
 UNIT_ERROR = 0.12
-#: Sums of log likelihoods: for a point that agrees, and against one that does not.
-AGREES, DISAGREES = 0.5, 1.0
-#: Hypotheses fitted to few keyframes, keyframes for it, and those fitted to more of them.
-N_FITTED, FEW_VIEWS, N_FINE, MORE_VIEWS = 80, 4, 8, 12
-#: Of these so many are fitted again from so many places around, turned by so much (rad) and moved by such a part of the
-#: size: standard deviations.
-N_AGAIN, N_AROUND, TURNED, MOVED = 12, 10, 0.08, 0.05
-#: Pixels searched in turn for them.
-ROUGH, FINE = (12, 8, 6, 4, 3), (8, 6, 5, 4, 3, 3, 3)
-#: So many points must lie on the object outside of the one plane that holds most: a flat face fits on any print.
-FEWEST_SOLID = 6
-#: A point lies on the object if its depth is that of the surface, over the object's size.
-ON_SURFACE = 0.06
+#: Log likelihood for a point that agrees, and against one that does not.
+AGREES = 0.5
+#: Hypotheses (of the second ranking, twice as many) fitted to few keyframes, keyframes for it, and those of more.
+N_FITTED, FEW_VIEWS, N_FINE, MORE_VIEWS = 60, 4, 8, 8
+#: Of these, the best so many are fitted again from where each keyframe alone would have them.
+N_AGAIN = 3
+#: Hypotheses are alike in a square of so many pixels and within this of the size (log); so many of them are fitted.
+CELL, SIZES_ALIKE, MOST_ALIKE = 64, 0.36, 3
+#: Pixels searched in turn for them: with few keyframes, with more of them, and from near.
+ROUGH, FINE, NEAREST = (12, 8, 6, 4, 3), (8, 6, 5, 4, 3), (4, 3, 3, 3, 3, 3)
+#: Keyframes that get points by stereo.
+N_STEREO = 8
+#: Where there are too few points to agree, edges decide among such places.
+NO_POINTS = 0.05
+#: A point lies on the object if it is so near to the surface, over the object's size.
+TOLERANCE = 0.015
 #: Fewer landmarks than this in a frame are tried in so many other places, too.
 MANY_CLICKS, N_MEANT = 6, 12
 #: Factor by which a rough distance may be off.
@@ -62,6 +71,11 @@ class Hints:
     region: tuple[int, tuple[float, float, float, float]] | None = None
 
 
+NO_HINTS = Hints()
+#: Takes points on other objects out of a map, and out of what its views have seen.
+Claimed = Callable[[MapPoints, Sequence[View]], tuple[MapPoints, list[View]]]
+
+
 @dataclass(frozen=True)
 class EdgeRegistration:
     """An object laid by its edges.
@@ -71,15 +85,23 @@ class EdgeRegistration:
     place : metres to the map's unit.
     covariance : (7, 7) of log scale, rotation vector and translation about the mean node.
     edges : how much of its edges the keyframes show there.
-    n_explained : points of the map on it.
-    n_solid : those outside of the one plane that holds most.
+    points : what the points of the map say.
     """
 
     place: SimilarityTransform
     covariance: Array
     edges: EdgeEvidence
-    n_explained: int
-    n_solid: int
+    points: PointEvidence
+
+    @property
+    def rank(self) -> float:
+        """What speaks for it."""
+        return _rank(self.edges, self.points)
+
+
+def _rank(edges: EdgeEvidence, points: PointEvidence) -> float:
+    """What speaks for a place, at most 1: its edges beyond chance and the points that agree must both do so."""
+    return edges.total * max(points.agreement, NO_POINTS)
 
 
 class EdgeSearch:
@@ -93,6 +115,8 @@ class EdgeSearch:
     views : keyframes of the map.
     camera : of the views, without distortion.
     metric : whether the map's unit is the metre.
+    hints : what is known of where the object is.
+    claimed : takes points on other objects out of a map.
     """
 
     def __init__(
@@ -103,53 +127,35 @@ class EdgeSearch:
         views: Sequence[View],
         camera: Camera,
         metric: bool,
+        hints: Hints = NO_HINTS,
+        claimed: Claimed | None = None,
     ) -> None:
         self.edges, self.surface = MeshEdges(nodes, triangles), Surface.of_mesh(nodes, triangles)
         self._points, self._views, self.camera, self._metric = points, list(views), camera, metric
+        self._hints, self._claimed = hints, claimed
 
-    def search(self, hints: Hints) -> list[EdgeRegistration]:
+    def search(self) -> list[EdgeRegistration]:
         """Distinct places, the best first; none where nothing resembles the object.
 
         Raises RegistrationError if a hint names what is not there.
         """
-        starts = self._by_clicks(hints.clicks) if hints.clicks else self._in_keyframe(hints)
+        starts = self._by_clicks() if self._hints.clicks else self._in_keyframe()
         few = EdgeImages(spread_views(self._views, FEW_VIEWS), self.camera)
-
-        def fitted(starts: Sequence[SimilarityTransform]) -> list[tuple[float, SimilarityTransform]]:
-            places = [few.refine(self.edges, start, self._metric, ROUGH, hints.clicks)[0] for start in starts]
-            gains = [few.evidence(self.edges, place).total for place in places]
-            return sorted(zip(gains, places, strict=True), key=lambda pair: -pair[0])
-
-        first = fitted(starts)
-        # A print has edges beside those of the object, which hold a fit that starts a little off.
-        best = [place for _, place in first[: 0 if hints.clicks else N_AGAIN]]
-        rough = sorted([*first, *fitted(self._around(best))], key=lambda pair: -pair[0])
+        rough = []
+        for start in starts:
+            place = few.refine(self.edges, start, self._metric, ROUGH, self._hints.clicks, self._on_it)[0]
+            rough.append((_rank(few.evidence(self.edges, place), self.points_at(place, FEW_VIEWS)), place))
         found: list[EdgeRegistration] = []
-        for _, place in rough:
+        for _, place in sorted(rough, key=lambda pair: -pair[0]):
             if len(found) < N_FINE and not any(self._same(place, other.place) for other in found):
-                found.append(self.refined(place, hints.clicks))
-        found.sort(key=lambda each: -each.edges.total)
+                found.append(self._fitted(place, self._images(place), FINE))
+        found.sort(key=lambda each: -each.rank)
+        found = [self._again(each) for each in found[:N_AGAIN]] + found[N_AGAIN:]
         kept: list[EdgeRegistration] = []
-        for each in found:
-            solid = bool(hints.clicks) or each.n_solid >= FEWEST_SOLID
-            if solid and not any(self._same(each.place, other.place) for other in kept):
+        for each in sorted(found, key=lambda each: -each.rank):
+            if not any(self._same(each.place, other.place) for other in kept):
                 kept.append(each)
         return kept
-
-    def _around(self, places: Sequence[SimilarityTransform]) -> list[SimilarityTransform]:
-        """Places a little off: turned, moved and, along the sight lines, scaled."""
-        rng, centre = np.random.default_rng(0), self.edges.nodes.mean(axis=0)
-        eye = self._views[len(self._views) // 2].camera_from_world.inverse.translation
-        near = []
-        for place in places:
-            for _ in range(N_AROUND):
-                turn = rotation_exp(TURNED * rng.normal(size=3)) @ place.rotation
-                middle = place.apply(centre) + MOVED * self.edges.size * place.scale * rng.normal(size=3)
-                farther = float(np.exp(0.0 if self._metric else MOVED * rng.normal()))
-                middle = eye + farther * (middle - eye)
-                scale = place.scale * farther
-                near.append(SimilarityTransform(scale, turn, middle - scale * turn @ centre))
-        return near
 
     def _same(self, a: SimilarityTransform, b: SimilarityTransform) -> bool:
         """Whether two places are one as a camera sees them; the map's unit may differ."""
@@ -161,32 +167,88 @@ class EdgeSearch:
             self.surface,
         )
 
-    def refined(self, start: SimilarityTransform, clicks: Sequence[Sighting] = ()) -> EdgeRegistration:
-        """The place near ``start`` that has its edges on those of the keyframes that see it."""
-        views = views_of(self.edges.nodes, start, self._views, self.camera, MORE_VIEWS)
-        images = EdgeImages(views, self.camera)
-        place, covariance = images.refine(self.edges, start, self._metric, FINE, clicks)
+    def _fitted(self, start: SimilarityTransform, images: EdgeImages, reaches: Sequence[float]) -> EdgeRegistration:
+        """The place near ``start`` for which most speaks: by points and edges, then by edges in its size, or by edges.
+
+        Points bring in what is far and give the size. But those around the object's foot may pull it, and edges are
+        more exact.
+        """
+        clicks, edges = self._hints.clicks, self.edges
+        by_both = images.refine(edges, start, self._metric, reaches, clicks, self._on_it)
+        by_edges = images.refine(edges, start, self._metric, [*reaches, *NEAREST], clicks)
+        in_size = images.refine(edges, by_both[0], True, NEAREST, clicks)[0]
         # What the mesh's edges are off is the same in all keyframes.
-        covariance = covariance * max(1, len(views))
-        return EdgeRegistration(place, covariance, images.evidence(self.edges, place), *self._on_surface(place))
+        count = max(1, len(images.views))
+        fits = [
+            EdgeRegistration(place, covariance * count, images.evidence(edges, place), self.points_at(place))
+            for place, covariance in (by_both, by_edges, (in_size, by_both[1]))
+        ]
+        return max(fits, key=lambda each: each.rank)
 
-    def evidence(self, place: SimilarityTransform) -> EdgeEvidence:
-        """How much of the object's edges the keyframes show at a place."""
-        views = views_of(self.edges.nodes, place, self._views, self.camera, MORE_VIEWS)
-        return EdgeImages(views, self.camera).evidence(self.edges, place)
+    def _again(self, found: EdgeRegistration) -> EdgeRegistration:
+        """The best place near one that was found, of those begun where each keyframe alone has the object."""
+        images, places = self._images(found.place), [found]
+        seeing = views_of(self.edges.nodes, found.place, self._dense[1], self.camera, MORE_VIEWS)
+        for view in seeing:
+            one = EdgeImages([view], self.camera)
+            alone = one.refine(self.edges, found.place, True, NEAREST, self._hints.clicks)[0]
+            pose = camera_from_object(view, alone)
+            unit = map_unit(pose, self.edges, view, self._dense[0], self.camera)[0]
+            start = placed(pose, view, unit if unit > 0.0 else alone.scale, self._metric)
+            places.append(self._fitted(start, images, NEAREST))
+        return max(places, key=lambda each: each.rank)
 
-    def _on_surface(self, place: SimilarityTransform) -> tuple[int, int]:
-        """How many points of the map lie on the object, and of them outside of one plane."""
-        local = place.inverse.apply(self._points.positions)
-        near = self.surface.tree.query(local)[0] < ON_SURFACE / 2.0 * self.surface.size
-        if near.sum() < 3:
-            return int(near.sum()), 0
-        flat = plane_points(local[near], ON_SURFACE / 2.0 * self.surface.size, np.random.default_rng(0))
-        return int(near.sum()), int((~flat).sum())
+    def _images(self, place: SimilarityTransform) -> EdgeImages:
+        """Edges of the keyframes that see the object at a place."""
+        return EdgeImages(views_of(self.edges.nodes, place, self._views, self.camera, MORE_VIEWS), self.camera)
 
-    def _in_keyframe(self, hints: Hints) -> list[SimilarityTransform]:
-        """Where one keyframe may show the object, and the map has points that agree."""
-        view, camera = self._searched(hints), self.camera
+    def at(self, place: SimilarityTransform) -> EdgeRegistration:
+        """What speaks for a place as it is."""
+        edges = self._images(place).evidence(self.edges, place)
+        return EdgeRegistration(place, np.zeros((7, 7)), edges, self.points_at(place))
+
+    def points_at(self, place: SimilarityTransform, most: int = MORE_VIEWS) -> PointEvidence:
+        """What the points seen in so many keyframes say of a place."""
+        nodes, triangles = self.edges.nodes, self.edges.triangles
+        views = views_of(nodes, place, self._dense[1], self.camera, most)
+        tolerance = TOLERANCE * self.edges.size * place.scale
+        positions = self._dense[0].positions
+        return gather_evidence(place, nodes, triangles, positions, views, self.camera, tolerance, DEPTH_NOISE)
+
+    @cached_property
+    def _dense(self) -> tuple[MapPoints, list[View]]:
+        """The map with the points of edges and texture of some keyframes, and these."""
+        asked = [] if self._hints.region is None else [self._keyframe(self._hints.region[0])]
+        spread = [view for view in spread_views(self._views, N_STEREO) if all(view is not each for each in asked)]
+        points, views = with_dense_points(self._points, self._views, asked + spread, self.camera)
+        return (points, views) if self._claimed is None else self._claimed(points, views)
+
+    def _keyframe(self, frame: int) -> View:
+        """The keyframe of a number; raises RegistrationError if there is none."""
+        for view in self._views:
+            if view.frame == frame:
+                return view
+        numbers = ", ".join(str(view.frame) for view in self._views)
+        raise RegistrationError(f"frame {frame} is no keyframe of the map: give the region in one of {numbers}")
+
+    @cached_property
+    def _off_planes(self) -> NDArray[np.bool_]:
+        """Points that do not lie on the map's large planes, on which any flat face fits in any size."""
+        points = self._dense[0]
+        away = np.linalg.norm(points.positions - points.viewpoints, axis=1)
+        return ~on_large_planes(points.positions, 0.5 * DEPTH_NOISE * float(np.median(away)))
+
+    @cached_property
+    def _on_it(self) -> PointsOnSurface:
+        return PointsOnSurface(self._dense[0], self.surface, len(self._dense[1]))
+
+    def _in_keyframe(self) -> list[SimilarityTransform]:
+        """Where one keyframe may show the object, and the map has points that agree.
+
+        It is that of the region, or one in the middle.
+        """
+        hints, camera = self._hints, self.camera
+        view = self._dense[1][0 if hints.region is not None else len(self._dense[1]) // 2]
         if not np.ptp(view.normalized) > 0:
             return []
         frame_size = (0.0, 0.0, float(camera.width), float(camera.height))
@@ -201,47 +263,31 @@ class EdgeSearch:
             across = float(np.hypot(right - left, bottom - top))
             sizes = sizes[(sizes > 0.8 * across) & (sizes < 1.5 * across)]
             places = places[((places > [left, top]) & (places < [right, bottom])).all(axis=1)]
-        drawings = EdgeDrawings.of(self.edges)
-        if not len(drawings.rotations) or not len(places):
+        if not len(places) or not len(sizes):
             return []
-        return self._agreeing(hypotheses(drawings, self.edges, view, camera, sizes, places), view)
+        found = hypotheses(self.edges, view, camera, sizes, places)
+        return [] if found is None else self._agreeing(found, view)
 
-    def _searched(self, hints: Hints) -> View:
-        """The keyframe to search: that of the region, or the one that sees most points."""
-        if hints.region is None:
-            return self._views[len(self._views) // 2]
-        for view in self._views:
-            if view.frame == hints.region[0]:
-                return view
-        numbers = ", ".join(str(view.frame) for view in self._views)
-        raise RegistrationError(
-            f"frame {hints.region[0]} is no keyframe of the map: give the region in one of {numbers}"
-        )
-
-    def _agreeing(self, found: list[InView], view: View) -> list[SimilarityTransform]:
+    def _agreeing(self, found: InView, view: View) -> list[SimilarityTransform]:
         """The best of the hypotheses by their edges and by the points of the map in their outline."""
-        ranked = self._ranked(found, view)[:N_FITTED]
-        return [placed(each.pose, view, unit, self._metric) for _, each, unit in ranked]
+        unit, agreeing, off_planes, others = found.units(view, self._dense[0], self._off_planes)
+        possible = agreeing >= FEWEST_AGREEING
+        if self._metric:
+            possible &= np.abs(np.log(np.maximum(unit, 1e-300))) < UNIT_ERROR
+        mostly = possible & (agreeing >= AGREEING_SHARE * (agreeing + others))
+        by_all = np.where(mostly, found.gains + AGREES * (agreeing - 2 * others), -np.inf)
+        by_telling = np.where(possible, found.gains + AGREES * (off_planes - others), -np.inf)
+        # A large plane fits any flat face, so that its points may mislead; but the object's faces may be planes.
+        best = [*_diverse(found, by_all, N_FITTED, N_FITTED), *_diverse(found, by_telling, 2 * N_FITTED, MOST_ALIKE)]
+        return [placed(found.pose(k), view, float(unit[k]), self._metric) for k in dict.fromkeys(best)]
 
-    def _ranked(self, found: Sequence[InView], view: View) -> list[tuple[float, InView, float]]:
-        """Hypotheses with which the map agrees: what speaks for them, the best first, and the map's unit by them."""
-        ranked = []
-        for each in found:
-            unit, agreeing, inside = map_unit(each.pose, self.edges, view, self._points, self.camera)
-            if agreeing < FEWEST_AGREEING or agreeing < AGREEING_SHARE * inside:
-                continue
-            if self._metric and abs(np.log(unit)) > UNIT_ERROR:
-                continue
-            ranked.append((each.gain + AGREES * agreeing - DISAGREES * (inside - agreeing), each, unit))
-        return sorted(ranked, key=lambda entry: -entry[0])
-
-    def _by_clicks(self, clicks: Sequence[Sighting]) -> list[SimilarityTransform]:
+    def _by_clicks(self) -> list[SimilarityTransform]:
         """Where landmarks in single frames have the object, in every unit that the points on it allow."""
         starts = []
-        for click in clicks:
+        for click in self._hints.clicks:
             if len(click.points) < 3:
                 continue
-            view = min(self._views, key=lambda view: abs(view.frame - click.frame))
+            view = min(self._dense[1], key=lambda view: abs(view.frame - click.frame))
             # Of few points, a pixel may turn the pose far: start from what the clicks may have meant, too.
             rng = np.random.default_rng(0)
             meant = [click] + [
@@ -256,7 +302,7 @@ class EdgeSearch:
                 unit = 1.0
                 for _ in range(3):
                     between = RigidTransform(near.rotation, near.translation / unit)
-                    found = map_unit(between @ pose, self.edges, view, self._points, self.camera)[0]
+                    found = map_unit(between @ pose, self.edges, view, self._dense[0], self.camera)[0]
                     unit = found if found > 0.0 else unit
                 starts.append(placed(pose, click, unit, self._metric))
         if not starts:
@@ -266,3 +312,18 @@ class EdgeSearch:
                 RegistrationFailure.LANDMARKS_DO_NOT_FIT,
             )
         return starts
+
+
+def _diverse(found: InView, speaking: Array, most: int, most_alike: int) -> list[int]:
+    """The hypotheses for which most speaks (n,), but few that are alike; none for which nothing does (-inf)."""
+    cells = np.column_stack([found.places // CELL, np.log(found.sizes) // SIZES_ALIKE]).astype(np.int64)
+    best: list[int] = []
+    taken = Counter[tuple[int, ...]]()
+    for k in np.argsort(-speaking)[: int(np.isfinite(speaking).sum())].tolist():
+        cell = tuple(cells[k].tolist())
+        taken[cell] += 1
+        if taken[cell] <= most_alike:
+            best.append(k)
+        if len(best) == most:
+            break
+    return best

@@ -22,7 +22,6 @@ from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, SimilarityTransform
 from morph_dslam.registration.edges import LEAST_EDGE, MeshEdges
 from morph_dslam.registration.scene import HasPose, MapPoints, View
-from morph_dslam.render.rasteriser import draw_depth
 
 Array = NDArray[np.float64]
 #: Sides from which the edges are drawn, turns of each drawing in the image, points compared, and directions of edges.
@@ -35,10 +34,11 @@ SHOWN, WINDOW = 0.8, 65
 SMALLEST, LARGEST, FACTOR = 0.12, 0.9, 1.2
 #: Points of the map are this near to the object's middle, over the image's height.
 NEAR = 0.125
-#: Distance at which the edges are drawn, over the object's size.
-DRAWN_AT = 4.0
-#: Hypotheses kept, and side of the squares and part of the sizes of which only the best one is, pixels.
-MOST, MOST_OF_SIDE, CELL = 1000, 400, 12
+#: Distance at which the edges are drawn, and what is seen of it there to either side, over the object's size; pixels of
+#: the drawn depth for it.
+DRAWN_AT, SEEN, DEPTH_PX = 4.0, 0.7, 40
+#: Hypotheses kept of each size, and side of the squares of which only the best one of each side is, pixels.
+MOST, MOST_OF_SIDE, CELL = 4000, 400, 12
 #: Points of the map on the object have distances alike to this part, and at least so many give the map's unit.
 ALIKE, FEWEST_POINTS = 0.03, 4
 
@@ -52,11 +52,14 @@ class EdgeDrawings:
     rotations : (s, 3, 3) camera from object.
     offsets : (s, N_POINTS, 2) from the object's middle, in parts of its size times focal length over distance.
     normals : (s, N_POINTS) direction across the edge in the image, rad.
+    depths : (s, d, d) how far its surface is behind its middle, in its size; inf where it is not. The drawing reaches
+        `SEEN` times its size to all sides.
     """
 
     rotations: Array
     offsets: Array
     normals: Array
+    depths: Array
 
     @classmethod
     def of(cls, edges: MeshEdges) -> EdgeDrawings:
@@ -67,9 +70,11 @@ class EdgeDrawings:
         sights = np.column_stack([flat * np.cos(turn), flat * np.sin(turn), up])
         focal = 100.0 * DRAWN_AT
         camera = Camera(256, 256, focal, focal, 127.5, 127.5)
+        short, middle = DRAWN_AT * DEPTH_PX / (2.0 * SEEN), 0.5 * (DEPTH_PX - 1)
+        small = Camera(DEPTH_PX, DEPTH_PX, short, short, middle, middle)
         centre = 0.5 * (edges.nodes.min(axis=0) + edges.nodes.max(axis=0))
         rng = np.random.default_rng(0)
-        rotations, offsets, normals = [], [], []
+        rotations, offsets, normals, depths = [], [], [], []
         for sight in sights:
             rotation = Rotation.align_vectors([[0.0, 0.0, 1.0]], [sight])[0].as_matrix()
             pose = RigidTransform(rotation, np.array([0.0, 0.0, DRAWN_AT * edges.size]) - rotation @ centre)
@@ -79,7 +84,8 @@ class EdgeDrawings:
                 rotations.append(rotation)
                 offsets.append((seen.pixels[chosen] - 127.5) / 100.0)
                 normals.append(np.arctan2(seen.normals[chosen, 1], seen.normals[chosen, 0]))
-        return cls(np.array(rotations), np.array(offsets), np.array(normals))
+                depths.append(edges.depth(pose, small) / edges.size - DRAWN_AT)
+        return cls(np.array(rotations), np.array(offsets), np.array(normals), np.array(depths))
 
 
 def edge_gains(view: View) -> NDArray[np.float32]:
@@ -145,60 +151,170 @@ def lay_over(gains, offsets, normals, turns, size, columns, rows, best, which):
 
 @dataclass(frozen=True)
 class InView:
-    """A hypothesis: the object in one view.
+    """Hypotheses of where one view shows an object.
 
     Attributes
     ----------
-    pose : camera_from_object, metres.
-    gain : of its edges there.
+    drawings : of the object.
+    centre : (3,) its middle, metres.
+    diameter : of the object, metres.
+    camera : of the view.
+    gains : (n,) sums of what speaks for the edges there.
+    sizes : (n,) apparent diameters, pixels.
+    sides : (n,) which of the drawings.
+    turns : (n,) and its turn in the image.
+    places : (n, 2) where its middle is, pixels.
     """
 
-    pose: RigidTransform
-    gain: float
+    drawings: EdgeDrawings
+    centre: Array
+    diameter: float
+    camera: Camera
+    gains: Array
+    sizes: Array
+    sides: NDArray[np.int64]
+    turns: NDArray[np.int64]
+    places: Array
+
+    def pose(self, k: int) -> RigidTransform:
+        """The camera_from_object, metres, of one of them."""
+        ray = self.camera.rays(self.places[k : k + 1])[0]
+        distance = self.diameter * self.camera.fx / self.sizes[k]
+        about = Rotation.from_rotvec([0.0, 0.0, 2.0 * np.pi * self.turns[k] / N_TURNS])
+        towards = Rotation.align_vectors([ray / np.linalg.norm(ray)], [[0.0, 0.0, 1.0]])[0]
+        rotation = (towards * about).as_matrix() @ self.drawings.rotations[self.sides[k]]
+        return RigidTransform(rotation, distance * ray - rotation @ self.centre)
+
+    def units(
+        self, view: View, points: MapPoints, telling: NDArray[np.bool_]
+    ) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """The map's unit by all of them, (n,) each, from the drawings.
+
+        Parameters
+        ----------
+        view : of the hypotheses.
+        points : of the map.
+        telling : (p,) which of them are also counted by themselves.
+
+        Returns
+        -------
+        The map's units per metre, numbers of points that agree on them, of telling ones that do, and of points in the
+        outline that do not.
+        """
+        rays = self.camera.rays(self.places)
+        rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        depths = view.camera_from_world.apply(points.positions[view.point_ids])[:, 2]
+        angles = 2.0 * np.pi * self.turns / N_TURNS
+        distances = self.camera.fx / self.sizes
+        units, agreeing, telling_ones, others = units_by_drawings(
+            self.drawings.depths,
+            self.sides,
+            angles,
+            self.sizes,
+            self.places,
+            rays,
+            distances,
+            view.pixels,
+            depths,
+            telling[view.point_ids],
+        )
+        return units / self.diameter, agreeing, telling_ones, others
 
 
-def hypotheses(
-    drawings: EdgeDrawings, edges: MeshEdges, view: View, camera: Camera, sizes: Array, places: Array
-) -> list[InView]:
-    """Where a view may show the object, the best first.
+@njit(cache=True, nogil=True)
+def units_by_drawings(drawn, sides, angles, sizes, places, rays, distances, pixels, depths, telling):
+    """The unit on which most points agree, for hypotheses of where an object of diameter 1 is seen.
 
     Parameters
     ----------
-    drawings : of the object.
+    drawn : (s, d, d) depths of `EdgeDrawings`.
+    sides : (n,) which of them.
+    angles : (n,) by which they are turned, rad.
+    sizes : (n,) apparent diameters, pixels.
+    places : (n, 2) of the middle, pixels.
+    rays : (n, 3) unit vectors through them.
+    distances : (n,) of the middle, along the optical axis, in diameters.
+    pixels : (k, 2) of points.
+    depths : (k,) of points, the map's unit.
+    telling : (k,) points that are also counted by themselves.
+
+    Returns
+    -------
+    Units of the map (n,), numbers (n,) of points that agree on it, of telling ones that do, and of points in the
+    outline that do not.
+    """
+    n, width = len(sides), drawn.shape[1]
+    units, counts = np.zeros(n), np.zeros((3, n), np.int64)
+    ratios, tells = np.empty(len(depths)), np.empty(len(depths), np.bool_)
+    for h in range(n):
+        c, s, count = np.cos(angles[h]), np.sin(angles[h]), 0
+        for p in range(len(depths)):
+            x, y = (pixels[p, 0] - places[h, 0]) / sizes[h], (pixels[p, 1] - places[h, 1]) / sizes[h]
+            if x * x + y * y > SEEN * SEEN:
+                continue
+            column = int(np.rint((c * x + s * y) / SEEN * 0.5 * width + 0.5 * (width - 1)))
+            row = int(np.rint((c * y - s * x) / SEEN * 0.5 * width + 0.5 * (width - 1)))
+            if (
+                column < 0
+                or row < 0
+                or column >= width
+                or row >= width
+                or not np.isfinite(drawn[sides[h], row, column])
+            ):
+                continue
+            # The drawing faces the camera: beside the optical axis it is tilted.
+            behind = rays[h, 2] * drawn[sides[h], row, column] - rays[h, 0] * x - rays[h, 1] * y
+            ratios[count], tells[count] = depths[p] / (distances[h] + behind), telling[p]
+            count += 1
+        if count < FEWEST_POINTS:
+            continue
+        ranked, first, least, largest = np.sort(ratios[:count]), 0, 0.0, 0.0
+        for last in range(count):
+            while ranked[last] > ranked[first] * (1.0 + 2.0 * ALIKE):
+                first += 1
+            if last - first + 1 > counts[0, h]:
+                counts[0, h], units[h] = last - first + 1, ranked[(first + last) // 2]
+                least, largest = ranked[first], ranked[last]
+        for k in range(count):
+            if tells[k] and least <= ratios[k] <= largest:
+                counts[1, h] += 1
+        counts[2, h] = count - counts[0, h]
+    return units, counts[0], counts[1], counts[2]
+
+
+def hypotheses(edges: MeshEdges, view: View, camera: Camera, sizes: Array, places: Array) -> InView | None:
+    """Where a view may show the object; None if it has no edges.
+
+    Parameters
+    ----------
     edges : of the object.
     view : to search.
     camera : of the view.
     sizes : apparent diameters to try, pixels.
     places : (k, 2) pixels at which its middle may be.
     """
+    drawings = EdgeDrawings.of(edges)
+    if not len(drawings.rotations):
+        return None
     gains = edge_gains(view)
-    centre = 0.5 * (edges.nodes.min(axis=0) + edges.nodes.max(axis=0))
     columns, rows = np.rint((places + 0.5) / HALF - 0.5).astype(np.int64).T
-    found: list[tuple[float, float, int, int, Array]] = []
+    cells = rows // CELL * 10000 + columns // CELL
+    found = []
     for size in sizes:
         best = np.zeros((len(places), len(drawings.rotations)), np.float32)
         which = np.zeros(best.shape, np.int16)
         lay_over(gains, drawings.offsets, drawings.normals, N_TURNS, size / HALF, columns, rows, best, which)
         # The best of each side in each square.
-        of_size: list[tuple[float, float, int, int, Array]] = []
-        cells = rows // CELL * 10000 + columns // CELL
-        order = np.argsort(-best, axis=0)
-        for side in range(best.shape[1]):
-            ranked = order[:MOST_OF_SIDE, side]
-            _, first = np.unique(cells[ranked], return_index=True)
-            of_size += [(float(best[r, side]), size, side, int(which[r, side]), places[r]) for r in ranked[first]]
-        of_size.sort(key=lambda hypothesis: -hypothesis[0])
-        found += of_size[:MOST]
-    found.sort(key=lambda hypothesis: -hypothesis[0])
-    result = []
-    for gain, size, side, turn, place in found:
-        ray = camera.rays(place[None])[0]
-        distance = edges.size * camera.fx / size
-        about = Rotation.from_rotvec([0.0, 0.0, 2.0 * np.pi * turn / N_TURNS])
-        towards = Rotation.align_vectors([ray / np.linalg.norm(ray)], [[0.0, 0.0, 1.0]])[0]
-        rotation = (towards * about).as_matrix() @ drawings.rotations[side]
-        result.append(InView(RigidTransform(rotation, distance * ray - rotation @ centre), gain))
-    return result
+        order = np.argsort(-best, axis=0)[:MOST_OF_SIDE]
+        kept = [order[np.unique(cells[order[:, side]], return_index=True)[1], side] for side in range(best.shape[1])]
+        sides = np.repeat(np.arange(best.shape[1]), [len(places_kept) for places_kept in kept])
+        at = np.concatenate(kept)
+        chosen = np.argsort(-best[at, sides])[:MOST]
+        at, sides = at[chosen], sides[chosen]
+        found.append((best[at, sides].astype(float), np.full(len(at), size), sides, which[at, sides], places[at]))
+    gain, apparent, side, turn, place = (np.concatenate(part) for part in zip(*found, strict=True))
+    centre = 0.5 * (edges.nodes.min(axis=0) + edges.nodes.max(axis=0))
+    return InView(drawings, centre, edges.size, camera, gain, apparent, side, turn.astype(np.int64), place)
 
 
 def sizes_and_places(camera: Camera, pixels: Array) -> tuple[Array, Array]:
@@ -228,9 +344,8 @@ def map_unit(
     if local[:, 2].min() <= 0.0:
         return 0.0, 0, 0
     factor = 4
-    drawn = (camera.project(local) + 0.5) / factor - 0.5
-    size = camera.height // factor, camera.width // factor
-    _, depth = draw_depth(np.ascontiguousarray(drawn), local[:, 2].copy(), edges.triangles, False, *size)
+    depth = edges.depth(pose, camera, factor)
+    size = depth.shape
     column, row = np.rint((view.pixels + 0.5) / factor - 0.5).astype(np.int64).T
     inside = (column >= 0) & (row >= 0) & (column < size[1]) & (row < size[0])
     there = np.full(len(column), np.inf)
