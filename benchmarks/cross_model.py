@@ -28,15 +28,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples" / "boot_seal"))
 
 import cv2
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from track import BEGUN, TrackedSeal
 
 import morph_dslam as md
-from morph_dslam.extend.geometry import RigidTransform, fit_similarity, rotation_exp
+from morph_dslam.extend.geometry import fit_similarity
 from morph_dslam.extend.models import MaterialPoints, SeparatedField, von_mises
 from morph_dslam.extend.registration import run_registration
 from morph_dslam.extend.slam import run_slam
@@ -56,8 +57,6 @@ FOREIGN = OUTPUT / "foreign_boot_seal.morph"
 SCAN_END = PATH[-1][0]
 LONGER = (*PATH, (220, -12.0, 286.0, 200.0))
 LEVER = ((160, 0.0), (215, 51.0))
-#: A frame is deformed where the lever has turned by so much, rad.
-BEGUN = np.radians(1.0)
 #: What is filmed, and what the camera file says of it with all disturbances.
 TRUE = md.Camera(640, 480, 560.0, 560.0, 320.0, 240.0)
 DISTURBED = replace(TRUE, distortion=(-0.12, 0.04, 0.0005, -0.0005), readout_s=0.02)
@@ -188,51 +187,9 @@ def registration_figures(run: Path, camera: Path, truth: Array) -> dict[str, flo
     }
 
 
-@dataclass(frozen=True)
-class Run:
-    """Poses and parameters of a run, and in truth, in the f frames that were tracked.
-
-    Attributes
-    ----------
-    placed, true_poses : camera_from_object, with the registration's turn about the axis taken out.
-    states : (f, 2) lever and side, as estimated.
-    parameters : (f, 1) the true lever.
-    n_deformed : frames of the recording that show the seal deformed, tracked or not.
-    """
-
-    placed: list[RigidTransform]
-    true_poses: list[RigidTransform]
-    states: Array
-    parameters: Array
-    n_deformed: int
-
-    @classmethod
-    def of(cls, run: Path, recording: Path) -> Run:
-        """Read a run folder and the truth of its recording."""
-        truth = np.load(recording / "truth.npz")
-        with h5py.File(run / "result.h5") as file:
-            frames, poses = np.asarray(file["frame"]), np.asarray(file["camera_from_object"])
-            states = np.asarray(file["parameters"])
-        rows = np.flatnonzero(np.isfinite(states).all(axis=1))
-        if not len(rows):
-            raise md.MorphError("no frame was tracked, so there is nothing to compare")
-        frames, poses, states = frames[rows], poses[rows], states[rows].copy()
-        true = truth["camera_from_object"][frames]
-        # A body of revolution may be registered with any turn about its axis.
-        between = poses[0][:3, :3].T @ true[0][:3, :3]
-        turn = float(np.arctan2(between[1, 0], between[0, 0]))
-        back = RigidTransform(rotation_exp(np.array([0.0, 0.0, turn])), np.zeros(3))
-        states[:, 1] = (states[:, 1] - turn + np.pi) % (2.0 * np.pi) - np.pi
-        placed = [RigidTransform.from_matrix(pose) @ back for pose in poses]
-        count = int((truth["parameters"][:, 0] > BEGUN).sum())
-        return cls(
-            placed, [RigidTransform.from_matrix(pose) for pose in true], states, truth["parameters"][frames], count
-        )
-
-
-def frame_errors(twins: Twins, run: Run, row: int, best: Array) -> dict[str, Array]:
+def frame_errors(twins: Twins, run: TrackedSeal, row: int, best: Array) -> dict[str, Array]:
     """Distances (p,) of surface points in a frame, mm, by their cause."""
-    placed, true_pose = run.placed[row], run.true_poses[row]
+    placed, true_pose = run.poses[row], run.true_poses[row]
     own, fitted, true = twins.own.value(run.states[row]), twins.own.value(best), twins.true.value(run.parameters[row])
     rest = twins.rest
     return {
@@ -243,21 +200,21 @@ def frame_errors(twins: Twins, run: Run, row: int, best: Array) -> dict[str, Arr
     }
 
 
-def stress_sums(twins: Twins, run: Run, row: int, best: Array) -> Array:
+def stress_sums(twins: Twins, run: TrackedSeal, row: int, best: Array) -> Array:
     """Squares (3,) of the von Mises stress's error, of that of the best fit, and of its truth, over the volume."""
     true = von_mises(twins.true_stress.value(run.parameters[row]))
     found = [von_mises(twins.own_stress.value(state)) for state in (run.states[row], best)]
     return np.array([twins.volumes @ (one - true) ** 2 for one in found] + [twins.volumes @ true**2])
 
 
-def figures(run: Run, twins: Twins) -> dict[str, float]:
+def figures(run: TrackedSeal, twins: Twins) -> dict[str, float]:
     """Errors against the foreign model, means over the frames that show the seal deformed."""
     deformed = np.flatnonzero(run.parameters[:, 0] > BEGUN).tolist()
     bests = np.array([twins.best(run.parameters[row]) for row in deformed])
     errors = [frame_errors(twins, run, row, best) for row, best in zip(deformed, bests, strict=True)]
     result = {name: float(np.mean([error[name] for error in errors])) for name in errors[0]}
     result["p95_mm"] = float(np.percentile([error["mean_mm"] for error in errors], 95))
-    before = sorted(set(range(len(run.placed))) - set(deformed))
+    before = sorted(set(range(len(run.poses))) - set(deformed))
     undeformed = [frame_errors(twins, run, row, np.zeros(2))["mean_mm"] for row in before]
     result["undeformed_mm"] = float(np.mean(undeformed))
     for name, states in (("", run.states[deformed]), ("best_", bests)):
@@ -266,7 +223,7 @@ def figures(run: Run, twins: Twins) -> dict[str, float]:
     sums = np.sum([stress_sums(twins, run, row, best) for row, best in zip(deformed, bests, strict=True)], axis=0)
     relative = 100.0 * np.sqrt(sums[:2] / sums[2])
     result |= {"von_mises_percent": float(relative[0]), "best_von_mises_percent": float(relative[1])}
-    return result | {"tracked": len(deformed), "frames": run.n_deformed}
+    return result | {"tracked": len(deformed)}
 
 
 def shown(found: dict[str, float]) -> str:
@@ -282,8 +239,10 @@ def measured(seed: int, variant: str, video: bool) -> dict[str, float]:
     run, recording = folder / "followed", folder / "recording"
     camera = followed(folder, run, variant == "disturbed", video)
     twins = Twins.of(md.load_model(run / "run" / "model.morph"), md.load_model(FOREIGN))
-    truth = np.load(recording / "truth.npz")["camera_from_object"]
-    return figures(Run.of(run / "run", recording), twins) | registration_figures(run, camera, truth)
+    truth = np.load(recording / "truth.npz")
+    found = figures(TrackedSeal.of(run / "run", recording), twins)
+    found |= registration_figures(run, camera, truth["camera_from_object"])
+    return found | {"frames": int((truth["parameters"][:, 0] > BEGUN).sum())}
 
 
 def main() -> int:

@@ -42,6 +42,51 @@ SETTLED_AFTER, BEGUN = 60, np.radians(1.0)
 
 
 @dataclass(frozen=True)
+class TrackedSeal:
+    """Poses and parameters of a run, and in truth, in the f frames that were tracked.
+
+    The seal is a body of revolution, so that its registration's turn about the axis is arbitrary: it is taken out.
+
+    Attributes
+    ----------
+    frames : (f,) numbers.
+    poses, true_poses : camera_from_object.
+    states : (f, 2) lever and side, as estimated, rad; the true side is 0.
+    parameters : (f, 1) the true lever, rad.
+    """
+
+    frames: NDArray[np.int64]
+    poses: list[RigidTransform]
+    true_poses: list[RigidTransform]
+    states: Array
+    parameters: Array
+
+    @classmethod
+    def of(cls, run: Path, sequence: Path) -> TrackedSeal:
+        """Read a run folder and the truth of its recording; raises MorphError if no frame was tracked."""
+        truth = np.load(sequence / "truth.npz")
+        with h5py.File(run / "result.h5") as file:
+            frames, poses = np.asarray(file["frame"]), np.asarray(file["camera_from_object"])
+            states = np.asarray(file["parameters"])
+        tracked = np.isfinite(states).all(axis=1)
+        if not tracked.any():
+            raise md.MorphError("no frame was tracked, so there is nothing to compare")
+        frames, poses, states = frames[tracked], poses[tracked], states[tracked]
+        true = truth["camera_from_object"][frames]
+        between = poses[0][:3, :3].T @ true[0][:3, :3]
+        turn = float(np.arctan2(between[1, 0], between[0, 0]))
+        back = RigidTransform(rotation_exp(np.array([0.0, 0.0, turn])), np.zeros(3))
+        states[:, 1] = (states[:, 1] - turn + np.pi) % (2.0 * np.pi) - np.pi
+        return cls(
+            frames,
+            [RigidTransform.from_matrix(pose) @ back for pose in poses],
+            [RigidTransform.from_matrix(pose) for pose in true],
+            states,
+            truth["parameters"][frames],
+        )
+
+
+@dataclass(frozen=True)
 class Errors:
     """Errors by frame: of the lever and of the side (f,), rad, and of the solid's nodes (f, n), metres."""
 
@@ -52,33 +97,14 @@ class Errors:
 
 
 def errors(run: Path, sequence: Path, model_file: Path) -> Errors:
-    """Compare a run with the truth, node by node in the camera frame, without alignment.
-
-    The registration's turn about the axis is arbitrary: a true node X is at R(d) X of the estimated object.
-    """
+    """Compare a run with the truth, node by node in the camera frame, without alignment."""
     model, turned = md.load_model(model_file), md.load_model(run / "model.morph")
-    truth = np.load(sequence / "truth.npz")
-    with h5py.File(run / "result.h5") as file:
-        frames, poses = np.asarray(file["frame"]), np.asarray(file["camera_from_object"])
-        parameters = np.asarray(file["parameters"])
-    tracked = np.flatnonzero(np.isfinite(parameters).all(axis=1))
-    if not len(tracked):
-        raise md.MorphError("no frame was tracked, so there is nothing to compare")
-    lever, side, nodes = [], [], []
-    first = truth["camera_from_object"][frames[tracked[0]]]
-    between = poses[tracked[0]][:3, :3].T @ first[:3, :3]
-    turn = float(np.arctan2(between[1, 0], between[0, 0]))
-    rotation = rotation_exp(np.array([0.0, 0.0, turn]))
-    for row in tracked:
-        angle = (parameters[row, 1] - turn + np.pi) % (2.0 * np.pi) - np.pi
-        moved = turned.positions(np.array([parameters[row, 0], angle])) @ rotation.T
-        estimated = RigidTransform.from_matrix(poses[row]).apply(moved)
-        mu = truth["parameters"][frames[row]]
-        true = RigidTransform.from_matrix(truth["camera_from_object"][frames[row]]).apply(model.positions(mu))
-        lever.append(parameters[row, 0] - mu[0])
-        side.append(angle)
-        nodes.append(np.linalg.norm(estimated - true, axis=1))
-    return Errors(frames[tracked], np.array(lever), np.array(side), np.array(nodes))
+    seal = TrackedSeal.of(run, sequence)
+    nodes = [
+        np.linalg.norm(pose.apply(turned.positions(state)) - true_pose.apply(model.positions(mu)), axis=1)
+        for pose, true_pose, state, mu in zip(seal.poses, seal.true_poses, seal.states, seal.parameters, strict=True)
+    ]
+    return Errors(seal.frames, seal.states[:, 0] - seal.parameters[:, 0], seal.states[:, 1], np.array(nodes))
 
 
 def deformed_frames(found: Errors, sequence: Path) -> NDArray[np.bool_]:

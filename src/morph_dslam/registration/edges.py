@@ -11,7 +11,7 @@ the mesh has an edge, over that of an edge as near in the same image a little to
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
@@ -41,8 +41,6 @@ EDGE_PX, SHIFT_PX = 1.0, 2.0
 CLICK_PX = 2.0
 #: An edge is where it is expected if it is as near, pixels; chance is asked this far to the sides.
 NEAR_PX, ASIDE_PX = 2.0, (8.0, 12.0, 16.0)
-#: Which edges are seen is asked anew after so many steps of a fit.
-SEEN_FOR = 1
 #: Fewer points of edges in the images are no evidence.
 FEWEST = 30
 
@@ -57,14 +55,12 @@ class VisibleEdges:
     pixels : (p, 2) where they are seen.
     normals : (p, 2) across them in the image.
     outline : (p,) whether something else is seen behind, and not another side of the object.
-    rows : (p,) which of the mesh's points along edges they are.
     """
 
     points: Array
     pixels: Array
     normals: Array
     outline: NDArray[np.bool_]
-    rows: NDArray[np.int64]
 
 
 class MeshEdges:
@@ -108,12 +104,7 @@ class MeshEdges:
         pixels = camera.project(local)
         seen = self._seen(pose, camera, local, pixels)
         rows, local, pixels = rows[seen], local[seen], pixels[seen]
-        return VisibleEdges(self._points[rows], pixels, self._normals(rows, pose, camera, local), turns[rows], rows)
-
-    def moved(self, seen: VisibleEdges, pose: RigidTransform, camera: Camera) -> VisibleEdges:
-        """The same points of edges at a pose near that at which they were seen."""
-        local = pose.apply(seen.points)
-        return replace(seen, pixels=camera.project(local), normals=self._normals(seen.rows, pose, camera, local))
+        return VisibleEdges(self._points[rows], pixels, self._normals(rows, pose, camera, local), turns[rows])
 
     def _normals(self, rows: NDArray[np.int64], pose: RigidTransform, camera: Camera, local: Array) -> Array:
         """Across the edges, (p, 2). Where a smooth surface turns away, its own normal is across the outline."""
@@ -320,13 +311,9 @@ class EdgeImages:
         free = slice(1 if metric else 0, None)
         near = None if points is None else points.near(start)
         covariance = np.zeros((7, 7))
-        seen: list[VisibleEdges] = []
-        for step_number, reach in enumerate(reaches):
+        for reach in reaches:
             poses = [camera_from_object(view, place) for view in self.views]
-            if step_number % SEEN_FOR == 0:
-                seen = [edges.visible(pose, self.camera) for pose in poses]
-            else:
-                seen = [edges.moved(each, pose, self.camera) for each, pose in zip(seen, poses, strict=True)]
+            seen = [edges.visible(pose, self.camera) for pose in poses]
             matrix, right = self._equations(seen, poses, place, reach, centre)
             for click in clicks:
                 add_clicks(matrix, right, click, place, centre, self.camera)

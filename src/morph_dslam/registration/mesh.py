@@ -182,7 +182,7 @@ def register_mesh(
         return _by_edges(places, search, points, views, metric, bool(hints.clicks))
     if _clear([place.rank for place in places]):
         return _by_edges(places, search, points, views, metric)
-    found = _by_points(search.surface, nodes, triangles, points, views, camera, metric, progress)
+    found = _by_points(search, points, views, metric, progress)
     there = search.at(found.world_from_object)
     if places and 100.0 * places[0].rank >= CONFIRMED and there.rank < AMBIGUOUS * places[0].rank:
         return _by_edges(places, search, points, views, metric)
@@ -234,16 +234,10 @@ def _by_edges(
 
 
 def _by_points(
-    surface: Surface,
-    nodes: Array,
-    triangles: NDArray[np.int64],
-    points: MapPoints,
-    views: Sequence[View],
-    camera: Camera,
-    metric: bool,
-    progress: bool,
+    search: EdgeSearch, points: MapPoints, views: Sequence[View], metric: bool, progress: bool
 ) -> MeshRegistration:
-    """The object found by the points of the map on its ``surface``; other parameters as of `register_mesh`."""
+    """The object found by the points of the map alone; parameters as of `register_mesh`."""
+    surface, nodes, triangles, camera = search.surface, search.edges.nodes, search.edges.triangles, search.camera
     rough = Surface.of_mesh(nodes, triangles, ROUGH_SAMPLES)
     planes = find_planes(points.positions)
     starts_in = attitudes(surface.axis_of_revolution, planes.largest_normal(points.positions))

@@ -254,13 +254,8 @@ def units_by_drawings(drawn, sides, angles, sizes, places, rays, distances, pixe
                 continue
             column = int(np.rint((c * x + s * y) / SEEN * 0.5 * width + 0.5 * (width - 1)))
             row = int(np.rint((c * y - s * x) / SEEN * 0.5 * width + 0.5 * (width - 1)))
-            if (
-                column < 0
-                or row < 0
-                or column >= width
-                or row >= width
-                or not np.isfinite(drawn[sides[h], row, column])
-            ):
+            inside = 0 <= column < width and 0 <= row < width
+            if not inside or not np.isfinite(drawn[sides[h], row, column]):
                 continue
             # The drawing faces the camera: beside the optical axis it is tilted.
             behind = rays[h, 2] * drawn[sides[h], row, column] - rays[h, 0] * x - rays[h, 1] * y
