@@ -98,10 +98,14 @@ def test_an_elastic_foundation_is_support_enough() -> None:
 
 def test_locking_elements_are_flagged_and_mixed_ones_are_not() -> None:
     with pytest.warns(NearlyIncompressibleWarning, match=r"0\.4999.*use mixed elements"):
-        problem = SolidProblem(MESH, {"all": SOFT}, [fixed("x_min")])
+        problem = SolidProblem(MESH, {"all": SOFT}, [fixed("x_min")], options=SolidOptions(mixed=False))
     assert "nearly incompressible" in problem.flags[0]
-    mixed = SolidProblem(MESH, {"all": SOFT}, [fixed("x_min")], options=SolidOptions(mixed=True))
-    assert mixed.flags == ()
+    assert SolidProblem(MESH, {"all": SOFT}, [fixed("x_min")], options=SolidOptions(mixed=True)).flags == ()
+    assert SolidProblem(MESH, {"all": SOFT}, [fixed("x_min")]).flags == ()
+    linear = block((1.0, 1.0, 1.0), (1, 1, 1), "tet4")
+    assert SolidProblem(linear, {"all": SOFT}, [fixed("x_min")]).flags == ()
+    with pytest.warns(NearlyIncompressibleWarning, match="of order 2"):
+        SolidProblem(linear, {"all": SOFT}, [fixed("x_min")], options=SolidOptions(order=1))
 
 
 def test_cells_that_do_not_serve_are_refused() -> None:
@@ -109,7 +113,7 @@ def test_cells_that_do_not_serve_are_refused() -> None:
         SolidProblem(SHEET, {"all": RUBBER})
     tetrahedra = block((1.0, 1.0, 1.0), (1, 1, 1), "tet4")
     with pytest.raises(StudyError, match="use tet10"):
-        SolidProblem(tetrahedra, {"all": SOFT}, [fixed("x_min")], options=SolidOptions(mixed=True))
+        SolidProblem(tetrahedra, {"all": SOFT}, [fixed("x_min")], options=SolidOptions(order=1, mixed=True))
     quadratic = block((1.0, 1.0, 1.0), (1, 1, 1), "hex20")
     with pytest.raises(StudyError, match="order 1 on cells of order 2"):
         SolidProblem(quadratic, {"all": RUBBER}, [fixed("x_min")], options=SolidOptions(order=1))
@@ -153,7 +157,11 @@ def test_a_load_that_cannot_be_carried_keeps_what_converged() -> None:
     ("changes", "expected"),
     [
         ([], []),
-        ([("poisson = 0.3", "poisson = 0.4995")], ["'rubber' is nearly incompressible (Poisson's ratio 0.4995)"]),
+        ([("poisson = 0.3", "poisson = 0.4995")], []),
+        (
+            [("poisson = 0.3", "poisson = 0.4995"), ("threads = 1", 'formulation = "displacement"')],
+            ["'rubber' is nearly incompressible (Poisson's ratio 0.4995)"],
+        ),
         ([("poisson = 0.3", "poisson = 0.4995"), ("threads = 1", 'formulation = "mixed"')], []),
     ],
 )
@@ -163,7 +171,7 @@ def test_elements_that_lock_are_said_of_a_study(tmp_path, changes, expected):
     assert len(found) == len(expected)
     for line, part in zip(found, expected, strict=True):
         assert part in line
-        assert line.endswith('set solver.formulation = "mixed"')
+        assert line.endswith('leave out solver.formulation = "displacement"')
 
 
 def test_build_warns_of_elements_method_and_stability():

@@ -35,7 +35,8 @@ def test_patch_of_distorted_cells(cell_type: str, mixed: bool) -> None:
     symbols = load_parameter(share=0.0)
     mesh = distorted(block((1.0, 1.0, 1.0), (2, 2, 2), cell_type), 0.12, corners_only=True)
     supports = [AffineSupport(face, gradient, symbols["share"]) for face in FACES]
-    problem = SolidProblem(mesh, {"all": RUBBER}, supports, parameters=symbols, options=SolidOptions(mixed=mixed))
+    options = SolidOptions(order=type_of(cell_type).order, mixed=mixed)
+    problem = SolidProblem(mesh, {"all": RUBBER}, supports, parameters=symbols, options=options)
     state = solved(problem, 1.0)
     np.testing.assert_allclose(problem.nodal_displacement(state.dofs), mesh.nodes @ gradient.T, atol=1e-10)
     F = np.eye(3) + gradient
@@ -76,7 +77,7 @@ def _error(cell_type: str, n: int, mixed: bool) -> float:
         {"all": material},
         [fixed("x_min")],
         loads,
-        options=SolidOptions(mixed=mixed),
+        options=SolidOptions(order=type_of(cell_type).order, mixed=mixed),
     )
     state = solve(problem, np.zeros(0), problem.initial_state())
     solution = ngs.GridFunction(problem.displacements.vector)

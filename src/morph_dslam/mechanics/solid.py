@@ -27,10 +27,10 @@ from morph_dslam.mechanics.ngsolve_mesh import NgsolveMesh
 from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
 from morph_dslam.mechanics.recovery import Recovery
 from morph_dslam.mechanics.solid_assembly import Assembly, Term
-from morph_dslam.mechanics.solid_materials import owners_of_cells, place_materials
+from morph_dslam.mechanics.solid_materials import mixed_materials, owners_of_cells, place_materials
 from morph_dslam.mechanics.solvers.linear_solver import LinearSolver
 from morph_dslam.mechanics.solvers.newton import Linearisation, State
-from morph_dslam.mechanics.spaces import DisplacementSpace
+from morph_dslam.mechanics.spaces import DisplacementSpace, default_order
 from morph_dslam.mechanics.supports import Constraints, ElasticFoundation, PrescribedMotion
 from morph_dslam.mechanics.viscous_history import ViscousHistory
 from morph_dslam.meshing.meshes import Mesh
@@ -45,15 +45,17 @@ class SolidOptions:
 
     Attributes
     ----------
-    order : of the displacements, 1 or 2; None for that of the cells. Order 2 on first-order cells adds
-        functions on their edges, faces and inside.
+    order : of the displacements, 1 or 2; None for 2 on tet4 and prism6 cells without hexahedra among them, which lock
+        in bending, and for that of the cells on all others. Order 2 on first-order cells adds functions on their
+        edges, faces and inside.
     mixed : give every material with a volumetric part pressures of its own, against locking near
-        incompressibility; see `pressure_space`. hex20 and prism15 then use all functions of second order.
+        incompressibility; see `PressureSpace`. hex20 and prism15 then use all functions of second order. None does so
+        for the materials that need it, where the cells have a mixed form.
     threads : of PARDISO; None leaves MKL's choice.
     """
 
     order: int | None = None
-    mixed: bool = False
+    mixed: bool | None = None
     threads: int | None = None
 
 
@@ -96,11 +98,13 @@ class SolidProblem:
         self.mesh, self.supports, self.loads, self.options = mesh, tuple(supports), tuple(loads), options
         self.symbols = parameters or ParameterSymbols()
         self.geometry = NgsolveMesh(mesh)
-        self.displacements = DisplacementSpace(self.geometry, options.order, full=options.mixed)
+        order = default_order(mesh) if options.order is None else options.order
+        mixed = mixed_materials(self.geometry, order, materials, options.mixed)
+        self.displacements = DisplacementSpace(self.geometry, order, full=bool(mixed))
         self.shape = Shape(self.displacements, shape)
         self.length = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
         self.cell_materials = owners_of_cells(mesh, materials)
-        self.regions = place_materials(self.displacements, self.cell_materials, materials, options.mixed)
+        self.regions = place_materials(self.displacements, self.cell_materials, materials, mixed)
         self.history = self._make_history(time)
         self.flags = tuple(region.flag for region in self.regions if region.flag)
         self.space = self._product_space()

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.materials.base import Material, green_lagrange
-from morph_dslam.mechanics.spaces import DisplacementSpace, PressureSpace, check_mixed
+from morph_dslam.mechanics.ngsolve_mesh import NgsolveMesh
+from morph_dslam.mechanics.spaces import DisplacementSpace, PressureSpace, check_mixed, has_mixed_form
 from morph_dslam.meshing.meshes import Mesh
 
 #: Poisson's ratio from which plain displacement elements lock noticeably.
@@ -95,8 +96,30 @@ def owners_of_cells(mesh: Mesh, materials: Mapping[str, Material]) -> NDArray[np
     return owners
 
 
+def can_be_mixed(material: Material) -> bool:
+    """Whether the mixed form can take a material: its energy has a volumetric part, which does not relax."""
+    relaxes = material.prony is not None and material.prony.bulk_relaxes
+    return material.volumetric_modulus is not None and not relaxes
+
+
+def mixed_materials(
+    geometry: NgsolveMesh, order: int, materials: Mapping[str, Material], mixed: bool | None
+) -> set[str]:
+    """Cell sets whose materials take the mixed form; with ``mixed`` None, those that would lock without it.
+
+    Raises StudyError if a material is unstable.
+    """
+    if mixed is not None:
+        return set(materials) if mixed else set()
+    if not has_mixed_form(geometry.mesh, order):
+        return set()
+    placed = {name: _placed(geometry, name, material) for name, material in materials.items()}
+    soft = [name for name, law in placed.items() if law.equivalent_poisson >= NEARLY_INCOMPRESSIBLE]
+    return {name for name in soft if can_be_mixed(placed[name])}
+
+
 def place_materials(
-    space: DisplacementSpace, owners: NDArray[np.int64], materials: Mapping[str, Material], mixed: bool
+    space: DisplacementSpace, owners: NDArray[np.int64], materials: Mapping[str, Material], mixed: set[str]
 ) -> list[MaterialRegion]:
     """A region for each material that has cells, in the order of ``materials``.
 
@@ -105,24 +128,30 @@ def place_materials(
     Parameters
     ----------
     owners : of `owners_of_cells`.
-    mixed : use the mixed form for materials that have a volumetric part.
+    mixed : cell sets whose materials use the mixed form, if they have a volumetric part.
     """
     regions = space.geometry.partition(owners)
     return [
-        _material_region(space, name, material, regions[number], mixed)
+        _material_region(space, name, material, regions[number], name in mixed)
         for number, (name, material) in enumerate(materials.items())
         if number in regions
     ]
 
 
-def _material_region(
-    space: DisplacementSpace, name: str, material: Material, region: ngs.Region, mixed: bool
-) -> MaterialRegion:
+def _placed(geometry: NgsolveMesh, name: str, material: Material) -> Material:
+    """The material with its directions on the mesh, checked."""
     try:
-        material = material.on_mesh(space.geometry.cell_field)
+        material = material.on_mesh(geometry.cell_field)
         material.check()
     except StudyError as error:
         raise StudyError(f"material of '{name}': {error}") from error
+    return material
+
+
+def _material_region(
+    space: DisplacementSpace, name: str, material: Material, region: ngs.Region, mixed: bool
+) -> MaterialRegion:
+    material = _placed(space.geometry, name, material)
     if mixed and material.volumetric_modulus is not None:
         mesh = space.geometry.mesh
         check_mixed(mesh, space.order)
@@ -133,7 +162,7 @@ def _material_region(
         return MaterialRegion(material, region)
     flag = (
         f"the material of '{name}' is nearly incompressible (Poisson's ratio {poisson:.4f}) "
-        "in displacement elements, which lock; use mixed elements"
+        "in displacement elements, which lock; use mixed elements, of order 2 on tetrahedra and prisms"
     )
     warnings.warn(flag, NearlyIncompressibleWarning, stacklevel=4)
     return MaterialRegion(material, region, flag=flag)

@@ -189,10 +189,26 @@ def _rows_once(
     return matrix
 
 
+def default_order(mesh: Mesh) -> int:
+    """Order of displacements that does not lock in bending: 2, save for meshes with hex8 cells.
+
+    Linear tetrahedra and prisms have one strain a cell or little more: a slender bar of them sags by a fraction of
+    what it should.
+    """
+    types = {block.cell_type for block in mesh.blocks}
+    if types <= {"tet4", "prism6"}:
+        return 2
+    return max(block.type.order for block in mesh.blocks)
+
+
+def has_mixed_form(mesh: Mesh, order: int) -> bool:
+    """Whether elements of this order on these cells have a stable mixed form."""
+    return order > 1 or {block.type.shape for block in mesh.blocks} == {"hex"}
+
+
 def check_mixed(mesh: Mesh, order: int) -> None:
     """Refuse cells that have no stable mixed element (StudyError)."""
-    shapes = {block.type.shape for block in mesh.blocks}
-    if order == 1 and shapes != {"hex"}:
+    if not has_mixed_form(mesh, order):
         raise StudyError(
             "mixed elements of first order exist for hex8 only: use tet10 or prism18, or order = 2, "
             "for a nearly incompressible material"

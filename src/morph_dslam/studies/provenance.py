@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from morph_dslam.mechanics.solid_materials import NEARLY_INCOMPRESSIBLE
+from morph_dslam.mechanics.solid_materials import NEARLY_INCOMPRESSIBLE, can_be_mixed
 from morph_dslam.mechanics.solvers.linear_solver import default_engine
+from morph_dslam.mechanics.spaces import default_order, has_mixed_form
 from morph_dslam.model import ReducedModel
 from morph_dslam.studies.affine import read_affine
 from morph_dslam.studies.external import ExternalStudy
@@ -61,8 +62,8 @@ def versions() -> dict[str, str]:
 def locking_warnings(study: Study) -> list[str]:
     """A sentence for each material that is nearly incompressible in displacement elements.
 
-    Constants that are parameters count with their defaults. Mixed elements lock neither; materials without a
-    volumetric part stay in displacement elements in a mixed study too.
+    Constants that are parameters count with their defaults. Mixed elements do not lock; materials without a
+    volumetric part, and linear tetrahedra asked for by name, have none.
     """
     if not isinstance(study, SolidStudy):
         return []
@@ -73,12 +74,17 @@ def locking_warnings(study: Study) -> list[str]:
         return read_affine(value, quantity, parameters)(defaults)
 
     materials = {f"'{name}'": section.make(read) for name, section in study.materials.items()}
-    mixed = study.solver.formulation == "mixed"
-    advice = "give it a law with a volumetric part, which mixed elements need"
-    advice = advice if mixed else 'set solver.formulation = "mixed"'
+    mesh, solver = study.solid_mesh(), study.solver
+    served = has_mixed_form(mesh, solver.order or default_order(mesh))
+    if solver.formulation == "displacement":
+        served, advice = False, 'leave out solver.formulation = "displacement"'
+    elif not served:
+        advice = "leave out solver.order = 1"
+    else:
+        advice = "give it a law with a volumetric part that does not relax, which mixed elements need"
     return [
         f"the material {name} is nearly incompressible (Poisson's ratio {law.equivalent_poisson:.4f}) in "
         f"displacement elements, which lock: {advice}"
         for name, law in materials.items()
-        if not (mixed and law.volumetric_modulus is not None) and law.equivalent_poisson >= NEARLY_INCOMPRESSIBLE
+        if not (served and can_be_mixed(law)) and law.equivalent_poisson >= NEARLY_INCOMPRESSIBLE
     ]

@@ -40,17 +40,22 @@ from morph_dslam.studies.solid_sweep import SolidSweep, ViscousSweep
 Array = NDArray[np.float64]
 
 
+#: `SolidOptions.mixed` by the name of a formulation.
+MIXED = {"automatic": None, "displacement": False, "mixed": True}
+
+
 class _SolidSolverSection(WorkSection):
     """Elements and how the machine is used.
 
-    ``order`` is that of the displacements, the cells' own if absent; ``formulation`` "mixed" gives nearly
-    incompressible materials pressures of their own. One worker with all cores as threads needs the least
-    memory; for small meshes more workers with one thread each are faster.
+    ``order`` is that of the displacements, if absent second on linear tetrahedra and the cells' own on others;
+    ``formulation`` "mixed" gives materials pressures of their own, "automatic" the nearly incompressible ones.
+    One worker with all cores as threads needs the least memory; for small meshes more workers with one thread
+    each are faster.
     """
 
     workers: int | None = Field(default=1, ge=1)
     order: Literal[1, 2] | None = None
-    formulation: Literal["displacement", "mixed"] = "displacement"
+    formulation: Literal["automatic", "displacement", "mixed"] = "automatic"
 
 
 class SolidStudy(Section):
@@ -214,9 +219,7 @@ class SolidStudy(Section):
             [section.make(reader) for section in self.supports],
             [section.make(reader) for section in self.loads],
             symbols,
-            SolidOptions(
-                order=self.solver.order, mixed=self.solver.formulation == "mixed", threads=self.solver.threads
-            ),
+            SolidOptions(order=self.solver.order, mixed=MIXED[self.solver.formulation], threads=self.solver.threads),
             shape_fields(self.shape, mesh, symbols),
             time=symbols[self.time.parameter] if self.time else None,
         )
