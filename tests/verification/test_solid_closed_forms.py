@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
+import meshio
 import numpy as np
 import pytest
 
-from morph_dslam.mechanics.loads import DeadTraction
+from morph_dslam.mechanics.loads import BodyForce, DeadTraction
 from morph_dslam.mechanics.materials.base import Material
 from morph_dslam.mechanics.materials.isotropic import NeoHookean, StVenantKirchhoff
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
-from morph_dslam.mechanics.supports import PrescribedDisplacement
+from morph_dslam.mechanics.solvers.newton import solve
+from morph_dslam.mechanics.supports import PrescribedDisplacement, fixed
 from morph_dslam.meshing.generators import block
+from morph_dslam.meshing.mesh_files import load_mesh
 from tests.support.solids import FACES, ROLLERS, RUBBER, AffineSupport, distorted, load_parameter, solved
 
 #: Lame's constants 4 and 1 (MPa): Poisson's ratio lambda / 2(lambda + mu), E = 2 mu (1 + nu).
@@ -75,3 +81,24 @@ def test_strain_energy_is_the_work_of_the_load() -> None:
     forces = [problem.reactions(s.dofs, s.mu, "x_max")[0][0] for s in states]
     end = solved(problem, 0.5)
     assert problem.strain_energy(end.dofs, end.mu) == pytest.approx(0.25 * weights @ forces, rel=1e-7)
+
+
+@pytest.mark.parametrize("poisson", [0.45, 0.4999])
+def test_a_bar_from_a_surface_file_sags_as_a_beam(poisson: float, tmp_path: Path) -> None:
+    """Under so little of its weight that it stays linear: Timoshenko's cantilever, shear factor 5/6.
+
+    The clamped end, which cannot contract, makes the solid 3 % stiffer than the beam.
+    """
+    length, side, young, load = 0.2, 0.02, 200e3, 10.0
+    box = block((length, side, side), (1, 1, 1), "hex8")
+    meshio.Mesh(1e3 * box.nodes, [("triangle", box.surface_triangles())]).write(tmp_path / "bar.stl")
+    mesh = load_mesh(tmp_path / "bar.stl", "mm", 0.01)
+    mesh = replace(mesh, node_sets={"root": np.flatnonzero(mesh.nodes[:, 0] < 1e-9)})
+    material = NeoHookean(young=young, poisson=poisson)
+    problem = SolidProblem(mesh, {"all": material}, [fixed("root")], [BodyForce((0.0, 0.0, -load))])
+    state = solve(problem, np.zeros(0), problem.initial_state())
+    tip = -problem.nodal_displacement(state.dofs)[:, 2].min()
+    area, inertia, shear = side**2, side**4 / 12.0, young / (2.0 * (1.0 + poisson))
+    weight = load * area
+    beam = weight * length**4 / (8.0 * young * inertia) + weight * length**2 / (2.0 * 5.0 / 6.0 * shear * area)
+    assert tip == pytest.approx(beam, rel=0.05)
