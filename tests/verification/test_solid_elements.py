@@ -6,7 +6,7 @@ import ngsolve as ngs
 import numpy as np
 import pytest
 
-from morph_dslam.mechanics.loads import BodyForce, DeadTraction
+from morph_dslam.mechanics.loads import BodyForce, DeadTraction, Load
 from morph_dslam.mechanics.materials.isotropic import NeoHookean
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.solvers.newton import solve
@@ -67,11 +67,11 @@ def _error(cell_type: str, n: int, mixed: bool) -> float:
     material = NeoHookean(young=3e6, poisson=0.4999 if mixed else 0.3)
     F = (ngs.Id(3) + _gradient(exact)).MakeVariable()
     stress = material.energy(F).Diff(F)
-    force = tuple(-sum(stress[i, j].Diff(axis) for j, axis in enumerate(AXES)) for i in range(3))
-    loads = [BodyForce(force)]
+    force = [-sum(stress[i, j].Diff(axis) for j, axis in enumerate(AXES)) for i in range(3)]
+    loads: list[Load] = [BodyForce((force[0], force[1], force[2]))]
     for face in FACES[1:]:
         j, sign = "xyz".index(face[0]), 1.0 if face.endswith("max") else -1.0
-        loads.append(DeadTraction(face, tuple(sign * stress[i, j] for i in range(3))))
+        loads.append(DeadTraction(face, (sign * stress[0, j], sign * stress[1, j], sign * stress[2, j])))
     problem = SolidProblem(
         block((1.0, 1.0, 1.0), (n, n, n), cell_type),
         {"all": material},
