@@ -57,6 +57,16 @@ def test_the_hanging_silicone_bar_is_where_its_depth_image_shows_it():
 
 
 @pytest.mark.slow
+def test_a_beam_fitted_to_its_own_weight_sinks_under_loads_as_measured():
+    done = run_example("silicone_beam", "--data", str(real_data("silicone_beam")))
+    assert done.returncode == 0, done.stderr[-2000:]
+    found = dict(re.findall(r"(\w+)=(-?[\d.]+)", done.stdout.splitlines()[-1]))
+    assert float(found["modulus_kPa"]) == pytest.approx(263.8, rel=0.15)  # published fit, of the motion
+    assert abs(float(found["load52_percent"])) <= 10.0
+    assert abs(float(found["load101_percent"])) <= 10.0
+
+
+@pytest.mark.slow
 def test_the_stiffness_that_pictures_tell_is_the_published_one_with_the_published_elements():
     data = str(real_data("diffcal_silicone"))
     done = run_example("diffcal_silicone", "--data", data, program="estimate.py")
