@@ -18,6 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from morph_dslam.mechanics.enhanced_assembly import EnhancedAssembly
 from morph_dslam.mechanics.kinematics import Kinematics
 from morph_dslam.mechanics.materials.base import VOIGT, green_lagrange
 from morph_dslam.mechanics.ngsolve_mesh import corner_monomials, reference_points
@@ -57,28 +58,69 @@ class _RegionFields:
     pressure: Any | None
 
 
+class _Compatible:
+    """Deformation gradient and pressures of a solution, and their changes with its derivatives by a parameter.
+
+    Attributes
+    ----------
+    F : 3x3.
+    pressures : unknowns of each material region.
+    change : of F (3x3) with the solution alone.
+    pressure_changes : of ``pressures``.
+    explicit : derivatives (3x3) of F by parameters at a fixed solution, by their index.
+    """
+
+    def __init__(self, problem: SolidProblem) -> None:
+        self._state, self._direction = ngs.GridFunction(problem.space), ngs.GridFunction(problem.space)
+        mixed = any(region.pressures for region in problem.regions)
+        state, self.pressures = problem.split(self._state.components if mixed else self._state)
+        direction, self.pressure_changes = problem.split(self._direction.components if mixed else self._direction)
+        self.F = Kinematics(state, problem.shape).deformation_gradient
+        self.change = Kinematics(direction, problem.shape).displacement_gradient
+        self.explicit = problem.symbols.derivatives(self.F)
+
+    def set(self, dofs: Array) -> None:
+        """Take a solution (n,)."""
+        self._state.vec.FV().NumPy()[:] = dofs
+
+    def set_change(self, dofs: Array, slope: Array, index: int) -> None:
+        """Take the derivative ``slope`` (n,) of the solution ``dofs`` by parameter ``index``."""
+        self._direction.vec.FV().NumPy()[:] = slope
+
+
+class _Enhanced:
+    """`_Compatible`, for cells with enhanced strains: through the quadrature points' F; ``change`` is the total one."""
+
+    def __init__(self, problem: SolidProblem, assembly: EnhancedAssembly) -> None:
+        self._assembly = assembly
+        self._gradient, self._change = assembly.quadrature_field(), assembly.quadrature_field()
+        self.F, self.change = self._gradient.function, self._change.function
+        self.pressures = self.pressure_changes = [[] for _ in problem.regions]
+        self.explicit: dict[int, Any] = {}
+
+    def set(self, dofs: Array) -> None:
+        self._gradient.set(self._assembly.deformation_gradients(dofs))
+
+    def set_change(self, dofs: Array, slope: Array, index: int) -> None:
+        self._change.set(self._assembly.deformation_gradient_slopes(dofs, slope, index))
+
+
 class Recovery:
     """Evaluates the fields of one problem; its expressions are made once."""
 
     def __init__(self, problem: SolidProblem) -> None:
-        self._problem = problem
-        self._state = ngs.GridFunction(problem.space)
-        self._direction = ngs.GridFunction(problem.space)
-        state, unknowns = problem.split(self._components(self._state))
-        direction, unknown_directions = problem.split(self._components(self._direction))
-        self._kinematics = Kinematics(state, problem.shape)
-        self._gradient_direction = Kinematics(direction, problem.shape).displacement_gradient
+        self._problem, assembly = problem, problem.assembly
+        enhanced = isinstance(assembly, EnhancedAssembly)
+        self._solution = _Enhanced(problem, assembly) if enhanced else _Compatible(problem)
         self._regions, self._pressure_directions = [], []
-        for region, p, dp in zip(problem.regions, unknowns, unknown_directions, strict=True):
+        unknowns = zip(problem.regions, self._solution.pressures, self._solution.pressure_changes, strict=True)
+        for region, p, dp in unknowns:
             self._regions.append(self._region_fields(region, p))
             self._pressure_directions.append(region.pressure(dp))
         self._at_nodes: tuple[NDArray, sp.csr_matrix] | None = None
 
-    def _components(self, function: ngs.GridFunction) -> Any:
-        return function.components if any(r.pressures for r in self._problem.regions) else function
-
     def _region_fields(self, region: Any, unknowns: list[Any]) -> _RegionFields:
-        F = self._kinematics.deformation_gradient.MakeVariable()
+        F = self._solution.F.MakeVariable()
         pressure = region.pressure(unknowns)
         pressure = pressure.MakeVariable() if pressure is not None else None
         P = region.elastic_energy(F, pressure).Diff(F)
@@ -121,12 +163,12 @@ class Recovery:
 
     def _set(self, dofs: Array, mu: Array) -> None:
         self._problem.symbols.set(mu)
-        self._state.vec.FV().NumPy()[:] = dofs
+        self._solution.set(dofs)
 
     def deformation_gradient(self, dofs: Array) -> Any:
-        """F (3x3) of a solution as a coefficient function, until the next call."""
-        self._state.vec.FV().NumPy()[:] = dofs
-        return self._kinematics.deformation_gradient
+        """F (3x3) of a solution at the present parameters as a coefficient function, until the next call."""
+        self._solution.set(dofs)
+        return self._solution.F
 
     def _evaluate(self, name: str, dofs: Array, mu: Array, points: NDArray) -> Array:
         self._set(dofs, mu)
@@ -146,7 +188,7 @@ class Recovery:
         result = []
         by_parameter = [self._problem.symbols.derivatives(region.fields[name]) for region in self._regions]
         for index, slope in enumerate(dof_slopes):
-            self._direction.vec.FV().NumPy()[:] = slope
+            self._solution.set_change(dofs, slope, index)
             total = self._by_region(through_state, points)
             if any(index in explicit for explicit in by_parameter):
                 zero = ngs.CF((0.0,) * 9, dims=(3, 3))
@@ -157,7 +199,7 @@ class Recovery:
         return result
 
     def _directional(self, region: _RegionFields, field: Any, pressure_direction: Any | None) -> Any:
-        change = field.Diff(region.gradient, self._gradient_direction)
+        change = field.Diff(region.gradient, self._solution.change)
         if region.pressure is not None:
             change = change + field.Diff(region.pressure, pressure_direction)
         return change
@@ -167,8 +209,8 @@ class Recovery:
         history = self._problem.history
         assert history is not None
         F = self._by_region([region.gradient for region in self._regions], points)
-        dF = self._by_region([self._gradient_direction] * len(self._regions), points)
-        explicit = self._problem.symbols.derivatives(self._kinematics.deformation_gradient).get(index)
+        dF = self._by_region([self._solution.change] * len(self._regions), points)
+        explicit = self._solution.explicit.get(index)
         if explicit is not None:
             dF += self._by_region([explicit] * len(self._regions), points)
         H, step = history.remembered_at(points), 1e-6

@@ -20,6 +20,8 @@ import ngsolve as ngs
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.mechanics.enhanced_assembly import EnhancedAssembly
+from morph_dslam.mechanics.enhanced_strain import EnhancedStrain, takes_enhanced_strain
 from morph_dslam.mechanics.kinematics import Kinematics, Shape, ShapeField
 from morph_dslam.mechanics.loads import BodyForce, FollowerPressure, Gravity, Load, NodalForces, PointLoad
 from morph_dslam.mechanics.materials.base import Material
@@ -27,7 +29,7 @@ from morph_dslam.mechanics.ngsolve_mesh import NgsolveMesh
 from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
 from morph_dslam.mechanics.recovery import Recovery
 from morph_dslam.mechanics.solid_assembly import Assembly, Term
-from morph_dslam.mechanics.solid_materials import mixed_materials, owners_of_cells, place_materials
+from morph_dslam.mechanics.solid_materials import can_be_mixed, mixed_materials, owners_of_cells, place_materials
 from morph_dslam.mechanics.solvers.linear_solver import LinearSolver
 from morph_dslam.mechanics.solvers.newton import Linearisation, State
 from morph_dslam.mechanics.spaces import DisplacementSpace, default_order
@@ -45,12 +47,12 @@ class SolidOptions:
 
     Attributes
     ----------
-    order : of the displacements, 1 or 2; None for 2 on tet4 and prism6 cells without hexahedra among them, which lock
-        in bending, and for that of the cells on all others. Order 2 on first-order cells adds functions on their
-        edges, faces and inside.
+    order : of the displacements, 1 or 2; None for 2, save on meshes of hex8 cells alone, which have elements of first
+        order that do not lock. Order 2 on first-order cells adds functions on their edges, faces and inside.
     mixed : give every material with a volumetric part pressures of its own, against locking near
-        incompressibility; see `PressureSpace`. hex20 and prism15 then use all functions of second order. None does so
-        for the materials that need it, where the cells have a mixed form.
+        incompressibility; see `PressureSpace`. hex20 and prism15 then use all functions of second order. None gives
+        meshes of hex8 cells alone enhanced strains (see `enhanced_strain`); of the materials on other meshes, those
+        take the mixed form that need it, where the cells have one. False is plain displacement elements.
     threads : of PARDISO; None leaves MKL's choice.
     """
 
@@ -77,7 +79,8 @@ class SolidProblem:
 
     Attributes
     ----------
-    n_dofs : see `newton.Equations`. The first 3 n_scalar dofs are displacements, those of x first; pressures follow.
+    n_dofs : see `newton.Equations`. The first 3 n_scalar dofs are displacements, those of x first; pressures, or
+        the added unknowns of enhanced strains, follow.
     free : see `newton.Equations`.
     scale : see `newton.Equations`.
     flags : what a result obtained with this discretisation must be doubted for; empty if nothing.
@@ -99,20 +102,22 @@ class SolidProblem:
         self.symbols = parameters or ParameterSymbols()
         self.geometry = NgsolveMesh(mesh)
         order = default_order(mesh) if options.order is None else options.order
-        mixed = mixed_materials(self.geometry, order, materials, options.mixed)
+        enhanced = options.mixed is None and takes_enhanced_strain(mesh, order)
+        mixed = set() if enhanced else mixed_materials(self.geometry, order, materials, options.mixed)
         self.displacements = DisplacementSpace(self.geometry, order, full=bool(mixed))
         self.shape = Shape(self.displacements, shape)
         self.length = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
         self.cell_materials = owners_of_cells(mesh, materials)
-        self.regions = place_materials(self.displacements, self.cell_materials, materials, mixed)
+        self.regions = place_materials(self.displacements, self.cell_materials, materials, mixed, enhanced)
         self.history = self._make_history(time)
         self.flags = tuple(region.flag for region in self.regions if region.flag)
         self.space = self._product_space()
-        self.n_dofs: int = self.space.ndof
+        self.enhanced = self._make_enhanced() if enhanced else None
+        self.n_dofs: int = self.enhanced.n_dofs if self.enhanced else self.space.ndof
         self.constraints = Constraints(self.displacements, self.shape, self.supports, self.symbols)
         self.constraints.check_rigid_motions()
         n_displacements = 3 * self.displacements.n_scalar
-        self.assembly = Assembly(self.space, self._terms(), self.symbols, n_displacements)
+        self.assembly = self._make_assembly()
         self.free: NDArray[np.bool_] = self._free_dofs()
         scale = np.full(self.n_dofs, np.inf)
         scale[:n_displacements] = self.length
@@ -120,6 +125,11 @@ class SolidProblem:
         self._latest: tuple[Array, Array, Array] | None = None
         points = [load for load in loads if isinstance(load, PointLoad)]
         self._nodal_forces = NodalForces(self.displacements, points, self.symbols)
+
+    def _make_enhanced(self) -> EnhancedStrain:
+        owners = self.cell_materials[self.geometry.cell_of_element]
+        split = [n for n, r in zip(np.unique(owners), self.regions, strict=True) if can_be_mixed(r.material)]
+        return EnhancedStrain(self.displacements, np.flatnonzero(np.isin(owners, split)))
 
     def _make_history(self, time: Scalar | None) -> ViscousHistory | None:
         if all(region.material.prony is None for region in self.regions):
@@ -170,6 +180,15 @@ class SolidProblem:
             terms += self._load_terms(load, kinematics, test)
         return terms
 
+    def _make_assembly(self) -> Assembly | EnhancedAssembly:
+        terms, n_displacements = self._terms(), 3 * self.displacements.n_scalar
+        if self.enhanced is None:
+            return Assembly(self.space, terms, self.symbols, n_displacements)
+        others, owners = terms[len(self.regions) :], self.cell_materials[self.geometry.cell_of_element]
+        return EnhancedAssembly(
+            self.displacements, self.enhanced, self.shape, self.regions, owners, others, self.symbols
+        )
+
     def _load_terms(self, load: Load, kinematics: Kinematics, test: Any) -> list[Term]:
         if isinstance(load, PointLoad):
             return []  # see `NodalForces`
@@ -186,7 +205,8 @@ class SolidProblem:
         return [Term(load.energy(kinematics), boundary, load.bonus_order)]
 
     def _free_dofs(self) -> NDArray[np.bool_]:
-        free = np.array(self.space.FreeDofs(), dtype=bool)
+        free = np.ones(self.n_dofs, dtype=bool)
+        free[: self.space.ndof] = np.array(self.space.FreeDofs(), dtype=bool)
         free[: 3 * self.displacements.n_scalar] &= ~self.constraints.held
         return free
 

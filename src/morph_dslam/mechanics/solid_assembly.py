@@ -25,6 +25,11 @@ Array = NDArray[np.float64]
 SMALL = 5000
 
 
+def threads(n_dofs: int) -> AbstractContextManager:
+    """NGSolve's threads; none for small problems, where starting them takes longer than the work."""
+    return ngs.TaskManager() if n_dofs > SMALL else nullcontext()
+
+
 @dataclass(frozen=True)
 class Term:
     """One integral of the residual.
@@ -83,8 +88,7 @@ class Assembly:
         self._condensation = Condensation(self._form, self._threads)
 
     def _threads(self) -> AbstractContextManager:
-        """NGSolve's threads; none for small problems, where starting them takes longer than the work."""
-        return ngs.TaskManager() if self._space.ndof > SMALL else nullcontext()
+        return threads(self._space.ndof)
 
     def _make_form(self, terms: Sequence[Term], condensed: bool) -> ngs.BilinearForm:
         form = ngs.BilinearForm(self._space, symmetric=self.symmetric, condense=condensed, store_inner=condensed)

@@ -58,6 +58,17 @@ class MaterialRegion:
             return energy
         return energy + ngs.InnerProduct(self.remembered, green_lagrange(F))
 
+    def energy_and_strain(self, F: Any, strain: Any) -> tuple[Any, Any]:
+        """Energy density (Pa) with the volumetric ``strain`` e given, and g: see `enhanced_assembly`.
+
+        remainder + K (e g - e^2 / 2), whose stationary value in e is the energy; the material must pass `can_be_mixed`.
+        """
+        remainder, g = self.material.parts(F)
+        energy = self.factors[0] * remainder + self.material.volumetric_modulus * strain * (g - 0.5 * strain)
+        if self.remembered is not None:
+            energy = energy + ngs.InnerProduct(self.remembered, green_lagrange(F))
+        return energy, g
+
     def elastic_energy(self, F: Any, pressure: Any | None) -> Any:
         """`energy` without the stress left from earlier steps."""
         if pressure is None and self.remembered is None:
@@ -119,7 +130,11 @@ def mixed_materials(
 
 
 def place_materials(
-    space: DisplacementSpace, owners: NDArray[np.int64], materials: Mapping[str, Material], mixed: set[str]
+    space: DisplacementSpace,
+    owners: NDArray[np.int64],
+    materials: Mapping[str, Material],
+    mixed: set[str],
+    enhanced: bool = False,
 ) -> list[MaterialRegion]:
     """A region for each material that has cells, in the order of ``materials``.
 
@@ -129,10 +144,11 @@ def place_materials(
     ----------
     owners : of `owners_of_cells`.
     mixed : cell sets whose materials use the mixed form, if they have a volumetric part.
+    enhanced : whether the cells have enhanced strains, which no material makes lock.
     """
     regions = space.geometry.partition(owners)
     return [
-        _material_region(space, name, material, regions[number], name in mixed)
+        _material_region(space, name, material, regions[number], name in mixed, enhanced)
         for number, (name, material) in enumerate(materials.items())
         if number in regions
     ]
@@ -149,11 +165,12 @@ def _placed(geometry: NgsolveMesh, name: str, material: Material) -> Material:
 
 
 def _material_region(
-    space: DisplacementSpace, name: str, material: Material, region: ngs.Region, mixed: bool
+    space: DisplacementSpace, name: str, material: Material, region: ngs.Region, mixed: bool, enhanced: bool
 ) -> MaterialRegion:
-    material = _placed(space.geometry, name, material)
+    material, mesh = _placed(space.geometry, name, material), space.geometry.mesh
+    if enhanced:
+        return MaterialRegion(material, region)
     if mixed and material.volumetric_modulus is not None:
-        mesh = space.geometry.mesh
         check_mixed(mesh, space.order)
         unit = material.small_strain_stiffness()[3, 3] / float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
         return MaterialRegion(material, region, PressureSpace(space, region), unit)

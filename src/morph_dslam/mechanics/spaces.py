@@ -140,6 +140,10 @@ class DisplacementSpace:
             self.geometry.ngs.SetDeformation(self._deformation)
             self.bonus_order = self.curved_bonus_order
 
+    def corner_dofs(self) -> Indices:
+        """Scalar dofs (n_cells, k) of the corners of each cell, in the order of its nodes; all cells have k corners."""
+        return np.concatenate([b.dofs[:, np.argsort(b.owner)[: b.type.corners]] for b in self._blocks])
+
     @property
     def curved_bonus_order(self) -> int:
         """`bonus_order` where cells are curved, by their nodes or by a shape parameter."""
@@ -190,15 +194,12 @@ def _rows_once(
 
 
 def default_order(mesh: Mesh) -> int:
-    """Order of displacements that does not lock in bending: 2, save for meshes with hex8 cells.
+    """Order of displacements that does not lock in bending: 2, save for meshes of hex8 cells alone.
 
     Linear tetrahedra and prisms have one strain a cell or little more: a slender bar of them sags by a fraction of
-    what it should.
+    what it should. Eight-node hexahedra take `enhanced_strain`.
     """
-    types = {block.cell_type for block in mesh.blocks}
-    if types <= {"tet4", "prism6"}:
-        return 2
-    return max(block.type.order for block in mesh.blocks)
+    return 1 if {block.cell_type for block in mesh.blocks} == {"hex8"} else 2
 
 
 def has_mixed_form(mesh: Mesh, order: int) -> bool:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from morph_dslam.mechanics.enhanced_strain import takes_enhanced_strain
 from morph_dslam.mechanics.solid_materials import NEARLY_INCOMPRESSIBLE, can_be_mixed
 from morph_dslam.mechanics.solvers.linear_solver import default_engine
 from morph_dslam.mechanics.spaces import default_order, has_mixed_form
@@ -62,8 +63,8 @@ def versions() -> dict[str, str]:
 def locking_warnings(study: Study) -> list[str]:
     """A sentence for each material that is nearly incompressible in displacement elements.
 
-    Constants that are parameters count with their defaults. Mixed elements do not lock; materials without a
-    volumetric part, and linear tetrahedra asked for by name, have none.
+    Constants that are parameters count with their defaults. Mixed elements and the default ones of hex8 cells do not
+    lock; materials without a volumetric part, and linear tetrahedra asked for by name, have no mixed form.
     """
     if not isinstance(study, SolidStudy):
         return []
@@ -75,7 +76,10 @@ def locking_warnings(study: Study) -> list[str]:
 
     materials = {f"'{name}'": section.make(read) for name, section in study.materials.items()}
     mesh, solver = study.solid_mesh(), study.solver
-    served = has_mixed_form(mesh, solver.order or default_order(mesh))
+    order = solver.order or default_order(mesh)
+    if solver.formulation == "automatic" and takes_enhanced_strain(mesh, order):
+        return []
+    served = has_mixed_form(mesh, order)
     if solver.formulation == "displacement":
         served, advice = False, 'leave out solver.formulation = "displacement"'
     elif not served:

@@ -47,8 +47,9 @@ MIXED = {"automatic": None, "displacement": False, "mixed": True}
 class _SolidSolverSection(WorkSection):
     """Elements and how the machine is used.
 
-    ``order`` is that of the displacements, if absent second on linear tetrahedra and the cells' own on others;
-    ``formulation`` "mixed" gives materials pressures of their own, "automatic" the nearly incompressible ones.
+    ``order`` is that of the displacements, if absent first on meshes of hex8 cells alone and second on others.
+    ``formulation`` "automatic" gives these hexahedra enhanced strains, and nearly incompressible materials of other
+    cells pressures of their own, as "mixed" does to all; "displacement" is neither.
     One worker with all cores as threads needs the least memory; for small meshes more workers with one thread
     each are faster.
     """
