@@ -13,6 +13,7 @@ import pytest
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.kinematics import ShapeField
 from morph_dslam.mechanics.loads import DeadTraction, FollowerPressure, MovingPatch, PointLoad
+from morph_dslam.mechanics.materials.anisotropic import Orthotropic
 from morph_dslam.mechanics.materials.isotropic import NeoHookean
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.point_location import locate
@@ -32,6 +33,17 @@ from tests.support.solids import RUBBER, load_parameter, solved
 MESH = block((1.0, 1.0, 1.0), (2, 1, 1), "hex8")
 HALVES = replace(MESH, cell_sets={"left": np.array([0]), "right": np.array([1])})
 SOFT = NeoHookean(young=1e6, poisson=0.4999)
+SOFT_WITHOUT_SPLIT = Orthotropic(
+    young_1=1e6,
+    young_2=1e6,
+    young_3=1e6,
+    poisson_12=0.4999,
+    poisson_13=0.4999,
+    poisson_23=0.4999,
+    shear_12=1e6 / 2.9998,
+    shear_13=1e6 / 2.9998,
+    shear_23=1e6 / 2.9998,
+)
 
 
 def test_unknown_sets_are_named_with_the_known_ones() -> None:
@@ -102,6 +114,7 @@ def test_locking_elements_are_flagged_and_mixed_ones_are_not() -> None:
     assert "nearly incompressible" in problem.flags[0]
     assert SolidProblem(MESH, {"all": SOFT}, [fixed("x_min")], options=SolidOptions(mixed=True)).flags == ()
     assert SolidProblem(MESH, {"all": SOFT}, [fixed("x_min")]).flags == ()
+    assert SolidProblem(MESH, {"all": SOFT_WITHOUT_SPLIT}, [fixed("x_min")]).flags == ()
     linear = block((1.0, 1.0, 1.0), (1, 1, 1), "tet4")
     assert SolidProblem(linear, {"all": SOFT}, [fixed("x_min")]).flags == ()
     with pytest.warns(NearlyIncompressibleWarning, match="of order 2"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from morph_dslam.mechanics.loads import (
     MovingPatch,
     PointLoad,
 )
-from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden, turned_direction
+from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden, Orthotropic, turned_direction
 from morph_dslam.mechanics.materials.isotropic import NeoHookean
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
@@ -72,6 +73,26 @@ def by_material_constant(mu: ParameterSymbols) -> SolidProblem:
     material = NeoHookean(young=3e6 * mu["p"], poisson=0.4 + 0.1 * mu["p"], density=1200.0)
     loads = [DeadTraction("x_max", (0.0, 0.0, 3e4)), Gravity()]
     return SolidProblem(MESH, {"all": material}, [fixed("x_min")], loads, mu)
+
+
+def by_one_of_two_laws(mu: ParameterSymbols) -> SolidProblem:
+    """Of which one has a volumetric part and the other none."""
+    young, poisson, shear = 2e6 * mu["p"] + 1e6, 0.3, 8e5
+    other = Orthotropic(
+        young_1=young,
+        young_2=1e6,
+        young_3=1e6,
+        poisson_12=poisson,
+        poisson_13=poisson,
+        poisson_23=poisson,
+        shear_12=shear,
+        shear_13=shear,
+        shear_23=shear,
+    )
+    mesh = replace(MESH, cell_sets={"other": np.arange(0, MESH.n_cells, 2)})
+    nearly = NeoHookean(young=2e6 * mu["p"] + 1e6, poisson=0.499)
+    load = DeadTraction("x_max", (5e4, 0.0, 2e4))
+    return SolidProblem(mesh, {"all": nearly, "other": other}, [fixed("x_min")], [load], mu)
 
 
 def by_pressure_unknowns(mu: ParameterSymbols) -> SolidProblem:
@@ -130,7 +151,7 @@ def test_derivatives_by_a_parameter(make: Callable[[ParameterSymbols], SolidProb
         np.testing.assert_allclose(fields[name][0], expected, atol=1e-6 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("make", [by_pressure, by_pressure_unknowns, by_foundation, by_shape])
+@pytest.mark.parametrize("make", [by_pressure, by_pressure_unknowns, by_foundation, by_shape, by_one_of_two_laws])
 def test_tangent(make: Callable[[ParameterSymbols], SolidProblem]) -> None:
     problem = make(load_parameter(p=0.3))
     rng = np.random.default_rng(1)
