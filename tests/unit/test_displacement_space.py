@@ -48,6 +48,32 @@ def test_fields_are_the_cells_own_interpolation(cell_type: str) -> None:
     np.testing.assert_allclose(ngs.CF((ngs.x, ngs.y, ngs.z))(points), places, atol=1e-12)
 
 
+@pytest.mark.parametrize("order", [2, 3])
+@pytest.mark.parametrize("cell_type", SOLID_CELLS)
+def test_higher_orders_contain_lower_ones(cell_type: str, order: int) -> None:
+    """The same field at any point; and what a face's nodes hold is all that does not vanish on the face."""
+    mesh = distorted(block((1.0, 1.0, 1.0), (2, 2, 2), cell_type), 0.05)
+    low, high = DisplacementSpace(NgsolveMesh(mesh)), DisplacementSpace(NgsolveMesh(mesh), order)
+    random = np.random.default_rng(0)
+    given = random.uniform(-1.0, 1.0, 3 * low.n_scalar)
+    elements, places = np.arange(mesh.n_cells), random.uniform(0.05, 0.3, (mesh.n_cells, 3))
+    values = []
+    for space, dofs in ((low, given), (high, high.embedded(low, given))):
+        field = ngs.GridFunction(space.vector)
+        field.vec.FV().NumPy()[:] = dofs
+        values.append(np.asarray(field(space.geometry.mesh_points(elements, places))))
+    assert np.abs(values[0]).max() > 0.1
+    np.testing.assert_allclose(values[1], values[0], atol=1e-12)
+    held, face = high.dofs_on(mesh.set_nodes("x_min")), high.geometry.boundary("x_min")
+    free = random.uniform(1.0, 2.0, high.n_scalar)
+    free[held] = 0.0
+    left = ngs.GridFunction(high.scalar)
+    left.vec.FV().NumPy()[:] = free
+    assert ngs.Integrate(ngs.CF(left) ** 2, high.geometry.ngs, ngs.BND, definedon=face) < 1e-24
+    on_face = {d for e in face.Elements() for d in high.scalar.GetDofNrs(ngs.ElementId(e))}
+    assert set(held) == {d for d in on_face if d >= 0}
+
+
 @pytest.mark.parametrize("cell_type", SOLID_CELLS)
 def test_a_set_holds_its_own_nodes(cell_type: str) -> None:
     mesh = block((1.0, 1.0, 1.0), (2, 2, 2), cell_type)

@@ -43,6 +43,7 @@ def _build_study(arguments: argparse.Namespace) -> None:
     from morph_dslam import build, write_build_report
     from morph_dslam.extend.mechanics import NearlyIncompressibleWarning
     from morph_dslam.extend.reduction import read_reference_curve, report_path
+    from morph_dslam.extend.reports import error_facts
     from morph_dslam.extend.studies import build_warnings
 
     if arguments.unit is not None:
@@ -54,6 +55,9 @@ def _build_study(arguments: argparse.Namespace) -> None:
         model = build(arguments.study, output, arguments.workers)
     write_build_report(report_path(output), model, reference)
     print(f"wrote {output} and {report_path(output)}")
+    for name, words in error_facts(model).items():
+        if name.endswith("error"):
+            print(f"{name}: {words}")
     for line in build_warnings(model.certificate):
         print(f"warning: {line}")
 

@@ -62,6 +62,7 @@ def summarise_model(model: ReducedModel) -> dict[str, Table]:
     """
     certificate = model.certificate
     summary = {
+        "errors": Table.of(error_facts(model)),
         "mesh": Table.of(_mesh(model)),
         "parameters": Table.of({parameter.name: _range(parameter) for parameter in model.parameters}),
         "fields": _fields(model),
@@ -76,6 +77,57 @@ def summarise_model(model: ReducedModel) -> dict[str, Table]:
         "made with": Table.of(flatten(_versions_last(model.provenance))),
     }
     return {heading: table for heading, table in summary.items() if table.rows}
+
+
+#: What a certificate of an earlier version says of the discretisation.
+_UNKNOWN_DISCRETISATION = {"not_estimated": "the model file is of an earlier version"}
+
+
+def error_facts(model: ReducedModel) -> Facts:
+    """The total error of a model and its two parts, discretisation and reduction; empty without a certificate."""
+    certificate = model.certificate
+    if "displacement" not in certificate:
+        return {}
+    reduction = main_errors(certificate)
+    facts = {"reduction error": _in_words(reduction)}
+    if "n_held_out" in certificate["displacement"]:
+        facts["reduction error"] += f", at {certificate['displacement']['n_held_out']} held-out solves"
+    discretisation = certificate.get("discretisation", _UNKNOWN_DISCRETISATION)
+    if "not_estimated" in discretisation:
+        unknown = f"not estimated: {discretisation['not_estimated']}"
+        return {"total error": "not estimated", "discretisation error": unknown} | facts
+    errors, states = main_errors(discretisation["errors"]), discretisation["coordinates"]
+    coarse, finer = discretisation["unknowns"]
+    facts = {
+        "total error": _in_words({name: errors[name] + reduction.get(name, 0.0) for name in errors}),
+        "discretisation error": f"{_in_words(errors)}, at {len(states)} of them",
+        **facts,
+        "finer elements": f"{discretisation['method']}; {finer} unknowns in place of {coarse}",
+    }
+    if "left_out" in discretisation:
+        facts["states left out"] = discretisation["left_out"]
+    described = [describe_point(model.parameters, state) for state in states]
+    return facts | {f"state solved again {n}": text for n, text in enumerate(described, start=1)}
+
+
+def main_errors(errors: Mapping[str, Any]) -> dict[str, float]:
+    """The figures that say most: mean and largest displacement error (mm), relative L2 errors of the rest (%).
+
+    Of the von Mises stresses of several faces, and of all reactions, it is the largest.
+    """
+    figures = {"mean": errors["displacement"]["mean_mm"], "largest": errors["displacement"]["max_mm"]}
+    stresses = [entry["von_mises"] for name, entry in errors.items() if name.startswith("stress_")]
+    reactions = [entry for name, entry in errors.items() if name.startswith("reaction_")]
+    for title, entries in (("von Mises stress", stresses), ("reactions", reactions)):
+        relative = [entry["relative_l2"] for entry in entries if entry.get("relative_l2") is not None]
+        figures |= {title: 100.0 * max(relative)} if relative else {}
+    return figures
+
+
+def _in_words(figures: Mapping[str, float]) -> str:
+    displacement = f"displacement {figures['mean']:.2g} mm mean, {figures['largest']:.2g} mm at most"
+    relative = [f"{name} {value:.2g} %" for name, value in figures.items() if name not in ("mean", "largest")]
+    return ", ".join([displacement, *relative])
 
 
 def held_out_facts(model: ReducedModel) -> Facts:

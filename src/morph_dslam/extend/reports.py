@@ -8,7 +8,7 @@ from morph_dslam.evaluation.force import (
     force_remarks as force_remarks,
     load_curve as load_curve,
 )
-from morph_dslam.evaluation.model_summary import summarise_model as summarise_model
+from morph_dslam.evaluation.model_summary import error_facts as error_facts, summarise_model as summarise_model
 from morph_dslam.evaluation.pixels import (
     PixelError as PixelError,
     PixelTracks as PixelTracks,

@@ -2,8 +2,9 @@
 
 Stresses and strains are taken at the quadrature points where they are most accurate (two in each direction: Barlow,
 IJNME 10, 1976), extrapolated within each cell and averaged, unweighted, over the cells around the node, across
-materials too; displacements need none of this. Derivatives are total: by the displacements and pressures, which follow
-the parameters, and by the parameters where constants or the undeformed shape contain them.
+materials too; elements of third order give them at the nodes. Displacements need none of this. Derivatives are total:
+by the displacements and pressures, which follow the parameters, and by the parameters where constants or the undeformed
+shape contain them.
 """
 
 from __future__ import annotations
@@ -255,6 +256,8 @@ class Recovery:
 
 def _extrapolation(kind: CellType, order: int) -> tuple[Array, Array]:
     """Points (q, 3) of the reference cell, and the weights (k, q) that extrapolate from them to its nodes."""
+    if order == 3:
+        return kind.nodes, np.eye(len(kind.nodes))
     gauss = (1.0 + np.array([-1.0, 1.0]) / np.sqrt(3.0)) / 2.0
     if kind.shape == "hex":
         points = np.array(list(product(gauss, repeat=3)))

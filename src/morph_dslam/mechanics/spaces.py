@@ -28,6 +28,8 @@ FULL_TYPE = {"tet": "tet10", "prism": "prism18", "hex": "hex27"}
 SERENDIPITY = {"prism15", "hex20"}
 #: Mid-side nodes nearer than this part of the mesh's size to the middle of straight edges count as straight.
 STRAIGHT = 1e-12
+#: A basis function smaller than this at a point is zero there.
+VANISHING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,8 @@ class _BlockBasis:
     Attributes
     ----------
     dofs : (m, b) scalar dof numbers of each cell.
-    owner : (b,) node of the full second-order cell that each function belongs to, where it is largest.
+    owner : (b,) part of the cell (`_parts`) that each function belongs to: a corner, an edge, a face or the inside.
+    beyond : (b,) whether a function is of higher than second order; these vanish at all nodes.
     values : (k, b) functions at the nodes of the block's own cell type.
     """
 
@@ -45,11 +48,12 @@ class _BlockBasis:
     connectivity: Indices
     dofs: Indices
     owner: Indices
+    beyond: NDArray[np.bool_]
     values: Array
 
 
 class DisplacementSpace:
-    """Continuous displacements of first or second order.
+    """Continuous displacements of first, second or third order.
 
     Scalar dofs are numbered 0 ... n_scalar - 1; a displacement field has n_scalar of x, then of y, then of z. Raises
     StudyError if cell types do not go together, or the order is below that of the cells.
@@ -57,8 +61,10 @@ class DisplacementSpace:
     Parameters
     ----------
     geometry : the mesh.
-    order : 1 or 2; None takes that of the cells.
-    full : use every function of second order even where hex20 or prism15 give the shape.
+    order : 1, 2 or 3; None takes that of the cells.
+    full : use every function of that order even where hex20 or prism15 give the shape, as order 3 always does.
+    serendipity : leave out second-order functions on faces with four corners and inside of cells that have no nodes
+        there, unless ``full``: half the unknowns of all, and little less accurate.
 
     Attributes
     ----------
@@ -70,7 +76,9 @@ class DisplacementSpace:
     bonus_order : what integrals over cells need beyond NGSolve's own order of quadrature.
     """
 
-    def __init__(self, geometry: NgsolveMesh, order: int | None = None, full: bool = False) -> None:
+    def __init__(
+        self, geometry: NgsolveMesh, order: int | None = None, full: bool = False, serendipity: bool = False
+    ) -> None:
         self.geometry = geometry
         mesh = geometry.mesh
         types = {block.cell_type for block in mesh.blocks}
@@ -78,12 +86,13 @@ class DisplacementSpace:
         self.order = shape_order if order is None else order
         if min(block.type.order for block in mesh.blocks) < shape_order:
             raise StudyError(f"first- and second-order cells meet in one mesh: {', '.join(sorted(types))}")
-        if self.order not in (1, 2) or self.order < shape_order:
-            raise StudyError(f"elements of order {order} on cells of order {shape_order}: use {shape_order} or 2")
+        if self.order not in (1, 2, 3) or self.order < shape_order:
+            raise StudyError(f"elements of order {order} on cells of order {shape_order}: use {shape_order} to 3")
         if types & SERENDIPITY and types & {"prism18", "hex27"}:
             raise StudyError(f"cells with and without nodes on their faces meet: {', '.join(sorted(types))}")
         self.scalar = ngs.H1(geometry.ngs, order=self.order)
-        if types & SERENDIPITY and not full:
+        serendipity = bool(types & SERENDIPITY) or (serendipity and not types & {"prism18", "hex27"})
+        if serendipity and self.order == 2 and not full:
             self.scalar.SetOrder(ngs.QUAD, 1)
             self.scalar.SetOrder(ngs.HEX, 1)
             self.scalar.Update()
@@ -101,15 +110,34 @@ class DisplacementSpace:
             elements = self.geometry.element_of_cell[start : start + len(block.connectivity)]
             ids = [ngs.ElementId(ngs.VOL, int(e)) for e in elements]
             dofs = np.array([self.scalar.GetDofNrs(i) for i in ids], dtype=np.int64)
-            # Functions of order 2 are even along edges and faces: the first cell's serve for all.
+            # Functions of order 2 are even along edges and faces, those beyond vanish at nodes: the first cell's serve
+            # for all.
             element = self.scalar.GetFE(ids[0])
             full = cell_type(FULL_TYPE[block.type.shape])
-            points = reference_points(full.shape, full.nodes)
-            values = np.array([np.array(element.CalcShape(*map(float, p))).ravel() for p in points])
+
+            def functions(points: Array, element: Any = element, shape: str = full.shape) -> Array:
+                points = reference_points(shape, points)
+                return np.array([np.array(element.CalcShape(*map(float, p))).ravel() for p in points])
+
+            values = functions(full.nodes)
             owner = np.argmax(np.abs(values), axis=0)
+            beyond = np.abs(values).max(axis=0) < VANISHING
+            values[:, beyond] = 0.0
+            probes = np.array([_probe(full, part) for part in _parts(full)])
+            # A function vanishes on every part but its own and those around that: the smallest one is its own.
+            owner[beyond] = np.argmax(np.abs(functions(probes)[:, beyond]) > VANISHING, axis=0)
             nodes = len(block.type.nodes)
-            blocks.append(_BlockBasis(block.type, block.connectivity, dofs, owner, values[:nodes]))
+            blocks.append(_BlockBasis(block.type, block.connectivity, dofs, owner, beyond, values[:nodes]))
         return blocks
+
+    def embedded(self, coarse: DisplacementSpace, dofs: Array) -> Array:
+        """The same displacement (3 n_scalar,) as ``dofs`` (3 n,) of a space of lower order on the same mesh."""
+        given, result = dofs.reshape(3, -1), np.zeros((3, self.n_scalar))
+        for own, other in zip(self._blocks, coarse._blocks, strict=True):
+            column = {int(own.owner[i]): i for i in np.flatnonzero(~own.beyond)}
+            same = [column[int(owner)] for owner in other.owner]
+            result[:, own.dofs[:, same]] = given[:, other.dofs]
+        return result.ravel()
 
     def _relate_nodes(self) -> None:
         n_nodes = self.geometry.mesh.n_nodes
@@ -117,7 +145,7 @@ class DisplacementSpace:
         self.coefficients = sp.csr_matrix((self.n_scalar, n_nodes))
         nodes_done, dofs_done = np.zeros(n_nodes, dtype=bool), np.zeros(self.n_scalar, dtype=bool)
         for basis in self._blocks:
-            shape_functions = basis.owner < len(basis.type.nodes)
+            shape_functions = (basis.owner < len(basis.type.nodes)) & ~basis.beyond
             inverse = np.zeros(basis.values.T.shape)
             inverse[shape_functions] = np.linalg.inv(basis.values[:, shape_functions])
             self.node_values += _rows_once(
@@ -160,18 +188,34 @@ class DisplacementSpace:
         held = np.zeros(self.n_scalar, dtype=bool)
         for basis in self._blocks:
             full = cell_type(FULL_TYPE[basis.type.shape])
-            corner_sets = [{i} for i in range(full.corners)] + [set(p) for p in full.parents]
+            corner_sets = _parts(full)
             for column, owner in enumerate(basis.owner):
                 if len(corner_sets[owner]) == full.corners:
                     continue
                 closure = (
                     [owner]
-                    if owner < len(basis.type.nodes)
+                    if owner < len(basis.type.nodes) and not basis.beyond[column]
                     else [i for i in range(len(basis.type.nodes)) if corner_sets[i] <= corner_sets[owner]]
                 )
                 rows = inside[basis.connectivity[:, closure]].all(axis=1)
                 held[basis.dofs[rows, column]] = True
         return np.flatnonzero(held)
+
+
+def _parts(full: CellType) -> list[set[int]]:
+    """Corners of each part of a cell, smaller parts first: corners, edges, faces with four corners as the nodes of
+    ``full`` are numbered, then triangles, and the inside where it has no node."""
+    parts = [{i} for i in range(full.corners)] + [set(parents) for parents in full.parents]
+    triangles = [set(face[:3]) for face in full.faces if len(face) == 6]
+    inside = set(range(full.corners))
+    return parts + triangles + ([] if inside in parts else [inside])
+
+
+def _probe(full: CellType, part: set[int]) -> Array:
+    """A point (3,) of a part of the reference cell, on none of the lines where its functions change sign."""
+    corners = full.nodes[sorted(part)]
+    weights = np.array([1.0, 0.61, 0.43, 0.29, 0.23, 0.17, 0.13, 0.11])[: len(corners)]
+    return weights @ corners / weights.sum()
 
 
 def _rows_once(
@@ -223,7 +267,7 @@ class PressureSpace:
     in each cell and discontinuous (Boffi, Brezzi and Fortin, Mixed Finite Element Methods and Applications, 2013,
     section 8.6), condensed cell by cell; tetrahedra and prisms Taylor and Hood's, linear and continuous within a
     material; hexahedra of first order one pressure a cell (Simo, Taylor and Pister, 1985), which may alternate between
-    neighbours.
+    neighbours. Displacements of third order take the same with pressures of second order.
 
     Parameters
     ----------
@@ -241,16 +285,18 @@ class PressureSpace:
         hexahedra = {block.type.shape for block in mesh.blocks} == {"hex"}
         self._offsets: list[Any] = []
         if not hexahedra:
-            self.spaces = [ngs.H1(ngs_mesh, order=1, definedon=region)]
+            self.spaces = [ngs.H1(ngs_mesh, order=space.order - 1, definedon=region)]
             return
-        count = 1 if space.order == 1 else 4
+        count = {1: 1, 2: 4, 3: 10}[space.order]
         self.spaces = [ngs.L2(ngs_mesh, order=0, definedon=region) for _ in range(count)]
-        if count == 4:
+        if count > 1:
             corners = np.concatenate([mesh.nodes[b.connectivity[:, :8]] for b in mesh.blocks])
             centre = geometry.cell_field(corners.mean(axis=1))
             size = geometry.cell_field(np.ptp(corners, axis=1).max(axis=1))
             offset = (ngs.CF((ngs.x, ngs.y, ngs.z)) - centre) / size
             self._offsets = [offset[i] for i in range(3)]
+            if count == 10:
+                self._offsets += [offset[i] * offset[j] for i in range(3) for j in range(i, 3)]
 
     def combine(self, unknowns: list[Any]) -> Any:
         """Pressure of functions of `spaces`, in their unit."""

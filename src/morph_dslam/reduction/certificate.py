@@ -12,7 +12,7 @@ between two neighbours of the sweep, a critical point lies between them: a limit
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -195,7 +195,7 @@ def certify(model: ReducedModel, held_out: list[Snapshot]) -> dict[str, Any]:
         if name == "displacement":
             certificate |= _displacement_errors(model, held_out)
         else:
-            certificate[name] = _field_errors(field, name, held_out)
+            certificate[name] = field_errors(name, _pairs(field, name, held_out))
     if all("displacement" in snapshot.sensitivities for snapshot in held_out):
         certificate["sensitivity"] = _sensitivity_errors(model, held_out)
     return certificate
@@ -236,9 +236,28 @@ def _unit(name: str) -> tuple[str, float]:
 
 def _tally(field: SeparatedField, name: str, held_out: list[Snapshot]) -> _ErrorTally:
     tally = _ErrorTally(_norm_weights(name, field.modes.shape[2]))
-    for snapshot in held_out:
-        tally.add(field.value(snapshot.coordinates), snapshot.fields[name])
+    for predicted, truth in _pairs(field, name, held_out):
+        tally.add(predicted, truth)
     return tally
+
+
+def _pairs(field: SeparatedField, name: str, held_out: list[Snapshot]) -> Iterator[tuple[Array, Array]]:
+    """What the model says of a field and what is true, solve by solve."""
+    return ((field.value(snapshot.coordinates), snapshot.fields[name]) for snapshot in held_out)
+
+
+def field_errors(name: str, pairs: Iterable[tuple[Array, Array]]) -> dict[str, Any]:
+    """Errors of one field as `certify` states them, from pairs of values (n, c), SI: those to judge, and the truth."""
+    tallies: dict[str, _ErrorTally] = {}
+    for predicted, truth in pairs:
+        kinds = {name: (predicted, truth, _norm_weights(name, truth.shape[1]))}
+        if name.startswith(_STRESS):
+            ours, true = (von_mises(values.astype(np.float64))[:, None] for values in (predicted, truth))
+            kinds["von_mises"] = (ours, true, np.ones(1))
+        for kind, (ours, true, weights) in kinds.items():
+            tallies.setdefault(kind, _ErrorTally(weights)).add(ours, true)
+    figures = {kind: tally.figures(*_unit(name)) for kind, tally in tallies.items()}
+    return figures.pop(name) | figures
 
 
 def _displacement_errors(model: ReducedModel, held_out: list[Snapshot]) -> dict[str, Any]:
@@ -258,18 +277,6 @@ def _displacement_errors(model: ReducedModel, held_out: list[Snapshot]) -> dict[
         "max_mm": (1e3 * tally.sample_maxima).tolist(),
     }
     return {name: figures, "held_out": samples}
-
-
-def _field_errors(field: SeparatedField, name: str, held_out: list[Snapshot]) -> dict[str, Any]:
-    figures = _tally(field, name, held_out).figures(*_unit(name))
-    if name.startswith(_STRESS):
-        tally = _ErrorTally(np.ones(1))
-        for snapshot in held_out:
-            predicted = von_mises(field.value(snapshot.coordinates))
-            truth = von_mises(snapshot.fields[name].astype(np.float64))
-            tally.add(predicted[:, None], truth[:, None])
-        figures["von_mises"] = tally.figures(*_unit(name))
-    return figures
 
 
 def _sensitivity_errors(model: ReducedModel, held_out: list[Snapshot]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any
 from tqdm import tqdm
 
 from morph_dslam.errors import StudyError
-from morph_dslam.evaluation.model_summary import describe_point, summarise_model
+from morph_dslam.evaluation.model_summary import describe_point, error_facts, summarise_model
 from morph_dslam.evaluation.report import Block, KeyFigures, Listing, Section, Table, Text, write_report
 from morph_dslam.model import ReducedModel
 from morph_dslam.reduction.report_pictures import (
@@ -99,14 +99,17 @@ def _key_figures(model: ReducedModel) -> KeyFigures:
     """The figures that are looked for first."""
     certificate = model.certificate
     errors = certificate["displacement"]
+    facts = error_facts(model)
     figures = {
-        "mean displacement error": f"{errors['mean_mm']:.2g} mm",
-        "largest error of any node": f"{errors['max_mm']:.2g} mm",
+        "total error": facts["total error"],
+        "discretisation error": facts["discretisation error"],
+        "mean reduction error": f"{errors['mean_mm']:.2g} mm",
+        "largest reduction error of any node": f"{errors['max_mm']:.2g} mm",
         "largest displacement": f"{errors['largest_mm']:.3g} mm",
     }
     stresses = [entry["von_mises"] for name, entry in certificate.items() if name.startswith("stress_")]
-    figures |= _largest_relative("von Mises stress error", stresses)
-    figures |= _largest_relative("error of sensitivities", certificate.get("sensitivity", {}).values())
+    figures |= _largest_relative("reduction error of von Mises stress", stresses)
+    figures |= _largest_relative("reduction error of sensitivities", certificate.get("sensitivity", {}).values())
     figures["displacement modes"] = str(model.displacement.n_modes)
     if "compression_percent" in certificate:
         figures["compression"] = f"{certificate['compression_percent']:.2f} %"

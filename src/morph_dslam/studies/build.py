@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from concurrent.futures import Executor
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,6 +15,7 @@ from morph_dslam.reduction.certificate import certify, compression_percent, stab
 from morph_dslam.reduction.registry import reduction_method
 from morph_dslam.reduction.task import ReductionTask
 from morph_dslam.studies.defaults import resolve_defaults
+from morph_dslam.studies.discretisation import discretisation_errors
 from morph_dslam.studies.problem import announce
 from morph_dslam.studies.provenance import locking_warnings, provenance
 from morph_dslam.studies.sections import ReductionSection
@@ -49,6 +51,7 @@ def build(
     if output is None:
         with TemporaryDirectory() as folder:
             return build(study, Path(folder) / "model.morph", workers, executor)
+    begin = time.monotonic()
     output = Path(output)
     if not output.parent.is_dir():
         raise StudyError(f"the folder {output.parent} for the model file does not exist: make it first")
@@ -56,6 +59,7 @@ def build(
     chosen = resolve_defaults(described)
     snapshots = take_snapshots(chosen, output.with_name(output.name + ".snapshots"), workers, executor)
     model = certified_model(snapshots, chosen.reduction, chosen.name)
+    model.certificate["discretisation"] = discretisation_errors(chosen, snapshots, model, time.monotonic() - begin)
     model.provenance.update(provenance(text, chosen, model))
     if found := locking_warnings(chosen):
         model.certificate["warnings"] = found

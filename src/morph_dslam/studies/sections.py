@@ -46,6 +46,8 @@ class Section(BaseModel):
 
 #: More solves than these are a mistake.
 MOST_SAMPLES = 1_000_000
+#: Held-out solves that may be solved again with finer elements.
+MOST_REFINED = 5
 
 
 class SamplingSection(Section):
@@ -56,6 +58,7 @@ class SamplingSection(Section):
     points of a full grid with ``points`` for each parameter, or one number for all; "adaptive" solves
     ``first`` scattered ones and then adds where the model's error is estimated to be largest, up to
     ``training``. The method of reduction chooses where it is absent. Held-out samples are always scattered.
+    ``refined`` of them are solved again with finer elements to estimate the discretisation error; 0 for none.
     """
 
     training: int = Field(default=256, ge=8, le=MOST_SAMPLES)
@@ -64,6 +67,7 @@ class SamplingSection(Section):
     points: int | tuple[int, ...] | None = None
     first: int = Field(default=16, ge=4)
     seed: int = Field(default=0, ge=0)
+    refined: int = Field(default=3, ge=0, le=MOST_REFINED)
 
     @field_validator("points")
     @classmethod

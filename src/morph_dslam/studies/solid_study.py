@@ -204,8 +204,8 @@ class SolidStudy(Section):
         """The snapshot alone."""
         return [snapshot]
 
-    def problem(self) -> SolidProblem:
-        """The discretised solid."""
+    def problem(self, options: SolidOptions | None = None) -> SolidProblem:
+        """The discretised solid, with the study's own elements if ``options`` name no others."""
         parameters, mesh = self.model_parameters(), self.solid_mesh()
         symbols = ParameterSymbols(parameters)
         values = [symbols[parameter.name] for parameter in parameters]
@@ -214,13 +214,14 @@ class SolidStudy(Section):
             return read_affine(value, quantity, parameters).expression(values)
 
         reader: Reader = read
+        own = SolidOptions(order=self.solver.order, mixed=MIXED[self.solver.formulation], threads=self.solver.threads)
         return SolidProblem(
             mesh,
             {section.on: section.make(reader) for section in self.materials.values()},
             [section.make(reader) for section in self.supports],
             [section.make(reader) for section in self.loads],
             symbols,
-            SolidOptions(order=self.solver.order, mixed=MIXED[self.solver.formulation], threads=self.solver.threads),
+            options or own,
             shape_fields(self.shape, mesh, symbols),
             time=symbols[self.time.parameter] if self.time else None,
         )

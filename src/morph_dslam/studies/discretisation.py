@@ -1,0 +1,250 @@
+"""The discretisation error of a study's solutions: a few held-out ones are solved again with elements one order higher.
+
+States are chosen by their strain alone, before anything is solved. How many can be afforded follows from numbers of
+unknowns, so that it is the same in every run; the clock ends what takes longer than foreseen, and the certificate says
+what was left out and why.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import SolverError
+from morph_dslam.mechanics.loads import REACTION, with_reactions
+from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning
+from morph_dslam.mechanics.solvers.continuation import advance, loaded_state
+from morph_dslam.mechanics.solvers.newton import Linearisation, State, solve
+from morph_dslam.model import ReducedModel
+from morph_dslam.reduction.certificate import field_errors
+from morph_dslam.studies.external import ExternalStudy
+from morph_dslam.studies.problem import Snapshot, announce
+from morph_dslam.studies.sheet_study import SheetStudy
+from morph_dslam.studies.snapshots import load_state
+from morph_dslam.studies.solid_study import SolidStudy
+from morph_dslam.studies.solid_sweep import SolidSweep, solid_snapshot
+from morph_dslam.studies.solutions import Snapshots
+from morph_dslam.studies.study import Study
+
+Array = NDArray[np.float64]
+#: Part of the whole build that the estimate may take.
+SHARE = 0.25
+#: Part of that time at which no tangent is begun any more: the last one must end, and fields be recovered.
+CLOCK = 0.8
+MOST_BYTES = 4e9
+#: Places of the states to solve again among the held-out ones sorted by strain, the first ones if there is less time.
+QUANTILES = (1.0, 0.5, 0.75, 0.25, 0.9)
+#: Tangents of a finer solve, and of one of the sweep's; powers of the number of unknowns with which the time of a
+#: tangent and the memory of its factors grow (measured on seals of 7 thousand to 110 thousand unknowns; nested
+#: dissection has 2 and 4/3 in the limit).
+FINER_TANGENTS, SWEEP_TANGENTS, TIME_POWER, MEMORY_POWER = 7.0, 3.0, 1.5, 4.0 / 3.0
+BYTES_OF_A_MILLION = 45e9
+#: Of the last correction, in units of the body's size: the errors looked for are far larger.
+TOLERANCE = 1e-5
+
+
+class _NotEstimated(Exception):
+    """Why there is no estimate."""
+
+
+class OutOfTime(Exception):
+    """A solve was stopped before it ended."""
+
+
+def discretisation_errors(study: Study, snapshots: Snapshots, model: ReducedModel, seconds: float) -> dict[str, Any]:
+    """The certificate's entry "discretisation", in plain JSON types.
+
+    Parameters
+    ----------
+    study : with its defaults resolved.
+    snapshots : its solutions.
+    model : made from them.
+    seconds : that the build has taken so far.
+
+    Returns
+    -------
+    dict
+        "method"; "unknowns" of the study's solid and of the finer one; "coordinates" of the states; "errors" of the
+        held-out solutions against the finer ones by field, at the nodes of the model (`certificate.field_errors`);
+        "left_out", why some states are missing. Or only "not_estimated", the reason.
+    """
+    try:
+        return _estimate(_solid(study), snapshots, model, seconds)
+    except _NotEstimated as reason:
+        return {"not_estimated": str(reason)}
+
+
+def _solid(study: Study) -> SolidStudy:
+    """The study, if its solutions can be solved again with finer elements."""
+    if isinstance(study, ExternalStudy):
+        raise _NotEstimated("the solutions are another program's")
+    if isinstance(study, SheetStudy):
+        raise _NotEstimated("studies of sheets have no finer elements to compare with")
+    if not study.sampling.refined:
+        raise _NotEstimated("switched off by sampling.refined = 0")
+    if study.time is not None:
+        raise _NotEstimated("a viscoelastic solid would have to be followed from the beginning with finer elements")
+    return study
+
+
+def chosen_states(held_out: Sequence[Snapshot], count: int) -> list[int]:
+    """Up to ``count`` held-out solutions: the one strained most, then typical ones, by the norm of nodal strains."""
+    order = np.argsort([float(np.linalg.norm(snapshot.fields["strain"])) for snapshot in held_out])
+    places = [round(quantile * (len(order) - 1)) for quantile in QUANTILES[:count]]
+    return [int(order[place]) for place in dict.fromkeys(places)]
+
+
+def _estimate(study: SolidStudy, snapshots: Snapshots, model: ReducedModel, seconds: float) -> dict[str, Any]:
+    assert snapshots.problem is not None
+    begin = time.monotonic()
+    sweep = snapshots.problem()
+    assert isinstance(sweep, SolidSweep)
+    solves = len(snapshots.training) + len(snapshots.held_out)
+    finer = HigherOrder(sweep.problem, _finer(study, sweep.problem))
+    chosen = chosen_states(snapshots.held_out, study.sampling.refined)
+    chosen = chosen[: _affordable(_unknowns(sweep.problem, finer.problem), solves)]
+    kept = {index: load_state(snapshots.held_out_files[index]) for index in chosen}
+    # Where solutions were found on disk, this build was shorter than the one that solved them.
+    solving = SWEEP_TANGENTS * _tangent_seconds(sweep.problem, kept[chosen[0]]) * solves / (study.work.workers or 1)
+    end = begin + CLOCK * SHARE / (1.0 - SHARE) * max(seconds, solving)
+    announce(f"solving {len(chosen)} held-out states again with finer elements")
+    solved, left_out = {}, ""
+    # From small strains to large ones: each solve starts from what the one before changed.
+    for index in sorted(chosen, key=lambda index: float(np.linalg.norm(snapshots.held_out[index].fields["strain"]))):
+        try:
+            solved[index] = finer.solve(kept[index]["dofs"], kept[index]["mu"], lambda: time.monotonic() < end)
+        except OutOfTime:
+            left_out = f"{len(chosen) - len(solved)} were left out: they would take more than a quarter of the build"
+            break
+        except SolverError as error:
+            left_out = f"one was left out: {error}"
+    if not solved:
+        raise _NotEstimated(left_out)
+    return _figures(model, snapshots, sweep.problem, finer.problem, solved) | (
+        {"left_out": left_out} if left_out else {}
+    )
+
+
+def _affordable(unknowns: list[int], solves: int) -> int:
+    """How many finer states a quarter of a build of ``solves`` can afford; ``unknowns`` are those of `_unknowns`.
+
+    Raises _NotEstimated where memory or time allow none.
+    """
+    own, finer = unknowns
+    memory = BYTES_OF_A_MILLION * (1e-6 * finer) ** MEMORY_POWER
+    if memory > MOST_BYTES:
+        raise _NotEstimated(f"{finer} unknowns of finer elements would need about {1e-9 * memory:.0f} GB of memory")
+    time_of_one = FINER_TANGENTS / SWEEP_TANGENTS * (finer / own) ** TIME_POWER
+    count = int(SHARE / (1.0 - SHARE) * solves / time_of_one)
+    if count < 1:
+        raise _NotEstimated(
+            f"one state with {finer} unknowns of finer elements would take as long as {time_of_one:.0f} of the build's "
+            f"{solves} solves, more than a quarter of the build"
+        )
+    return count
+
+
+def _finer(study: SolidStudy, coarse: SolidProblem) -> SolidProblem:
+    """The study's solid with displacements of one order more."""
+    options = SolidOptions(order=coarse.displacements.order + 1, serendipity=True, threads=coarse.options.threads)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NearlyIncompressibleWarning)  # the study's elements were warned about
+        return study.problem(options)
+
+
+def _unknowns(coarse: SolidProblem, finer: SolidProblem) -> list[int]:
+    """Displacement unknowns of both."""
+    return [3 * problem.displacements.n_scalar for problem in (coarse, finer)]
+
+
+def _tangent_seconds(problem: SolidProblem, state: dict[str, Array]) -> float:
+    """Time of one tangent, its factors and a solve with them; the second one, for the first makes what is kept."""
+    elapsed = []
+    for _ in range(2):
+        begin = time.monotonic()
+        tangent = problem.linearise(state["dofs"], state["mu"])
+        tangent.solve(tangent.residual)
+        elapsed.append(time.monotonic() - begin)
+    return min(elapsed)
+
+
+class HigherOrder:
+    """Solves the states of a solid again with displacements of higher order on the same cells.
+
+    Parameters
+    ----------
+    coarse : the solid.
+    problem : the same solid with elements of higher order.
+    """
+
+    def __init__(self, coarse: SolidProblem, problem: SolidProblem) -> None:
+        self._coarse, self.problem = coarse, problem
+        self._latest: tuple[State, Array] | None = None
+
+    def solve(self, dofs: Array, mu: Array, in_time: Callable[[], bool] = lambda: True) -> State:
+        """The solution at ``mu`` (d,) next to one of the coarse solid.
+
+        Newton's method starts from the coarse solution ``dofs`` (n,), corrected by what the finer elements changed at
+        the state solved before; where that does not converge, the path from that state is followed in increments.
+
+        Raises
+        ------
+        OutOfTime
+            When ``in_time`` says no: it is asked before each factorisation.
+        SolverError
+            If no solution is found.
+        """
+        equations, given = _Stoppable(self.problem, in_time), np.zeros(self.problem.n_dofs)
+        embedded = self.problem.displacements.embedded(
+            self._coarse.displacements, dofs[: 3 * self._coarse.displacements.n_scalar]
+        )
+        given[: len(embedded)] = embedded
+        change = self._latest[0].dofs - self._latest[1] if self._latest else 0.0
+        try:
+            state = solve(equations, mu, State(mu, given + change), TOLERANCE)
+        except SolverError:
+            start = self._latest[0] if self._latest else loaded_state(equations, self.problem.symbols.default)
+            state = advance(equations, start, mu, TOLERANCE)[-1]
+        self._latest = state, given
+        return state
+
+
+class _Stoppable:
+    """The equations of a solid, whose factorisations stop when time is up."""
+
+    def __init__(self, problem: SolidProblem, in_time: Callable[[], bool]) -> None:
+        self._problem, self._in_time = problem, in_time
+        self.n_dofs, self.free, self.scale = problem.n_dofs, problem.free, problem.scale
+        self.prescribed, self.prescribed_slopes = problem.prescribed, problem.prescribed_slopes
+        self.residual, self.residual_slopes = problem.residual, problem.residual_slopes
+
+    def linearise(self, x: Array, mu: Array) -> Linearisation:
+        if not self._in_time():
+            raise OutOfTime
+        return self._problem.linearise(x, mu)
+
+
+def _figures(
+    model: ReducedModel, snapshots: Snapshots, coarse: SolidProblem, finer: SolidProblem, solved: dict[int, State]
+) -> dict[str, Any]:
+    """Errors of the held-out solutions against the finer ones, field by field."""
+    reactions = [name.removeprefix(REACTION) for name in model.fields if name.startswith(REACTION)]
+    pairs = [
+        (snapshots.held_out[index], with_reactions(solid_snapshot(finer, state.dofs, state.mu), reactions))
+        for index, state in sorted(solved.items())
+    ]
+    return {
+        "method": f"displacements of order {finer.displacements.order} on the same cells",
+        "unknowns": _unknowns(coarse, finer),
+        "coordinates": [own.coordinates.tolist() for own, _ in pairs],
+        "errors": {
+            name: field_errors(name, [(own.fields[name], truth.fields[name]) for own, truth in pairs])
+            for name in model.fields
+        },
+    }

@@ -1,0 +1,123 @@
+"""The discretisation error in certificates: against beam theory, and what is said where there is no estimate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import morph_dslam as md
+from morph_dslam.cli import app as cli
+from morph_dslam.evaluation.model_summary import error_facts, summarise_model
+from morph_dslam.studies import discretisation
+from morph_dslam.studies.build import certified_model
+from morph_dslam.studies.defaults import resolve_defaults
+from morph_dslam.studies.discretisation import discretisation_errors
+from morph_dslam.studies.solutions import Snapshots, take_snapshots
+from morph_dslam.studies.study import Study
+
+YOUNG, SIDE, LENGTH, PUSH = 3e6, 0.01, 0.16, 10.0
+
+
+def bar(**solver: Any) -> Study:
+    """A slender bar of hexahedra, clamped at one end; its other end is pushed sideways, so little that it is linear."""
+    content = {
+        "name": "bar",
+        "mesh": {"generator": "block", "size": ["10 mm", "10 mm", "160 mm"], "divisions": [1, 1, 16], "cells": "hex8"},
+        "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.0}},
+        "supports": [{"kind": "fixed", "on": "z_min"}],
+        "loads": [{"kind": "traction", "on": "z_max", "traction": ["push", "0 Pa", "0 Pa"]}],
+        "parameters": {"push": {"range": ["0 Pa", f"{PUSH} Pa"]}},
+        "sampling": {"scheme": "even", "training": 9, "held_out": 6},
+        "reduction": {"method": "pod"},
+        "solver": {"workers": 1, "threads": 1, "formulation": "displacement"} | solver,
+    }
+    return resolve_defaults(md.make_study(content))
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Study, Snapshots, md.ReducedModel]:
+    study = bar()
+    snapshots = take_snapshots(study, tmp_path_factory.mktemp("bar"))
+    return study, snapshots, certified_model(snapshots, study.reduction, study.name)
+
+
+@pytest.fixture
+def all_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(discretisation, "SHARE", 0.9999)
+
+
+@pytest.mark.usefixtures("all_the_time")
+def test_the_estimate_is_how_far_beam_theory_is_from_locking_hexahedra(
+    solved: tuple[Study, Snapshots, md.ReducedModel],
+) -> None:
+    """Cube-shaped hex8 carry shear where they should bend; Poisson's ratio is zero, so that beam theory is exact."""
+    study, snapshots, model = solved
+    entry = discretisation_errors(study, snapshots, model, 1e3)
+    assert entry["method"] == "displacements of order 2 on the same cells"
+    assert entry["unknowns"] == [3 * 4 * 17, 3 * (4 * 17 + 4 * 16 + 4 * 17)]
+    z = model.nodes[:, 2]
+    inertia, shear_stiffness = SIDE**4 / 12.0, 5.0 / 6.0 * YOUNG / 2.0 * SIDE**2
+    unit = SIDE**2 * (z**2 * (3.0 * LENGTH - z) / (6.0 * YOUNG * inertia) + z / shear_stiffness)
+    true, found = [], []
+    for snapshot in snapshots.held_out:
+        if any(np.allclose(snapshot.coordinates, state) for state in entry["coordinates"]):
+            true.append(unit * snapshot.coordinates[0])
+            found.append(snapshot.fields["displacement"][:, 0])
+    assert len(true) == 3
+    missing = np.abs(np.array(true) - found)
+    assert missing.max() > 0.2 * np.abs(true).max()
+    assert entry["errors"]["displacement"]["mean_mm"] == pytest.approx(1e3 * missing.mean(), rel=0.03)
+    assert entry["errors"]["displacement"]["max_mm"] == pytest.approx(1e3 * missing.max(), rel=0.03)
+    # The reaction is the load, whatever the elements; its moment too.
+    assert entry["errors"]["reaction_force_z_min"]["relative_l2"] < 1e-6
+
+
+@pytest.mark.usefixtures("all_the_time")
+def test_second_order_elements_are_compared_with_third_order(tmp_path: Path) -> None:
+    study = bar(order=2)
+    snapshots = take_snapshots(study, tmp_path)
+    model = certified_model(snapshots, study.reduction, study.name)
+    entry = discretisation_errors(study, snapshots, model, 1e3)
+    assert entry["method"] == "displacements of order 3 on the same cells"
+    assert entry["errors"]["displacement"]["relative_l2"] < 0.005
+    facts = error_facts(replace(model, certificate=model.certificate | {"discretisation": entry}))
+    assert list(facts)[:3] == ["total error", "discretisation error", "reduction error"]
+    mean = model.certificate["displacement"]["mean_mm"] + entry["errors"]["displacement"]["mean_mm"]
+    assert facts["total error"].startswith(f"displacement {mean:.2g} mm mean")
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"MOST_BYTES": 1.0}, "GB of memory"),
+        ({}, "more than a quarter"),
+        ({"FINER_TANGENTS": 1e-12, "SWEEP_TANGENTS": 1e-9}, "were left out"),
+    ],
+)
+def test_what_exceeds_its_share_is_not_estimated(
+    solved: tuple[Study, Snapshots, md.ReducedModel],
+    monkeypatch: pytest.MonkeyPatch,
+    changes: dict[str, float],
+    why: str,
+) -> None:
+    """By memory, by the number of solves, and, where that was foreseen wrongly, by the clock."""
+    for name, value in changes.items():
+        monkeypatch.setattr(discretisation, name, value)
+    entry = discretisation_errors(*solved, 0.0)
+    assert list(entry) == ["not_estimated"]
+    assert why in entry["not_estimated"]
+
+
+def test_no_estimate_is_the_first_thing_that_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    study = bar()
+    study = study.model_copy(update={"sampling": study.sampling.model_copy(update={"refined": 0})})
+    model = md.build(study, tmp_path / "bar.morph")
+    assert next(iter(summarise_model(model))) == "errors"
+    assert error_facts(model)["discretisation error"] == "not estimated: switched off by sampling.refined = 0"
+    assert cli.main(["info", str(tmp_path / "bar.morph")]) == 0
+    _title, _, heading, first, *_ = capsys.readouterr().out.splitlines()
+    assert [heading, *first.split()] == ["errors", "total", "error", "not", "estimated"]
