@@ -100,7 +100,7 @@ def error_facts(model: ReducedModel) -> Facts:
     coarse, finer = discretisation["unknowns"]
     facts = {
         "total error": _in_words({name: errors[name] + reduction.get(name, 0.0) for name in errors}),
-        "discretisation error": f"{_in_words(errors)}, at {len(states)} of them",
+        "discretisation error": f"{_in_words(errors)}, at {len(states)} held-out states solved again",
         **facts,
         "finer elements": f"{discretisation['method']}; {finer} unknowns in place of {coarse}",
     }

@@ -2,9 +2,9 @@
 
 Stresses and strains are taken at the quadrature points where they are most accurate (two in each direction: Barlow,
 IJNME 10, 1976), extrapolated within each cell and averaged, unweighted, over the cells around the node, across
-materials too; elements of third order give them at the nodes. Displacements need none of this. Derivatives are total:
-by the displacements and pressures, which follow the parameters, and by the parameters where constants or the undeformed
-shape contain them.
+materials too; elements of third order, and others on request, give them at the nodes. Displacements need none of this.
+Derivatives are total: by the displacements and pressures, which follow the parameters, and by the parameters where
+constants or the undeformed shape contain them.
 """
 
 from __future__ import annotations
@@ -230,10 +230,11 @@ class Recovery:
         """Mesh points (q,) in all cells, and the matrix (n_nodes, q) that takes values there to nodes."""
         if self._at_nodes is None:
             geometry = self._problem.geometry
+            order = 3 if self._problem.options.at_nodes else self._problem.displacements.order
             mesh, parts, count = geometry.mesh, [], 0
             rows, columns, data = [], [], []
             for block, start in zip(mesh.blocks, mesh.block_starts()[:-1], strict=True):
-                reference, weights = _extrapolation(block.type, self._problem.displacements.order)
+                reference, weights = _extrapolation(block.type, order)
                 m, q = len(block.connectivity), len(reference)
                 elements = np.repeat(geometry.element_of_cell[start : start + m], q)
                 points = np.tile(reference_points(block.type.shape, reference), (m, 1))

@@ -55,12 +55,15 @@ class SolidOptions:
         take the mixed form that need it, where the cells have one. False is plain displacement elements.
     serendipity : leave out functions that second-order cells with nodes on their edges alone have not, where no
         material is mixed; see `DisplacementSpace`.
+    at_nodes : evaluate stresses and strains at the nodes themselves, as elements of third order do, in place of where
+        they are most accurate: what coarser elements are compared with must not share their error of extrapolation.
     threads : of PARDISO; None leaves MKL's choice.
     """
 
     order: int | None = None
     mixed: bool | None = None
     serendipity: bool = False
+    at_nodes: bool = False
     threads: int | None = None
 
 

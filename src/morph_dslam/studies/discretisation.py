@@ -152,7 +152,8 @@ def _affordable(unknowns: list[int], solves: int) -> int:
 
 def _finer(study: SolidStudy, coarse: SolidProblem) -> SolidProblem:
     """The study's solid with displacements of one order more."""
-    options = SolidOptions(order=coarse.displacements.order + 1, serendipity=True, threads=coarse.options.threads)
+    order = coarse.displacements.order + 1
+    options = SolidOptions(order=order, serendipity=True, at_nodes=True, threads=coarse.options.threads)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NearlyIncompressibleWarning)  # the study's elements were warned about
         return study.problem(options)
