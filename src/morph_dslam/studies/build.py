@@ -13,6 +13,7 @@ from morph_dslam.model import ReducedModel, save_model
 from morph_dslam.reduction.adaptive_sampling import estimator_check
 from morph_dslam.reduction.certificate import certify, compression_percent, stability_warnings
 from morph_dslam.reduction.registry import reduction_method
+from morph_dslam.reduction.self_penetration import penetration_report
 from morph_dslam.reduction.task import ReductionTask
 from morph_dslam.studies.defaults import resolve_defaults
 from morph_dslam.studies.discretisation import discretisation_errors
@@ -101,6 +102,11 @@ def certified_model(snapshots: Snapshots, options: ReductionSection, name: str) 
         model.certificate["estimator"] = estimator_check(task, snapshots.held_out_files)
     if snapshots.stability is not None:
         model.certificate["stability"] = snapshots.stability
+    penetration = penetration_report(
+        snapshots.mesh, snapshots.parameters, [*(group[0] for group in training), *held_out]
+    )
+    if penetration is not None:
+        model.certificate["self_penetration"] = penetration
     return model
 
 
@@ -111,6 +117,8 @@ def _samples(snapshots: Snapshots) -> dict[str, Any]:
 
 
 def build_warnings(certificate: dict[str, Any]) -> list[str]:
-    """Sentences on the study's elements, the stability of its solutions, and the method of reduction."""
+    """Sentences on the study's elements, what its solutions pass through, their stability, the method of reduction."""
     of_the_method = certificate.get("reduction", {}).get("warnings", [])
-    return [*certificate.get("warnings", []), *stability_warnings(certificate), *of_the_method]
+    penetration = certificate.get("self_penetration", {"states": []})
+    passing = [penetration["statement"]] if penetration["states"] else []
+    return [*certificate.get("warnings", []), *passing, *stability_warnings(certificate), *of_the_method]

@@ -1,0 +1,187 @@
+"""Where the surface of a deformed solid passes through itself.
+
+The equations of a solid know no contact, so parts of a surface that meet go through one another. A node of the surface
+lies inside another part of the solid where the surface winds around it more often than around a point of itself: its
+winding number, the solid angle over 4 pi (van Oosterom & Strackee, The solid angle of a plane triangle, 1983), is that
+of its own corner, between 0 and 1, and 1 more for each part that holds it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from morph_dslam.evaluation.model_summary import describe_point
+from morph_dslam.model import Parameter
+from morph_dslam.studies.problem import ModelMesh, Snapshot
+
+Array = NDArray[np.float64]
+#: Parts of a surface may touch if they face each other and are nearer than such a part of what they were.
+NEARER = 0.5
+
+
+def penetration_report(
+    mesh: ModelMesh, parameters: Sequence[Parameter], solutions: Sequence[Snapshot]
+) -> dict[str, Any] | None:
+    """What a certificate says of solutions whose surface passes through itself, in plain JSON types.
+
+    Returns
+    -------
+    dict
+        "statement", "checked" and "states", the worst first: coordinates (SI), number of nodes inside another part,
+        and "depth_mm" of the deepest one. None where the surface is not closed, as that of a sheet.
+    """
+    sides, uses = np.unique(np.sort(mesh.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)), axis=0, return_counts=True)
+    if not len(sides) or (uses % 2).any():
+        return None
+    surface, states = SurfaceContact(mesh.nodes, mesh.triangles), []
+    for solution in solutions:
+        found = surface.find(mesh.nodes + solution.fields["displacement"])
+        if len(found.nodes):
+            depth = 1e3 * float(found.depths.max())
+            states.append({"coordinates": solution.coordinates.tolist(), "nodes": len(found.nodes), "depth_mm": depth})
+    states.sort(key=lambda state: -state["depth_mm"])
+    statement = f"in none of {len(solutions)} solutions the surface passes through itself"
+    if states:
+        worst = describe_point(parameters, states[0]["coordinates"])
+        statement = (
+            f"in {len(states)} of {len(solutions)} solutions the surface passes through itself, by "
+            f"{states[0]['depth_mm']:.2g} mm at {worst}: the solver knows no contact"
+        )
+    return {"statement": statement, "checked": len(solutions), "states": states}
+
+
+@dataclass(frozen=True)
+class SelfPenetration:
+    """Nodes of a surface that lie inside another part of the solid.
+
+    Attributes
+    ----------
+    nodes : (k,) their indices.
+    depths : (k,) how far each is from the nearest part of the surface that faces it, m.
+    """
+
+    nodes: NDArray[np.int64]
+    depths: Array
+
+
+class SurfaceContact:
+    """Finds where a closed surface passes through itself.
+
+    Parameters
+    ----------
+    nodes : (n, 3) undeformed, m.
+    triangles : (t, 3) of the surface, outwards.
+    """
+
+    def __init__(self, nodes: Array, triangles: NDArray[np.int64]) -> None:
+        self._undeformed, self._triangles = np.asarray(nodes, dtype=np.float64), np.asarray(triangles, dtype=np.int64)
+        self._on_surface = np.unique(triangles)
+
+    def find(self, deformed: Array) -> SelfPenetration:
+        """The nodes that lie inside another part of the solid, of nodes (n, 3) where they are now, m."""
+        deformed = np.ascontiguousarray(deformed, dtype=np.float64)
+        normals, longest = _normals(deformed, self._triangles), _longest_side(deformed, self._triangles)
+        asked = self._touching(deformed, normals, longest)
+        known = np.zeros(len(deformed), dtype=bool)
+        inside, depths = np.zeros(0, dtype=np.int64), np.zeros(0)
+        while len(asked):
+            known[asked] = True
+            windings, away = winding_numbers(asked, deformed, normals, self._triangles, longest)
+            found = windings > 1.0
+            inside, depths = np.append(inside, asked[found]), np.append(depths, away[found])
+            # Deeper ones are beside those found.
+            asked = np.unique(self._triangles[np.isin(self._triangles, asked[found]).any(axis=1)])
+            asked = asked[~known[asked]]
+        return SelfPenetration(inside, depths)
+
+    def _touching(self, deformed: Array, normals: Array, longest: float) -> NDArray[np.int64]:
+        """Nodes that have come near to others that face them, and may have passed them."""
+        pairs = KDTree(deformed[self._on_surface]).query_pairs(longest, output_type="ndarray")
+        one, other = self._on_surface[pairs].T
+        facing = np.einsum("px,px->p", normals[one], normals[other]) < 0.0
+        one, other = one[facing], other[facing]
+        was = np.linalg.norm(self._undeformed[one] - self._undeformed[other], axis=1)
+        between = deformed[one] - deformed[other]
+        near = np.linalg.norm(between, axis=1) < NEARER * was
+        one_behind = near & (np.einsum("px,px->p", between, normals[other]) < 0.0)
+        other_behind = near & (np.einsum("px,px->p", between, normals[one]) > 0.0)
+        return np.union1d(one[one_behind], other[other_behind])
+
+
+def _longest_side(nodes: Array, triangles: NDArray[np.int64]) -> float:
+    sides = nodes[triangles] - nodes[np.roll(triangles, -1, axis=1)]
+    return float(np.linalg.norm(sides, axis=2).max())
+
+
+def _normals(nodes: Array, triangles: NDArray[np.int64]) -> Array:
+    """Outward normals (n, 3) of a surface at its nodes, of any length."""
+    a, b, c = (nodes[triangles[:, corner]] for corner in range(3))
+    of_triangles, normals = np.cross(b - a, c - a), np.zeros_like(nodes)
+    for corner in range(3):
+        np.add.at(normals, triangles[:, corner], of_triangles)
+    return normals
+
+
+@njit(cache=True, nogil=True)
+def winding_numbers(asked, nodes, normals, triangles, longest):
+    """How often a surface winds around some of its own nodes, and how far its parts that face them are.
+
+    Parameters
+    ----------
+    asked : (k,) nodes.
+    nodes : (n, 3) where all nodes are.
+    normals : (n, 3) of the surface at the nodes.
+    triangles : (t, 3) of the closed surface.
+    longest : side of a triangle.
+
+    Returns
+    -------
+    Winding numbers (k,), and distances (k,), infinite where nothing faces the node.
+    """
+    windings, away = np.zeros(len(asked)), np.full(len(asked), np.inf)
+    for k in range(len(asked)):
+        node, total = asked[k], 0.0
+        x, y, z = nodes[node]
+        nx, ny, nz = normals[node]
+        for t in range(len(triangles)):
+            i, j, m = triangles[t]
+            if i == node or j == node or m == node:
+                continue
+            ax, ay, az = nodes[i, 0] - x, nodes[i, 1] - y, nodes[i, 2] - z
+            bx, by, bz = nodes[j, 0] - x, nodes[j, 1] - y, nodes[j, 2] - z
+            cx, cy, cz = nodes[m, 0] - x, nodes[m, 1] - y, nodes[m, 2] - z
+            na, nb = np.sqrt(ax * ax + ay * ay + az * az), np.sqrt(bx * bx + by * by + bz * bz)
+            nc = np.sqrt(cx * cx + cy * cy + cz * cz)
+            volume = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
+            ab, bc, ca = ax * bx + ay * by + az * bz, bx * cx + by * cy + bz * cz, cx * ax + cy * ay + cz * az
+            total += np.arctan2(volume, na * nb * nc + ab * nc + bc * na + ca * nb)
+            facing = nx * (normals[i, 0] + normals[j, 0] + normals[m, 0])
+            facing += ny * (normals[i, 1] + normals[j, 1] + normals[m, 1])
+            facing += nz * (normals[i, 2] + normals[j, 2] + normals[m, 2])
+            # No point of a triangle is nearer than its nearest corner less its longest side.
+            if facing < 0.0 and min(na, nb, nc) < away[k] + longest:
+                away[k] = min(away[k], _distance(nodes[triangles[t]] - nodes[node]))
+        windings[k] = total / (2.0 * np.pi)
+    return windings, away
+
+
+@njit(cache=True, nogil=True)
+def _distance(corners):
+    """Distance of a triangle (3, 3) from the origin: of its plane where the foot is inside, of its sides else."""
+    nearest, inside = np.inf, True
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    for k in range(3):
+        corner, side = corners[k], corners[(k + 1) % 3] - corners[k]
+        share = min(max(-np.dot(corner, side) / max(np.dot(side, side), 1e-300), 0.0), 1.0)
+        nearest = min(nearest, np.linalg.norm(corner + share * side))
+        inside = inside and np.dot(np.cross(corner, side), normal) > 0.0
+    if inside:
+        nearest = abs(np.dot(corners[0], normal)) / np.linalg.norm(normal)
+    return nearest

@@ -1,0 +1,82 @@
+"""Surfaces that pass through themselves, on shapes whose overlap is known in closed form."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morph_dslam.meshing.generators import block
+from morph_dslam.meshing.meshes import model_mesh_of
+from morph_dslam.model import Parameter
+from morph_dslam.reduction.self_penetration import SurfaceContact, penetration_report
+from morph_dslam.studies.problem import Snapshot
+
+THICK, LENGTH, RADIUS = 1.0, 40.0, 6.0
+
+
+def coiled(mesh, pitch, rise):
+    """The bar coiled along x: its axis is a spiral that shrinks by ``pitch`` and rises by ``rise`` a turn."""
+    along, across, aside = mesh.nodes.T
+    angle = -along / RADIUS
+    turns = along / RADIUS / (2.0 * np.pi)
+    radius = RADIUS - pitch * turns + across
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), aside + rise * turns])
+
+
+def inside_another_turn(mesh, pitch, rise):
+    """Whether a node is inside the bar a turn before or after, and how far from its nearest face (n,)."""
+    along, across, aside = mesh.nodes.T
+    depth = np.full(len(along), -np.inf)
+    for turn in (-1.0, 1.0):
+        there = along + turn * 2.0 * np.pi * RADIUS
+        r, z = across + turn * pitch, aside - turn * rise
+        faces = np.array([there, LENGTH - there, r, THICK - r, z, THICK - z])
+        depth = np.maximum(depth, faces.min(axis=0))
+    return depth
+
+
+def test_the_overlap_of_a_coiled_bar_is_found_node_by_node():
+    mesh = block((LENGTH, THICK, THICK), (160, 4, 4), "hex8")
+    pitch, rise = 0.7, 0.13
+    found = SurfaceContact(mesh.nodes, mesh.surface_triangles()).find(coiled(mesh, pitch, rise))
+    expected = inside_another_turn(mesh, pitch, rise)
+    on_surface = np.unique(mesh.surface_triangles())
+    surely = on_surface[expected[on_surface] > 0.02]
+    surely_not = on_surface[expected[on_surface] < -0.02]
+    assert len(surely) > 20
+    assert np.isin(surely, found.nodes).all()
+    assert not np.isin(found.nodes, surely_not).any()
+    # The turns overlap by what the pitch leaves of the bar's thickness.
+    assert found.depths.max() == pytest.approx(THICK - pitch, rel=0.05)
+
+
+def test_turns_that_pass_each_other_are_not_accused():
+    mesh = block((LENGTH, THICK, THICK), (160, 4, 4), "hex8")
+    surface = SurfaceContact(mesh.nodes, mesh.surface_triangles())
+    assert len(surface.find(coiled(mesh, 1.02, 0.0)).nodes) == 0
+    assert len(surface.find(coiled(mesh, 0.0, 1.02)).nodes) == 0
+    assert len(surface.find(mesh.nodes).nodes) == 0
+    # Strongly squeezed and sheared, but nowhere through itself.
+    sheared = mesh.nodes @ np.array([[0.3, 0.0, 0.0], [0.9, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    assert len(surface.find(sheared).nodes) == 0
+
+
+def test_the_certificate_names_the_states_and_the_depth():
+    mesh, parameters = (
+        block((LENGTH, THICK, THICK), (160, 4, 4), "hex8"),
+        (Parameter("pitch", "length", "m", 0.0, 2.0, 0.0),),
+    )
+    states = [
+        Snapshot(np.array([pitch]), {"displacement": coiled(mesh, pitch, 0.13) - mesh.nodes})
+        for pitch in (1.1, 0.9, 0.7)
+    ]
+    report = penetration_report(model_mesh_of(mesh), parameters, states)
+    assert report["checked"] == 3
+    assert [state["coordinates"] for state in report["states"]] == [[0.7], [0.9]]
+    assert [state["depth_mm"] for state in report["states"]] == pytest.approx([300.0, 100.0], rel=0.08)
+
+
+def test_an_open_surface_is_not_checked():
+    mesh = model_mesh_of(block((1.0, 1.0, 1.0), (2, 2, 2), "hex8"))
+    opened = replace(mesh, triangles=mesh.triangles[1:])
+    assert penetration_report(opened, (), []) is None
