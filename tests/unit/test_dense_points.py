@@ -1,5 +1,7 @@
 """Points by stereo of keyframes, and what they say of a place, on a rendered wedge whose surface is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -63,6 +65,19 @@ def test_points_move_a_place_onto_them(richer):
     step = np.linalg.solve(matrix[4:, 4:], right[4:])
     wanted = WORLD.apply(centre) - off.apply(centre)
     np.testing.assert_allclose(step, wanted, atol=0.25 * float(np.linalg.norm(wanted)))
+
+
+def test_measured_depth_takes_the_place_of_stereo():
+    """Images without contrast have no stereo; the points are where the depth says."""
+    points, views = scanned(SimilarityTransform.identity())
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform([0.0, 0.0], [CAMERA.width - 1.0, CAMERA.height - 1.0], (50, 2)).astype(np.float32)
+    depths = rng.uniform(0.3, 0.6, 50).astype(np.float32)
+    measuring = replace(views[0], depths=np.column_stack([pixels, depths]))
+    dense, (richer,) = with_dense_points(points, [measuring, *views[1:]], [measuring], CAMERA)
+    local = measuring.camera_from_world.apply(dense.positions[richer.point_ids[len(views[0].point_ids) :]])
+    np.testing.assert_allclose(CAMERA.project(local), pixels, atol=1e-3)
+    np.testing.assert_allclose(local[:, 2], depths, atol=1e-6)
 
 
 def test_points_of_a_large_plane_are_told_from_those_above_it():

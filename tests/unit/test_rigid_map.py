@@ -177,8 +177,10 @@ def test_keyframes_stay_that_show_what_others_do_not_or_that_candidates_wait_for
 def test_a_saved_map_has_only_the_keyframes_that_are_left(tmp_path):
     rigid_map = map_of([0, 1], [0, 1], [0, 1], [0, 1], n_points=2)
     rigid_map.remove_keyframe(1, carrier=0)
+    rigid_map.keyframes[2].depths = np.array([[4.0, 12.0, 0.75]], dtype=np.float32)
     save_map(tmp_path / "map.h5", rigid_map, CAMERA)
     loaded = load_scene(tmp_path / "map.h5", CAMERA).map
+    assert [keyframe.depths.tolist() for keyframe in loaded.keyframes] == [[], [[4.0, 12.0, 0.75]], []]
     assert [keyframe.index for keyframe in loaded.keyframes] == [0, 20, 30]
     assert loaded.template_keyframe.tolist() == [2, 2]
     assert loaded.keyframes[loaded.template_keyframe[0]].normalized[0, 0] == 3

@@ -35,6 +35,16 @@ def test_holes_edges_and_the_outside_give_no_depth():
     assert np.isnan(far).all()
 
 
+def test_samples_of_a_depth_image_are_on_its_plane_and_away_from_holes():
+    depth = slanted_depth().astype(np.float32)
+    depth[:30, :40] = np.nan
+    samples = DepthImage(depth, BASELINE_PX).samples()
+    columns, rows, found = samples.astype(float).T
+    assert len(samples) > 30
+    assert not ((columns < 40) & (rows < 30)).any()
+    assert found == pytest.approx(1.0 / (0.4 + 0.002 * columns - 0.001 * rows), rel=1e-5)
+
+
 def shifted_pair(disparity):
     texture = printed_texture(240, 320, seed=2)
     height, width = texture.shape

@@ -8,7 +8,9 @@ sweeping: Collins, A space-sweep approach to true multi-image matching, 1996; at
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -95,7 +97,7 @@ class _Depths:
 def with_dense_points(
     points: MapPoints, views: Sequence[View], chosen: Sequence[View], camera: Camera
 ) -> tuple[MapPoints, list[View]]:
-    """A map with the points that stereo of its keyframes adds, and the keyframes that have them.
+    """A map with the points that depth images of its keyframes, or their stereo, add, and the keyframes with them.
 
     Parameters
     ----------
@@ -104,7 +106,14 @@ def with_dense_points(
     chosen : those of them that are to have points; all are compared.
     camera : of the views, without distortion.
     """
-    measured = [_stereo(points, view, views, camera) for view in chosen]
+
+    def depths_of(view: View) -> _Depths:
+        if len(view.depths):
+            return _Depths(view.depths[:, :2].astype(float), view.depths[:, 2].astype(float))
+        return _stereo(points, view, views, camera)
+
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        measured = list(threads.map(depths_of, chosen))
     positions, viewpoints, count, richer = [points.positions], [points.viewpoints], len(points), []
     for view, found in zip(chosen, measured, strict=True):
         local = camera.rays(found.pixels) * found.depths[:, None]

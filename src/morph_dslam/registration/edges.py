@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 #: Cosine of the angle between two triangles from which their edge is seen, points along the edges of the size of the
 #: object, and the factor by which depth is drawn smaller.
 SHARP, SPACING, SHRINK = 0.85, 80, 2
+#: The same cosine, from which on the two triangles lie in one plane.
+FLAT = 1.0 - 1e-9
 #: Change of grey in a pixel that is an edge, and cosine to the direction expected.
 LEAST_EDGE, PARALLEL = 3.0, 0.8
 #: How far to either side edges are searched in turn, pixels.
@@ -41,6 +43,8 @@ EDGE_PX, SHIFT_PX = 1.0, 2.0
 CLICK_PX = 2.0
 #: An edge is where it is expected if it is as near, pixels; chance is asked this far to the sides.
 NEAR_PX, ASIDE_PX = 2.0, (8.0, 12.0, 16.0)
+#: Share of an object's edges that an image shows.
+SHOWN = 0.8
 #: Fewer points of edges in the images are no evidence.
 FEWEST = 30
 
@@ -84,6 +88,9 @@ class MeshEdges:
         other = np.where(uses == 2, owner[order[np.minimum(first + 1, len(order) - 1)]], -1)
         normals = triangle_normals(nodes, triangles)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        # An edge within a plane is never seen.
+        bent = (other < 0) | (np.einsum("ex,ex->e", normals[one], normals[other]) < FLAT)
+        ends, one, other = ends[bent], one[bent], other[bent]
         length = np.linalg.norm(nodes[ends[:, 1]] - nodes[ends[:, 0]], axis=1)
         edge, share = _spaced(length, self.size / SPACING)
         start, self._along = nodes[ends[edge, 0]], (nodes[ends[:, 1]] - nodes[ends[:, 0]])[edge]
@@ -246,11 +253,17 @@ class EdgeEvidence:
 
     @property
     def total(self) -> float:
-        """As `gain`, of all edges."""
+        """The mean log likelihood of all edges on the object over that by chance, 1 where all are seen.
+
+        Of the object's edges an image shows the part `SHOWN`, or what it shows by chance if that is more.
+        """
         every = max(self.count + self.n_inner, 1)
         share = (self.count * self.share + self.n_inner * self.inner) / every
         chance = (self.count * self.chance + self.n_inner * self.inner_chance) / every
-        return _beyond_chance(share, chance)
+        chance = float(np.clip(chance, 0.01, 0.95))
+        seen = np.log(max(SHOWN, chance) / chance)
+        missed = np.log((1.0 - max(SHOWN, chance)) / (1.0 - chance))
+        return float(share + (1.0 - share) * missed / max(seen, 1e-9)) if seen > 0.0 else 0.0
 
     @property
     def gain(self) -> float:

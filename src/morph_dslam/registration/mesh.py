@@ -37,7 +37,14 @@ from morph_dslam.registration.registration import Axis
 from morph_dslam.registration.scene import MapPoints, View, spread_views
 from morph_dslam.registration.search_space import attitudes, candidate_regions, find_planes
 from morph_dslam.registration.texture import TextureComparison
-from morph_dslam.registration.view_registration import NO_HINTS, Claimed, EdgeRegistration, EdgeSearch, Hints
+from morph_dslam.registration.view_registration import (
+    NO_HINTS,
+    TELLING_CHANCE,
+    Claimed,
+    EdgeRegistration,
+    EdgeSearch,
+    Hints,
+)
 
 Array = NDArray[np.float64]
 #: Sizes at which the surface starts, over that of the region.
@@ -62,9 +69,9 @@ AMBIGUOUS = 0.8
 #: An object laid by its edges is confirmed from this score on; where landmarks have it there, if so much of its outline
 #: is on edges, of what chance does not put there. Its images are believed before its edges unless they lose more than
 #: this part of the score.
-CONFIRMED, CONFIRMED_BY_CLICKS, LOST = 15.0, 0.5, 5.0
-#: The edges speak against a place found by points below this, if chance puts less than that on edges.
-AGAINST, TELLING_CHANCE = 0.25, 0.5
+CONFIRMED, CONFIRMED_BY_CLICKS, LOST = 10.0, 0.5, 5.0
+#: The edges speak against a place found by points below this.
+AGAINST = 0.25
 #: So many of the best places are compared by the images on them, if they score at least this part of the
 #: best. Images that differ by more than this, pixels, or so many times as much as on another place, speak
 #: against a place.
@@ -182,11 +189,16 @@ def register_mesh(
         return _by_edges(places, search, points, views, metric, bool(hints.clicks))
     if _clear([place.rank for place in places]):
         return _by_edges(places, search, points, views, metric)
-    found = _by_points(search, points, views, metric, progress)
-    there = search.at(found.world_from_object)
-    if places and 100.0 * places[0].rank >= CONFIRMED and there.rank < AMBIGUOUS * places[0].rank:
+    by_edges = bool(places) and 100.0 * places[0].rank >= CONFIRMED
+    try:
+        found = _by_points(search, points, views, metric, progress)
+    except RegistrationError:
+        if not by_edges:
+            raise
         return _by_edges(places, search, points, views, metric)
-    # On a dense texture, edges are everywhere and say nothing.
+    there = search.at(found.world_from_object)
+    if by_edges and there.rank < AMBIGUOUS * places[0].rank:
+        return _by_edges(places, search, points, views, metric)
     informative = 0.0 < there.edges.chance < TELLING_CHANCE
     return replace(found, edges=there.edges) if informative and there.edges.gain < AGAINST else found
 
@@ -207,6 +219,7 @@ def _by_edges(
     """The best of the places, refined by the images on it where its edges stay; the others are its rivals."""
     best, nodes, triangles = places[0], search.edges.nodes, search.edges.triangles
     axis, score = search.surface.axis_of_revolution, 100.0 * best.rank
+    asked = spread_views(views, MOST_ASKED)
     found = MeshRegistration(
         best.place,
         best.covariance,
@@ -215,7 +228,7 @@ def _by_edges(
         int(best.points.explained.sum()),
         None,
         axis,
-        outline=outline_fit(best.place, nodes, triangles, spread_views(views, MOST_ASKED), search.camera),
+        outline=outline_fit(best.place, nodes, triangles, asked, search.camera),
         unconfirmed=not by_clicks and score < CONFIRMED,
         edges=best.edges,
         by_clicks=by_clicks,
@@ -230,7 +243,8 @@ def _by_edges(
     there = search.at(adjusted.world_from_object)
     if adjusted.keyframes is None or 100.0 * there.rank < score - LOST:
         return found
-    return replace(adjusted, edges=there.edges)
+    outline = outline_fit(adjusted.world_from_object, nodes, triangles, asked, search.camera)
+    return replace(adjusted, edges=there.edges, outline=outline)
 
 
 def _by_points(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -44,6 +44,7 @@ class View:
     camera_from_world : its pose.
     point_ids : (k,) rows of the map points seen.
     pixels : (k, 2) where.
+    depths : (m, 3) column, row and depth, metres, where a depth image measured it.
     """
 
     frame: int
@@ -51,6 +52,7 @@ class View:
     camera_from_world: RigidTransform
     point_ids: NDArray[np.int64]
     pixels: Array
+    depths: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 3), dtype=np.float32))
 
 
 def points_and_views(scene: Scene) -> tuple[MapPoints, Sequence[View]]:
@@ -64,7 +66,9 @@ def points_and_views(scene: Scene) -> tuple[MapPoints, Sequence[View]]:
         pose = RigidTransform.from_matrix(keyframe.camera_from_world)
         seen = row[keyframe.point_ids]
         kept = seen >= 0
-        views.append(View(keyframe.index, keyframe.normalized, pose, seen[kept], keyframe.pixels[kept]))
+        views.append(
+            View(keyframe.index, keyframe.normalized, pose, seen[kept], keyframe.pixels[kept], keyframe.depths)
+        )
         total[seen[kept]] += pose.inverse.translation
         count[seen[kept]] += 1.0
     used = count > 0

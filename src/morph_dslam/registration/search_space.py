@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
@@ -33,21 +34,46 @@ ALIKE = 0.1
 
 def plane_points(points: Array, thickness: float, rng: np.random.Generator) -> NDArray[np.bool_]:
     """Points (n,) of the plane that holds most of them, by RANSAC; none if it holds too few."""
-    chosen = np.array([rng.choice(len(points), 3, replace=False) for _ in range(TRIALS)])
-    a, b, c = points[chosen].transpose(1, 0, 2)
-    normals = np.cross(b - a, c - a)
-    lengths = np.linalg.norm(normals, axis=1)
-    planes = lengths > 0.0
-    a, normals = a[planes], normals[planes] / lengths[planes, None]
-    near = np.abs(normals @ points.T - np.einsum("tx,tx->t", normals, a)[:, None]) <= thickness
-    if not len(near):
-        return np.zeros(len(points), dtype=bool)
-    best = near[near.sum(axis=1).argmax()]
-    if best.sum() < 3:
+    if not len(points):
+        return np.zeros(0, dtype=bool)
+    normal, offset = fullest_plane(points, rng.integers(len(points), size=(TRIALS, 3)), thickness)
+    best = np.abs(points @ normal - offset) <= thickness
+    if best.sum() < 3 or not normal.any():
         return np.zeros(len(points), dtype=bool)
     centre = points[best].mean(axis=0)
     normal = np.linalg.svd(points[best] - centre, full_matrices=False)[2][-1]
     return np.abs((points - centre) @ normal) <= thickness
+
+
+@njit(cache=True, nogil=True)
+def fullest_plane(points, triples, thickness):
+    """The plane through three points that has most of them within its thickness.
+
+    Parameters
+    ----------
+    points : (n, 3).
+    triples : (t, 3) indices of the points to try; those on one line are left out.
+    thickness : to either side.
+
+    Returns
+    -------
+    The unit normal (3,) of the plane, and its distance from the origin along it; 0 if there is none.
+    """
+    normal, offset, most = np.zeros(3), 0.0, 0
+    for t in range(len(triples)):
+        a, b, c = points[triples[t, 0]], points[triples[t, 1]], points[triples[t, 2]]
+        across = np.cross(b - a, c - a)
+        length = np.sqrt(np.sum(across**2))
+        if length == 0.0:
+            continue
+        across, count = across / length, 0
+        away = across[0] * a[0] + across[1] * a[1] + across[2] * a[2]
+        for p in range(len(points)):
+            here = across[0] * points[p, 0] + across[1] * points[p, 1] + across[2] * points[p, 2]
+            count += abs(here - away) <= thickness
+        if count > most:
+            normal, offset, most = across, away, count
+    return normal, offset
 
 
 def on_large_planes(points: Array, thickness: float) -> NDArray[np.bool_]:

@@ -1,6 +1,7 @@
 """Registration of a mesh by its edges in keyframes, with or without hints of where it is.
 
-One keyframe is searched for the object's edges, or landmarks say where it is in a frame. Points by stereo on each
+Up to three keyframes are searched for the object's edges, or landmarks say where it is in a frame. Points by depth
+images or stereo on each
 hypothesis give the unit and speak for it. The best ones are fitted to points and edges of all keyframes: a place that
 is right has its edges on theirs and their points on its surface, and a chance place seldom has both.
 """
@@ -35,14 +36,19 @@ FEWEST_AGREEING, AGREEING_SHARE = 6, 0.6
 UNIT_ERROR = 0.12
 #: Log likelihood for a point that agrees, and against one that does not.
 AGREES = 0.5
-#: Hypotheses (of the second ranking, twice as many) fitted to few keyframes, keyframes for it, and those of more.
-N_FITTED, FEW_VIEWS, N_FINE, MORE_VIEWS = 60, 4, 8, 8
-#: Of these, the best so many are fitted again from where each keyframe alone would have them.
-N_AGAIN = 3
+#: Hypotheses of each ranking fitted to their own keyframe.
+N_BY_ALL, N_BY_TELLING = 60, 300
+#: Of these, the best fitted to few keyframes, keyframes for it, and those of more.
+N_FITTED, FEW_VIEWS, N_FINE, MORE_VIEWS = 40, 4, 8, 8
+#: Edges say nothing where chance puts so much of an outline on some.
+TELLING_CHANCE = 0.5
+#: No other keyframe is searched if a place has such a rank, and the next one less than such a part of it. Places as
+#: good are fitted again from where each keyframe alone would have them.
+ENOUGH, MUCH_WORSE = 0.2, 0.5
 #: Hypotheses are alike in a square of so many pixels and within this of the size (log); so many of them are fitted.
 CELL, SIZES_ALIKE, MOST_ALIKE = 64, 0.36, 3
-#: Pixels searched in turn for them: with few keyframes, with more of them, and from near.
-ROUGH, FINE, NEAREST = (12, 8, 6, 4, 3), (8, 6, 5, 4, 3), (4, 3, 3, 3, 3, 3)
+#: Pixels searched in turn for them: in one keyframe, with few, with more of them, and from near.
+QUICK, ROUGH, FINE, NEAREST = (8, 5, 3), (12, 8, 6, 4, 3), (8, 6, 5, 4, 3), (4, 3, 3, 3, 3, 3)
 #: Keyframes that get points by stereo.
 N_STEREO = 8
 #: Where there are too few points to agree, edges decide among such places.
@@ -139,7 +145,28 @@ class EdgeSearch:
 
         Raises RegistrationError if a hint names what is not there.
         """
-        starts = self._by_clicks() if self._hints.clicks else self._in_keyframe()
+        if self._hints.clicks:
+            return self._polished(self._fitted_from(self._by_clicks()))
+        found: list[EdgeRegistration] = []
+        for view in self._searched():
+            found = self._distinct(found + self._fitted_from(self._in_keyframe(view)))
+            ranks = [each.rank for each in found[:2]]
+            if ranks and ranks[0] >= ENOUGH and sum(ranks[1:]) <= MUCH_WORSE * ranks[0]:
+                break
+            # On a dense texture, edges are everywhere and say nothing, in other keyframes neither.
+            if found and found[0].edges.chance >= TELLING_CHANCE:
+                break
+        return self._polished(found)
+
+    def _searched(self) -> list[View]:
+        """Keyframes in which the object is searched: that of the region; or one in the middle, an early, a late one."""
+        views = self._dense[1]
+        if self._hints.region is not None or not views:
+            return views[:1]
+        return [views[k] for k in dict.fromkeys([len(views) // 2, len(views) // 6, 5 * len(views) // 6])]
+
+    def _fitted_from(self, starts: Sequence[SimilarityTransform]) -> list[EdgeRegistration]:
+        """Distinct places near some others, the best first."""
         few = EdgeImages(spread_views(self._views, FEW_VIEWS), self.camera)
         rough = []
         for start in starts:
@@ -149,8 +176,15 @@ class EdgeSearch:
         for _, place in sorted(rough, key=lambda pair: -pair[0]):
             if len(found) < N_FINE and not any(self._same(place, other.place) for other in found):
                 found.append(self._fitted(place, self._images(place), FINE))
-        found.sort(key=lambda each: -each.rank)
-        found = [self._again(each) for each in found[:N_AGAIN]] + found[N_AGAIN:]
+        return self._distinct(found)
+
+    def _polished(self, found: Sequence[EdgeRegistration]) -> list[EdgeRegistration]:
+        """Distinct places, the best first, those that may be right fitted from other starts, too."""
+        best = max((each.rank for each in found), default=0.0)
+        return self._distinct([self._again(each) if each.rank >= MUCH_WORSE * best else each for each in found])
+
+    def _distinct(self, found: Sequence[EdgeRegistration]) -> list[EdgeRegistration]:
+        """Those that are not the same place as a better one, the best first."""
         kept: list[EdgeRegistration] = []
         for each in sorted(found, key=lambda each: -each.rank):
             if not any(self._same(each.place, other.place) for other in kept):
@@ -168,7 +202,7 @@ class EdgeSearch:
         )
 
     def _fitted(self, start: SimilarityTransform, images: EdgeImages, reaches: Sequence[float]) -> EdgeRegistration:
-        """The place near ``start`` for which most speaks: by points and edges, then by edges in its size, or by edges.
+        """The place near ``start`` for which most speaks: by edges in the size that points and edges give, or by edges.
 
         Points bring in what is far and give the size. But those around the object's foot may pull it, and edges are
         more exact.
@@ -181,7 +215,7 @@ class EdgeSearch:
         count = max(1, len(images.views))
         fits = [
             EdgeRegistration(place, covariance * count, images.evidence(edges, place), self.points_at(place))
-            for place, covariance in (by_both, by_edges, (in_size, by_both[1]))
+            for place, covariance in (by_edges, (in_size, by_both[1]))
         ]
         return max(fits, key=lambda each: each.rank)
 
@@ -209,8 +243,10 @@ class EdgeSearch:
 
     def points_at(self, place: SimilarityTransform, most: int = MORE_VIEWS) -> PointEvidence:
         """What the points seen in so many keyframes say of a place."""
+        return self._points_in(place, views_of(self.edges.nodes, place, self._dense[1], self.camera, most))
+
+    def _points_in(self, place: SimilarityTransform, views: Sequence[View]) -> PointEvidence:
         nodes, triangles = self.edges.nodes, self.edges.triangles
-        views = views_of(nodes, place, self._dense[1], self.camera, most)
         tolerance = TOLERANCE * self.edges.size * place.scale
         positions = self._dense[0].positions
         return gather_evidence(place, nodes, triangles, positions, views, self.camera, tolerance, DEPTH_NOISE)
@@ -219,7 +255,10 @@ class EdgeSearch:
     def _dense(self) -> tuple[MapPoints, list[View]]:
         """The map with the points of edges and texture of some keyframes, and these."""
         asked = [] if self._hints.region is None else [self._keyframe(self._hints.region[0])]
-        spread = [view for view in spread_views(self._views, N_STEREO) if all(view is not each for each in asked)]
+        # Depth that was measured needs no other keyframe, and has no errors of their poses.
+        with_depth = [view for view in self._views if len(view.depths)] if self._metric else []
+        spread = spread_views(with_depth or self._views, N_STEREO)
+        spread = [view for view in spread if all(view is not each for each in asked)]
         points, views = with_dense_points(self._points, self._views, asked + spread, self.camera)
         return (points, views) if self._claimed is None else self._claimed(points, views)
 
@@ -242,13 +281,9 @@ class EdgeSearch:
     def _on_it(self) -> PointsOnSurface:
         return PointsOnSurface(self._dense[0], self.surface, len(self._dense[1]))
 
-    def _in_keyframe(self) -> list[SimilarityTransform]:
-        """Where one keyframe may show the object, and the map has points that agree.
-
-        It is that of the region, or one in the middle.
-        """
+    def _in_keyframe(self, view: View) -> list[SimilarityTransform]:
+        """Where a keyframe may show the object, and the map has points that agree, the best first."""
         hints, camera = self._hints, self.camera
-        view = self._dense[1][0 if hints.region is not None else len(self._dense[1]) // 2]
         if not np.ptp(view.normalized) > 0:
             return []
         frame_size = (0.0, 0.0, float(camera.width), float(camera.height))
@@ -266,7 +301,12 @@ class EdgeSearch:
         if not len(places) or not len(sizes):
             return []
         found = hypotheses(self.edges, view, camera, sizes, places)
-        return [] if found is None else self._agreeing(found, view)
+        starts = [] if found is None else self._agreeing(found, view)
+        one, ranked = EdgeImages([view], camera), []
+        for start in starts:
+            place = one.refine(self.edges, start, True, QUICK, (), self._on_it)[0]
+            ranked.append((_rank(one.evidence(self.edges, place), self._points_in(place, [view])), place))
+        return [place for _, place in sorted(ranked, key=lambda pair: -pair[0])[:N_FITTED]]
 
     def _agreeing(self, found: InView, view: View) -> list[SimilarityTransform]:
         """The best of the hypotheses by their edges and by the points of the map in their outline."""
@@ -278,7 +318,7 @@ class EdgeSearch:
         by_all = np.where(mostly, found.gains + AGREES * (agreeing - 2 * others), -np.inf)
         by_telling = np.where(possible, found.gains + AGREES * (off_planes - others), -np.inf)
         # A large plane fits any flat face, so that its points may mislead; but the object's faces may be planes.
-        best = [*_diverse(found, by_all, N_FITTED, N_FITTED), *_diverse(found, by_telling, 2 * N_FITTED, MOST_ALIKE)]
+        best = [*_diverse(found, by_all, N_BY_ALL, N_BY_ALL), *_diverse(found, by_telling, N_BY_TELLING, MOST_ALIKE)]
         return [placed(found.pose(k), view, float(unit[k]), self._metric) for k in dict.fromkeys(best)]
 
     def _by_clicks(self) -> list[SimilarityTransform]:

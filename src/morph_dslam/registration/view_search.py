@@ -10,17 +10,20 @@ that a cluttered print does not win by its many edges.
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, SimilarityTransform
-from morph_dslam.registration.edges import LEAST_EDGE, MeshEdges
+from morph_dslam.registration.edges import LEAST_EDGE, SHOWN, MeshEdges
 from morph_dslam.registration.scene import HasPose, MapPoints, View
 
 Array = NDArray[np.float64]
@@ -28,8 +31,8 @@ Array = NDArray[np.float64]
 N_SIDES, N_TURNS, N_POINTS, N_DIRECTIONS = 160, 24, 48, 8
 #: The image is halved; a point meets an edge within so many of these pixels, and the drawing moves by so many.
 HALF, TOLERANCE, STEP = 2, 2.0, 4
-#: Share of the object's edges that an image shows; window over which chance is measured, pixels of the halved image.
-SHOWN, WINDOW = 0.8, 65
+#: Window over which chance is measured, pixels of the halved image.
+WINDOW = 65
 #: Apparent diameters tried, over the image's height, and the factor from one to the next.
 SMALLEST, LARGEST, FACTOR = 0.12, 0.9, 1.2
 #: Points of the map are this near to the object's middle, over the image's height.
@@ -294,8 +297,8 @@ def hypotheses(edges: MeshEdges, view: View, camera: Camera, sizes: Array, place
     gains = edge_gains(view)
     columns, rows = np.rint((places + 0.5) / HALF - 0.5).astype(np.int64).T
     cells = rows // CELL * 10000 + columns // CELL
-    found = []
-    for size in sizes:
+
+    def of_size(size: float) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.int16], Array]:
         best = np.zeros((len(places), len(drawings.rotations)), np.float32)
         which = np.zeros(best.shape, np.int16)
         lay_over(gains, drawings.offsets, drawings.normals, N_TURNS, size / HALF, columns, rows, best, which)
@@ -306,7 +309,10 @@ def hypotheses(edges: MeshEdges, view: View, camera: Camera, sizes: Array, place
         at = np.concatenate(kept)
         chosen = np.argsort(-best[at, sides])[:MOST]
         at, sides = at[chosen], sides[chosen]
-        found.append((best[at, sides].astype(float), np.full(len(at), size), sides, which[at, sides], places[at]))
+        return best[at, sides].astype(float), np.full(len(at), size), sides, which[at, sides], places[at]
+
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        found = list(threads.map(of_size, sizes.tolist()))
     gain, apparent, side, turn, place = (np.concatenate(part) for part in zip(*found, strict=True))
     centre = 0.5 * (edges.nodes.min(axis=0) + edges.nodes.max(axis=0))
     return InView(drawings, centre, edges.size, camera, gain, apparent, side, turn.astype(np.int64), place)
@@ -322,8 +328,10 @@ def sizes_and_places(camera: Camera, pixels: Array) -> tuple[Array, Array]:
     step, near = STEP * HALF, NEAR * camera.height
     grid = np.stack(np.meshgrid(np.arange(step, camera.width, step), np.arange(step, camera.height, step)), axis=-1)
     places = grid.reshape(-1, 2).astype(float)
-    apart = np.linalg.norm(places[:, None] - pixels[None], axis=2)
-    return sizes, places[(apart < near).sum(axis=1) >= FEWEST_POINTS]
+    if not len(pixels):
+        return sizes, places[:0]
+    count_near = KDTree(pixels).query_ball_point(places, near, return_length=True)
+    return sizes, places[np.asarray(count_near) >= FEWEST_POINTS]
 
 
 def map_unit(

@@ -141,6 +141,8 @@ SEARCH_PX = 6
 ROW_HALF, ROW_CLEARNESS = 5, 1.25
 #: A point's rows in both rectified images differ by less than this, pixels.
 MOST_ROW_ERROR = 0.75
+#: Every so many pixels in both directions a depth image is sampled for a keyframe.
+SAMPLED = 8
 #: Baseline, metres, that depth images are taken to have: structured light's noise is then half a pixel.
 VIRTUAL_BASELINE = 0.08
 
@@ -150,6 +152,10 @@ class FrameDepth(Protocol):
 
     def right_columns(self, pixels: Array, expected: Array | None = None) -> Array:
         """Columns (n,) of pixels (n, 2) in the right image, NaN if not measured or not near ``expected``."""
+        ...
+
+    def samples(self) -> NDArray[np.float32]:
+        """Column, row and depth (m, 3), metres, of pixels spread over the image, where they are measured anyway."""
         ...
 
 
@@ -182,6 +188,14 @@ class DepthImage:
         result[rows[smooth]] = (pixels[rows, 0] - (weights * disparity).sum(axis=0))[smooth]
         return _near(result, expected)
 
+    def samples(self) -> NDArray[np.float32]:
+        """As `FrameDepth` says; none next to edges and holes."""
+        height, width = self.depth.shape
+        row, column = np.mgrid[SAMPLED // 2 : height : SAMPLED, SAMPLED // 2 : width : SAMPLED]
+        pixels = np.column_stack([column.ravel(), row.ravel()]).astype(float)
+        depths = depth_of(pixels, self.right_columns(pixels), self.baseline_px)
+        return np.column_stack([pixels, depths])[np.isfinite(depths)].astype(np.float32)
+
 
 @dataclass(frozen=True)
 class StereoImages:
@@ -205,6 +219,10 @@ class StereoImages:
         good &= (likeness > LEAST_CORRELATION) & (np.abs(found[:, 1] - seen[:, 1]) < MOST_ROW_ERROR)
         result[rows[good]] = found[good, 0]
         return _near(result, expected)
+
+    def samples(self) -> NDArray[np.float32]:
+        """None: each pixel would have to be searched."""
+        return np.empty((0, 3), dtype=np.float32)
 
 
 def _near(columns: Array, expected: Array | None) -> Array:

@@ -102,6 +102,8 @@ class _PosedTracker(Tracker):
 
 FORMAT, VERSION = "morph-dslam map", 4
 KEYFRAME_ARRAYS = ("normalized", "camera_from_world", "point_ids", "pixels", "right", "described_ids", "descriptors")
+#: Maps of earlier releases have none.
+LATER_KEYFRAME_ARRAYS = ("depths",)
 TRAJECTORY_ARRAYS = ("timestamps", "world_from_camera", "indices")
 
 
@@ -122,7 +124,7 @@ def save_map(path: Path, rigid_map: RigidMap, camera: Camera, trajectory: Trajec
         for number, keyframe in enumerate(rigid_map.keyframes[k] for k in kept):
             group = file.create_group(f"keyframes/{number:06d}")
             group.attrs.update({"index": keyframe.index, "timestamp": keyframe.timestamp})
-            for name in KEYFRAME_ARRAYS:
+            for name in KEYFRAME_ARRAYS + LATER_KEYFRAME_ARRAYS:
                 packed = {"compression": "gzip", "compression_opts": 1} if name == "normalized" else {}
                 group.create_dataset(name, data=getattr(keyframe, name), **packed)
         for name in TRAJECTORY_ARRAYS if trajectory is not None else ():
@@ -171,8 +173,10 @@ def _read(path: Path, file: h5py.File, camera: Camera) -> RigidMap:
     rigid_map.merged_into = np.arange(len(rigid_map.state))
     for name in keyframes:
         arrays = [np.asarray(keyframes[f"{name}/{array}"]) for array in KEYFRAME_ARRAYS]
+        later = [array for array in LATER_KEYFRAME_ARRAYS if f"{name}/{array}" in keyframes]
         index, timestamp = (np.asarray(keyframes[name].attrs[key]).item() for key in ("index", "timestamp"))
-        rigid_map.keyframes.append(Keyframe(index, timestamp, *arrays))
+        optional = {array: np.asarray(keyframes[f"{name}/{array}"]) for array in later}
+        rigid_map.keyframes.append(Keyframe(index, timestamp, *arrays, **optional))
     return rigid_map
 
 

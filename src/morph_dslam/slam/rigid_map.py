@@ -56,6 +56,7 @@ class Keyframe:
     pixels : (k, 2) where.
     right : (k,) their columns in a right image (`Followed`); all unmeasured by default.
     described_ids, descriptors : (d,), (d, 32) what points looked like, by `frame_images.describe`.
+    depths : (m, 3) column, row and depth, metres, where a depth image measured it (`FrameDepth.samples`).
     carrier : number of the keyframe that stands for this one since it was taken out, -1 before.
     from_carrier : (4, 4) this one as seen from it.
     """
@@ -69,6 +70,7 @@ class Keyframe:
     right: Array = None  # type: ignore[assignment]
     described_ids: Indices = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     descriptors: NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 32), dtype=np.uint8))
+    depths: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 3), dtype=np.float32))
     carrier: int = field(default=-1, kw_only=True)
     from_carrier: Array = field(default_factory=lambda: np.eye(4), kw_only=True)
 
@@ -79,7 +81,12 @@ class Keyframe:
     @classmethod
     def of_view(cls, view: FrameView, camera_from_world: Array, seen: Followed) -> Keyframe:
         """A frame at a pose (4, 4), with the points seen in it."""
-        return cls(view.index, view.timestamp, view.normalized, camera_from_world, seen.ids, seen.pixels, seen.right)
+        keyframe = cls(
+            view.index, view.timestamp, view.normalized, camera_from_world, seen.ids, seen.pixels, seen.right
+        )
+        if view.depth is not None:
+            keyframe.depths = view.depth.samples()
+        return keyframe
 
     def describe(self, grey: NDArray[np.uint8]) -> None:
         """Describe what its points look like in its grey image (h, w), so that they can be recognised."""
