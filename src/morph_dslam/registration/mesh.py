@@ -66,10 +66,10 @@ TOLERANCE = 0.015
 FEWEST_EXPLAINED = 20
 #: The runner-up's score over the best's above which they are ambiguous.
 AMBIGUOUS = 0.8
-#: An object laid by its edges is confirmed from this score on; where landmarks have it there, if so much of its outline
-#: is on edges, of what chance does not put there. Its images are believed before its edges unless they lose more than
-#: this part of the score.
-CONFIRMED, CONFIRMED_BY_CLICKS, LOST = 10.0, 0.5, 5.0
+#: An object laid by its edges is confirmed from this score on, if so much of its outline is on edges, of what chance
+#: does not put there; where landmarks have it, by the outline alone. Its images are believed before its edges unless
+#: they lose more than this part of the score.
+CONFIRMED, OUTLINE_SHOWN, LOST = 10.0, 0.5, 5.0
 #: The edges speak against a place found by points below this.
 AGAINST = 0.25
 #: So many of the best places are compared by the images on them, if they score at least this part of the
@@ -98,7 +98,6 @@ class MeshRegistration:
     unconfirmed : whether there are images, but nothing on the object could be compared in them: a floor and a
         wall, say, that have its shape in another size.
     edges : how much of its edges the keyframes show, if it was found by these or they contradict the points.
-    by_clicks : whether landmarks say where it is.
     """
 
     world_from_object: SimilarityTransform
@@ -112,7 +111,6 @@ class MeshRegistration:
     outline: OutlineFit = field(default_factory=OutlineFit)
     unconfirmed: bool = False
     edges: EdgeEvidence | None = None
-    by_clicks: bool = False
 
     @property
     def warnings(self) -> tuple[RegistrationWarning, ...]:
@@ -132,8 +130,8 @@ class MeshRegistration:
 
     @property
     def _lacks_edges(self) -> bool:
-        """Whether the keyframes show too little of its edges."""
-        return self.edges is not None and self.edges.gain < (CONFIRMED_BY_CLICKS if self.by_clicks else AGAINST)
+        """Whether the keyframes show too little of its outline."""
+        return self.edges is not None and self.edges.gain < OUTLINE_SHOWN
 
     @property
     def ambiguous(self) -> bool:
@@ -231,7 +229,6 @@ def _by_edges(
         outline=outline_fit(best.place, nodes, triangles, asked, search.camera),
         unconfirmed=not by_clicks and score < CONFIRMED,
         edges=best.edges,
-        by_clicks=by_clicks,
     )
     aligned = TextureComparison(nodes, triangles, search.camera).refine(best.place, views, metric)
     if aligned is None or aligned[1] > POOR_AGREEMENT_PX:

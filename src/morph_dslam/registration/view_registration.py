@@ -1,9 +1,9 @@
 """Registration of a mesh by its edges in keyframes, with or without hints of where it is.
 
 Up to three keyframes are searched for the object's edges, or landmarks say where it is in a frame. Points by depth
-images or stereo on each
-hypothesis give the unit and speak for it. The best ones are fitted to points and edges of all keyframes: a place that
-is right has its edges on theirs and their points on its surface, and a chance place seldom has both.
+images or stereo on each hypothesis give the unit and speak for it. The best ones are fitted to points and edges of all
+keyframes: a place that is right has its edges on theirs and their points on its surface, and a chance place seldom has
+both.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ N_FITTED, FEW_VIEWS, N_FINE, MORE_VIEWS = 40, 4, 8, 8
 TELLING_CHANCE = 0.5
 #: No other keyframe is searched if a place has such a rank, and the next one less than such a part of it. Places as
 #: good are fitted again from where each keyframe alone would have them.
-ENOUGH, MUCH_WORSE = 0.2, 0.5
+ENOUGH, MUCH_WORSE = 0.3, 0.5
 #: Hypotheses are alike in a square of so many pixels and within this of the size (log); so many of them are fitted.
 CELL, SIZES_ALIKE, MOST_ALIKE = 64, 0.36, 3
 #: Pixels searched in turn for them: in one keyframe, with few, with more of them, and from near.
