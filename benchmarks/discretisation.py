@@ -22,11 +22,18 @@ HEIGHT, RADIUS, DEPTH, FOLDS = 90.0, 30.0, 4.0, 4
 DIVISIONS = (38, 2, 21)
 
 
-def bellows() -> Any:
-    """The study; the wall is 3 mm thick."""
-    z = np.linspace(0.0, HEIGHT, DIVISIONS[0] + 1)
+def bellows(divisions: tuple[int, int, int], pull: str, sampling: dict[str, Any]) -> Any:
+    """The study; the wall is 3 mm thick. The top moves up by ``pull``, an expression of the lever's angle."""
+    z = np.linspace(0.0, HEIGHT, divisions[0] + 1)
     profile = np.column_stack([RADIUS + DEPTH * np.cos(2.0 * np.pi * FOLDS * z / HEIGHT), z])
-    turned = {"kind": "rotation", "on": "top", "axis": [0, 1, 0], "centre": ["0 mm", "0 mm", "45 mm"], "angle": "lever"}
+    turned = {
+        "kind": "rotation",
+        "on": "top",
+        "axis": [0, 1, 0],
+        "centre": ["0 mm", "0 mm", "45 mm"],
+        "angle": "lever",
+        "translation": ["0 mm", "0 mm", pull],
+    }
     return md.make_study(
         {
             "name": "bellows",
@@ -35,20 +42,20 @@ def bellows() -> Any:
                 "profile": profile.tolist(),
                 "unit": "mm",
                 "thickness": "3 mm",
-                "divisions": list(DIVISIONS),
+                "divisions": list(divisions),
                 "cells": "hex8",
             },
             "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.45}},
             "supports": [{"kind": "fixed", "on": "bottom"}, turned],
             "parameters": {"lever": {"range": ["0 deg", "52 deg"]}},
-            "sampling": {"training": 128, "held_out": 40, "refined": 3},
+            "sampling": sampling,
             "solver": {"workers": 1, "threads": 1},
         }
     )
 
 
 def main() -> None:
-    study = bellows()
+    study = bellows(DIVISIONS, "0 mm", {"scheme": "sobol", "training": 128, "held_out": 40, "refined": 3})
     with tempfile.TemporaryDirectory() as folder:
         stated = md.build(study, Path(folder) / "bellows.morph").certificate["discretisation"]
     own, second, third = (study.problem(options) for options in (None, SolidOptions(order=2), SolidOptions(order=3)))

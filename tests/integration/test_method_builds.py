@@ -88,4 +88,4 @@ def test_defaults_follow_the_study():
     one = json.loads(json.dumps(BLOCK)) | {"parameters": {"bend": BLOCK["parameters"]["bend"]}, "reduction": {}}
     del one["supports"][1]["translation"]
     single = resolve_defaults(make_study(one))
-    assert (single.reduction.method, single.sampling.scheme) == ("pod", "sobol")
+    assert (single.reduction.method, single.sampling.scheme) == ("pod", "adaptive")

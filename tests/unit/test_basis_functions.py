@@ -12,6 +12,7 @@ from morph_dslam.model.basis_functions import (
     cubic_spline_basis,
     fourier_basis,
     hat_basis,
+    hermite_basis,
     kriging_basis,
     p_spline_basis,
 )
@@ -21,6 +22,7 @@ BASES = {
     "chebyshev": chebyshev_basis(-1.0, 3.0, 7),
     "constant": chebyshev_basis(-1.0, 3.0, 0),
     "cubic spline": cubic_spline_basis([-1.0, -0.5, 0.0, 0.7, 2.0, 2.2, 3.0]),
+    "hermite": hermite_basis([-1.0, -0.4, 0.0, 2.0, 3.0]),
     "p-spline": p_spline_basis(-1.0, 3.0, 9),
     "hats": hat_basis([-1.0, 0.0, 0.5, 2.0, 3.0]),
     "fourier": fourier_basis(-1.0, 3.0, 3),

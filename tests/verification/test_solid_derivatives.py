@@ -24,7 +24,7 @@ from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.solvers.continuation import advance
 from morph_dslam.mechanics.solvers.linear_solver import default_engine
-from morph_dslam.mechanics.solvers.newton import sensitivities, solve
+from morph_dslam.mechanics.solvers.newton import State, sensitivities, solve
 from morph_dslam.mechanics.supports import ElasticFoundation, PrescribedDisplacement, RigidRotation, fixed
 from morph_dslam.meshing.generators import block
 from tests.support.solids import RUBBER, distorted, load_parameter
@@ -214,3 +214,24 @@ def test_reactions_balance_the_loads() -> None:
     areas = np.linalg.norm(np.cross(*(MESH.nodes[faces[:, i]] - MESH.nodes[faces[:, 0]] for i in (1, 3))), axis=1)
     moment = np.cross(areas @ corners.mean(axis=1) / 0.5 - about, applied)
     np.testing.assert_allclose(sum(moment for _, moment in reactions), -moment, rtol=1e-8)
+
+
+@pytest.mark.parametrize("problem_of", [by_rotation, by_pressure, by_dead_loads])
+def test_reactions_have_derivatives(problem_of: Callable[[ParameterSymbols], SolidProblem]) -> None:
+    """Forces and moments about the origin, of supports that stay and that move, against central differences."""
+    problem = problem_of(load_parameter(p=0.3))
+    states = [solve(problem, np.array([p]), problem.initial_state()) for p in (0.3 - 1e-4, 0.3, 0.3 + 1e-4)]
+    before, now, after = (reactions_about_origin(problem, state) for state in states)
+    tangent = problem.linearise(states[1].dofs, states[1].mu)
+    slopes = sensitivities(problem, states[1], tangent)
+    of_forces = tangent.apply(slopes) + problem.residual_slopes(states[1].dofs, states[1].mu)
+    for support, parts in now.items():
+        found = problem.reaction_slopes(states[1].dofs, states[1].mu, slopes, of_forces, support, np.zeros(3))
+        for index, slope in enumerate(found):
+            expected = (after[support][index] - before[support][index]) / 2e-4
+            np.testing.assert_allclose(slope[0], expected, atol=1e-6 * np.linalg.norm(parts[index]))
+
+
+def reactions_about_origin(problem: SolidProblem, state: State) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    names = [support.on for support in problem.supports]
+    return {name: problem.reactions(state.dofs, state.mu, name, np.zeros(3)) for name in names}

@@ -225,6 +225,6 @@ def reaction_names(snapshots: Sequence[Snapshot], size: float) -> list[str]:
 
 
 def with_reactions(snapshot: Snapshot, names: Sequence[str]) -> Snapshot:
-    """The snapshot with these outputs (3,) as fields (1, 3); their derivatives are not known."""
+    """The snapshot with these outputs (3,) as fields (1, 3)."""
     fields = {REACTION + name: np.reshape(snapshot.outputs[name], (1, 3)) for name in names}
     return replace(snapshot, fields=snapshot.fields | fields)

@@ -219,7 +219,11 @@ class SolidProblem:
     @cached_property
     def solver(self) -> LinearSolver:
         """The linear solver, made when first needed."""
-        return LinearSolver(self.free & self.assembly.coupled, self.assembly.symmetric, threads=self.options.threads)
+        return self.solver_of(self.free)
+
+    def solver_of(self, free: NDArray[np.bool_]) -> LinearSolver:
+        """A linear solver of the ``free`` (n_dofs,) dofs."""
+        return LinearSolver(free & self.assembly.coupled, self.assembly.symmetric, threads=self.options.threads)
 
     def initial_state(self) -> State:
         """The undeformed solid at the parameters' defaults: where every path starts."""
@@ -239,7 +243,8 @@ class SolidProblem:
         self._latest = x.copy(), np.array(mu), residual
         return residual.copy()
 
-    def linearise(self, x: Array, mu: Array) -> Linearisation:
+    def linearise(self, x: Array, mu: Array, solver: LinearSolver | None = None) -> Linearisation:
+        """See `newton.Equations`; ``solver``, in place of the solid's own, holds part of the free dofs too."""
         # Newton's method has mostly just asked for the residual at the same point.
         known = self._latest
         if known is None or not (np.array_equal(known[0], x) and np.array_equal(known[1], mu)):
@@ -247,7 +252,7 @@ class SolidProblem:
             known = self._latest
         assert known is not None
         self._set(mu)
-        return self.assembly.linearise(x, mu, known[2], self.solver)
+        return self.assembly.linearise(x, mu, known[2], solver or self.solver)
 
     def residual_slopes(self, x: Array, mu: Array) -> Array:
         self._set(mu)
@@ -303,9 +308,34 @@ class SolidProblem:
         name : node set or surface; only what prescribed motions hold of it counts.
         about : point of the moment (3,), m; None for the centroid of the set's undeformed nodes.
         """
-        n_scalar = self.displacements.n_scalar
-        forces = np.where(self.constraints.held, self.residual(dofs, mu)[: 3 * n_scalar], 0.0).reshape(3, -1)
-        return self.constraints.resultant(name, forces, dofs[: 3 * n_scalar].reshape(3, -1), about)
+        forces, displacement = self._held_part(self.residual(dofs, mu)), self._by_component(dofs)
+        return self.constraints.resultant(name, forces, displacement, about)
+
+    def reaction_slopes(
+        self, dofs: Array, mu: Array, dof_slopes: Array, force_slopes: Array, name: str, about: Array
+    ) -> tuple[Array, Array]:
+        """Derivatives (d, 3) of the force and the moment of `reactions` by the parameters.
+
+        Parameters
+        ----------
+        dof_slopes : (d, n_dofs) of the solution.
+        force_slopes : (d, n_dofs) of the residual along the solution: the tangent times ``dof_slopes``, plus
+            `residual_slopes`.
+        name : node set or surface.
+        about : point of the moment (3,), m.
+        """
+        forces = self._held_part(self.residual(dofs, mu)), self._held_part(force_slopes)
+        displacements = self._by_component(dofs), self._by_component(dof_slopes)
+        return self.constraints.resultant_slopes(name, forces, displacements, about)
+
+    def _by_component(self, dofs: Array) -> Array:
+        """(..., 3, n_scalar) displacement part of (..., n_dofs)."""
+        return dofs[..., : 3 * self.displacements.n_scalar].reshape(*dofs.shape[:-1], 3, -1)
+
+    def _held_part(self, forces: Array) -> Array:
+        """(..., 3, n_scalar) what supports exert, of the forces (..., n_dofs) at all dofs."""
+        by_component = self._by_component(forces)
+        return np.where(self.constraints.held.reshape(3, -1), by_component, 0.0)
 
     def strain_energy(self, dofs: Array, mu: Array) -> float:
         """Elastic energy, J."""

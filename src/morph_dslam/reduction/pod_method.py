@@ -1,8 +1,8 @@
 """The method "pod": modes of the snapshots, functions of the parameters through their coefficients.
 
-Snapshots on a full, evenly spaced grid (of one parameter, a line) are interpolated by splines, so that all
-that is left of the error is what the modes leave out. Scattered ones are fitted by polynomials of the total
-degree that predicts left-out samples best, with sensitivities where they are known.
+Snapshots over the whole range of a single parameter are interpolated by piecewise cubics, and those on a full, evenly
+spaced grid by splines. Scattered ones are fitted by polynomials of the total degree that predicts left-out samples
+best, with sensitivities where they are known.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.model.basis_functions import chebyshev_basis
 from morph_dslam.model.functions import Functions, ParameterFunctions
 from morph_dslam.reduction.grid_functions import EvenGrid, functions_on_grid
+from morph_dslam.reduction.line_functions import covers, interpolate_line
 from morph_dslam.reduction.pod import Pod, Truncation, compute_pod, truncate
 from morph_dslam.reduction.registry import register_reduction
 from morph_dslam.reduction.regression import fit_functions
@@ -37,9 +38,10 @@ def reduce_by_pod(task: ReductionTask) -> ReducedModel:
 
     Snapshots of one group (mirror images) are left out together in cross-validation.
     """
-    snapshots, grid = task.snapshots, EvenGrid.of(task.samples, task.box)
-    _check_choices(task, grid)
-    use_grid = grid is not None and task.options.basis in (None, *GRID_BASES) and task.options.format != "polynomial"
+    snapshots, line = task.snapshots, covers(task.samples, task.box)
+    grid = None if line else EvenGrid.of(task.samples, task.box)
+    _check_choices(task, line or grid is not None)
+    through = task.options.basis in (None, *GRID_BASES) and task.options.format != "polynomial"
     fields, summaries = {}, {}
     for name in tqdm(task.field_names, desc="modes and functions", unit="field"):
         values = task.values(name)
@@ -51,30 +53,31 @@ def reduce_by_pod(task: ReductionTask) -> ReducedModel:
             pod.modes.reshape(-1, *shape), coefficients.T, weights, task.options.tolerance, task.options.max_modes
         )
         coefficients = coefficients @ kept.rotation.T
-        if use_grid:
-            assert grid is not None
-            functions, summary = _interpolated(task, grid, coefficients)
+        if grid is not None and through:
+            functions, summary = _on_grid(task, grid, coefficients)
         else:
-            functions, summary = _fitted(task, coefficients, _slopes(snapshots, name, pod, kept))
+            make = _on_line if line and through else _fitted
+            functions, summary = make(task, coefficients, _slopes(snapshots, name, pod, kept))
         fields[name] = SeparatedField(kept.modes, functions)
         summaries[name] = summary | {"modes": len(kept.modes), "singular_values": kept.singular_values[:60].tolist()}
     return task.model(fields, {"method": "pod", **summaries["displacement"]})
 
 
-def _check_choices(task: ReductionTask, grid: EvenGrid | None) -> None:
+def _check_choices(task: ReductionTask, ordered: bool) -> None:
+    """Refuse functions that these samples do not allow; ``ordered`` samples cover a range or a grid."""
     options = task.options
     if options.basis not in (None, "chebyshev", *GRID_BASES):
         raise StudyError(
-            f'reduction.method = "pod" has no functions "{options.basis}": use "chebyshev", on even samples '
-            'and grids "cubic_spline" or "hat", or method = "sparse_pgd", which has all of them'
+            f'reduction.method = "pod" has no functions "{options.basis}": use "chebyshev", on samples of one '
+            'parameter and grids "cubic_spline" or "hat", or method = "sparse_pgd", which has all of them'
         )
-    if options.basis in GRID_BASES and grid is None:
+    if options.basis in GRID_BASES and not ordered:
         raise StudyError(
-            f'reduction.basis = "{options.basis}" interpolates on even samples, at least 4 along each '
-            'parameter and all of them solved: use sampling.scheme = "even" (one parameter) or "grid", '
-            'or basis = "chebyshev"'
+            f'reduction.basis = "{options.basis}" interpolates samples that cover the box, at least 4 along each '
+            'parameter, on a grid all of them solved: use sampling.scheme = "adaptive" or "even" (one parameter) or '
+            '"grid", or basis = "chebyshev"'
         )
-    if (grid is None or options.basis == "chebyshev") and options.format in ("tucker", "cp"):
+    if (not ordered or options.basis == "chebyshev") and options.format in ("tucker", "cp"):
         raise StudyError(
             f'reduction.format = "{options.format}" of method "pod" needs samples on a grid and splines: '
             'use "polynomial" or "tensor_train", or sampling.scheme = "grid"'
@@ -98,11 +101,19 @@ def _slopes(snapshots: list[Snapshot], name: str, pod: Pod, kept: Truncation) ->
     return np.array(slopes)
 
 
-def _interpolated(task: ReductionTask, grid: EvenGrid, coefficients: Array) -> tuple[Functions, dict[str, Any]]:
+def _on_line(task: ReductionTask, coefficients: Array, slopes: Array | None) -> tuple[Functions, dict[str, Any]]:
+    """Piecewise cubics, or hats, through coefficients (n_snapshots, n_modes) and slopes, of one parameter."""
+    own = None if slopes is None else slopes[:, 0]
+    functions = interpolate_line(task.samples[:, 0], coefficients, own, task.options.basis)
+    basis = task.options.basis or ("cubic_spline" if own is None else "cubic_hermite")
+    return functions, {"format": "tensor_train", "basis": basis, "grid": [len(coefficients)]}
+
+
+def _on_grid(task: ReductionTask, grid: EvenGrid, coefficients: Array) -> tuple[Functions, dict[str, Any]]:
     """Splines through coefficients (n_snapshots, n_modes) on a grid."""
     options = task.options
     basis = options.basis or "cubic_spline"
-    form = options.format or ("tucker" if len(task.parameters) > 1 else "tensor_train")
+    form = options.format or "tucker"
     bases = parameter_bases(basis, task.parameters, grid.counts)
     functions = functions_on_grid(grid.tensor(coefficients), bases, form, SHARE * options.tolerance)
     return functions, {"format": form, "basis": basis, "grid": list(grid.counts)}
@@ -138,7 +149,8 @@ def _train(functions: ParameterFunctions, tolerance: float) -> Functions:
 
 
 def _offered_functions(dimension: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    return ("polynomial", "tucker", "tensor_train", "cp"), ("chebyshev", *GRID_BASES)
+    several = ("tucker", "cp") if dimension > 1 else ()
+    return ("polynomial", "tensor_train", *several), ("chebyshev", *GRID_BASES)
 
 
-register_reduction("pod", reduce_by_pod, functions=_offered_functions)
+register_reduction("pod", reduce_by_pod, bisects=True, functions=_offered_functions)

@@ -36,6 +36,8 @@ class ReductionMethod:
     equations : whether it needs the equations of a solid without memory.
     adaptive : whether samples are chosen by the Galerkin model's estimated error, unless the study says otherwise.
     greedy : whether adaptive sampling solves one sample at a time, and begins with as few as can be.
+    bisects : whether it interpolates samples of a single parameter wherever they lie, so that they are chosen by
+        bisection, unless the study says otherwise.
     functions : formats and bases that a study may ask for; any, if None.
     """
 
@@ -44,6 +46,7 @@ class ReductionMethod:
     equations: bool = False
     adaptive: bool = False
     greedy: bool = False
+    bisects: bool = False
     functions: OfferedFunctions | None = None
 
 

@@ -11,13 +11,15 @@ from morph_dslam.studies.study import Study
 
 #: Solves that greedy sampling starts with, beside one for each parameter.
 FEWEST = 4
+#: Solves that bisection starts with, and held-out ones beside it: with 95 % confidence they bound 82.9 % of the range.
+FIRST, HELD_OUT = 5, 16
 
 
 def resolve_defaults(study: Study) -> Study:
     """The study with its method of reduction and its scheme of sampling chosen.
 
-    Solids with several parameters are reduced by "galerkin", everything else by "pod"; Galerkin models are
-    sampled adaptively, up to ``sampling.training`` solves, unless the study has another scheme.
+    Solids with several parameters are reduced by "galerkin", everything else by "pod"; Galerkin models, and those of
+    one parameter, are sampled adaptively, up to ``sampling.training`` solves, unless the study has another scheme.
 
     Raises
     ------
@@ -54,16 +56,21 @@ def _method(study: Study) -> ReductionMethod:
 
 
 def _sampling(sampling: SamplingSection, method: ReductionMethod, dimension: int, equations: bool) -> SamplingSection:
-    scheme = sampling.scheme or ("adaptive" if method.adaptive else "sobol")
-    if scheme == "adaptive" and not method.adaptive:
+    bisects = method.bisects and dimension == 1
+    scheme = sampling.scheme or ("adaptive" if method.adaptive or bisects else "sobol")
+    if scheme == "adaptive" and not (method.adaptive or bisects):
         raise StudyError(
             f'sampling.scheme = "adaptive" needs an estimate of the error, which method "{method.name}" '
             'lacks: use scheme = "sobol"' + (', or method = "galerkin"' if equations else "")
         )
-    first = sampling.first
-    if method.greedy and "first" not in sampling.model_fields_set:
-        first = dimension + FEWEST  # each choice knows all before it
-    return sampling.model_copy(update={"scheme": scheme, "first": min(first, sampling.training)})
+    defaults = {"first": sampling.first, "held_out": sampling.held_out}
+    if bisects and scheme == "adaptive":
+        defaults = {"first": FIRST, "held_out": HELD_OUT}
+    elif method.greedy:
+        defaults["first"] = dimension + FEWEST  # each choice knows all before it
+    chosen = {name: value for name, value in defaults.items() if name not in sampling.model_fields_set}
+    chosen["first"] = min(chosen.get("first", sampling.first), sampling.training)
+    return sampling.model_copy(update={"scheme": scheme, **chosen})
 
 
 def _check_functions(options: ReductionSection, method: ReductionMethod, dimension: int) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from morph_dslam.mechanics.loads import REACTION, with_reactions
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning
 from morph_dslam.mechanics.solvers.continuation import advance, loaded_state
-from morph_dslam.mechanics.solvers.newton import Linearisation, State, solve
+from morph_dslam.mechanics.solvers.newton import Linearisation, State, size, solve
 from morph_dslam.model import ReducedModel
 from morph_dslam.reduction.certificate import field_errors
 from morph_dslam.studies.external import ExternalStudy
@@ -40,13 +41,13 @@ CLOCK = 0.8
 MOST_BYTES = 4e9
 #: Places of the states to solve again among the held-out ones sorted by strain, the first ones if there is less time.
 QUANTILES = (1.0, 0.5, 0.75, 0.25, 0.9)
-#: Tangents of a finer solve, and of one of the sweep's; powers of the number of unknowns with which the time of a
+#: Tangents of a finer solve, and of one of the sweep; powers of the number of unknowns with which the time of a
 #: tangent and the memory of its factors grow (measured on seals of 7 thousand to 110 thousand unknowns; nested
 #: dissection has 2 and 4/3 in the limit).
-FINER_TANGENTS, SWEEP_TANGENTS, TIME_POWER, MEMORY_POWER = 7.0, 3.0, 1.5, 4.0 / 3.0
+FINER_TANGENTS, SWEEP_TANGENTS, TIME_POWER, MEMORY_POWER = 3.5, 3.0, 1.5, 4.0 / 3.0
 BYTES_OF_A_MILLION = 45e9
-#: Of the last correction, in units of the body's size: the errors looked for are far larger.
-TOLERANCE = 1e-5
+#: Of the last correction: at first in units of the body's size, then as a part of what the finer elements changed.
+TOLERANCE, PART = 1e-2, 0.03
 
 
 class _NotEstimated(Exception):
@@ -186,13 +187,14 @@ class HigherOrder:
 
     def __init__(self, coarse: SolidProblem, problem: SolidProblem) -> None:
         self._coarse, self.problem = coarse, problem
-        self._latest: tuple[State, Array] | None = None
+        self._latest: State | None = None
 
     def solve(self, dofs: Array, mu: Array, in_time: Callable[[], bool] = lambda: True) -> State:
-        """The solution at ``mu`` (d,) next to one of the coarse solid.
+        """The solution at ``mu`` (d,) next to one of the coarse solid, to a few percent of the difference.
 
-        Newton's method starts from the coarse solution ``dofs`` (n,), corrected by what the finer elements changed at
-        the state solved before; where that does not converge, the path from that state is followed in increments.
+        First the unknowns that only the finer elements have are solved for, with the coarse solution ``dofs`` (n,)
+        held: as finer displacements this one is strained far too much in bending, and Newton's method would take long
+        from it. Where it does not converge, the path from the state solved before is followed in increments.
 
         Raises
         ------
@@ -201,19 +203,29 @@ class HigherOrder:
         SolverError
             If no solution is found.
         """
-        equations, given = _Stoppable(self.problem, in_time), np.zeros(self.problem.n_dofs)
-        embedded = self.problem.displacements.embedded(
-            self._coarse.displacements, dofs[: 3 * self._coarse.displacements.n_scalar]
-        )
-        given[: len(embedded)] = embedded
-        change = self._latest[0].dofs - self._latest[1] if self._latest else 0.0
+        equations, given = _Stoppable(self.problem, in_time), self._embedded(dofs)
         try:
-            state = solve(equations, mu, State(mu, given + change), TOLERANCE)
+            state = solve(_Added(self.problem, in_time, self._kept, given), mu, State(mu, given), TOLERANCE)
+            tolerance = PART * size(equations, state.dofs - given)
+            state = solve(equations, mu, state, tolerance)
         except SolverError:
-            start = self._latest[0] if self._latest else loaded_state(equations, self.problem.symbols.default)
-            state = advance(equations, start, mu, TOLERANCE)[-1]
-        self._latest = state, given
+            start = self._latest or loaded_state(equations, self.problem.symbols.default)
+            state = advance(equations, start, mu, PART * TOLERANCE)[-1]
+        self._latest = state
         return state
+
+    @cached_property
+    def _kept(self) -> NDArray[np.bool_]:
+        """The dofs (n,) that the coarse solid has too."""
+        return self._embedded(np.ones(3 * self._coarse.displacements.n_scalar)) != 0.0
+
+    def _embedded(self, dofs: Array) -> Array:
+        """The displacement of a coarse solution as dofs (n,) of the finer solid."""
+        result = np.zeros(self.problem.n_dofs)
+        coarse = dofs[: 3 * self._coarse.displacements.n_scalar]
+        embedded = self.problem.displacements.embedded(self._coarse.displacements, coarse)
+        result[: len(embedded)] = embedded
+        return result
 
 
 class _Stoppable:
@@ -224,11 +236,28 @@ class _Stoppable:
         self.n_dofs, self.free, self.scale = problem.n_dofs, problem.free, problem.scale
         self.prescribed, self.prescribed_slopes = problem.prescribed, problem.prescribed_slopes
         self.residual, self.residual_slopes = problem.residual, problem.residual_slopes
+        self._solver = problem.solver
 
     def linearise(self, x: Array, mu: Array) -> Linearisation:
         if not self._in_time():
             raise OutOfTime
-        return self._problem.linearise(x, mu)
+        return self._problem.linearise(x, mu, self._solver)
+
+
+class _Added(_Stoppable):
+    """The same with the ``kept`` (n,) dofs held as in ``given`` (n,)."""
+
+    def __init__(
+        self, problem: SolidProblem, in_time: Callable[[], bool], kept: NDArray[np.bool_], given: Array
+    ) -> None:
+        super().__init__(problem, in_time)
+        self._kept, self._given = kept, given
+        self.free, self.prescribed = problem.free & ~kept, self._held
+        self._solver = problem.solver_of(self.free)
+
+    def _held(self, mu: Array) -> Array:
+        prescribed = self._problem.prescribed(mu)
+        return np.where(self._kept & self._problem.free, self._given, prescribed)
 
 
 def _figures(

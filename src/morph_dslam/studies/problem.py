@@ -30,7 +30,8 @@ class Snapshot:
     fields : by name, (n, c): "displacement" (n, 3) m and, by kind of object, "stress_top" and "stress_bottom"
         (n, 3) or "stress_solid" (n, 6) Pa and "strain" (n, 6). The names are those of the model file. A
         snapshot on disk reads them each time (`morph_dslam.studies.snapshots.StoredArrays`).
-    sensitivities : derivatives (d, n, c) of the same fields by the parameters; empty where they are unknown.
+    sensitivities : derivatives (d, n, c) of the same fields, and of reactions as fields (1, 3), by the parameters;
+        empty where they are unknown.
     outputs : other results by name, recorded but not reduced: a grip's motion, the reaction of a support.
     """
 

@@ -25,7 +25,7 @@ def training_samples(study: ParametricStudy) -> Array:
     """The samples (n, d) that the model is made from; with "adaptive", those that are solved first."""
     sampling = study.sampling
     if sampling.scheme == "even":
-        return study.admissible(_even(study, sampling.training))
+        return even_samples(study, sampling.training)
     if sampling.scheme == "grid":
         axes = grid_axes(study)  # the last parameter runs fastest
         return study.admissible(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes)))
@@ -63,14 +63,14 @@ def sample_box(study: ParametricStudy, count: int, seed: int, towards_edges: flo
     return study.admissible(box.mean(axis=1) + xi * np.diff(box, axis=1).ravel() / 2.0)
 
 
-def _even(study: ParametricStudy, count: int) -> Array:
+def even_samples(study: ParametricStudy, count: int) -> Array:
     """Evenly spaced samples (count, 1), both ends included."""
     box = bounds(study)
     if len(box) != 1:
         raise StudyError(
             f'sampling.scheme = "even" is for one parameter, and this study has {len(box)}: use "grid" or "sobol"'
         )
-    return np.linspace(box[0, 0], box[0, 1], count)[:, None]
+    return study.admissible(np.linspace(box[0, 0], box[0, 1], count)[:, None])
 
 
 def grid_axes(study: ParametricStudy) -> list[Array]:

@@ -56,8 +56,9 @@ class SamplingSection(Section):
     ``scheme`` places the training samples: "sobol" scatters ``training`` of them, denser towards the edges of
     the box; "even" spaces them evenly with both ends included, for a single parameter; "grid" takes all
     points of a full grid with ``points`` for each parameter, or one number for all; "adaptive" solves
-    ``first`` scattered ones and then adds where the model's error is estimated to be largest, up to
-    ``training``. The method of reduction chooses where it is absent. Held-out samples are always scattered.
+    ``first`` and then adds where the model's error is estimated to be largest, or, of a single parameter, in the
+    middle of intervals, up to ``training``. The method of reduction chooses where it is absent. Held-out samples
+    are always scattered.
     ``refined`` of them are solved again with finer elements to estimate the discretisation error; 0 for none.
     """
 

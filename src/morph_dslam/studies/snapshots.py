@@ -21,7 +21,7 @@ from morph_dslam.studies.problem import ParametricStudy, Snapshot
 
 Array = NDArray[np.float64]
 #: Raised by whoever changes what a solver computes: snapshots of another number are solved anew.
-SOLVER_VERSION = 2
+SOLVER_VERSION = 3
 #: Ending of a file that is being written; one left behind is a build's that was killed.
 PARTIAL = ".partial"
 #: Bytes in a zip archive before a member's name, and at most so many between the name and the data.

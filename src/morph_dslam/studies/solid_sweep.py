@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError
+from morph_dslam.mechanics.loads import FORCE, MOMENT, REACTION
 from morph_dslam.mechanics.solid import SolidProblem
 from morph_dslam.mechanics.solvers.continuation import PathError, advance, loaded_state
 from morph_dslam.mechanics.solvers.newton import Linearisation, State, sensitivities, solve, solve_with_kept_tangent
@@ -20,7 +21,12 @@ _FIELDS = {"displacement": "displacement", "stress_solid": "stress", "strain": "
 
 
 def solid_snapshot(
-    problem: SolidProblem, dofs: Array, mu: Array, slopes: Array | None = None, reactions: bool = True
+    problem: SolidProblem,
+    dofs: Array,
+    mu: Array,
+    slopes: Array | None = None,
+    force_slopes: Array | None = None,
+    reactions: bool = True,
 ) -> Snapshot:
     """Displacement, Cauchy stress and Green-Lagrange strain at the nodes, and what supports exert.
 
@@ -33,6 +39,8 @@ def solid_snapshot(
     dofs : (n,) of the solution.
     mu : (d,) parameters, SI.
     slopes : (d, n) of the dofs by the parameters; None where they are unknown.
+    force_slopes : (d, n) of the residual by the parameters, as `SolidProblem.reaction_slopes` has them; None where
+        they are unknown.
     reactions : whether forces (N) and moments (N m, about the origin) on each set held are among the outputs.
     """
     fields = _named(problem.sample(dofs, mu))
@@ -45,6 +53,8 @@ def solid_snapshot(
         if derivatives:
             changes = [at_nodes @ change for change in problem.shape.coordinate_slopes(problem.symbols)]
             derivatives["displacement"] = derivatives["displacement"] + np.array(changes)
+    if slopes is not None and force_slopes is not None:
+        derivatives |= _reaction_slopes(problem, dofs, mu, slopes, force_slopes)
     return Snapshot(mu, fields, derivatives, support_reactions(problem, dofs, mu) if reactions else {})
 
 
@@ -58,7 +68,19 @@ def support_reactions(problem: SolidProblem, dofs: Array, mu: Array) -> dict[str
     outputs = {}
     for support in problem.supports:
         force, moment = problem.reactions(dofs, mu, support.on, np.zeros(3))
-        outputs[f"force_{support.on}"], outputs[f"moment_{support.on}"] = force, moment
+        outputs[FORCE + support.on], outputs[MOMENT + support.on] = force, moment
+    return outputs
+
+
+def _reaction_slopes(
+    problem: SolidProblem, dofs: Array, mu: Array, slopes: Array, force_slopes: Array
+) -> dict[str, Array]:
+    """Derivatives (d, 1, 3) of `support_reactions`, under the names that reactions have as fields."""
+    outputs = {}
+    for support in problem.supports:
+        parts = problem.reaction_slopes(dofs, mu, slopes, force_slopes, support.on, np.zeros(3))
+        for kind, part in zip((FORCE, MOMENT), parts, strict=True):
+            outputs[REACTION + kind + support.on] = part[:, None]
     return outputs
 
 
@@ -128,15 +150,17 @@ class SolidSweep:
         If the tangent at ``start`` is still at hand it serves first.
         """
         predicted = start.dofs + (target - start.mu) @ start.slopes
-        at_hand = self._tangent is not None and np.array_equal(self._tangent[0], start.mu)
-        tangent = self._tangent[1] if self._tangent and at_hand else None
-        self._tangent = None
+        tangent, self._tangent = self._tangent_at(start.mu), None
         try:
             state = solve_with_kept_tangent(self.problem, target, predicted, tangent)
             state = state or solve(self.problem, target, State(target, predicted))
         except SolverError:
             state = follow(self.problem, State(start.mu, start.dofs), target)
         return self._with_slopes(state)
+
+    def _tangent_at(self, mu: Array) -> Linearisation | None:
+        """The tangent of a solution if it is still at hand."""
+        return self._tangent[1] if self._tangent is not None and np.array_equal(self._tangent[0], mu) else None
 
     def _with_slopes(self, state: State) -> _SolidState:
         self._tangent = self._solved = None
@@ -147,7 +171,9 @@ class SolidSweep:
 
     def take_snapshot(self, state: _SolidState) -> Snapshot:
         """Fields at the nodes, their slopes, reactions, and the tangent's negative pivots."""
-        snapshot = solid_snapshot(self.problem, state.dofs, state.mu, state.slopes)
+        tangent = self._tangent_at(state.mu) or self.problem.linearise(state.dofs, state.mu)
+        forces = tangent.apply(state.slopes) + self.problem.residual_slopes(state.dofs, state.mu)
+        snapshot = solid_snapshot(self.problem, state.dofs, state.mu, state.slopes, forces)
         if state.negative_pivots is not None:
             snapshot.outputs["negative_pivots"] = np.array(state.negative_pivots)
         return snapshot

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from morph_dslam.mechanics.loads import reaction_names, with_reactions
 from morph_dslam.model import Parameter
 from morph_dslam.reduction.adaptive_sampling import sample_adaptively
+from morph_dslam.reduction.bisection import sample_by_bisection
 from morph_dslam.reduction.certificate import stability_report
+from morph_dslam.reduction.registry import reduction_method
 from morph_dslam.studies.executors import default_executor
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.problem import ModelMesh, ParametricStudy, Snapshot, SweepProblem, bounds
@@ -86,10 +88,12 @@ def _solve(study: ParametricStudy, folder: Path, executor: Executor) -> Snapshot
         return run_sweep(study, study.canonical(samples), folder, executor)
 
     problem, rounds = cache(study.sweep_problem), []
-    if study.sampling.scheme == "adaptive":
-        training, rounds = sample_adaptively(study, problem(), sweep)
-    else:
+    if study.sampling.scheme != "adaptive":
         training = training_samples(study)
+    elif reduction_method(study.reduction.method or "").bisects:
+        training, rounds = sample_by_bisection(study, sweep)
+    else:
+        training, rounds = sample_adaptively(study, problem(), sweep)
     samples = np.vstack([training, held_out_samples(study)])
     return _gather(study, samples, len(training), sweep(samples), problem, rounds)
 

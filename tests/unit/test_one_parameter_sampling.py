@@ -1,0 +1,142 @@
+"""Functions through samples of one parameter, and their choice by bisection, against closed forms."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from morph_dslam.reduction.bisection import sample_by_bisection
+from morph_dslam.reduction.line_functions import covers, interpolate_line
+from morph_dslam.studies.defaults import resolve_defaults
+from morph_dslam.studies.problem import Snapshot
+from morph_dslam.studies.snapshots import encode_snapshot
+from morph_dslam.studies.solid_study import SolidStudy
+from morph_dslam.studies.study import make_study
+from morph_dslam.studies.sweep import SweepResult
+from tests.support.block_study import STUDY
+
+Array = NDArray[np.float64]
+BOX = np.array([[0.0, 4.0]])
+
+
+def cubic(x: Array) -> Array:
+    return np.column_stack([x**3 - x, 2.0 * x**2 + 1.0])
+
+
+def cubic_slope(x: Array) -> Array:
+    return np.column_stack([3.0 * x**2 - 1.0, 4.0 * x])
+
+
+def test_cubics_pass_through_values_and_slopes_of_samples_in_any_order() -> None:
+    points = np.array([4.0, 0.0, 0.3, 2.5])
+    functions = interpolate_line(points, cubic(points), cubic_slope(points))
+    for x in np.linspace(0.0, 4.0, 23):
+        value, slope = functions.evaluate(np.array([x]))
+        np.testing.assert_allclose(value, cubic(np.array([x]))[0], atol=1e-11)
+        np.testing.assert_allclose(slope[0], cubic_slope(np.array([x]))[0], atol=1e-10)
+
+
+@pytest.mark.parametrize("slopes", [True, False])
+def test_errors_are_those_of_the_textbook(slopes: bool) -> None:
+    """h^4 / 384 times the fourth derivative; without slopes far from the ends of even samples."""
+    points, between = np.linspace(0.0, 4.0, 81), np.linspace(1.0, 3.0, 401)
+    known = np.cos(points)[:, None] if slopes else None
+    functions = interpolate_line(points, np.sin(points)[:, None], known)
+    values = np.array([functions.evaluate(np.array([x]))[0][0] for x in between])
+    assert np.abs(values - np.sin(between)).max() == pytest.approx(0.05**4 / 384.0, rel=0.03)
+
+
+def test_hats_are_linear_between_samples() -> None:
+    functions = interpolate_line(np.array([0.0, 1.0, 4.0, 2.0]), np.array([[0.0], [3.0], [1.0], [5.0]]), None, "hat")
+    assert [functions.evaluate(np.array([x]))[0][0] for x in (0.5, 1.5, 3.0)] == pytest.approx([1.5, 4.0, 3.0])
+
+
+def test_only_samples_from_end_to_end_are_interpolated() -> None:
+    assert covers(np.array([[4.0], [0.0], [1.0], [3.9]]), BOX)
+    assert not covers(np.array([[3.9], [0.0], [1.0], [2.0]]), BOX), "the upper end is missing"
+    assert not covers(np.array([[0.0], [4.0], [2.0]]), BOX), "three are too few for cubics"
+    assert not covers(np.zeros((4, 2)), np.array([[0.0, 4.0], [0.0, 1.0]]))
+
+
+def study(**sampling: int) -> SolidStudy:
+    """A block of one parameter from 0 to 600 kPa, never solved here."""
+    content = tomllib.loads(STUDY) | {"sampling": sampling, "reduction": {"tolerance": 1e-4}}
+    content["materials"]["rubber"]["young"] = "3 MPa"
+    content["loads"][0]["traction"] = ["0 Pa", "0 Pa", "pull"]
+    content["parameters"] = {"pull": content["parameters"]["pull"]}
+    resolved = resolve_defaults(make_study(content))
+    assert isinstance(resolved, SolidStudy)
+    return resolved
+
+
+def sweep_of(
+    function: Callable[[float], tuple[float, float]], solved: SolidStudy, folder: Path, failing: float = -1.0
+) -> Callable[[Array], SweepResult]:
+    """A sweep that displaces all nodes by a function of the parameter over its range, given with its slope."""
+    n_nodes = len(solved.model_mesh().nodes)
+
+    def sweep(samples: Array) -> SweepResult:
+        result = SweepResult()
+        for index, x in enumerate(samples[:, 0]):
+            value, slope = function(x / 6e5)
+            if x == failing:
+                result.failed[index] = "no equilibrium"
+                continue
+            snapshot = Snapshot(
+                samples[index],
+                {"displacement": np.full((n_nodes, 3), value)},
+                {"displacement": np.full((1, n_nodes, 3), slope / 6e5)},
+            )
+            result.solved[index] = folder / f"{index}.npz"
+            result.solved[index].write_bytes(encode_snapshot(snapshot, {}))
+        return result
+
+    return sweep
+
+
+def bend(t: float) -> tuple[float, float]:
+    """Zero up to 0.3, then a parabola: its second derivative jumps."""
+    return (t - 0.3) ** 2 * (t > 0.3), 2.0 * (t - 0.3) * (t > 0.3)
+
+
+def test_a_straight_line_needs_the_first_samples_and_their_middles(tmp_path: Path) -> None:
+    chosen = study()
+    samples, rounds = sample_by_bisection(chosen, sweep_of(lambda t: (t, 1.0), chosen, tmp_path))
+    np.testing.assert_allclose(np.sort(samples[:, 0]), np.linspace(0.0, 6e5, 9))
+    assert [entry["solves"] for entry in rounds] == [9]
+    assert rounds[0]["largest_estimate"] < 1e-6
+    assert chosen.sampling.held_out == 16
+
+
+def test_samples_gather_where_the_function_bends(tmp_path: Path) -> None:
+    """The first interval across the bend misses by 0.0037; each halving divides that by four, down to 1e-4."""
+    chosen = study()
+    samples, rounds = sample_by_bisection(chosen, sweep_of(bend, chosen, tmp_path))
+    unit = np.sort(samples[:, 0]) / 6e5
+    gaps = np.diff(unit)
+    assert gaps[np.searchsorted(unit, 0.3) - 1] <= 1.0 / 64.0
+    assert gaps[unit[1:] > 0.5].min() == pytest.approx(1.0 / 8.0)
+    assert rounds[-1]["largest_estimate"] <= 1e-4 < rounds[-2]["largest_estimate"]
+    assert len(samples) == rounds[-1]["solves"] < 20
+
+
+def test_sampling_ends_at_the_most_samples_and_leaves_what_cannot_be_solved(tmp_path: Path) -> None:
+    chosen = study(training=11)
+    samples, _ = sample_by_bisection(
+        chosen, sweep_of(lambda t: (np.sin(40.0 * t), 40.0 * np.cos(40.0 * t)), chosen, tmp_path)
+    )
+    assert len(samples) == 11
+    missing = study()
+    failing = float(0.125 * 6e5)
+    samples, _ = sample_by_bisection(missing, sweep_of(bend, missing, tmp_path, failing))
+    assert not np.any((samples > 0.0) & (samples < 0.125 * 6e5)), "nothing is looked for beside a failure"
+
+
+def test_a_study_may_choose_otherwise() -> None:
+    own = study(held_out=7, first=6).sampling
+    assert (own.scheme, own.first, own.held_out) == ("adaptive", 6, 7)
