@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 import re
 import tomllib
+from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 
 from morph_dslam import build, load_study, make_study
 from morph_dslam.cli import app as cli
 from morph_dslam.evaluation.run_folder import load_run
-from morph_dslam.model import load_model
+from morph_dslam.mechanics.solvers.continuation import advance
+from morph_dslam.model import load_model, save_model
 from morph_dslam.studies.snapshots import load_snapshot
 from tests.support.block_study import sliding
 from tests.support.scenes import write_texture
@@ -162,8 +165,42 @@ def filmed(built):
     return [*options, "--camera", str(sequence / "camera.yaml"), "--landmarks", str(sequence / "landmarks.csv")]
 
 
-def test_a_solid_is_filmed_and_tracked(built, filmed):
-    assert cli.main(["track", *filmed, "-o", str(built / "run")]) == 0
+@pytest.fixture(scope="module")
+def tracked(built, filmed):
+    """The run folder of the block, with arrows for forces and moduli known to 5 %."""
+    assert cli.main(["track", *filmed, "--forces", "--modulus-std", "5", "-o", str(built / "run")]) == 0
+    return built / "run"
+
+
+def test_forces_of_supports_come_with_every_frame(built, tracked):
+    """Against the finite elements at the true parameters; the block is in equilibrium."""
+    truth = np.load(built / "seq" / "truth.npz")
+    problem = load_study(built / "study.toml").problem()
+    last = advance(problem, problem.initial_state(), truth["parameters"][-1])[-1]
+    force, moment = problem.reactions(last.dofs, last.mu, "z_max", np.zeros(3))
+    with h5py.File(tracked / "result.h5") as file:
+        top, bottom = (
+            {key: item[()] for key, item in file[f"reactions/{name}"].items()} for name in ("z_max", "z_min")
+        )
+    np.testing.assert_allclose(top["force"], -bottom["force"], atol=1e-3 * np.abs(force).max())
+    about_origin = top["moment"] + np.cross(top["point"], top["force"])
+    np.testing.assert_allclose(top["force"][-1], force, atol=0.02 * np.linalg.norm(force))
+    np.testing.assert_allclose(about_origin[-1], moment, atol=0.02 * np.linalg.norm(moment))
+    middle = (
+        problem.mesh.nodes[problem.mesh.set_nodes("z_max")]
+        + problem.nodal_displacement(last.dofs)[problem.mesh.set_nodes("z_max")]
+    )
+    np.testing.assert_allclose(top["point"][-1], middle.mean(axis=0), atol=2e-4)
+    assert np.all(top["force_std"] >= 0.05 * np.abs(top["force"]) * (1.0 - 1e-9))
+    summary = json.loads((tracked / "summary.json").read_text())
+    largest = summary["largest_forces"][0]
+    assert largest["force_N"] == pytest.approx(np.linalg.norm(top["force"], axis=1).max(), rel=1e-3)
+    table = (tracked / "frames.csv").read_text().splitlines()
+    column = table[0].split(",").index("force_z_max_z_N")
+    assert float(table[-1].split(",")[column]) == pytest.approx(force[2], rel=0.03)
+
+
+def test_a_solid_is_filmed_and_tracked(built, tracked):
     assert (built / "run" / "augmented.mp4").stat().st_size > 1000
     run = load_run(built / "run")
     assert run.tracked.all()
@@ -171,6 +208,14 @@ def test_a_solid_is_filmed_and_tracked(built, filmed):
     assert cli.main(["evaluate", str(built / "run"), *points]) == 0
     figures = json.loads((built / "run" / "evaluation.json").read_text())
     assert figures["mean_mm"] < 0.5
+
+
+def test_arrows_need_reactions(built, filmed, tmp_path, capsys):
+    model = load_model(built / "block.morph")
+    save_model(tmp_path / "bare.morph", replace(model, reactions={}))
+    options = [str(tmp_path / "bare.morph") if part.endswith("block.morph") else part for part in filmed]
+    assert cli.main(["track", *options, "--forces", "-o", str(tmp_path / "run")]) == 2
+    assert "leave out --forces" in capsys.readouterr().err
 
 
 def test_the_outline_of_a_closed_surface_counts_beside_its_texture(built, filmed):

@@ -1,10 +1,15 @@
-"""Reactions of supports become fields of one point; those that are rounding do not."""
+"""Reactions of supports: fields of one point in a model, forces with deviations in a frame."""
 
 import numpy as np
 import pytest
 
+from morph_dslam.geometry import RigidTransform
 from morph_dslam.mechanics.loads import reaction_names, with_reactions
+from morph_dslam.model import Parameter, ReducedModel, SeparatedField
+from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.studies.problem import Snapshot
+from morph_dslam.tracking.estimator import Estimate, State
+from morph_dslam.tracking.reactions import Reactions
 
 
 def solve(pull, **outputs):
@@ -40,3 +45,67 @@ def test_nothing_is_reduced_where_no_force_ever_acts():
     assert reaction_names([solve(0.0)], 0.1) == []
     with pytest.raises(KeyError):
         with_reactions(solve(0.0), ["force_side"])
+
+
+def linear(*columns):
+    """A field of constant, first and second parameter over [-1, 1]^2, each times an array (n, c)."""
+    indices = np.array([[0, 0], [1, 0], [0, 1]])
+    functions = ParameterFunctions(-np.ones(2), np.ones(2), indices, np.eye(3))
+    return SeparatedField(np.array(columns, dtype=float), functions)
+
+
+def held_bar(supports):
+    """A bar of 2 m along z: its top moves by (a, 0, b) m, pulled with 100 a N along x and 300 b N along z."""
+    none, x, z = np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, 3))
+    x[1, 0] = z[1, 2] = 1.0
+    parameters = tuple(Parameter(name, "length", "m", -1.0, 1.0, 0.0) for name in "ab")
+    nodes, triangles = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]]), np.empty((0, 3), dtype=np.int64)
+    reactions = {
+        "force_top": linear([[0, 0, 0]], [[100, 0, 0]], [[0, 0, 300]]),
+        "moment_top": linear([[0, 0, 0]], [[0, 250, 0]], [[0, 0, 0]]),
+    }
+    displacement = linear(none, x, z)
+    return ReducedModel("bar", nodes, triangles, parameters, displacement, supports=supports, reactions=reactions)
+
+
+def estimate_at(a, b, covariance):
+    state = State(np.array([a, b]), RigidTransform(np.eye(3), np.array([0.0, 0.0, 5.0])))
+    whole = np.zeros((8, 8))
+    whole[:2, :2] = covariance
+    return Estimate(state, 0.0, np.empty((0, 2)), 0.1, whole, np.zeros(2, dtype=bool), 5, True)
+
+
+def test_forces_have_the_deviations_of_the_parameters():
+    """The force is (20, 0, 90) N; a and b are known to 0.01 and 0.02 m with a correlation of 0.5."""
+    covariance = np.array([[1e-4, 1e-4], [1e-4, 4e-4]])
+    top = Reactions(held_bar({"top": np.array([1])}))(estimate_at(0.2, 0.3, covariance))["top"]
+    assert top.point == pytest.approx([0.2, 0.0, 2.3])
+    assert top.force.value == pytest.approx([20.0, 0.0, 90.0])
+    assert top.force.std == pytest.approx([1.0, 0.0, 6.0])
+    along = np.array([20.0, 90.0]) / np.hypot(20.0, 90.0)
+    expected = along @ np.array([[1.0, 3.0], [3.0, 36.0]]) @ along
+    assert top.force.size_std == pytest.approx(np.sqrt(expected))
+
+
+def test_moments_are_about_the_middle_of_the_support():
+    """About the origin 250 a; of it (2 + b) 100 a - a 300 b are the force's, so that a (50 + 200 b) is left."""
+    covariance = np.diag([1e-4, 4e-4])
+    top = Reactions(held_bar({"top": np.array([1])}))(estimate_at(0.2, 0.3, covariance))["top"]
+    assert top.moment.value == pytest.approx([0.0, 0.2 * (50.0 + 200.0 * 0.3), 0.0])
+    assert top.moment.std[1] == pytest.approx(np.hypot(0.01 * (50.0 + 200.0 * 0.3), 0.02 * 0.2 * 200.0))
+    about_origin = Reactions(held_bar({}))(estimate_at(0.2, 0.3, covariance))["top"]
+    assert about_origin.moment.value == pytest.approx([0.0, 50.0, 0.0])
+
+
+def test_moduli_count_by_one_common_factor():
+    model = held_bar({"top": np.array([1])})
+    top = Reactions(model)(estimate_at(0.2, 0.3, np.diag([1e-4, 4e-4])), modulus_std=0.1)["top"]
+    assert top.force.std == pytest.approx([np.hypot(1.0, 2.0), 0.0, np.hypot(6.0, 9.0)])
+    exact = Reactions(model)(estimate_at(0.2, 0.3, np.zeros((2, 2))), modulus_std=0.1)["top"]
+    assert exact.force.size_std == pytest.approx(0.1 * np.hypot(20.0, 90.0))
+
+
+def test_forces_of_undetermined_parameters_are_undetermined():
+    top = Reactions(held_bar({}))(estimate_at(0.2, 0.3, np.full((2, 2), np.inf)))["top"]
+    assert np.isposinf([*top.force.std, top.force.size_std, *top.moment.std]).all()
+    assert top.force.value == pytest.approx([20.0, 0.0, 90.0])

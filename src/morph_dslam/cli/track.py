@@ -15,6 +15,7 @@ from morph_dslam.cli.arguments import (
     add_repeated,
     frame_and_file,
     named_value,
+    positive_number,
 )
 from morph_dslam.errors import TrackingError
 
@@ -81,6 +82,8 @@ def print_summary(folder: Path, summary: dict[str, Any]) -> None:
         print(f"note: {flag}")
     for figures in summary["one_over_the_sequence"]:
         print(value_line(figures))
+    for figures in summary["largest_forces"]:
+        print("largest force on {on}: {force_N:.4g} ± {standard_deviation_N:.2g} N in frame {frame}".format(**figures))
     print(f"wrote {folder}")
     line = f"tracked={summary['n_tracked']}/{summary['n_frames']}"
     if "live" in summary:
@@ -147,6 +150,7 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
             use_texture=not arguments.no_texture,
             per_sequence=tuple(arguments.per_sequence),
             random_walk=_random_walk(arguments),
+            modulus_std=0.01 * arguments.modulus_std,
         ),
         others=tuple(others),
         first=first,
@@ -154,7 +158,7 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
         output=arguments.output,
         overwrite=arguments.overwrite,
         video=not arguments.no_video,
-        drawing=DrawOptions(arguments.show, section),
+        drawing=DrawOptions(arguments.show, section, arguments.forces),
         **more,
     )
 
@@ -261,6 +265,15 @@ def add_tracking_arguments(command: argparse.ArgumentParser) -> None:
         "--section",
         metavar="PLANE",
         help="draw a solid cut open: x=12 takes away all beyond x = 12 mm, -x=12 all before it; also y and z",
+    )
+    add_flag(command, "--forces", "draw what supports exert on the object as arrows, with its size")
+    command.add_argument(
+        "--modulus-std",
+        type=positive_number,
+        default=0.0,
+        metavar="PERCENT",
+        help="standard deviation of the moduli of the study, by one common factor: it counts in the reactions of "
+        "supports (default: they are exact)",
     )
     add_range(command, "frames to track, of a recording")
     add_flag(command, "--no-video", "do not draw the augmented video")

@@ -20,11 +20,10 @@ from morph_dslam.errors import EvaluationError
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.io.text import read_text
 from morph_dslam.model import ReducedModel
+from morph_dslam.model.reduced_model import FORCE
 from morph_dslam.units import FACTORS
 
 Array = NDArray[np.float64]
-#: Of the reaction's name in a model.
-FORCE = "force_"
 #: Fewer comparisons determine no factor and offset with anything left over.
 LEAST = 3
 _REACTION = re.compile(r"(?P<support>.+?)(?::(?P<sign>[+-]?)(?P<axis>[xyz]))?")

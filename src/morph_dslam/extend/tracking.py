@@ -17,4 +17,5 @@ from morph_dslam.tracking.estimator import (
     State as State,
     moved as moved,
 )
+from morph_dslam.tracking.reactions import Reaction as Reaction, VectorEstimate as VectorEstimate
 from morph_dslam.tracking.run_options import ObjectOptions as ObjectOptions

@@ -18,6 +18,7 @@ from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.kinematics import Kinematics
 from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
 from morph_dslam.mechanics.spaces import DisplacementSpace
+from morph_dslam.model.reduced_model import FORCE, MOMENT, REACTION
 from morph_dslam.studies.problem import Snapshot
 
 Array = NDArray[np.float64]
@@ -204,8 +205,6 @@ class NodalForces:
         return slopes.reshape(len(self._symbols), -1)
 
 
-#: Name of a reaction's field: this and the name of the output, "force_SET" (N) or "moment_SET" (N m).
-REACTION, FORCE, MOMENT = "reaction_", "force_", "moment_"
 #: A reaction that never exceeds so much of the largest is rounding, and has nothing to be reduced.
 NEGLIGIBLE = 1e-6
 

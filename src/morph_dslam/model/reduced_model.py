@@ -95,6 +95,10 @@ def von_mises(stress: Array) -> Array:
     return np.sqrt(normal + 3.0 * sum(shear**2 for shear in shears))
 
 
+#: Name of a reaction's field in the file: this and its name in the model, "force_SET" (N) or "moment_SET" (N m).
+REACTION, FORCE, MOMENT = "reaction_", "force_", "moment_"
+
+
 @dataclass(frozen=True)
 class ReducedModel:
     """What a `.morph` file holds.
@@ -111,6 +115,7 @@ class ReducedModel:
         (xx, yy, zz, yz, xz, xy) in the object frame; pascals. Empty where none was computed.
     cells : volume cells (k, c) by type ("hex8", "tet10"), nodes in VTK's order; empty for sheets.
     strain : Green-Lagrange strain of a solid, 6 components as of the stress (tensor shears), or None.
+    supports : nodes (k,) that each support holds, by the name of the set.
     reactions : what supports exert, fields of one point: "force_SET" in newtons and "moment_SET" about the
         origin in newton metres, 3 components in the object frame.
     certificate : held-out errors and how they were measured, plain JSON.
@@ -125,6 +130,7 @@ class ReducedModel:
     stresses: dict[str, SeparatedField] = field(default_factory=dict)
     cells: dict[str, NDArray[np.int64]] = field(default_factory=dict)
     strain: SeparatedField | None = None
+    supports: dict[str, NDArray[np.int64]] = field(default_factory=dict)
     reactions: dict[str, SeparatedField] = field(default_factory=dict)
     certificate: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -191,7 +197,7 @@ class ReducedModel:
         result = {"displacement": self.displacement}
         result |= {f"stress_{place}": field for place, field in self.stresses.items()}
         result |= {} if self.strain is None else {"strain": self.strain}
-        return result | {f"reaction_{name}": field for name, field in self.reactions.items()}
+        return result | {REACTION + name: field for name, field in self.reactions.items()}
 
     def von_mises(self, parameters: ParameterValues, place: str | None = None, outside: Outside = "bounded") -> Array:
         """Von Mises stress (n,) in pascals.

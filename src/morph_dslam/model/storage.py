@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import ModelFileError
 from morph_dslam.io.checksum import check_checksum, is_other_hdf5, written_with_checksum
 from morph_dslam.model.field_storage import names, read_array, read_field, read_group, read_text, write_field
-from morph_dslam.model.reduced_model import Parameter, ReducedModel
+from morph_dslam.model.reduced_model import REACTION, Parameter, ReducedModel
 from morph_dslam.model.separated import SeparatedField
 from morph_dslam.units import FACTORS
 
@@ -39,8 +39,10 @@ def check_model(model: ReducedModel) -> None:
         if matched is None:
             raise ValueError(f"'{name}' is not a type of cell")
         _check_indices(f"{name} cells", connectivity, int(matched[1]), n_nodes)
+    for name, nodes in model.supports.items():
+        _check_indices(f"nodes of the support '{name}'", nodes[:, None], 1, n_nodes)
     for name, field in model.fields.items():
-        n_points = 1 if name.startswith("reaction_") else n_nodes
+        n_points = 1 if name.startswith(REACTION) else n_nodes
         n_components = {"stress": (3, 6), "strain": (6,)}.get(name.split("_")[0], (3,))
         _check_field(name, field, n_points, n_components, model)
 
@@ -111,6 +113,8 @@ def save_model(path: str | Path, model: ReducedModel) -> None:
         file.create_dataset("triangles", data=model.triangles.astype(np.int32))
         for cell_type, connectivity in model.cells.items():
             file.create_dataset(f"cells/{cell_type}", data=connectivity.astype(np.int32))
+        for name, nodes in model.supports.items():
+            file.create_dataset(f"supports/{quote(name, safe=_PLAIN)}", data=nodes.astype(np.int32))
         for name, field in model.fields.items():
             write_field(file.create_group(f"fields/{quote(name, safe=_PLAIN)}"), field)
 
@@ -131,13 +135,20 @@ def _with_prefix(fields: dict[str, SeparatedField], prefix: str) -> dict[str, Se
     return {name.removeprefix(prefix): fields.pop(name) for name in found}
 
 
+def _read_indices(file: h5py.File, group: str, n_dimensions: int) -> dict[str, NDArray[np.int64]]:
+    """The arrays of node indices in a group, by name; none where the group is missing."""
+    if group not in file:
+        return {}
+    found = read_group(file, group)
+    return {unquote(name): read_array(found, name, n_dimensions, np.int64) for name in names(found)}
+
+
 def _read_model(file: h5py.File) -> ReducedModel:
     parameters = _read_parameters(file)
     lower = np.array([p.lower for p in parameters], dtype=np.float64)
     upper = np.array([p.upper for p in parameters], dtype=np.float64)
     group = read_group(file, "fields")
     fields = {unquote(name): read_field(read_group(group, name), lower, upper) for name in names(group)}
-    cells = read_group(file, "cells") if "cells" in file else None
     model = ReducedModel(
         name=read_text(file, "name"),
         nodes=read_array(file, "nodes", 2),
@@ -145,9 +156,10 @@ def _read_model(file: h5py.File) -> ReducedModel:
         parameters=parameters,
         displacement=fields.pop("displacement"),
         stresses=_with_prefix(fields, "stress_"),
-        cells={} if cells is None else {n: read_array(cells, n, 2, np.int64) for n in names(cells)},
+        cells=_read_indices(file, "cells", 2),
+        supports=_read_indices(file, "supports", 1),
         strain=fields.pop("strain", None),
-        reactions=_with_prefix(fields, "reaction_"),
+        reactions=_with_prefix(fields, REACTION),
         certificate=json.loads(read_text(file, "certificate")),
         provenance=json.loads(read_text(file, "provenance")),
     )

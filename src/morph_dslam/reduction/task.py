@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
-from morph_dslam.mechanics.loads import REACTION
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.model.basis_functions import (
     Basis,
@@ -23,6 +22,7 @@ from morph_dslam.model.basis_functions import (
     kriging_basis,
     p_spline_basis,
 )
+from morph_dslam.model.reduced_model import REACTION
 from morph_dslam.studies.problem import ModelMesh, Snapshot, SweepProblem
 from morph_dslam.studies.sections import BasisName, ReductionSection
 
@@ -93,6 +93,7 @@ class ReductionTask:
             nodes=self.mesh.nodes,
             triangles=self.mesh.triangles,
             cells=self.mesh.cells,
+            supports=self.mesh.supports,
             parameters=self.parameters,
             displacement=fields["displacement"],
             stresses=_without_prefix(fields, STRESS),

@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError
-from morph_dslam.mechanics.loads import REACTION, with_reactions
+from morph_dslam.mechanics.loads import with_reactions
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning
 from morph_dslam.mechanics.solvers.continuation import advance, loaded_state
 from morph_dslam.mechanics.solvers.newton import Linearisation, State, size, solve
 from morph_dslam.model import ReducedModel
+from morph_dslam.model.reduced_model import REACTION
 from morph_dslam.reduction.certificate import field_errors
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.problem import Snapshot, announce

@@ -50,6 +50,7 @@ class ModelMesh:
     nodes : (n, 3) undeformed, m.
     triangles : (t, 3) the visible surface.
     cells : volume cells (m, k) by type; empty for sheets.
+    supports : nodes (k,) that supports hold, by the name of the set.
     weights : (n,) share of each node in the volume, or in a sheet's area; they sum to 1.
     """
 
@@ -57,6 +58,7 @@ class ModelMesh:
     triangles: NDArray[np.int64]
     weights: Array
     cells: dict[str, NDArray[np.int64]] = field(default_factory=dict)
+    supports: dict[str, NDArray[np.int64]] = field(default_factory=dict)
 
 
 class SweepProblem(Protocol):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -233,5 +234,6 @@ class SolidStudy(Section):
         return ViscousSweep(self.problem(), list(self.parameters).index(self.time.parameter), self.time.step)
 
     def model_mesh(self) -> ModelMesh:
-        """The nodes of the mesh, its outer surface, its cells, and the volume of each node."""
-        return model_mesh_of(self.solid_mesh())
+        """The nodes of the mesh, its outer surface, its cells, the volume of each node, and what supports hold."""
+        mesh = self.solid_mesh()
+        return replace(model_mesh_of(mesh), supports={part.on: mesh.set_nodes(part.on) for part in self.supports})

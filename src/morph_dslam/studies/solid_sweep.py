@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError
-from morph_dslam.mechanics.loads import FORCE, MOMENT, REACTION
 from morph_dslam.mechanics.solid import SolidProblem
 from morph_dslam.mechanics.solvers.continuation import PathError, advance, loaded_state
 from morph_dslam.mechanics.solvers.newton import Linearisation, State, sensitivities, solve, solve_with_kept_tangent
+from morph_dslam.model.reduced_model import FORCE, MOMENT, REACTION
 from morph_dslam.studies.problem import Snapshot
 
 Array = NDArray[np.float64]

@@ -60,6 +60,7 @@ class DrawnSurface:
             stresses={},
             cells={},
             strain=None,
+            supports={},
             reactions={},
         )
         return cls(drawn, _closes_a_volume(nodes, triangles))

@@ -26,6 +26,7 @@ from morph_dslam.sources import FrameSource
 from morph_dslam.tracking.binding import DrawnSurface, View, facing
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, near_jumps
 from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.force_arrows import ForceArrows
 from morph_dslam.tracking.run_results import RunResults
 
 Array = NDArray[np.float64]
@@ -181,10 +182,12 @@ class DrawOptions:
     show : "stress" (von Mises), "strain" (equivalent) or "displacement"; None for stress where the model has
         one, else the displacement
     section : a plane that cuts the object open; None for none.
+    forces : whether arrows show the forces of supports.
     """
 
     show: Shown | None = None
     section: SectionPlane | None = None
+    forces: bool = False
 
 
 class AugmentedView:
@@ -214,6 +217,7 @@ class AugmentedView:
         self._rest = model.rest_positions(self._points)
         self._displacement = self._restricted("displacement")
         self._fields = {name: self._restricted(name) for name in _fields_of(model, self.show)}
+        self._arrows = ForceArrows(model) if options.forces else None
 
     def _restricted(self, name: str) -> SeparatedField:
         field = self._model.restrict(self._points, name)
@@ -327,7 +331,7 @@ class AugmentedView:
                 label=structure.name,
                 brightness=lambert(vertex_normals(nodes, structure.triangles), LIGHT, AMBIENT),
             )
-        return drawn
+        return drawn if self._arrows is None else self._arrows.draw(drawn, state, self._camera)
 
 
 def with_caption(image: NDArray[np.uint8], caption: str) -> NDArray[np.uint8]:

@@ -45,6 +45,7 @@ class TrackerOptions:
         with too little texture is followed by it alone.
     use_texture : whether texture counts where the outline does.
     use_depth : whether the depth images of frames that have them count too.
+    modulus_std : standard deviation of a factor common to all moduli, a share; it counts in the reactions.
     depth_sigma : standard deviation of one pixel's depth at 1 m, metres; it grows with the distance squared.
     use_discrepancy : whether to look for what the object's shape has beyond the model's.
     per_sequence : names of the parameters that are one over the whole sequence.
@@ -79,6 +80,7 @@ class TrackerOptions:
     use_discrepancy: bool = False
     per_sequence: tuple[str, ...] = ()
     random_walk: tuple[tuple[str, float], ...] = ()
+    modulus_std: float = 0.0
     start: StartFrom = "previous"
     new_views: bool = True
     max_views: int = 12

@@ -16,6 +16,7 @@ from morph_dslam.tracking.displacement_jumps import DisplacementJump, near_jumps
 from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.observability import displacement_std, von_mises_std
 from morph_dslam.tracking.outcomes import FoundBy, PoseSource, Rejection, Status, TrackingWarning, reason_text
+from morph_dslam.tracking.reactions import Reaction, Reactions
 
 Array = NDArray[np.float64]
 _Kind = TypeVar("_Kind", bound=TrackingWarning)
@@ -195,6 +196,15 @@ class FrameResult:
         if self.model.strain is None:
             raise KeyError(f"the model '{self.model.name}' holds no strain")
         return self.model.strain.value(self._mu)
+
+    def reactions(self, modulus_std: float = 0.0) -> dict[str, Reaction]:
+        """What supports exert on the object, by the name of the set; empty for a model without reactions.
+
+        Parameters
+        ----------
+        modulus_std : standard deviation of a factor common to all moduli, 0.05 for 5 %.
+        """
+        return Reactions(self.model)(self._tracked, modulus_std)
 
     @property
     def _tracked(self) -> Estimate:

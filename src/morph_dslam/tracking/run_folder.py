@@ -26,6 +26,7 @@ from morph_dslam.model.inner_structure import CarriedStructure
 from morph_dslam.notices import Notice
 from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.observability import one_value
+from morph_dslam.tracking.reactions import Reaction
 from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.run_notices import notices_of
 from morph_dslam.tracking.run_plots import write_plots
@@ -123,11 +124,40 @@ def write_hdf5(path: Path, run: RunResults) -> None:
         file["largest_displacement"], file["largest_displacement_std"] = run.largest_displacements().T
         if run.model.stresses:
             file["largest_von_mises"], file["largest_von_mises_std"] = run.largest_stresses().T
+        _write_reactions(file, run)
         file["residual_rms_px"], file["unexplained_px"] = run.residuals_px(), run.unexplained_px()
         file["n_points"], file["n_inliers"] = run.counts().T
         file["timings_ms"] = run.timings_ms()
         file["timings_ms"].attrs["names"] = [*STAGES, "total"]
         save_discrepancies(file, [result.discrepancy for result in run.results])
+
+
+def _write_reactions(file: h5py.File, run: RunResults) -> None:
+    """``reactions/SET/force`` and so on (f, 3), NaN where the object was hidden or lost."""
+    lost = np.full((5, 3), np.nan)
+    for name, frames in run.reactions().items():
+        rows = [lost if one is None else np.array([one.point, *_parts_of(one)]) for one in frames]
+        parts = np.moveaxis(np.array(rows), 1, 0)
+        for part, values in zip(("point", "force", "force_std", "moment", "moment_std"), parts, strict=True):
+            file[f"reactions/{name}/{part}"] = values
+
+
+def _parts_of(reaction: Reaction) -> tuple[Array, Array, Array, Array]:
+    """Force (N), moment (N m), each with its deviations."""
+    return reaction.force.value, reaction.force.std, reaction.moment.value, reaction.moment.std
+
+
+def _reaction_columns(run: RunResults) -> tuple[list[str], list[list[str]]]:
+    """Names of the columns with reactions, and what is in them in each frame: newtons and newton millimetres."""
+    names: list[str] = []
+    rows: list[list[str]] = [[] for _ in run.frames]
+    for support, frames in run.reactions().items():
+        for kind, unit in (("force", "N"), ("moment", "Nmm")):
+            names += [f"{kind}_{support}_{axis}{std}_{unit}" for std in ("", "_std") for axis in "xyz"]
+        for row, reaction in zip(rows, frames, strict=True):
+            values = np.full(12, np.nan) if reaction is None else np.concatenate(_parts_of(reaction))
+            row += ["" if np.isnan(v) else f"{v:.5g}" for v in values * np.repeat([1.0, 1e3], 6)]
+    return names, rows
 
 
 def write_csv(path: Path, run: RunResults) -> None:
@@ -139,11 +169,12 @@ def write_csv(path: Path, run: RunResults) -> None:
     header += ["largest_displacement_mm", "largest_displacement_std_mm"]
     header += ["x_mm", "y_mm", "z_mm", "rotation_x_deg", "rotation_y_deg", "rotation_z_deg"]
     header += ["residual_rms_px", "unexplained_px", "n_points", "n_inliers", "time_ms"]
-    rows = zip(run.frames, run.timestamps, run.results, 1e3 * run.largest_displacements(), strict=True)
+    names, reactions = _reaction_columns(run)
+    rows = zip(run.frames, run.timestamps, run.results, 1e3 * run.largest_displacements(), reactions, strict=True)
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(header)
-        for frame, timestamp, result, largest in rows:
+        writer.writerow(header + names)
+        for frame, timestamp, result, largest, forces in rows:
             row: list[Any] = [frame, f"{timestamp:.6f}", result.status, result.reason, result.pose_from]
             if result.estimate is None:
                 row += [""] * (3 * len(parameters) + 10)
@@ -157,7 +188,7 @@ def write_csv(path: Path, run: RunResults) -> None:
                 row += [f"{1e3 * value:.4f}" for value in pose.translation]
                 row += [f"{value:.4f}" for value in np.degrees(rotation_log(pose.rotation))]
                 row += [f"{result.residual_rms_px:.4f}", f"{result.unexplained_px:.4f}"]
-            writer.writerow([*row, result.n_points, result.n_inliers, f"{result.total_ms:.3f}"])
+            writer.writerow([*row, result.n_points, result.n_inliers, f"{result.total_ms:.3f}", *forces])
 
 
 def summarise(run: RunResults, notices: Sequence[Notice] = ()) -> dict[str, Any]:
@@ -188,11 +219,24 @@ def summarise(run: RunResults, notices: Sequence[Notice] = ()) -> dict[str, Any]
             "median": 1e3 * float(np.nanmedian(beyond)),
             "largest": 1e3 * float(np.nanmax(beyond)),
         }
+    summary["largest_forces"] = largest_forces(run)
     summary["one_over_the_sequence"] = values_over_the_sequence(run)
     notices = [*notices, *notices_of(run)]
     summary["flags"] = [notice.text for notice in notices]
     summary["notices"] = [notice.content() for notice in notices]
     return summary
+
+
+def largest_forces(run: RunResults) -> list[dict[str, Any]]:
+    """Of each support its largest force, with standard deviation and frame; the largest of them first."""
+    found = []
+    for name, frames in run.reactions().items():
+        known = [(reaction, frame) for reaction, frame in zip(frames, run.frames, strict=True) if reaction is not None]
+        if known:
+            largest, frame = max(((reaction.force, frame) for reaction, frame in known), key=lambda one: one[0].size)
+            figures = {"on": name, "force_N": largest.size, "standard_deviation_N": largest.size_std, "frame": frame}
+            found.append(figures)
+    return sorted(found, key=lambda figures: -float(figures["force_N"]))
 
 
 def values_over_the_sequence(run: RunResults) -> list[dict[str, object]]:

@@ -19,12 +19,13 @@ MOST_STAGES, LEAST_SHARE = 10, 0.005
 
 
 def write_plots(folder: Path, run: RunResults) -> None:
-    """Write ``residual.png``, ``timings.png``, of objects that deform ``parameters.png`` and ``confidence.png``, and
-    ``jumps.png`` if any are."""
+    """Write ``residual.png``, ``timings.png`` and, where there is something in them, the other plots of the run."""
     folder.mkdir(exist_ok=True)
     if run.model.parameters:
         plot_confidence(folder / "confidence.png", run)
         plot_parameters(folder / "parameters.png", run)
+    if run.reactions():
+        plot_reactions(folder / "reactions.png", run)
     plot_residual(folder / "residual.png", run)
     plot_timings(folder / "timings.png", run)
     if any(result.jumps for result in run.results):
@@ -67,6 +68,24 @@ def plot_confidence(path: Path, run: RunResults) -> None:
         top = 1.5 * float(np.nanmax(both[:, 0], initial=0.0)) or 1.0
         _plot_band(axes, run, both[:, 0], both[:, 1], (0.0, top))
         axes.set_ylabel(label)
+    all_axes[0].legend(loc="upper left", fontsize=8)
+    figure.savefig(path, dpi=DPI)
+
+
+def plot_reactions(path: Path, run: RunResults) -> None:
+    """Size of force and moment of each support, each with a band of two standard deviations."""
+    reactions = run.reactions()
+    figure, all_axes = _rows(2 * len(reactions), 1.9)
+    for number, (name, frames) in enumerate(reactions.items()):
+        for kind, unit, scale, axes in (
+            ("force", "N", 1.0, all_axes[2 * number]),
+            ("moment", "N mm", 1e3, all_axes[2 * number + 1]),
+        ):
+            found = [getattr(reaction, kind, None) for reaction in frames]
+            both = scale * np.array([(np.nan, np.nan) if one is None else (one.size, one.size_std) for one in found])
+            top = 1.2 * float(np.nanmax(both[:, 0], initial=0.0)) or 1.0
+            _plot_band(axes, run, both[:, 0], both[:, 1], (0.0, top))
+            axes.set_ylabel(f"{kind} on {name} [{unit}]", fontsize=8)
     all_axes[0].legend(loc="upper left", fontsize=8)
     figure.savefig(path, dpi=DPI)
 

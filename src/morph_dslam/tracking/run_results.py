@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from morph_dslam.tracking.binding import DrawnSurface
 from morph_dslam.tracking.estimator import Estimate, State
 from morph_dslam.tracking.observability import largest_displacement, largest_von_mises
 from morph_dslam.tracking.outcomes import Status
+from morph_dslam.tracking.reactions import Reaction, Reactions
 from morph_dslam.tracking.result import STAGES, FrameResult
 
 Array = NDArray[np.float64]
@@ -29,6 +31,7 @@ class RunResults:
     reference_frame : number of the frame that the object is known from.
     refined : whether the reference state was refined over the frames.
     per_sequence : names of the parameters that are the same in all frames.
+    modulus_std : standard deviation of a factor common to all moduli, a share.
     frames : (f,) numbers.
     timestamps : (f,) seconds.
     results : (f,), without the residuals of single points: runs may be long.
@@ -38,11 +41,13 @@ class RunResults:
     reference_frame: int
     refined: bool = False
     per_sequence: tuple[str, ...] = ()
+    modulus_std: float = 0.0
     frames: list[int] = field(default_factory=list)
     timestamps: list[float] = field(default_factory=list)
     results: list[FrameResult] = field(default_factory=list)
     _largest: list[tuple[float, float]] = field(default_factory=list, repr=False)
     _stressed: list[tuple[float, float]] = field(default_factory=list, repr=False)
+    _reactions: list[dict[str, Reaction]] = field(default_factory=list, repr=False)
 
     def add(self, frame: int, timestamp: float, result: FrameResult) -> None:
         if result.estimate is not None:
@@ -106,6 +111,18 @@ class RunResults:
         used = np.unique(self.model.triangles)
         stresses = {place: f.with_modes(f.modes[:, used]) for place, f in self.model.stresses.items()}
         return self._added_to(self._stressed, largest_von_mises, replace(self.model, stresses=stresses))
+
+    def reactions(self) -> dict[str, list[Reaction | None]]:
+        """Of each support what it exerts in every frame, None where the object was hidden or lost."""
+        reactions = self._reactions_of_model
+        for result in self.results[len(self._reactions) :]:
+            found = result.estimate
+            self._reactions.append({} if found is None else reactions(found, self.modulus_std))
+        return {name: [frame.get(name) for frame in self._reactions] for name in reactions.names}
+
+    @cached_property
+    def _reactions_of_model(self) -> Reactions:
+        return Reactions(self.model)
 
     def _added_to(
         self,

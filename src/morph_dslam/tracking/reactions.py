@@ -1,0 +1,135 @@
+"""What supports exert on the object in a state, with standard deviations: forces from images.
+
+The reduced model holds force and moment of every support as functions of the parameters. Their deviations follow from
+those of the parameters to first order; a common factor by which all moduli may be off changes every force alike, and is
+added. Neither the error of the model nor that of its law is in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.model import ReducedModel, SeparatedField
+from morph_dslam.model.reduced_model import FORCE, MOMENT
+from morph_dslam.tracking.estimator import Estimate
+
+Array = NDArray[np.float64]
+#: Values (3,) of a field at parameters, and their derivatives (d, 3).
+_Field = Callable[[Array], tuple[Array, Array]]
+
+
+@dataclass(frozen=True)
+class VectorEstimate:
+    """A vector with standard deviations.
+
+    Attributes
+    ----------
+    value : (3,) in the object frame.
+    std : (3,) of its components.
+    size_std : of its length.
+    """
+
+    value: Array
+    std: Array
+    size_std: float
+
+    @property
+    def size(self) -> float:
+        """Its length."""
+        return float(np.linalg.norm(self.value))
+
+
+@dataclass(frozen=True)
+class Reaction:
+    """What one support exerts on the object.
+
+    Attributes
+    ----------
+    point : (3,) mean of the deformed nodes that the support holds, object frame, m; the origin for a model file that
+        does not name them.
+    force : N.
+    moment : about the point, N m.
+    """
+
+    point: Array
+    force: VectorEstimate
+    moment: VectorEstimate
+
+
+class Reactions:
+    """The reactions of a model's supports."""
+
+    def __init__(self, model: ReducedModel) -> None:
+        names = [name.removeprefix(FORCE) for name in model.reactions if name.startswith(FORCE)]
+        self._parts = {name: _fields_of(model, name) for name in names}
+
+    def __call__(self, estimate: Estimate, modulus_std: float = 0.0) -> dict[str, Reaction]:
+        """The reaction of each support, by the name of its set.
+
+        Parameters
+        ----------
+        estimate : of a frame.
+        modulus_std : standard deviation of a factor common to all moduli.
+        """
+        mu = estimate.state.parameters
+        covariance = estimate.covariance[: len(mu), : len(mu)]
+        determined = bool(np.isfinite(covariance).all())
+
+        def estimated(value: Array, slopes: Array) -> VectorEstimate:
+            if not determined:
+                return VectorEstimate(value, np.full(3, np.inf), np.inf)
+            # A common factor of the moduli is one more parameter, by which the derivative is the value itself.
+            of_components = slopes.T @ covariance @ slopes + modulus_std**2 * np.outer(value, value)
+            along = value / max(float(np.linalg.norm(value)), 1e-300)
+            variances = np.maximum([*np.diag(of_components), along @ of_components @ along], 0.0)
+            return VectorEstimate(value, np.sqrt(variances[:3]), float(np.sqrt(variances[3])))
+
+        found = {}
+        for name, fields in self._parts.items():
+            (point, arms), (force, forces), (about_origin, moments) = (field(mu) for field in fields)
+            moment = about_origin - np.cross(point, force)
+            moment_slopes = moments - np.cross(arms, force) - np.cross(point, forces)
+            found[name] = Reaction(point, estimated(force, forces), estimated(moment, moment_slopes))
+        return found
+
+    def forces(self, mu: Array) -> dict[str, tuple[Array, Array]]:
+        """Point (3,), m, and force (3,), N, of each support at parameters (d,), in the object frame."""
+        return {name: (place(mu)[0], force(mu)[0]) for name, (place, force, _) in self._parts.items()}
+
+    @property
+    def names(self) -> list[str]:
+        """Of the supports."""
+        return list(self._parts)
+
+
+def _fields_of(model: ReducedModel, name: str) -> tuple[_Field, _Field, _Field]:
+    """Place of a support, its force and its moment about the origin."""
+    d = len(model.parameters)
+
+    def nothing(mu: Array) -> tuple[Array, Array]:
+        return np.zeros(3), np.zeros((d, 3))
+
+    def value_of(field: SeparatedField) -> _Field:
+        def of(mu: Array) -> tuple[Array, Array]:
+            value, slopes = field.value_and_sensitivities(mu)
+            return value[0], slopes[:, 0]
+
+        return of
+
+    place = nothing
+    if name in model.supports:
+        held = model.supports[name]
+        rest = model.nodes[held].mean(axis=0)
+        moved = model.displacement.with_modes(model.displacement.modes[:, held].mean(axis=1, keepdims=True))
+
+        def place(mu: Array) -> tuple[Array, Array]:
+            value, slopes = value_of(moved)(mu)
+            return rest + value, slopes
+
+    # A moment that never exceeds rounding is not in the file.
+    moment = model.reactions.get(MOMENT + name)
+    return place, value_of(model.reactions[FORCE + name]), nothing if moment is None else value_of(moment)
