@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import meshio
 import numpy as np
 import pytest
 
@@ -10,7 +13,19 @@ from morph_dslam.errors import StudyError
 from morph_dslam.studies.solid_study import SolidStudy
 
 THICKNESS = {"kind": "thickness", "on": "outer", "kept": "inner", "amplitude": "growth"}
+FIELD = {"kind": "field", "unit": "mm", "field": "growth", "amplitude": "growth / 1 mm"}
 RADIUS = {"kind": "radius", "axis": [0, 0, 3], "amplitude": "-1 mm + 0.5 * growth"}
+
+
+def write_field(path: Path, component: float = 1.0, skip: int = 0) -> dict:
+    """A file in which all nodes of a tube move away from its axis by 1 mm, in any order; the shape that names it."""
+    nodes = tube_study("20 mm", "30 mm", []).solid_mesh().nodes[skip:]
+    nodes = np.random.default_rng(0).permutation(np.concatenate([nodes, [[0.0, 0.0, 0.5]]]))
+    moves = component * nodes / np.maximum(np.linalg.norm(nodes[:, :2], axis=1, keepdims=True), 1e-9)
+    moves[:, 2] = 0.0
+    points = [("vertex", np.arange(len(nodes))[:, None])]
+    meshio.Mesh(1e3 * nodes, points, point_data={"growth": moves, "age": nodes[:, 0]}).write(path)
+    return FIELD | {"file": str(path)}
 
 
 def tube_study(inner: str, outer: str, shape: list[dict]) -> SolidStudy:
@@ -65,6 +80,44 @@ def test_a_snapshot_is_that_of_the_other_mesh(shape: list[dict], inner: str, out
     for name in ("displacement", "stress_solid"):
         slope = (states[0].fields[name] - states[1].fields[name]) / 2e-6
         np.testing.assert_allclose(one.sensitivities[name][0], slope, atol=1e-5 * np.abs(slope).max())
+
+
+def test_a_displacement_field_moves_the_nodes(tmp_path: Path) -> None:
+    mu = np.array([0.002])
+    found = tube_study("20 mm", "30 mm", [write_field(tmp_path / "growth.vtu")]).sweep_problem()
+    expected = tube_study("22 mm", "32 mm", []).sweep_problem()
+    one, other = (s.take_snapshot(s.advance(s.first_state(), mu)) for s in (found, expected))
+    scale = np.abs(other.fields["stress_solid"]).max()
+    np.testing.assert_allclose(one.fields["stress_solid"], other.fields["stress_solid"], atol=1e-6 * scale)
+
+
+def test_a_displacement_field_counts_by_its_content(tmp_path: Path) -> None:
+    first, moved = write_field(tmp_path / "a.vtu"), write_field(tmp_path / "b.vtu")
+    prints = [tube_study("20 mm", "30 mm", [shape]).fingerprint() for shape in (first, moved)]
+    assert prints[0] == prints[1]
+    write_field(tmp_path / "a.vtu", component=1.1)
+    assert tube_study("20 mm", "30 mm", [first]).fingerprint() != prints[0]
+
+
+def test_mistakes_in_a_displacement_field_are_named(tmp_path: Path) -> None:
+    shape = write_field(tmp_path / "growth.vtu")
+    with pytest.raises(StudyError, match=r"growth\.vtu has no point data 'swelling'; it has: .*growth"):
+        tube_study("20 mm", "30 mm", [shape | {"field": "swelling"}]).problem()
+    with pytest.raises(StudyError, match=r"'age' has 1 components in place of 3"):
+        tube_study("20 mm", "30 mm", [shape | {"field": "age"}]).problem()
+    with pytest.raises(StudyError, match=r"has no point at 96 of the mesh's 96 nodes, the first at .* cm"):
+        tube_study("20 mm", "30 mm", [shape | {"unit": "cm"}]).problem()
+    with pytest.raises(StudyError, match=r"cannot read the solution .*none\.vtu"):
+        tube_study("20 mm", "30 mm", [shape | {"file": "none.vtu"}]).problem()
+    with pytest.raises(StudyError, match=r"shape\.0\.unit: unknown unit|shape\.0\.unit: .*furlong"):
+        tube_study("20 mm", "30 mm", [shape | {"unit": "furlong"}])
+    with pytest.raises(StudyError, match=r"holds values that are not finite"):
+        tube_study("20 mm", "30 mm", [write_field(tmp_path / "nan.vtu", component=np.nan)]).problem()
+    with pytest.raises(StudyError, match=r"has no point at 3 of the mesh's 96 nodes, the first at \(20, 0, 0\) mm"):
+        tube_study("20 mm", "30 mm", [write_field(tmp_path / "part.vtu", skip=3)]).problem()
+    inwards = [shape | {"amplitude": "10 * growth / 1 mm"}]
+    with pytest.raises(StudyError, match=r"the shape at growth = -3 mm: .*(inverted|folded)"):
+        tube_study("20 mm", "30 mm", inwards).problem()
 
 
 def test_a_model_has_the_shape_as_a_parameter(tmp_path) -> None:

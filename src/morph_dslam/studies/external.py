@@ -9,24 +9,22 @@ from __future__ import annotations
 import csv
 import re
 from pathlib import Path
-from typing import Any
 
 import meshio
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field
 
 from morph_dslam.errors import StudyError
 from morph_dslam.meshing.mesh_checks import check_size
 from morph_dslam.meshing.meshes import CellBlock, Mesh, model_mesh_of
 from morph_dslam.model import Parameter
 from morph_dslam.studies.problem import ModelMesh, Snapshot
-from morph_dslam.studies.sections import ReductionSection, Section
+from morph_dslam.studies.sections import ReductionSection, Section, StudyPath
+from morph_dslam.studies.solution_files import SAME, point_data, read_solution
 from morph_dslam.units import quantity_of, to_si
 
 Array = NDArray[np.float64]
-#: Of meshio, by the ending of a file's name: `meshio.read` itself ends the program where a file is damaged.
-_READERS = {".vtu": meshio.vtu.read, ".vtk": meshio.vtk.read, ".xdmf": meshio.xdmf.read, ".xmf": meshio.xdmf.read}
 #: Cell types by the names that meshio gives them; the order of their nodes is VTK's.
 _CELL_TYPES = {
     "hexahedron": "hex8",
@@ -42,8 +40,6 @@ _CELL_TYPES = {
 }
 #: Where xx, yy, zz, yz, xz, xy stand among VTK's six components, and among nine row by row.
 _VOIGT = {6: [0, 1, 2, 4, 5, 3], 9: [0, 4, 8, 5, 2, 1]}
-#: Nodes may differ by so much of the mesh's size from file to file, which is written in single precision.
-_SAME = 1e-5
 _COLUMN = re.compile(r"\s*(?P<name>\w+)\s*(?:\[(?P<unit>[^\]]+)\])?\s*")
 
 
@@ -57,17 +53,12 @@ class _ExternalSection(Section):
     ``strain`` (Green-Lagrange) have six components in VTK's order xx, yy, zz, xy, yz, xz, or nine.
     """
 
-    table: Path
+    table: StudyPath
     length_unit: str
     displacement: str = "displacement"
     stress: str | None = None
     stress_unit: str = "Pa"
     strain: str | None = None
-
-    @field_validator("table")
-    @classmethod
-    def _resolve(cls, table: Path, info: ValidationInfo) -> Path:
-        return Path((info.context or {}).get("folder", ".")) / table
 
 
 class _HoldOutSection(Section):
@@ -98,7 +89,9 @@ class ExternalStudy(Section):
         mesh: Mesh | None = None
         for row, point in zip(rows, coordinates, strict=True):
             path = self.external.table.parent / row["file"]
-            content = _read(path, row.get("step"))
+            if not path.is_file():
+                raise StudyError(f"the solution {path} that the table names does not exist")
+            content = read_solution(path, row.get("step"))
             here = _mesh(content, to_si(1.0, self.external.length_unit, "length"), path)
             if mesh is None:
                 check_size(here)
@@ -111,10 +104,10 @@ class ExternalStudy(Section):
     def _fields(self, content: meshio.Mesh, path: Path) -> dict[str, Array]:
         section = self.external
         length, stress = to_si(1.0, section.length_unit, "length"), to_si(1.0, section.stress_unit, "stress")
-        fields = {"displacement": length * _point_data(content, section.displacement, (3,), path)}
+        fields = {"displacement": length * point_data(content, section.displacement, (3,), path)}
         for name, key, factor in (("stress_solid", section.stress, stress), ("strain", section.strain, 1.0)):
             if key is not None:
-                values = _point_data(content, key, tuple(_VOIGT), path)
+                values = point_data(content, key, tuple(_VOIGT), path)
                 fields[name] = factor * values[:, _VOIGT[values.shape[1]]]
         return fields
 
@@ -185,24 +178,6 @@ def _number(path: Path, line: int, row: dict[str, str], key: str) -> float:
         raise StudyError(f"{path}, line {line}: '{row.get(key)}' is no number for {key}") from None
 
 
-def _read(path: Path, step: str | None) -> meshio.Mesh:
-    """A file's mesh and point data; of an XDMF series those of one step."""
-    if not path.is_file():
-        raise StudyError(f"the solution {path} that the table names does not exist")
-    read = _READERS.get(path.suffix.lower())
-    if read is None:
-        raise StudyError(f"{path} is no solution that can be read; use {', '.join(_READERS)}")
-    try:
-        if step is None:
-            return read(str(path))
-        with meshio.xdmf.TimeSeriesReader(path) as reader:
-            points, cells = reader.read_points_cells()
-            _, point_data, _ = reader.read_data(int(step))
-            return meshio.Mesh(np.asarray(points), cells, point_data=point_data)
-    except Exception as error:  # meshio raises whatever its parsers meet
-        raise StudyError(f"cannot read the solution {path}: {error}") from error
-
-
 def _mesh(content: meshio.Mesh, unit: float, path: Path) -> Mesh:
     """The cells of the highest dimension; other types are an error."""
     blocks = [block for block in content.cells if block.type not in ("vertex", "line")]
@@ -224,23 +199,8 @@ def _check_same(first: Mesh, other: Mesh, path: Path) -> None:
     same = same and all(
         np.array_equal(a.connectivity, b.connectivity) for a, b in zip(first.blocks, other.blocks, strict=True)
     )
-    if not same or np.abs(first.nodes - other.nodes).max() > _SAME * np.ptp(first.nodes, axis=0).max():
+    if not same or np.abs(first.nodes - other.nodes).max() > SAME * np.ptp(first.nodes, axis=0).max():
         raise StudyError(
             f"{path} has another mesh than the first solution: all need the same undeformed nodes and cells, "
             "with the displacement as point data"
         )
-
-
-def _point_data(content: meshio.Mesh, name: str, widths: tuple[int, ...], path: Path) -> Array:
-    """Point data (n, c) with one of the given numbers of components."""
-    if name not in content.point_data:
-        known = ", ".join(content.point_data) or "none"
-        raise StudyError(f"{path} has no point data '{name}'; it has: {known}")
-    values: Any = np.asarray(content.point_data[name], dtype=np.float64)
-    values = values.reshape(len(content.points), -1)
-    if values.shape[1] not in widths:
-        wanted = " or ".join(str(width) for width in widths)
-        raise StudyError(f"{path}: '{name}' has {values.shape[1]} components in place of {wanted}")
-    if not np.isfinite(values).all():
-        raise StudyError(f"{path}: '{name}' holds values that are not finite")
-    return values

@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from morph_dslam.errors import StudyError
 from morph_dslam.reduction.registry import reduction_method
@@ -36,6 +46,26 @@ Length = Annotated[float, quantity("length")]
 PositiveLength = Annotated[float, quantity("length"), Field(gt=0, allow_inf_nan=False)]
 Stress = Annotated[float, quantity("stress"), Field(gt=0, allow_inf_nan=False)]
 Angle = Annotated[float, quantity("angle")]
+
+
+def _length_unit(unit: str) -> str:
+    try:
+        to_si(1.0, unit, "length")
+    except StudyError as error:
+        raise ValueError(str(error)) from error
+    return unit
+
+
+#: The unit of a file's or a list's lengths.
+LengthUnit = Annotated[str, AfterValidator(_length_unit)]
+
+
+def _in_folder(path: Path, info: ValidationInfo) -> Path:
+    return Path((info.context or {}).get("folder", ".")) / path
+
+
+#: A file, relative to the study's.
+StudyPath = Annotated[Path, AfterValidator(_in_folder)]
 
 
 class Section(BaseModel):

@@ -1,4 +1,4 @@
-"""The [mesh], [[shape]], [[supports]] and [[loads]] sections of a solid's study.
+"""The [mesh], [[supports]] and [[loads]] sections of a solid's study.
 
 A value is a number with its unit, the name of a parameter, or a linear expression of parameters
 (`morph_dslam.studies.affine`). ``make`` turns a section into what the solver understands.
@@ -8,29 +8,20 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable
 from functools import lru_cache
-from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationInfo, field_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag
 
-from morph_dslam.errors import StudyError
 from morph_dslam.mechanics import loads, supports
-from morph_dslam.mechanics.kinematics import ShapeField
-from morph_dslam.mechanics.morphing import radius_field, thickness_field
-from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.meshing import generators as mesh_generators
 from morph_dslam.meshing.mesh_checks import check_mesh
 from morph_dslam.meshing.mesh_files import load_mesh
 from morph_dslam.meshing.meshes import Mesh
-from morph_dslam.model import Parameter
-from morph_dslam.studies.affine import Affine, read_affine
-from morph_dslam.studies.sections import Angle, Length, Number, PositiveLength, Section
+from morph_dslam.studies.sections import Angle, LengthUnit, Number, PositiveLength, Section, StudyPath
 from morph_dslam.units import to_si
 
 CellName = Literal["hex8", "hex20", "hex27", "tet4", "tet10", "prism6", "prism15", "prism18"]
@@ -55,14 +46,9 @@ class _FileMesh(Section):
     a cell where the file has a surface only and its volume is meshed.
     """
 
-    file: Path
+    file: StudyPath
     unit: str
     size: PositiveLength | None = None
-
-    @field_validator("file")
-    @classmethod
-    def _resolve(cls, file: Path, info: ValidationInfo) -> Path:
-        return Path((info.context or {}).get("folder", ".")) / file
 
     def make(self) -> Mesh:
         return load_mesh(self.file, self.unit, self.size)
@@ -118,21 +104,12 @@ class _RevolutionMesh(Section):
 
     generator: Literal["revolution"]
     profile: tuple[tuple[Number, Number], ...]
-    unit: str
+    unit: LengthUnit
     thickness: PositiveLength
     divisions: Divisions
     cells: CellName = "hex20"
     angles: tuple[Angle, Angle] = (0.0, 2.0 * np.pi)
     collars: tuple[_CollarSection, ...] = ()
-
-    @field_validator("unit")
-    @classmethod
-    def _is_length(cls, unit: str) -> str:
-        try:
-            to_si(1.0, unit, "length")
-        except StudyError as error:
-            raise ValueError(str(error)) from error
-        return unit
 
     def make(self) -> Mesh:
         profile = np.array(self.profile) * to_si(1.0, self.unit, "length")
@@ -185,76 +162,6 @@ def mesh_fingerprint(mesh: Mesh) -> str:
         for name in sorted(sets):
             digest.update(name.encode() + np.ascontiguousarray(sets[name], dtype=np.int64).tobytes())
     return digest.hexdigest()
-
-
-Array = NDArray[np.float64]
-
-
-class _ShapeSection(Section):
-    amplitude: Value
-
-    def make(self, read: Reader) -> Any:
-        """The amplitude, m."""
-        return read(self.amplitude, "length")
-
-
-class _ThicknessShape(_ShapeSection):
-    """A wall that is thicker by ``amplitude``: surface ``on`` moves outwards, surface ``kept`` stays."""
-
-    kind: Literal["thickness"]
-    on: str
-    kept: str
-
-    def field(self, mesh: Mesh) -> Array:
-        """How far each node (n, 3) moves for an amplitude of 1."""
-        return thickness_field(mesh, self.on, self.kept)
-
-
-class _RadiusShape(_ShapeSection):
-    """A body that is wider by ``amplitude`` all around an axis, its wall as it was."""
-
-    kind: Literal["radius"]
-    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    centre: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
-
-    def field(self, mesh: Mesh) -> Array:
-        """How far each node (n, 3) moves for an amplitude of 1."""
-        return radius_field(mesh.nodes, np.array(self.centre), np.array(self.axis))
-
-
-ShapeSection = Annotated[_ThicknessShape | _RadiusShape, Field(discriminator="kind")]
-
-
-def shape_fields(
-    sections: Sequence[_ThicknessShape | _RadiusShape], mesh: Mesh, symbols: ParameterSymbols
-) -> list[ShapeField]:
-    """The shape as the solver takes it, checked at the ends of the parameters that it depends on."""
-    parameters = symbols.parameters
-    amplitudes = [read_affine(section.amplitude, "length", parameters) for section in sections]
-    fields = [section.field(mesh) for section in sections]
-    _check_ends(mesh, amplitudes, fields, parameters)
-    values = [symbols[parameter.name] for parameter in parameters]
-    return [
-        ShapeField(amplitude.expression(values), field) for amplitude, field in zip(amplitudes, fields, strict=True)
-    ]
-
-
-def _check_ends(
-    mesh: Mesh, amplitudes: Sequence[Affine], fields: Sequence[Array], parameters: Sequence[Parameter]
-) -> None:
-    varied = [any(a.slopes[i] for a in amplitudes) for i in range(len(parameters))]
-    ends = [(p.lower, p.upper) if used else (p.default,) for p, used in zip(parameters, varied, strict=True)]
-    for corner in product(*ends) if amplitudes else ():
-        moves = [a(np.array(corner)) * field for a, field in zip(amplitudes, fields, strict=True)]
-        try:
-            check_mesh(replace(mesh, nodes=mesh.nodes + sum(moves)))
-        except StudyError as error:
-            where = ", ".join(
-                f"{p.name} = {p.display(value):.4g} {p.unit}".removesuffix(" 1")
-                for p, value, used in zip(parameters, corner, varied, strict=True)
-                if used
-            )
-            raise StudyError(f"the shape at {where or 'its amplitude'}: {error}") from error
 
 
 #: A quantity in a study file.

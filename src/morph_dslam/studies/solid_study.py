@@ -22,6 +22,7 @@ from morph_dslam.studies.material_sections import MaterialSection
 from morph_dslam.studies.parameters import ParameterSection, TimeSection
 from morph_dslam.studies.problem import ModelMesh, Snapshot, SweepProblem
 from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section, WorkSection
+from morph_dslam.studies.shape_sections import ShapeSection, shape_fields
 from morph_dslam.studies.snapshots import SOLVER_VERSION
 from morph_dslam.studies.solid_sections import (
     BodyForceLoad,
@@ -29,12 +30,10 @@ from morph_dslam.studies.solid_sections import (
     LoadSection,
     MeshSection,
     Reader,
-    ShapeSection,
     SupportSection,
     Value,
     make_mesh,
     mesh_fingerprint,
-    shape_fields,
 )
 from morph_dslam.studies.solid_sweep import SolidSweep, ViscousSweep
 
@@ -180,9 +179,10 @@ class SolidStudy(Section):
         content["parameters"] = list(self.parameters)
         content["root"] = self.root().tolist() if self.time else None
         content["time"] = self.time.model_dump() if self.time else None
-        content["mesh"] = mesh_fingerprint(self.solid_mesh())
+        mesh = self.solid_mesh()
+        content["mesh"] = mesh_fingerprint(mesh)
         content["code"] = SOLVER_VERSION
-        content |= {"shape": self.model_dump(mode="json")["shape"]} if self.shape else {}
+        content |= {"shape": [section.fingerprint(mesh) for section in self.shape]} if self.shape else {}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def root(self) -> Array:

@@ -1,0 +1,52 @@
+"""Fields at the nodes of a mesh from files of other programs: VTU, VTK, XDMF."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import StudyError
+
+Array = NDArray[np.float64]
+#: Of meshio, by the ending of a file's name: `meshio.read` itself ends the program where a file is damaged.
+_READERS = {".vtu": meshio.vtu.read, ".vtk": meshio.vtk.read, ".xdmf": meshio.xdmf.read, ".xmf": meshio.xdmf.read}
+#: Nodes may differ by so much of the mesh's size from file to file, which is written in single precision.
+SAME = 1e-5
+
+
+def read_solution(path: Path, step: str | None = None) -> meshio.Mesh:
+    """A file's mesh and point data; of an XDMF series those of one step.
+
+    Raises StudyError if it is missing, damaged or of another kind.
+    """
+    read = _READERS.get(path.suffix.lower())
+    if read is None:
+        raise StudyError(f"{path} is no solution that can be read; use {', '.join(_READERS)}")
+    try:
+        if step is None:
+            return read(str(path))
+        with meshio.xdmf.TimeSeriesReader(path) as reader:
+            points, cells = reader.read_points_cells()
+            _, point_data, _ = reader.read_data(int(step))
+            return meshio.Mesh(np.asarray(points), cells, point_data=point_data)
+    except Exception as error:  # meshio raises whatever its parsers meet
+        raise StudyError(f"cannot read the solution {path}: {error}") from error
+
+
+def point_data(content: meshio.Mesh, name: str, widths: tuple[int, ...], path: Path) -> Array:
+    """Point data (n, c) with one of the given numbers of components; StudyError if there are none, or not finite."""
+    if name not in content.point_data:
+        known = ", ".join(content.point_data) or "none"
+        raise StudyError(f"{path} has no point data '{name}'; it has: {known}")
+    values: Any = np.asarray(content.point_data[name], dtype=np.float64)
+    values = values.reshape(len(content.points), -1)
+    if values.shape[1] not in widths:
+        wanted = " or ".join(str(width) for width in widths)
+        raise StudyError(f"{path}: '{name}' has {values.shape[1]} components in place of {wanted}")
+    if not np.isfinite(values).all():
+        raise StudyError(f"{path}: '{name}' holds values that are not finite")
+    return values
