@@ -9,7 +9,7 @@ twice. The recordings (Soft Robotics Lab, ETH Zurich, with diffPD_sim2real) are 
 The model has the modulus and the hung weight as parameters. The modulus alone is fitted, to the two recordings of own
 weight; the four others are predicted. What is compared is the fall of the markers, resting minus held, as measured.
 A hand held the beam, so repetitions differ by up to 0.7 mm. The markers lie in the plane of the tip's face, as the
-recordings' authors have it in their program.
+recordings' authors have it in their program. `identify` finds the modulus; errors within a recording count as one.
 """
 
 from __future__ import annotations
@@ -24,11 +24,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import matplotlib
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 import morph_dslam as md
 from morph_dslam.extend import run_and_report_errors
-from morph_dslam.extend.geometry import fit_similarity
+from morph_dslam.extend.identification import Estimate, MeasuredPoints, identify
 from support import data_folder, keep_model
 
 matplotlib.use("Agg")
@@ -65,9 +64,14 @@ class Markers:
     resting: Array
 
     @property
+    def way(self) -> Array:
+        """How far (3, 3), m, the markers went."""
+        return self.resting - self.held
+
+    @property
     def fall(self) -> float:
         """By how much the markers sink, m."""
-        return float((self.held - self.resting)[:, 0].mean())
+        return -float(self.way[:, 0].mean())
 
     @property
     def places(self) -> Array:
@@ -90,29 +94,34 @@ def read_markers(folder: Path, state: str, repetition: str) -> Markers:
 
 
 class Beam:
-    """The reduced model of the beam, with what is fixed to its tip."""
+    """The reduced model of the beam, with the markers at its tip."""
 
     def __init__(self, model: md.ReducedModel) -> None:
-        self.model, self.bounds = model, (model.parameters[0].lower, model.parameters[0].upper)
-        self._tip = model.nodes[:, 2] > LENGTH - 1e-6
+        self.model = model
+
+    def table(self, recordings: list[Markers]) -> MeasuredPoints:
+        """The markers at rest, as points of the beam; by the way that each went while it was let go."""
+        rows = [(each, place, way) for each in recordings for place, way in zip(each.places, each.way, strict=True)]
+        return MeasuredPoints(
+            self.model,
+            states=tuple(each.name for each, _, _ in rows),
+            known={"load": np.array([GRAVITY * MASSES[each.state] for each, _, _ in rows])},
+            places=np.array([place for _, place, _ in rows]),
+            measured=np.array([place + way for _, place, way in rows]),
+        )
 
     def motion(self, modulus: float, markers: Markers) -> Array:
-        """How far (3, 3), m, the markers move, carried by the rigid motion of the tip's face."""
-        nodes = self.model.positions(np.array([modulus, GRAVITY * MASSES[markers.state]]))
-        moved = fit_similarity(self.model.nodes[self._tip], nodes[self._tip], with_scale=False)
-        return moved.apply(markers.places) - markers.places
+        """How far (3, 3), m, the model moves the markers."""
+        table = self.table([markers])
+        return table.positions(lambda known: self.model.vector({**known, "modulus": modulus})) - markers.places
 
     def fall(self, modulus: float, markers: Markers) -> float:
         """By how much the markers sink, m."""
         return -float(self.motion(modulus, markers)[:, 0].mean())
 
-    def best_modulus(self, recordings: list[Markers]) -> float:
-        """The modulus, Pa, with the least squares of the falls' errors."""
-
-        def squares(modulus: float) -> float:
-            return 1e6 * sum((self.fall(modulus, each) - each.fall) ** 2 for each in recordings)
-
-        return float(minimize_scalar(squares, bounds=self.bounds, method="bounded").x)
+    def identified(self, recordings: list[Markers]) -> Estimate:
+        """The modulus with its interval."""
+        return identify(self.model, [self.table(recordings)], ["modulus"])["modulus"]
 
 
 def beam_theory(recordings: list[Markers]) -> float:
@@ -120,6 +129,11 @@ def beam_theory(recordings: list[Markers]) -> float:
     weight = DENSITY * SIDE**2 * LENGTH * GRAVITY
     fall = float(np.mean([each.fall for each in recordings]))
     return weight * LENGTH**3 / (8.0 * SIDE**4 / 12.0 * fall)
+
+
+def _stated(modulus: Estimate) -> str:
+    low, high = modulus.interval
+    return f"{modulus.value / 1e3:.1f} kPa (95 % interval {low / 1e3:.0f} to {high / 1e3:.0f})"
 
 
 def plot(beam: Beam, recordings: list[Markers], moduli: dict[str, float], path: Path) -> None:
@@ -147,9 +161,10 @@ def run(arguments: argparse.Namespace) -> None:
     keep_model(STUDY, OUTPUT / "beam.morph")
     beam = Beam(md.load_model(OUTPUT / "beam.morph"))
     fitted_to = [each for each in recordings if each.state == FITTED]
-    modulus, of_all = beam.best_modulus(fitted_to), beam.best_modulus(recordings)
-    print(f"modulus by own weight alone {modulus / 1e3:.1f} kPa, by beam theory {beam_theory(fitted_to) / 1e3:.1f} kPa")
-    print(f"modulus that fits all recordings best {of_all / 1e3:.1f} kPa")
+    by_weight, by_all = beam.identified(fitted_to), beam.identified(recordings)
+    modulus, of_all = by_weight.value, by_all.value
+    print(f"modulus by own weight alone {_stated(by_weight)}, by beam theory {beam_theory(fitted_to) / 1e3:.1f} kPa")
+    print(f"modulus that fits all recordings best {_stated(by_all)}")
     print("recording    measured mm  predicted mm  error %   with the modulus of all  error %")
     errors: dict[str, list[float]] = {state: [] for state in MASSES}
     for each in recordings:
@@ -161,7 +176,7 @@ def run(arguments: argparse.Namespace) -> None:
         )
     plot(beam, recordings, {"fitted to own weight": modulus, "fitted to all": of_all}, OUTPUT / "falls.png")
     print(f"plot    {OUTPUT / 'falls.png'}")
-    misses = [beam.motion(modulus, each) - (each.resting - each.held) for each in fitted_to]
+    misses = [beam.motion(modulus, each) - each.way for each in fitted_to]
     largest = {state: max(values, key=abs) for state, values in errors.items()}
     print(
         f"modulus_kPa={modulus / 1e3:.1f} fit_mm={1e3 * np.linalg.norm(misses, axis=2).mean():.2f} "

@@ -74,6 +74,10 @@ class EvaluationError(MorphError):
     """Results and ground truth do not fit together."""
 
 
+class IdentificationError(MorphError):
+    """Measurements, and parameters to identify from them, do not fit together."""
+
+
 class TrackingError(MorphError):
     """A tracking run cannot be written where it was asked for."""
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import EvaluationError
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.io.text import read_text
-from morph_dslam.model import ReducedModel
+from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.model.reduced_model import FORCE
 from morph_dslam.units import FACTORS
 
@@ -45,6 +45,46 @@ class ForceCurve:
     places: Array
     forces: Array
     name: str = "force"
+
+
+@dataclass(frozen=True)
+class ReactionInDirection:
+    """The force of a model on a support, in a direction of the object frame.
+
+    Attributes
+    ----------
+    support : the set that it holds.
+    field : the force, N.
+    axis : 0, 1 or 2.
+    sign : 1 or -1.
+    """
+
+    support: str
+    field: SeparatedField
+    axis: int
+    sign: float
+
+    def __call__(self, mu: Array) -> float:
+        """Newtons at parameters (d,), SI."""
+        return self.sign * float(self.field.value(mu)[0, self.axis])
+
+
+def reaction_in_direction(model: ReducedModel, text: str) -> ReactionInDirection:
+    """The reaction that "SET:x" or "SET:-x" names.
+
+    Raises
+    ------
+    EvaluationError
+        If the model has no force on this support, or the text no direction.
+    """
+    asked = _REACTION.fullmatch(text)
+    if asked is None or not asked["axis"]:
+        raise EvaluationError(f"'{text}' names no direction: write SET:x, SET:-x, SET:y and so on, in the object frame")
+    fields = _force_fields(model)
+    if asked["support"] not in fields:
+        raise EvaluationError(f"the model has no force on '{asked['support']}'; it has those on {', '.join(fields)}")
+    sign = -1.0 if asked["sign"] == "-" else 1.0
+    return ReactionInDirection(asked["support"], fields[asked["support"]], "xyz".index(asked["axis"]), sign)
 
 
 def load_curve(path: str | Path, model: ReducedModel, column: str | None = None) -> ForceCurve:
@@ -235,14 +275,20 @@ def _modelled(run: Run, rows: NDArray[np.integer], measured: Array, reaction: st
 
 def _forces(run: Run, rows: NDArray[np.integer]) -> dict[str, Array]:
     """The model's force (e, 3) on each support in the estimated states."""
-    fields = {name[len(FORCE) :]: f for name, f in run.model.reactions.items() if name.startswith(FORCE)}
+    fields = _force_fields(run.model)
+    return {name: np.array([field.value(run.parameters[row])[0] for row in rows]) for name, field in fields.items()}
+
+
+def _force_fields(model: ReducedModel) -> dict[str, SeparatedField]:
+    """The force on each support; EvaluationError if the model has none."""
+    fields = {name[len(FORCE) :]: f for name, f in model.reactions.items() if name.startswith(FORCE)}
     if not fields:
         raise EvaluationError(
-            f"the model '{run.model.name}' holds no reaction of a support. Models of solids do, unless they were "
+            f"the model '{model.name}' holds no reaction of a support. Models of solids do, unless they were "
             "turned about the axis of a body of revolution or come from solutions of another program; models of "
             "sheets do not"
         )
-    return {name: np.array([field.value(run.parameters[row])[0] for row in rows]) for name, field in fields.items()}
+    return fields
 
 
 def _fit(modelled: Array, measured: Array) -> tuple[float, float, float]:

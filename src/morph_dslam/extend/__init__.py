@@ -5,6 +5,7 @@ file that registers it. Building blocks stand in a module for each subject:
 
 =====================  ==============================================================================
 `extend.geometry`      rigid and similarity transforms, rotations
+`extend.identification` constant parameters from measured points and forces
 `extend.mechanics`     meshes, hyperelastic laws, supports, loads, and what solves a `SolidProblem`
 `extend.models`        separated fields, functions of the parameters, points that a model carries
 `extend.reduction`     methods that reduce solutions, and their certificate

@@ -7,6 +7,7 @@ from morph_dslam.evaluation.force import (
     force_line as force_line,
     force_remarks as force_remarks,
     load_curve as load_curve,
+    reaction_in_direction as reaction_in_direction,
 )
 from morph_dslam.evaluation.model_summary import error_facts as error_facts, summarise_model as summarise_model
 from morph_dslam.evaluation.pixels import (

@@ -1,0 +1,19 @@
+"""Identification of constant parameters from measured points and forces."""
+
+from morph_dslam.identification.identify import (
+    Estimate as Estimate,
+    Identification as Identification,
+    Misfit as Misfit,
+    identify as identify,
+)
+from morph_dslam.identification.measurements import (
+    MeasuredForces as MeasuredForces,
+    MeasuredPoints as MeasuredPoints,
+    Measurement as Measurement,
+    load_points as load_points,
+)
+from morph_dslam.identification.report import (
+    identification_lines as identification_lines,
+    last_line as last_line,
+    write_identification as write_identification,
+)

@@ -1,0 +1,1 @@
+"""Parameters that are one for a whole recording, from measured points and forces."""

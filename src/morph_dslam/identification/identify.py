@@ -1,0 +1,272 @@
+"""Identification: the parameters for which a reduced model predicts what was measured best.
+
+Weighted least squares over all measurements, each in units of what it misses in the end. Standard deviations allow for
+errors that belong together, as those of one state: the covariance is A^-1 B A^-1 with A = J'J and B the sum of
+(J_g' r_g)(J_g' r_g)' over groups g (Liang and Zeger 1986), and not less than that of independent errors. Intervals are
+Student's with as many degrees of freedom as there are groups less unknowns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.stats import qmc, t
+
+from morph_dslam.errors import IdentificationError
+from morph_dslam.identification.measurements import Measurement
+from morph_dslam.model import Parameter, ReducedModel
+
+Array = NDArray[np.float64]
+#: Range of the common factor of all moduli, and its name among the unknowns.
+FACTOR, FACTOR_RANGE = "moduli_factor", (0.01, 100.0)
+#: Starts of the search, so that it does not end in a local minimum (a power of two); rounds of weighting.
+STARTS, ROUNDS = 8, 4
+#: A standard deviation of this share of a range makes the 95 % interval as wide as the range.
+UNIDENTIFIED = 0.25
+#: An estimate so near to an end of its range, over the range, is at it.
+AT_THE_END = 1e-6
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One identified parameter, SI.
+
+    Attributes
+    ----------
+    parameter : with its range; the factor of all moduli has one too.
+    value : that fits best.
+    std : standard deviation.
+    interval : (2,), 95 %.
+    at_bound : whether it is at an end of its range.
+    identified : whether the interval is narrower than the range, and the value inside of it.
+    """
+
+    parameter: Parameter
+    value: float
+    std: float
+    interval: tuple[float, float]
+    at_bound: bool
+    identified: bool
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """What a measurement is missed by, SI.
+
+    Attributes
+    ----------
+    measurement : see `measurements`.
+    predicted : (n,) with the offset.
+    offset : that fits best; 0 where there is none.
+    rms : root mean square of predicted minus measured.
+    """
+
+    measurement: Measurement
+    predicted: Array
+    offset: float
+    rms: float
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What was identified.
+
+    Attributes
+    ----------
+    estimates : one for each parameter.
+    correlation : (k, k) of the estimates.
+    misfits : of each measurement.
+    groups : number of groups of values whose errors count as independent.
+    """
+
+    estimates: tuple[Estimate, ...]
+    correlation: Array
+    misfits: tuple[Misfit, ...]
+    groups: int
+
+    def __getitem__(self, name: str) -> Estimate:
+        return next(each for each in self.estimates if each.parameter.name == name)
+
+
+class _Values:
+    """Values of the unknowns, as measurements take them."""
+
+    def __init__(self, model: ReducedModel, unknowns: Sequence[Parameter], theta: Array) -> None:
+        self._model = model
+        self._own = {p.name: float(value) for p, value in zip(unknowns, theta, strict=True)}
+        self.factor = self._own.pop(FACTOR, 1.0)
+
+    def vector(self, known: Mapping[str, float]) -> Array:
+        return self._model.vector({**known, **self._own})
+
+
+def identify(
+    model: ReducedModel,
+    measurements: Sequence[Measurement],
+    parameters: Sequence[str] = (),
+    moduli: bool = False,
+    prior: Mapping[str, tuple[float, float]] | None = None,
+) -> Identification:
+    """The parameters for which the model predicts the measurements best.
+
+    Parameters
+    ----------
+    model : whose parameters are identified; those that are neither identified nor known keep their defaults.
+    measurements : see `measurements`.
+    parameters : names of those to identify.
+    moduli : whether a common factor of all moduli is identified too: it scales the forces, and changes no shape of a
+        body that is moved by its supports alone.
+    prior : value and standard deviation, SI, of parameters that are known already, as from pictures.
+
+    Raises
+    ------
+    IdentificationError
+        If a parameter is not the model's, or nothing measured depends on one.
+    """
+    unknowns = _unknowns(model, parameters, moduli)
+    if not measurements and not prior:
+        raise IdentificationError("nothing was measured: give points or forces")
+    fit = _Fit(model, unknowns, measurements, prior or {})
+    theta = fit.best()
+    return fit.result(theta)
+
+
+def _unknowns(model: ReducedModel, names: Sequence[str], moduli: bool) -> list[Parameter]:
+    known = {parameter.name: parameter for parameter in model.parameters}
+    if strange := next((name for name in names if name not in known), None):
+        raise IdentificationError(f"the model '{model.name}' has no parameter '{strange}'; it has {', '.join(known)}")
+    factor = Parameter(FACTOR, "ratio", "1", *FACTOR_RANGE, 1.0, "factor of all moduli")
+    unknowns = [known[name] for name in dict.fromkeys(names)] + [factor] * moduli
+    if not unknowns:
+        raise IdentificationError("nothing is to be identified: name parameters, or ask for the factor of all moduli")
+    return unknowns
+
+
+class _Fit:
+    """One fit; ``theta`` (k,) are the unknowns over their ranges, from 0 to 1."""
+
+    def __init__(
+        self,
+        model: ReducedModel,
+        unknowns: Sequence[Parameter],
+        measurements: Sequence[Measurement],
+        prior: Mapping[str, tuple[float, float]],
+    ) -> None:
+        self._model, self._unknowns, self._measurements = model, list(unknowns), list(measurements)
+        names = [parameter.name for parameter in unknowns]
+        self._prior = [(names.index(name), value, std) for name, (value, std) in prior.items() if name in names]
+        # A factor that may be a hundredth or a hundred is looked for by its logarithm.
+        self._log = np.array([p.name == FACTOR for p in unknowns])
+        ends = np.array([(p.lower, p.upper) for p in unknowns])
+        self._ends = np.where(self._log[:, None], np.log(np.maximum(ends, 1e-300)), ends)
+        self._noise = np.ones(len(self._measurements))
+        self._groups = self._joint_groups()
+
+    def _joint_groups(self) -> NDArray[np.int64]:
+        """Labels (n,) over all measurements."""
+        parts: list[NDArray[np.int64]] = []
+        for measurement in self._measurements:
+            start = parts[-1].max() + 1 if parts else 0
+            parts.append(np.unique(measurement.groups, return_inverse=True)[1] + start)
+        start = parts[-1].max() + 1 if parts else 0
+        return np.concatenate([*parts, start + np.arange(len(self._prior))])
+
+    def _si(self, theta: Array) -> Array:
+        inner = self._ends[:, 0] + theta * np.diff(self._ends, axis=1)[:, 0]
+        return np.where(self._log, np.exp(np.where(self._log, inner, 0.0)), inner)
+
+    def _misfits(self, theta: Array) -> list[Misfit]:
+        values = _Values(self._model, self._unknowns, self._si(theta))
+        found = []
+        for measurement in self._measurements:
+            predicted, measured = measurement.predict(values), measurement.values
+            offset = float(np.mean(measured - predicted)) if measurement.has_offset else 0.0
+            missed = predicted + offset - measured
+            found.append(Misfit(measurement, predicted + offset, offset, float(np.sqrt(np.mean(missed**2)))))
+        return found
+
+    def _residuals(self, theta: Array) -> Array:
+        misfits, values = zip(self._misfits(theta), self._noise, strict=True), self._si(theta)
+        parts = [(m.predicted - m.measurement.values) / noise for m, noise in misfits]
+        return np.concatenate([*parts, [(values[i] - value) / std for i, value, std in self._prior]])
+
+    def best(self) -> Array:
+        """The unknowns that fit best, over their ranges; measurements are weighted by what they are missed by."""
+        k = len(self._unknowns)
+        starts = 0.05 + 0.9 * qmc.Sobol(k, scramble=False).random(STARTS)
+        middle = np.full(k, 0.5)
+        self._noise = np.array([max(float(np.std(m.values)), 1e-300) for m in self._measurements])
+        found = min((self._solved(start) for start in (middle, *starts)), key=lambda each: each[0])[1]
+        for _ in range(ROUNDS if len(self._measurements) > 1 else 1):
+            # What is predicted to rounding must not get all the weight.
+            least = [1e-6 * max(float(np.abs(m.values).max()), 1e-300) for m in self._measurements]
+            self._noise = np.maximum([misfit.rms for misfit in self._misfits(found)], least)
+            found = self._solved(found)[1]
+        return found
+
+    def _solved(self, start: Array) -> tuple[float, Array]:
+        inside = np.clip(start, 1e-9, 1.0 - 1e-9)
+        solution = least_squares(self._residuals, inside, jac="3-point", bounds=(0.0, 1.0), xtol=1e-12, ftol=1e-12)
+        return float(solution.cost), np.asarray(solution.x, dtype=np.float64)
+
+    def result(self, theta: Array) -> Identification:
+        """Estimates with deviations."""
+        jacobian, residuals = self._jacobian(theta), self._residuals(theta)
+        silent = [p.name for p, column in zip(self._unknowns, jacobian.T, strict=True) if not column.any()]
+        if silent:
+            raise IdentificationError(
+                f"nothing that was measured depends on '{silent[0]}': leave it out, or measure something that does"
+            )
+        covariance, groups = self._covariance(jacobian, residuals)
+        std = np.sqrt(np.diag(covariance))
+        freedom = max(groups - len(theta), 1)
+        half = float(t.ppf(0.975, freedom)) * std
+        low, high = self._si(theta - half), self._si(theta + half)
+        at_bound = (theta < AT_THE_END) | (theta > 1.0 - AT_THE_END)
+        value = self._si(theta)
+        # Over the factor's logarithm a deviation is a relative one.
+        slope = np.where(self._log, value, 1.0) * np.diff(self._ends, axis=1)[:, 0]
+        estimates = [
+            Estimate(
+                parameter,
+                float(value[i]),
+                float(slope[i] * std[i]),
+                (float(low[i]), float(high[i])),
+                bool(at_bound[i]),
+                bool(std[i] < UNIDENTIFIED and not at_bound[i]),
+            )
+            for i, parameter in enumerate(self._unknowns)
+        ]
+        correlation = covariance / np.outer(std, std)
+        return Identification(tuple(estimates), correlation, tuple(self._misfits(theta)), groups)
+
+    def _jacobian(self, theta: Array) -> Array:
+        """Derivatives (n, k) by central differences within the range."""
+        columns = []
+        for i in range(len(theta)):
+            step = 1e-4 * np.eye(len(theta))[i]
+            above, below = np.clip(theta + step, 0.0, 1.0), np.clip(theta - step, 0.0, 1.0)
+            change = self._residuals(above) - self._residuals(below)
+            columns.append(change / (above - below)[i])
+        return np.column_stack(columns)
+
+    def _covariance(self, jacobian: Array, residuals: Array) -> tuple[Array, int]:
+        """(k, k) over the ranges, and the number of groups."""
+        n, k = jacobian.shape
+        groups = len(np.unique(self._groups))
+        inverse = np.linalg.pinv(jacobian.T @ jacobian)
+        # Directions that the measurements do not see are as uncertain as can be.
+        values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
+        unseen = vectors[:, values <= 1e-12 * values.max()]
+        independent = inverse * float(residuals @ residuals) / max(n - k, 1) + unseen @ unseen.T
+        if groups <= k:
+            return independent, groups
+        scores = np.zeros((groups, k))
+        np.add.at(scores, self._groups, jacobian * residuals[:, None])
+        together = inverse @ scores.T @ scores @ inverse * groups / (groups - k)
+        wider = np.sqrt(np.maximum(np.diag(together) / np.diag(independent), 1.0))
+        return independent * np.outer(wider, wider), groups

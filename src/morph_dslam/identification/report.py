@@ -1,0 +1,147 @@
+"""What an identification found: figures for programs, lines for people, a picture."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from morph_dslam.identification.identify import Estimate, Identification, Misfit
+from morph_dslam.identification.measurements import MeasuredForces
+from morph_dslam.model import Parameter
+
+DPI = 110
+
+
+def summarise(found: Identification) -> dict[str, Any]:
+    """The content of ``identification.json``, parameters in their own units, plain JSON."""
+    names = [each.parameter.name for each in found.estimates]
+    rows = [dict(zip(names, row, strict=True)) for row in found.correlation.tolist()]
+    return {
+        "parameters": [_figures(each) for each in found.estimates],
+        "correlation": dict(zip(names, rows, strict=True)),
+        "measurements": [_misfit_figures(misfit) for misfit in found.misfits],
+        "groups": found.groups,
+    }
+
+
+def _figures(each: Estimate) -> dict[str, Any]:
+    parameter = each.parameter
+    return {
+        "name": parameter.name,
+        "unit": parameter.unit,
+        "value": parameter.display(each.value),
+        "standard_deviation": parameter.display(each.std),
+        "interval_95": [parameter.display(end) for end in each.interval],
+        "at_bound": each.at_bound,
+        "identified": each.identified,
+    }
+
+
+def _misfit_figures(misfit: Misfit) -> dict[str, Any]:
+    measurement = misfit.measurement
+    figures = {
+        "name": measurement.name,
+        "unit": measurement.unit,
+        "values": len(measurement.values),
+        "groups": len(np.unique(measurement.groups)),
+        "rms": measurement.scale * misfit.rms,
+        "largest": measurement.scale * float(np.abs(misfit.predicted - measurement.values).max()),
+    }
+    return figures | ({"offset": measurement.scale * misfit.offset} if measurement.has_offset else {})
+
+
+#: Estimates that are more correlated than this, either way, are named.
+CORRELATED = 0.95
+
+
+def identification_lines(figures: Mapping[str, Any]) -> list[str]:
+    """What was identified, and what a reader must know of it."""
+    said = []
+    for each in figures["parameters"]:
+        low, high = each["interval_95"]
+        unit = "" if each["unit"] == "1" else f" {each['unit']}"
+        said.append(f"{each['name']} = {each['value']:.4g}{unit}, 95 % interval {low:.4g} to {high:.4g}{unit}")
+        if each["at_bound"]:
+            said.append(f"note: {each['name']} is at the end of its range: the model may need a wider one")
+        elif not each["identified"]:
+            said.append(f"note: {each['name']} could not be identified: its interval is as wide as its range")
+    names = list(figures["correlation"])
+    for i, a in enumerate(names):
+        for b in names[i + 1 :]:
+            if abs(figures["correlation"][a][b]) > CORRELATED:
+                said.append(
+                    f"note: {a} and {b} are correlated by {figures['correlation'][a][b]:.3f}: what was measured tells "
+                    "little more than a combination of them"
+                )
+    if figures["groups"] < 3 * len(names):
+        said.append(
+            f"note: only {figures['groups']} groups of measurements whose errors are independent of each other: "
+            "intervals are rough"
+        )
+    for each in figures["measurements"]:
+        offset = f", offset {each['offset']:.3g} {each['unit']}" if "offset" in each else ""
+        said.append(f"{each['name']}: {each['values']} values missed by {each['rms']:.3g} {each['unit']} rms{offset}")
+    return said
+
+
+def last_line(figures: Mapping[str, Any]) -> str:
+    """All estimates in one line."""
+    parts = []
+    for each in figures["parameters"]:
+        name = each["name"] if each["unit"] == "1" else f"{each['name']}_{each['unit']}"
+        parts.append(f"{name}={each['value']:.5g} std={each['standard_deviation']:.2g}")
+    return " ".join(parts)
+
+
+def write_identification(folder: Path, found: Identification) -> dict[str, Any]:
+    """Write ``identification.json`` and ``identification.png``; returns the figures."""
+    folder.mkdir(parents=True, exist_ok=True)
+    figures = summarise(found)
+    (folder / "identification.json").write_text(json.dumps(figures, indent=2) + "\n")
+    plot(folder / "identification.png", found.misfits)
+    return figures
+
+
+def plot(path: Path, misfits: Sequence[Misfit]) -> None:
+    """Each measurement beside what the model predicts."""
+    figure = Figure(figsize=(5.2 * max(len(misfits), 1), 4.4), layout="constrained")
+    for axes, misfit in zip(np.atleast_1d(figure.subplots(1, max(len(misfits), 1))), misfits, strict=False):
+        if isinstance(misfit.measurement, MeasuredForces):
+            _plot_forces(axes, misfit, misfit.measurement)
+        else:
+            _plot_points(axes, misfit)
+        axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=DPI)
+
+
+def _plot_forces(axes: Axes, misfit: Misfit, forces: MeasuredForces) -> None:
+    parameter = next((p for p in forces.model.parameters if p.name == forces.curve.against), None)
+    order = np.argsort(forces.places)
+    places = forces.places[order] * (1.0 if parameter is None else parameter.display(1.0))
+    axes.plot(places, forces.values[order], "k.", markersize=4, label="measured")
+    axes.plot(places, misfit.predicted[order], color="#1f4e79", label="model and offset")
+    axes.set_xlabel("frame" if parameter is None else _label(parameter))
+    axes.set_ylabel(f"{forces.name} [N]")
+    axes.legend(fontsize=8)
+
+
+def _plot_points(axes: Axes, misfit: Misfit) -> None:
+    """Predicted over measured coordinates, one colour a state."""
+    measurement, scale = misfit.measurement, misfit.measurement.scale
+    for group in np.unique(measurement.groups):
+        own = measurement.groups == group
+        axes.plot(scale * measurement.values[own], scale * misfit.predicted[own], ".", markersize=6)
+    ends = scale * np.array([measurement.values.min(), measurement.values.max()])
+    axes.plot(ends, ends, color="#888888", linewidth=0.8)
+    axes.set(xlabel="measured coordinate [mm]", ylabel="predicted coordinate [mm]")
+    axes.set_title(f"{scale * misfit.rms:.2f} mm rms", fontsize=10)
+
+
+def _label(parameter: Parameter) -> str:
+    return f"{parameter.name} [{parameter.unit}]"

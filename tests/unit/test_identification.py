@@ -1,0 +1,198 @@
+"""Identification from points and forces against least squares in closed form, and what it says where it cannot tell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import t
+
+from morph_dslam.cli import app as cli
+from morph_dslam.errors import EvaluationError, IdentificationError
+from morph_dslam.evaluation.force import ForceCurve, load_curve, reaction_in_direction
+from morph_dslam.identification.identify import FACTOR, identify
+from morph_dslam.identification.measurements import MeasuredForces, MeasuredPoints, load_points
+from morph_dslam.identification.report import identification_lines, summarise
+from morph_dslam.model import Parameter, ReducedModel, SeparatedField, save_model
+from morph_dslam.model.functions import ParameterFunctions
+
+#: A plate of 1 m in the plane z = 0; it is shifted by (a, 0, 0) and (0, b c, 0), and turned about x by a small angle d.
+CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+RNG = np.random.default_rng(5)
+
+
+def plate() -> ReducedModel:
+    names = ("a", "b", "c")
+    indices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 1]])
+    functions = ParameterFunctions(np.zeros(3), np.ones(3), indices, np.eye(3))
+    # Chebyshev polynomials of the scaled parameter 2 a - 1.
+    shift, lift = np.zeros((4, 3)), np.zeros((4, 3))
+    shift[:, 0], lift[:, 1] = 0.5, 0.25
+    modes = np.array([shift + lift, shift, lift])
+    force = np.zeros((3, 1, 3))
+    force[0, 0, 2], force[1, 0, 2] = 50.0, 50.0  # 100 a newtons along z
+    functions_of_force = ParameterFunctions(np.zeros(3), np.ones(3), indices, np.eye(3))
+    return ReducedModel(
+        "plate",
+        CORNERS,
+        np.array([[0, 1, 2], [0, 2, 3]]),
+        tuple(Parameter(name, "ratio", "1", 0.0, 1.0, 0.5) for name in names),
+        SeparatedField(modes, functions),
+        reactions={"force_edge": SeparatedField(force, functions_of_force)},
+    )
+
+
+def points_at(shifts: list[float], noise: float, known: dict[str, np.ndarray] | None = None) -> MeasuredPoints:
+    """Four points of the plate along x in states in which it is shifted so, each state with an error of its own."""
+    states = [f"state {i}" for i, _ in enumerate(shifts) for _ in range(4)]
+    errors = np.repeat(noise * RNG.normal(size=len(shifts)), 4)
+    places = np.tile(CORNERS, (len(shifts), 1))
+    measured = np.full_like(places, np.nan)
+    measured[:, 0] = places[:, 0] + np.repeat(shifts, 4) + errors
+    return MeasuredPoints(plate(), tuple(states), known or {}, places, measured)
+
+
+def test_a_shift_is_the_mean_and_its_deviation_that_of_the_states() -> None:
+    """Errors within a state are one: n states, not 4 n points, tell the deviation."""
+    table = points_at([0.3] * 9, 0.01)
+    means = (table.measured[:, 0] - table.places[:, 0]).reshape(9, 4).mean(axis=1)
+    found = identify(table.model, [table], ["a"])
+    assert found["a"].value == pytest.approx(means.mean(), abs=1e-8)
+    # The covariance with groups is that of n states, but with n in place of n - 1 corrected by n / (n - 1).
+    assert found["a"].std == pytest.approx(means.std(ddof=1) / 3.0, rel=1e-4)
+    half = float(t.ppf(0.975, 8)) * found["a"].std
+    assert found["a"].interval == pytest.approx((means.mean() - half, means.mean() + half), abs=1e-8)
+    assert found["a"].identified
+    assert found.groups == 9
+
+
+def test_only_the_product_of_two_parameters_is_identified() -> None:
+    table = points_at([0.0] * 3, 0.0)
+    table.measured[:, 1] = table.places[:, 1] + lift_of(0.6, 0.4) + 1e-3 * RNG.normal(size=12)
+    table = MeasuredPoints(table.model, table.states, {"a": np.zeros(12)}, table.places, table.measured)
+    figures = summarise(identify(table.model, [table], ["b", "c"]))
+    assert abs(figures["correlation"]["b"]["c"]) > 0.95
+    text = "\n".join(identification_lines(figures))
+    assert "b and c are correlated" in text
+    assert not any(each["identified"] for each in figures["parameters"])
+
+
+def lift_of(b: float, c: float) -> float:
+    """How far the plate goes along y: the constant and the product of the scaled parameters, 0.25 each."""
+    return 0.25 + 0.25 * (2.0 * b - 1.0) * (2.0 * c - 1.0)
+
+
+def test_forces_give_the_factor_of_the_moduli_and_the_zero_of_the_cell() -> None:
+    model, places = plate(), np.linspace(0.0, 1.0, 25)
+    measured = 0.8 * 100.0 * places + 1.5 + 0.2 * RNG.normal(size=25)
+    forces = MeasuredForces(model, ForceCurve("a", places, measured), reaction_in_direction(model, "edge:z"))
+    found = identify(model, [forces], moduli=True)
+    slope, offset = np.polyfit(100.0 * places, measured, 1)
+    assert found[FACTOR].value == pytest.approx(slope, rel=1e-6)
+    assert found.misfits[0].offset == pytest.approx(offset, rel=1e-4)
+    assert found.groups == 8
+    low, high = found[FACTOR].interval
+    assert low < 0.8 < high < 0.85
+
+
+def test_points_and_forces_are_weighted_by_what_they_are_missed_by() -> None:
+    """The shift is 0.3 by points good to 1 mm, and 0.35 by forces with an error of 20 N: the points decide."""
+    table = points_at([0.3] * 6, 1e-3)
+    model = table.model
+    curve = ForceCurve("b", np.linspace(0.0, 1.0, 9), np.linspace(-20.0, 20.0, 9) + 35.0)
+    forces = MeasuredForces(model, curve, reaction_in_direction(model, "edge:z"))
+    found = identify(model, [table, forces], ["a"])
+    assert found["a"].value == pytest.approx(0.3, abs=2e-3)
+
+
+def test_what_pictures_have_told_counts_with_its_deviation() -> None:
+    """A single prior and points: the mean weighted by the inverse variances."""
+    table = points_at([0.3] * 12, 0.02)
+    alone = identify(table.model, [table], ["a"])["a"].value
+    std = float(np.std(table.measured[:, 0] - table.places[:, 0])) / np.sqrt(48.0)
+    both = identify(table.model, [table], ["a"], prior={"a": (alone + 2.0 * std, std)})["a"].value
+    assert both == pytest.approx(alone + std, abs=0.05 * std)
+
+
+def test_a_point_beside_the_surface_is_carried_as_a_rigid_body() -> None:
+    """The upper two corners turn about the lower edge by 0.1 rad: a marker 0.2 m above the plate goes with it."""
+    turn = np.zeros((4, 3))
+    turn[2:, 1], turn[2:, 2] = np.cos(0.1) - 1.0, np.sin(0.1)
+    functions = ParameterFunctions(np.zeros(1), np.ones(1), np.array([[0]]), np.eye(1))
+    parameter = Parameter("a", "ratio", "1", 0.0, 1.0, 0.5)
+    model = ReducedModel(
+        "plate", CORNERS, np.array([[0, 1, 2], [0, 2, 3]]), (parameter,), SeparatedField(turn[None], functions)
+    )
+    place = np.array([[0.5, 0.5, 0.2]])
+    table = MeasuredPoints(model, ("one",), {}, place, place)
+    expected = [0.5, 0.5 * np.cos(0.1) - 0.2 * np.sin(0.1), 0.5 * np.sin(0.1) + 0.2 * np.cos(0.1)]
+    assert table.positions(lambda known: model.vector(known))[0] == pytest.approx(expected, abs=1e-12)
+
+
+def test_tables_are_read_with_units(tmp_path: Path) -> None:
+    path = tmp_path / "points.csv"
+    path.write_text("state,b_1,place_x_mm,place_y_cm,place_z_m,x_mm,y_mm,z_mm\none,0.25,10,2,0.03,11,,33\n")
+    table = load_points(path, plate())
+    assert table.places[0] == pytest.approx([0.01, 0.02, 0.03])
+    assert table.values == pytest.approx([0.011, 0.033])
+    assert table.known["b"] == pytest.approx([0.25])
+
+
+HEADER = "state,place_x_mm,place_y_mm,place_z_mm,x_mm,y_mm,z_mm\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("", "has no column state"),
+        ("state,place_x_mm\none,1\n", "place_y_mm"),
+        (HEADER.replace("x_mm,y", "x_N,y", 1) + "one,0,0,0,1,1,1\n", "unit of length"),
+        (HEADER + "one,0,0,zero,1,1,1\n", "'zero' is not a number"),
+        (HEADER + "one,0,,0,1,1,1\n", "every row needs"),
+        (HEADER + "one,0,0,0,,,\n", "no point was measured"),
+        ("load_N," + HEADER + "1,one,0,0,0,1,1,1\n", "'load_N' is no parameter"),
+        ("b_1," + HEADER + ",one,0,0,0,1,1,1\n", "parameter 'b' is not given"),
+    ],
+)
+def test_wrong_tables_are_refused(tmp_path: Path, content: str, said: str) -> None:
+    (tmp_path / "points.csv").write_text(content)
+    with pytest.raises(IdentificationError, match=said):
+        load_points(tmp_path / "points.csv", plate())
+
+
+def test_wrong_questions_are_refused() -> None:
+    table = points_at([0.3] * 3, 0.0)
+    model = table.model
+    with pytest.raises(IdentificationError, match="no parameter 'young'"):
+        identify(model, [table], ["young"])
+    with pytest.raises(IdentificationError, match="nothing is to be identified"):
+        identify(model, [table])
+    with pytest.raises(IdentificationError, match="nothing was measured"):
+        identify(model, [], ["a"])
+    with pytest.raises(IdentificationError, match=f"depends on '{FACTOR}'"):
+        identify(model, [table], ["a"], moduli=True)
+    far = MeasuredPoints(model, ("one",), {}, np.array([[0.0, 0.0, 5.0]]), np.zeros((1, 3)))
+    with pytest.raises(IdentificationError, match="off the undeformed object"):
+        identify(model, [far], ["a"])
+    with pytest.raises(EvaluationError, match="names no direction"):
+        reaction_in_direction(model, "edge")
+    with pytest.raises(EvaluationError, match="it has those on edge"):
+        reaction_in_direction(model, "rim:x")
+    with pytest.raises(IdentificationError, match="give --run"):
+        MeasuredForces(model, ForceCurve("frame", np.arange(5.0), np.ones(5)), reaction_in_direction(model, "edge:z"))
+
+
+def test_the_command_writes_figures_and_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_model(tmp_path / "plate.morph", plate())
+    places = np.linspace(0.0, 1.0, 9)
+    (tmp_path / "curve.csv").write_text("a_1,force_N\n" + "".join(f"{a},{70 * a + 2}\n" for a in places))
+    curve = load_curve(tmp_path / "curve.csv", plate())
+    assert curve.forces[-1] == 72.0
+    command = ["identify", str(tmp_path / "plate.morph"), "--moduli", "--force", str(tmp_path / "curve.csv")]
+    assert cli.main([*command, "--reaction", "edge:z", "-o", str(tmp_path / "out")]) == 0
+    assert capsys.readouterr().out.splitlines()[-1].startswith(f"{FACTOR}=0.7 std=")
+    assert (tmp_path / "out" / "identification.json").is_file()
+    assert (tmp_path / "out" / "identification.png").stat().st_size > 1000
+    assert cli.main([*command, "-o", str(tmp_path / "out")]) == 2
+    assert "give one --reaction" in capsys.readouterr().err
