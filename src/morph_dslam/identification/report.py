@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from morph_dslam.identification.identify import Estimate, Identification, Misfit
-from morph_dslam.identification.measurements import MeasuredForces
+from morph_dslam.identification.measurements import MeasuredForces, MeasuredPoints
 from morph_dslam.model import Parameter
 
 DPI = 110
@@ -109,13 +109,13 @@ def write_identification(folder: Path, found: Identification) -> dict[str, Any]:
 
 
 def plot(path: Path, misfits: Sequence[Misfit]) -> None:
-    """Each measurement beside what the model predicts."""
+    """What the model predicts beside measured forces, and what it misses measured points by."""
     figure = Figure(figsize=(5.2 * max(len(misfits), 1), 4.4), layout="constrained")
     for axes, misfit in zip(np.atleast_1d(figure.subplots(1, max(len(misfits), 1))), misfits, strict=False):
         if isinstance(misfit.measurement, MeasuredForces):
             _plot_forces(axes, misfit, misfit.measurement)
-        else:
-            _plot_points(axes, misfit)
+        elif isinstance(misfit.measurement, MeasuredPoints):
+            _plot_points(axes, misfit, misfit.measurement)
         axes.grid(alpha=0.3)
     figure.savefig(path, dpi=DPI)
 
@@ -131,16 +131,19 @@ def _plot_forces(axes: Axes, misfit: Misfit, forces: MeasuredForces) -> None:
     axes.legend(fontsize=8)
 
 
-def _plot_points(axes: Axes, misfit: Misfit) -> None:
-    """Predicted over measured coordinates, one colour a state."""
-    measurement, scale = misfit.measurement, misfit.measurement.scale
-    for group in np.unique(measurement.groups):
-        own = measurement.groups == group
-        axes.plot(scale * measurement.values[own], scale * misfit.predicted[own], ".", markersize=6)
-    ends = scale * np.array([measurement.values.min(), measurement.values.max()])
-    axes.plot(ends, ends, color="#888888", linewidth=0.8)
-    axes.set(xlabel="measured coordinate [mm]", ylabel="predicted coordinate [mm]")
-    axes.set_title(f"{scale * misfit.rms:.2f} mm rms", fontsize=10)
+def _plot_points(axes: Axes, misfit: Misfit, points: MeasuredPoints) -> None:
+    """What each coordinate is missed by, state by state."""
+    missed = np.full(points.measured.shape, np.nan)
+    missed[np.isfinite(points.measured)] = points.scale * (misfit.predicted - points.values)
+    states = list(dict.fromkeys(points.states))
+    at = np.array([states.index(state) for state in points.states])
+    for axis, name in enumerate("xyz"):
+        axes.plot(at + 0.12 * (axis - 1), missed[:, axis], "x+1"[axis], markersize=8, label=name)
+    axes.axhline(0.0, color="#888888", linewidth=0.8)
+    axes.set_xticks(range(len(states)), states, rotation=40, ha="right", fontsize=8)
+    axes.set_ylabel("predicted - measured [mm]")
+    axes.set_title(f"{points.scale * misfit.rms:.2f} mm rms", fontsize=10)
+    axes.legend(fontsize=8)
 
 
 def _label(parameter: Parameter) -> str:
