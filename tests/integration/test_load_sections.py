@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from morph_dslam import make_study
 from morph_dslam.errors import StudyError
+from morph_dslam.meshing.generators import block
 from morph_dslam.studies.problem import Snapshot
 from morph_dslam.studies.solid_study import SolidStudy
 
@@ -145,3 +147,42 @@ def test_gravity_without_a_density_is_refused() -> None:
         snapshot(materials={"stiff": massless}, **weight)
     light = massless | {"density": "0 kg/m3"}
     np.testing.assert_allclose(snapshot(materials={"stiff": light}, **weight).outputs["force_z_min"], 0.0)
+
+
+#: A contact at `MU`, and how far points (n, 3) of the top, or of the side, are from the obstacle there, m.
+SOFT = {"law": "neo_hookean", "young": "young", "poisson": 0.3}
+CONTACTS: dict[str, tuple[dict[str, Any], Callable[[np.ndarray], np.ndarray]]] = {
+    "plane": (
+        {"on": "z_max", "point": ["0 mm", "0 mm", "20 mm - 2 mm * share"], "normal": [0.0, 0.0, -1.0]},
+        lambda x: 0.019 - x[:, 2],
+    ),
+    "sphere": (
+        {"on": "z_max", "centre": ["20 mm + place", "20 mm", "35 mm - 4 mm * share"], "radius": "15 mm"},
+        lambda x: np.linalg.norm(x - [0.024, 0.02, 0.033], axis=1) - 0.015,
+    ),
+    "cylinder": (
+        {
+            "on": "z_max",
+            "point": ["0 mm", "20 mm", "35 mm - 4 mm * share"],
+            "axis": [1, 0, 0],
+            "radius": "place + 11 mm",
+        },
+        lambda x: np.linalg.norm(x[:, 1:] - [0.02, 0.033], axis=1) - 0.015,
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", CONTACTS)
+def test_what_a_contact_keeps_out(kind: str) -> None:
+    section, gap = CONTACTS[kind]
+    mesh = {"generator": "block", "size": ["40 mm", "40 mm", "20 mm"], "divisions": [8, 8, 3], "cells": "hex8"}
+    contacts, materials = [{"kind": kind} | section], {"rubber": SOFT}
+    solved = snapshot(mesh=mesh, materials=materials, contacts=contacts)
+    body = block((0.04, 0.04, HEIGHT), (8, 8, 3), "hex8")
+    nodes = body.set_nodes(section["on"])
+    rest = body.nodes[nodes]
+    moved = gap(rest + solved.fields["displacement"][nodes])
+    # The obstacle has come a millimetre and more into where the block was, which gives way by less than a tenth of that
+    # and, with its flat faces, touches near nodes.
+    assert gap(rest).min() < -0.9e-3
+    assert -0.9e-4 < moved.min() < 3e-4

@@ -15,6 +15,7 @@ from morph_dslam.io.camera_files import load_camera
 from morph_dslam.io.export import StateChoice
 from morph_dslam.io.landmarks import load_landmarks
 from morph_dslam.mechanics.materials.user import UserMaterial
+from morph_dslam.mechanics.solvers.continuation import advance
 from morph_dslam.model import Parameter, save_model
 from morph_dslam.reduction.report_pictures import read_reference_curve
 from morph_dslam.registration.board import load_board
@@ -46,7 +47,7 @@ def test_every_sample_file_is_read_by_a_test_here():
         ("registration", "csv"): 1,
         ("registration-aids", "csv"): 1,
         ("solid-study", "csv"): 1,
-        ("solid-study", "toml"): 3,
+        ("solid-study", "toml"): 4,
         ("study-file", "toml"): 1,
     }
 
@@ -156,6 +157,25 @@ def test_values_of_a_solids_study():
     assert found["x"][0].slopes == pytest.approx((0.0, 0.0, 0.0, 0.0015))
 
 
+def test_a_ball_that_presses_on_a_block():
+    places = {name: {"range": ["20 mm", "80 mm"], "default": "40 mm"} for name in ("place_x", "place_y")}
+    study = {
+        "name": "block",
+        "mesh": {"generator": "block", "size": ["100 mm", "100 mm", "30 mm"], "divisions": [5, 5, 2], "cells": "hex8"},
+        "materials": {"silicone": {"law": "neo_hookean", "young": "0.1 MPa", "poisson": 0.45}},
+        "supports": [{"kind": "fixed", "on": "z_min"}],
+        "parameters": {"depth": {"range": ["0 mm", "8 mm"]}} | places,
+    }
+    study |= tomllib.loads(samples("solid-study", "toml")[1])
+    made = make_study(study)
+    assert isinstance(made, SolidStudy)
+    problem = made.problem()
+    state = advance(problem, problem.initial_state(), np.array([0.004, 0.04, 0.06]))[-1]
+    below = problem.mesh.nodes + problem.nodal_displacement(state.dofs)
+    # The ball's lowest point was 4 mm below the top, where the node under it has gone.
+    assert np.linalg.norm(below - [0.04, 0.06, 0.041], axis=1).min() == pytest.approx(0.015, abs=5e-4)
+
+
 def test_shape_of_a_solid():
     study = {
         "name": "tube",
@@ -170,7 +190,7 @@ def test_shape_of_a_solid():
         "supports": [{"kind": "fixed", "on": "bottom"}],
         "parameters": {"growth": {"range": ["-0.5 mm", "1 mm"]}},
     }
-    study |= tomllib.loads(samples("solid-study", "toml")[1])
+    study |= tomllib.loads(samples("solid-study", "toml")[2])
     made = make_study(study)
     assert isinstance(made, SolidStudy)
     assert [shape.kind for shape in made.shape] == ["thickness"]
@@ -179,7 +199,7 @@ def test_shape_of_a_solid():
 
 
 def test_solutions_of_another_program(tmp_path):
-    study = make_study(tomllib.loads(samples("solid-study", "toml")[2]), tmp_path)
+    study = make_study(tomllib.loads(samples("solid-study", "toml")[3]), tmp_path)
     assert isinstance(study, ExternalStudy)
     (tmp_path / "parameters.csv").write_text(samples("solid-study", "csv")[0])
     parameters, values, rows = read_table(study.external.table)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.contact import RigidPlane
 from morph_dslam.mechanics.kinematics import ShapeField
 from morph_dslam.mechanics.loads import DeadTraction, FollowerPressure, MovingPatch, PointLoad
 from morph_dslam.mechanics.materials.anisotropic import Orthotropic
@@ -96,6 +97,17 @@ def test_an_unstable_material_is_refused_by_its_set() -> None:
 def test_missing_supports_are_described(supports: list, words: str) -> None:
     with pytest.raises(StudyError, match=f"free to {words}"):
         SolidProblem(MESH, {"all": RUBBER}, supports)
+
+
+def test_an_obstacle_that_overlaps_at_rest_is_refused() -> None:
+    above = RigidPlane("x_max", (0.9, 0.0, 0.0), (-1.0, 0.0, 0.0))
+    with pytest.raises(StudyError, match=r"the plane reaches 100 mm into the undeformed surface 'x_max'"):
+        SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")], contacts=[above])
+    SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")], contacts=[replace(above, point=(1.0, 0.0, 0.0))])
+    with pytest.raises(StudyError, match="the normal of the contact on 'x_max' has no direction"):
+        replace(above, normal=(0.0, 0.0, 0.0))
+    with pytest.raises(StudyError, match="no surface 'lid'"):
+        SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")], contacts=[replace(above, on="lid")])
 
 
 def test_an_elastic_foundation_is_support_enough() -> None:

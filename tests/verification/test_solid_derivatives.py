@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from morph_dslam.mechanics.contact import RigidCylinder, RigidPlane, RigidSphere
 from morph_dslam.mechanics.kinematics import ShapeField
 from morph_dslam.mechanics.loads import (
     BodyForce,
@@ -125,12 +126,30 @@ def by_shape(mu: ParameterSymbols) -> SolidProblem:
     return SolidProblem(MESH, {"all": RUBBER}, supports, loads, mu, shape=[ShapeField(mu["p"] - 0.1, thicker)])
 
 
+def by_contact(mu: ParameterSymbols) -> SolidProblem:
+    down = 0.1 * mu["p"]
+    contacts = [
+        RigidSphere("z_max", (0.4 + 0.3 * mu["p"], 0.25, 0.9 - down), 0.4 - 0.2 * down),
+        RigidCylinder("y_max", (0.8, 1.0 - down, 0.0), (0.1, 0.0, 1.0), 0.4),
+        RigidPlane("z_min", (0.0, 0.0, -0.02 + down), (0.2, 0.0, 1.0)),
+    ]
+    return SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")], [], mu, contacts=contacts)
+
+
+def by_shape_in_contact(mu: ParameterSymbols) -> SolidProblem:
+    thicker = ShapeField(mu["p"], MESH.nodes * [0.0, 0.0, 0.5])
+    sphere = RigidSphere("x_max", (0.5, 0.25, 0.25), 0.62, inside=True)
+    plane = RigidPlane("z_max", (0.0, 0.0, 0.52), (0.1, 0.0, -1.0))
+    return SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")], [], mu, shape=[thicker], contacts=[plane, sphere])
+
+
 MAKERS = [value for name, value in sorted(globals().items()) if name.startswith("by_")]
 
 
 @pytest.mark.parametrize("make", MAKERS, ids=lambda make: make.__name__[3:])
 def test_derivatives_by_a_parameter(make: Callable[[ParameterSymbols], SolidProblem]) -> None:
-    problem = make(load_parameter(p=0.0 if make in (by_rotation, by_displacement) else 0.3))
+    from_rest = make in (by_rotation, by_displacement, by_contact, by_shape_in_contact)
+    problem = make(load_parameter(p=0.0 if from_rest else 0.3))
     start = problem.initial_state()
     mu = np.array([0.3])
     state = solve(problem, mu, advance(problem, start, mu)[-1], EXACT)
@@ -151,13 +170,17 @@ def test_derivatives_by_a_parameter(make: Callable[[ParameterSymbols], SolidProb
         np.testing.assert_allclose(fields[name][0], expected, atol=1e-6 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("make", [by_pressure, by_pressure_unknowns, by_foundation, by_shape, by_one_of_two_laws])
+@pytest.mark.parametrize(
+    "make", [by_pressure, by_pressure_unknowns, by_foundation, by_shape, by_one_of_two_laws, by_contact]
+)
 def test_tangent(make: Callable[[ParameterSymbols], SolidProblem]) -> None:
-    problem = make(load_parameter(p=0.3))
+    touches = make is by_contact
+    problem = make(load_parameter(p=0.0 if touches else 0.3))
     rng = np.random.default_rng(1)
-    x = rng.uniform(-0.02, 0.02, problem.n_dofs)
+    # Pressures beyond Young's modulus would not be in the tangent with all that they do.
+    x = rng.uniform(-0.02, 0.02, problem.n_dofs) * (0.05 if touches else 1.0)
     direction = rng.uniform(-1.0, 1.0, problem.n_dofs)
-    mu, step = np.array([0.3]), 1e-5
+    mu, step = np.array([0.05 if touches else 0.3]), 1e-5
     sides = [problem.residual(x + h * direction, mu) for h in (-2 * step, -step, step, 2 * step)]
     expected = (sides[0] - 8.0 * sides[1] + 8.0 * sides[2] - sides[3]) / (12.0 * step)
     linearisation = problem.linearise(x, mu)

@@ -1,5 +1,10 @@
-"""Meshes, hyperelastic laws, supports and loads of a `morph_dslam.SolidProblem`, and what solves it."""
+"""Meshes, hyperelastic laws, supports, loads and contacts of a `morph_dslam.SolidProblem`, and what solves it."""
 
+from morph_dslam.mechanics.contact import (
+    RigidCylinder as RigidCylinder,
+    RigidPlane as RigidPlane,
+    RigidSphere as RigidSphere,
+)
 from morph_dslam.mechanics.loads import (
     BodyForce as BodyForce,
     DeadTraction as DeadTraction,

@@ -26,6 +26,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from morph_dslam.mechanics.contact_assembly import added
 from morph_dslam.mechanics.enhanced_strain import (
     ADDED,
     NODAL,
@@ -312,8 +313,10 @@ class EnhancedAssembly:
         place, source = self._other_entries
         np.add.at(data, place, matrix.data[source])
 
-    def linearise(self, x: Array, mu: Array, residual: Array, solver: LinearSolver) -> Linearisation:
-        """Tangent at ``x``, with the ``residual`` (n,) there; ``mu`` is set already."""
+    def linearise(
+        self, x: Array, mu: Array, residual: Array, solver: LinearSolver, contact: sp.csr_matrix | None = None
+    ) -> Linearisation:
+        """See `solid_assembly.Assembly.linearise`."""
         state, cells = self._deformed(x), self._cells()
         indices, pointers, positions, starts = self._pattern
         data = np.zeros(len(indices))
@@ -336,6 +339,8 @@ class EnhancedAssembly:
                 negative += found
         self._add_others(x, data)
         matrix = sp.csr_matrix((data, indices, pointers), shape=(len(x), len(x)))
+        if contact is not None:
+            matrix = added(matrix, contact, triangular=False)
         coupled = AssembledLinearisation(residual, matrix, solver)
         following = _rows(follow, self._enhanced.dofs[:, :NODAL], len(x))
         cellwise = CellwiseLinearisation(coupled, self._n_displacements, following, inner, negative)

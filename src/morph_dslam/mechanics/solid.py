@@ -5,8 +5,8 @@ A solid is its energy. With the kinematics of `kinematics`, the residual is the 
     int W(F) dV + foundations - dead loads
 
 plus the virtual work of loads without energy, and the tangent is the derivative of the residual, both taken
-by NGSolve; derivatives by parameters are taken of the same integrands. `SolidProblem` implements the
-`Equations` of `newton` and leaves solution paths to it.
+by NGSolve; derivatives by parameters are taken of the same integrands. Contact is added, see `contact_assembly`.
+`SolidProblem` implements the `Equations` of `newton` and leaves solution paths to it.
 """
 
 from __future__ import annotations
@@ -18,13 +18,16 @@ from typing import Any
 
 import ngsolve as ngs
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from morph_dslam.mechanics.contact import RigidObstacle
+from morph_dslam.mechanics.contact_assembly import ContactAssembly
 from morph_dslam.mechanics.enhanced_assembly import EnhancedAssembly
 from morph_dslam.mechanics.enhanced_strain import EnhancedStrain, takes_enhanced_strain
 from morph_dslam.mechanics.kinematics import Kinematics, Shape, ShapeField
 from morph_dslam.mechanics.loads import BodyForce, FollowerPressure, Gravity, Load, NodalForces, PointLoad
-from morph_dslam.mechanics.materials.base import Material
+from morph_dslam.mechanics.materials.base import Material, isotropic_average
 from morph_dslam.mechanics.ngsolve_mesh import NgsolveMesh
 from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
 from morph_dslam.mechanics.recovery import Recovery
@@ -38,6 +41,8 @@ from morph_dslam.mechanics.viscous_history import ViscousHistory
 from morph_dslam.meshing.meshes import Mesh
 
 Array = NDArray[np.float64]
+#: The tangent of contact is complete where the forces on free dofs are balanced to such a part of those of contact.
+BALANCED = 0.02
 Support = PrescribedMotion | ElasticFoundation
 
 
@@ -70,7 +75,8 @@ class SolidOptions:
 class SolidProblem:
     """A solid with its materials, supports, loads and parameters.
 
-    Raises StudyError for unknown sets, cells with no material or with two, unstable materials, missing supports.
+    Raises StudyError for unknown sets, cells with no material or with two, unstable materials, missing supports,
+    obstacles that overlap the undeformed solid.
 
     Parameters
     ----------
@@ -82,6 +88,7 @@ class SolidProblem:
     options : see `SolidOptions`.
     shape : how the undeformed shape depends on parameters.
     time : expression of the parameters that is the time, s; viscous materials need it.
+    contacts : what surfaces touch, see `contact`.
 
     Attributes
     ----------
@@ -89,6 +96,7 @@ class SolidProblem:
         the added unknowns of enhanced strains, follow.
     free : see `newton.Equations`.
     scale : see `newton.Equations`.
+    in_contact : see `newton.in_contact`.
     flags : what a result obtained with this discretisation must be doubted for; empty if nothing.
     """
 
@@ -102,10 +110,12 @@ class SolidProblem:
         options: SolidOptions | None = None,
         shape: Sequence[ShapeField] = (),
         time: Scalar | None = None,
+        contacts: Sequence[RigidObstacle] = (),
     ) -> None:
         options = options or SolidOptions()
         self.mesh, self.supports, self.loads, self.options = mesh, tuple(supports), tuple(loads), options
         self.symbols = parameters or ParameterSymbols()
+        self.symbols.set(self.symbols.default)
         self.geometry = NgsolveMesh(mesh)
         order = default_order(mesh) if options.order is None else options.order
         enhanced = options.mixed is None and takes_enhanced_strain(mesh, order)
@@ -124,6 +134,8 @@ class SolidProblem:
         self.constraints.check_rigid_motions()
         n_displacements = 3 * self.displacements.n_scalar
         self.assembly = self._make_assembly()
+        self.contact = self._make_contact(contacts)
+        self.in_contact = bool(contacts)
         self.free: NDArray[np.bool_] = self._free_dofs()
         scale = np.full(self.n_dofs, np.inf)
         scale[:n_displacements] = self.length
@@ -195,6 +207,13 @@ class SolidProblem:
             self.displacements, self.enhanced, self.shape, self.regions, owners, others, self.symbols
         )
 
+    def _make_contact(self, contacts: Sequence[RigidObstacle]) -> ContactAssembly | None:
+        if not contacts:
+            return None
+        moduli = [isotropic_average(region.material.small_strain_stiffness())[1] for region in self.regions]
+        shear = np.array(moduli)[np.searchsorted(np.unique(self.cell_materials), self.cell_materials)]
+        return ContactAssembly(self.displacements, self.shape, contacts, shear, self.symbols)
+
     def _load_terms(self, load: Load, kinematics: Kinematics, test: Any) -> list[Term]:
         if isinstance(load, PointLoad):
             return []  # see `NodalForces`
@@ -240,6 +259,8 @@ class SolidProblem:
     def residual(self, x: Array, mu: Array) -> Array:
         self._set(mu)
         residual = self.assembly.residual(x) - self._padded(self._nodal_forces.values())
+        if self.contact:
+            residual += self._padded(self.contact.residual(x[: 3 * self.displacements.n_scalar]))
         self._latest = x.copy(), np.array(mu), residual
         return residual.copy()
 
@@ -252,11 +273,22 @@ class SolidProblem:
             known = self._latest
         assert known is not None
         self._set(mu)
-        return self.assembly.linearise(x, mu, known[2], solver or self.solver)
+        contact = self._contact_tangent(x, known[2]) if self.contact else None
+        return self.assembly.linearise(x, mu, known[2], solver or self.solver, contact)
+
+    def _contact_tangent(self, x: Array, residual: Array) -> sp.csr_matrix:
+        assert self.contact is not None
+        n, free = 3 * self.displacements.n_scalar, self.free
+        forces = self.contact.residual(x[:n])
+        balanced = np.linalg.norm(residual[free]) <= BALANCED * np.linalg.norm(forces[free[:n]])
+        return self.contact.tangent(x[:n], limited=not balanced)
 
     def residual_slopes(self, x: Array, mu: Array) -> Array:
         self._set(mu)
-        return self.assembly.residual_slopes(x) - self._padded(self._nodal_forces.slopes())
+        slopes = self.assembly.residual_slopes(x) - self._padded(self._nodal_forces.slopes())
+        if self.contact:
+            slopes += self._padded(self.contact.residual_slopes(x[: 3 * self.displacements.n_scalar]))
+        return slopes
 
     def advance_history(self, x: Array, mu: Array) -> None:
         """Accept a solution: viscous materials remember it. Derivatives are those at a fixed history."""
@@ -336,6 +368,15 @@ class SolidProblem:
         """(..., 3, n_scalar) what supports exert, of the forces (..., n_dofs) at all dofs."""
         by_component = self._by_component(forces)
         return np.where(self.constraints.held.reshape(3, -1), by_component, 0.0)
+
+    def contact_forces(self, dofs: Array, mu: Array, number: int) -> Array:
+        """Forces (3, n_scalar) that a contact exerts on the solid, N, by displacement dof.
+
+        Those of the corners (see `spaces`) add up to the resultant. ``number`` counts the contacts from 0.
+        """
+        assert self.contact is not None
+        self.symbols.set(mu)
+        return self.contact.forces(dofs[: 3 * self.displacements.n_scalar], number).reshape(3, -1)
 
     def strain_energy(self, dofs: Array, mu: Array) -> float:
         """Elastic energy, J."""

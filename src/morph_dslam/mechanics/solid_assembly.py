@@ -15,6 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from morph_dslam.mechanics.contact_assembly import added
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solvers.condensation import Condensation, CondensedLinearisation
 from morph_dslam.mechanics.solvers.linear_solver import AssembledLinearisation, LinearSolver
@@ -125,10 +126,18 @@ class Assembly:
             result[index] = self._apply(form, x)
         return result
 
-    def linearise(self, x: Array, mu: Array, residual: Array, solver: LinearSolver) -> Linearisation:
-        """Tangent at ``x``, with the ``residual`` (n,) there; ``mu`` is set already."""
+    def linearise(
+        self, x: Array, mu: Array, residual: Array, solver: LinearSolver, contact: sp.csr_matrix | None = None
+    ) -> Linearisation:
+        """Tangent at ``x``, with the ``residual`` (n,) there; ``mu`` is set already.
+
+        ``contact`` is a tangent of the displacements alone that is to be added.
+        """
         multipliers = int(np.count_nonzero(solver.free[self._n_displacements :]))
-        linearisation = _MixedLinearisation(residual, self.tangent(x), solver, multipliers)
+        matrix = self.tangent(x)
+        if contact is not None:
+            matrix = added(matrix, contact, self.symmetric and solver.is_triangle(matrix))
+        linearisation = _MixedLinearisation(residual, matrix, solver, multipliers)
         if not self.condensed:
             return linearisation
         x, mu = x.copy(), mu.copy()

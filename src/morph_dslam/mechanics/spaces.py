@@ -9,6 +9,7 @@ NGSolve the curved shape of second-order cells.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import ngsolve as ngs
@@ -115,17 +116,13 @@ class DisplacementSpace:
             element = self.scalar.GetFE(ids[0])
             full = cell_type(FULL_TYPE[block.type.shape])
 
-            def functions(points: Array, element: Any = element, shape: str = full.shape) -> Array:
-                points = reference_points(shape, points)
-                return np.array([np.array(element.CalcShape(*map(float, p))).ravel() for p in points])
-
-            values = functions(full.nodes)
+            values = _functions(element, full.shape, full.nodes)
             owner = np.argmax(np.abs(values), axis=0)
             beyond = np.abs(values).max(axis=0) < VANISHING
             values[:, beyond] = 0.0
             probes = np.array([_probe(full, part) for part in _parts(full)])
             # A function vanishes on every part but its own and those around that: the smallest one is its own.
-            owner[beyond] = np.argmax(np.abs(functions(probes)[:, beyond]) > VANISHING, axis=0)
+            owner[beyond] = np.argmax(np.abs(_functions(element, full.shape, probes)[:, beyond]) > VANISHING, axis=0)
             nodes = len(block.type.nodes)
             blocks.append(_BlockBasis(block.type, block.connectivity, dofs, owner, beyond, values[:nodes]))
         return blocks
@@ -168,6 +165,40 @@ class DisplacementSpace:
             self.geometry.ngs.SetDeformation(self._deformation)
             self.bonus_order = self.curved_bonus_order
 
+    def face_functions(self, faces: Indices) -> tuple[Indices, Array]:
+        """The functions that do not vanish on faces (f, 2), as polynomials of two coordinates.
+
+        The coordinates are 0 at a face's first corner; s grows to its second corner and t to its last.
+
+        Returns
+        -------
+        Scalar dofs (f, b) and coefficients (f, b, m) of the monomials s^i t^j, i and j up to the order, j running
+        fastest. Faces with fewer functions than others end in functions that are zero.
+        """
+        exponents = np.array(list(product(range(self.order + 1), repeat=2)))
+        dofs = np.zeros((len(faces), len(exponents)), dtype=np.int64)
+        coefficients = np.zeros((len(faces), len(exponents), len(exponents)))
+        for basis, start in zip(self._blocks, self.geometry.mesh.block_starts()[:-1], strict=True):
+            for number, local in enumerate(basis.type.faces):
+                inside = (faces[:, 0] >= start) & (faces[:, 0] < start + len(basis.dofs)) & (faces[:, 1] == number)
+                corners = basis.type.nodes[[node for node in local if node < basis.type.corners]]
+                used = np.flatnonzero((len(corners) == 4) | (exponents.sum(axis=1) <= self.order))
+                lattice = exponents[used] / self.order
+                points = corners[0] + lattice @ (corners[[1, -1]] - corners[0])
+                inverse = np.linalg.inv(np.prod(lattice[:, None] ** exponents[used], axis=2))
+                rows = np.flatnonzero(inside)
+                # Functions beyond the second order depend on how the cell's corners are numbered.
+                for group in [rows] if self.order < 3 else rows[:, None]:
+                    if len(group):
+                        cells = faces[group, 0] - start
+                        element = self.geometry.element_of_cell[faces[group[0], 0]]
+                        fe = self.scalar.GetFE(ngs.ElementId(ngs.VOL, int(element)))
+                        values = _functions(fe, basis.type.shape, points)
+                        here = np.flatnonzero(np.abs(values).max(axis=0) > VANISHING)
+                        dofs[group, : len(here)] = basis.dofs[cells][:, here]
+                        coefficients[np.ix_(group, np.arange(len(here)), used)] = (inverse @ values[:, here]).T
+        return dofs, coefficients
+
     def corner_dofs(self) -> Indices:
         """Scalar dofs (n_cells, k) of the corners of each cell, in the order of its nodes; all cells have k corners."""
         return np.concatenate([b.dofs[:, np.argsort(b.owner)[: b.type.corners]] for b in self._blocks])
@@ -200,6 +231,11 @@ class DisplacementSpace:
                 rows = inside[basis.connectivity[:, closure]].all(axis=1)
                 held[basis.dofs[rows, column]] = True
         return np.flatnonzero(held)
+
+
+def _functions(element: Any, shape: str, points: Array) -> Array:
+    """Values (p, b) of the functions of one of NGSolve's elements at points (p, 3) of a `CellType`'s reference cell."""
+    return np.array([np.array(element.CalcShape(*map(float, p))).ravel() for p in reference_points(shape, points)])
 
 
 def _parts(full: CellType) -> list[set[int]]:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.mechanics.solid import SolidProblem
 from morph_dslam.mechanics.solvers.continuation import advance
-from morph_dslam.mechanics.solvers.newton import Equations, Linearisation, State, solve
+from morph_dslam.mechanics.solvers.newton import Equations, Linearisation, State, in_contact, solve
 from morph_dslam.reduction.pod import compute_pod
 from morph_dslam.reduction.regression import fit_functions
 from morph_dslam.studies.problem import SweepProblem
@@ -87,7 +87,7 @@ class GalerkinEquations:
     def __init__(self, equations: Equations, modes: Array) -> None:
         if np.any(modes[:, ~np.asarray(equations.free, dtype=bool)]):
             raise ValueError("the modes must be zero at prescribed dofs")
-        self.full, self.modes = equations, modes
+        self.full, self.modes, self.in_contact = equations, modes, in_contact(equations)
         self.n_dofs = len(modes)
         self.free = np.ones(self.n_dofs, dtype=bool)
         # A coefficient's change counts by the largest change of a full dof that it brings.

@@ -1,4 +1,4 @@
-"""The [mesh], [[supports]] and [[loads]] sections of a solid's study.
+"""The [mesh], [[supports]], [[loads]] and [[contacts]] sections of a solid's study.
 
 A value is a number with its unit, the name of a parameter, or a linear expression of parameters
 (`morph_dslam.studies.affine`). ``make`` turns a section into what the solver understands.
@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
-from morph_dslam.mechanics import loads, supports
+from morph_dslam.mechanics import contact, loads, supports
 from morph_dslam.meshing import generators as mesh_generators
 from morph_dslam.meshing.mesh_checks import check_mesh
 from morph_dslam.meshing.mesh_files import load_mesh
@@ -323,6 +323,50 @@ class _MovingLineLoad(Section):
         return loads.MovingLine(self.on, force, centre, self.direction, self.width)
 
 
+class _PlaneContact(Section):
+    """A rigid plane that a surface cannot pass; ``normal`` points towards the solid."""
+
+    kind: Literal["plane"]
+    on: str
+    point: Triple
+    normal: tuple[Number, Number, Number]
+
+    def make(self, read: Reader) -> contact.RigidPlane:
+        return contact.RigidPlane(self.on, _triple(self.point, "length", read), self.normal)
+
+
+class _SphereContact(Section):
+    """A rigid sphere that a surface cannot enter, or cannot leave where it is ``inside``."""
+
+    kind: Literal["sphere"]
+    on: str
+    centre: Triple
+    radius: Value
+    inside: bool = False
+
+    def make(self, read: Reader) -> contact.RigidSphere:
+        centre = _triple(self.centre, "length", read)
+        return contact.RigidSphere(self.on, centre, read(self.radius, "length"), self.inside)
+
+
+class _CylinderContact(Section):
+    """A rigid cylinder without ends that a surface cannot enter, or cannot leave where it is ``inside``.
+
+    ``point`` is one of the ``axis``, which gives the direction.
+    """
+
+    kind: Literal["cylinder"]
+    on: str
+    point: Triple
+    axis: tuple[Number, Number, Number]
+    radius: Value
+    inside: bool = False
+
+    def make(self, read: Reader) -> contact.RigidCylinder:
+        point, radius = _triple(self.point, "length", read), read(self.radius, "length")
+        return contact.RigidCylinder(self.on, point, self.axis, radius, self.inside)
+
+
 SupportSection = Annotated[
     _FixedSupport | _DisplacementSupport | _RotationSupport | _FoundationSupport, Field(discriminator="kind")
 ]
@@ -336,3 +380,4 @@ LoadSection = Annotated[
     | _MovingLineLoad,
     Field(discriminator="kind"),
 ]
+ContactSection = Annotated[_PlaneContact | _SphereContact | _CylinderContact, Field(discriminator="kind")]

@@ -1,4 +1,4 @@
-"""The study of a solid: mesh, materials, supports, loads, and the parameters that any of them may name."""
+"""The study of a solid: mesh, materials, supports, loads, contacts, and the parameters that any of them may name."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from morph_dslam.studies.shape_sections import ShapeSection, shape_fields
 from morph_dslam.studies.snapshots import SOLVER_VERSION
 from morph_dslam.studies.solid_sections import (
     BodyForceLoad,
+    ContactSection,
     GravityLoad,
     LoadSection,
     MeshSection,
@@ -67,6 +68,7 @@ class SolidStudy(Section):
     materials: dict[str, MaterialSection] = Field(min_length=1)
     supports: tuple[SupportSection, ...] = ()
     loads: tuple[LoadSection, ...] = ()
+    contacts: tuple[ContactSection, ...] = ()
     shape: tuple[ShapeSection, ...] = ()
     parameters: dict[str, ParameterSection] = Field(min_length=1)
     time: TimeSection | None = None
@@ -130,9 +132,10 @@ class SolidStudy(Section):
             raise ValueError(f"parameters.{clock.name}: time starts at the lower end; leave out the default")
 
     def _parts(self) -> list[tuple[str, Any]]:
-        """Materials, supports, loads and shapes with what messages call them."""
+        """Materials, supports, loads, contacts and shapes with what messages call them."""
         parts: list[tuple[str, Any]] = [(f"materials.{name}", section) for name, section in self.materials.items()]
-        for kind, sections in (("support", self.supports), ("load", self.loads), ("shape", self.shape)):
+        groups = {"support": self.supports, "load": self.loads, "contact": self.contacts, "shape": self.shape}
+        for kind, sections in groups.items():
             parts += [(f"{kind} {number}", section) for number, section in enumerate(sections, start=1)]
         return parts
 
@@ -161,7 +164,7 @@ class SolidStudy(Section):
     def solid_mesh(self) -> Mesh:
         """The mesh, checked together with the sets that the study names."""
         mesh = make_mesh(self.mesh)  # type: ignore[arg-type]
-        held = [part.on for part in self.supports]
+        held = [part.on for part in (*self.supports, *self.contacts)]
         regions = [material.on for material in self.materials.values()]
         for load in self.loads:
             if isinstance(load, BodyForceLoad):
@@ -172,7 +175,7 @@ class SolidStudy(Section):
         return mesh
 
     def fingerprint(self) -> str:
-        """Hash of mesh, shape, materials, supports, loads, parameters' names, elements and solver version."""
+        """Hash of mesh, shape, materials, supports, loads, contacts, parameters' names, elements and solver version."""
         content: dict[str, Any] = self.model_dump(mode="json", include={"materials", "supports", "loads"})
         content["functions"] = [material.source for material in self.materials.values()]
         content["elements"] = self.solver.order, self.solver.formulation
@@ -183,6 +186,7 @@ class SolidStudy(Section):
         content["mesh"] = mesh_fingerprint(mesh)
         content["code"] = SOLVER_VERSION
         content |= {"shape": [section.fingerprint(mesh) for section in self.shape]} if self.shape else {}
+        content |= self.model_dump(mode="json", include={"contacts"}) if self.contacts else {}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def root(self) -> Array:
@@ -225,6 +229,7 @@ class SolidStudy(Section):
             options or own,
             shape_fields(self.shape, mesh, symbols),
             time=symbols[self.time.parameter] if self.time else None,
+            contacts=[section.make(reader) for section in self.contacts],
         )
 
     def sweep_problem(self) -> SweepProblem:

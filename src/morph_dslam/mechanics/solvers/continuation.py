@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError
-from morph_dslam.mechanics.solvers.newton import TOLERANCE, Equations, Linearisation, State, solve
+from morph_dslam.mechanics.solvers.newton import TOLERANCE, Equations, Linearisation, State, in_contact, solve
 
 Array = NDArray[np.float64]
 AnyState = TypeVar("AnyState")
@@ -116,6 +116,7 @@ class _LoadRamp:
     def __init__(self, equations: Equations, full: Array) -> None:
         self._equations, self._full = equations, full
         self.n_dofs, self.free, self.scale = equations.n_dofs, equations.free, equations.scale
+        self.in_contact = in_contact(equations)
         self._unloaded = np.where(self.free, equations.residual(np.zeros(self.n_dofs), full), 0.0)
 
     def prescribed(self, mu: Array) -> Array:

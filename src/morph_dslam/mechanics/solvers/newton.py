@@ -5,8 +5,8 @@ the prescribed dofs together with all others along the tangent (the linearised p
 far more than an element's size. Damping follows Deuflhard's natural monotonicity test (Newton Methods for Nonlinear
 Problems, 2004, section 3.3): the simplified correction, which reuses the factorisation, must shrink. It does not depend
 on the scaling of the equations, which a test of the residual does: stretching and bending residuals of a thin sheet
-differ by (length / thickness)^2. The simplified correction also ends the iteration without the extra factorisation that
-would only confirm convergence.
+differ by (length / thickness)^2. Contact, whose tangent jumps, may have a correction that grows. The simplified
+correction also ends the iteration without the extra factorisation that would only confirm convergence.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ MAX_ITERATIONS = 20
 DIVERGED = 10.0
 #: A step damped further has stalled.
 SMALLEST_DAMPING = 1.0 / 64.0
+#: Where points begin or cease to touch on the way, the simplified correction may be so much larger than the update.
+GROWTH_IN_CONTACT = 3.0
 #: A tangent is kept where so many more corrections with it should do, judged by the last two ...
 MOST_CHORDS = 4
 #: ... and these end at this part of the tolerance.
@@ -107,6 +109,11 @@ class State:
     iterations: int = 0
 
 
+def in_contact(equations: Equations) -> bool:
+    """Whether equations have contact, which they say by a true attribute of this name: their tangent may jump."""
+    return bool(getattr(equations, "in_contact", False))
+
+
 def size(equations: Equations, update: Array) -> float:
     """Largest entry of ``update`` (n,) in units of `Equations.scale`."""
     return float(np.max(np.abs(update / equations.scale)))
@@ -164,6 +171,7 @@ def _damped_step(
 ) -> _Trial:
     """The point along ``update`` that is accepted."""
     length, damping = size(equations, update), 1.0
+    allowed = length * (GROWTH_IN_CONTACT if in_contact(equations) else 1.0)
     while damping >= SMALLEST_DAMPING:
         point = x + damping * update
         residual = equations.residual(point, mu)
@@ -171,7 +179,7 @@ def _damped_step(
             rest = correction(linearisation, residual, (1.0 - damping) * gap)
             remaining = size(equations, rest)
             # An update at the level of rounding need not shrink any further.
-            if remaining <= (1.0 - damping / 4.0) * length or (damping == 1.0 and length <= tolerance):
+            if remaining <= (1.0 - damping / 4.0) * allowed or (damping == 1.0 and length <= tolerance):
                 return _Trial(point, length, rest, remaining, damping == 1.0)
         damping /= 2.0
     raise SolverError(f"Newton's method stalls at {mu}: no part of its update brings the solution nearer")

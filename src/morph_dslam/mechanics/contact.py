@@ -1,0 +1,176 @@
+"""Rigid obstacles that the surfaces of a solid touch. There is no friction.
+
+`contact_assembly` says how contact is solved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
+
+Array = NDArray[np.float64]
+Vector = tuple[Scalar, Scalar, Scalar]
+
+
+@dataclass(frozen=True)
+class Touch:
+    """Where points are in relation to an obstacle of smooth shape.
+
+    Attributes
+    ----------
+    gap : (q,) distance from it, m; negative inside.
+    normal : (q, 3) derivatives of the gap by the point: the obstacle's outward unit normal.
+    curvature : (q, 3, 3) second derivatives, 1/m.
+    """
+
+    gap: Array
+    normal: Array
+    curvature: Array
+
+
+class RigidObstacle(Protocol):
+    """A rigid body of smooth shape that a surface cannot enter."""
+
+    @property
+    def on(self) -> str:
+        """The surface."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        ...
+
+    def touch(self, symbols: ParameterSymbols, points: Array) -> Touch:
+        """Where ``points`` (q, 3), m, are at the present parameters."""
+        ...
+
+    def slopes(self, symbols: ParameterSymbols) -> tuple[Array, Array]:
+        """Derivatives by the parameters of its place (d, 3) and of all gaps at a fixed place (d,)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class RigidPlane:
+    """Everything behind a plane.
+
+    Attributes
+    ----------
+    on : surface.
+    point : of the plane, m: numbers or expressions of parameters.
+    normal : (3,) towards the solid; its length does not matter.
+    """
+
+    on: str
+    point: Vector
+    normal: tuple[float, float, float]
+    name = "plane"
+
+    def __post_init__(self) -> None:
+        _check_direction(self.on, "normal", self.normal)
+
+    def touch(self, symbols: ParameterSymbols, points: Array) -> Touch:
+        """See `RigidObstacle`."""
+        unit, point = _unit(self.normal), _values(symbols, self.point)
+        return Touch((points - point) @ unit, np.tile(unit, (len(points), 1)), np.zeros((len(points), 3, 3)))
+
+    def slopes(self, symbols: ParameterSymbols) -> tuple[Array, Array]:
+        """See `RigidObstacle`."""
+        return _slopes(symbols, self.point), np.zeros(len(symbols))
+
+
+@dataclass(frozen=True, eq=False)
+class RigidSphere:
+    """A ball, or everything around one.
+
+    Attributes
+    ----------
+    on : surface.
+    centre : m: numbers or expressions of parameters.
+    radius : m: a number or an expression.
+    inside : whether the solid is inside of the sphere.
+    """
+
+    on: str
+    centre: Vector
+    radius: Scalar
+    inside: bool = False
+    name = "sphere"
+
+    def touch(self, symbols: ParameterSymbols, points: Array) -> Touch:
+        """See `RigidObstacle`."""
+        arms = points - _values(symbols, self.centre)
+        return _around(arms, np.eye(3), symbols.value(self.radius), self.inside)
+
+    def slopes(self, symbols: ParameterSymbols) -> tuple[Array, Array]:
+        """See `RigidObstacle`."""
+        return _slopes(symbols, self.centre), _sign(self.inside) * -symbols.slopes(self.radius)
+
+
+@dataclass(frozen=True, eq=False)
+class RigidCylinder:
+    """A rod without ends, or everything around one.
+
+    Attributes
+    ----------
+    on : surface.
+    point : of the axis, m: numbers or expressions of parameters.
+    axis : (3,) direction; its length does not matter.
+    radius : m: a number or an expression.
+    inside : whether the solid is inside of the cylinder.
+    """
+
+    on: str
+    point: Vector
+    axis: tuple[float, float, float]
+    radius: Scalar
+    inside: bool = False
+    name = "cylinder"
+
+    def __post_init__(self) -> None:
+        _check_direction(self.on, "axis", self.axis)
+
+    def touch(self, symbols: ParameterSymbols, points: Array) -> Touch:
+        """See `RigidObstacle`."""
+        across = np.eye(3) - np.outer(_unit(self.axis), _unit(self.axis))
+        arms = (points - _values(symbols, self.point)) @ across
+        return _around(arms, across, symbols.value(self.radius), self.inside)
+
+    def slopes(self, symbols: ParameterSymbols) -> tuple[Array, Array]:
+        """See `RigidObstacle`."""
+        return _slopes(symbols, self.point), _sign(self.inside) * -symbols.slopes(self.radius)
+
+
+def _check_direction(on: str, name: str, direction: tuple[float, float, float]) -> None:
+    if not np.linalg.norm(direction) > 0.0:
+        raise StudyError(f"the {name} of the contact on '{on}' has no direction: {direction}")
+
+
+def _unit(direction: tuple[float, float, float]) -> Array:
+    return np.array(direction, dtype=float) / np.linalg.norm(direction)
+
+
+def _values(symbols: ParameterSymbols, vector: Vector) -> Array:
+    return np.array([symbols.value(value) for value in vector])
+
+
+def _slopes(symbols: ParameterSymbols, vector: Vector) -> Array:
+    return np.column_stack([symbols.slopes(value) for value in vector])
+
+
+def _sign(inside: bool) -> float:
+    return -1.0 if inside else 1.0
+
+
+def _around(arms: Array, across: Array, radius: float, inside: bool) -> Touch:
+    """Of points at ``arms`` (q, 3) from the nearest point of a centre or axis; ``across`` projects on their space."""
+    lengths = np.maximum(np.linalg.norm(arms, axis=1), 1e-12 * radius)
+    normals, sign = arms / lengths[:, None], _sign(inside)
+    curvature = (across - normals[:, :, None] * normals[:, None, :]) / lengths[:, None, None]
+    return Touch(sign * (lengths - radius), sign * normals, sign * curvature)
