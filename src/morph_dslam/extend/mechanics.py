@@ -1,10 +1,12 @@
-"""Meshes, hyperelastic laws, supports, loads and contacts of a `morph_dslam.SolidProblem`, and what solves it."""
+"""Meshes, laws, supports, loads, couplings and contacts of a `morph_dslam.SolidProblem`, and what solves it."""
 
 from morph_dslam.mechanics.contact import (
     RigidCylinder as RigidCylinder,
     RigidPlane as RigidPlane,
     RigidSphere as RigidSphere,
 )
+from morph_dslam.mechanics.coupled_solid import CoupledSolid as CoupledSolid
+from morph_dslam.mechanics.couplings import Coupling as Coupling
 from morph_dslam.mechanics.loads import (
     BodyForce as BodyForce,
     DeadTraction as DeadTraction,

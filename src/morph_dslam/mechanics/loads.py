@@ -214,11 +214,12 @@ def reaction_names(snapshots: Sequence[Snapshot], size: float) -> list[str]:
 
     Parameters
     ----------
-    size : extent of the body, m; a moment counts against the largest force at that distance.
+    size : extent of the body, m; moments count against the largest force at that distance, and forces against the
+        largest moment so.
     """
     names = [name for name in snapshots[0].outputs if name.startswith((FORCE, MOMENT))]
     largest = {name: max(float(np.linalg.norm(s.outputs[name])) for s in snapshots) for name in names}
-    force = max((value for name, value in largest.items() if name.startswith(FORCE)), default=0.0)
+    force = max((value if name.startswith(FORCE) else value / size for name, value in largest.items()), default=0.0)
     limit = {FORCE: NEGLIGIBLE * force, MOMENT: NEGLIGIBLE * force * size}
     return [name for name in names if largest[name] > limit[name[: name.index("_") + 1]]]
 

@@ -94,6 +94,7 @@ class SolidProblem:
     ----------
     n_dofs : see `newton.Equations`. The first 3 n_scalar dofs are displacements, those of x first; pressures, or
         the added unknowns of enhanced strains, follow.
+    n_unknowns : how many dofs are the solid's own; motions of couplings follow (`coupled_solid`).
     free : see `newton.Equations`.
     scale : see `newton.Equations`.
     in_contact : see `newton.in_contact`.
@@ -129,7 +130,8 @@ class SolidProblem:
         self.flags = tuple(region.flag for region in self.regions if region.flag)
         self.space = self._product_space()
         self.enhanced = self._make_enhanced() if enhanced else None
-        self.n_dofs: int = self.enhanced.n_dofs if self.enhanced else self.space.ndof
+        self.n_unknowns: int = self.enhanced.n_dofs if self.enhanced else self.space.ndof
+        self.n_dofs: int = self.n_unknowns
         self.constraints = Constraints(self.displacements, self.shape, self.supports, self.symbols)
         self.constraints.check_rigid_motions()
         n_displacements = 3 * self.displacements.n_scalar
@@ -257,28 +259,31 @@ class SolidProblem:
         return self._padded(self.constraints.slopes())
 
     def residual(self, x: Array, mu: Array) -> Array:
+        return self._evaluate(x, mu).copy()
+
+    def _evaluate(self, x: Array, mu: Array) -> Array:
+        """The residual, kept for the tangent at the same point."""
         self._set(mu)
         residual = self.assembly.residual(x) - self._padded(self._nodal_forces.values())
         if self.contact:
             residual += self._padded(self.contact.residual(x[: 3 * self.displacements.n_scalar]))
         self._latest = x.copy(), np.array(mu), residual
-        return residual.copy()
+        return residual
 
     def linearise(self, x: Array, mu: Array, solver: LinearSolver | None = None) -> Linearisation:
         """See `newton.Equations`; ``solver``, in place of the solid's own, holds part of the free dofs too."""
         # Newton's method has mostly just asked for the residual at the same point.
         known = self._latest
-        if known is None or not (np.array_equal(known[0], x) and np.array_equal(known[1], mu)):
-            self.residual(x, mu)
-            known = self._latest
-        assert known is not None
+        same = known is not None and np.array_equal(known[0], x) and np.array_equal(known[1], mu)
+        residual = known[2] if known is not None and same else self._evaluate(x, mu)
         self._set(mu)
-        contact = self._contact_tangent(x, known[2]) if self.contact else None
-        return self.assembly.linearise(x, mu, known[2], solver or self.solver, contact)
+        solver = solver or self.solver
+        contact = self._contact_tangent(x, residual, solver.free) if self.contact else None
+        return self.assembly.linearise(x, mu, residual, solver, contact)
 
-    def _contact_tangent(self, x: Array, residual: Array) -> sp.csr_matrix:
+    def _contact_tangent(self, x: Array, residual: Array, free: NDArray[np.bool_]) -> sp.csr_matrix:
         assert self.contact is not None
-        n, free = 3 * self.displacements.n_scalar, self.free
+        n = 3 * self.displacements.n_scalar
         forces = self.contact.residual(x[:n])
         balanced = np.linalg.norm(residual[free]) <= BALANCED * np.linalg.norm(forces[free[:n]])
         return self.contact.tangent(x[:n], limited=not balanced)
@@ -304,7 +309,7 @@ class SolidProblem:
 
     def _padded(self, displacement_part: Array) -> Array:
         """(..., 3 n_scalar) with zeros for the pressures."""
-        result = np.zeros((*displacement_part.shape[:-1], self.n_dofs))
+        result = np.zeros((*displacement_part.shape[:-1], self.n_unknowns))
         result[..., : displacement_part.shape[-1]] = displacement_part
         return result
 

@@ -41,6 +41,8 @@ def _why_no_equations(study: Study) -> str | None:
         return "the equations behind another program's solutions are not known"
     if isinstance(study, SheetStudy):
         return "a sheet's solutions lie on branches that no projection follows"
+    if study.couplings:
+        return "the rigid motions of couplings are not projected"
     return None if study.time is None else "the memory of a viscoelastic solid is not projected"
 
 

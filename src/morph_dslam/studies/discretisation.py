@@ -218,14 +218,15 @@ class HigherOrder:
     @cached_property
     def _kept(self) -> NDArray[np.bool_]:
         """The dofs (n,) that the coarse solid has too."""
-        return self._embedded(np.ones(3 * self._coarse.displacements.n_scalar)) != 0.0
+        return self._embedded(np.ones(self._coarse.n_dofs)) != 0.0
 
     def _embedded(self, dofs: Array) -> Array:
-        """The displacement of a coarse solution as dofs (n,) of the finer solid."""
+        """The displacement of a coarse solution, and the motions of its couplings, as dofs (n,) of the finer solid."""
         result = np.zeros(self.problem.n_dofs)
         coarse = dofs[: 3 * self._coarse.displacements.n_scalar]
         embedded = self.problem.displacements.embedded(self._coarse.displacements, coarse)
         result[: len(embedded)] = embedded
+        result[self.problem.n_unknowns :] = dofs[self._coarse.n_unknowns :]
         return result
 
 

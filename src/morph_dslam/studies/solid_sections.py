@@ -1,4 +1,4 @@
-"""The [mesh], [[supports]], [[loads]] and [[contacts]] sections of a solid's study.
+"""The [mesh], [[supports]], [[loads]], [[couplings]] and [[contacts]] sections of a solid's study.
 
 A value is a number with its unit, the name of a parameter, or a linear expression of parameters
 (`morph_dslam.studies.affine`). ``make`` turns a section into what the solver understands.
@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
-from morph_dslam.mechanics import contact, loads, supports
+from morph_dslam.mechanics import contact, couplings, loads, supports
 from morph_dslam.meshing import generators as mesh_generators
 from morph_dslam.meshing.mesh_checks import check_mesh
 from morph_dslam.meshing.mesh_files import load_mesh
@@ -321,6 +321,23 @@ class _MovingLineLoad(Section):
     def make(self, read: Reader) -> loads.MovingLine:
         force, centre = _triple(self.force, "force per length", read), _triple(self.centre, "length", read)
         return loads.MovingLine(self.on, force, centre, self.direction, self.width)
+
+
+class CouplingSection(Section):
+    """A set that moves as a rigid body under a force and a moment, which keep their directions.
+
+    The force acts at ``point``, which moves with the set: the mean of the set's nodes if absent.
+    """
+
+    on: str
+    point: Triple | None = None
+    force: Triple = ("0 N", "0 N", "0 N")
+    moment: Triple = ("0 N.m", "0 N.m", "0 N.m")
+
+    def make(self, read: Reader) -> couplings.Coupling:
+        point = None if self.point is None else _triple(self.point, "length", read)
+        force, moment = _triple(self.force, "force", read), _triple(self.moment, "moment", read)
+        return couplings.Coupling(self.on, force, moment, point)
 
 
 class _PlaneContact(Section):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.coupled_solid import CoupledSolid
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.meshing.mesh_checks import check_mesh
@@ -27,6 +29,7 @@ from morph_dslam.studies.snapshots import SOLVER_VERSION
 from morph_dslam.studies.solid_sections import (
     BodyForceLoad,
     ContactSection,
+    CouplingSection,
     GravityLoad,
     LoadSection,
     MeshSection,
@@ -68,6 +71,7 @@ class SolidStudy(Section):
     materials: dict[str, MaterialSection] = Field(min_length=1)
     supports: tuple[SupportSection, ...] = ()
     loads: tuple[LoadSection, ...] = ()
+    couplings: tuple[CouplingSection, ...] = ()
     contacts: tuple[ContactSection, ...] = ()
     shape: tuple[ShapeSection, ...] = ()
     parameters: dict[str, ParameterSection] = Field(min_length=1)
@@ -132,9 +136,15 @@ class SolidStudy(Section):
             raise ValueError(f"parameters.{clock.name}: time starts at the lower end; leave out the default")
 
     def _parts(self) -> list[tuple[str, Any]]:
-        """Materials, supports, loads, contacts and shapes with what messages call them."""
+        """Materials, supports, loads, couplings, contacts and shapes with what messages call them."""
         parts: list[tuple[str, Any]] = [(f"materials.{name}", section) for name, section in self.materials.items()]
-        groups = {"support": self.supports, "load": self.loads, "contact": self.contacts, "shape": self.shape}
+        groups = {
+            "support": self.supports,
+            "load": self.loads,
+            "coupling": self.couplings,
+            "contact": self.contacts,
+            "shape": self.shape,
+        }
         for kind, sections in groups.items():
             parts += [(f"{kind} {number}", section) for number, section in enumerate(sections, start=1)]
         return parts
@@ -164,7 +174,7 @@ class SolidStudy(Section):
     def solid_mesh(self) -> Mesh:
         """The mesh, checked together with the sets that the study names."""
         mesh = make_mesh(self.mesh)  # type: ignore[arg-type]
-        held = [part.on for part in (*self.supports, *self.contacts)]
+        held = [part.on for part in (*self.supports, *self.couplings, *self.contacts)]
         regions = [material.on for material in self.materials.values()]
         for load in self.loads:
             if isinstance(load, BodyForceLoad):
@@ -175,7 +185,7 @@ class SolidStudy(Section):
         return mesh
 
     def fingerprint(self) -> str:
-        """Hash of mesh, shape, materials, supports, loads, contacts, parameters' names, elements and solver version."""
+        """Hash of mesh, shape, mechanics, parameters' names, elements and solver version."""
         content: dict[str, Any] = self.model_dump(mode="json", include={"materials", "supports", "loads"})
         content["functions"] = [material.source for material in self.materials.values()]
         content["elements"] = self.solver.order, self.solver.formulation
@@ -186,6 +196,7 @@ class SolidStudy(Section):
         content["mesh"] = mesh_fingerprint(mesh)
         content["code"] = SOLVER_VERSION
         content |= {"shape": [section.fingerprint(mesh) for section in self.shape]} if self.shape else {}
+        content |= self.model_dump(mode="json", include={"couplings"}) if self.couplings else {}
         content |= self.model_dump(mode="json", include={"contacts"}) if self.contacts else {}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
@@ -220,7 +231,9 @@ class SolidStudy(Section):
 
         reader: Reader = read
         own = SolidOptions(order=self.solver.order, mixed=MIXED[self.solver.formulation], threads=self.solver.threads)
-        return SolidProblem(
+        coupled = [section.make(reader) for section in self.couplings]
+        make = partial(CoupledSolid, coupled) if coupled else SolidProblem
+        return make(
             mesh,
             {section.on: section.make(reader) for section in self.materials.values()},
             [section.make(reader) for section in self.supports],

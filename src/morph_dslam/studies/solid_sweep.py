@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError
+from morph_dslam.mechanics.coupled_solid import CoupledSolid
 from morph_dslam.mechanics.solid import SolidProblem
 from morph_dslam.mechanics.solvers.continuation import PathError, advance, loaded_state
 from morph_dslam.mechanics.solvers.newton import Linearisation, State, sensitivities, solve, solve_with_kept_tangent
@@ -55,7 +56,18 @@ def solid_snapshot(
             derivatives["displacement"] = derivatives["displacement"] + np.array(changes)
     if slopes is not None and force_slopes is not None:
         derivatives |= _reaction_slopes(problem, dofs, mu, slopes, force_slopes)
-    return Snapshot(mu, fields, derivatives, support_reactions(problem, dofs, mu) if reactions else {})
+    outputs = support_reactions(problem, dofs, mu) if reactions else {}
+    return Snapshot(mu, fields, derivatives, outputs | _coupled_motions(problem, dofs))
+
+
+def _coupled_motions(problem: SolidProblem, dofs: Array) -> dict[str, Array]:
+    """Translation (3,), m, and rotation vector (3,), rad, of each coupling."""
+    if not isinstance(problem, CoupledSolid):
+        return {}
+    outputs = {}
+    for coupling, motion in zip(problem.couplings, problem.motions(dofs), strict=True):
+        outputs["translation_" + coupling.on], outputs["rotation_" + coupling.on] = motion[:3], motion[3:]
+    return outputs
 
 
 def _named(recovered: dict[str, Array]) -> dict[str, Array]:
