@@ -160,6 +160,11 @@ def test_mirrored_snapshots_are_solutions(built: Path, which: int) -> None:
     other = problem.take_snapshot(state)
     assert mirrored.outputs["motion"] == pytest.approx(other.outputs["motion"], abs=1e-7)
     assert mirrored.fields["displacement"] == pytest.approx(other.fields["displacement"], abs=1e-7)
+    for name in ("force_left", "moment_left", "force_right", "moment_right"):
+        size = np.abs(other.outputs[name]).max()
+        assert mirrored.outputs[name] == pytest.approx(other.outputs[name], abs=1e-3 * size)
+        ours, theirs = (snapshot.sensitivities[f"reaction_{name}"] for snapshot in (mirrored, other))
+        assert ours == pytest.approx(theirs, abs=2e-3 * np.abs(theirs).max())
     ours, theirs = mirrored.sensitivities["displacement"], other.sensitivities["displacement"]
     assert np.abs(ours - theirs).max() < 1e-3 * np.abs(theirs).max()
     for face in ("stress_top", "stress_bottom"):

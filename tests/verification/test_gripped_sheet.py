@@ -85,3 +85,37 @@ def test_sensitivities_match_differences_of_solutions(held: GrippedSheet) -> Non
 def test_unreachable_coordinates_are_named(held: GrippedSheet) -> None:
     with pytest.raises(SolverError, match=r"no equilibrium found at bulge .* % of the way"):
         held.advance(held.first_state(0.012), np.array([0.5, 1.0, 0.0, 0.0]))
+
+
+def test_a_column_is_pushed_with_eulers_force(planar: GrippedSheet) -> None:
+    """Held straight at a small bulge: 4 pi^2 E I / L^2 along the line of the grips, and moments P A / 2 at the ends."""
+    state = planar.advance(planar.first_state(0.004), np.array([0.002, 0.0, 0.0, 0.0]))
+    (left, right), _ = planar.reactions(state)
+    euler = 4.0 * np.pi**2 * YOUNG * THICKNESS**3 / 12.0 * WIDTH / FREE**2
+    assert left[0] == pytest.approx(euler, rel=2e-3)
+    assert right[:3] == pytest.approx(-left[:3], abs=1e-6 * euler)
+    # The grips lie at z = 0 and are pushed inwards: about a point on that line the moments are those at the ends.
+    amplitude = 4.0 / 3.0 * 0.002
+    assert abs(left[4]) == pytest.approx(euler * amplitude / 2.0, rel=1e-2)
+    assert right[4] == pytest.approx(-left[4], rel=1e-6)
+
+
+def test_an_arc_is_bent_by_moments_alone(planar: GrippedSheet) -> None:
+    """bend = 1: the moment E I 8 h / L^2 of a shallow arc, and a force that is small beside Euler's."""
+    state = planar.first_state(0.004)
+    (left, right), _ = planar.reactions(state)
+    rigidity = YOUNG * THICKNESS**3 / 12.0 * WIDTH
+    assert abs(left[4]) == pytest.approx(rigidity * 8.0 * 0.004 / 0.869311 / FREE**2, rel=5e-3)
+    assert np.linalg.norm(right[:3]) < 0.01 * 4.0 * np.pi**2 * rigidity / FREE**2
+
+
+def test_grips_hold_the_sheet_in_balance_and_their_forces_have_derivatives(held: GrippedSheet) -> None:
+    coordinates = np.array([0.02, 0.8, 0.05, 0.1])
+    state = held.advance(held.first_state(0.012), coordinates)
+    both, slopes = held.reactions(state)
+    assert both.sum(axis=0) == pytest.approx(np.zeros(6), abs=1e-5 * np.abs(both).max())
+    for k, step in enumerate([1e-5, 1e-3, 1e-3, 1e-3]):
+        change = step * np.eye(4)[k]
+        after, before = (held.reactions(held.solve(coordinates + sign * change, state))[0] for sign in (1.0, -1.0))
+        difference = (after - before) / (2.0 * step)
+        assert np.linalg.norm(slopes[k] - difference) < 2e-3 * np.linalg.norm(difference)

@@ -125,15 +125,27 @@ def _place(path: str | Path, header: str, model: ReducedModel) -> tuple[str, flo
     """What the first column is, and the factor of its values to SI."""
     if header == "frame":
         return header, 1.0
+    found = parameter_of_column(header, model)
+    if found is None:
+        raise EvaluationError(
+            f"{path}: the first column is '{header}'; name it frame, or as a parameter of the model with its unit: "
+            f"{parameter_columns(model)}"
+        )
+    return found
+
+
+def parameter_of_column(header: str, model: ReducedModel) -> tuple[str, float] | None:
+    """The parameter that a column such as ``stroke_mm`` holds, and the factor of its values to SI; None if none."""
     name, _, unit = header.rpartition("_")
     for parameter in model.parameters:
         if parameter.name == name and unit in FACTORS[parameter.quantity]:
             return name, FACTORS[parameter.quantity][unit]
-    known = [f"{p.name}_{p.unit}" for p in model.parameters]
-    raise EvaluationError(
-        f"{path}: the first column is '{header}'; name it frame, or as a parameter of the model with its unit: "
-        f"{', '.join(known)}"
-    )
+    return None
+
+
+def parameter_columns(model: ReducedModel) -> str:
+    """How columns with the model's parameters are named, for messages."""
+    return ", ".join(f"{parameter.name}_{parameter.unit}" for parameter in model.parameters)
 
 
 def _numbers(path: str | Path, row: Sequence[str], at: int) -> tuple[float, float]:
@@ -284,9 +296,8 @@ def _force_fields(model: ReducedModel) -> dict[str, SeparatedField]:
     fields = {name[len(FORCE) :]: f for name, f in model.reactions.items() if name.startswith(FORCE)}
     if not fields:
         raise EvaluationError(
-            f"the model '{model.name}' holds no reaction of a support. Models of solids do, unless they were "
-            "turned about the axis of a body of revolution or come from solutions of another program; models of "
-            "sheets do not"
+            f"the model '{model.name}' holds no reaction of a support. Models do, unless they were turned about the "
+            "axis of a body of revolution or come from solutions of another program"
         )
     return fields
 

@@ -19,14 +19,13 @@ from scipy.stats import qmc, t
 from morph_dslam.errors import IdentificationError
 from morph_dslam.identification.measurements import Measurement
 from morph_dslam.model import Parameter, ReducedModel
+from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE
 
 Array = NDArray[np.float64]
 #: Range of the common factor of all moduli, and its name among the unknowns.
 FACTOR, FACTOR_RANGE = "moduli_factor", (0.01, 100.0)
 #: Starts of the search, so that it does not end in a local minimum (a power of two); rounds of weighting.
 STARTS, ROUNDS = 8, 4
-#: A standard deviation of this share of a range makes the 95 % interval as wide as the range.
-UNIDENTIFIED = 0.25
 #: An estimate so near to an end of its range, over the range, is at it.
 AT_THE_END = 1e-6
 
@@ -237,7 +236,7 @@ class _Fit:
                 float(slope[i] * std[i]),
                 (float(low[i]), float(high[i])),
                 bool(at_bound[i]),
-                bool(std[i] < UNIDENTIFIED and not at_bound[i]),
+                bool(std[i] < UNOBSERVABLE_SHARE and not at_bound[i]),
             )
             for i, parameter in enumerate(self._unknowns)
         ]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import IdentificationError
-from morph_dslam.evaluation.force import ForceCurve, ReactionInDirection
+from morph_dslam.evaluation.force import ForceCurve, ReactionInDirection, parameter_columns, parameter_of_column
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.io.text import read_text
 from morph_dslam.model import MaterialPoints, ReducedModel
@@ -206,12 +206,12 @@ def _is_own(column: str) -> bool:
 
 def _parameter(path: str | Path, column: str, model: ReducedModel) -> tuple[str, float]:
     """The parameter that a column holds, and the factor of its values to SI."""
-    name, _, unit = column.rpartition("_")
-    for parameter in model.parameters:
-        if parameter.name == name and unit in FACTORS[parameter.quantity]:
-            return name, FACTORS[parameter.quantity][unit]
-    known = ", ".join(f"{p.name}_{p.unit}" for p in model.parameters)
-    raise IdentificationError(f"{path}: column '{column}' is no parameter of the model with its unit: {known}")
+    found = parameter_of_column(column, model)
+    if found is None:
+        raise IdentificationError(
+            f"{path}: column '{column}' is no parameter of the model with its unit: {parameter_columns(model)}"
+        )
+    return found
 
 
 def _coordinates(path: str | Path, rows: list[dict[str, str]], columns: list[str], names: tuple[str, ...]) -> Array:

@@ -45,10 +45,15 @@ class EquilibriumState:
 
 @dataclass(frozen=True)
 class _Response:
-    """One factorised tangent: how the sheet answers the residual and each grip motion."""
+    """One factorised tangent: how the sheet answers the residual and each grip motion.
+
+    ``reactions`` (6, 3 n_held) are the forces at the held dofs after the correction, in units of the shell's energy,
+    and their derivatives by the motions.
+    """
 
     correction: Array
     per_motion: Array
+    reactions: Array
     border: Array
     border_residual: Array
 
@@ -75,6 +80,7 @@ class GrippedSheet:
         self.shell = KoiterSheet(mesh, material, order, rigid_elements=rigid)
         self._find_held_dofs(rigid)
         self._bulge_row = self._bulge_functional()
+        self._latest: tuple[EquilibriumState, _Response] | None = None
 
     def _find_held_dofs(self, rigid_elements: list[int]) -> None:
         """Dofs under the grips: those of vertices move with the grip, those of higher order stay zero."""
@@ -158,7 +164,8 @@ class GrippedSheet:
                 result.data -= form.inner_solve * residual
             fields.append(result.FV().NumPy().copy())
         per_motion = np.array(fields[1:])
-        return _Response(fields[0], per_motion, *self._border(motion, target, fields, reactions, velocity))
+        border = self._border(motion, target, fields, reactions, velocity)
+        return _Response(fields[0], per_motion, np.array(reactions), *border)
 
     def _border(
         self, motion: Array, target: Array, fields: list[Array], reactions: list[Array], velocity: Array
@@ -227,9 +234,7 @@ class GrippedSheet:
 
         Implicit differentiation of the equilibrium equations: one factorisation, one solve each.
         """
-        self.shell.state_vector()[:] = state.dofs
-        self.shell.refresh_normals()
-        response = self._respond(state.motion, state.coordinates)
+        response = self._response_at(state)
         free = list(FREE_MOTIONS)
         motions = self.grips.prescribed_motion_gradient(state.coordinates).T
         for k, motion in enumerate(motions):
@@ -237,6 +242,39 @@ class GrippedSheet:
             load[0] -= 1.0 if k == 0 else 0.0
             motion[free] -= np.linalg.solve(response.border[:, free], load)
         return motions @ response.per_motion, motions
+
+    def _response_at(self, state: EquilibriumState) -> _Response:
+        """At a solved state; that of the latest one is kept."""
+        if self._latest is None or self._latest[0] is not state:
+            self.shell.state_vector()[:] = state.dofs
+            self.shell.refresh_normals()
+            self._latest = state, self._respond(state.motion, state.coordinates)
+        return self._latest[1]
+
+    def reactions(self, state: EquilibriumState) -> tuple[Array, Array]:
+        """What the left and the right grip exert, with derivatives by the coordinates.
+
+        Returns
+        -------
+        Force (N) and moment about the origin (N m) of each grip, (2, 6); derivatives (4, 2, 6).
+        """
+        response, (_, motions) = self._response_at(state), self.sensitivities(state)
+        positions = np.vstack(self._held_points) + self._by_vertex(self._held_values(state.motion))
+        forces = self.shell.energy_scale * self._by_vertex(response.reactions[0])
+        velocities = np.moveaxis(self._by_vertex(self._held_velocity(state.motion).T), 0, -1) @ motions.T
+        slopes = self.shell.energy_scale * self._by_vertex(motions @ response.reactions[1:])
+        both = np.concatenate([forces, np.cross(positions, forces)], axis=1)
+        turned = np.cross(np.moveaxis(velocities, -1, 0), forces) + np.cross(positions, slopes)
+        both_slopes = np.concatenate([slopes, turned], axis=2)
+        left = len(self._held_points[0])
+        return (
+            np.array([both[:left].sum(axis=0), both[left:].sum(axis=0)]),
+            np.stack([both_slopes[:, :left].sum(axis=1), both_slopes[:, left:].sum(axis=1)], axis=1),
+        )
+
+    def _by_vertex(self, held: Array) -> Array:
+        """(..., n_held, 3) of values (..., 3 n_held) at the held dofs; the inverse of `_by_component`."""
+        return np.swapaxes(held.reshape(*held.shape[:-1], 3, -1), -1, -2)
 
     def first_state(self, bulge: float) -> EquilibriumState:
         """Equilibrium of the gently arched sheet, bend = 1, from a circular arc as the first guess.

@@ -21,6 +21,7 @@ from morph_dslam.mechanics.gripped_sheet import EquilibriumState, GrippedSheet
 from morph_dslam.mechanics.grips import COORDINATES, Grips
 from morph_dslam.mechanics.shell import OrthotropicSheet
 from morph_dslam.model import Parameter
+from morph_dslam.model.reduced_model import FORCE, MOMENT, REACTION
 from morph_dslam.studies.problem import ModelMesh, Snapshot
 from morph_dslam.studies.sections import (
     Angle,
@@ -36,6 +37,8 @@ from morph_dslam.studies.sections import (
 from morph_dslam.studies.snapshots import SOLVER_VERSION
 
 Array = NDArray[np.float64]
+#: Names of the grips, as of supports.
+GRIPS = ("left", "right")
 #: Signs that the coordinates take when the sheet is mirrored in its own plane, in x = 0 and in y = 0.
 MIRROR_Z = np.array([-1.0, 1.0, -1.0, 1.0])
 MIRROR_X = np.array([1.0, 1.0, -1.0, -1.0])
@@ -51,7 +54,7 @@ def output_points(length: float, width: float, grid: tuple[int, int]) -> Array:
 
 
 def take_snapshot(problem: GrippedSheet, state: EquilibriumState, points: Array, thickness_ratio: float) -> Snapshot:
-    """Displacement, stress and their derivatives at a solved state.
+    """Displacement, stress, what the grips exert, and the derivatives of all at a solved state.
 
     Parameters
     ----------
@@ -63,12 +66,15 @@ def take_snapshot(problem: GrippedSheet, state: EquilibriumState, points: Array,
     dof_slopes, _ = problem.sensitivities(state)
     fields = _fields(problem, state.dofs, points, thickness_ratio)
     slopes = [_fields(problem, slope, points, thickness_ratio) for slope in dof_slopes]
-    return Snapshot(
-        state.coordinates,
-        fields,
-        {name: np.array([slope[name] for slope in slopes]) for name in fields},
-        {"motion": state.motion},
-    )
+    derivatives = {name: np.array([slope[name] for slope in slopes]) for name in fields}
+    # Forces go with bending stiffness, as the sheet does not stretch.
+    reactions, reaction_slopes = (thickness_ratio**3 * part for part in problem.reactions(state))
+    outputs = {"motion": state.motion}
+    for i, grip in enumerate(GRIPS):
+        for kind, part in ((FORCE, slice(3)), (MOMENT, slice(3, 6))):
+            outputs[kind + grip] = reactions[i, part]
+            derivatives[REACTION + kind + grip] = reaction_slopes[:, i, None, part]
+    return Snapshot(state.coordinates, fields, derivatives, outputs)
 
 
 def _fields(problem: GrippedSheet, dofs: Array, points: Array, ratio: float) -> dict[str, Array]:
@@ -110,7 +116,14 @@ def _image(
         }
 
     slopes = image(snapshot.sensitivities, signs[:, None, None])
-    return Snapshot(snapshot.coordinates * signs, image(snapshot.fields, 1.0), slopes, {"motion": motion})
+    outputs = {"motion": motion}
+    for grip, other in zip(GRIPS, reversed(GRIPS) if axis == -2 else GRIPS, strict=True):
+        # A moment is a vector of a rotation: mirrored, it keeps what a force turns round.
+        for kind, turned in ((FORCE, np.array(vector)), (MOMENT, -np.array(vector))):
+            outputs[kind + grip] = snapshot.outputs[kind + other] * turned
+            slope = snapshot.sensitivities[REACTION + kind + other]
+            slopes[REACTION + kind + grip] = slope * turned * signs[:, None, None]
+    return Snapshot(snapshot.coordinates * signs, image(snapshot.fields, 1.0), slopes, outputs)
 
 
 def mirrored(snapshot: Snapshot) -> Snapshot:
@@ -356,7 +369,18 @@ class SheetStudy(Section):
             nodes=np.column_stack([points, np.zeros(len(points))]),
             triangles=_grid_triangles(nx, ny),
             weights=np.outer(y, x).ravel() / (nx * ny),
+            supports=self._held_points(points),
         )
+
+    def _held_points(self, points: Array) -> dict[str, NDArray[np.int64]]:
+        """Output points (n, 2) under each grip, as far as there are any."""
+        grips, inner = self.grips, self.sheet.length / 2.0 - self.grips.depth
+        found = {}
+        for grip, sign, centre in zip(GRIPS, (-1.0, 1.0), (grips.centre_left, grips.centre_right), strict=True):
+            near = np.abs(points[:, 1] - centre) <= grips.height / 2.0 * (1.0 + 1e-9)
+            held = np.flatnonzero((sign * points[:, 0] >= inner * (1.0 - 1e-9)) & near)
+            found |= {grip: held} if len(held) else {}
+        return found
 
     def _output_points(self) -> Array:
         return output_points(self.sheet.length, self.sheet.width, self.reduction.grid)

@@ -33,8 +33,8 @@ class ForceArrows:
         self._reactions = Reactions(model)
         if not self._reactions.names:
             raise TrackingError(
-                f"the model '{model.name}' holds no reactions of supports to draw: leave out --forces. Models of "
-                "solids do, unless they come from solutions of another program"
+                f"the model '{model.name}' holds no reactions of supports to draw: leave out --forces. Models "
+                "do, unless they come from solutions of another program"
             )
         states = [self._reactions.forces(mu) for mu in model.spread_parameters(SAMPLES)]
         largest = max(float(np.linalg.norm(force)) for state in states for _, force in state.values())
