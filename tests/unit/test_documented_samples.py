@@ -47,7 +47,7 @@ def test_every_sample_file_is_read_by_a_test_here():
         ("registration", "csv"): 1,
         ("registration-aids", "csv"): 1,
         ("solid-study", "csv"): 1,
-        ("solid-study", "toml"): 5,
+        ("solid-study", "toml"): 6,
         ("study-file", "toml"): 1,
     }
 
@@ -157,6 +157,20 @@ def test_values_of_a_solids_study():
     assert found["x"][0].slopes == pytest.approx((0.0, 0.0, 0.0, 0.0015))
 
 
+def test_a_strip_that_buckles_upwards_first():
+    study = {
+        "name": "strip",
+        "mesh": {"generator": "block", "size": ["100 mm", "10 mm", "2 mm"], "divisions": [10, 1, 1], "cells": "hex8"},
+        "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.3}},
+        "parameters": {"weight": {"range": ["0 Pa", "30 Pa"], "default": "20 Pa"}},
+    }
+    sample = tomllib.loads(samples("solid-study", "toml")[1])
+    weight = {"kind": "traction", "on": "z_max", "traction": ["0 Pa", "0 Pa", "-1 * weight"]}
+    supports, loads = [{"kind": "fixed", "on": "x_min"}, *sample["supports"]], [*sample["loads"], weight]
+    sweep = make_study(study | {"supports": supports, "loads": loads}).sweep_problem()
+    assert sweep.take_snapshot(sweep.first_state()).fields["displacement"][:, 2].max() > 5e-3
+
+
 def test_a_bar_with_a_fitting_at_its_end():
     """The support holds what the fitting transmits: the force, and its moment about the deformed place."""
     study = {
@@ -166,7 +180,7 @@ def test_a_bar_with_a_fitting_at_its_end():
         "supports": [{"kind": "fixed", "on": "x_min"}],
         "parameters": {"pull": {"range": ["0 N", "0.1 N"]}, "bend": {"range": ["-5 N.mm", "5 N.mm"]}},
     }
-    study |= tomllib.loads(samples("solid-study", "toml")[1])
+    study |= tomllib.loads(samples("solid-study", "toml")[2])
     sweep = make_study(study).sweep_problem()
     outputs = sweep.take_snapshot(sweep.advance(sweep.first_state(), np.array([0.05, 2e-3]))).outputs
     place = np.array([0.12, 0.0, 0.025]) + outputs["translation_x_max"]
@@ -184,7 +198,7 @@ def test_a_ball_that_presses_on_a_block():
         "supports": [{"kind": "fixed", "on": "z_min"}],
         "parameters": {"depth": {"range": ["0 mm", "8 mm"]}} | places,
     }
-    study |= tomllib.loads(samples("solid-study", "toml")[2])
+    study |= tomllib.loads(samples("solid-study", "toml")[3])
     made = make_study(study)
     assert isinstance(made, SolidStudy)
     problem = made.problem()
@@ -208,7 +222,7 @@ def test_shape_of_a_solid():
         "supports": [{"kind": "fixed", "on": "bottom"}],
         "parameters": {"growth": {"range": ["-0.5 mm", "1 mm"]}},
     }
-    study |= tomllib.loads(samples("solid-study", "toml")[3])
+    study |= tomllib.loads(samples("solid-study", "toml")[4])
     made = make_study(study)
     assert isinstance(made, SolidStudy)
     assert [shape.kind for shape in made.shape] == ["thickness"]
@@ -217,7 +231,7 @@ def test_shape_of_a_solid():
 
 
 def test_solutions_of_another_program(tmp_path):
-    study = make_study(tomllib.loads(samples("solid-study", "toml")[4]), tmp_path)
+    study = make_study(tomllib.loads(samples("solid-study", "toml")[5]), tmp_path)
     assert isinstance(study, ExternalStudy)
     (tmp_path / "parameters.csv").write_text(samples("solid-study", "csv")[0])
     parameters, values, rows = read_table(study.external.table)

@@ -54,6 +54,10 @@ class Coupling:
     moment: Vector = (0.0, 0.0, 0.0)
     point: Vector | None = None
 
+    def unloaded(self) -> Coupling:
+        """The same without force and moment."""
+        return Coupling(self.on, point=self.point)
+
 
 @dataclass(frozen=True)
 class Rotation:

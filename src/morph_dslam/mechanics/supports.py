@@ -237,6 +237,13 @@ def fixed(on: str) -> PrescribedDisplacement:
     return PrescribedDisplacement(on, 0.0, 0.0, 0.0)
 
 
+def held_still(support: PrescribedMotion | ElasticFoundation) -> PrescribedMotion | ElasticFoundation:
+    """The support without its motion."""
+    if isinstance(support, ElasticFoundation):
+        return support
+    return PrescribedDisplacement(support.on, *(0.0 if held else None for held in support.components))
+
+
 @dataclass(frozen=True, eq=False)
 class RigidRotation:
     """Moves a set as a rigid body: a finite rotation about an axis through a centre, then a translation.

@@ -236,7 +236,7 @@ class _Stoppable:
     def __init__(self, problem: SolidProblem, in_time: Callable[[], bool]) -> None:
         self._problem, self._in_time = problem, in_time
         self.n_dofs, self.free, self.scale = problem.n_dofs, problem.free, problem.scale
-        self.in_contact = problem.in_contact
+        self.in_contact, self.applied_first = problem.in_contact, problem.applied_first
         self.prescribed, self.prescribed_slopes = problem.prescribed, problem.prescribed_slopes
         self.residual, self.residual_slopes = problem.residual, problem.residual_slopes
         self._solver = problem.solver

@@ -58,11 +58,15 @@ def _unit(value: Value) -> str:
     return parts[1]
 
 
+Duration = Annotated[float, quantity("time"), Field(gt=0, allow_inf_nan=False)]
+
+
 class TimeSection(Section):
     """The parameter that is the time; at the lower end of its range the body is loaded in an instant.
 
-    ``step`` is the longest increment of time.
+    ``step`` is the longest increment of time; ``rest`` how long before that what is applied first has acted.
     """
 
     parameter: str
-    step: Annotated[float, quantity("time"), Field(gt=0, allow_inf_nan=False)]
+    step: Duration
+    rest: Duration | None = None

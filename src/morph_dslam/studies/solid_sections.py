@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Discriminator, Field, Tag
@@ -176,17 +176,24 @@ def _triple(values: Triple, quantity: str, read: Reader) -> tuple[Any, Any, Any]
     return x, y, z
 
 
+class _Applied(Section):
+    """What is applied to the solid, ``first``: before all that is not."""
+
+    first: bool = False
+
+
 class _FixedSupport(Section):
     """Holds a set in all three directions."""
 
     kind: Literal["fixed"]
     on: str
+    first: ClassVar[bool] = False
 
     def make(self, read: Reader) -> supports.PrescribedDisplacement:
         return supports.fixed(self.on)
 
 
-class _DisplacementSupport(Section):
+class _DisplacementSupport(_Applied):
     """Moves a set by given lengths; a direction that is left out stays free."""
 
     kind: Literal["displacement"]
@@ -200,7 +207,7 @@ class _DisplacementSupport(Section):
         return supports.PrescribedDisplacement(self.on, *values)
 
 
-class _RotationSupport(Section):
+class _RotationSupport(_Applied):
     """Turns a set as a rigid body about an axis, then shifts it.
 
     ``axis`` gives the direction, right-handed; ``centre`` a point on it, or the set whose mean point it is
@@ -232,12 +239,13 @@ class _FoundationSupport(Section):
     on: str
     stiffness: Value
     normal_only: bool = False
+    first: ClassVar[bool] = False
 
     def make(self, read: Reader) -> supports.ElasticFoundation:
         return supports.ElasticFoundation(self.on, read(self.stiffness, "stiffness per area"), self.normal_only)
 
 
-class _TractionLoad(Section):
+class _TractionLoad(_Applied):
     """Force per undeformed area that keeps its direction."""
 
     kind: Literal["traction"]
@@ -248,7 +256,7 @@ class _TractionLoad(Section):
         return loads.DeadTraction(self.on, _triple(self.traction, "stress", read))
 
 
-class _PressureLoad(Section):
+class _PressureLoad(_Applied):
     """Pressure that follows the deformed surface; positive pushes inwards."""
 
     kind: Literal["pressure"]
@@ -259,7 +267,7 @@ class _PressureLoad(Section):
         return loads.FollowerPressure(self.on, read(self.pressure, "pressure"))
 
 
-class BodyForceLoad(Section):
+class BodyForceLoad(_Applied):
     """Force per undeformed volume of a cell set."""
 
     kind: Literal["body_force"]
@@ -270,7 +278,7 @@ class BodyForceLoad(Section):
         return loads.BodyForce(_triple(self.force, "force per volume", read), self.on)
 
 
-class GravityLoad(Section):
+class GravityLoad(_Applied):
     """Weight: materials need their density."""
 
     kind: Literal["gravity"]
@@ -280,7 +288,7 @@ class GravityLoad(Section):
         return loads.Gravity(_triple(self.acceleration, "acceleration", read))
 
 
-class _PointLoadSection(Section):
+class _PointLoadSection(_Applied):
     """A force shared equally by the nodes of a set."""
 
     kind: Literal["point"]
@@ -291,7 +299,7 @@ class _PointLoadSection(Section):
         return loads.PointLoad(self.on, _triple(self.force, "force", read))
 
 
-class _MovingPatchLoad(Section):
+class _MovingPatchLoad(_Applied):
     """A force spread over a round patch of a surface, whose ``centre`` may move with a parameter.
 
     ``width`` is the standard deviation of its Gaussian density, at least about half an element.
@@ -308,7 +316,7 @@ class _MovingPatchLoad(Section):
         return loads.MovingPatch(self.on, force, centre, self.width)
 
 
-class _MovingLineLoad(Section):
+class _MovingLineLoad(_Applied):
     """A force per length along a straight line over a surface; ``centre`` may move with a parameter."""
 
     kind: Literal["moving_line"]
@@ -323,7 +331,7 @@ class _MovingLineLoad(Section):
         return loads.MovingLine(self.on, force, centre, self.direction, self.width)
 
 
-class CouplingSection(Section):
+class CouplingSection(_Applied):
     """A set that moves as a rigid body under a force and a moment, which keep their directions.
 
     The force acts at ``point``, which moves with the set: the mean of the set's nodes if absent.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
@@ -16,6 +17,7 @@ from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.coupled_solid import CoupledSolid
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.mechanics.supports import held_still
 from morph_dslam.meshing.mesh_checks import check_mesh
 from morph_dslam.meshing.meshes import Mesh, model_mesh_of
 from morph_dslam.model import Parameter
@@ -134,6 +136,22 @@ class SolidStudy(Section):
             raise ValueError("[time] is for viscoelastic materials, and none has a prony series")
         if clock.default != clock.lower:
             raise ValueError(f"parameters.{clock.name}: time starts at the lower end; leave out the default")
+        if self.time.rest is not None:
+            self._check_rest(parameters, parameters.index(clock))
+
+    def _check_rest(self, parameters: tuple[Parameter, ...], clock: int) -> None:
+        """What rests before the time begins must be there, and cannot depend on the time."""
+        first = self._applied_first()
+        if not first:
+            raise ValueError("time.rest: nothing rests; say of a load or support that it is first = true")
+
+        def read(value: Value, quantity: str | None) -> float:
+            if read_affine(value, quantity, parameters).slopes[clock]:
+                raise ValueError(f"'{value}' names the time, but rests before the time begins: leave out first = true")
+            return 0.0
+
+        for section in first:
+            section.make(read)
 
     def _parts(self) -> list[tuple[str, Any]]:
         """Materials, supports, loads, couplings, contacts and shapes with what messages call them."""
@@ -187,11 +205,13 @@ class SolidStudy(Section):
     def fingerprint(self) -> str:
         """Hash of mesh, shape, mechanics, parameters' names, elements and solver version."""
         content: dict[str, Any] = self.model_dump(mode="json", include={"materials", "supports", "loads"})
+        for part in (*content["supports"], *content["loads"]):
+            part |= {"first": True} if part.pop("first", False) else {}
         content["functions"] = [material.source for material in self.materials.values()]
         content["elements"] = self.solver.order, self.solver.formulation
         content["parameters"] = list(self.parameters)
         content["root"] = self.root().tolist() if self.time else None
-        content["time"] = self.time.model_dump() if self.time else None
+        content["time"] = self.time.model_dump(exclude_none=True) if self.time else None
         mesh = self.solid_mesh()
         content["mesh"] = mesh_fingerprint(mesh)
         content["code"] = SOLVER_VERSION
@@ -231,25 +251,39 @@ class SolidStudy(Section):
 
         reader: Reader = read
         own = SolidOptions(order=self.solver.order, mixed=MIXED[self.solver.formulation], threads=self.solver.threads)
-        coupled = [section.make(reader) for section in self.couplings]
-        make = partial(CoupledSolid, coupled) if coupled else SolidProblem
-        return make(
-            mesh,
-            {section.on: section.make(reader) for section in self.materials.values()},
-            [section.make(reader) for section in self.supports],
-            [section.make(reader) for section in self.loads],
-            symbols,
-            options or own,
-            shape_fields(self.shape, mesh, symbols),
-            time=symbols[self.time.parameter] if self.time else None,
-            contacts=[section.make(reader) for section in self.contacts],
-        )
+        materials = {section.on: section.make(reader) for section in self.materials.values()}
+        shape = shape_fields(self.shape, mesh, symbols)
+        contacts = [section.make(reader) for section in self.contacts]
+        time = symbols[self.time.parameter] if self.time else None
+
+        def solid(supports: list[Any], loads: list[Any], couplings: list[Any]) -> SolidProblem:
+            make = partial(CoupledSolid, couplings) if couplings else SolidProblem
+            elements = options or own
+            return make(mesh, materials, supports, loads, symbols, elements, shape, time=time, contacts=contacts)
+
+        def made(sections: Iterable[Any]) -> list[tuple[Any, bool]]:
+            return [(section.make(reader), section.first) for section in sections]
+
+        supports, loads, couplings = made(self.supports), made(self.loads), made(self.couplings)
+        problem = solid(*([part for part, _ in parts] for parts in (supports, loads, couplings)))
+        if self._applied_first():
+            problem.applied_first = solid(
+                [part if first else held_still(part) for part, first in supports],
+                [part for part, first in loads if first],
+                [part if first else part.unloaded() for part, first in couplings],
+            )
+        return problem
+
+    def _applied_first(self) -> list[Any]:
+        """Supports, loads and couplings that act before the others."""
+        return [section for section in (*self.supports, *self.loads, *self.couplings) if section.first]
 
     def sweep_problem(self) -> SweepProblem:
         """What the sweep solves with."""
         if self.time is None:
             return SolidSweep(self.problem())
-        return ViscousSweep(self.problem(), list(self.parameters).index(self.time.parameter), self.time.step)
+        clock = list(self.parameters).index(self.time.parameter)
+        return ViscousSweep(self.problem(), clock, self.time.step, self.time.rest or 0.0)
 
     def model_mesh(self) -> ModelMesh:
         """The nodes of the mesh, its outer surface, its cells, the volume of each node, and what supports hold."""

@@ -17,6 +17,8 @@ from morph_dslam.model.reduced_model import FORCE, MOMENT, REACTION
 from morph_dslam.studies.problem import Snapshot
 
 Array = NDArray[np.float64]
+#: Each increment of time of a rest is so many times the one before.
+GROWTH = 1.2
 #: Fields of a snapshot and what they are called when recovered.
 _FIELDS = {"displacement": "displacement", "stress_solid": "stress", "strain": "strain"}
 
@@ -219,16 +221,38 @@ class ViscousSweep:
     problem : at rest; its clock stands at the default of the time.
     clock : index of the parameter that is the time.
     step : longest increment of time, s.
+    rest : how long what is applied first has acted when all else comes, s.
     """
 
-    def __init__(self, problem: SolidProblem, clock: int, step: float) -> None:
-        self.problem, self._clock, self._step = problem, clock, step
+    def __init__(self, problem: SolidProblem, clock: int, step: float, rest: float = 0.0) -> None:
+        self.problem, self._clock, self._step, self._rest = problem, clock, step, rest
+
+    def _rested(self, mu: Array) -> Array | None:
+        """Dofs (n,) of what is applied first, after its rest, whose memory the problem takes; None without a rest."""
+        first, history = self.problem.applied_first, self.problem.history
+        if first is None or not self._rest:
+            return None
+        assert history is not None
+        assert first.history is not None
+        # Increments grow with the age of the load, as relaxation slows down.
+        count = int(np.ceil(np.log1p((GROWTH - 1.0) * self._rest / self._step) / np.log(GROWTH)))
+        ages = self._rest * (GROWTH ** np.arange(count + 1) - 1.0) / (GROWTH**count - 1.0)
+        moments = [self._at_time(mu, mu[self._clock] - self._rest + age) for age in ages]
+        memory = history.values()
+        memory[-1] = moments[0][self._clock]
+        first.history.restore(memory)
+        state = loaded_state(first, moments[0])
+        first.advance_history(state.dofs, state.mu)
+        for moment in moments[1:]:
+            state = follow(first, state, moment)
+        history.restore(first.history.values())
+        return state.dofs
 
     @cached_property
     def _loaded(self) -> _ViscousSolution:
         """The default state, an instant after loading."""
         mu = self.problem.symbols.default
-        state = loaded_state(self.problem, mu)
+        state = loaded_state(self.problem, mu, self._rested(mu))
         self.problem.advance_history(state.dofs, mu)
         return self._with_memory(state)
 

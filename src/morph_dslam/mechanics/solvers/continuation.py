@@ -107,40 +107,50 @@ class _Shifted:
 
 
 class _LoadRamp:
-    """Equations in one parameter: the share s of all loads and motions at the parameters ``full``.
+    """Equations in one parameter: the share s of all loads and motions at ``full`` that are still missing in ``start``.
 
-    The residual r(x) - (1 - s) r(0) is that of the share s of every dead load (Newton's homotopy; Allgower and Georg,
-    Numerical Continuation Methods, 1990, section 1.2): x = 0 solves it at s = 0, and s = 1 is the problem itself.
+    The residual r(x) - (1 - s) r(start) is that of the share s of every missing dead load (Newton's homotopy; Allgower
+    and Georg, Numerical Continuation Methods, 1990, section 1.2): ``start`` solves it at s = 0, and s = 1 is the
+    problem itself.
     """
 
-    def __init__(self, equations: Equations, full: Array) -> None:
+    def __init__(self, equations: Equations, full: Array, start: Array) -> None:
         self._equations, self._full = equations, full
         self.n_dofs, self.free, self.scale = equations.n_dofs, equations.free, equations.scale
         self.in_contact = in_contact(equations)
-        self._unloaded = np.where(self.free, equations.residual(np.zeros(self.n_dofs), full), 0.0)
+        self._missing = np.where(self.free, equations.residual(start, full), 0.0)
+        self._begin = np.where(self.free, 0.0, start)
+        self._motion = equations.prescribed(full) - self._begin
 
     def prescribed(self, mu: Array) -> Array:
-        return mu[0] * self._equations.prescribed(self._full)
+        return self._begin + mu[0] * self._motion
 
     def prescribed_slopes(self, mu: Array) -> Array:
-        return self._equations.prescribed(self._full)[None]
+        return self._motion[None]
 
     def residual(self, x: Array, mu: Array) -> Array:
-        return self._equations.residual(x, self._full) - (1.0 - mu[0]) * self._unloaded
+        return self._equations.residual(x, self._full) - (1.0 - mu[0]) * self._missing
 
     def residual_slopes(self, x: Array, mu: Array) -> Array:
-        return self._unloaded[None]
+        return self._missing[None]
 
     def linearise(self, x: Array, mu: Array) -> Linearisation:
         original = self._equations.linearise(x, self._full)
-        return _Shifted(original, original.residual - (1.0 - mu[0]) * self._unloaded)
+        return _Shifted(original, original.residual - (1.0 - mu[0]) * self._missing)
 
 
-def loaded_state(equations: Equations, mu: Array) -> State:
+def loaded_state(equations: Equations, mu: Array, start: Array | None = None) -> State:
     """Equilibrium at ``mu`` (d,), reached from the undeformed, stress-free body while all loads grow together.
 
     Raises SolverError if the loads cannot be carried.
+
+    Parameters
+    ----------
+    equations : where they have others, ``applied_first``, what these have grows before the rest.
+    start : (n,) where that has led already; None if nothing is applied yet.
     """
-    start = State(np.zeros(1), np.zeros(equations.n_dofs))
-    reached = advance(_LoadRamp(equations, mu), start, np.ones(1))[-1]
+    if start is None:
+        first = getattr(equations, "applied_first", None)
+        start = np.zeros(equations.n_dofs) if first is None else loaded_state(first, mu).dofs
+    reached = advance(_LoadRamp(equations, mu, start), State(np.zeros(1), start), np.ones(1))[-1]
     return State(np.array(mu, dtype=float), reached.dofs, reached.negative_pivots, reached.iterations)
