@@ -61,7 +61,7 @@ def test_other_supports_hold_still_meanwhile() -> None:
     ordered = strip_study(True, supports=held, loads=loads)
     first = ordered.problem().applied_first
     assert first is not None
-    np.testing.assert_array_equal(first.prescribed(ordered.root()), 0.0)
+    np.testing.assert_array_equal(first().prescribed(ordered.root()), 0.0)
     assert rise(ordered) == pytest.approx(rise(strip_study(False, supports=held)), rel=1e-5)
 
 

@@ -114,7 +114,9 @@ def test_mistakes_in_a_coupling_are_named() -> None:
         bar_study(couplings=[{"on": "x_max", "force": ["0 N", "0 N", "bond"]}])
     with pytest.raises(StudyError, match=r"coupling 1: 'N' is not a unit of moment; use one of N.m, N.mm"):
         bar_study(couplings=[{"on": "x_max", "moment": ["1 N", "0 N.m", "0 N.m"]}])
-    with pytest.raises(StudyError, match=r"unknown key couplings\.0\.kind; known here: first, on, point, force, moment"):
+    with pytest.raises(
+        StudyError, match=r"unknown key couplings\.0\.kind; known here: first, on, point, force, moment"
+    ):
         bar_study(couplings=[{"on": "x_max", "kind": "rigid"}])
 
 

@@ -11,7 +11,7 @@ by NGSolve; derivatives by parameters are taken of the same integrands. Contact 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -98,8 +98,8 @@ class SolidProblem:
     free : see `newton.Equations`.
     scale : see `newton.Equations`.
     in_contact : see `newton.in_contact`.
-    applied_first : the same solid with what is to act before everything else (`continuation.loaded_state`); None if
-        all grows together.
+    applied_first : makes the same solid with what is to act before everything else (`continuation.loaded_state`);
+        None if all grows together.
     flags : what a result obtained with this discretisation must be doubted for; empty if nothing.
     """
 
@@ -140,7 +140,7 @@ class SolidProblem:
         self.assembly = self._make_assembly()
         self.contact = self._make_contact(contacts)
         self.in_contact = bool(contacts)
-        self.applied_first: SolidProblem | None = None
+        self.applied_first: Callable[[], SolidProblem] | None = None
         self.free: NDArray[np.bool_] = self._free_dofs()
         scale = np.full(self.n_dofs, np.inf)
         scale[:n_displacements] = self.length

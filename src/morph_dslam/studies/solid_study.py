@@ -267,7 +267,8 @@ class SolidStudy(Section):
         supports, loads, couplings = made(self.supports), made(self.loads), made(self.couplings)
         problem = solid(*([part for part, _ in parts] for parts in (supports, loads, couplings)))
         if self._applied_first():
-            problem.applied_first = solid(
+            problem.applied_first = partial(
+                solid,
                 [part if first else held_still(part) for part, first in supports],
                 [part for part, first in loads if first],
                 [part if first else part.unloaded() for part, first in couplings],

@@ -229,9 +229,9 @@ class ViscousSweep:
 
     def _rested(self, mu: Array) -> Array | None:
         """Dofs (n,) of what is applied first, after its rest, whose memory the problem takes; None without a rest."""
-        first, history = self.problem.applied_first, self.problem.history
-        if first is None or not self._rest:
+        if self.problem.applied_first is None or not self._rest:
             return None
+        first, history = self.problem.applied_first(), self.problem.history
         assert history is not None
         assert first.history is not None
         # Increments grow with the age of the load, as relaxation slows down.

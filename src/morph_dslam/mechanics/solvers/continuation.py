@@ -146,11 +146,11 @@ def loaded_state(equations: Equations, mu: Array, start: Array | None = None) ->
 
     Parameters
     ----------
-    equations : where they have others, ``applied_first``, what these have grows before the rest.
+    equations : where ``applied_first`` makes others, what these have grows before the rest.
     start : (n,) where that has led already; None if nothing is applied yet.
     """
     if start is None:
         first = getattr(equations, "applied_first", None)
-        start = np.zeros(equations.n_dofs) if first is None else loaded_state(first, mu).dofs
+        start = np.zeros(equations.n_dofs) if first is None else loaded_state(first(), mu).dofs
     reached = advance(_LoadRamp(equations, mu, start), State(np.zeros(1), start), np.ones(1))[-1]
     return State(np.array(mu, dtype=float), reached.dofs, reached.negative_pivots, reached.iterations)
