@@ -62,8 +62,8 @@ Nothing prompts, and nothing needs a display.
 STUDY_KEYS_INTRODUCTION = """\
 # Study keys
 
-All keys with their defaults. The pages on the study of a [solid](../solid-study.md) and of a [sheet](../study-file.md)
-explain them.
+All keys with their defaults. The pages on the study of a [solid](../solid-study.md), a [shell](../shell-study.md) and a
+[sheet](../study-file.md) explain them.
 
 """
 

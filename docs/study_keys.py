@@ -12,10 +12,15 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from morph_dslam.io.sections import sections_of
-from morph_dslam.studies.study import ExternalStudy, SheetStudy, SolidStudy
+from morph_dslam.studies.study import ExternalStudy, SheetStudy, ShellStudy, SolidStudy
 
 #: Kinds of studies with their headings.
-_STUDIES = {"Solid": SolidStudy, "Sheet in two grips": SheetStudy, "Solutions of another program": ExternalStudy}
+_STUDIES = {
+    "Solid": SolidStudy,
+    "Shell": ShellStudy,
+    "Sheet in two grips": SheetStudy,
+    "Solutions of another program": ExternalStudy,
+}
 
 
 def study_reference() -> str:

@@ -22,6 +22,7 @@ from morph_dslam.slam.scene import finish_scene
 from morph_dslam.slam.slam import Slam
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.sheet_study import SheetStudy
+from morph_dslam.studies.shell_study import ShellStudy
 from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.tracking.outcomes import Status, TrackingWarning
 from morph_dslam.tracking.run_folder import summarise, write_csv, write_hdf5
@@ -46,6 +47,7 @@ def keys_of(*roots: type[BaseModel]) -> set[str]:
         (["registration-aids"], [BoardFile, PictureFile, GuessFile], 15),
         (["solid-study"], [SolidStudy, ExternalStudy], 70),
         (["study-file", "solid-study"], [SheetStudy], 20),
+        (["shell-study", "solid-study"], [ShellStudy], 45),
     ],
 )
 def test_every_key_is_documented(pages, roots, n_keys):
@@ -85,12 +87,13 @@ def test_every_result_of_camera_tracking_is_documented(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("page", "roots"), [("study-file", [SheetStudy]), ("solid-study", [SolidStudy, ExternalStudy])]
+    ("page", "roots"),
+    [("study-file", [SheetStudy]), ("solid-study", [SolidStudy, ExternalStudy]), ("shell-study", [ShellStudy])],
 )
 def test_every_key_in_a_table_exists(page, roots):
     known = keys_of(*roots) | {"relative_moduli", "times", "bulk_moduli", "prony", "density"}
     # keys of a material are those of its law; generators are values
-    known |= {"block", "tube", "revolution"}
+    known |= {"block", "tube", "revolution", "plate", "cylinder", "sphere", "annulus", "true"}
     n_keys = 0
     for table in re.findall(r"^\| key \|.*\n\|[-|]+\n((?:\|.*\n)+)", PAGES[page], flags=re.MULTILINE):
         for row in table.splitlines():

@@ -15,7 +15,7 @@ from morph_dslam.io.camera_files import load_camera
 from morph_dslam.io.export import StateChoice
 from morph_dslam.io.landmarks import load_landmarks
 from morph_dslam.mechanics.materials.user import UserMaterial
-from morph_dslam.mechanics.solvers.continuation import advance
+from morph_dslam.mechanics.solvers.continuation import advance, loaded_state
 from morph_dslam.model import Parameter, save_model
 from morph_dslam.reduction.report_pictures import read_reference_curve
 from morph_dslam.registration.board import load_board
@@ -25,6 +25,7 @@ from morph_dslam.render.scene_file import load_scene_file
 from morph_dslam.studies.affine import read_affine
 from morph_dslam.studies.external import ExternalStudy, read_table
 from morph_dslam.studies.sheet_study import SheetStudy
+from morph_dslam.studies.shell_study import ShellStudy
 from morph_dslam.studies.solid_study import SolidStudy
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.documents import PAGES, samples
@@ -46,6 +47,7 @@ def test_every_sample_file_is_read_by_a_test_here():
         ("scene-file", "toml"): 2,
         ("registration", "csv"): 1,
         ("registration-aids", "csv"): 1,
+        ("shell-study", "toml"): 1,
         ("solid-study", "csv"): 1,
         ("solid-study", "toml"): 6,
         ("study-file", "toml"): 1,
@@ -102,6 +104,14 @@ def test_study_of_a_sheet():
     study = make_study(tomllib.loads(samples("study-file", "toml")[0]))
     assert isinstance(study, SheetStudy)
     assert study.sheet.length == pytest.approx(0.420)
+
+
+def test_study_of_a_shell():
+    study = make_study(tomllib.loads(samples("shell-study", "toml")[0]))
+    assert isinstance(study, ShellStudy)
+    problem, mu = study.problem(), np.array([20.0, 0.2])
+    start = loaded_state(problem, study.root())
+    assert problem.nodal_displacement(advance(problem, start, mu)[-1].dofs)[:, 1].max() > 3e-4
 
 
 def test_a_recording_of_your_own(tmp_path, monkeypatch):

@@ -24,7 +24,7 @@ Labels = NDArray[np.int64]
 ELEMENTS = {
     "C3D4": ("tet4", 4), "C3D6": ("prism6", 6), "C3D8": ("hex8", 8), "C3D10": ("tet10", 10),
     "C3D15": ("prism15", 15), "C3D20": ("hex20", 20), "C3D27": ("hex27", 27),
-    "S3": ("tri3", 3), "S4": ("quad4", 4),
+    "S3": ("tri3", 3), "S4": ("quad4", 4), "S6": ("tri6", 6), "STRI65": ("tri6", 6), "S8": ("quad8", 8),
 }  # fmt: skip
 _GENERATING = (
     "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "SUBMODEL", "SYMMETRIC MODEL GENERATION",

@@ -1,4 +1,4 @@
-"""Loads on a solid, any of them a function of parameters.
+"""Loads on a solid or a shell, any of them a function of parameters.
 
 Dead loads have an energy; the follower pressure has none, and makes the tangent unsymmetric. All areas and volumes are
 those of the undeformed solid, whatever its shape parameters.
@@ -106,6 +106,25 @@ class PointLoad:
 
 
 @dataclass(frozen=True, eq=False)
+class EdgeLoad:
+    """Force per undeformed length along edges of a shell that keeps its direction.
+
+    Attributes
+    ----------
+    on : node set; an edge is loaded if all of its nodes are in it.
+    force : N/m.
+    """
+
+    on: str
+    force: Vector
+    bonus_order = 0
+
+    def energy(self, kinematics: Kinematics) -> Any:
+        """Energy per length of NGSolve's mesh, up to a constant."""
+        return -ngs.CF(self.force) * kinematics.displacement
+
+
+@dataclass(frozen=True, eq=False)
 class MovingPatch:
     """Dead force spread around a point that moves over a surface, with a Gaussian density.
 
@@ -173,7 +192,7 @@ class MovingLine:
         return -density * (ngs.CF(self.force) * kinematics.displacement) * kinematics.area_ratio
 
 
-Load = DeadTraction | MovingPatch | MovingLine | FollowerPressure | BodyForce | Gravity | PointLoad
+Load = DeadTraction | EdgeLoad | MovingPatch | MovingLine | FollowerPressure | BodyForce | Gravity | PointLoad
 
 
 def _check_width(on: str, width: float) -> None:

@@ -23,9 +23,13 @@ Indices = NDArray[np.int64]
 
 
 def reference_points(shape: str, points: Array) -> Array:
-    """NGSolve's reference coordinates (p, 3) of points (p, 3) given in a `CellType`'s reference cell."""
+    """NGSolve's reference coordinates (p, 3) of points (p, 2 or 3) given in a `CellType`'s reference cell."""
     if shape == "hex":
         return points
+    if points.shape[1] == 2:
+        x, y = points.T
+        zero = np.zeros_like(x)
+        return np.column_stack([x, y, zero] if shape == "quad" else [1.0 - x - y, x, zero])
     x, y, z = points.T
     return np.column_stack([1.0 - x - y - z, x, y] if shape == "tet" else [1.0 - x - y, x, z])
 
@@ -49,39 +53,51 @@ class NgsolveMesh:
     element_of_cell : (n_cells,) NGSolve's element number of each cell; ``cell_of_element`` is its inverse.
     """
 
+    #: What NGSolve's elements of the cells are: volumes.
+    kind = ngs.VOL
+
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
         for block in mesh.blocks:
             if block.type.dimension != 3:
                 raise StudyError(f"cells of type {block.cell_type} are no solids; use a solid cell type")
-        corners = [block.connectivity[:, : block.type.corners] for block in mesh.blocks]
-        self.node_of_vertex: Indices = np.unique(np.concatenate([c.ravel() for c in corners]))
-        self._vertex = np.full(mesh.n_nodes, -1, dtype=np.int64)
-        self._vertex[self.node_of_vertex] = np.arange(len(self.node_of_vertex))
-        target: Any = netgen_meshing.Mesh(dim=3)  # pyright: ignore[reportAttributeAccessIssue]
-        target.AddPoints(np.ascontiguousarray(mesh.nodes[self.node_of_vertex]))
-        self._regions = _Combinations(mesh.cell_sets, mesh.n_cells)
+        target = self._with_vertices()
+        self._regions = Combinations(mesh.cell_sets, mesh.n_cells)
         self.element_of_cell = self._add_cells(target)
         self.cell_of_element: Indices = np.argsort(self.element_of_cell)
         self._boundaries = self._add_faces(target)
         self.ngs = ngs.Mesh(target)
 
+    def _with_vertices(self) -> Any:
+        """Netgen's mesh of the corners alone."""
+        corners = [block.connectivity[:, : block.type.corners] for block in self.mesh.blocks]
+        self.node_of_vertex: Indices = np.unique(np.concatenate([c.ravel() for c in corners]))
+        self._vertex = np.full(self.mesh.n_nodes, -1, dtype=np.int64)
+        self._vertex[self.node_of_vertex] = np.arange(len(self.node_of_vertex))
+        target: Any = netgen_meshing.Mesh(dim=3)  # pyright: ignore[reportAttributeAccessIssue]
+        target.AddPoints(np.ascontiguousarray(self.mesh.nodes[self.node_of_vertex]))
+        return target
+
     def _add_cells(self, target: Any) -> Indices:
-        mesh, element_of_cell, count = self.mesh, np.empty(self.mesh.n_cells, dtype=np.int64), 0
         for region in range(self._regions.count):
-            target.SetMaterial(region + 1, _region_name(region))
+            target.SetMaterial(region + 1, region_name(region))
+        return self._add_elements(target, dim=3)
+
+    def _add_elements(self, target: Any, dim: int) -> Indices:
+        """Add the cells region by region; returns the element number of each."""
+        mesh, element_of_cell, count = self.mesh, np.empty(self.mesh.n_cells, dtype=np.int64), 0
         starts = mesh.block_starts()
         for block, start in zip(mesh.blocks, starts[:-1], strict=True):
             corners = self._vertex[block.connectivity[:, : block.type.corners]].astype(np.int32)
             of_region = self._regions.number[start : start + len(corners)]
             for region in np.unique(of_region):
                 rows = np.flatnonzero(of_region == region)
-                target.AddElements(dim=3, index=int(region) + 1, data=np.ascontiguousarray(corners[rows]), base=0)
+                target.AddElements(dim=dim, index=int(region) + 1, data=np.ascontiguousarray(corners[rows]), base=0)
                 element_of_cell[start + rows] = count + np.arange(len(rows))
                 count += len(rows)
         return element_of_cell
 
-    def _add_faces(self, target: Any) -> _Combinations:
+    def _add_faces(self, target: Any) -> Combinations:
         """Every outer face, and every named one inside; a face that two surfaces share is added once."""
         mesh = self.mesh
         faces = np.concatenate([mesh.boundary_faces(), *mesh.surfaces.values()]).astype(np.int64)
@@ -92,13 +108,13 @@ class NgsolveMesh:
         for name, surface in mesh.surfaces.items():
             members[name] = which[position : position + len(surface)]
             position += len(surface)
-        combinations = _Combinations(members, len(first))
+        combinations = Combinations(members, len(first))
         for region in range(combinations.count):
             face = netgen_meshing.FaceDescriptor(  # pyright: ignore[reportAttributeAccessIssue]
                 surfnr=region + 1, domin=1, domout=0, bc=region + 1
             )
             target.Add(face)
-            target.SetBCName(region, _region_name(region))
+            target.SetBCName(region, region_name(region))
             vertices = np.where(nodes >= 0, self._vertex[nodes], -1)[first[combinations.number == region]]
             for corners in (3, 4):
                 data = vertices[(vertices >= 0).sum(axis=1) == corners][:, :corners].astype(np.int32)
@@ -116,7 +132,7 @@ class NgsolveMesh:
         regions = {}
         for owner in np.unique(owners):
             groups = np.unique(self._regions.number[owners == owner])
-            regions[int(owner)] = self.ngs.Materials("|".join(_region_name(int(g)) for g in groups))
+            regions[int(owner)] = self.ngs.Materials("|".join(region_name(int(g)) for g in groups))
         return regions
 
     def boundary(self, surface: str) -> ngs.Region:
@@ -134,27 +150,35 @@ class NgsolveMesh:
         columns = values.reshape(self.mesh.n_cells, -1)
         parts = []
         for column in columns.T:
-            part = ngs.GridFunction(ngs.L2(self.ngs, order=0))
+            part = self._constant()
             part.vec.FV().NumPy()[self.element_of_cell] = column
             parts.append(part)
         return parts[0] if values.ndim == 1 else ngs.CF(tuple(parts))
+
+    def _constant(self) -> ngs.GridFunction:
+        """A function that is constant in each cell."""
+        return ngs.GridFunction(ngs.L2(self.ngs, order=0))
 
     def mesh_points(self, elements: Indices, reference: Array) -> NDArray:
         """NGSolve's points (p,) in ``elements`` (p,) at its own reference coordinates (p, 3)."""
         pattern = self.ngs.MapToAllElements(
             {kind: ngs.IntegrationRule(kind, 0) for kind in (ngs.HEX, ngs.TET, ngs.PRISM)}, ngs.VOL
         )
+        return self._placed(pattern, elements, reference)
+
+    @staticmethod
+    def _placed(pattern: NDArray, elements: Indices, reference: Array) -> NDArray:
         points = np.repeat(pattern[:1], len(elements))
         points["nr"] = elements
         points["x"], points["y"], points["z"] = reference.T
         return points
 
 
-def _region_name(number: int) -> str:
+def region_name(number: int) -> str:
     return f"region{number}"
 
 
-class _Combinations:
+class Combinations:
     """Items grouped by which of some overlapping sets they are in."""
 
     def __init__(self, sets: Mapping[str, Indices], n_items: int) -> None:
@@ -168,4 +192,4 @@ class _Combinations:
 
     def pattern(self, name: str) -> str:
         """Regular expression for the groups that make up a set."""
-        return "|".join(_region_name(int(group)) for group in self._groups[name])
+        return "|".join(region_name(int(group)) for group in self._groups[name])

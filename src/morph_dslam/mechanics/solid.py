@@ -195,10 +195,7 @@ class SolidProblem:
         ]
         for support in self.supports:
             if isinstance(support, ElasticFoundation):
-                u = kinematics.displacement
-                u = u * kinematics.unit_normal if support.normal_only else u
-                energy = 0.5 * support.stiffness * (u * u) * kinematics.area_ratio
-                terms.append(Term(energy, self.geometry.boundary(support.on)))
+                terms.append(Term(support.energy(kinematics), self.geometry.boundary(support.on)))
         for load in self.loads:
             terms += self._load_terms(load, kinematics, test)
         return terms

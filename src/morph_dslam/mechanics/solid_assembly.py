@@ -41,6 +41,7 @@ class Term:
     region : volume or boundary region that it is integrated over.
     bonus_order : added to NGSolve's order of quadrature.
     rules : quadrature rules by element type, instead of NGSolve's own; empty for these.
+    on_rims : integrate over the edges of each element of the region instead, each edge once for every element.
     """
 
     integrand: Any
@@ -48,10 +49,13 @@ class Term:
     bonus_order: int = 0
     has_energy: bool = True
     rules: dict[Any, ngs.IntegrationRule] = field(default_factory=dict)
+    on_rims: bool = False
 
     def add_to(self, form: ngs.BilinearForm) -> None:
-        symbol = ngs.dx if self.region.VB() == ngs.VOL else ngs.ds
-        measure = symbol(definedon=self.region, bonus_intorder=self.bonus_order, intrules=self.rules)
+        symbol = ngs.ds if self.region.VB() == ngs.BND else ngs.dx
+        measure = symbol(
+            definedon=self.region, bonus_intorder=self.bonus_order, intrules=self.rules, element_boundary=self.on_rims
+        )
         integral = self.integrand.Compile() * measure
         form += ngs.Variation(integral) if self.has_energy else integral
 

@@ -25,8 +25,9 @@ from morph_dslam.meshing.meshes import Mesh
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 #: The cell type of each shape that has a node for every function of second order.
-FULL_TYPE = {"tet": "tet10", "prism": "prism18", "hex": "hex27"}
-SERENDIPITY = {"prism15", "hex20"}
+FULL_TYPE = {"tri": "tri6", "quad": "quad9", "tet": "tet10", "prism": "prism18", "hex": "hex27"}
+SERENDIPITY = {"quad8", "prism15", "hex20"}
+WITH_CENTRES = {"quad9", "prism18", "hex27"}
 #: Mid-side nodes nearer than this part of the mesh's size to the middle of straight edges count as straight.
 STRAIGHT = 1e-12
 #: A basis function smaller than this at a point is zero there.
@@ -89,10 +90,10 @@ class DisplacementSpace:
             raise StudyError(f"first- and second-order cells meet in one mesh: {', '.join(sorted(types))}")
         if self.order not in (1, 2, 3) or self.order < shape_order:
             raise StudyError(f"elements of order {order} on cells of order {shape_order}: use {shape_order} to 3")
-        if types & SERENDIPITY and types & {"prism18", "hex27"}:
+        if types & SERENDIPITY and types & WITH_CENTRES:
             raise StudyError(f"cells with and without nodes on their faces meet: {', '.join(sorted(types))}")
         self.scalar = ngs.H1(geometry.ngs, order=self.order)
-        serendipity = bool(types & SERENDIPITY) or (serendipity and not types & {"prism18", "hex27"})
+        serendipity = bool(types & SERENDIPITY) or (serendipity and not types & WITH_CENTRES)
         if serendipity and self.order == 2 and not full:
             self.scalar.SetOrder(ngs.QUAD, 1)
             self.scalar.SetOrder(ngs.HEX, 1)
@@ -109,7 +110,7 @@ class DisplacementSpace:
         mesh, blocks = self.geometry.mesh, []
         for block, start in zip(mesh.blocks, mesh.block_starts()[:-1], strict=True):
             elements = self.geometry.element_of_cell[start : start + len(block.connectivity)]
-            ids = [ngs.ElementId(ngs.VOL, int(e)) for e in elements]
+            ids = [ngs.ElementId(self.geometry.kind, int(e)) for e in elements]
             dofs = np.array([self.scalar.GetDofNrs(i) for i in ids], dtype=np.int64)
             # Functions of order 2 are even along edges and faces, those beyond vanish at nodes: the first cell's serve
             # for all.
@@ -155,7 +156,7 @@ class DisplacementSpace:
     def _curve(self) -> None:
         """Give NGSolve the cells' true shape: coefficients of the position beyond the corners.
 
-        It goes on choosing quadrature for straight cells, which on tetrahedra is too low for curved ones.
+        It goes on choosing quadrature for straight cells, which on triangles and tetrahedra is too low for curved ones.
         """
         bubbles = self.coordinates.copy()
         bubbles[: self.geometry.ngs.nv] = 0.0
@@ -206,13 +207,13 @@ class DisplacementSpace:
     @property
     def curved_bonus_order(self) -> int:
         """`bonus_order` where cells are curved, by their nodes or by a shape parameter."""
-        return 2 if any(basis.type.shape == "tet" for basis in self._blocks) else 0
+        return 2 if any(basis.type.shape in ("tri", "tet") for basis in self._blocks) else 0
 
     def dofs_on(self, nodes: Indices) -> Indices:
         """Scalar dofs (sorted) that a set of nodes holds.
 
         Those of its own nodes; and where elements have functions beyond the nodes of the cells, those on edges and
-        faces all of whose nodes are in the set. Functions inside of cells are never held.
+        faces all of whose nodes are in the set. Functions inside of solid cells are never held.
         """
         inside = np.zeros(self.geometry.mesh.n_nodes, dtype=bool)
         inside[nodes] = True
@@ -221,7 +222,7 @@ class DisplacementSpace:
             full = cell_type(FULL_TYPE[basis.type.shape])
             corner_sets = _parts(full)
             for column, owner in enumerate(basis.owner):
-                if len(corner_sets[owner]) == full.corners:
+                if len(corner_sets[owner]) == full.corners and full.dimension == 3:
                     continue
                 closure = (
                     [owner]

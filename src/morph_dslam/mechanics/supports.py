@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
-from morph_dslam.mechanics.kinematics import Shape
+from morph_dslam.mechanics.kinematics import Kinematics, Shape
 from morph_dslam.mechanics.morphing import surface_normals
 from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
 from morph_dslam.mechanics.spaces import DisplacementSpace
@@ -117,10 +117,15 @@ class Constraints:
         moments = np.cross(arm_slopes, f.T) + np.cross(arms, f_slopes.transpose(0, 2, 1))
         return f_slopes @ constant, moments.sum(axis=1)
 
-    def check_rigid_motions(self) -> None:
-        """Refuse supports that leave the body free to move as a whole (StudyError)."""
+    def check_rigid_motions(self, axes: Array | None = None) -> None:
+        """Refuse supports that leave the body free to move as a whole (StudyError).
+
+        ``axes`` (k, 3) are unit vectors about which supports hold the body from turning, beside the held dofs.
+        """
         modes = self._rigid_modes()
         rows = [modes[self.held.reshape(3, -1)]]
+        if axes is not None:
+            rows.append(np.hstack([np.zeros(axes.shape), axes]))
         for foundation in self._foundations:
             nodes = self._mesh.surface_nodes(foundation.on)
             at_nodes = np.stack([self._space.node_values[nodes] @ mode for mode in modes], axis=1)
@@ -244,6 +249,11 @@ def held_still(support: PrescribedMotion | ElasticFoundation) -> PrescribedMotio
     return PrescribedDisplacement(support.on, *(0.0 if held else None for held in support.components))
 
 
+def cross_matrix(x: float, y: float, z: float) -> Array:
+    """(3, 3) with which the cross product of a vector from the left is taken."""
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
 @dataclass(frozen=True, eq=False)
 class RigidRotation:
     """Moves a set as a rigid body: a finite rotation about an axis through a centre, then a translation.
@@ -279,7 +289,7 @@ class RigidRotation:
 
     def motion(self, symbols: ParameterSymbols, centroid: Array, centroid_slopes: Array) -> AffineMotion:
         x, y, z = np.array(self.axis, dtype=float) / np.linalg.norm(self.axis)
-        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        cross = cross_matrix(x, y, z)
         angle = symbols.value(self.angle)
         matrix = np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
         per_angle = np.cos(angle) * cross + np.sin(angle) * cross @ cross
@@ -311,3 +321,9 @@ class ElasticFoundation:
     on: str
     stiffness: Scalar
     normal_only: bool = False
+
+    def energy(self, kinematics: Kinematics) -> Any:
+        """Energy per area of NGSolve's mesh."""
+        u = kinematics.displacement
+        u = u * kinematics.unit_normal if self.normal_only else u
+        return 0.5 * self.stiffness * (u * u) * kinematics.area_ratio

@@ -27,8 +27,8 @@ _CORNERS: dict[str, tuple[tuple[int, ...], ...]] = {
     ),
 }  # fmt: skip
 _EDGES: dict[str, tuple[tuple[int, int], ...]] = {
-    "tri": (),
-    "quad": (),
+    "tri": ((0, 1), (1, 2), (2, 0)),
+    "quad": ((0, 1), (1, 2), (2, 3), (3, 0)),
     "tet": ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)),
     "prism": ((0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3), (0, 3), (1, 4), (2, 5)),
     "hex": ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)),
@@ -42,6 +42,7 @@ _CORNER_FACES: dict[str, tuple[tuple[int, ...], ...]] = {
 }
 #: Corners around the nodes in the middle of faces, and of the cell, in the order in which VTK numbers them.
 _FACE_CENTRES: dict[str, tuple[tuple[int, ...], ...]] = {
+    "quad9": ((0, 1, 2, 3),),
     "prism18": ((0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)),
     "hex27": (
         (0, 4, 7, 3), (1, 2, 6, 5), (0, 1, 5, 4), (3, 7, 6, 2), (0, 3, 2, 1), (4, 5, 6, 7),
@@ -49,9 +50,11 @@ _FACE_CENTRES: dict[str, tuple[tuple[int, ...], ...]] = {
     ),
 }  # fmt: skip
 _SHAPES = {
-    "tri3": "tri", "quad4": "quad", "tet4": "tet", "tet10": "tet",
+    "tri3": "tri", "tri6": "tri", "quad4": "quad", "quad8": "quad", "quad9": "quad", "tet4": "tet", "tet10": "tet",
     "prism6": "prism", "prism15": "prism", "prism18": "prism", "hex8": "hex", "hex20": "hex", "hex27": "hex",
 }  # fmt: skip
+#: Types with nodes beyond their corners.
+SECOND_ORDER = ("tri6", "quad8", "quad9", "tet10", "prism15", "prism18", "hex20", "hex27")
 
 
 def _monomials(name: str) -> list[tuple[int, ...]]:
@@ -61,8 +64,10 @@ def _monomials(name: str) -> list[tuple[int, ...]]:
         return [e for e in product(linear, repeat=len(_CORNERS[_SHAPES[name]][0])) if sum(e) <= 1]
     if name in ("quad4", "hex8"):
         return list(product(linear, repeat=len(_CORNERS[_SHAPES[name]][0])))
-    if name == "tet10":
-        return [e for e in product(quadratic, repeat=3) if sum(e) <= 2]
+    if name in ("tri6", "tet10"):
+        return [e for e in product(quadratic, repeat=len(_CORNERS[_SHAPES[name]][0])) if sum(e) <= 2]
+    if name in ("quad8", "quad9"):  # quad8 is serendipity, as hex20
+        return [e for e in product(quadratic, repeat=2) if name == "quad9" or e.count(2) <= 1]
     if name == "hex20":  # serendipity: at most one of the coordinates squared
         return [e for e in product(quadratic, repeat=3) if e.count(2) <= 1]
     if name == "hex27":
@@ -160,7 +165,7 @@ def cell_type(name: str) -> CellType:
     shape = _SHAPES[name]
     corners = np.array(_CORNERS[shape], dtype=float)
     parents: tuple[tuple[int, ...], ...] = ()
-    if name in ("tet10", "prism15", "prism18", "hex20", "hex27"):
+    if name in SECOND_ORDER:
         parents = _EDGES[shape] + _FACE_CENTRES.get(name, ())
     middle = [corners[list(parent)].mean(axis=0) for parent in parents]
     node_between = {frozenset(parent): len(corners) + i for i, parent in enumerate(parents)}

@@ -85,7 +85,7 @@ def _check_orientation(mesh: Mesh) -> None:
         bad = np.flatnonzero(worst <= 1e-12 * size)
         if not len(bad):
             continue
-        where = _place(mesh, block.connectivity[bad[0]])
+        where = place(mesh, block.connectivity[bad[0]])
         if len(bad) == len(worst) and (determinants < 0.0).all():
             raise StudyError(
                 f"every {block.cell_type} cell is inverted: their nodes are listed in mirrored order; "
@@ -105,7 +105,7 @@ def _check_duplicates(mesh: Mesh) -> None:
         if len(repeated):
             raise StudyError(
                 f"{len(repeated)} {block.cell_type} cells use a node twice, the first cell "
-                f"{start + repeated[0]} {_place(mesh, block.connectivity[repeated[0]])}; "
+                f"{start + repeated[0]} {place(mesh, block.connectivity[repeated[0]])}; "
                 "use cells of the shape that is left instead (a prism, say)"
             )
         _, first, counts = np.unique(ordered, axis=0, return_index=True, return_counts=True)
@@ -113,7 +113,7 @@ def _check_duplicates(mesh: Mesh) -> None:
         if len(double):
             raise StudyError(
                 f"{len(double)} {block.cell_type} cells are there more than once, the first cell "
-                f"{start + double[0]} {_place(mesh, block.connectivity[double[0]])}; remove the copies"
+                f"{start + double[0]} {place(mesh, block.connectivity[double[0]])}; remove the copies"
             )
 
 
@@ -126,7 +126,7 @@ def _check_faces(mesh: Mesh) -> None:
     if len(crowded):
         nodes = keys[crowded[0]]
         raise StudyError(
-            f"{len(crowded)} faces have more than two cells, the first {_place(mesh, nodes[nodes >= 0])}; "
+            f"{len(crowded)} faces have more than two cells, the first {place(mesh, nodes[nodes >= 0])}; "
             "cells overlap there: remove the extra ones"
         )
 
@@ -148,7 +148,7 @@ def _check_connection(mesh: Mesh) -> None:
         second = np.flatnonzero(part == np.argsort(-sizes)[1])
         raise StudyError(
             f"the mesh falls into {len(sizes)} parts that share no node; the second largest has "
-            f"{len(second)} nodes {_place(mesh, second)}: merge coincident nodes, or keep one part"
+            f"{len(second)} nodes {place(mesh, second)}: merge coincident nodes, or keep one part"
         )
 
 
@@ -156,5 +156,5 @@ def _millimetres(point: NDArray[np.float64]) -> str:
     return "(" + ", ".join(f"{1e3 * x:.4g}" for x in point) + ") mm"
 
 
-def _place(mesh: Mesh, nodes: Indices) -> str:
+def place(mesh: Mesh, nodes: Indices) -> str:
     return f"around {_millimetres(mesh.nodes[nodes].mean(axis=0))}"

@@ -19,7 +19,7 @@ from morph_dslam.io.inp_file import InpFile, SurfacePart, read_inp
 from morph_dslam.meshing.cell_types import cell_type
 from morph_dslam.meshing.mesh_repair import reoriented, without_collapsed_cells
 from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces
-from morph_dslam.meshing.netgen_meshing import SURFACES, mesh_step_file, mesh_surface_file
+from morph_dslam.meshing.netgen_meshing import SURFACES, mesh_step_file, mesh_surface_file, read_surface
 from morph_dslam.units import to_si
 
 Indices = NDArray[np.int64]
@@ -56,6 +56,22 @@ def load_mesh(path: Path | str, unit: str, size: float | None = None) -> Mesh:
         return mesh_step_file(path, unit, None if size is None else size * 1e3).scaled(1e-3)
     mesh = _mesh_from_inp(read_inp(path)) if kind == ".inp" else _read_with_meshio(path)
     return reoriented(without_collapsed_cells(mesh)).scaled(scale)
+
+
+def load_surface_mesh(path: Path | str, unit: str) -> Mesh:
+    """Read a mesh of a surface: of cells in a mesh file, or the triangles of an STL, OBJ or PLY file as they are.
+
+    Raises StudyError as `load_mesh`, and if the file holds solids. ``unit`` is that of its coordinates; the result is
+    in metres.
+    """
+    path = Path(path)
+    if path.suffix.lower() in SURFACES:
+        surface = read_surface(path)
+        blocks = (CellBlock("tri3", surface.triangles),)
+        return Mesh(surface.points, blocks).without_unused_nodes().scaled(to_si(1.0, unit, "length"))
+    if path.suffix.lower() in (".step", ".stp"):
+        raise StudyError(f"{path} holds solids; a shell needs a mesh of its middle surface")
+    return load_mesh(path, unit)
 
 
 #: Abaqus lists a C3D27's centre before the centres of its faces S1 to S6; VTK has opposite faces, then it.
@@ -107,12 +123,13 @@ def _part_faces(mesh: Mesh, part: SurfacePart, element_labels: Indices) -> Indic
 
 #: Our cell types by meshio's names; its node order is VTK's, save that linear prisms are as Abaqus's.
 _CELLS = {
-    "tetra": "tet4", "tetra10": "tet10", "triangle": "tri3", "quad": "quad4",
+    "tetra": "tet4", "tetra10": "tet10",
+    "triangle": "tri3", "triangle6": "tri6", "quad": "quad4", "quad8": "quad8", "quad9": "quad9",
     "wedge": "prism6", "wedge18": "prism18",
     "hexahedron": "hex8", "hexahedron20": "hex20", "hexahedron27": "hex27",
 }  # fmt: skip
 #: Dimension of the cells that may only bound others.
-_BOUNDING = {"vertex": 0, "line": 1, "line3": 1, "triangle6": 2, "quad8": 2, "quad9": 2}
+_BOUNDING = {"vertex": 0, "line": 1, "line3": 1}
 #: Integer data with more values than this number things rather than group them.
 _MOST_GROUPS = 256
 

@@ -31,7 +31,7 @@ class CellBlock:
     Attributes
     ----------
     cell_type : "hex8", "hex20", "hex27", "tet4", "tet10", "prism6", "prism15", "prism18"; for
-        sheets "tri3", "quad4".
+        surfaces "tri3", "tri6", "quad4", "quad8", "quad9".
     connectivity : (m, k) node indices in VTK's order.
     """
 

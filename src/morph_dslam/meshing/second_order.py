@@ -14,6 +14,8 @@ from morph_dslam.meshing.meshes import CellBlock, Mesh
 Indices = NDArray[np.int64]
 #: Second-order types by the first-order type that they refine.
 SECOND_ORDER: dict[str, tuple[str, ...]] = {
+    "tri3": ("tri6",),
+    "quad4": ("quad9", "quad8"),
     "hex8": ("hex20", "hex27"),
     "tet4": ("tet10",),
     "prism6": ("prism15", "prism18"),
@@ -40,8 +42,8 @@ def to_second_order(mesh: Mesh, *wanted: str) -> Mesh:
     """Give every cell its middle nodes, halfway between the corners around them.
 
     A node set takes in the middle nodes all of whose corners it holds; one that bears the name of a surface takes in
-    that surface's. Surfaces and cell sets stay as they are. Raises StudyError if a cell has no second-order type
-    (sheets), or is of second order already.
+    that surface's. Surfaces and cell sets stay as they are. Raises StudyError if a cell is of second order
+    already.
 
     Parameters
     ----------

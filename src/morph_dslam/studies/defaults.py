@@ -7,6 +7,7 @@ from morph_dslam.reduction.registry import ReductionMethod, reduction_method, re
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section
 from morph_dslam.studies.sheet_study import SheetStudy
+from morph_dslam.studies.shell_study import ShellStudy
 from morph_dslam.studies.study import Study
 
 #: Solves that greedy sampling starts with, beside one for each parameter.
@@ -41,6 +42,8 @@ def _why_no_equations(study: Study) -> str | None:
         return "the equations behind another program's solutions are not known"
     if isinstance(study, SheetStudy):
         return "a sheet's solutions lie on branches that no projection follows"
+    if isinstance(study, ShellStudy):
+        return "the equations of shells are not projected"
     if study.couplings:
         return "the rigid motions of couplings are not projected"
     return None if study.time is None else "the memory of a viscoelastic solid is not projected"

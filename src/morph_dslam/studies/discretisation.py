@@ -28,6 +28,7 @@ from morph_dslam.reduction.certificate import field_errors
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.problem import Snapshot, announce
 from morph_dslam.studies.sheet_study import SheetStudy
+from morph_dslam.studies.shell_study import ShellStudy
 from morph_dslam.studies.snapshots import load_state
 from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.studies.solid_sweep import SolidSweep, solid_snapshot
@@ -86,8 +87,8 @@ def _solid(study: Study) -> SolidStudy:
     """The study, if its solutions can be solved again with finer elements."""
     if isinstance(study, ExternalStudy):
         raise _NotEstimated("the solutions are another program's")
-    if isinstance(study, SheetStudy):
-        raise _NotEstimated("studies of sheets have no finer elements to compare with")
+    if isinstance(study, SheetStudy | ShellStudy):
+        raise _NotEstimated("studies of sheets and shells have no finer elements to compare with")
     if not study.sampling.refined:
         raise _NotEstimated("switched off by sampling.refined = 0")
     if study.time is not None:

@@ -30,16 +30,17 @@ Count = Annotated[int, Field(ge=1)]
 MOST_CELLS = 5_000_000
 
 
-def _few(divisions: tuple[int, int, int]) -> tuple[int, int, int]:
+def few_cells(divisions: tuple[int, ...]) -> tuple[int, ...]:
+    """Divisions of a generator; ValueError if they make too many cells."""
     if math.prod(divisions) > MOST_CELLS:
         raise ValueError(f"these make {math.prod(divisions)} cells, and {MOST_CELLS} are the most")
     return divisions
 
 
-Divisions = Annotated[tuple[Count, Count, Count], AfterValidator(_few)]
+Divisions = Annotated[tuple[Count, Count, Count], AfterValidator(few_cells)]
 
 
-class _FileMesh(Section):
+class FileMesh(Section):
     """A mesh file: Abaqus or CalculiX .inp, Gmsh .msh, VTK, STL, OBJ, PLY or STEP.
 
     ``file`` is relative to the study file; ``unit`` is that of its coordinates; ``size`` the longest edge of
@@ -117,18 +118,19 @@ class _RevolutionMesh(Section):
         return mesh_generators.revolution(profile, self.thickness, self.divisions, self.cells, self.angles, collars)
 
 
-def _kind(value: Any) -> str:
+def mesh_kind(value: Any) -> str:
+    """Tag of a [mesh] section: "file", or its generator."""
     if isinstance(value, Section):
-        return "file" if isinstance(value, _FileMesh) else value.generator  # type: ignore[attr-defined]
+        return "file" if isinstance(value, FileMesh) else value.generator  # type: ignore[attr-defined]
     return str(value.get("generator", "file")) if isinstance(value, dict) else "file"
 
 
 MeshSection = Annotated[
-    Annotated[_FileMesh, Tag("file")]
+    Annotated[FileMesh, Tag("file")]
     | Annotated[_BlockMesh, Tag("block")]
     | Annotated[_TubeMesh, Tag("tube")]
     | Annotated[_RevolutionMesh, Tag("revolution")],
-    Discriminator(_kind),
+    Discriminator(mesh_kind),
 ]
 
 
@@ -143,7 +145,7 @@ def file_stamp(path: Path) -> tuple[int, int]:
 
 def make_mesh(section: Any) -> Mesh:
     """The mesh of a `MeshSection`, checked; made once, and again when its file has been written again."""
-    return _made(section, file_stamp(section.file) if isinstance(section, _FileMesh) else None)
+    return _made(section, file_stamp(section.file) if isinstance(section, FileMesh) else None)
 
 
 @lru_cache(maxsize=2)
@@ -171,7 +173,8 @@ Triple = tuple[Value, Value, Value]
 Reader = Callable[[Value, str | None], Any]
 
 
-def _triple(values: Triple, quantity: str, read: Reader) -> tuple[Any, Any, Any]:
+def triple(values: Triple, quantity: str, read: Reader) -> tuple[Any, Any, Any]:
+    """Three values of a vector."""
     x, y, z = (read(value, quantity) for value in values)
     return x, y, z
 
@@ -182,7 +185,7 @@ class _Applied(Section):
     first: bool = False
 
 
-class _FixedSupport(Section):
+class FixedSupport(Section):
     """Holds a set in all three directions."""
 
     kind: Literal["fixed"]
@@ -193,7 +196,7 @@ class _FixedSupport(Section):
         return supports.fixed(self.on)
 
 
-class _DisplacementSupport(_Applied):
+class DisplacementSupport(_Applied):
     """Moves a set by given lengths; a direction that is left out stays free."""
 
     kind: Literal["displacement"]
@@ -207,7 +210,7 @@ class _DisplacementSupport(_Applied):
         return supports.PrescribedDisplacement(self.on, *values)
 
 
-class _RotationSupport(_Applied):
+class RotationSupport(_Applied):
     """Turns a set as a rigid body about an axis, then shifts it.
 
     ``axis`` gives the direction, right-handed; ``centre`` a point on it, or the set whose mean point it is
@@ -227,12 +230,12 @@ class _RotationSupport(_Applied):
             self.on,
             self.axis,
             read(self.angle, "angle"),
-            _triple(centre, "length", read) if isinstance(centre, tuple) else centre,
-            _triple(self.translation, "length", read),
+            triple(centre, "length", read) if isinstance(centre, tuple) else centre,
+            triple(self.translation, "length", read),
         )
 
 
-class _FoundationSupport(Section):
+class FoundationSupport(Section):
     """Springs spread over a surface: ``stiffness`` is force per area and displacement."""
 
     kind: Literal["foundation"]
@@ -253,7 +256,7 @@ class _TractionLoad(_Applied):
     traction: Triple
 
     def make(self, read: Reader) -> loads.DeadTraction:
-        return loads.DeadTraction(self.on, _triple(self.traction, "stress", read))
+        return loads.DeadTraction(self.on, triple(self.traction, "stress", read))
 
 
 class _PressureLoad(_Applied):
@@ -275,7 +278,7 @@ class BodyForceLoad(_Applied):
     force: Triple
 
     def make(self, read: Reader) -> loads.BodyForce:
-        return loads.BodyForce(_triple(self.force, "force per volume", read), self.on)
+        return loads.BodyForce(triple(self.force, "force per volume", read), self.on)
 
 
 class GravityLoad(_Applied):
@@ -285,10 +288,10 @@ class GravityLoad(_Applied):
     acceleration: Triple = ("0 m/s2", "0 m/s2", "-9.80665 m/s2")
 
     def make(self, read: Reader) -> loads.Gravity:
-        return loads.Gravity(_triple(self.acceleration, "acceleration", read))
+        return loads.Gravity(triple(self.acceleration, "acceleration", read))
 
 
-class _PointLoadSection(_Applied):
+class PointLoadSection(_Applied):
     """A force shared equally by the nodes of a set."""
 
     kind: Literal["point"]
@@ -296,10 +299,10 @@ class _PointLoadSection(_Applied):
     force: Triple
 
     def make(self, read: Reader) -> loads.PointLoad:
-        return loads.PointLoad(self.on, _triple(self.force, "force", read))
+        return loads.PointLoad(self.on, triple(self.force, "force", read))
 
 
-class _MovingPatchLoad(_Applied):
+class MovingPatchLoad(_Applied):
     """A force spread over a round patch of a surface, whose ``centre`` may move with a parameter.
 
     ``width`` is the standard deviation of its Gaussian density, at least about half an element.
@@ -312,11 +315,11 @@ class _MovingPatchLoad(_Applied):
     width: PositiveLength
 
     def make(self, read: Reader) -> loads.MovingPatch:
-        force, centre = _triple(self.force, "force", read), _triple(self.centre, "length", read)
+        force, centre = triple(self.force, "force", read), triple(self.centre, "length", read)
         return loads.MovingPatch(self.on, force, centre, self.width)
 
 
-class _MovingLineLoad(_Applied):
+class MovingLineLoad(_Applied):
     """A force per length along a straight line over a surface; ``centre`` may move with a parameter."""
 
     kind: Literal["moving_line"]
@@ -327,7 +330,7 @@ class _MovingLineLoad(_Applied):
     width: PositiveLength
 
     def make(self, read: Reader) -> loads.MovingLine:
-        force, centre = _triple(self.force, "force per length", read), _triple(self.centre, "length", read)
+        force, centre = triple(self.force, "force per length", read), triple(self.centre, "length", read)
         return loads.MovingLine(self.on, force, centre, self.direction, self.width)
 
 
@@ -343,8 +346,8 @@ class CouplingSection(_Applied):
     moment: Triple = ("0 N.m", "0 N.m", "0 N.m")
 
     def make(self, read: Reader) -> couplings.Coupling:
-        point = None if self.point is None else _triple(self.point, "length", read)
-        force, moment = _triple(self.force, "force", read), _triple(self.moment, "moment", read)
+        point = None if self.point is None else triple(self.point, "length", read)
+        force, moment = triple(self.force, "force", read), triple(self.moment, "moment", read)
         return couplings.Coupling(self.on, force, moment, point)
 
 
@@ -357,7 +360,7 @@ class _PlaneContact(Section):
     normal: tuple[Number, Number, Number]
 
     def make(self, read: Reader) -> contact.RigidPlane:
-        return contact.RigidPlane(self.on, _triple(self.point, "length", read), self.normal)
+        return contact.RigidPlane(self.on, triple(self.point, "length", read), self.normal)
 
 
 class _SphereContact(Section):
@@ -370,7 +373,7 @@ class _SphereContact(Section):
     inside: bool = False
 
     def make(self, read: Reader) -> contact.RigidSphere:
-        centre = _triple(self.centre, "length", read)
+        centre = triple(self.centre, "length", read)
         return contact.RigidSphere(self.on, centre, read(self.radius, "length"), self.inside)
 
 
@@ -388,21 +391,15 @@ class _CylinderContact(Section):
     inside: bool = False
 
     def make(self, read: Reader) -> contact.RigidCylinder:
-        point, radius = _triple(self.point, "length", read), read(self.radius, "length")
+        point, radius = triple(self.point, "length", read), read(self.radius, "length")
         return contact.RigidCylinder(self.on, point, self.axis, radius, self.inside)
 
 
 SupportSection = Annotated[
-    _FixedSupport | _DisplacementSupport | _RotationSupport | _FoundationSupport, Field(discriminator="kind")
+    FixedSupport | DisplacementSupport | RotationSupport | FoundationSupport, Field(discriminator="kind")
 ]
 LoadSection = Annotated[
-    _TractionLoad
-    | _PressureLoad
-    | BodyForceLoad
-    | GravityLoad
-    | _PointLoadSection
-    | _MovingPatchLoad
-    | _MovingLineLoad,
+    _TractionLoad | _PressureLoad | BodyForceLoad | GravityLoad | PointLoadSection | MovingPatchLoad | MovingLineLoad,
     Field(discriminator="kind"),
 ]
 ContactSection = Annotated[_PlaneContact | _SphereContact | _CylinderContact, Field(discriminator="kind")]

@@ -9,11 +9,8 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
-from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.coupled_solid import CoupledSolid
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
@@ -22,9 +19,10 @@ from morph_dslam.meshing.mesh_checks import check_mesh
 from morph_dslam.meshing.meshes import Mesh, model_mesh_of
 from morph_dslam.model import Parameter
 from morph_dslam.studies.affine import read_affine
+from morph_dslam.studies.body_study import BodyStudy, check_names, read_once, reader_of
 from morph_dslam.studies.material_sections import MaterialSection
 from morph_dslam.studies.parameters import ParameterSection, TimeSection
-from morph_dslam.studies.problem import ModelMesh, Snapshot, SweepProblem
+from morph_dslam.studies.problem import ModelMesh, SweepProblem
 from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section, WorkSection
 from morph_dslam.studies.shape_sections import ShapeSection, shape_fields
 from morph_dslam.studies.snapshots import SOLVER_VERSION
@@ -35,16 +33,12 @@ from morph_dslam.studies.solid_sections import (
     GravityLoad,
     LoadSection,
     MeshSection,
-    Reader,
     SupportSection,
     Value,
     make_mesh,
     mesh_fingerprint,
 )
 from morph_dslam.studies.solid_sweep import SolidSweep, ViscousSweep
-
-Array = NDArray[np.float64]
-
 
 #: `SolidOptions.mixed` by the name of a formulation.
 MIXED = {"automatic": None, "displacement": False, "mixed": True}
@@ -65,7 +59,7 @@ class _SolidSolverSection(WorkSection):
     formulation: Literal["automatic", "displacement", "mixed"] = "automatic"
 
 
-class SolidStudy(Section):
+class SolidStudy(BodyStudy, Section):
     """A hyperelastic solid under supports and loads that depend on parameters."""
 
     name: str
@@ -82,27 +76,13 @@ class SolidStudy(Section):
     sampling: SamplingSection = SamplingSection()
     reduction: ReductionSection = ReductionSection()
 
-    @field_validator("parameters")
-    @classmethod
-    def _names(cls, parameters: dict[str, ParameterSection]) -> dict[str, ParameterSection]:
-        for name in parameters:
-            if not name.isidentifier():
-                raise ValueError(f"'{name}' is no name for a parameter: use letters, digits and underscores")
-        return parameters
+    _names = field_validator("parameters")(check_names)
 
     @model_validator(mode="after")
     def _check_values(self) -> SolidStudy:
         """Read every value once, so that a mistake is found before anything is solved."""
         parameters = self.model_parameters()
-
-        def read(value: Value, quantity: str | None) -> float:
-            return read_affine(value, quantity, parameters)(np.array([p.default for p in parameters]))
-
-        for where, section in self._parts():
-            try:
-                section.make(read)
-            except StudyError as error:
-                raise ValueError(f"{where}: {error}") from error
+        read_once(self._parts(), parameters)
         if len({material.on for material in self.materials.values()}) < len(self.materials):
             raise ValueError("two materials are on the same cell set: give each its own")
         self._check_time(parameters)
@@ -167,27 +147,12 @@ class SolidStudy(Section):
             parts += [(f"{kind} {number}", section) for number, section in enumerate(sections, start=1)]
         return parts
 
-    def __hash__(self) -> int:
-        return hash(self.model_dump_json())
-
     # -- what the sweep asks (`morph_dslam.studies.problem.ParametricStudy`) ---------------------------
 
     @property
     def work(self) -> WorkSection:
         """Workers and threads."""
         return self.solver
-
-    @property
-    def advice(self) -> str:
-        """What to change when the solid cannot be solved."""
-        return (
-            "Narrow the ranges of the parameters, refine the mesh, or prescribe a displacement in place of a "
-            "load past its limit point"
-        )
-
-    def model_parameters(self) -> tuple[Parameter, ...]:
-        """The parameters in the order of the file."""
-        return tuple(section.parameter(name) for name, section in self.parameters.items())
 
     def solid_mesh(self) -> Mesh:
         """The mesh, checked together with the sets that the study names."""
@@ -220,36 +185,11 @@ class SolidStudy(Section):
         content |= self.model_dump(mode="json", include={"contacts"}) if self.contacts else {}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
-    def root(self) -> Array:
-        """The parameters' defaults."""
-        return np.array([parameter.default for parameter in self.model_parameters()])
-
-    def scale(self) -> Array:
-        """The sizes of the ranges."""
-        return np.array([parameter.upper - parameter.lower for parameter in self.model_parameters()])
-
-    def admissible(self, samples: Array) -> Array:
-        """All samples are."""
-        return samples
-
-    def canonical(self, samples: Array) -> Array:
-        """A solid has no mirror images."""
-        return samples
-
-    def images(self, snapshot: Snapshot) -> list[Snapshot]:
-        """The snapshot alone."""
-        return [snapshot]
-
     def problem(self, options: SolidOptions | None = None) -> SolidProblem:
         """The discretised solid, with the study's own elements if ``options`` name no others."""
         parameters, mesh = self.model_parameters(), self.solid_mesh()
         symbols = ParameterSymbols(parameters)
-        values = [symbols[parameter.name] for parameter in parameters]
-
-        def read(value: Value, quantity: str | None) -> Any:
-            return read_affine(value, quantity, parameters).expression(values)
-
-        reader: Reader = read
+        reader = reader_of(symbols)
         own = SolidOptions(order=self.solver.order, mixed=MIXED[self.solver.formulation], threads=self.solver.threads)
         materials = {section.on: section.make(reader) for section in self.materials.values()}
         shape = shape_fields(self.shape, mesh, symbols)

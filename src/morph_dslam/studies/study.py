@@ -1,7 +1,7 @@
 """Reading study files: which kind of study a file describes, and what is wrong with it.
 
-A file with a [sheet] is a sheet in two grips, one with [external] names solutions of another program, and
-every other one is a solid.
+A file with a [sheet] is a sheet in two grips, one with a [shell] a shell, one with [external] names solutions of
+another program, and every other one is a solid.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from morph_dslam.io.sections import explain
 from morph_dslam.io.text import read_toml
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.sheet_study import SheetStudy
+from morph_dslam.studies.shell_study import ShellStudy
 from morph_dslam.studies.solid_study import SolidStudy
 
-Study = SheetStudy | SolidStudy | ExternalStudy
+Study = SheetStudy | ShellStudy | SolidStudy | ExternalStudy
 
 
 def load_study(path: str | Path) -> Study:
@@ -56,6 +57,5 @@ def make_study(content: Mapping[str, Any], folder: str | Path = Path(), where: s
 
 
 def _kind(content: Mapping[str, Any]) -> type[Study]:
-    if "external" in content:
-        return ExternalStudy
-    return SheetStudy if "sheet" in content else SolidStudy
+    kinds: dict[str, type[Study]] = {"external": ExternalStudy, "sheet": SheetStudy, "shell": ShellStudy}
+    return next((kind for section, kind in kinds.items() if section in content), SolidStudy)

@@ -1,0 +1,93 @@
+"""Elastic plane-stress materials of a shell, any of their constants a function of parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import ngsolve as ngs
+import numpy as np
+
+from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.materials.base import evaluate
+from morph_dslam.mechanics.parameters import Scalar
+
+#: A direction whose part along the surface is smaller than this says nothing there.
+ALONG = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class ShellMaterial:
+    """Orthotropic plane stress: large rotations, small strains.
+
+    The fibres run along the given direction, projected on the surface. Strains are the compliance times the stresses:
+
+        E11 = S11 / E1 - nu S22 / E1,   E22 = S22 / E2 - nu S11 / E1,   2 E12 = S12 / G
+
+    Jones, Mechanics of Composite Materials, 2nd ed. 1999, section 2.5.
+
+    Attributes
+    ----------
+    young_fibre : Young's modulus E1 along the fibres, Pa.
+    young_cross : Young's modulus E2 across them, Pa.
+    poisson : contraction across under tension along the fibres, nu_12.
+    shear : shear modulus G_12, Pa.
+    density : kg/m3; None where there is no weight.
+    fibre : direction of the fibres before it is projected: three numbers, or a vector of expressions.
+    fibre_angle : turns the projected direction about the surface's normal, rad, anticlockwise seen from its tip.
+    """
+
+    young_fibre: Scalar
+    young_cross: Scalar
+    poisson: Scalar
+    shear: Scalar
+    density: Scalar | None = None
+    fibre: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    fibre_angle: Scalar = 0.0
+
+    def check(self) -> None:
+        """Refuse constants that are unstable at the parameters' present values (StudyError)."""
+        names = ("young_fibre", "young_cross", "shear")
+        values = {name: evaluate(getattr(self, name)) for name in (*names, "poisson")}
+        for name in names:
+            if not values[name] > 0.0:
+                raise StudyError(f"{name} = {values[name]:g} Pa must be positive")
+        if values["poisson"] ** 2 * values["young_cross"] >= values["young_fibre"]:
+            raise StudyError(
+                f"poisson = {values['poisson']:g} is unstable for these moduli: "
+                "poisson^2 * young_cross / young_fibre must be below 1"
+            )
+        if not np.linalg.norm(self.fibre) > 0.0:
+            raise StudyError(f"the fibre {tuple(self.fibre)} has no direction")
+
+    def frame(self, normal: Any) -> tuple[Any, Any]:
+        """Unit vectors along and across the fibres on a surface with this unit ``normal``.
+
+        Where the given direction is within about 6 degrees of the normal, it is the next of the axes x, y and z,
+        cyclically from its largest component.
+        """
+        given = np.array(self.fibre, dtype=float) / np.linalg.norm(self.fibre)
+        other = np.roll(np.eye(3), 1, axis=1)[int(np.argmax(np.abs(given)))]
+        tangents = [d - (d * normal) * normal for d in (ngs.CF(tuple(given)), ngs.CF(tuple(other)))]
+        along = ngs.IfPos(ngs.Norm(tangents[0]) - ALONG, tangents[0], tangents[1])
+        along = along / ngs.Norm(along)
+        across = ngs.Cross(normal, along)
+        if isinstance(self.fibre_angle, (int, float)) and self.fibre_angle == 0.0:
+            return along, across
+        c, s = ngs.cos(self.fibre_angle), ngs.sin(self.fibre_angle)
+        return c * along + s * across, c * across - s * along
+
+    def complementary_energy(self, s11: Any, s22: Any, s12: Any) -> Any:
+        """1/2 S : compliance : S of a stress in the frame along and across the fibres."""
+        direct = (s11 * s11 - 2.0 * self.poisson * s11 * s22) / self.young_fibre + s22 * s22 / self.young_cross
+        return 0.5 * (direct + s12 * s12 / self.shear)
+
+
+def isotropic(young: Scalar, poisson: Scalar, **others: Any) -> ShellMaterial:
+    """An isotropic material of a shell; ``others`` as `ShellMaterial`."""
+    return ShellMaterial(young, young, poisson, young / (2.0 * (1.0 + poisson)), **others)
+
+
+def components(tensor: Any, along: Any, across: Any) -> tuple[Any, Any, Any]:
+    """(T11, T22, T12) of a tangential symmetric tensor (3x3) in a local frame."""
+    return (tensor * along) * along, (tensor * across) * across, (tensor * along) * across

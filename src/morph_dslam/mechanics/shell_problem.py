@@ -1,0 +1,251 @@
+"""Equilibrium of a thin shell on a surface mesh in space; the energy is in `shell_energy`.
+
+Dofs are those of the displacement, then membrane forces and bending moments, which are condensed element by element,
+then the rotations of the edges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import ngsolve as ngs
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.kinematics import Kinematics, Shape
+from morph_dslam.mechanics.loads import BodyForce, EdgeLoad, Gravity, Load, NodalForces, PointLoad
+from morph_dslam.mechanics.materials.base import evaluate
+from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
+from morph_dslam.mechanics.shell_energy import AveragedNormals, ShellKinematics, ShellUnknowns, rim_angle
+from morph_dslam.mechanics.shell_material import ShellMaterial, components
+from morph_dslam.mechanics.shell_recovery import ShellRecovery
+from morph_dslam.mechanics.shell_supports import HoldsDirection
+from morph_dslam.mechanics.solid import SolidProblem, Support
+from morph_dslam.mechanics.solid_assembly import Assembly, Term
+from morph_dslam.mechanics.solvers.linear_solver import LinearSolver
+from morph_dslam.mechanics.solvers.newton import Linearisation
+from morph_dslam.mechanics.spaces import DisplacementSpace
+from morph_dslam.mechanics.supports import Constraints, ElasticFoundation
+from morph_dslam.mechanics.surface_mesh import SurfaceMesh
+from morph_dslam.meshing.meshes import Mesh
+
+Array = NDArray[np.float64]
+#: Place of the rotations among the parts of the space.
+ROTATIONS = 3
+
+
+@dataclass(frozen=True)
+class ShellOptions:
+    """How a shell is discretised.
+
+    Attributes
+    ----------
+    order : of the displacements, 2 or 3; forces, moments and rotations have one less.
+    threads : of PARDISO; None leaves MKL's choice.
+    """
+
+    order: int = 2
+    threads: int | None = None
+
+
+class ShellProblem(SolidProblem):
+    """A shell with its material, supports, loads and parameters.
+
+    Raises StudyError for unknown sets, an unstable material, a thickness that is not positive, missing supports.
+
+    Parameters
+    ----------
+    mesh : of surface cells, metres, a manifold whose cells turn alike (`surface_checks`).
+    material : of every cell.
+    thickness : m; the mesh is in the middle of it.
+    supports : see `supports` and `shell_supports`.
+    loads : see `loads`.
+    parameters : the symbols that all of these were written with.
+    options : see `ShellOptions`.
+    """
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        material: ShellMaterial,
+        thickness: Scalar,
+        supports: Sequence[Support] = (),
+        loads: Sequence[Load] = (),
+        parameters: ParameterSymbols | None = None,
+        options: ShellOptions | None = None,
+    ) -> None:
+        self.options = options or ShellOptions()
+        self.material, self.thickness = material, thickness
+        self.supports, self.loads = tuple(supports), tuple(loads)
+        self.history = self.enhanced = self.contact = None
+        self.in_contact, self.applied_first = False, None
+        self.symbols = parameters or ParameterSymbols()
+        self.symbols.set(self.symbols.default)
+        material.check()
+        if not evaluate(thickness) > 0.0:
+            raise StudyError(f"the shell has thickness {evaluate(thickness):g} m; it must be positive")
+        self.geometry = SurfaceMesh(mesh, [load.on for load in loads if isinstance(load, EdgeLoad)])
+        self.mesh = self.geometry.mesh
+        self.displacements = DisplacementSpace(self.geometry, self.options.order)
+        self.shape, self.flags = Shape(self.displacements, ()), ()
+        self.length = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
+        self.space = self._make_space()
+        self.n_unknowns: int = self.space.ndof
+        self.n_dofs: int = self.n_unknowns
+        self.constraints = Constraints(self.displacements, self.shape, self.supports, self.symbols)
+        directed = [support for support in self.supports if isinstance(support, HoldsDirection)]
+        self.constraints.check_rigid_motions(self._edge_directions([support.on for support in directed]))
+        self._state = ngs.GridFunction(self.space)
+        held = [(support, self.geometry.edge_numbers(support.on)) for support in directed]
+        self._normals = AveragedNormals(self.geometry.ngs, self.options.order - 1, self._state.components[0], held)
+        self.assembly = _ShellAssembly(self.space, self._terms(), self.symbols, self.refresh_normals)
+        self._held_rotations = {support.on: self._rotation_dofs(edges) for support, edges in held}
+        self.free: NDArray[np.bool_] = self._free_dofs()
+        scale = np.full(self.n_dofs, np.inf)
+        scale[: 3 * self.displacements.n_scalar] = self.length
+        self.scale: Array | float = scale
+        self._latest = None
+        points = [load for load in loads if isinstance(load, PointLoad)]
+        self._nodal_forces = NodalForces(self.displacements, points, self.symbols)
+
+    def _edge_directions(self, sets: list[str]) -> Array:
+        """Unit vectors (e, 3) along the edges of node sets."""
+        ends = np.concatenate([np.empty((0, 2), dtype=np.int64), *(self.geometry.edges_on(name) for name in sets)])
+        along = self.mesh.nodes[ends[:, 1]] - self.mesh.nodes[ends[:, 0]]
+        return along / np.linalg.norm(along, axis=1, keepdims=True)
+
+    def _make_space(self) -> ngs.FESpace:
+        mesh, order = self.geometry.ngs, self.options.order - 1
+        # Membrane forces of fewer functions leave quadrilaterals free to hourglass.
+        forces = ngs.HCurlCurl(mesh, order=order, discontinuous=True)
+        moments = ngs.HDivDivSurface(mesh, order=order, discontinuous=True)
+        rotations = ngs.NormalFacetSurface(mesh, order=order)
+        self.strain_space = forces
+        return self.displacements.vector * forces * moments * rotations
+
+    def unknowns(self, functions: Sequence[Any]) -> ShellUnknowns:
+        """The parts of trial functions or of a state, in SI units.
+
+        Forces and moments are carried in units of the shell's stiffness at the parameters' defaults over its size, in
+        which they are about as large as displacements.
+        """
+        displacement, *others = functions
+        # Only trial functions have to be told that they are meant on the surface.
+        force, moment, rotation = (f.Trace() if hasattr(f, "Trace") else f for f in others)
+        force_unit, moment_unit = self.units
+        return ShellUnknowns(displacement, force_unit * force, moment_unit * moment, rotation)
+
+    @cached_property
+    def units(self) -> tuple[float, float]:
+        """Of membrane forces (N/m per m) and of moments (N per m)."""
+        young, thickness = evaluate(self.material.young_fibre), evaluate(self.thickness)
+        return young * thickness / self.length, young * thickness**3 / 12.0 / self.length
+
+    def _terms(self) -> list[Term]:
+        unknowns = self.unknowns(self.space.TrialFunction())
+        kinematics, bonus = ShellKinematics(unknowns.displacement), self.displacements.bonus_order
+        everywhere, t = self.geometry.region("all"), self.thickness
+        n, tangent = ShellKinematics.reference_normal, ngs.specialcf.tangential(3)
+        m, force, across = unknowns.moment, unknowns.force, ngs.Cross(n, tangent)
+        frame, compliance = self.material.frame(n), self.material.complementary_energy
+        strain = ngs.Interpolate(kinematics.strain, self.strain_space)
+        membrane = ngs.InnerProduct(force, strain) - compliance(*components(force, *frame)) / t
+        bending = ngs.InnerProduct(m, kinematics.curvature) - 12.0 / t**3 * compliance(*components(m, *frame))
+        now = rim_angle(kinematics.normal, kinematics.tangent, self._normals.current)
+        before = rim_angle(n, tangent, self._normals.reference)
+        # `Cross(normal, tangent)` points out of the element, as a positive angle turns the normal.
+        hinge = -(now - before - unknowns.rotation * across) * ((m * across) * across)
+        terms = [
+            Term(membrane, everywhere, bonus),
+            Term(bending, everywhere, bonus),
+            Term(hinge, everywhere, bonus, on_rims=True),
+        ]
+        at_points, test = Kinematics(unknowns.displacement, self.shape), self.space.TestFunction()[0]
+        for support in self.supports:
+            if isinstance(support, ElasticFoundation):
+                terms.append(Term(support.energy(at_points), self.geometry.boundary(support.on)))
+        for load in self.loads:
+            terms += self._load_terms(load, at_points, test)
+        return terms
+
+    def _load_terms(self, load: Load, kinematics: Kinematics, test: Any) -> list[Term]:
+        if isinstance(load, EdgeLoad):
+            return [Term(load.energy(kinematics), self.geometry.edge_region(load.on), load.bonus_order)]
+        if isinstance(load, Gravity):
+            load = BodyForce(tuple(self.material.density * a for a in load.acceleration))
+        if isinstance(load, BodyForce):
+            weight = ngs.CF(load.force) * kinematics.displacement
+            return [Term(-self.thickness * weight, self.geometry.region(load.on), self.displacements.bonus_order)]
+        return super()._load_terms(load, kinematics, test)
+
+    def _rotation_dofs(self, edges: list[int]) -> NDArray[np.int64]:
+        """Dofs of the rotations of edges."""
+        rotations, first = self.space.components[ROTATIONS], self.space.Range(ROTATIONS).start
+        numbers = [dof for edge in edges for dof in rotations.GetDofNrs(ngs.NodeId(ngs.EDGE, edge))]
+        return first + np.array(numbers, dtype=np.int64)
+
+    def _free_dofs(self) -> NDArray[np.bool_]:
+        free = super()._free_dofs()
+        for dofs in self._held_rotations.values():
+            free[dofs] = False
+        return free
+
+    def refresh_normals(self, x: Array) -> None:
+        """Average the edge normals at the solution ``x`` (n,), at the parameters' present values."""
+        self._state.vec.FV().NumPy()[:] = x
+        self._normals.update()
+
+    def linearise(self, x: Array, mu: Array, solver: LinearSolver | None = None) -> Linearisation:
+        """Tangent at ``x``; the frozen edge normals are averaged there first.
+
+        That renewal shifts the meaning of the edges' rotations, which the next correction makes up for.
+        """
+        self.refresh_normals(x)
+        self._latest = None
+        return super().linearise(x, mu, solver)
+
+    def reactions(self, dofs: Array, mu: Array, name: str, about: Array | None = None) -> tuple[Array, Array]:
+        force, moment = super().reactions(dofs, mu, name, about)
+        return force, moment + self._edge_couple(dofs, name)
+
+    def _edge_couple(self, dofs: Array, name: str) -> Array:
+        """Moment (3,), N m, by which the supports of a set hold the direction of its edges."""
+        indicator = self._normals.indicators.get(name)
+        if indicator is None:
+            return np.zeros(3)
+        self._state.vec.FV().NumPy()[:] = dofs
+        parts = self.unknowns(self._state.components)
+        tangent = ngs.specialcf.tangential(3)
+        across = ngs.Cross(ShellKinematics.reference_normal, tangent)
+        couple = indicator * ((parts.moment * across) * across) * ShellKinematics(parts.displacement).tangent
+        rims, mesh = ngs.ds(element_boundary=True), self.geometry.ngs
+        return np.array([ngs.Integrate(couple[axis] * rims, mesh) for axis in range(3)])
+
+    @cached_property
+    def recovery(self) -> ShellRecovery:
+        """Fields at nodes, made when first needed."""
+        return ShellRecovery(self)
+
+    def strain_energy(self, dofs: Array, mu: Array) -> float:
+        self.symbols.set(mu)
+        return self.assembly.energy(dofs, 3)
+
+
+class _ShellAssembly(Assembly):
+    """The forms of a shell, assembled with the edge normals of the point itself."""
+
+    def __init__(
+        self, space: ngs.FESpace, terms: list[Term], symbols: ParameterSymbols, refresh: Callable[[Array], None]
+    ) -> None:
+        # Forces and moments are condensed, and rotations add no negative pivots: none of the dofs left is a multiplier.
+        super().__init__(space, terms, symbols, space.ndof)
+        self._refresh = refresh
+
+    def tangent(self, x: Array) -> sp.csr_matrix:
+        self._refresh(x)
+        return super().tangent(x)

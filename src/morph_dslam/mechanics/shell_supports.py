@@ -1,0 +1,81 @@
+"""How the supports of a shell hold the direction of its edges, beside the place of its nodes (`supports`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import ngsolve as ngs
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.mechanics.parameters import ParameterSymbols
+from morph_dslam.mechanics.supports import AffineMotion, RigidRotation, cross_matrix
+
+Array = NDArray[np.float64]
+
+
+@runtime_checkable
+class HoldsDirection(Protocol):
+    """A support that says where the normals on the edges of its set point."""
+
+    @property
+    def on(self) -> str: ...
+
+    def undeformed_normal(self, averaged: Any) -> Any:
+        """The normal that is held of the undeformed shell, from that of its cells; not of unit length."""
+        ...
+
+    def edge_normal(self, undeformed: Any, averaged: Any) -> Any:
+        """The normal that is held, from the undeformed one and from that of the cells; not of unit length."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Clamp(RigidRotation):
+    """Moves a set of a shell as a rigid body, its place and the direction of its normals."""
+
+    def undeformed_normal(self, averaged: Any) -> Any:
+        return averaged
+
+    def edge_normal(self, undeformed: Any, averaged: Any) -> Any:
+        x, y, z = np.array(self.axis, dtype=float) / np.linalg.norm(self.axis)
+        cross = cross_matrix(x, y, z)
+        matrices = [ngs.CF(tuple(m.ravel()), dims=(3, 3)) for m in (np.eye(3), cross, cross @ cross)]
+        turn = matrices[0] + ngs.sin(self.angle) * matrices[1] + (1.0 - ngs.cos(self.angle)) * matrices[2]
+        return turn * undeformed
+
+
+@dataclass(frozen=True, eq=False)
+class SymmetryPlane:
+    """Keeps a set in a plane across a coordinate axis, and the normals of the shell there along the plane.
+
+    Attributes
+    ----------
+    on : node set.
+    axis : 0, 1 or 2: the plane is across x, y or z.
+    """
+
+    on: str
+    axis: int
+    centred_on = None
+
+    @property
+    def components(self) -> tuple[bool, bool, bool]:
+        return self.axis == 0, self.axis == 1, self.axis == 2
+
+    def motion(self, symbols: ParameterSymbols, centroid: Array, centroid_slopes: Array) -> AffineMotion:
+        d = len(symbols)
+        return AffineMotion(np.zeros((3, 3)), np.zeros(3), np.zeros((d, 3, 3)), np.zeros((d, 3)))
+
+    def undeformed_normal(self, averaged: Any) -> Any:
+        across = ngs.CF(tuple(np.eye(3)[self.axis]))
+        return averaged - (averaged * across) * across
+
+    def edge_normal(self, undeformed: Any, averaged: Any) -> Any:
+        return self.undeformed_normal(averaged)
+
+
+def clamped(on: str) -> Clamp:
+    """Holds place and direction of a set as they are."""
+    return Clamp(on, (0.0, 0.0, 1.0), 0.0)

@@ -1,0 +1,351 @@
+"""The sections of a shell's study that differ from a solid's: mesh, shell, material, sets, supports and loads."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
+
+from morph_dslam.errors import StudyError
+from morph_dslam.mechanics import loads, supports
+from morph_dslam.mechanics.shell_material import ShellMaterial, isotropic
+from morph_dslam.mechanics.shell_supports import Clamp, SymmetryPlane, clamped
+from morph_dslam.meshing import surface_generators
+from morph_dslam.meshing.mesh_checks import check_mesh
+from morph_dslam.meshing.mesh_files import load_surface_mesh
+from morph_dslam.meshing.meshes import Mesh
+from morph_dslam.meshing.surface_checks import check_surface
+from morph_dslam.studies.sections import Angle, Length, Number, PositiveLength, Section
+from morph_dslam.studies.solid_sections import (
+    BodyForceLoad,
+    Count,
+    DisplacementSupport,
+    FileMesh,
+    FixedSupport,
+    FoundationSupport,
+    GravityLoad,
+    MovingLineLoad,
+    MovingPatchLoad,
+    PointLoadSection,
+    Reader,
+    RotationSupport,
+    Triple,
+    Value,
+    few_cells,
+    file_stamp,
+    mesh_kind,
+    triple,
+)
+
+Array = NDArray[np.float64]
+CellName = Literal["tri3", "tri6", "quad4", "quad8", "quad9"]
+Divisions = Annotated[tuple[Count, Count], AfterValidator(few_cells)]
+FULL_TURN = (0.0, surface_generators.FULL_TURN)
+
+
+class _FileSurface(FileMesh):
+    """A mesh of the shell's middle surface: Abaqus or CalculiX .inp, Gmsh .msh, VTK; STL, OBJ or PLY as they are.
+
+    ``file`` is relative to the study file; ``unit`` is that of its coordinates.
+    """
+
+    size: None = None
+
+    def make(self) -> Mesh:
+        return load_surface_mesh(self.file, self.unit)
+
+
+class _PlateMesh(Section):
+    """A rectangle from the origin along x and y; sets x_min, x_max, y_min, y_max."""
+
+    generator: Literal["plate"]
+    size: tuple[PositiveLength, PositiveLength]
+    divisions: Divisions
+    cells: CellName = "quad9"
+
+    def make(self) -> Mesh:
+        return surface_generators.plate(self.size, self.divisions, self.cells)
+
+
+class _TurnedMesh(Section):
+    """A surface around the z axis; ``slit`` leaves a full turn open.
+
+    Sets, for less than a full turn or with a slit: start and end.
+    """
+
+    divisions: Divisions
+    cells: CellName = "quad9"
+    angles: tuple[Angle, Angle] = FULL_TURN
+    slit: bool = False
+
+
+class _CylinderMesh(_TurnedMesh):
+    """A cylinder around the z axis from z = 0; divisions are along z and around it.
+
+    Sets: bottom, top and, for less than a full turn or with a ``slit``, start and end.
+    """
+
+    generator: Literal["cylinder"]
+    radius: PositiveLength
+    length: PositiveLength
+
+    def make(self) -> Mesh:
+        return surface_generators.cylinder(self.radius, self.length, self.divisions, self.cells, self.angles, self.slit)
+
+
+class _SphereMesh(_TurnedMesh):
+    """A part of a sphere around the origin, between two ``polar_angles`` from the z axis; from 0 it has no hole.
+
+    Divisions are from the top to the rim and around. Sets: top (of a hole), rim and, for less than a full turn or with
+    a ``slit``, start and end.
+    """
+
+    generator: Literal["sphere"]
+    radius: PositiveLength
+    polar_angles: tuple[Angle, Angle]
+
+    def make(self) -> Mesh:
+        return surface_generators.sphere(
+            self.radius, self.polar_angles, self.divisions, self.cells, self.angles, self.slit
+        )
+
+
+class _AnnulusMesh(_TurnedMesh):
+    """A flat ring around the origin, a disc if ``inner_radius`` is 0; divisions are outwards and around.
+
+    Sets: inner (of a ring), outer and, for less than a full turn or with a ``slit``, start and end.
+    """
+
+    generator: Literal["annulus"]
+    inner_radius: Length
+    outer_radius: PositiveLength
+
+    def make(self) -> Mesh:
+        return surface_generators.annulus(
+            self.inner_radius, self.outer_radius, self.divisions, self.cells, self.angles, self.slit
+        )
+
+
+SurfaceSection = Annotated[
+    Annotated[_FileSurface, Tag("file")]
+    | Annotated[_PlateMesh, Tag("plate")]
+    | Annotated[_CylinderMesh, Tag("cylinder")]
+    | Annotated[_SphereMesh, Tag("sphere")]
+    | Annotated[_AnnulusMesh, Tag("annulus")],
+    Discriminator(mesh_kind),
+]
+
+
+class SetSection(Section):
+    """Nodes by their place: all in a ``box``, given by two of its corners, or the one ``nearest`` to a point."""
+
+    box: tuple[tuple[Length, Length, Length], tuple[Length, Length, Length]] | None = None
+    nearest: tuple[Length, Length, Length] | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> SetSection:
+        if (self.box is None) == (self.nearest is None):
+            raise ValueError("give either box or nearest")
+        return self
+
+    def nodes(self, points: Array) -> NDArray[np.int64]:
+        """Indices of the nodes, of all (n, 3) in metres."""
+        if self.nearest is not None:
+            return np.array([np.argmin(np.linalg.norm(points - self.nearest, axis=1))])
+        low, high = np.sort(np.array(self.box), axis=0)
+        tolerance = 1e-9 * float(np.ptp(points, axis=0).max())
+        return np.flatnonzero(((points >= low - tolerance) & (points <= high + tolerance)).all(axis=1))
+
+
+def shell_mesh(section: Any, sets: dict[str, SetSection]) -> Mesh:
+    """The checked mesh of a `SurfaceSection` with more node sets; StudyError if one of these is empty or known.
+
+    It is made once, and again when its file has been written again.
+    """
+    mesh = _made(section, file_stamp(section.file) if isinstance(section, _FileSurface) else None)
+    found = {name: chosen.nodes(mesh.nodes) for name, chosen in sets.items()}
+    for name, nodes in found.items():
+        if name in mesh.node_sets:
+            raise StudyError(f"sets.{name}: the mesh has a set of this name; choose another")
+        if not len(nodes):
+            raise StudyError(f"sets.{name}: no node of the mesh lies in the box; move or widen it")
+    return replace(mesh, node_sets={**mesh.node_sets, **found})
+
+
+@lru_cache(maxsize=2)
+def _made(section: Any, stamp: tuple[int, int] | None) -> Mesh:
+    mesh = section.make()
+    check_mesh(mesh)
+    check_surface(mesh)
+    return mesh
+
+
+class ShellSection(Section):
+    """The shell: its ``thickness``, half of it on either side of the mesh."""
+
+    thickness: Value
+
+    def make(self, read: Reader) -> Any:
+        """The thickness, m."""
+        return read(self.thickness, "length")
+
+
+class ShellMaterialSection(Section):
+    """Linear elasticity in the Green-Lagrange strain, plane stress.
+
+    Isotropic with ``young`` and ``poisson``; orthotropic with ``young_fibre``, ``young_cross``, ``poisson`` (of the
+    contraction across under tension along the fibres) and ``shear``. The ``fibre`` direction is projected on the
+    surface and turned by ``fibre_angle`` about its normal. ``density`` is for gravity.
+    """
+
+    young: Value | None = None
+    young_fibre: Value | None = None
+    young_cross: Value | None = None
+    poisson: Value
+    shear: Value | None = None
+    density: Value | None = None
+    fibre: tuple[Number, Number, Number] = (1.0, 0.0, 0.0)
+    fibre_angle: Value = "0 deg"
+
+    @model_validator(mode="after")
+    def _check_constants(self) -> ShellMaterialSection:
+        orthotropic = (self.young_fibre, self.young_cross, self.shear)
+        if self.young is None and any(value is None for value in orthotropic):
+            raise ValueError("give young and poisson, or young_fibre, young_cross, poisson and shear")
+        if self.young is not None and any(value is not None for value in orthotropic):
+            raise ValueError("young is that of an isotropic material: leave it out, or young_fibre, young_cross, shear")
+        return self
+
+    def make(self, read: Reader) -> ShellMaterial:
+        poisson = read(self.poisson, "ratio")
+        others = {
+            "density": None if self.density is None else read(self.density, "density"),
+            "fibre": self.fibre,
+            "fibre_angle": read(self.fibre_angle, "angle"),
+        }
+        if self.young is not None:
+            material = isotropic(self._stress("young", read), poisson, **others)
+        else:
+            fibre, cross, shear = (self._stress(name, read) for name in ("young_fibre", "young_cross", "shear"))
+            material = ShellMaterial(fibre, cross, poisson, shear, **others)
+        material.check()
+        return material
+
+    def _stress(self, name: str, read: Reader) -> Any:
+        return read(getattr(self, name), "stress")
+
+
+class _ClampedSupport(Section):
+    """Holds a set in place and its edges in their direction."""
+
+    kind: Literal["clamped"]
+    on: str
+
+    def make(self, read: Reader) -> Clamp:
+        return clamped(self.on)
+
+
+class _SymmetrySupport(Section):
+    """Keeps a set in its plane across ``axis``, "x", "y" or "z", and the shell there perpendicular to that plane."""
+
+    kind: Literal["symmetry"]
+    on: str
+    axis: Literal["x", "y", "z"]
+
+    def make(self, read: Reader) -> SymmetryPlane:
+        return SymmetryPlane(self.on, "xyz".index(self.axis))
+
+
+class _ShellRotationSupport(RotationSupport):
+    """Turns a set as a rigid body about an axis, then shifts it; its edges are clamped in the body.
+
+    ``axis`` gives the direction, right-handed; ``centre`` a point on it, or the set whose mean point it is
+    (this one if absent).
+    """
+
+    def make(self, read: Reader) -> Clamp:
+        moved: supports.RigidRotation = super().make(read)
+        return Clamp(moved.on, moved.axis, moved.angle, moved.centre, moved.translation)
+
+
+class _ShellFoundationSupport(FoundationSupport):
+    """Springs spread over a cell set, all cells if absent: ``stiffness`` is force per area and displacement."""
+
+    on: str = "all"
+
+
+class _ShellTractionLoad(Section):
+    """Force per undeformed area of a cell set that keeps its direction."""
+
+    kind: Literal["traction"]
+    on: str = "all"
+    traction: Triple
+
+    def make(self, read: Reader) -> loads.DeadTraction:
+        return loads.DeadTraction(self.on, triple(self.traction, "stress", read))
+
+
+class _ShellPressureLoad(Section):
+    """Pressure that follows the deformed surface of a cell set; positive pushes against the normal.
+
+    The normal is on the side from which the nodes of a cell turn anticlockwise.
+    """
+
+    kind: Literal["pressure"]
+    on: str = "all"
+    pressure: Value
+
+    def make(self, read: Reader) -> loads.FollowerPressure:
+        return loads.FollowerPressure(self.on, read(self.pressure, "pressure"))
+
+
+class EdgeLoadSection(Section):
+    """Force per undeformed length of the edges of a set that keeps its direction."""
+
+    kind: Literal["edge"]
+    on: str
+    force: Triple
+
+    def make(self, read: Reader) -> loads.EdgeLoad:
+        return loads.EdgeLoad(self.on, triple(self.force, "force per length", read))
+
+
+class _ShellPatchLoad(MovingPatchLoad):
+    """A force spread over a round patch of a cell set, whose ``centre`` may move with a parameter.
+
+    ``width`` is the standard deviation of its Gaussian density, at least about half an element.
+    """
+
+    on: str = "all"
+
+
+class _ShellLineLoad(MovingLineLoad):
+    """A force per length along a straight line over a cell set; ``centre`` may move with a parameter."""
+
+    on: str = "all"
+
+
+ShellSupportSection = Annotated[
+    FixedSupport
+    | _ClampedSupport
+    | DisplacementSupport
+    | _SymmetrySupport
+    | _ShellRotationSupport
+    | _ShellFoundationSupport,
+    Field(discriminator="kind"),
+]
+ShellLoadSection = Annotated[
+    _ShellTractionLoad
+    | _ShellPressureLoad
+    | BodyForceLoad
+    | GravityLoad
+    | EdgeLoadSection
+    | PointLoadSection
+    | _ShellPatchLoad
+    | _ShellLineLoad,
+    Field(discriminator="kind"),
+]

@@ -1,0 +1,106 @@
+"""The study of a thin shell: mesh, thickness, material, supports, loads, and the parameters any of them may name."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from morph_dslam.mechanics.parameters import ParameterSymbols
+from morph_dslam.mechanics.shell_problem import ShellOptions, ShellProblem
+from morph_dslam.meshing.meshes import Mesh, model_mesh_of
+from morph_dslam.studies.body_study import BodyStudy, check_names, read_once, reader_of
+from morph_dslam.studies.parameters import ParameterSection
+from morph_dslam.studies.problem import ModelMesh, SweepProblem
+from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section, WorkSection
+from morph_dslam.studies.shell_sections import (
+    SetSection,
+    ShellLoadSection,
+    ShellMaterialSection,
+    ShellSection,
+    ShellSupportSection,
+    SurfaceSection,
+    shell_mesh,
+)
+from morph_dslam.studies.shell_sweep import ShellSweep
+from morph_dslam.studies.snapshots import SOLVER_VERSION
+from morph_dslam.studies.solid_sections import mesh_fingerprint
+
+
+class _ShellSolverSection(WorkSection):
+    """``order`` of the displacements, and how the machine is used: one thread in each worker unless stated."""
+
+    order: Literal[2, 3] = 2
+
+
+class ShellStudy(BodyStudy, Section):
+    """A thin elastic shell under supports and loads that depend on parameters."""
+
+    name: str
+    mesh: SurfaceSection
+    shell: ShellSection
+    material: ShellMaterialSection
+    sets: dict[str, SetSection] = Field(default_factory=dict)
+    supports: tuple[ShellSupportSection, ...] = ()
+    loads: tuple[ShellLoadSection, ...] = ()
+    parameters: dict[str, ParameterSection] = Field(min_length=1)
+    solver: _ShellSolverSection = _ShellSolverSection()
+    sampling: SamplingSection = SamplingSection()
+    reduction: ReductionSection = ReductionSection()
+
+    _names = field_validator("parameters")(check_names)
+
+    @model_validator(mode="after")
+    def _check_values(self) -> ShellStudy:
+        """Read every value once, so that a mistake is found before anything is solved."""
+        parts: list[tuple[str, Any]] = [("shell", self.shell), ("material", self.material)]
+        for kind, sections in (("support", self.supports), ("load", self.loads)):
+            parts += [(f"{kind} {number}", section) for number, section in enumerate(sections, start=1)]
+        read_once(parts, self.model_parameters())
+        if any(getattr(part, "first", False) for part in (*self.supports, *self.loads)):
+            raise ValueError("first is for solids: leave it out, or let a parameter say how much of a load acts")
+        if self.material.density is None and any(load.kind == "gravity" for load in self.loads):
+            raise ValueError("gravity needs the material's density: add it")
+        return self
+
+    @property
+    def work(self) -> WorkSection:
+        """One thread in each worker unless the study says otherwise: the workers fill the cores."""
+        return WorkSection(workers=self.solver.workers, threads=self.solver.threads or 1)
+
+    def shell_mesh(self) -> Mesh:
+        """The mesh, checked, with the sets of the study."""
+        return shell_mesh(self.mesh, self.sets)
+
+    def fingerprint(self) -> str:
+        """Hash of mesh, shell, material, supports, loads, parameters' names, elements and solver version."""
+        content = self.model_dump(mode="json", include={"shell", "material", "supports", "loads"})
+        content["elements"] = self.solver.order
+        content["parameters"] = list(self.parameters)
+        content["mesh"] = mesh_fingerprint(self.shell_mesh())
+        content["code"] = SOLVER_VERSION
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    def problem(self) -> ShellProblem:
+        """The discretised shell."""
+        symbols = ParameterSymbols(self.model_parameters())
+        read = reader_of(symbols)
+        return ShellProblem(
+            self.shell_mesh(),
+            self.material.make(read),
+            self.shell.make(read),
+            [section.make(read) for section in self.supports],
+            [section.make(read) for section in self.loads],
+            symbols,
+            ShellOptions(order=self.solver.order, threads=self.work.threads),
+        )
+
+    def sweep_problem(self) -> SweepProblem:
+        """What the sweep solves with."""
+        return ShellSweep(self.problem())
+
+    def model_mesh(self) -> ModelMesh:
+        """The nodes of the mesh, its cells cut into triangles, and the area of each node."""
+        return model_mesh_of(self.shell_mesh())

@@ -1,0 +1,24 @@
+"""A shell as the sweep sees it: a solid's paths with a shell's fields."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from morph_dslam.studies.problem import Snapshot
+from morph_dslam.studies.solid_sweep import SolidSweep, support_reactions
+
+
+class ShellSweep(SolidSweep):
+    """Solves a shell at one parameter point after another (`morph_dslam.studies.problem.SweepProblem`)."""
+
+    def take_snapshot(self, state: Any) -> Snapshot:
+        """Displacement, stresses of both faces and their slopes, reactions, and the tangent's negative pivots."""
+        problem = self.problem
+        fields = problem.sample(state.dofs, state.mu)
+        slopes = problem.sample_slopes(state.dofs, state.mu, state.slopes)
+        outputs = support_reactions(problem, state.dofs, state.mu)
+        if state.negative_pivots is not None:
+            outputs["negative_pivots"] = np.array(state.negative_pivots)
+        return Snapshot(state.mu, fields, slopes, outputs)

@@ -1,0 +1,160 @@
+"""What a shell's study refuses, what its mesh generators make, and what it reads from files."""
+
+import tomllib
+
+import meshio
+import numpy as np
+import pytest
+
+from morph_dslam.cli import app as cli
+from morph_dslam.errors import StudyError
+from morph_dslam.meshing import surface_generators
+from morph_dslam.meshing.mesh_checks import check_mesh
+from morph_dslam.meshing.mesh_files import load_surface_mesh
+from morph_dslam.meshing.meshes import CellBlock, Mesh, jacobian_determinants
+from morph_dslam.meshing.second_order import to_second_order
+from morph_dslam.meshing.surface_checks import check_surface
+from morph_dslam.studies.study import make_study
+from tests.support.shells import shell_study
+
+STRIP = """
+mesh = { generator = "plate", size = ["40 mm", "20 mm"], divisions = [2, 1] }
+shell = { thickness = "1 mm" }
+supports = [{ kind = "clamped", on = "x_min" }]
+material = { young = "1 GPa", poisson = 0.3 }
+"""
+SQUARES = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0], [1, 1, 0], [2, 1, 0], [1, 0, 1], [1, 1, 1]]) * 0.01
+
+
+def surface(*cells):
+    corners = np.array(cells)
+    return Mesh(SQUARES, (CellBlock("quad4" if corners.shape[1] == 4 else "tri3", corners),)).without_unused_nodes()
+
+
+def test_a_third_cell_at_an_edge_is_refused():
+    with pytest.raises(StudyError, match=r"1 edges .* more than two cells \(a T-junction\).*\(10, 5, 0\) mm"):
+        check_surface(surface([0, 1, 4, 3], [1, 2, 5, 4], [1, 6, 7, 4]))
+
+
+def test_a_corner_in_the_middle_of_an_edge_is_refused():
+    with pytest.raises(StudyError, match=r"node 1 .*\(10, 0, 0\) mm lies in the middle of an edge"):
+        check_surface(surface([0, 5, 3], [0, 2, 5], [1, 2, 6]))
+
+
+def test_cells_that_turn_differently_are_refused():
+    with pytest.raises(StudyError, match=r"opposite sides up at 1 edges.*\(10, 5, 0\) mm between cells 0 and 1"):
+        check_surface(surface([0, 1, 4, 3], [1, 4, 5, 2]))
+
+
+def test_a_study_of_a_surface_with_a_branch_ends_with_one_message(tmp_path, capsys):
+    mesh = surface([0, 1, 4, 3], [1, 2, 5, 4], [1, 6, 7, 4])
+    meshio.Mesh(mesh.nodes, [("quad", mesh.blocks[0].connectivity)]).write(tmp_path / "branch.vtu")
+    (tmp_path / "study.toml").write_text("""
+        name = "branch"
+        mesh = { file = "branch.vtu", unit = "m" }
+        shell = { thickness = "0.1 mm" }
+        material = { young = "1 GPa", poisson = 0.3 }
+        sets = { held = { box = [["0 mm", "0 mm", "0 mm"], ["0 mm", "10 mm", "0 mm"]] } }
+        supports = [{ kind = "clamped", on = "held" }]
+        parameters = { load = { range = ["0 Pa", "1 Pa"] } }
+    """)
+    command = ["build", tmp_path / "study.toml", "-o", tmp_path / "branch.morph"]
+    assert cli.main([str(argument) for argument in command]) == 2
+    assert "T-junction" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"material": {"poisson": 0.3}}, "give young and poisson, or young_fibre"),
+        ({"material": {"young": "1 GPa", "young_fibre": "1 GPa", "poisson": 0.3}}, "leave it out"),
+        ({"material": {"young": "1 GPa", "poisson": 1.2}}, "unstable"),
+        ({"material": {"young": "0 Pa", "poisson": 0.2}}, "must be positive"),
+        ({"material": {"young": "1 GPa", "poisson": 0.3, "fibre": [0, 0, 0]}}, "no direction"),
+        ({"loads": [{"kind": "gravity"}]}, "gravity needs the material's density"),
+        ({"loads": [{"kind": "edge", "on": "x_max", "force": ["1 N", "0 N/m", "0 N/m"]}]}, "not a unit of force per"),
+        ({"sets": {"tip": {}}}, "either box or nearest"),
+        ({"mesh": {"file": "sheet.vtu", "unit": "m", "size": "1 mm"}}, "size"),
+        ({"shell": {"thickness": "1 mm * part"}}, "part"),
+    ],
+)
+def test_sections_that_say_what_cannot_be(change, message):
+    content = tomllib.loads(STRIP) | {"name": "strip", "parameters": {"a": {"range": [0.0, 1.0]}}}
+    with pytest.raises(StudyError, match=message):
+        make_study(content | change)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ('sets = { tip = { box = [["1 m", "0 m", "0 m"], ["2 m", "0 m", "0 m"]] } }', "no node of the mesh lies in"),
+        ('sets = { x_max = { nearest = ["1 m", "0 m", "0 m"] } }', "a set of this name"),
+        ('loads = [{ kind = "edge", on = "rim", force = ["1 N/m", "0 N/m", "0 N/m"] }]', "no node set .*'rim'"),
+        (
+            """
+            sets = { tip = { nearest = ["40 mm", "0 m", "0 m"] } }
+            loads = [{ kind = "edge", on = "tip", force = ["1 N/m", "0 N/m", "0 N/m"] }]
+            """,
+            "no edge of the mesh has all of its nodes in the set 'tip'",
+        ),
+    ],
+)
+def test_sets_that_hold_nothing(more, message):
+    with pytest.raises(StudyError, match=message):
+        shell_study(STRIP + more).problem()
+
+
+def test_a_shell_that_can_turn_is_refused():
+    text = STRIP.replace('kind = "clamped"', 'kind = "fixed"')
+    with pytest.raises(StudyError, match="turn about y"):
+        shell_study(text).problem()
+
+
+@pytest.mark.parametrize("cells", surface_generators.SURFACES)
+@pytest.mark.parametrize("slit", [False, True])
+def test_generators_make_the_true_area(cells, slit):
+    straight = cells in ("tri3", "quad4")
+    meshes = {
+        "plate": (surface_generators.plate((0.2, 0.1), (4, 3), cells), 0.02),
+        "cylinder": (surface_generators.cylinder(0.1, 0.3, (3, 48), cells, slit=slit), 2 * np.pi * 0.03),
+        "hemisphere": (surface_generators.sphere(0.1, (0.0, np.pi / 2), (12, 48), cells, slit=slit), 2 * np.pi * 0.01),
+        "ring": (surface_generators.annulus(0.06, 0.1, (2, 48), cells, slit=slit), np.pi * 0.0064),
+    }
+    for mesh, area in meshes.values():
+        check_mesh(mesh)
+        check_surface(mesh)
+        sizes = [jacobian_determinants(mesh, block) @ block.type.quadrature()[1] for block in mesh.blocks]
+        assert sum(part.sum() for part in sizes) == pytest.approx(area, rel=5e-3 if straight else 2e-5)
+        for name, nodes in mesh.node_sets.items():
+            assert len(nodes), name
+    assert ("start" in meshes["ring"][0].node_sets) == slit
+    assert set(meshes["cylinder"][0].node_sets) >= {"bottom", "top"}
+
+
+@pytest.mark.parametrize("kind", ["triangle6", "quad8", "quad9"])
+def test_second_order_surfaces_are_read(kind, tmp_path):
+    cells = kind.replace("triangle", "tri")
+    made = surface_generators.cylinder(0.1, 0.3, (2, 8), cells)
+    meshio.Mesh(made.nodes, [(kind, made.blocks[0].connectivity)]).write(tmp_path / "cylinder.vtu")
+    read = load_surface_mesh(tmp_path / "cylinder.vtu", "m")
+    np.testing.assert_array_equal(read.blocks[0].connectivity, made.blocks[0].connectivity)
+    np.testing.assert_allclose(read.nodes, made.nodes)
+
+
+def test_an_open_stl_is_a_surface(tmp_path):
+    mesh = surface([0, 1, 4], [0, 4, 3])
+    meshio.Mesh(1e3 * mesh.nodes, [("triangle", mesh.blocks[0].connectivity)]).write(tmp_path / "open.stl")
+    read = load_surface_mesh(tmp_path / "open.stl", "mm")
+    assert sum(len(block.connectivity) for block in read.blocks) == 2
+    np.testing.assert_allclose(np.ptp(read.nodes, axis=0), [0.01, 0.01, 0.0])
+
+
+def test_a_solid_is_no_shell(tmp_path):
+    (tmp_path / "part.step").write_text("")
+    with pytest.raises(StudyError, match="middle surface"):
+        load_surface_mesh(tmp_path / "part.step", "mm")
+
+
+def test_middle_nodes_of_surface_cells():
+    mesh = to_second_order(surface([0, 1, 4, 3]), "quad9")
+    np.testing.assert_allclose(mesh.nodes[mesh.blocks[0].connectivity[0, 8]], [0.005, 0.005, 0.0])
