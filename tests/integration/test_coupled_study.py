@@ -97,6 +97,18 @@ def test_finer_elements_start_from_the_motions_of_the_couplings() -> None:
     assert np.abs(motions[1] - motions[2]).max() < 0.2 * np.abs(motions[0] - motions[2]).max()
 
 
+def test_a_prop_of_a_study_has_a_reaction() -> None:
+    moment = ["0 N.mm", "0.1 * bend", "0 N.mm"]
+    study = bar_study(couplings=[{"on": "x_max", "moment": moment, "held": ["z"]}])
+    sweep = study.sweep_problem()
+    snapshot = sweep.take_snapshot(sweep.advance(sweep.first_state(), np.array([1e-3])))
+    assert "reaction_force_x_max" in snapshot.sensitivities
+    np.testing.assert_allclose(snapshot.outputs["force_x_max"][2], 1.5 * 1e-4 / LENGTH, rtol=0.1)
+    assert set(study.model_mesh().supports) == {"x_min", "x_max"}
+    with pytest.raises(StudyError, match=r"couplings\.0\.held\.0: .*'rz'"):
+        bar_study(couplings=[{"on": "x_max", "held": ["turn"]}])
+
+
 def test_methods_that_project_equations_are_refused() -> None:
     several = {"bend": {"range": ["-2 N.mm", "2 N.mm"]}, "young": {"range": ["2 MPa", "3 MPa"]}}
     rubber = {"rubber": {"law": "neo_hookean", "young": "young", "poisson": 0.3}}
@@ -115,7 +127,7 @@ def test_mistakes_in_a_coupling_are_named() -> None:
     with pytest.raises(StudyError, match=r"coupling 1: 'N' is not a unit of moment; use one of N.m, N.mm"):
         bar_study(couplings=[{"on": "x_max", "moment": ["1 N", "0 N.m", "0 N.m"]}])
     with pytest.raises(
-        StudyError, match=r"unknown key couplings\.0\.kind; known here: first, on, point, force, moment"
+        StudyError, match=r"unknown key couplings\.0\.kind; known here: first, on, point, force, moment, held"
     ):
         bar_study(couplings=[{"on": "x_max", "kind": "rigid"}])
 

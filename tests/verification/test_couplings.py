@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.contact import RigidPlane
 from morph_dslam.mechanics.coupled_solid import CoupledSolid
-from morph_dslam.mechanics.couplings import Coupling
+from morph_dslam.mechanics.couplings import Coupling, Motion
 from morph_dslam.mechanics.kinematics import ShapeField
 from morph_dslam.mechanics.loads import DeadTraction, FollowerPressure
 from morph_dslam.mechanics.materials.isotropic import NeoHookean, StVenantKirchhoff
@@ -126,7 +126,64 @@ def test_a_turned_problem_has_the_turned_solution() -> None:
     np.testing.assert_allclose(turned, motion @ Q.T, atol=1e-8)
 
 
-def parametric(cell_type: str, mixed: bool | None) -> CoupledSolid:
+def slender_beam(left: Coupling | None, right: Coupling) -> CoupledSolid:
+    """A beam along x of length 1 m with E I = 1 N m2, fixed on the left where there is no coupling."""
+    width = 0.04
+    couplings = [right] if left is None else [left, right]
+    return CoupledSolid(
+        couplings,
+        block((1.0, width, width), (6, 1, 1), "hex20"),
+        {"all": StVenantKirchhoff(young=12.0 / width**4, poisson=0.0)},
+        [fixed("x_min")] if left is None else [],
+    )
+
+
+def test_a_hinged_beam_turns_and_leans_on_its_hinges() -> None:
+    """A moment M at an end of a beam on two hinges turns it by M L / 3 E I, the other end back by half of that."""
+    moment = 1e-3
+    left = Coupling("x_min", held=("x", "y", "z", "rx", "rz"))
+    right = Coupling("x_max", moment=(0.0, moment, 0.0), held=("y", "z", "rx", "rz"))
+    beam = slender_beam(left, right)
+    state = solved(beam)
+    motions = beam.motions(state.dofs)
+    np.testing.assert_allclose(motions[:, 4], [-moment / 6.0, moment / 3.0], rtol=0.01)
+    np.testing.assert_array_equal(motions[:, [1, 2, 3, 5]], 0.0)
+    for name, sign in (("x_min", -1.0), ("x_max", 1.0)):
+        force, about_end = beam.reactions(state.dofs, state.mu, name)
+        np.testing.assert_allclose(force, [0.0, 0.0, sign * moment], atol=1e-3 * moment)
+        np.testing.assert_allclose(about_end, 0.0, atol=1e-6 * moment)
+    assert beam.linearise(state.dofs, state.mu).negative_pivots == 0, "a moment about a hinge has an energy"
+
+
+def test_a_propped_beam_leans_on_its_prop() -> None:
+    """Clamped and propped: 3 M / 2 L on the prop, M L / 4 E I at it."""
+    moment = 1e-3
+    beam = slender_beam(None, Coupling("x_max", moment=(0.0, moment, 0.0), held=("z",)))
+    state = solved(beam)
+    np.testing.assert_allclose(beam.motions(state.dofs)[0, 4], moment / 4.0, rtol=0.02)
+    force, _ = beam.reactions(state.dofs, state.mu, "x_max", np.zeros(3))
+    np.testing.assert_allclose(force, [0.0, 0.0, 1.5 * moment], atol=0.01 * moment)
+
+
+def test_reactions_of_a_hinge_have_derivatives() -> None:
+    """By loads, the hinge's place and the shape, at large turns; against differences."""
+    problem, mu = parametric("tet10", False, ("y", "z", "rx", "rz")), np.array([0.7, 0.1, 0.2, 1.1])
+    state, about = loaded_state(problem, mu), np.array([0.1, -0.2, 0.3])
+    tangent = problem.linearise(state.dofs, mu)
+    slopes = sensitivities(problem, state, tangent)
+    forces = tangent.apply(slopes) + problem.residual_slopes(state.dofs, mu)
+    found = problem.reaction_slopes(state.dofs, mu, slopes, forces, "x_max", about)
+    assert abs(problem.motions(state.dofs)[0, 4]) > 0.15
+    for index in range(len(mu)):
+        change = 1e-4 * np.eye(len(mu))[index]
+        ends = [solve(problem, mu + sign * change, state) for sign in (1.0, -1.0)]
+        reactions = [problem.reactions(end.dofs, end.mu, "x_max", about) for end in ends]
+        for part in (0, 1):
+            expected = (reactions[0][part] - reactions[1][part]) / 2e-4
+            np.testing.assert_allclose(found[part][index], expected, atol=1e-5 * np.abs(found[part]).max())
+
+
+def parametric(cell_type: str, mixed: bool | None, held: tuple[Motion, ...] = ()) -> CoupledSolid:
     """Two couplings whose loads, places and sets depend on parameters, beside a pressure that follows."""
     symbols = load_parameter(load=0.5, arm=0.2, growth=0.1, stiffness=1.0)
     mesh = block((1.0, 0.5, 0.5), (3, 1, 1), cell_type)
@@ -136,7 +193,7 @@ def parametric(cell_type: str, mixed: bool | None) -> CoupledSolid:
     mesh = replace(mesh, node_sets={"pad": np.flatnonzero(low & inside)})
     load, arm = symbols["load"], symbols["arm"]
     couplings = [
-        Coupling("x_max", (3e4 * load, 2e4, 1e4 * load), (2e3, -3e3 * load, 1e3), (1.0 + arm, arm * arm, 0.0)),
+        Coupling("x_max", (3e4 * load, 2e4, 1e4 * load), (2e3, -3e3 * load, 1e3), (1.0 + arm, arm * arm, 0.0), held),
         Coupling("pad", (0.0, 0.0, 1e4 * load)),
     ]
     return CoupledSolid(
@@ -222,3 +279,5 @@ def test_couplings_share_no_nodes_and_hold_no_body() -> None:
         CoupledSolid([Coupling("x_max"), Coupling("x_max")], BAR, {"all": RUBBER}, [fixed("x_min")])
     with pytest.raises(StudyError, match="free to move along x, y, z"):
         CoupledSolid([Coupling("x_max")], BAR, {"all": RUBBER})
+    with pytest.raises(StudyError, match="free to move along z and to turn about y"):
+        CoupledSolid([Coupling("x_max", held=("x", "y", "z", "rx", "rz"))], BAR, {"all": RUBBER})

@@ -47,11 +47,9 @@ class CoupledSolid(SolidProblem):
     """
 
     def __init__(self, couplings: Sequence[Coupling], *solid: Any, **options: Any) -> None:
-        super().__init__(*solid, **options)
         self.couplings = tuple(couplings)
-        space, shape = self.displacements, self.shape
-        self._sets = [CoupledSet(c, space, shape, self.constraints, self.symbols) for c in self.couplings]
-        by_component = np.arange(3)[:, None] * space.n_scalar
+        super().__init__(*solid, **options)
+        by_component = np.arange(3)[:, None] * self.displacements.n_scalar
         self._following = np.concatenate([(by_component + part.dofs).ravel() for part in self._sets])
         self._starts = np.cumsum([3 * len(part.dofs) for part in self._sets])[:-1]
         if len(np.unique(self._following)) < len(self._following):
@@ -59,10 +57,23 @@ class CoupledSolid(SolidProblem):
             raise StudyError(f"two of the couplings' sets {names} share nodes; a node follows one of them")
         count = MOTIONS * len(self._sets)
         self.n_dofs = self.n_unknowns + count
-        self.free = np.concatenate([self.free, np.ones(count, dtype=bool)])
+        self.free = np.concatenate([self.free, *(~part.held for part in self._sets)])
         motion_scale = np.tile(np.repeat([self.length, 1.0], 3), len(self._sets))
         self.scale = np.concatenate([np.broadcast_to(self.scale, self.n_unknowns), motion_scale])
         self.scale[self._following] = np.inf
+
+    @cached_property
+    def _sets(self) -> list[CoupledSet]:
+        space, shape = self.displacements, self.shape
+        return [CoupledSet(coupling, space, shape, self.constraints, self.symbols) for coupling in self.couplings]
+
+    def _held_motions(self) -> Array:
+        modes = self.constraints.rigid_modes()
+        return np.concatenate([part.held_modes(modes) for part in self._sets])
+
+    @property
+    def held_sets(self) -> list[str]:
+        return super().held_sets + [coupling.on for coupling in self.couplings if coupling.held]
 
     def motions(self, dofs: Array) -> Array:
         """(..., k, 6) translation, m, and rotation vector, rad, of each coupling, of ``dofs`` (..., n_dofs)."""
@@ -140,6 +151,35 @@ class CoupledSolid(SolidProblem):
         unbalanced = slopes[:, self._following] @ self._columns(x).T + explicit
         slopes[:, self._following] = -moved[:, self._following]
         return self._with_motions(slopes, unbalanced)
+
+    def reactions(self, dofs: Array, mu: Array, name: str, about: Array | None = None) -> tuple[Array, Array]:
+        force, moment = super().reactions(dofs, mu, name, about)
+        about = self.constraints.centroid(name)[0] if about is None else about
+        for k, (part, q) in self._on(name, dofs):
+            work = np.where(part.held, self.motions(self.residual(dofs, mu))[k], 0.0)
+            own, turning = part.reaction(q, work)
+            force = force + own
+            moment = moment + turning + np.cross(part.point() + q[:3] - about, own)
+        return force, moment
+
+    def reaction_slopes(
+        self, dofs: Array, mu: Array, dof_slopes: Array, force_slopes: Array, name: str, about: Array
+    ) -> tuple[Array, Array]:
+        force, moment = super().reaction_slopes(dofs, mu, dof_slopes, force_slopes, name, about)
+        for k, (part, q) in self._on(name, dofs):
+            forces = self.motions(self.residual(dofs, mu))[k], self.motions(force_slopes)[:, k]
+            work, work_slopes = (np.where(part.held, values, 0.0) for values in forces)
+            moved = self.motions(dof_slopes)[:, k]
+            own, turning = part.reaction_slopes(q, work, moved, work_slopes)
+            arm, arm_slopes = part.point() + q[:3] - about, part.point_slopes() + moved[:, :3]
+            force = force + own
+            moment = moment + turning + np.cross(arm_slopes, work[:3]) + np.cross(arm, own)
+        return force, moment
+
+    def _on(self, name: str, x: Array) -> list[tuple[int, tuple[CoupledSet, Array]]]:
+        """Number, set and motion (6,) of the couplings that are on a set and hold it."""
+        numbered = enumerate(self._moved(x))
+        return [(k, (part, q)) for k, (part, q) in numbered if part.coupling.on == name and part.coupling.held]
 
     def advance_history(self, x: Array, mu: Array) -> None:
         super().advance_history(self._placed(x), mu)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import factorial
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -27,8 +28,10 @@ from morph_dslam.mechanics.spaces import DisplacementSpace
 from morph_dslam.mechanics.supports import Constraints
 
 Array = NDArray[np.float64]
+Motion = Literal["x", "y", "z", "rx", "ry", "rz"]
 #: Motions of a coupling.
 MOTIONS = 6
+_NAMES: tuple[Motion, ...] = get_args(Motion)
 #: Matrices (3, 3, 3) of the cross product with each unit vector from the left.
 _CROSS: Array = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1)
 #: a and b as power series in |t|^2; so many terms are exact beyond a full turn.
@@ -47,16 +50,19 @@ class Coupling:
     force : N, keeps its direction, at the reference point.
     moment : N m, keeps its direction in space.
     point : reference point, m; None for the mean of the set's nodes. It moves with the set.
+    held : motions that are zero: of the point along x, y, z, and components rx, ry, rz of the rotation vector. A hinge
+        about z holds all but rz.
     """
 
     on: str
     force: Vector = (0.0, 0.0, 0.0)
     moment: Vector = (0.0, 0.0, 0.0)
     point: Vector | None = None
+    held: tuple[Motion, ...] = ()
 
     def unloaded(self) -> Coupling:
         """The same without force and moment."""
-        return Coupling(self.on, point=self.point)
+        return Coupling(self.on, point=self.point, held=self.held)
 
 
 @dataclass(frozen=True)
@@ -112,6 +118,7 @@ class CoupledSet:
     Attributes
     ----------
     dofs : (n,) scalar dofs that follow it.
+    held : (6,) whether each motion is.
     """
 
     def __init__(
@@ -128,6 +135,7 @@ class CoupledSet:
         if not len(nodes):
             raise StudyError(f"the set '{coupling.on}' of a coupling is empty; name a set that holds nodes")
         self.dofs = space.dofs_on(nodes)
+        self.held = np.array([name in coupling.held for name in _NAMES])
         if constraints.held.reshape(3, -1)[:, self.dofs].any():
             raise StudyError(
                 f"the set '{coupling.on}' of a coupling has nodes that a support holds; "
@@ -153,15 +161,11 @@ class CoupledSet:
 
     def _arms(self) -> Array:
         """Coefficients (n, 3) of X - P, undeformed."""
-        point, on = self.coupling.point, self.coupling.on
-        place = self._constraints.centroid(on)[0] if point is None else self._value(point)
-        return self._shape.coordinates(self._symbols)[self.dofs] - np.outer(self._constant, place)
+        return self._shape.coordinates(self._symbols)[self.dofs] - np.outer(self._constant, self.point())
 
     def _arm_slopes(self) -> Array:
         """(d, n, 3) derivatives of the arms by the parameters."""
-        point, on = self.coupling.point, self.coupling.on
-        place = self._constraints.centroid(on)[1] if point is None else self._slopes(point)
-        moved = self._constant[:, None] * place[:, None]
+        moved = self._constant[:, None] * self.point_slopes()[:, None]
         return self._shape.coordinate_slopes(self._symbols)[:, self.dofs] - moved
 
     def displacement(self, motion: Array) -> Array:
@@ -203,5 +207,36 @@ class CoupledSet:
 
     @property
     def has_energy(self) -> bool:
-        """Whether the remote load has one: a moment has none."""
-        return not self._value(self.coupling.moment).any()
+        """Whether the remote load has one: a moment has none, save about a hinge."""
+        return int(np.count_nonzero(~self.held[3:])) < 2 or not self._value(self.coupling.moment).any()
+
+    def held_modes(self, modes: Array) -> Array:
+        """What is held (k, 6) of rigid ``modes`` (3, n_scalar, 6) of the body."""
+        columns = self.columns(np.zeros(MOTIONS)).T
+        motions = np.linalg.lstsq(columns, modes[:, self.dofs].reshape(-1, MOTIONS))[0].astype(np.float64)
+        motions[3:] *= np.abs(self._arms()).max()
+        return motions[self.held]
+
+    def point(self) -> Array:
+        """Reference point (3,)."""
+        point = self.coupling.point
+        return self._constraints.centroid(self.coupling.on)[0] if point is None else self._value(point)
+
+    def point_slopes(self) -> Array:
+        """(d, 3) derivatives of the reference point by the parameters."""
+        point = self.coupling.point
+        return self._constraints.centroid(self.coupling.on)[1] if point is None else self._slopes(point)
+
+    def reaction(self, motion: Array, work: Array) -> tuple[Array, Array]:
+        """Force (3,), and moment (3,) about the point, whose ``work`` (6,) per motion is given."""
+        moment = np.linalg.solve(Rotation.of(motion[3:]).spins, work[3:])
+        return work[:3], moment.astype(np.float64)
+
+    def reaction_slopes(
+        self, motion: Array, work: Array, motion_slopes: Array, work_slopes: Array
+    ) -> tuple[Array, Array]:
+        """Derivatives (d, 3) of `reaction`, from those (d, 6) of motion and work."""
+        rotation, moment = Rotation.of(motion[3:]), self.reaction(motion, work)[1]
+        turned = np.einsum("ijc,dj,c->di", rotation.spin_slopes, motion_slopes[:, 3:], moment)
+        moment_slopes = np.linalg.solve(rotation.spins, (work_slopes[:, 3:] - turned).T).T
+        return work_slopes[:, :3], moment_slopes.astype(np.float64)

@@ -99,7 +99,8 @@ class ShellProblem(SolidProblem):
         self.n_dofs: int = self.n_unknowns
         self.constraints = Constraints(self.displacements, self.shape, self.supports, self.symbols)
         directed = [support for support in self.supports if isinstance(support, HoldsDirection)]
-        self.constraints.check_rigid_motions(self._edge_directions([support.on for support in directed]))
+        axes = self._edge_directions([support.on for support in directed])
+        self.constraints.check_rigid_motions(np.hstack([np.zeros(axes.shape), axes]))
         self._state = ngs.GridFunction(self.space)
         held = [(support, self.geometry.edge_numbers(support.on)) for support in directed]
         self._normals = AveragedNormals(self.geometry.ngs, self.options.order - 1, self._state.components[0], held)

@@ -135,7 +135,7 @@ class SolidProblem:
         self.n_unknowns: int = self.enhanced.n_dofs if self.enhanced else self.space.ndof
         self.n_dofs: int = self.n_unknowns
         self.constraints = Constraints(self.displacements, self.shape, self.supports, self.symbols)
-        self.constraints.check_rigid_motions()
+        self.constraints.check_rigid_motions(self._held_motions())
         n_displacements = 3 * self.displacements.n_scalar
         self.assembly = self._make_assembly()
         self.contact = self._make_contact(contacts)
@@ -148,6 +148,15 @@ class SolidProblem:
         self._latest: tuple[Array, Array, Array] | None = None
         points = [load for load in loads if isinstance(load, PointLoad)]
         self._nodal_forces = NodalForces(self.displacements, points, self.symbols)
+
+    def _held_motions(self) -> Array:
+        """What holds the body beside its supports, see `Constraints.check_rigid_motions`."""
+        return np.zeros((0, 6))
+
+    @property
+    def held_sets(self) -> list[str]:
+        """Sets that have reactions."""
+        return [support.on for support in self.supports]
 
     def _make_enhanced(self) -> EnhancedStrain:
         owners = self.cell_materials[self.geometry.cell_of_element]

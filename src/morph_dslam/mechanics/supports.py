@@ -117,15 +117,13 @@ class Constraints:
         moments = np.cross(arm_slopes, f.T) + np.cross(arms, f_slopes.transpose(0, 2, 1))
         return f_slopes @ constant, moments.sum(axis=1)
 
-    def check_rigid_motions(self, axes: Array | None = None) -> None:
+    def check_rigid_motions(self, others: Array) -> None:
         """Refuse supports that leave the body free to move as a whole (StudyError).
 
-        ``axes`` (k, 3) are unit vectors about which supports hold the body from turning, beside the held dofs.
+        ``others`` (k, 6) are what else is held, by the share of each of `rigid_modes` in it.
         """
-        modes = self._rigid_modes()
-        rows = [modes[self.held.reshape(3, -1)]]
-        if axes is not None:
-            rows.append(np.hstack([np.zeros(axes.shape), axes]))
+        modes = self.rigid_modes()
+        rows = [modes[self.held.reshape(3, -1)], others]
         for foundation in self._foundations:
             nodes = self._mesh.surface_nodes(foundation.on)
             at_nodes = np.stack([self._space.node_values[nodes] @ mode for mode in modes], axis=1)
@@ -142,7 +140,7 @@ class Constraints:
                 f"the supports leave the body free to {_describe(free)}: fix a set, or give it a foundation"
             )
 
-    def _rigid_modes(self) -> Array:
+    def rigid_modes(self) -> Array:
         """(3, n_scalar, 6) coefficients of unit translations and of rotations scaled to unit size."""
         centred = self._space.coordinates - np.outer(self._constant, self._mesh.nodes.mean(axis=0))
         centred /= np.abs(centred).max()

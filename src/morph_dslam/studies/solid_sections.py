@@ -337,18 +337,20 @@ class MovingLineLoad(_Applied):
 class CouplingSection(_Applied):
     """A set that moves as a rigid body under a force and a moment, which keep their directions.
 
-    The force acts at ``point``, which moves with the set: the mean of the set's nodes if absent.
+    The force acts at ``point``, which moves with the set: the mean of the set's nodes if absent. Motions that are
+    ``held`` stay zero: those of the point along the axes, and turns about them.
     """
 
     on: str
     point: Triple | None = None
     force: Triple = ("0 N", "0 N", "0 N")
     moment: Triple = ("0 N.m", "0 N.m", "0 N.m")
+    held: tuple[couplings.Motion, ...] = ()
 
     def make(self, read: Reader) -> couplings.Coupling:
         point = None if self.point is None else triple(self.point, "length", read)
         force, moment = triple(self.force, "force", read), triple(self.moment, "moment", read)
-        return couplings.Coupling(self.on, force, moment, point)
+        return couplings.Coupling(self.on, force, moment, point, self.held)
 
 
 class _PlaneContact(Section):

@@ -229,4 +229,5 @@ class SolidStudy(BodyStudy, Section):
     def model_mesh(self) -> ModelMesh:
         """The nodes of the mesh, its outer surface, its cells, the volume of each node, and what supports hold."""
         mesh = self.solid_mesh()
-        return replace(model_mesh_of(mesh), supports={part.on: mesh.set_nodes(part.on) for part in self.supports})
+        held = [part.on for part in (*self.supports, *(part for part in self.couplings if part.held))]
+        return replace(model_mesh_of(mesh), supports={name: mesh.set_nodes(name) for name in held})

@@ -80,9 +80,8 @@ def _named(recovered: dict[str, Array]) -> dict[str, Array]:
 def support_reactions(problem: SolidProblem, dofs: Array, mu: Array) -> dict[str, Array]:
     """Force (N) and moment (N m, about the object frame's origin) on each set that is held."""
     outputs = {}
-    for support in problem.supports:
-        force, moment = problem.reactions(dofs, mu, support.on, np.zeros(3))
-        outputs[FORCE + support.on], outputs[MOMENT + support.on] = force, moment
+    for name in problem.held_sets:
+        outputs[FORCE + name], outputs[MOMENT + name] = problem.reactions(dofs, mu, name, np.zeros(3))
     return outputs
 
 
@@ -91,10 +90,10 @@ def _reaction_slopes(
 ) -> dict[str, Array]:
     """Derivatives (d, 1, 3) of `support_reactions`, under the names that reactions have as fields."""
     outputs = {}
-    for support in problem.supports:
-        parts = problem.reaction_slopes(dofs, mu, slopes, force_slopes, support.on, np.zeros(3))
+    for name in problem.held_sets:
+        parts = problem.reaction_slopes(dofs, mu, slopes, force_slopes, name, np.zeros(3))
         for kind, part in zip((FORCE, MOMENT), parts, strict=True):
-            outputs[REACTION + kind + support.on] = part[:, None]
+            outputs[REACTION + kind + name] = part[:, None]
     return outputs
 
 
