@@ -186,3 +186,12 @@ def test_what_a_contact_keeps_out(kind: str) -> None:
     # and, with its flat faces, touches near nodes.
     assert gap(rest).min() < -0.9e-3
     assert -0.9e-4 < moved.min() < 3e-4
+
+
+def test_surfaces_in_contact_are_sets_of_the_mesh() -> None:
+    materials, touching = {"rubber": SOFT}, {"kind": "surface", "on": "z_max"}
+    alone, with_itself = snapshot(materials=materials), snapshot(materials=materials, contacts=[touching])
+    # A top that meets nothing is not changed.
+    np.testing.assert_array_equal(alone.fields["displacement"], with_itself.fields["displacement"])
+    with pytest.raises(StudyError, match="no node set or surface 'lid'"):
+        snapshot(materials=materials, contacts=[touching | {"against": "lid"}])

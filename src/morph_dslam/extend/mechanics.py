@@ -4,6 +4,7 @@ from morph_dslam.mechanics.contact import (
     RigidCylinder as RigidCylinder,
     RigidPlane as RigidPlane,
     RigidSphere as RigidSphere,
+    SurfaceContact as SurfaceContact,
 )
 from morph_dslam.mechanics.coupled_solid import CoupledSolid as CoupledSolid
 from morph_dslam.mechanics.couplings import Coupling as Coupling

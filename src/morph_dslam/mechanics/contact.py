@@ -1,4 +1,4 @@
-"""Rigid obstacles that the surfaces of a solid touch. There is no friction.
+"""What the surfaces of a solid touch: rigid obstacles, and other parts of the surface. There is no friction.
 
 `contact_assembly` says how contact is solved.
 """
@@ -145,6 +145,28 @@ class RigidCylinder:
     def slopes(self, symbols: ParameterSymbols) -> tuple[Array, Array]:
         """See `RigidObstacle`."""
         return _slopes(symbols, self.point), _sign(self.inside) * -symbols.slopes(self.radius)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceContact:
+    """Two surfaces of the solid that cannot pass through each other, or one that cannot pass through itself.
+
+    Attributes
+    ----------
+    on : surface.
+    against : the other surface, or the same.
+    """
+
+    on: str
+    against: str
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return f"surface '{self.against}'"
+
+
+Contact = RigidObstacle | SurfaceContact
 
 
 def _check_direction(on: str, name: str, direction: tuple[float, float, float]) -> None:

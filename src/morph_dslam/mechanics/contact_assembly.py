@@ -24,7 +24,8 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
-from morph_dslam.mechanics.contact import RigidObstacle
+from morph_dslam.mechanics.contact import Contact, RigidObstacle, SurfaceContact
+from morph_dslam.mechanics.contact_search import Crossings, find_crossings, local_geometry
 from morph_dslam.mechanics.contact_surface import ContactSurface
 from morph_dslam.mechanics.kinematics import Shape
 from morph_dslam.mechanics.parameters import ParameterSymbols
@@ -33,11 +34,41 @@ from morph_dslam.mechanics.spaces import DisplacementSpace
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 #: Stiffness of contact over that of a layer of the material as thick as a face of an element is wide.
-STIFFNESS = 30.0
+STIFFNESS = 100.0
 #: Pressure, over Young's modulus, up to which a limited tangent is complete.
-LARGEST_PRESSURE = 1.0
+LARGEST_PRESSURE = 0.1
 #: Surfaces that overlap by less than such a part of a face's width touch.
 TOUCHING = 1e-4
+
+
+@dataclass(frozen=True)
+class _Spring:
+    """What k points of a surface resist penetration with.
+
+    Attributes
+    ----------
+    weights : (k,) area, m2.
+    stiffness : (k,) eps, Pa/m.
+    young : (k,) modulus of the material, Pa.
+    """
+
+    weights: Array
+    stiffness: Array
+    young: Array
+
+
+@dataclass(frozen=True)
+class _Side:
+    """A surface in contact, and Young's modulus (f,) behind each of its faces, Pa."""
+
+    surface: ContactSurface
+    young: Array
+
+    def spring(self, points: Indices) -> _Spring:
+        """Of some of its points (k,)."""
+        faces = self.surface.face[points]
+        young = self.young[faces]
+        return _Spring(self.surface.weights[points], STIFFNESS * young / self.surface.widths[faces], young)
 
 
 @dataclass(frozen=True)
@@ -46,11 +77,10 @@ class _Entered:
 
     Attributes
     ----------
+    spring : what they resist with.
     gap : (k,) m, negative.
-    weights : (k,) area, m2.
-    stiffness : (k,) eps, Pa/m.
-    young : (k,) modulus of the material, Pa.
-    normal : (k, 3).
+    normal : (k, 3) of what they have entered.
+    place : (k, 3) where they are, m.
     forms : sparse (r k, 3 n): changes that the gap depends on, r for each point; the first three are those of its place
         in relation to what it has entered.
     curvature : (k, r, r) second derivatives of the gap by these.
@@ -58,11 +88,10 @@ class _Entered:
     normal_slopes : (d, k, 3) of the normal.
     """
 
+    spring: _Spring
     gap: Array
-    weights: Array
-    stiffness: Array
-    young: Array
     normal: Array
+    place: Array
     forms: sp.csr_matrix
     curvature: Array
     slopes: Array
@@ -77,23 +106,23 @@ class _Entered:
         """(..., 3 n) forces of tractions (..., k, 3), Pa, on the points' places."""
         several = traction.shape[:-2]
         forces = np.zeros((*traction.shape[:-1], self.curvature.shape[1]))
-        forces[..., :3] = self.weights[:, None] * traction
+        forces[..., :3] = self.spring.weights[:, None] * traction
         flat = forces.reshape(int(np.prod(several)), self._size[0])
         return (self.forms.T @ flat.T).T.reshape(*several, self._size[1])
 
     @property
     def residual(self) -> Array:
         """(3 n,) derivative of the energy."""
-        return self.assembled((self.stiffness * self.gap)[:, None] * self.normal)
+        return self.assembled((self.spring.stiffness * self.gap)[:, None] * self.normal)
 
     def tangent(self, limited: bool) -> sp.csr_matrix:
         """(3 n, 3 n) derivative of the residual; ``limited`` to `LARGEST_PRESSURE`."""
-        pressure = -self.stiffness * self.gap
+        pressure = -self.spring.stiffness * self.gap
         if limited:
-            pressure = np.minimum(pressure, LARGEST_PRESSURE * self.young)
+            pressure = np.minimum(pressure, LARGEST_PRESSURE * self.spring.young)
         blocks = -pressure[:, None, None] * self.curvature
-        blocks[:, :3, :3] += self.stiffness[:, None, None] * self.normal[:, :, None] * self.normal[:, None, :]
-        blocks *= self.weights[:, None, None]
+        blocks[:, :3, :3] += self.spring.stiffness[:, None, None] * self.normal[:, :, None] * self.normal[:, None, :]
+        blocks *= self.spring.weights[:, None, None]
         number = np.arange(len(blocks))
         middle = sp.bsr_matrix((blocks, number, np.arange(len(blocks) + 1)), shape=(self._size[0],) * 2)
         return sp.csr_matrix(self.forms.T @ (middle @ self.forms))
@@ -101,7 +130,7 @@ class _Entered:
     def residual_slopes(self) -> Array:
         """(d, 3 n) derivatives of the residual by the parameters at fixed dofs and undeformed shape."""
         change = self.slopes[:, :, None] * self.normal + self.gap[:, None] * self.normal_slopes
-        return self.assembled(self.stiffness[:, None] * change)
+        return self.assembled(self.spring.stiffness[:, None] * change)
 
 
 class ContactAssembly:
@@ -120,83 +149,157 @@ class ContactAssembly:
         self,
         space: DisplacementSpace,
         shape: Shape,
-        contacts: Sequence[RigidObstacle],
+        contacts: Sequence[Contact],
         shear: Array,
         symbols: ParameterSymbols,
     ) -> None:
         self._shape, self._symbols, self._contacts, self._n = shape, symbols, contacts, space.n_scalar
-        self._surfaces, self._young = [], []
+        self._mesh, self._space, self._shear = space.geometry.mesh, space, shear
+        self._sides: dict[str, _Side] = {}
         for contact in contacts:
-            faces = space.geometry.mesh.surface(contact.on)
-            self._surfaces.append(ContactSurface.of(space, faces))
-            self._young.append(3.0 * shear[faces[:, 0]])
-        self._latest: tuple[Array, Array, list[_Entered]] | None = None
+            self._side(contact.on)
+            if isinstance(contact, SurfaceContact):
+                self._side(contact.against)
+        self._latest: tuple[Array, Array, list[list[_Entered]]] | None = None
         self._check_apart()
 
-    def _check_apart(self) -> None:
-        for contact, surface, entered in zip(
-            self._contacts, self._surfaces, self._entered(np.zeros(3 * self._n)), strict=True
-        ):
-            moved = any(slopes.any() for slopes in contact.slopes(self._symbols))
-            if moved or not (entered.gap < -TOUCHING * surface.widths.mean()).any():
-                continue
-            deepest = int(np.argmin(entered.gap))
-            place = entered.forms[3 * deepest : 3 * deepest + 3] @ self._shape.coordinates(self._symbols).T.ravel()
-            where = ", ".join(f"{1e3 * x:.4g}" for x in place)
-            raise StudyError(
-                f"the {contact.name} reaches {-1e3 * entered.gap[deepest]:.3g} mm into the undeformed surface "
-                f"'{contact.on}', deepest at ({where}) mm: move it away, or let a parameter push it in"
-            )
+    def _side(self, name: str) -> _Side:
+        if name not in self._sides:
+            faces = self._mesh.surface(name)
+            self._sides[name] = _Side(ContactSurface.of(self._space, faces), 3.0 * self._shear[faces[:, 0]])
+        return self._sides[name]
 
-    def _entered(self, x: Array) -> list[_Entered]:
-        """The points that have entered something at ``x`` (3 n,) and the present parameters, of each contact."""
+    def _check_apart(self) -> None:
+        for contact, parts in zip(self._contacts, self._entered(np.zeros(3 * self._n)), strict=True):
+            if not isinstance(contact, SurfaceContact) and any(s.any() for s in contact.slopes(self._symbols)):
+                continue
+            entered = min(parts, key=lambda part: part.gap.min(initial=0.0))
+            depth = -entered.gap.min(initial=0.0)
+            if depth > TOUCHING * self._side(contact.on).surface.widths.mean():
+                where = ", ".join(f"{1e3 * x:.4g}" for x in entered.place[int(np.argmin(entered.gap))])
+                raise StudyError(
+                    f"the {contact.name} reaches {1e3 * depth:.3g} mm into the undeformed surface '{contact.on}', "
+                    f"deepest at ({where}) mm: move it away, or let a parameter push it in"
+                )
+
+    def _entered(self, x: Array) -> list[list[_Entered]]:
+        """For each contact, the points that have entered something at ``x`` (3 n,) and the present parameters."""
         mu = np.array([self._symbols.value(self._symbols[p.name]) for p in self._symbols.parameters])
         known = self._latest
         if known is None or not (np.array_equal(known[0], x) and np.array_equal(known[1], mu)):
-            coordinates = self._shape.coordinates(self._symbols) + x.reshape(3, -1).T
-            found = [self._entered_rigid(number, coordinates) for number in range(len(self._contacts))]
+            undeformed = self._shape.coordinates(self._symbols)
+            deformed = undeformed + x.reshape(3, -1).T
+            found = []
+            for contact in self._contacts:
+                if isinstance(contact, SurfaceContact):
+                    pairs = {(contact.on, contact.against), (contact.against, contact.on)}
+                    found.append([self._entered_surface(*pair, undeformed, deformed) for pair in sorted(pairs)])
+                else:
+                    found.append([self._entered_rigid(contact, deformed)])
             known = self._latest = x.copy(), mu, found
         return known[2]
 
-    def _entered_rigid(self, number: int, coordinates: Array) -> _Entered:
-        contact, surface = self._contacts[number], self._surfaces[number]
-        touch = contact.touch(self._symbols, surface.positions(coordinates))
+    def _entered_rigid(self, contact: RigidObstacle, deformed: Array) -> _Entered:
+        side = self._side(contact.on)
+        places = side.surface.positions(deformed)
+        touch = contact.touch(self._symbols, places)
         inside = np.flatnonzero(touch.gap < 0.0)
         moved, offset = contact.slopes(self._symbols)
         normal, curvature = touch.normal[inside], touch.curvature[inside]
-        faces = surface.face[inside]
-        young = self._young[number][faces]
         return _Entered(
+            side.spring(inside),
             touch.gap[inside],
-            surface.weights[inside],
-            STIFFNESS * young / surface.widths[faces],
-            young,
             normal,
-            place_forms(surface.dofs[faces], surface.functions[inside], self._n),
+            places[inside],
+            place_forms(side.surface.dofs[side.surface.face[inside]], side.surface.functions[inside], self._n),
             curvature,
             offset[:, None] - moved @ normal.T,
             -np.einsum("kxy,dy->dkx", curvature, moved),
         )
 
+    def _entered_surface(self, on: str, against: str, undeformed: Array, deformed: Array) -> _Entered:
+        side, other = self._side(on), self._side(against).surface
+        found = find_crossings(side.surface, other, (undeformed, undeformed), (deformed, deformed))
+        places = side.surface.positions(deformed)[found.points]
+        own, faces = side.surface.face[found.points], found.face
+        dofs = np.hstack([side.surface.dofs[own], other.dofs[faces]])
+        there = other.functions_at(faces, found.place)
+        relative = place_forms(dofs, np.hstack([side.surface.functions[found.points], -there]), self._n)
+        turning, curvature = _turning(other, deformed, found, places, self._n)
+        none = np.zeros((len(self._symbols), len(found.gap)))
+        return _Entered(
+            side.spring(found.points),
+            found.gap,
+            found.normal,
+            places,
+            _interleaved(relative, turning),
+            curvature,
+            none,
+            np.zeros((*none.shape, 3)),
+        )
+
     def residual(self, x: Array) -> Array:
         """(3 n,) at displacements ``x`` (3 n,) and the present parameters."""
-        return np.sum([entered.residual for entered in self._entered(x)], axis=0)
+        return np.sum([part.residual for part in self._parts(x)], axis=0)
+
+    def _parts(self, x: Array) -> list[_Entered]:
+        return [part for parts in self._entered(x) for part in parts]
 
     def forces(self, x: Array, number: int) -> Array:
         """(3 n,) forces that one contact exerts on the solid, N."""
-        return -self._entered(x)[number].residual
+        return -np.sum([part.residual for part in self._entered(x)[number]], axis=0)
 
     def tangent(self, x: Array, limited: bool) -> sp.csr_matrix:
         """(3 n, 3 n) derivative of the residual; see the module for what is ``limited``."""
-        return sp.csr_matrix(sum(entered.tangent(limited) for entered in self._entered(x)))
+        return sp.csr_matrix(sum(part.tangent(limited) for part in self._parts(x)))
 
     def residual_slopes(self, x: Array) -> Array:
         """(d, 3 n) derivatives of the residual by the parameters at fixed ``x``."""
-        slopes = np.sum([entered.residual_slopes() for entered in self._entered(x)], axis=0)
+        slopes = np.sum([part.residual_slopes() for part in self._parts(x)], axis=0)
         if self._shape.functions:
             moved = self._shape.coordinate_slopes(self._symbols).swapaxes(1, 2).reshape(len(slopes), -1)
             slopes = slopes + (self.tangent(x, limited=False) @ moved.T).T
         return slopes
+
+
+def _turning(
+    other: ContactSurface, deformed: Array, found: Crossings, points: Array, n: int
+) -> tuple[sp.csr_matrix, Array]:
+    """What turns the normals of faces, and second derivatives of the gap.
+
+    Let v be the change of a point's place in relation to its projection, t_a tangents with the metric A, k_ab their
+    derivatives and D_a their changes along the normal. The projection moves by y = (A - g k)^-1 (t . v + g D) on its
+    face, and the gap has the second derivative g (D + k y) A^-1 (D + k y) - 2 D y - y k y (Wriggers, section 9.1).
+
+    Returns
+    -------
+    Sparse (2 k, 3 n) forms D, and (k, 5, 5) derivatives by v and D.
+    """
+    dofs, gap, normal = other.dofs[found.face], found.gap, found.normal
+    _, first, second, metric, bends = local_geometry(other, deformed, points, found.face, found.place)
+    slopes = np.stack([other.functions_at(found.face, found.place, d) for d in ((1, 0), (0, 1))], axis=1)
+    values = (slopes[:, :, None, :] * normal[:, None, :, None]).reshape(-1)
+    k, b = dofs.shape
+    columns = np.repeat((dofs[:, None, :] + n * np.arange(3)[:, None])[:, None], 2, axis=1).reshape(-1)
+    forms = sp.csr_matrix((values, columns, np.arange(0, 6 * k * b + 1, 3 * b)), shape=(2 * k, 3 * n))
+    bend = np.einsum("kabx,kx->kab", bends, normal)
+    turned = np.zeros((k, 2, 5))
+    turned[:, :, 3:] = np.eye(2)
+    along = gap[:, None, None] * turned
+    along[:, :, :3] += np.stack([first, second], axis=1)
+    slid = np.linalg.solve(metric - gap[:, None, None] * bend, along)
+    tilted = turned + bend @ slid
+    crossed = turned.swapaxes(1, 2) @ slid
+    curvature = gap[:, None, None] * (tilted.swapaxes(1, 2) @ np.linalg.solve(metric, tilted))
+    curvature -= crossed + crossed.swapaxes(1, 2) + slid.swapaxes(1, 2) @ bend @ slid
+    return forms, curvature
+
+
+def _interleaved(relative: sp.csr_matrix, turning: sp.csr_matrix) -> sp.csr_matrix:
+    """Rows of forms (3 k, n) and (2 k, n) point by point (5 k, n)."""
+    k = relative.indptr.size // 3
+    order = np.hstack([np.arange(3 * k).reshape(-1, 3), 3 * k + np.arange(2 * k).reshape(-1, 2)]).ravel()
+    return sp.csr_matrix(sp.vstack([relative, turning]))[order]
 
 
 def place_forms(dofs: Indices, functions: Array, n: int) -> sp.csr_matrix:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.mechanics.spaces import DisplacementSpace
+from morph_dslam.meshing.meshes import Mesh
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -33,6 +34,7 @@ class ContactSurface:
     coefficients : (f, b, m) of each one's polynomial.
     corners : (f,) number of each face's corners.
     coordinates : (n, 3) undeformed coefficients of the position, m: they give quadrature its areas.
+    heights : (f,) of the cells behind the faces, m; infinite for rigid bodies.
 
     Attributes
     ----------
@@ -41,9 +43,12 @@ class ContactSurface:
     functions : (q, b) the face's functions at it.
     weights : (q,) area that it stands for, m2.
     widths : (f,) square root of each face's area, of triangles' twice the area, m.
+    heights : (f,) as given.
     """
 
-    def __init__(self, dofs: Indices, coefficients: Array, corners: Indices, coordinates: Array) -> None:
+    def __init__(
+        self, dofs: Indices, coefficients: Array, corners: Indices, coordinates: Array, heights: Array
+    ) -> None:
         self.dofs, self.corners, self._coefficients = dofs, corners, coefficients
         self._exponents = np.array(list(product(range(round(coefficients.shape[2] ** 0.5)), repeat=2)))
         face, place, shares = [], [], []
@@ -57,6 +62,7 @@ class ContactSurface:
         areas = np.linalg.norm(self.area_vectors(coordinates), axis=1)
         self.weights: Array = areas * np.concatenate(shares)
         whole = np.bincount(self.face, self.weights, minlength=len(dofs))
+        self.heights = heights
         self.widths: Array = np.sqrt(np.where(corners == 3, 2.0, 1.0) * whole)
 
     @staticmethod
@@ -64,7 +70,7 @@ class ContactSurface:
         """The faces (f, 2) of a solid."""
         dofs, coefficients = space.face_functions(faces)
         corners = (space.geometry.mesh.face_nodes(faces, corners_only=True) >= 0).sum(axis=1)
-        return ContactSurface(dofs, coefficients, corners, space.coordinates)
+        return ContactSurface(dofs, coefficients, corners, space.coordinates, _heights(space.geometry.mesh, faces))
 
     def functions_at(self, face: Indices, place: Array, derivative: tuple[int, int] = (0, 0)) -> Array:
         """Functions (k, b) of faces (k,), or a derivative of them, at places (k, 2)."""
@@ -78,8 +84,21 @@ class ContactSurface:
 
     def area_vectors(self, coordinates: Array) -> Array:
         """Outward normals (q, 3) at the quadrature points, as long as the area per area of the coordinates."""
-        first, second = (self.at(coordinates, self.face, self.place, d) for d in ((1, 0), (0, 1)))
+        return self._area_vectors_at(coordinates, self.face, self.place)
+
+    def _area_vectors_at(self, coordinates: Array, face: Indices, place: Array) -> Array:
+        first, second = (self.at(coordinates, face, place, d) for d in ((1, 0), (0, 1)))
         return np.cross(first, second)
+
+    def normals_at(self, coordinates: Array, face: Indices, place: Array) -> Array:
+        """Outward unit normals (k, 3) of faces (k,) at places (k, 2)."""
+        return unit(self._area_vectors_at(coordinates, face, place))
+
+    def centres(self, values: Array) -> Array:
+        """Means (f, c) over the faces of ``values`` (q, c) at the quadrature points."""
+        counts = np.bincount(self.face, minlength=len(self.dofs))
+        sums = [np.bincount(self.face, column, minlength=len(self.dofs)) for column in values.T]
+        return np.column_stack(sums) / counts[:, None]
 
     def positions(self, coordinates: Array) -> Array:
         """The quadrature points (q, 3) where the ``coordinates`` (n, 3) have these coefficients."""
@@ -88,3 +107,23 @@ class ContactSurface:
     def at(self, coordinates: Array, face: Indices, place: Array, derivative: tuple[int, int] = (0, 0)) -> Array:
         """Positions (k, 3), or a derivative of them, on faces (k,) at places (k, 2)."""
         return np.einsum("kb,kbx->kx", self.functions_at(face, place, derivative), coordinates[self.dofs[face]])
+
+
+def unit(vectors: Array) -> Array:
+    """Vectors (k, 3) of length 1."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(float).tiny)
+
+
+def _heights(mesh: Mesh, faces: Indices) -> Array:
+    """Length (f,) of the shortest way, m, from a corner of each of the ``faces`` (f, 2) to one of its cell's others."""
+    heights = np.zeros(len(faces))
+    for block, start in zip(mesh.blocks, mesh.block_starts()[:-1], strict=True):
+        corners = mesh.nodes[block.connectivity[:, : block.type.corners]]
+        for number, local in enumerate(block.type.faces):
+            cell = faces[:, 0] - start
+            rows = np.flatnonzero((cell >= 0) & (cell < len(corners)) & (faces[:, 1] == number))
+            on = [node for node in local if node < block.type.corners]
+            off = np.setdiff1d(np.arange(block.type.corners), on)
+            ways = corners[cell[rows]][:, on, None] - corners[cell[rows]][:, None, off]
+            heights[rows] = np.linalg.norm(ways, axis=3).min(axis=(1, 2))
+    return heights

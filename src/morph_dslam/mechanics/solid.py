@@ -21,7 +21,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from morph_dslam.mechanics.contact import RigidObstacle
+from morph_dslam.mechanics.contact import Contact
 from morph_dslam.mechanics.contact_assembly import ContactAssembly
 from morph_dslam.mechanics.enhanced_assembly import EnhancedAssembly
 from morph_dslam.mechanics.enhanced_strain import EnhancedStrain, takes_enhanced_strain
@@ -113,7 +113,7 @@ class SolidProblem:
         options: SolidOptions | None = None,
         shape: Sequence[ShapeField] = (),
         time: Scalar | None = None,
-        contacts: Sequence[RigidObstacle] = (),
+        contacts: Sequence[Contact] = (),
     ) -> None:
         options = options or SolidOptions()
         self.mesh, self.supports, self.loads, self.options = mesh, tuple(supports), tuple(loads), options
@@ -218,7 +218,7 @@ class SolidProblem:
             self.displacements, self.enhanced, self.shape, self.regions, owners, others, self.symbols
         )
 
-    def _make_contact(self, contacts: Sequence[RigidObstacle]) -> ContactAssembly | None:
+    def _make_contact(self, contacts: Sequence[Contact]) -> ContactAssembly | None:
         if not contacts:
             return None
         moduli = [isotropic_average(region.material.small_strain_stiffness())[1] for region in self.regions]

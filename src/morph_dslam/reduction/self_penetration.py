@@ -1,6 +1,6 @@
 """Where the surface of a deformed solid passes through itself.
 
-The equations of a solid know no contact, so parts of a surface that meet go through one another. A node of the surface
+Without contact in the equations of a solid, parts of a surface that meet go through one another. A node of the surface
 lies inside another part of the solid where the surface winds around it more often than around a point of itself: its
 winding number, the solid angle over 4 pi (van Oosterom & Strackee, The solid angle of a plane triangle, 1983), is that
 of its own corner, between 0 and 1, and 1 more for each part that holds it.
@@ -24,6 +24,8 @@ from morph_dslam.studies.problem import ModelMesh, Snapshot
 Array = NDArray[np.float64]
 #: Parts of a surface may touch if they face each other and are nearer than such a part of what they were.
 NEARER = 0.5
+#: Nodes that are less deep than such a part of the solid's extent only touch.
+TOUCHING = 1e-4
 
 
 def penetration_report(
@@ -43,16 +45,17 @@ def penetration_report(
     surface, states = SurfaceContact(mesh.nodes, mesh.triangles), []
     for solution in solutions:
         found = surface.find(mesh.nodes + solution.fields["displacement"])
-        if len(found.nodes):
-            depth = 1e3 * float(found.depths.max())
-            states.append({"coordinates": solution.coordinates.tolist(), "nodes": len(found.nodes), "depth_mm": depth})
+        deep = found.depths[found.depths > TOUCHING * np.linalg.norm(np.ptp(mesh.nodes, axis=0))]
+        if len(deep):
+            depth = 1e3 * float(deep.max())
+            states.append({"coordinates": solution.coordinates.tolist(), "nodes": len(deep), "depth_mm": depth})
     states.sort(key=lambda state: -state["depth_mm"])
     statement = f"in none of {len(solutions)} solutions the surface passes through itself"
     if states:
         worst = describe_point(parameters, states[0]["coordinates"])
         statement = (
             f"in {len(states)} of {len(solutions)} solutions the surface passes through itself, by "
-            f"{states[0]['depth_mm']:.2g} mm at {worst}: the solver knows no contact"
+            f"{states[0]['depth_mm']:.2g} mm at {worst}; only contact that the study names keeps surfaces apart"
         )
     return {"statement": statement, "checked": len(solutions), "states": states}
 

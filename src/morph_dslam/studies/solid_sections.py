@@ -397,6 +397,17 @@ class _CylinderContact(Section):
         return contact.RigidCylinder(self.on, point, self.axis, radius, self.inside)
 
 
+class _SurfaceContact(Section):
+    """A surface that cannot pass through another, ``against``, or through itself where that is absent."""
+
+    kind: Literal["surface"]
+    on: str
+    against: str | None = None
+
+    def make(self, read: Reader) -> contact.SurfaceContact:
+        return contact.SurfaceContact(self.on, self.against or self.on)
+
+
 SupportSection = Annotated[
     FixedSupport | DisplacementSupport | RotationSupport | FoundationSupport, Field(discriminator="kind")
 ]
@@ -404,4 +415,6 @@ LoadSection = Annotated[
     _TractionLoad | _PressureLoad | BodyForceLoad | GravityLoad | PointLoadSection | MovingPatchLoad | MovingLineLoad,
     Field(discriminator="kind"),
 ]
-ContactSection = Annotated[_PlaneContact | _SphereContact | _CylinderContact, Field(discriminator="kind")]
+ContactSection = Annotated[
+    _PlaneContact | _SphereContact | _CylinderContact | _SurfaceContact, Field(discriminator="kind")
+]

@@ -158,6 +158,7 @@ class SolidStudy(BodyStudy, Section):
         """The mesh, checked together with the sets that the study names."""
         mesh = make_mesh(self.mesh)  # type: ignore[arg-type]
         held = [part.on for part in (*self.supports, *self.couplings, *self.contacts)]
+        held += [part.against for part in self.contacts if part.kind == "surface" and part.against]
         regions = [material.on for material in self.materials.values()]
         for load in self.loads:
             if isinstance(load, BodyForceLoad):

@@ -29,7 +29,7 @@ DIVERGED = 10.0
 #: A step damped further has stalled.
 SMALLEST_DAMPING = 1.0 / 64.0
 #: Where points begin or cease to touch on the way, the simplified correction may be so much larger than the update.
-GROWTH_IN_CONTACT = 3.0
+GROWTH_IN_CONTACT = 100.0
 #: A tangent is kept where so many more corrections with it should do, judged by the last two ...
 MOST_CHORDS = 4
 #: ... and these end at this part of the tolerance.

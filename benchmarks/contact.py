@@ -1,0 +1,88 @@
+"""Contact: Hertz's sphere, and a seal whose folds touch.
+
+The seal is half of examples/boot_seal with coarser cells, turned by 52 degrees with and without contact of its surfaces
+with themselves; its depth is that of the deepest node that the certificate would name.
+Run: python benchmarks/contact.py
+"""
+
+from __future__ import annotations
+
+import time
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import morph_dslam as md
+from morph_dslam.extend.mechanics import (
+    LinearElastic,
+    ParameterSymbols,
+    PrescribedDisplacement,
+    RigidSphere,
+    advance,
+    block,
+    fixed,
+    model_mesh_of,
+)
+from morph_dslam.extend.reduction import penetration_report
+from morph_dslam.extend.studies import Snapshot
+
+SEAL = Path(__file__).resolve().parents[1] / "examples" / "boot_seal" / "study.toml"
+YOUNG, POISSON, RADIUS, DEPTH = 1e6, 0.3, 1.0, 0.0025
+
+
+def hertz(cells: int) -> tuple[float, float]:
+    """Radius of contact and peak pressure of a sphere on a block, over Hertz's for the same force."""
+    mesh = block((1.0, 1.0, 1.0), (cells, cells, cells), "hex8")
+    shares = np.where([True, True, False], mesh.nodes, 1.0 - mesh.nodes)
+    graded = 0.015 * np.sinh(np.arcsinh(1.0 / 0.015) * shares)
+    mesh = replace(mesh, nodes=np.where([True, True, False], graded, 1.0 - graded))
+    symbols = ParameterSymbols([md.Parameter("depth", "length", "m", 0.0, 0.01, 0.0)])
+    sphere = RigidSphere("z_max", (0.0, 0.0, 1.0 + RADIUS - symbols["depth"]), RADIUS)
+    supports = [fixed("z_min"), PrescribedDisplacement("x_min", x=0.0), PrescribedDisplacement("y_min", y=0.0)]
+    solid = {"all": LinearElastic(young=YOUNG, poisson=POISSON)}
+    problem = md.SolidProblem(mesh, solid, supports, [], symbols, contacts=[sphere])
+    state = advance(problem, problem.initial_state(), np.array([DEPTH]))[-1]
+    force = 4.0 * problem.reactions(state.dofs, state.mu, "z_min")[0][2]
+    radius = (3.0 * force * RADIUS * (1.0 - POISSON**2) / (4.0 * YOUNG)) ** (1.0 / 3.0)
+    pressed = -problem.contact_forces(state.dofs, state.mu, 0)[2]
+    square = pressed @ (problem.displacements.coefficients @ mesh.nodes[:, 0] ** 2) / pressed.sum()
+    centre = np.argmin(np.linalg.norm(mesh.nodes - [0.0, 0.0, 1.0], axis=1))
+    peak = -problem.sample(state.dofs, state.mu)["stress"][centre, 2]
+    return np.sqrt(5.0 * square) / radius, peak / (3.0 * force / (2.0 * np.pi * radius**2))
+
+
+def seal(contact: bool) -> tuple[float, float]:
+    """Depth (mm) of the deepest node of half a seal inside another part of it at 52 degrees, and seconds."""
+    study = tomllib.loads(SEAL.read_text())
+    study["mesh"] |= {"divisions": [51, 2, 12], "angles": ["0 deg", "180 deg"]}
+    study["supports"] += [{"kind": "displacement", "on": cut, "y": "0 mm"} for cut in ("start", "end")]
+    study["solver"] = {"threads": 1}
+    if contact:
+        study["contacts"] = [{"kind": "surface", "on": "outer"}, {"kind": "surface", "on": "inner"}]
+    problem = md.make_study(study).problem()  # type: ignore[union-attr]
+    begin, state = time.perf_counter(), problem.initial_state()
+    for angle in np.radians(np.arange(4.0, 52.1, 4.0)):
+        state = advance(problem, state, np.array([angle]))[-1]
+    seconds = time.perf_counter() - begin
+    mesh = model_mesh_of(problem.mesh)
+    solution = Snapshot(state.mu, {"displacement": problem.nodal_displacement(state.dofs)})
+    report = penetration_report(mesh, problem.symbols.parameters, [solution])
+    assert report is not None
+    print(f"{len(mesh.nodes)} nodes, {seconds:.1f} s: {report['statement']}", flush=True)
+    return max((found["depth_mm"] for found in report["states"]), default=0.0), seconds
+
+
+def main() -> None:
+    radius, peak = hertz(16)
+    print(f"hertz: radius {radius:.4f}, peak pressure {peak:.4f} of the closed form's", flush=True)
+    (deepest, without), (depth, seconds) = seal(False), seal(True)
+    print(
+        f"hertz_radius={radius:.4f} hertz_peak={peak:.4f} seal_depth_mm={depth:.4f} "
+        f"seal_depth_without_mm={deepest:.3f} time_ratio={seconds / without:.2f}"
+    )
+
+
+if __name__ == "__main__":
+    main()
