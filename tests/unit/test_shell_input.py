@@ -110,6 +110,13 @@ def test_a_shell_that_can_turn_is_refused():
         shell_study(text).problem()
 
 
+def test_a_shell_that_falls_is_refused():
+    text = STRIP.replace('kind = "clamped", on = "x_min"', 'kind = "displacement", on = "x_min", x = "0 m", z = "0 m"')
+    text = text.replace("poisson = 0.3", 'poisson = 0.3, density = "1 g/cm3"') + 'loads = [{ kind = "gravity" }]'
+    with pytest.raises(StudyError, match="free to move along y: fix a set"):
+        shell_study(text).problem()
+
+
 @pytest.mark.parametrize("cells", surface_generators.SURFACES)
 @pytest.mark.parametrize("slit", [False, True])
 def test_generators_make_the_true_area(cells, slit):

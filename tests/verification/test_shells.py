@@ -13,6 +13,7 @@ from tests.support.shells import (
     HEMISPHERE_STUDY,
     SLIT_PLATE,
     SLIT_PLATE_STUDY,
+    shell_study,
     solved_shell,
 )
 
@@ -267,6 +268,20 @@ def test_derivatives_by_a_parameter(loaded):
         np.testing.assert_allclose(slope[0], difference, atol=2e-4 * np.abs(difference).max())
 
 
+def test_the_support_listed_first_holds_an_edge():
+    """A clamp of the same edges, listed after a plane of symmetry, changes nothing."""
+    plane = '{ kind = "symmetry", on = "x_min", axis = "x" }, { kind = "fixed", on = "x_min" }'
+    text = """
+        mesh = { generator = "plate", size = ["40 mm", "20 mm"], divisions = [2, 1] }
+        shell = { thickness = "1 mm" }
+        material = { young = "1 GPa", poisson = 0.3 }
+        supports = [%s]
+        loads = [{ kind = "pressure", pressure = "1 kPa" }]
+    """
+    alone, both = (solved_shell(text % s) for s in (plane, plane + ', { kind = "clamped", on = "x_min" }'))
+    np.testing.assert_allclose(both.field("displacement"), alone.field("displacement"), atol=1e-12)
+
+
 def test_reactions_balance_the_loads():
     """Force and moment of a clamped edge, against those of a point load at its deformed place."""
     shell = solved_shell("""
@@ -281,3 +296,29 @@ def test_reactions_balance_the_loads():
     force, moment = shell.problem.reactions(shell.state.dofs, shell.state.mu, "x_min", np.zeros(3))
     np.testing.assert_allclose(force, -load, atol=1e-9)
     np.testing.assert_allclose(moment, -np.cross(place, load), atol=1e-7)
+
+
+@pytest.mark.slow
+def test_a_cloth_hung_by_two_corners():
+    """It swings down from level to rest: its weight is on the corners, and its middle hangs below them."""
+    study = shell_study("""
+        mesh = { generator = "plate", size = ["0.55 m", "0.55 m"], divisions = [4, 4] }
+        shell = { thickness = "0.5 mm" }
+        material = { young = "1 MPa", poisson = 0.3, density = "400 kg/m3" }
+        loads = [{ kind = "gravity", acceleration = ["0 m/s2", "0 m/s2", "-9.81 m/s2"] }]
+        supports = [{ kind = "fixed", on = "left" }, { kind = "fixed", on = "right" }]
+        [sets]
+        left.nearest = ["0 m", "0.55 m", "0 m"]
+        right.nearest = ["0.55 m", "0.55 m", "0 m"]
+    """)
+    sweep = study.sweep_problem()
+    snapshot = sweep.take_snapshot(sweep.first_state())
+    weight = 400.0 * 0.5e-3 * 0.55**2 * 9.81
+    for corner in ("left", "right"):
+        assert snapshot.outputs[f"force_{corner}"][2] == pytest.approx(weight / 2.0, rel=1e-6)
+    assert snapshot.outputs["negative_pivots"] == 0
+    place = study.model_mesh().nodes + snapshot.fields["displacement"]
+    lowest = place[np.argmin(place[:, 2])]
+    assert lowest[2] < -0.5
+    # Its middle hangs straight below the line between the corners.
+    assert np.average(place, axis=0, weights=study.model_mesh().weights)[1] == pytest.approx(0.55, abs=2e-3)

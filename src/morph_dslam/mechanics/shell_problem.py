@@ -100,12 +100,14 @@ class ShellProblem(SolidProblem):
         self.constraints = Constraints(self.displacements, self.shape, self.supports, self.symbols)
         directed = [support for support in self.supports if isinstance(support, HoldsDirection)]
         axes = self._edge_directions([support.on for support in directed])
-        self.constraints.check_rigid_motions(np.hstack([np.zeros(axes.shape), axes]))
+        hanging = any(isinstance(load, Gravity) for load in self.loads)
+        self.constraints.check_rigid_motions(np.hstack([np.zeros(axes.shape), axes]), hanging)
         self._state = ngs.GridFunction(self.space)
-        held = [(support, self.geometry.edge_numbers(support.on)) for support in directed]
+        self._drag, self._anchor = ngs.Parameter(0.0), ngs.GridFunction(self.displacements.vector)
+        held = self._held_edges(directed)
         self._normals = AveragedNormals(self.geometry.ngs, self.options.order - 1, self._state.components[0], held)
         self.assembly = _ShellAssembly(self.space, self._terms(), self.symbols, self.refresh_normals)
-        self._held_rotations = {support.on: self._rotation_dofs(edges) for support, edges in held}
+        self._held_rotations = self._rotation_dofs([edge for _, edges in held for edge in edges])
         self.free: NDArray[np.bool_] = self._free_dofs()
         scale = np.full(self.n_dofs, np.inf)
         scale[: 3 * self.displacements.n_scalar] = self.length
@@ -119,6 +121,16 @@ class ShellProblem(SolidProblem):
         ends = np.concatenate([np.empty((0, 2), dtype=np.int64), *(self.geometry.edges_on(name) for name in sets)])
         along = self.mesh.nodes[ends[:, 1]] - self.mesh.nodes[ends[:, 0]]
         return along / np.linalg.norm(along, axis=1, keepdims=True)
+
+    def _held_edges(self, supports: Sequence[HoldsDirection]) -> list[tuple[HoldsDirection, list[int]]]:
+        """The edges whose direction each support holds; the one listed first has those that two name."""
+        taken, result = set(), []
+        for support in supports:
+            edges = [edge for edge in self.geometry.edge_numbers(support.on) if edge not in taken]
+            taken.update(edges)
+            if edges:
+                result.append((support, edges))
+        return result
 
     def _make_space(self) -> ngs.FESpace:
         mesh, order = self.geometry.ngs, self.options.order - 1
@@ -166,6 +178,8 @@ class ShellProblem(SolidProblem):
             Term(bending, everywhere, bonus),
             Term(hinge, everywhere, bonus, on_rims=True),
         ]
+        moved = unknowns.displacement - self._anchor
+        terms.append(Term(0.5 * self._drag * (moved * moved), everywhere, bonus))
         at_points, test = Kinematics(unknowns.displacement, self.shape), self.space.TestFunction()[0]
         for support in self.supports:
             if isinstance(support, ElasticFoundation):
@@ -192,9 +206,19 @@ class ShellProblem(SolidProblem):
 
     def _free_dofs(self) -> NDArray[np.bool_]:
         free = super()._free_dofs()
-        for dofs in self._held_rotations.values():
-            free[dofs] = False
+        free[self._held_rotations] = False
         return free
+
+    @property
+    def area(self) -> float:
+        """Of the undeformed shell, m2."""
+        return ngs.Integrate(ngs.CF(1.0) * ngs.ds, self.geometry.ngs)
+
+    def set_drag(self, drag: float, x: Array) -> None:
+        """Tie the shell to its solution ``x`` (n,) by ``drag``, a force per area and displacement; 0 lets it go."""
+        self._drag.Set(drag)
+        self._anchor.vec.FV().NumPy()[:] = x[: 3 * self.displacements.n_scalar]
+        self._latest = None
 
     def refresh_normals(self, x: Array) -> None:
         """Average the edge normals at the solution ``x`` (n,), at the parameters' present values."""

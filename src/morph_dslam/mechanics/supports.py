@@ -117,10 +117,13 @@ class Constraints:
         moments = np.cross(arm_slopes, f.T) + np.cross(arms, f_slopes.transpose(0, 2, 1))
         return f_slopes @ constant, moments.sum(axis=1)
 
-    def check_rigid_motions(self, others: Array) -> None:
+    def check_rigid_motions(self, others: Array, hanging: bool = False) -> None:
         """Refuse supports that leave the body free to move as a whole (StudyError).
 
-        ``others`` (k, 6) are what else is held, by the share of each of `rigid_modes` in it.
+        Parameters
+        ----------
+        others : (k, 6) what else is held, by the share of each of `rigid_modes` in it.
+        hanging : whether its weight may hold a body that can turn: only translations are looked at.
         """
         modes = self.rigid_modes()
         rows = [modes[self.held.reshape(3, -1)], others]
@@ -133,8 +136,9 @@ class Constraints:
             else:
                 rows.append(at_nodes.reshape(-1, 6))
         held = np.concatenate(rows)
-        _, sizes, vectors = np.linalg.svd(held.T @ held)
-        free = vectors[sizes < FREE_MOTION**2 * max(len(held), 1)]
+        looked_at = 3 if hanging else 6
+        _, sizes, vectors = np.linalg.svd(held[:, :looked_at].T @ held[:, :looked_at])
+        free = np.pad(vectors[sizes < FREE_MOTION**2 * max(len(held), 1)], ((0, 0), (0, 6 - looked_at)))
         if len(free):
             raise StudyError(
                 f"the supports leave the body free to {_describe(free)}: fix a set, or give it a foundation"

@@ -6,12 +6,26 @@ from typing import Any
 
 import numpy as np
 
+from morph_dslam.errors import SolverError
+from morph_dslam.mechanics.shell_problem import ShellProblem
+from morph_dslam.mechanics.solvers.continuation import loaded_state
+from morph_dslam.mechanics.solvers.relaxation import relaxed_state
 from morph_dslam.studies.problem import Snapshot
 from morph_dslam.studies.solid_sweep import SolidSweep, support_reactions
 
 
 class ShellSweep(SolidSweep):
     """Solves a shell at one parameter point after another (`morph_dslam.studies.problem.SweepProblem`)."""
+
+    problem: ShellProblem
+
+    def first_state(self) -> Any:
+        """Equilibrium at the parameters' defaults: all loads grown together, or else where the shell comes to rest."""
+        mu = self.problem.symbols.default
+        try:
+            return self._with_slopes(loaded_state(self.problem, mu))
+        except SolverError:
+            return self._with_slopes(relaxed_state(self.problem, mu, self.problem.area))
 
     def take_snapshot(self, state: Any) -> Snapshot:
         """Displacement, stresses of both faces and their slopes, reactions, and the tangent's negative pivots."""
