@@ -1,5 +1,8 @@
-"""From a shell's study to a model file and its summary."""
+"""From a shell's study to a model file, its summary, and the tracking of a simulated film."""
 
+import shutil
+
+import h5py
 import numpy as np
 import pytest
 
@@ -8,6 +11,7 @@ from morph_dslam.mechanics.solvers.continuation import loaded_state
 from morph_dslam.model import load_model
 from morph_dslam.studies.build import build
 from morph_dslam.studies.study import load_study
+from tests.support.scenes import film_and_track, write_scene
 
 STUDY = """
 name = "arch"
@@ -26,6 +30,21 @@ divisions = [1, 4]
 
 [parameters.turn]
 range = ["-5 deg", "5 deg"]
+"""
+
+
+FILM = """
+[[parameters]]
+frame = 0
+turn = -4.0
+[[parameters]]
+frame = 4
+turn = 4.0
+
+[[pose]]
+frame = 0
+position_mm = [0, 0, 220]
+rotation_deg = [-90, 0, 0]
 """
 
 
@@ -59,3 +78,14 @@ def test_the_model_is_the_shell(folder):
 def test_the_model_is_summed_up(folder, capsys):
     assert cli.main(["info", str(folder / "arch.morph")]) == 0
     assert "stress, top face" in capsys.readouterr().out
+
+
+def test_the_shell_is_filmed_and_tracked(folder, tmp_path):
+    """Its outer side has the print; the parameter comes back from the film."""
+    shutil.copy(folder / "arch.morph", tmp_path / "sheet.morph")
+    scene = write_scene(tmp_path, tail=FILM)
+    summary, _, run = film_and_track(scene, tmp_path / "sheet.morph")
+    assert summary["n_tracked"] == 5
+    with h5py.File(run / "result.h5") as file:
+        found = np.degrees(file["parameters"][:, 0])
+    np.testing.assert_allclose(found[[0, -1]], [-4.0, 4.0], atol=0.1)

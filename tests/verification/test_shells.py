@@ -4,6 +4,7 @@ import meshio
 import numpy as np
 import pytest
 
+from morph_dslam.mechanics.solvers.buckling import buckling_modes
 from morph_dslam.mechanics.solvers.newton import sensitivities
 from morph_dslam.meshing.surface_generators import plate
 from tests.support.shells import (
@@ -322,3 +323,31 @@ def test_a_cloth_hung_by_two_corners():
     assert lowest[2] < -0.5
     # Its middle hangs straight below the line between the corners.
     assert np.average(place, axis=0, weights=study.model_mesh().weights)[1] == pytest.approx(0.55, abs=2e-3)
+
+
+def test_the_euler_load_of_a_clamped_strip():
+    """4 pi^2 E I / L^2, reached by moving one clamped end towards the other by the strain that it means."""
+    length, thickness = 0.3, 2e-3
+    shell = solved_shell("""
+        mesh = { generator = "plate", size = ["300 mm", "20 mm"], divisions = [8, 1] }
+        shell = { thickness = "2 mm" }
+        material = { young = "5 GPa", poisson = 0.0 }
+        parameters = { push = { range = ["0 mm", "1 mm"] } }
+        [[supports]]
+        kind = "clamped"
+        on = "x_min"
+        [[supports]]
+        kind = "rotation"
+        on = "x_max"
+        axis = [0, 1, 0]
+        angle = "0 deg"
+        translation = ["-1 * push", "0 mm", "0 mm"]
+    """)
+    (mode,) = buckling_modes(shell.problem, shell.state, parameter=0, step=1e-6)
+    strain = 4.0 * np.pi**2 * thickness**2 / 12.0 / length**2
+    assert mode.change == pytest.approx(strain * length, rel=5e-3)
+    shape = shell.problem.nodal_displacement(mode.shape)
+    along = shell.problem.mesh.nodes[:, 0]
+    np.testing.assert_allclose(
+        shape[:, 2], shape[:, 2].max() * (1.0 - np.cos(2 * np.pi * along / length)) / 2.0, atol=2e-3
+    )
