@@ -23,6 +23,7 @@ from morph_dslam.registration.guess import load_guess
 from morph_dslam.registration.picture import load_picture
 from morph_dslam.render.scene_file import load_scene_file
 from morph_dslam.studies.affine import read_affine
+from morph_dslam.studies.defaults import resolve_defaults
 from morph_dslam.studies.external import ExternalStudy, read_table
 from morph_dslam.studies.sheet_study import SheetStudy
 from morph_dslam.studies.shell_study import ShellStudy
@@ -211,6 +212,9 @@ def test_a_ball_that_presses_on_a_block():
     study |= tomllib.loads(samples("solid-study", "toml")[3])
     made = make_study(study)
     assert isinstance(made, SolidStudy)
+    assert resolve_defaults(made).reduction.method == "pod"
+    with pytest.raises(StudyError, match="begin to touch"):
+        resolve_defaults(make_study(study | {"reduction": {"method": "galerkin"}}))
     problem = made.problem()
     state = advance(problem, problem.initial_state(), np.array([0.004, 0.04, 0.06]))[-1]
     below = problem.mesh.nodes + problem.nodal_displacement(state.dofs)

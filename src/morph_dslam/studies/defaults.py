@@ -19,8 +19,9 @@ FIRST, HELD_OUT = 5, 16
 def resolve_defaults(study: Study) -> Study:
     """The study with its method of reduction and its scheme of sampling chosen.
 
-    Solids with several parameters are reduced by "galerkin", everything else by "pod"; Galerkin models, and those of
-    one parameter, are sampled adaptively, up to ``sampling.training`` solves, unless the study has another scheme.
+    Solids with several parameters are reduced by "galerkin" where their equations can be projected, everything else by
+    "pod"; Galerkin models, and those of one parameter, are sampled adaptively, up to ``sampling.training`` solves, unless
+    the study has another scheme.
 
     Raises
     ------
@@ -46,6 +47,8 @@ def _why_no_equations(study: Study) -> str | None:
         return "the equations of shells are not projected"
     if study.couplings:
         return "the rigid motions of couplings are not projected"
+    if study.contacts:
+        return "where points begin to touch, projected equations need not converge"
     return None if study.time is None else "the memory of a viscoelastic solid is not projected"
 
 
