@@ -36,7 +36,6 @@ def test_hemisphere_with_a_hole():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cells", ["quad9", "tri6"])
-@pytest.mark.slow
 def test_slit_annular_plate(cells):
     shell = solved_shell(SLIT_PLATE_STUDY.format(across=4, around=32, cells=cells)).at(1.0)
     end = shell.problem.mesh.set_nodes("end")
