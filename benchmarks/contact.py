@@ -26,7 +26,7 @@ from morph_dslam.extend.mechanics import (
     model_mesh_of,
 )
 from morph_dslam.extend.reduction import penetration_report
-from morph_dslam.extend.studies import Snapshot
+from morph_dslam.extend.studies import Snapshot, SolidStudy
 
 SEAL = Path(__file__).resolve().parents[1] / "examples" / "boot_seal" / "study.toml"
 YOUNG, POISSON, RADIUS, DEPTH = 1e6, 0.3, 1.0, 0.0025
@@ -61,7 +61,9 @@ def seal(contact: bool) -> tuple[float, float]:
     study["solver"] = {"threads": 1}
     if contact:
         study["contacts"] = [{"kind": "surface", "on": "outer"}, {"kind": "surface", "on": "inner"}]
-    problem = md.make_study(study).problem()  # type: ignore[union-attr]
+    made = md.make_study(study)
+    assert isinstance(made, SolidStudy)
+    problem = made.problem()
     begin, state = time.perf_counter(), problem.initial_state()
     for angle in np.radians(np.arange(4.0, 52.1, 4.0)):
         state = advance(problem, state, np.array([angle]))[-1]
