@@ -20,8 +20,8 @@ def resolve_defaults(study: Study) -> Study:
     """The study with its method of reduction and its scheme of sampling chosen.
 
     Solids with several parameters are reduced by "galerkin" where their equations can be projected, everything else by
-    "pod". Galerkin models, and those of one parameter, are sampled adaptively, up to ``sampling.training`` solves, where
-    the study has no other scheme.
+    "pod". Galerkin models, and those of one parameter, are sampled adaptively, up to ``sampling.training`` solves,
+    where the study has no other scheme.
 
     Raises
     ------
