@@ -265,6 +265,28 @@ BENCHMARKS = {
         "elements of third order",
         lines=2,
     ),
+    "contact": Benchmark(
+        "Mechanics",
+        "Contact: Hertz, a seal that touches itself, and what kinks cost",
+        "python benchmarks/contact.py",
+        "Hertz's closed form; depths by the check of the certificate; finite element solutions for the reduced models",
+        lines=5,
+        about="The reduced models, of 40 solutions each, are of a ball that presses at any place on a block of coarse "
+        "cells, once always touching and once from 4 mm above it.",
+    ),
+    "shells": Benchmark(
+        "Mechanics",
+        "Shells beside published solutions",
+        "python benchmarks/shells.py cantilever hemisphere slit_plate",
+        "published: tables of Sze, Liu and Lo (2004), as public repositories have them",
+    ),
+    "shells_pinched": Benchmark(
+        "Mechanics",
+        "A pinched half cylinder beside published solutions",
+        "python benchmarks/shells.py pinched",
+        "published: the table of Sze, Liu and Lo (2004), as public repositories have it",
+        lines=11,
+    ),
     "boot_seal_felupe": Benchmark(
         "Mechanics",
         "The solver beside felupe",
