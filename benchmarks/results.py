@@ -89,6 +89,17 @@ BENCHMARKS = {
         3,
         ABOUT_FORCE,
     ),
+    "rubber_identify": Benchmark(
+        "Real objects",
+        "The rubber's law from one specimen, the force of another from its video",
+        "python examples/rubber_tension/identify.py --data DIR",
+        "measured: forces of a testing machine, at the stroke of a clamp that moves evenly",
+        RUBBER,
+        lines=8,
+        about="Both constants are identified from the force curve of the specimen with long notches up to 10 mm of "
+        "stroke. Chosen with both curves in sight: that the law is Mooney and Rivlin's, and that the stroke counts "
+        "from the pictures at rest; the last figure is the largest error without that.",
+    ),
     "rubber_black": Benchmark(
         "Real objects",
         "Black rubber, by its outline alone",

@@ -96,3 +96,12 @@ def test_a_real_crack_is_named_when_it_grows():
     found = dict(re.findall(r"(\w+)=(-?[\d.]+)", done.stdout.splitlines()[-1]))
     # Seen by eye in the pictures, and the force falls after the last of these frames.
     assert 82 <= int(found["crack_frame"]) <= 98
+
+
+@pytest.mark.slow
+def test_the_law_of_one_specimen_predicts_the_force_of_another_from_its_video():
+    done = run_example("rubber_tension", "--data", str(real_data("rubber_tension")), program="identify.py")
+    assert done.returncode == 0, done.stderr[-2000:]
+    found = dict(re.findall(r"(\w+)=([+-]?[\d.]+)", done.stdout.splitlines()[-1]))
+    assert abs(float(found["largest_percent"])) <= 5.0
+    assert int(found["frames"]) >= 80
