@@ -48,7 +48,7 @@ def sequence(tmp_path_factory):
     folder = tmp_path_factory.mktemp("chain")
     scene = write_scene(folder, "frames = 16\n", MOTION, CAMERA)
     assert cli.main(["simulate", str(scene), "-o", str(folder / "seq")]) == 0
-    assert cli.main(track_command(folder)) == 0
+    assert cli.main(track_command(folder, "--frame-log", str(folder / "frames.jsonl"))) == 0
     return folder
 
 
@@ -80,6 +80,16 @@ def test_the_commands_in_a_row_find_the_truth(sequence, capsys):
     truth = np.load(sequence / "seq" / "truth.npz")
     assert np.abs(parameters[:, 0] - truth["parameters"][:, 0]).max() < 2e-3  # arch, m
     assert np.abs(poses[:, :3, 3] - truth["camera_from_object"][:, :3, 3]).max() < 3e-3  # m
+
+
+def test_the_frame_log_has_a_line_for_each_frame(sequence):
+    rows = [json.loads(line) for line in (sequence / "frames.jsonl").read_text().splitlines()]
+    with h5py.File(sequence / "run" / "result.h5") as file:
+        assert [row["frame"] for row in rows] == file["frame"][()].tolist()
+        assert [row["status"] for row in rows] == file["status"].asstr()[()].tolist()
+        for key, name in (("camera_from_object", "camera_from_object"), ("largest_von_mises", "largest_von_mises")):
+            np.testing.assert_array_equal([row[key] for row in rows], file[name][()])
+        np.testing.assert_array_equal([list(row["parameters"].values()) for row in rows], file["parameters"][()])
 
 
 def test_bad_input_is_one_message(sequence, tmp_path, refused):

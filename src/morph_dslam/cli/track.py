@@ -158,6 +158,7 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
         output=arguments.output,
         overwrite=arguments.overwrite,
         video=not arguments.no_video,
+        frame_log=arguments.frame_log,
         drawing=DrawOptions(arguments.show, section, arguments.forces),
         **more,
     )
@@ -277,3 +278,9 @@ def add_tracking_arguments(command: argparse.ArgumentParser) -> None:
     )
     add_range(command, "frames to track, of a recording")
     add_flag(command, "--no-video", "do not draw the augmented video")
+    add_file(
+        command,
+        "--frame-log",
+        "write a line of JSON for each frame as soon as it is tracked (docs/run-folder.md)",
+        "FILE",
+    )

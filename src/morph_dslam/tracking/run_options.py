@@ -63,6 +63,7 @@ class TrackOptions(ObjectOptions):
     video : whether to draw the augmented video.
     drawing : what is drawn.
     overwrite : whether to replace a run that is in the folder.
+    frame_log : file that gets a line of JSON for each frame of the first object as soon as it is tracked.
     """
 
     frames: Path | str
@@ -83,6 +84,7 @@ class TrackOptions(ObjectOptions):
     video: bool = True
     drawing: DrawOptions = field(default_factory=DrawOptions)
     overwrite: bool = False
+    frame_log: Path | None = None
 
     @property
     def objects(self) -> tuple[ObjectOptions, ...]:

@@ -27,6 +27,7 @@ from morph_dslam.tracking.combinations import check_depth, check_inputs, check_o
 from morph_dslam.tracking.discrepancy import DiscrepancyFit, Reference, refine_discrepancy
 from morph_dslam.tracking.drawing import AugmentedView, write_video
 from morph_dslam.tracking.frame_estimation import temporal_facts
+from morph_dslam.tracking.frame_log import FrameLog
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.placement import (
     FramesAt,
@@ -188,7 +189,8 @@ class _Job:
         sharpens = {part.name: run.live and part.options.pose == "still" for part in placed}
         self._again = {p.name: Sharpening(p) if sharpens[p.name] else Reregistration(p) for p in placed}
         self._times, self._seen = LiveTimes(), {part.name: [] for part in placed}
-        sinks: list[Sink] = [*self._folders]
+        self._log = None if run.frame_log is None else FrameLog(run.frame_log, self._folders[0])
+        sinks: list[Sink] = [*self._folders, *([] if self._log is None else [self._log])]
         screens = self._screens(stack) if run.live else []
         if run.live:
             sinks += [self._times, *screens]
@@ -212,7 +214,11 @@ class _Job:
             for folder, part in zip(self._folders, self._placed, strict=True):
                 folder.start_again(part.new_results(refined=isinstance(part.object.start, Landmarks)), part.camera)
             self._views = [AugmentedView(part.model, part.camera, run.drawing, part.inner) for part in self._placed]
-            new_session(self._placed, self._source, self._folders).run(progress=True)
+            sinks: list[Sink] = [*self._folders]
+            if self._log is not None:
+                self._log.start_again()
+                sinks.append(self._log)
+            new_session(self._placed, self._source, sinks).run(progress=True)
 
     def write(self, number: int, tell: Tell) -> dict[str, Any]:
         """Write the run folder of one object, the video last because it takes longest; returns the summary."""
