@@ -26,6 +26,10 @@ from morph_dslam.mechanics.materials.base import (
     log_volume as log_volume,
     right_cauchy_green as right_cauchy_green,
 )
+from morph_dslam.mechanics.materials.catalogue import (
+    CataloguedMaterial as CataloguedMaterial,
+    material_catalogue as material_catalogue,
+)
 from morph_dslam.mechanics.materials.isotropic import (
     Gent as Gent,
     LinearElastic as LinearElastic,
@@ -38,6 +42,7 @@ from morph_dslam.mechanics.materials.isotropic import (
     first_invariant as first_invariant,
     second_invariant as second_invariant,
 )
+from morph_dslam.mechanics.materials.library import constant_quantities as constant_quantities, laws as laws
 from morph_dslam.mechanics.materials.viscoelastic import Prony as Prony
 from morph_dslam.mechanics.parameters import ParameterSymbols as ParameterSymbols
 from morph_dslam.mechanics.solid import SolidOptions as SolidOptions
@@ -51,6 +56,7 @@ from morph_dslam.mechanics.supports import (
     fixed as fixed,
 )
 from morph_dslam.meshing.generators import Profile as Profile, block as block, revolution as revolution, tube as tube
+from morph_dslam.meshing.inp_writing import save_mesh as save_mesh
 from morph_dslam.meshing.mesh_checks import check_mesh as check_mesh
 from morph_dslam.meshing.mesh_files import load_mesh as load_mesh
 from morph_dslam.meshing.meshes import CellBlock as CellBlock, Mesh as Mesh, model_mesh_of as model_mesh_of

@@ -1,0 +1,94 @@
+"""Materials with measured constants and their sources, for those who have not tested their own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class CataloguedMaterial:
+    """A material as a study's section [materials.NAME] states it, and where its constants come from.
+
+    Attributes
+    ----------
+    name : what it is called in a study.
+    title : for people.
+    section : keys and values of the section.
+    source : publication or data sheet.
+    note : how far the constants hold.
+    """
+
+    name: str
+    title: str
+    section: Mapping[str, Any]
+    source: str
+    note: str
+
+    def content(self) -> dict[str, Any]:
+        """All of it as plain JSON."""
+        return asdict(self) | {"section": dict(self.section)}
+
+
+def material_catalogue() -> tuple[CataloguedMaterial, ...]:
+    """The materials that are known, from hard to soft within each kind."""
+    return _CATALOGUE
+
+
+_TENSILE = (
+    "constants fitted here to the pull-to-failure test of L. Marechal et al., Soft Robotics 8, 284 (2021), "
+    "github.com/LucMarechal/Soft-Robotics-Materials-Database"
+)
+_BULK = "Bulk modulus chosen, 1000 times the shear modulus."
+_FIRST_LOADING = f"First loading in tension, up to three times the length. {_BULK}"
+
+_CATALOGUE: tuple[CataloguedMaterial, ...] = (
+    CataloguedMaterial(
+        name="natural_rubber",
+        title="Natural rubber (Treloar)",
+        section={
+            "law": "ogden",
+            "moduli": ["0.4095 MPa", "0.003 MPa", "0.01 MPa"],
+            "exponents": [1.3, 5.0, -2.0],
+            "bulk": "422.5 MPa",
+        },
+        source="R. W. Ogden, Proc. R. Soc. Lond. A 326, 565 (1972), fitted to tests of L. R. G. Treloar (1944)",
+        note=f"Stretches up to 7. Moduli are half of Ogden's times his exponents. {_BULK}",
+    ),
+    CataloguedMaterial(
+        name="sylgard_184",
+        title="PDMS, Sylgard 184, cured at 25 °C",
+        section={"law": "mooney_rivlin", "c10": "0.22 MPa", "bulk": "440 MPa"},
+        source="I. D. Johnston et al., J. Micromech. Microeng. 24, 035017 (2014)",
+        note=f"Young's modulus 1.32 MPa, up to 40 % strain; 2.97 MPa if cured at 200 °C. {_BULK}",
+    ),
+    CataloguedMaterial(
+        name="mold_star_16",
+        title="Mold Star 16 FAST",
+        section={"law": "yeoh", "c10": "42 kPa", "c20": "2.6 kPa", "bulk": "84 MPa"},
+        source=_TENSILE,
+        note=_FIRST_LOADING,
+    ),
+    CataloguedMaterial(
+        name="dragon_skin_10",
+        title="Dragon Skin 10 MEDIUM",
+        section={"law": "yeoh", "c10": "22.5 kPa", "c20": "2.1 kPa", "bulk": "45 MPa", "density": "1070 kg/m3"},
+        source=_TENSILE,
+        note=_FIRST_LOADING,
+    ),
+    CataloguedMaterial(
+        name="ecoflex_00_50",
+        title="Ecoflex 00-50",
+        section={"law": "yeoh", "c10": "10.4 kPa", "c20": "0.267 kPa", "bulk": "20.8 MPa", "density": "1070 kg/m3"},
+        source=_TENSILE,
+        note=_FIRST_LOADING,
+    ),
+    CataloguedMaterial(
+        name="ecoflex_00_30",
+        title="Ecoflex 00-30",
+        section={"law": "yeoh", "c10": "7.54 kPa", "c20": "0.13 kPa", "bulk": "15.1 MPa"},
+        source=_TENSILE,
+        note=_FIRST_LOADING,
+    ),
+)
