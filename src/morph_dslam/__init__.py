@@ -50,6 +50,7 @@ _MODULES = {
     "map_scene": "slam.scene",
     "open_live": "sources",
     "open_source": "sources",
+    "open_studio": "studio.server",
     "register": "registration.register",
     "register_board": "registration.board_registration",
     "register_landmarks": "registration.landmarks",
@@ -93,6 +94,7 @@ if TYPE_CHECKING:  # the same for editors and type checkers
     from morph_dslam.sources.frames import Frame as Frame
     from morph_dslam.studies.build import build as build
     from morph_dslam.studies.study import load_study as load_study, make_study as make_study
+    from morph_dslam.studio.server import open_studio as open_studio
     from morph_dslam.tracking.options import TrackerOptions as TrackerOptions
     from morph_dslam.tracking.outcomes import Status as Status, TrackingWarning as TrackingWarning
     from morph_dslam.tracking.result import FrameResult as FrameResult

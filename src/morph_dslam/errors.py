@@ -96,3 +96,7 @@ class ExportError(MorphError):
 
 class ExploreError(MorphError):
     """A model cannot be shown at the port that was asked for."""
+
+
+class StudioError(MorphError):
+    """`morph studio` cannot start, or a request asks for what the project cannot give."""

@@ -97,9 +97,9 @@ class Page:
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
-    def wait_for(self, expression):
+    def wait_for(self, expression, seconds=_SECONDS):
         """Wait until an expression is true."""
-        end = time.monotonic() + _SECONDS
+        end = time.monotonic() + seconds
         while not self.evaluate(expression):
             assert time.monotonic() < end, f"{expression} did not become true; {self.problems}"
             time.sleep(0.02)
@@ -110,6 +110,50 @@ class Page:
             ("mousePressed", start, 1), ("mouseMoved", end, 1), ("mouseReleased", end, 0),
         ):  # fmt: skip
             self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=held, clickCount=1)
+
+    def click_at(self, x, y, modifiers=0):
+        """Click a place in page pixels."""
+        for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
+            button = {} if kind == "mouseMoved" else {"button": "left", "clickCount": 1}
+            self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, modifiers=modifiers, **button)
+
+    def middle_of(self, selector):
+        """Where an element's middle is after it was scrolled into view, page pixels."""
+        self.wait_for(f"document.querySelector({selector!r}) !== null")
+        return self.evaluate(
+            f"(e => {{ e.scrollIntoView({{block: 'center'}}); const r = e.getBoundingClientRect();"
+            f" return [r.left + r.width / 2, r.top + r.height / 2]; }})(document.querySelector({selector!r}))"
+        )
+
+    def click(self, selector):
+        """Click the middle of an element once it is there and enabled."""
+        self.wait_for(
+            f"document.querySelector({selector!r})?.disabled === false"
+            f" || document.querySelector({selector!r})?.disabled === undefined"
+        )
+        self.click_at(*self.middle_of(selector))
+
+    def enter(self, selector, text):
+        """Type a text into an input, in place of what it holds."""
+        self.middle_of(selector)
+        self.evaluate(f"(e => {{ e.focus(); e.select(); }})(document.querySelector({selector!r}))")
+        self.send("Input.insertText", text=text)
+        self.evaluate("document.activeElement.blur()")
+
+    def choose(self, selector, value):
+        """Choose an option of a select by its value."""
+        self.wait_for(f"document.querySelector({selector!r}) !== null")
+        self.evaluate(
+            f"(e => {{ e.value = {value!r}; e.dispatchEvent(new Event('change', {{bubbles: true}})); }})"
+            f"(document.querySelector({selector!r}))"
+        )
+
+    def drop(self, selector, *paths):
+        """Drop files on an element."""
+        x, y = self.middle_of(selector)
+        data = {"items": [], "files": [str(path) for path in paths], "dragOperationsMask": 1}
+        for kind in ("dragEnter", "dragOver", "drop"):
+            self.send("Input.dispatchDragEvent", type=kind, x=x, y=y, data=data)
 
     def screenshot(self):
         """The page as an image (h, w, 3), blue, green, red."""

@@ -47,7 +47,7 @@ class _ColourField:
     top: float
 
 
-class _ModelSurface:
+class ModelSurface:
     """The visible surface of a reduced model, evaluated for one state after the other.
 
     Attributes
@@ -134,20 +134,31 @@ _FILES = {
 }  # fmt: skip
 
 
-class _BadRequest(Exception):
+class BadRequest(Exception):
     """What the page asked for cannot be answered."""
 
 
-class _Answers:
-    """Answers to the page's requests, without the network: (content type, content) for a path."""
+class ModelPages:
+    """Answers to the page's requests, without the network: (content type, content) for a path.
+
+    Attributes
+    ----------
+    surface : of the model.
+    """
 
     def __init__(self, model: ReducedModel) -> None:
-        self._model, self._surface = model, _ModelSurface(model)
-        self._model_json = json.dumps(self._surface.description()).encode()
-        self._shape = self._surface.shape()
+        self._model, self.surface = model, ModelSurface(model)
+        self._model_json = json.dumps(self.surface.description()).encode()
+        self._shape = self.surface.shape()
 
     def answer(self, target: str) -> tuple[str, bytes] | None:
-        """The answer to a request's path and query, None where there is nothing."""
+        """The answer to a request's path and query, None where there is nothing.
+
+        Raises
+        ------
+        BadRequest
+            If the query describes no state of the model.
+        """
         url = urlsplit(target)
         if url.path in _FILES:
             name = _FILES[url.path]
@@ -164,9 +175,9 @@ class _Answers:
 
     def _state(self, query: dict[str, str]) -> bytes:
         try:
-            return self._surface.state(self._parameters(query["mu"]), query["field"])
+            return self.surface.state(self._parameters(query["mu"]), query["field"])
         except KeyError as error:
-            raise _BadRequest(f"{error} is missing, or no field of this model") from error
+            raise BadRequest(f"{error} is missing, or no field of this model") from error
 
     def _parameters(self, text: str) -> NDArray[np.float64]:
         """The values (d,) of "1.5,20" in the parameters' units as SI, within their ranges."""
@@ -175,16 +186,16 @@ class _Answers:
             given = zip(model.parameters, text.split(",") if text else [], strict=True)
             mu = np.array([to_si(float(value), p.unit, p.quantity) for p, value in given])
         except ValueError as error:
-            raise _BadRequest(f"'{text}' is not {len(model.parameters)} numbers") from error
+            raise BadRequest(f"'{text}' is not {len(model.parameters)} numbers") from error
         if not np.isfinite(mu).all():
-            raise _BadRequest(f"'{text}' holds values that are not finite")
+            raise BadRequest(f"'{text}' holds values that are not finite")
         return np.clip(mu, model.lower, model.upper)
 
 
 class _Handler(LocalHandler):
     protocol_version = "HTTP/1.1"
 
-    def __init__(self, answers: _Answers, *arguments) -> None:
+    def __init__(self, answers: ModelPages, *arguments) -> None:
         self._answers = answers
         super().__init__(*arguments)
 
@@ -192,7 +203,7 @@ class _Handler(LocalHandler):
         status = HTTPStatus.OK
         try:
             answer = self._answers.answer(self.path)
-        except _BadRequest as error:
+        except BadRequest as error:
             status, answer = HTTPStatus.BAD_REQUEST, ("text/plain; charset=utf-8", str(error).encode())
         if answer is None:
             self.send_error(HTTPStatus.NOT_FOUND)
@@ -204,7 +215,7 @@ class _Handler(LocalHandler):
 
 def make_server(model: ReducedModel, port: int) -> LocalServer:
     """A server for one model; ``port`` 0 takes any free one."""
-    return local_server(port, partial(_Handler, _Answers(model)), ExploreError, "--port")
+    return local_server(port, partial(_Handler, ModelPages(model)), ExploreError, "--port")
 
 
 def explore(model: str | Path | ReducedModel, port: int = 8765, open_browser: bool = False) -> None:

@@ -28,11 +28,11 @@ export class SolidView {
     const material = new THREE.MeshLambertMaterial({
       map: colourTexture(colours), side: THREE.DoubleSide, flatShading: true,
     });
-    const surface = new THREE.Mesh(this.geometry, material);
-    surface.frustumCulled = false; // its bounding sphere is that of another state
+    this.surface = new THREE.Mesh(this.geometry, material);
+    this.surface.frustumCulled = false; // its bounding sphere is that of another state
     this.rest = this.restShape(nodes, triangles);
     this.scene = new THREE.Scene();
-    this.scene.add(surface, this.rest, new THREE.AmbientLight(0xffffff, 0.6 * Math.PI));
+    this.scene.add(this.surface, this.rest, new THREE.AmbientLight(0xffffff, 0.6 * Math.PI));
     this.renderer = new THREE.WebGLRenderer({ antialias: true });
     this.renderer.setClearColor(0x5a646f);
     container.append(this.renderer.domElement);

@@ -1,0 +1,234 @@
+"""The start: the object placed by clicked pairs of a point on the mesh and a pixel, and what is drawn over an image.
+
+These functions run in the worker process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam import Camera, ReducedModel, load_camera, load_model, register_landmarks
+from morph_dslam.errors import StudioError
+from morph_dslam.explorer.server import BadRequest, ModelPages
+from morph_dslam.extend.geometry import RigidTransform
+from morph_dslam.extend.registration import Landmarks, bind_landmarks, load_landmarks, save_landmarks
+from morph_dslam.studio.packing import packed
+from morph_dslam.units import from_si
+
+Array = NDArray[np.float64]
+#: Pairs that a page may send.
+MOST_PAIRS = 500
+#: Fewer pairs than these do not give a pose.
+FEWEST_PAIRS = 4
+
+
+def stamp(path: Path) -> tuple[int, int]:
+    """What changes when a file is written again; zeros if there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return 0, 0
+    return found.st_mtime_ns, found.st_size
+
+
+@lru_cache(maxsize=1)
+def _model(path: Path, seal: tuple[int, int]) -> ReducedModel:
+    return load_model(path)
+
+
+@lru_cache(maxsize=2)
+def _camera(path: Path, seal: tuple[int, int]) -> Camera:
+    return load_camera(path)
+
+
+def opened_model(path: Path) -> ReducedModel:
+    """A model file, read once."""
+    return _model(path, stamp(path))
+
+
+def opened_camera(path: Path) -> Camera:
+    """A camera file, read once."""
+    return _camera(path, stamp(path))
+
+
+def camera_facts(path: Path) -> dict[str, Any]:
+    """What a page shows of a camera."""
+    camera = opened_camera(path)
+    return {
+        "width": camera.width,
+        "height": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "distortion": list(camera.distortion),
+        "lens": camera.lens_model,
+    }
+
+
+def model_facts(path: Path) -> dict[str, Any]:
+    """Name, sizes, errors and parameters of a model; ``factor`` turns SI into a parameter's own unit."""
+    model = opened_model(path)
+    parameters = [
+        {
+            "name": p.name,
+            "description": p.description,
+            "unit": "" if p.unit == "1" else p.unit,
+            "factor": from_si(1.0, p.unit, p.quantity),
+            "lower": p.lower,
+            "upper": p.upper,
+            "default": p.default,
+        }
+        for p in model.parameters
+    ]
+    return {
+        "name": model.name,
+        "nodes": len(model.nodes),
+        "parameters": parameters,
+        "has_stress": bool(model.stresses),
+        "supports": sorted(model.supports),
+    }
+
+
+def model_surface(path: Path) -> bytes:
+    """The undeformed surface of a model: ``nodes`` (n, 3) in metres and ``triangles`` (t, 3)."""
+    model = opened_model(path)
+    used, corners = _surface(model)
+    return packed({"name": model.name}, nodes=model.nodes[used], triangles=corners)
+
+
+def _surface(model: ReducedModel) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Nodes (n,) of the surface, and its triangles (t, 3) of positions among them."""
+    used, corners = np.unique(model.triangles, return_inverse=True)
+    return used, corners.reshape(-1, 3)
+
+
+def fit_clicks(model_path: Path, camera_path: Path, pairs: Sequence[Sequence[float]], at_rest: bool) -> bytes:
+    """The pose and the parameters that pairs give, how well each pair fits, and the overlay.
+
+    Parameters
+    ----------
+    model_path, camera_path : files.
+    pairs : (k, 5) millimetres on the undeformed object, then pixels of the image as recorded.
+    at_rest : whether the object is undeformed in the image.
+
+    Returns
+    -------
+    Facts: ``residuals_px`` (k,), ``rms_px``, ``worst`` position, ``parameters`` in SI, ``warnings``; and what
+    `overlay` returns. Without a fit, ``message`` says why.
+    """
+    landmarks = _landmarks(pairs)
+    missing = FEWEST_PAIRS - len(pairs)
+    if missing > 0:
+        return packed({"message": f"click {missing} more pair{'s' if missing > 1 else ''}"})
+    model, camera = opened_model(model_path), opened_camera(camera_path)
+    found = register_landmarks(model, camera, landmarks, at_rest=at_rest)
+    positions = _positions_of(model, landmarks.points, found.state.parameters)
+    seen = camera.project_recorded(found.state.camera_from_object.apply(positions))
+    residuals = np.linalg.norm(seen - landmarks.pixels, axis=1)
+    facts = {
+        "residuals_px": residuals.tolist(),
+        "rms_px": float(np.sqrt(np.mean(residuals**2))),
+        "worst": int(residuals.argmax()),
+        "parameters": dict(zip((p.name for p in model.parameters), found.state.parameters.tolist(), strict=True)),
+        "warnings": [warning.text for warning in found.warnings],
+    }
+    return _overlay(model_path, camera, found.state.parameters, found.state.camera_from_object, facts)
+
+
+def _landmarks(pairs: Sequence[Sequence[float]]) -> Landmarks:
+    try:
+        table = np.array(pairs, dtype=np.float64).reshape(-1, 5)
+    except (TypeError, ValueError, OverflowError):
+        raise StudioError("pairs are lists of five numbers: x, y, z in millimetres, u, v in pixels") from None
+    if len(table) > MOST_PAIRS or not np.isfinite(table).all():
+        raise StudioError(f"pairs are at most {MOST_PAIRS}, of finite numbers")
+    return Landmarks(1e-3 * table[:, :3], np.ascontiguousarray(table[:, 3:]))
+
+
+def _positions_of(model: ReducedModel, points: Array, mu: Array) -> Array:
+    """Deformed positions (k, 3) of points near the undeformed surface, by `register_landmarks`'s own binding."""
+    bound = bind_landmarks(model, points)
+    return bound.rest + bound.field.value(mu)
+
+
+def overlay(model_path: Path, camera_path: Path, parameters: Sequence[float], pose: Sequence[Sequence[float]]) -> bytes:
+    """A model over an image, as recorded.
+
+    Parameters
+    ----------
+    model_path, camera_path : files.
+    parameters : (d,) SI.
+    pose : (4, 4) camera_from_object, metres.
+
+    Returns
+    -------
+    ``pixels`` (n, 2) of the surface's nodes, ``order`` (t,) of its triangles that face the camera, from the farthest to
+    the nearest, ``values`` (n,) von Mises stress in MPa or displacement in mm, ``displacement`` (n, 3) in metres.
+    """
+    transform = RigidTransform.from_matrix(np.array(pose, dtype=np.float64))
+    return _overlay(model_path, opened_camera(camera_path), np.array(parameters), transform, {})
+
+
+def _overlay(path: Path, camera: Camera, mu: Array, camera_from_object: RigidTransform, facts: dict[str, Any]) -> bytes:
+    model = opened_model(path)
+    used, triangles = _surface(model)
+    displacement = model.displacement.value(mu)[used]
+    points = camera_from_object.apply(model.nodes[used] + displacement)
+    pixels = camera.project_recorded(points)
+    corners = points[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    centres = corners.mean(axis=1)
+    seen = np.isfinite(pixels[triangles]).all(axis=(1, 2))
+    if model.cells:  # only solids have a back
+        seen &= np.einsum("tx,tx->t", normals, centres) < 0.0
+    order = np.flatnonzero(seen)[np.argsort(-centres[seen, 2])]
+    if model.stresses:
+        values, unit = 1e-6 * model.von_mises(mu)[used], "MPa"
+    else:
+        values, unit = 1e3 * np.linalg.norm(displacement, axis=1), "mm"
+    return packed(
+        facts | {"unit": unit, "top": _top(path), "largest": float(values.max())},
+        pixels=np.nan_to_num(pixels),
+        order=order,
+        values=values,
+        displacement=displacement,
+    )
+
+
+@lru_cache(maxsize=1)
+def _pages(path: Path, seal: tuple[int, int]) -> ModelPages:
+    return ModelPages(_model(path, seal))
+
+
+def explore_answer(path: Path, target: str) -> tuple[str, bytes] | None:
+    """What `morph explore` answers to a path and query (content type, content), None where it has nothing."""
+    try:
+        return _pages(path, stamp(path)).answer(target)
+    except BadRequest as error:
+        raise StudioError(str(error)) from error
+
+
+def _top(path: Path) -> float:
+    """The end of the colours, one for the whole box as in `morph explore`."""
+    fields = {field.unit: field.top for field in _pages(path, stamp(path)).surface.fields}
+    return fields.get("MPa", fields["mm"])
+
+
+def save_clicks(pairs: Sequence[Sequence[float]], target: Path) -> None:
+    """Write pairs as the file of landmarks that `morph track` takes."""
+    save_landmarks(target, _landmarks(pairs))
+
+
+def read_clicks(path: Path) -> list[list[float]]:
+    """Pairs of a file of landmarks; empty if there is none."""
+    if not path.is_file():
+        return []
+    found = load_landmarks(path)
+    return np.column_stack([1e3 * found.points, found.pixels]).tolist()

@@ -1,0 +1,102 @@
+"""Who may ask: a browser that was given the token, by this server's own name, from this server's own pages."""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+from collections.abc import Iterable
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers, QueryParams
+from starlette.requests import cookie_parser
+from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from morph_dslam.io.local_server import HOST
+
+_COOKIE = "morph_studio"
+_SAFE = ("GET", "HEAD")
+#: Bytes of a request that is no upload.
+MOST_BODY = 4_000_000
+
+
+def new_token() -> str:
+    """A token that cannot be guessed."""
+    return secrets.token_urlsafe(24)
+
+
+class Gate:
+    """Lets requests through to an application if they carry the token, and adds headers that keep others out.
+
+    The token comes once in the address (``?token=...``), which sets a cookie for this server alone. Then the cookie is
+    asked for. A page from elsewhere can neither read the address nor send the cookie; a name of its own for this
+    address, or a request from its pages, is refused too.
+
+    Parameters
+    ----------
+    application : behind the gate.
+    token : of this run of the server.
+    hosts : names that the server is asked by, beside those of this computer.
+    policy : Content-Security-Policy of all answers that have none of their own.
+    """
+
+    def __init__(self, application: ASGIApp, token: str, hosts: Iterable[str], policy: str) -> None:
+        self._application, self._token, self._policy = application, token, policy
+        self._hosts = {HOST, "localhost", *hosts}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request, or refuse it."""
+        if scope["type"] == "lifespan":
+            await self._application(scope, receive, send)
+            return
+        if scope["type"] != "http":
+            return
+        refusal = self._refusal(scope)
+        await (refusal or self._application)(scope, receive, self._with_headers(send))
+
+    def _refusal(self, scope: Scope) -> Response | None:
+        headers, query = Headers(scope=scope), QueryParams(scope.get("query_string", b""))
+        if _hostname(f"//{headers.get('host', '')}") not in self._hosts:
+            return PlainTextResponse("this server is not known by that name", 403)
+        origin = headers.get("origin")
+        if origin is not None and origin != f"{scope['scheme']}://{headers['host']}":
+            return PlainTextResponse("pages from elsewhere are not answered", 403)
+        given = query.get("token")
+        if given is not None and self._is_token(given) and scope["method"] in _SAFE and scope["path"] == "/":
+            answer = RedirectResponse("/", 303)
+            answer.set_cookie(
+                f"{_COOKIE}_{headers['host'].rpartition(':')[2]}", self._token, httponly=True, samesite="strict"
+            )
+            return answer
+        cookies = cookie_parser(headers.get("cookie", ""))
+        if not self._is_token(cookies.get(f"{_COOKIE}_{headers['host'].rpartition(':')[2]}", "")):
+            return PlainTextResponse("open the address that `morph studio` printed: it carries the token", 401)
+        if scope["method"] not in _SAFE and origin is None:
+            return PlainTextResponse("a change must come from the studio's own page", 403)
+        return None
+
+    def _is_token(self, given: str) -> bool:
+        return hmac.compare_digest(given.encode(), self._token.encode())
+
+    def _with_headers(self, send: Send) -> Send:
+        async def guarded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                known = {name.lower() for name, _ in message["headers"]}
+                extra = {
+                    b"x-content-type-options": b"nosniff",
+                    b"referrer-policy": b"no-referrer",
+                    b"cache-control": b"no-store",
+                    b"cross-origin-resource-policy": b"same-origin",
+                    b"content-security-policy": self._policy.encode(),
+                }
+                message["headers"] = [*message["headers"], *((k, v) for k, v in extra.items() if k not in known)]
+            await send(message)
+
+        return guarded
+
+
+def _hostname(address: str) -> str | None:
+    try:
+        return urlsplit(address).hostname
+    except ValueError:  # brackets that close nothing
+        return None

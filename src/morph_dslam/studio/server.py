@@ -1,0 +1,102 @@
+"""`morph studio`: the server, and what it prints when it begins."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import webbrowser
+from pathlib import Path
+
+import uvicorn
+
+from morph_dslam.errors import StudioError
+from morph_dslam.io.local_server import HOST
+from morph_dslam.studio.app import make_app
+from morph_dslam.studio.gate import new_token
+from morph_dslam.studio.project import Project
+from morph_dslam.studio.steps import Steps
+
+
+class StudioServer:
+    """The studio of one project, not yet running.
+
+    Parameters
+    ----------
+    folder : of the project; it is made.
+    port : 0 takes any free one.
+    host : address to listen at; that of this computer alone by default.
+
+    Attributes
+    ----------
+    address : with the token, to be opened in a browser.
+
+    Raises
+    ------
+    StudioError
+        If the folder cannot be made, or the address cannot be taken.
+    """
+
+    def __init__(self, folder: str | Path, port: int = 8766, host: str = HOST) -> None:
+        project, self.token = Project(folder), new_token()
+        self._socket = _listening(host, port)
+        self.port = int(self._socket.getsockname()[1])
+        hosts = () if host == HOST else (host, socket.gethostname())
+        config = uvicorn.Config(
+            make_app(Steps(project), self.token, hosts), log_level="error", access_log=False, server_header=False,
+            ws="none", lifespan="on", timeout_graceful_shutdown=2,
+        )  # fmt: skip
+        self._server = uvicorn.Server(config)
+        shown = socket.gethostname() if host in ("0.0.0.0", "::") else host
+        self.address = f"http://{shown}:{self.port}/?token={self.token}"
+
+    def run(self) -> None:
+        """Answer until the process is interrupted, or `stop`."""
+        self._server.run(sockets=[self._socket])
+
+    @property
+    def started(self) -> bool:
+        """Whether it answers."""
+        return self._server.started
+
+    def stop(self) -> None:
+        """End `run`, from another thread."""
+        self._server.should_exit = True
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    try:
+        listening = socket.create_server((host, port), backlog=64)
+    except (OSError, OverflowError) as error:
+        raise StudioError(
+            f"{host}:{port} cannot be taken ({error}); choose another with --port; --port 0 takes any free one"
+        ) from error
+    return listening
+
+
+def open_studio(folder: str | Path = ".", port: int = 8766, host: str = HOST, open_browser: bool = False) -> None:
+    """Serve the studio of a project until it is interrupted.
+
+    Parameters
+    ----------
+    folder : of the project; it is made.
+    port : 0 takes any free one.
+    host : address to listen at; that of this computer alone by default.
+    open_browser : whether to open the page at once.
+
+    Raises
+    ------
+    StudioError
+        If the folder cannot be made, or the address cannot be taken.
+    """
+    server = StudioServer(folder, port, host)
+    print(f"the studio of {Path(folder).resolve()} is at {server.address} (Ctrl-C ends it)", flush=True)
+    if open_browser:
+        webbrowser.open(server.address)
+    # uvicorn ends on Ctrl-C and raises it again; the studio's own answer to it is to end quietly.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        server.run()
+    except KeyboardInterrupt:
+        print()
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,90 @@
+// Camera: the recording, and the camera's intrinsics from a file, a board, or a guess.
+
+import { call, frame, upload } from './server.js';
+import { choice, command, digits, dropZone, el, facts, field, title } from './parts.js';
+import { ImageView } from './overlay.js';
+
+const PICTURES = '.png,.jpg,.jpeg,.bmp,.tif,.tiff';
+const VIDEOS = '.mp4,.mov,.avi,.mkv,.webm,.m4v';
+const isPicture = (file) => PICTURES.split(',').some((ending) => file.name.toLowerCase().endsWith(ending));
+
+export async function cameraStep(app) {
+  const recording = el('div');
+  const camera = el('div');
+  const board = el('input', { id: 'board', value: '9x6' });
+  const square = el('input', { id: 'square', value: '25 mm' });
+  const lens = choice('lens', [['radial-tangential', 'normal'], ['fisheye', 'fisheye']]);
+  let boards = app.state.files.includes('board') ? 'Pictures of the board are there.' : 'No pictures yet.';
+  const boardNote = el('p', { className: 'note' }, boards);
+  app.panel.append(
+    ...title('Camera', 'The video of the object, and what is known of the camera that took it.'),
+    el('h3', { style: 'margin-top: 8px' }, 'Recording'),
+    dropZone('drop-recording', 'Drop a video, or numbered images', 'MP4, MOV, AVI, MKV, WebM; PNG, JPEG', `${VIDEOS},${PICTURES}`,
+      (files) => app.doing(async () => {
+        if (isPicture(files[0])) {
+          await call('forget_frames', { folder: 'frames' });
+          for (const [i, file] of files.entries()) {
+            app.message(`uploading image ${i + 1} of ${files.length}`);
+            await upload('frame', file);
+          }
+        } else await upload('recording', files[0]);
+        await refresh();
+      })),
+    recording,
+    el('h3', {}, 'Intrinsics'),
+    dropZone('drop-camera', 'Drop a camera file', 'of this program, OpenCV, ROS, Kalibr, COLMAP', '.yaml,.yml,.txt',
+      ([file]) => app.doing(async () => { await upload('camera', file); await refresh(); })),
+    camera,
+    el('details', {}, el('summary', {}, 'Calibrate with a checkerboard'),
+      dropZone('drop-board', 'Drop 15 to 30 pictures of the board', 'or a slow video of it', `${VIDEOS},${PICTURES}`,
+        (files) => app.doing(async () => {
+          await call('forget_frames', { folder: 'board' });
+          for (const file of files) await upload('board', file);
+          boardNote.textContent = `${files.length} file${files.length > 1 ? 's' : ''} uploaded.`;
+        })),
+      boardNote,
+      el('div', { className: 'row' }, field('Inner corners', board), field('Square', square), field('Lens', lens)),
+      el('button', { id: 'calibrate', onclick: () => app.doing(() => call('calibrate',
+        { board: board.value, square: square.value, lens: lens.value })) }, 'Calibrate'),
+      command('morph calibrate board -o camera.yaml')),
+    el('details', {}, el('summary', {}, 'Guess from a photograph'),
+      el('p', { className: 'note' }, 'A photograph of the same phone says its focal length. Good for a first look, not for measurements.'),
+      dropZone('drop-photo', 'Drop a photograph', 'JPEG straight from the phone', '.jpg,.jpeg', ([file]) => app.doing(async () => {
+        await call('guess_camera', { photo: await upload('photo', file) });
+        await refresh();
+      }))),
+    el('button', { id: 'to-start', onclick: () => app.show('start') }, 'Next: start'),
+  );
+
+  async function refresh() { await app.refresh(); await draw(); }
+
+  async function draw() {
+    const { state } = app;
+    const found = state.recording;
+    recording.replaceChildren();
+    if (found?.message) recording.append(el('p', { className: 'problem' }, found.message));
+    else if (found) {
+      recording.append(facts([['File', state.choices.recording], ['Frames', `${found.frames}, from ${found.first}`],
+        ['Size', `${found.width} × ${found.height}`], ['Rate', `${digits(found.fps, 3)} a second`]]));
+      const container = el('div', { className: 'fill' });
+      app.view.replaceChildren(container, el('span', { className: 'tag' }, `frame ${found.first}`));
+      new ImageView(container).setImage(await frame(found.first));
+    } else app.view.replaceChildren(el('div', { className: 'empty' }, 'The first frame appears here.'));
+    const one = state.camera;
+    camera.replaceChildren();
+    if (one?.message) camera.append(el('p', { className: 'problem' }, one.message));
+    else if (one) {
+      camera.append(facts([['From', state.choices.camera_from ?? 'camera.yaml'], ['Size', `${one.width} × ${one.height}`],
+        ['Focal length', `${digits(one.fx)}, ${digits(one.fy)} px`], ['Centre', `${digits(one.cx)}, ${digits(one.cy)} px`],
+        ['Distortion', one.distortion.length ? one.distortion.map((k) => digits(k, 3)).join(', ') : 'none']]));
+      if (state.choices.camera_note) camera.append(el('p', { className: 'warning note' }, state.choices.camera_note));
+      if (found && !found.message && (found.width !== one.width || found.height !== one.height)) {
+        camera.append(el('p', { className: 'problem' }, 'The camera file is for images of another size than the recording\'s.'));
+      }
+      camera.append(command('writes camera.yaml'));
+    }
+  }
+
+  await draw();
+  return { job: (job, ended) => { if (ended && job.kind === 'calibrate') app.doing(draw); } };
+}

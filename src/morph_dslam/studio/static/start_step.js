@@ -1,0 +1,149 @@
+// Start: pairs of a point on the mesh and a pixel place the object in one frame.
+
+import { call, explored, frame } from './server.js';
+import { check, command, digits, dropZone, el, facts, title } from './parts.js';
+import { MeshView } from './mesh_view.js';
+import { ImageView, colourBar } from './overlay.js';
+import { upload } from './server.js';
+
+const GOOD = '#0f6e8c';
+const WORST = '#b3261e';
+const PENDING = '#f08c00';
+const PLAIN = Array(256).fill([40, 170, 200]); // of an undeformed object, which has no stress
+
+export async function startStep(app) {
+  app.panel.append(...title('Start', 'Click a point on the mesh and the same point in the image, four pairs or more.'));
+  const { recording, camera, done } = app.state;
+  if (!done.build || !recording || recording.message || !camera || camera.message) {
+    app.panel.append(el('p', { className: 'problem' }, 'This step needs the model, the recording and the camera.'));
+    return {};
+  }
+  const [mesh, known, model, { colours }] = await Promise.all([
+    call('model_mesh'), call('start_files'), call('model'), explored('model.json')]);
+  const first = recording.first;
+  const last = recording.first + recording.frames - 1;
+  let pairs = known.pairs;
+  let pending = { point: null, pixel: null };
+  let fitted = null;
+  let saved = pairs.length > 0;
+  let number = known.frame ?? first;
+
+  const left = el('div', {}, el('span', { className: 'tag' }, 'image'));
+  const right = el('div', {}, el('span', { className: 'tag' }, 'undeformed model'));
+  const imagePlace = el('div', { className: 'fill', id: 'start-image' });
+  const meshPlace = el('div', { className: 'fill', id: 'start-mesh' });
+  left.append(imagePlace);
+  right.append(meshPlace, el('p', { className: 'hint' }, 'Drag turns or shifts, wheel zooms, click sets a point.'));
+  app.view.append(el('div', { className: 'split' }, left, right));
+  const image = new ImageView(imagePlace, (pixel) => { pending.pixel = pixel; paired(); });
+  const faces = Int32Array.from({ length: mesh.triangles.length / 3 }, (_, i) => i);
+  const solid = new MeshView(meshPlace, mesh.nodes, mesh.triangles, faces, ({ point }) => { pending.point = point; paired(); });
+  imagePlace.view = image;
+  meshPlace.view = solid;
+
+  const atRest = el('input', { id: 'at-rest', checked: known.at_rest, onchange: () => fit() });
+  const frameInput = el('input', { id: 'frame', type: 'range', min: first, max: last, value: number });
+  const frameText = el('output', { className: 'fixed' }, String(number));
+  const opacity = el('input', { id: 'opacity', type: 'range', min: 0, max: 1, step: 0.05, value: image.opacity,
+    oninput: () => { image.opacity = opacity.valueAsNumber; image.draw(); } });
+  const list = el('ul', { className: 'list', id: 'pairs' });
+  const result = el('div', { id: 'fit' });
+  const save = el('button', { id: 'save-start', className: 'main', onclick: () => app.doing(async () => {
+    await call('save_start', { pairs, frame: number, at_rest: atRest.checked });
+    saved = true;
+    await app.refresh();
+    draw();
+  }) }, 'Save');
+  frameInput.addEventListener('input', () => { frameText.textContent = frameInput.value; });
+  frameInput.addEventListener('change', () => app.doing(async () => {
+    number = Number(frameInput.value);
+    image.setImage(await frame(number));
+    saved = false;
+    draw();
+  }));
+  app.panel.append(
+    el('div', { className: 'row' }, el('span', { className: 'fixed' }, 'Frame'), frameInput, frameText),
+    check('The object is undeformed in this frame', atRest),
+    list, result,
+    el('div', { className: 'row' }, el('span', { className: 'fixed' }, 'Overlay'), opacity),
+    el('div', { className: 'row' }, save, el('button', { id: 'clear', onclick: () => { pairs = []; fit(); } }, 'Clear')),
+    command('writes landmarks.csv'),
+    el('details', {}, el('summary', {}, 'Use a file of landmarks'),
+      dropZone('drop-landmarks', 'Drop landmarks.csv', 'x_mm, y_mm, z_mm, u_px, v_px', '.csv', ([file]) => app.doing(async () => {
+        await upload('landmarks', file);
+        pairs = (await call('start_files')).pairs;
+        await call('save_start', { pairs, frame: number, at_rest: atRest.checked });
+        await app.refresh();
+        await fit();
+      }))),
+    el('button', { id: 'to-track', onclick: () => app.show('track') }, 'Next: track'),
+  );
+
+  function paired() {
+    if (pending.point && pending.pixel) {
+      pairs = [...pairs, [...pending.point.map((x) => Math.round(1e6 * x) / 1e3), ...pending.pixel]];
+      pending = { point: null, pixel: null };
+      fit();
+    } else draw();
+  }
+
+  // Clicks that come while one is fitted are fitted together when it is done.
+  let fitting = false;
+  let again = false;
+  async function fit() {
+    saved = false;
+    draw();
+    again = true;
+    if (fitting) return;
+    fitting = true;
+    while (again) {
+      again = false;
+      const began = performance.now();
+      try {
+        fitted = await call('fit', { pairs, at_rest: atRest.checked });
+        fitted.ms = performance.now() - began;
+      } catch (error) {
+        fitted = { message: error.message, refused: true };
+      }
+    }
+    fitting = false;
+    draw();
+  }
+
+  function draw() {
+    const worst = fitted?.residuals_px ? fitted.worst : -1;
+    const errors = fitted?.residuals_px ?? [];
+    const colour = (i) => (i === worst && errors.length > 4 ? WORST : GOOD);
+    image.marks = pairs.map(([, , , u, v], i) => ({ pixel: [u, v], colour: colour(i), label: String(i + 1) }));
+    if (pending.pixel) image.marks.push({ pixel: pending.pixel, colour: PENDING });
+    image.setOverlay(fitted, mesh.triangles, atRest.checked ? PLAIN : colours);
+    const points = pairs.map(([x, y, z], i) => ({ point: [x / 1000, y / 1000, z / 1000], colour: colour(i) }));
+    if (pending.point) points.push({ point: pending.point, colour: PENDING });
+    solid.mark(points);
+    list.replaceChildren(...pairs.map((pair, i) => el('li', {},
+      el('span', {}, `${i + 1}  `, el('small', {}, `${pair.slice(0, 3).map((x) => digits(x)).join(', ')} mm`)),
+      el('small', { className: i === worst && errors.length > 4 ? 'problem' : '' }, errors[i] === undefined ? '' : `${errors[i].toFixed(2)} px`),
+      el('button', { className: 'plain', title: 'take out', onclick: () => { pairs.splice(i, 1); fit(); } }, '✕'))));
+    const waiting = pending.point ? 'Now click the same point in the image.' : pending.pixel ? 'Now click the same point on the mesh.' : '';
+    if (waiting) result.replaceChildren(el('p', { className: 'warning' }, waiting));
+    else if (!fitted) result.replaceChildren();
+    else if (fitted.message) result.replaceChildren(el('p', { className: fitted.refused ? 'problem' : 'note' }, fitted.message));
+    else {
+      const values = model.parameters.map((p) => [p.name, `${digits(fitted.parameters[p.name] * p.factor)} ${p.unit}`]);
+      result.replaceChildren(facts([['Error, rms', `${fitted.rms_px.toFixed(2)} px`],
+        ['Worst pair', `${fitted.worst + 1}, ${errors[fitted.worst].toFixed(2)} px`],
+        ...(atRest.checked ? [] : values), ['Fitted in', `${Math.round(fitted.ms)} ms`]]),
+      ...fitted.warnings.map((one) => el('p', { className: 'warning note' }, one)));
+    }
+    left.querySelector('.bar')?.remove();
+    if (fitted?.pixels && !atRest.checked) left.append(colourBar(colours, fitted));
+    save.disabled = !fitted?.pixels || saved;
+    save.textContent = saved && pairs.length ? 'Saved' : 'Save';
+    result.dataset.pairs = fitting ? '' : String(pairs.length);
+  }
+
+  image.setImage(await frame(number));
+  if (pairs.length) { const was = saved; await fit(); saved = was; }
+  draw();
+  return {};
+}

@@ -1,0 +1,123 @@
+// The frame of the studio: steps, the command that runs, messages.
+
+import * as server from './server.js';
+import { el, time } from './parts.js';
+import { objectStep } from './object_step.js';
+import { studyStep } from './study_step.js';
+import { buildStep } from './build_step.js';
+import { cameraStep } from './camera_step.js';
+import { startStep } from './start_step.js';
+import { trackStep } from './track_step.js';
+import { resultsStep } from './results_step.js';
+
+const STEPS = [
+  ['object', 'Object', objectStep], ['study', 'Study', studyStep], ['build', 'Build', buildStep],
+  ['camera', 'Camera', cameraStep], ['start', 'Start', startStep], ['track', 'Track', trackStep],
+  ['results', 'Results', resultsStep],
+];
+
+class Studio {
+  constructor() {
+    this.panel = document.getElementById('panel');
+    this.view = document.getElementById('view');
+    this.frames = [];
+    this.open = {};
+  }
+
+  async start() {
+    await this.refresh();
+    server.listen({ job: (job) => this.takeJob(job), frames: (news) => this.takeFrames(news) });
+    const wanted = location.hash.slice(1);
+    const first = STEPS.find(([id]) => id === wanted) ?? STEPS.find(([id]) => !this.state.done[id]) ?? STEPS.at(-1);
+    await this.show(first[0]);
+  }
+
+  async refresh() {
+    this.state = await server.state();
+    document.getElementById('folder').textContent = this.state.folder.split('/').at(-1);
+    document.getElementById('folder').title = this.state.folder;
+    this.drawSteps();
+    this.drawJob();
+  }
+
+  drawSteps() {
+    document.getElementById('steps').replaceChildren(...STEPS.map(([id, name], i) => {
+      const done = this.state.done[id];
+      const button = el('button', {
+        id: `step-${id}`, className: done ? 'done' : '', onclick: () => this.show(id),
+      }, el('b', {}, done && id !== this.current ? '✓' : String(i + 1)), name);
+      if (id === this.current) button.setAttribute('aria-current', 'step');
+      return button;
+    }));
+  }
+
+  async show(id) {
+    this.open.close?.();
+    this.current = id;
+    history.replaceState(null, '', `#${id}`);
+    this.drawSteps();
+    this.panel.replaceChildren();
+    this.view.replaceChildren();
+    this.panel.scrollTop = 0;
+    const opened = {};
+    this.open = opened;
+    await this.doing(async () => {
+      await this.refresh();
+      Object.assign(opened, await STEPS.find(([key]) => key === id)[2](this) ?? {});
+    });
+    this.panel.dataset.ready = id;
+  }
+
+  async doing(action) {
+    try {
+      this.message('');
+      return await action();
+    } catch (error) {
+      this.message(error.message);
+      return undefined;
+    }
+  }
+
+  message(text) {
+    const place = document.getElementById('message');
+    place.textContent = text;
+    place.hidden = !text;
+    clearTimeout(this.hiding);
+    if (text) this.hiding = setTimeout(() => { place.hidden = true; }, 15000);
+  }
+
+  async takeJob(job) {
+    const ended = this.state.job?.running && job && !job.running;
+    this.state.job = job;
+    this.drawJob();
+    if (ended) await this.doing(() => this.refresh());
+    this.open.job?.(job, ended);
+  }
+
+  takeFrames(news) {
+    if (news.anew) this.frames = [];
+    this.frames.push(...news.frames);
+    this.open.frames?.(this.frames);
+  }
+
+  drawJob() {
+    const { job } = this.state;
+    const footer = document.getElementById('job');
+    footer.hidden = !job;
+    if (!job) return;
+    const share = job.total ? Math.min(1, job.done / job.total) : 0;
+    const words = job.running
+      ? `${job.what}${job.total ? ` ${job.done} of ${job.total}` : ''}${job.left_s ? `, ${time(job.left_s)} left` : ''}`
+      : job.status === 0 ? `done in ${time(job.seconds)}` : job.stopped ? 'stopped' : 'ended with an error';
+    const kind = job.running ? '' : job.status === 0 ? 'good' : job.stopped ? 'warning' : 'problem';
+    footer.replaceChildren(
+      el('strong', { className: kind, id: 'job-words' }, words),
+      el('code', { title: job.command }, job.command),
+      job.running ? el('div', { className: 'progress' }, el('i', { style: `width: ${100 * share}%` })) : el('span'),
+      job.running ? el('button', { id: 'job-stop', onclick: () => this.doing(() => server.call('stop')) }, 'Stop')
+        : el('span'),
+    );
+  }
+}
+
+await new Studio().start();

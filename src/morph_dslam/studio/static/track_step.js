@@ -1,0 +1,88 @@
+// Track: the command runs; its frames are plotted and drawn as they come.
+
+import { call, explored, frame } from './server.js';
+import { check, command, el, facts, title } from './parts.js';
+import { ImageView, colourBar } from './overlay.js';
+import { makePlots } from './plot.js';
+
+// The picture of a frame with the model over it.
+export class RunPicture {
+  constructor(container, mesh, colours) {
+    Object.assign(this, { container, mesh, colours, view: new ImageView(container), busy: false, wanted: null });
+  }
+
+  // Shows the frame that was asked for last; ones in between are left out.
+  async show(row, shown = () => {}) {
+    this.wanted = row;
+    if (this.busy) return;
+    this.busy = true;
+    try {
+      while (this.wanted) {
+        const next = this.wanted;
+        this.wanted = null;
+        const tracked = next.status === 'tracked';
+        const [image, overlay] = await Promise.all([frame(next.frame), tracked ? call('overlay', { frame: next.frame }) : null]);
+        this.view.setOverlay(overlay, this.mesh.triangles, this.colours);
+        this.view.setImage(image);
+        this.container.parentElement.querySelector('.bar')?.remove();
+        if (overlay) this.container.after(colourBar(this.colours, overlay));
+        this.container.dataset.frame = next.frame;
+        shown(next, overlay);
+      }
+    } finally {
+      this.busy = false;
+    }
+  }
+}
+
+export async function trackStep(app) {
+  app.panel.append(...title('Track', 'Pose and parameters are found in every frame.'));
+  if (!app.state.done.start || !app.state.done.build || !app.state.done.camera) {
+    app.panel.append(el('p', { className: 'problem' }, 'This step needs the model, the camera, the recording and the saved start.'));
+    return {};
+  }
+  const [mesh, model, { colours }, known] = await Promise.all([
+    call('model_mesh'), call('model'), explored('model.json'), call('tracked_frames')]);
+  app.frames = known.frames;
+  const refine = el('input', { id: 'refine', checked: !(app.state.choices.at_rest ?? true) });
+  const outline = el('input', { id: 'outline' });
+  const start = el('button', { id: 'track', className: 'main', onclick: () => app.doing(() => call('track',
+    { refine: refine.checked, outline: outline.checked })) });
+  const result = el('div', { id: 'track-result' });
+  app.panel.append(
+    check('Refine the start over the whole video, and track once more', refine),
+    el('p', { className: 'note' }, 'Takes twice as long. The start is then not taken as undeformed.'),
+    check('Use the outline too', outline),
+    el('p', { className: 'note' }, 'Where the object stands out from the background.'),
+    start, command('morph track … --frame-log track.jsonl -o run'), result,
+  );
+  const picture = el('div', { className: 'fill', id: 'track-image' });
+  const plots = el('div', { className: 'plots' });
+  app.view.append(el('div', { className: 'runview' }, el('div', {}, picture), plots));
+  const shown = new RunPicture(picture, mesh, colours);
+  const plot = makePlots(plots, model);
+
+  function drawFrames(frames) {
+    plot(frames);
+    if (frames.length) shown.show(frames.at(-1)).catch(() => {});
+  }
+
+  function drawJob(job) {
+    start.textContent = app.state.done.track ? 'Track again' : 'Track';
+    start.disabled = Boolean(job?.running);
+    const tracked = app.frames.filter((row) => row.status === 'tracked').length;
+    const mine = job?.kind === 'track' ? job : null;
+    const parts = [facts([['Frames', String(app.frames.length)], ['Tracked', String(tracked)]])];
+    if (mine && !mine.running && mine.status) {
+      parts.push(el('p', { className: mine.stopped ? 'warning' : 'problem' }, mine.lines.at(-1) ?? 'it ended without a message'));
+    }
+    if (app.state.done.track && !mine?.running) {
+      parts.push(el('button', { id: 'to-results', onclick: () => app.show('results') }, 'Next: results'));
+    }
+    result.replaceChildren(...parts);
+  }
+
+  drawJob(app.state.job);
+  drawFrames(app.frames);
+  return { job: drawJob, frames: (frames) => { drawFrames(frames); drawJob(app.state.job); } };
+}
