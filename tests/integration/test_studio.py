@@ -3,6 +3,8 @@
 import http.client
 import io
 import json
+import re
+import signal
 import subprocess
 import sys
 import tomllib
@@ -12,9 +14,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from morph_dslam import Camera, load_study, save_model
+from morph_dslam import Board, Camera, load_study, save_model
 from morph_dslam.extend.geometry import RigidTransform, rotation_exp
 from morph_dslam.extend.mechanics import load_mesh
+from tests.support.rendered_board import board_image, board_poses
 from tests.support.stretched_block import stretched_block_model
 from tests.support.studio import Client, running_studio, write_part
 
@@ -172,7 +175,9 @@ def test_pairs_place_the_object_and_name_the_worst(client, placed):
     assert 0 < len(found["order"]) < len(model.triangles)  # the back of a solid is not drawn
     pairs[4, 3] += 3.0
     found = client.call("fit", pairs=pairs.tolist(), at_rest=True)
-    assert found["worst"] == 4
+    quick = client.call("fit", pairs=pairs.tolist(), at_rest=True, quick=True)
+    np.testing.assert_allclose(quick["residuals_px"], found["residuals_px"], atol=1e-3)
+    assert found["worst"] == quick["worst"] == 4
     assert 1.0 < found["residuals_px"][4] < 3.0
     pairs[4, 3] += 60.0
     assert "do not fit the object" in client.refused("fit", pairs=pairs.tolist(), at_rest=True)
@@ -263,6 +268,26 @@ def test_without_the_extra_there_is_one_message():
     )
 
 
+def test_it_ends_quietly_although_a_page_is_open(tmp_path):
+    program = "import sys; from morph_dslam.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, "studio", str(tmp_path / "project"), "--port", "0", "--host", "0.0.0.0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        line = process.stdout.readline()
+        port, token = re.search(r"http://[^ ]+:(\d+)/\?token=([\w-]+) \(Ctrl-C ends it\)", line).groups()
+        statuses, opened = {}, []
+        for host in (f"127.0.0.1:{port}", f"192.168.7.8:{port}", f"studio.example:{port}"):
+            page = http.client.HTTPConnection("127.0.0.1", int(port), timeout=30)
+            page.request("GET", "/api/events", headers={"Host": host, "Cookie": f"morph_studio_{port}={token}"})
+            opened += [page.getresponse(), page]
+            statuses[host.partition(":")[0]] = opened[-2].status
+        assert statuses == {"127.0.0.1": 200, "192.168.7.8": 200, "studio.example": 403}
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+        assert process.stderr.read() == ""
+        for each in opened:
+            each.close()
+
+
 def test_a_port_that_is_taken_is_one_message(server, refused):
     assert f"127.0.0.1:{server.port} cannot be taken" in refused("studio", "--port", str(server.port))
 
@@ -276,3 +301,20 @@ def test_an_upload_that_breaks_off_leaves_nothing(server, client, folder):
     connection.close()
     assert client.ask("PUT", "/api/upload/camera/big.yaml", b"", **{"Content-Length": "2000000"})[0] in (400, 413)
     assert not any(name.startswith(("half.stl", "big.yaml")) for name in client.state()["files"])
+
+
+@pytest.mark.slow
+def test_pictures_of_a_board_give_the_camera(client, folder):
+    """Rendered pictures of a checkerboard; the focal length is that of the camera that rendered them."""
+    board = Board(9, 6, 0.025)
+    camera = Camera(640, 480, 541.0, 538.5, 327.3, 236.1, (-0.27, 0.09, 8e-4, -5e-4))
+    client.call("forget_frames", folder="board")
+    for number, pose in enumerate(board_poses(camera, board, 16, 40.0, seed=2)):
+        _, data = cv2.imencode(".png", board_image(camera, board, pose, number))
+        assert client.upload("board", f"{number}.png", data.tobytes()) == 200
+    client.call("calibrate", board="9x6", square="25 mm", lens="radial-tangential")
+    job = client.events(lambda name, job: name == "job" and job is not None and not job["running"])[-1][1]
+    assert job["status"] == 0, job["lines"]
+    found = client.state()["camera"]
+    assert (found["fx"], found["fy"]) == pytest.approx((541.0, 538.5), rel=2e-3)
+    assert "square" in client.refused("calibrate", board="9x6", square="-o x", lens="fisheye")

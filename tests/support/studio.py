@@ -134,6 +134,7 @@ class Client:
                 answer.readline()
                 found.append((name, json.loads(data)))
         finally:
+            answer.close()
             connection.close()
         return found
 

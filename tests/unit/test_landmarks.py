@@ -37,6 +37,15 @@ def test_bent_object_is_found_exactly_without_a_start():
     assert found.warnings == ()
 
 
+def test_a_start_close_by_leads_to_the_same_minimum():
+    few = landmarks(noise=0.5)
+    near = register_landmarks(MODEL, CAMERA, Landmarks(few.points[:9], few.pixels[:9])).state
+    assert np.abs(near.parameters - BENT.parameters).max() > 1e-3
+    found = register_landmarks(MODEL, CAMERA, landmarks(), near=near)
+    np.testing.assert_allclose(found.state.parameters, BENT.parameters, atol=1e-6)
+    np.testing.assert_allclose(found.state.camera_from_object.matrix, POSE.matrix, atol=1e-6)
+
+
 def test_bend_the_other_way_is_distinguished():
     other = State(BENT.parameters * [-1, 1, 1], POSE)
     found = register_landmarks(MODEL, CAMERA, landmarks(other, noise=0.3))

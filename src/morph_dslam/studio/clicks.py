@@ -6,6 +6,7 @@ These functions run in the worker process.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam import Camera, ReducedModel, load_camera, load_model, register_landmarks
-from morph_dslam.errors import StudioError
+from morph_dslam import Camera, ReducedModel, Registration, load_camera, load_model, register_landmarks
+from morph_dslam.errors import RegistrationError, StudioError
 from morph_dslam.explorer.server import BadRequest, ModelPages
 from morph_dslam.extend.geometry import RigidTransform
 from morph_dslam.extend.registration import Landmarks, bind_landmarks, load_landmarks, save_landmarks
+from morph_dslam.extend.tracking import State
 from morph_dslam.studio.packing import packed
 from morph_dslam.units import from_si
 
@@ -26,6 +28,8 @@ Array = NDArray[np.float64]
 MOST_PAIRS = 500
 #: Fewer pairs than these do not give a pose.
 FEWEST_PAIRS = 4
+#: A quick fit that is worse than this, pixels, is fitted anew from all starts.
+GOOD_PX = 3.0
 
 
 def stamp(path: Path) -> tuple[int, int]:
@@ -109,7 +113,13 @@ def _surface(model: ReducedModel) -> tuple[NDArray[np.int64], NDArray[np.int64]]
     return used, corners.reshape(-1, 3)
 
 
-def fit_clicks(model_path: Path, camera_path: Path, pairs: Sequence[Sequence[float]], at_rest: bool) -> bytes:
+#: The state that was fitted last, by what it was fitted to.
+_last: dict[tuple, State] = {}
+
+
+def fit_clicks(
+    model_path: Path, camera_path: Path, pairs: Sequence[Sequence[float]], at_rest: bool, quick: bool = False
+) -> bytes:
     """The pose and the parameters that pairs give, how well each pair fits, and the overlay.
 
     Parameters
@@ -117,6 +127,8 @@ def fit_clicks(model_path: Path, camera_path: Path, pairs: Sequence[Sequence[flo
     model_path, camera_path : files.
     pairs : (k, 5) millimetres on the undeformed object, then pixels of the image as recorded.
     at_rest : whether the object is undeformed in the image.
+    quick : whether to start from the last fit alone, as long as that leads to a good one; a fit of the same pairs that
+        is not quick finds what else they may mean.
 
     Returns
     -------
@@ -128,7 +140,11 @@ def fit_clicks(model_path: Path, camera_path: Path, pairs: Sequence[Sequence[flo
     if missing > 0:
         return packed({"message": f"click {missing} more pair{'s' if missing > 1 else ''}"})
     model, camera = opened_model(model_path), opened_camera(camera_path)
-    found = register_landmarks(model, camera, landmarks, at_rest=at_rest)
+    key = (model_path, stamp(model_path), camera_path, stamp(camera_path), at_rest)
+    near = _last.get(key) if quick else None
+    found = _registered(model, camera, landmarks, at_rest, near)
+    _last.clear()
+    _last[key] = found.state
     positions = _positions_of(model, landmarks.points, found.state.parameters)
     seen = camera.project_recorded(found.state.camera_from_object.apply(positions))
     residuals = np.linalg.norm(seen - landmarks.pixels, axis=1)
@@ -140,6 +156,18 @@ def fit_clicks(model_path: Path, camera_path: Path, pairs: Sequence[Sequence[flo
         "warnings": [warning.text for warning in found.warnings],
     }
     return _overlay(model_path, camera, found.state.parameters, found.state.camera_from_object, facts)
+
+
+def _registered(
+    model: ReducedModel, camera: Camera, landmarks: Landmarks, at_rest: bool, near: State | None
+) -> Registration:
+    """The object placed by landmarks, from a state close by if that will do."""
+    if near is not None:
+        with suppress(RegistrationError):  # there may be a better start
+            found = register_landmarks(model, camera, landmarks, at_rest=at_rest, near=near)
+            if found.facts["residual_rms_px"] <= GOOD_PX:
+                return found
+    return register_landmarks(model, camera, landmarks, at_rest=at_rest)
 
 
 def _landmarks(pairs: Sequence[Sequence[float]]) -> Landmarks:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hmac
+import ipaddress
 import secrets
 from collections.abc import Iterable
 from urllib.parse import urlsplit
@@ -16,6 +17,8 @@ from morph_dslam.io.local_server import HOST
 
 _COOKIE = "morph_studio"
 _SAFE = ("GET", "HEAD")
+#: Among the hosts: the server may be asked by any numeric address.
+ANY_ADDRESS = "address"
 #: Bytes of a request that is no upload.
 MOST_BODY = 4_000_000
 
@@ -36,7 +39,7 @@ class Gate:
     ----------
     application : behind the gate.
     token : of this run of the server.
-    hosts : names that the server is asked by, beside those of this computer.
+    hosts : names that the server is asked by, beside those of this computer; may hold `ANY_ADDRESS`.
     policy : Content-Security-Policy of all answers that have none of their own.
     """
 
@@ -56,7 +59,7 @@ class Gate:
 
     def _refusal(self, scope: Scope) -> Response | None:
         headers, query = Headers(scope=scope), QueryParams(scope.get("query_string", b""))
-        if _hostname(f"//{headers.get('host', '')}") not in self._hosts:
+        if not self._is_known(_hostname(f"//{headers.get('host', '')}")):
             return PlainTextResponse("this server is not known by that name", 403)
         origin = headers.get("origin")
         if origin is not None and origin != f"{scope['scheme']}://{headers['host']}":
@@ -74,6 +77,9 @@ class Gate:
         if scope["method"] not in _SAFE and origin is None:
             return PlainTextResponse("a change must come from the studio's own page", 403)
         return None
+
+    def _is_known(self, host: str | None) -> bool:
+        return host in self._hosts or (ANY_ADDRESS in self._hosts and _is_address(host or ""))
 
     def _is_token(self, given: str) -> bool:
         return hmac.compare_digest(given.encode(), self._token.encode())
@@ -93,6 +99,14 @@ class Gate:
             await send(message)
 
         return guarded
+
+
+def _is_address(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
 
 
 def _hostname(address: str) -> str | None:

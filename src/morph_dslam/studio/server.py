@@ -6,13 +6,14 @@ import signal
 import socket
 import webbrowser
 from pathlib import Path
+from types import FrameType
 
 import uvicorn
 
 from morph_dslam.errors import StudioError
 from morph_dslam.io.local_server import HOST
 from morph_dslam.studio.app import make_app
-from morph_dslam.studio.gate import new_token
+from morph_dslam.studio.gate import ANY_ADDRESS, new_token
 from morph_dslam.studio.project import Project
 from morph_dslam.studio.steps import Steps
 
@@ -40,12 +41,14 @@ class StudioServer:
         project, self.token = Project(folder), new_token()
         self._socket = _listening(host, port)
         self.port = int(self._socket.getsockname()[1])
-        hosts = () if host == HOST else (host, socket.gethostname())
+        # An address is no name that another site could take for its own.
+        hosts = () if host == HOST else (host, socket.gethostname(), ANY_ADDRESS)
+        steps = Steps(project)
         config = uvicorn.Config(
-            make_app(Steps(project), self.token, hosts), log_level="error", access_log=False, server_header=False,
+            make_app(steps, self.token, hosts), log_level="error", access_log=False, server_header=False,
             ws="none", lifespan="on", timeout_graceful_shutdown=2,
         )  # fmt: skip
-        self._server = uvicorn.Server(config)
+        self._server = _Server(config, steps)
         shown = socket.gethostname() if host in ("0.0.0.0", "::") else host
         self.address = f"http://{shown}:{self.port}/?token={self.token}"
 
@@ -60,7 +63,25 @@ class StudioServer:
 
     def stop(self) -> None:
         """End `run`, from another thread."""
-        self._server.should_exit = True
+        self._server.end()
+
+
+class _Server(uvicorn.Server):
+    """A server whose pages are let go when it ends; it would wait for them."""
+
+    def __init__(self, config: uvicorn.Config, steps: Steps) -> None:
+        super().__init__(config)
+        self._steps = steps
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """End, as a signal asks."""
+        self._steps.end_news()
+        super().handle_exit(sig, frame)
+
+    def end(self) -> None:
+        """End without a signal."""
+        self._steps.end_news()
+        self.should_exit = True
 
 
 def _listening(host: str, port: int) -> socket.socket:

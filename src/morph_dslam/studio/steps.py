@@ -52,10 +52,13 @@ class Steps:
     def _tell(self) -> None:
         self._changed.set()
 
+    def end_news(self) -> None:
+        """End what is told to pages, so that their connections close."""
+        self._ended = True
+
     async def close(self) -> None:
         """Stop the command that runs, and end the worker."""
-        self._ended = True
-        self._changed.set()
+        self.end_news()
         await self._jobs.stop()
         self._worker.close()
 
@@ -128,7 +131,9 @@ class Steps:
         except StudioError:
             path.unlink(missing_ok=True)
             raise
-        if kind == "frame":
+        if kind == "object":
+            project.choose(object=None, sets=None)
+        elif kind == "frame":
             project.choose(recording=names.FRAMES, reference_frame=None)
         return {"name": name}
 
@@ -145,9 +150,11 @@ class Steps:
         size = None if size_mm is None else 1e-3 * size_mm
         surface = await self._worker.call(object_mesh.object_surface, self.project.path(file), unit, size)
         chosen = {"object": file, "unit": unit, "size_mm": size_mm}
-        if any(known.get(key) != value for key, value in chosen.items()):
+        is_another = any(known.get(key) != value for key, value in chosen.items())
+        if is_another:
             self.project.choose(**chosen, sets=None)  # faces of another mesh have other numbers
-        await self._write_mesh()
+        if is_another or not self.project.has(names.MESH):
+            await self._write_mesh()
         return surface
 
     def _object(self) -> tuple[Path, str, float | None]:
@@ -277,10 +284,10 @@ class Steps:
         """The undeformed surface of the model."""
         return await self._worker.call(clicks.model_surface, self._needed(names.MODEL, "build the model first"))
 
-    async def fit(self, pairs: Pairs, at_rest: bool) -> bytes:
-        """The object placed by pairs, with its overlay and the errors."""
+    async def fit(self, pairs: Pairs, at_rest: bool, quick: bool = False) -> bytes:
+        """The object placed by pairs, with its overlay and the errors; quick ones start from the last fit."""
         model, camera = self._model_and_camera()
-        return await self._worker.call(clicks.fit_clicks, model, camera, pairs, at_rest)
+        return await self._worker.call(clicks.fit_clicks, model, camera, pairs, at_rest, quick)
 
     def _model_and_camera(self) -> tuple[Path, Path]:
         return (

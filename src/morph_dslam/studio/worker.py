@@ -25,7 +25,7 @@ class Worker:
 
     def __init__(self) -> None:
         self._executor: ProcessPoolExecutor | None = None
-        self._others: set[Any] = set()
+        self._processes: set[Any] = set()
         self._lock = asyncio.Lock()
 
     async def call(self, function: Callable, *arguments: Any, seconds: float = LONGEST) -> Any:
@@ -59,14 +59,15 @@ class Worker:
                 ) from None
 
     def _start(self) -> None:
-        self._others = set(multiprocessing.active_children())
-        context = multiprocessing.get_context("spawn")
+        others, context = set(multiprocessing.active_children()), multiprocessing.get_context("spawn")
         self._executor = ProcessPoolExecutor(1, mp_context=context, initializer=_start_worker)
+        self._executor.submit(int)  # the first task starts the process
+        self._processes = set(multiprocessing.active_children()) - others
 
     def _end(self) -> None:
         executor, self._executor = self._executor, None
         if executor is not None:
-            for process in set(multiprocessing.active_children()) - self._others:
+            for process in self._processes:
                 process.kill()
             executor.shutdown(wait=False, cancel_futures=True)
 

@@ -6,6 +6,7 @@ import { MeshView } from './mesh_view.js';
 import { ImageView, colourBar } from './overlay.js';
 import { upload } from './server.js';
 
+const SOON = 500; // milliseconds without a click
 const GOOD = '#0f6e8c';
 const WORST = '#b3261e';
 const PENDING = '#f08c00';
@@ -87,11 +88,14 @@ export async function startStep(app) {
     } else draw();
   }
 
-  // Clicks that come while one is fitted are fitted together when it is done.
+  // Clicks that come while one is fitted are fitted together when it is done. Each is fitted at once from the fit before;
+  // when no more come, once more from everywhere, which shows what else the pairs may mean.
   let fitting = false;
   let again = false;
-  async function fit() {
-    saved = false;
+  let thorough = null;
+  async function fit(quick = true) {
+    if (quick) saved = false;
+    clearTimeout(thorough);
     draw();
     again = true;
     if (fitting) return;
@@ -100,13 +104,14 @@ export async function startStep(app) {
       again = false;
       const began = performance.now();
       try {
-        fitted = await call('fit', { pairs, at_rest: atRest.checked });
-        fitted.ms = performance.now() - began;
+        fitted = { ...await call('fit', { pairs, at_rest: atRest.checked, quick }), ms: fitted?.ms };
+        if (quick) fitted.ms = performance.now() - began;
       } catch (error) {
         fitted = { message: error.message, refused: true };
       }
     }
     fitting = false;
+    if (quick) thorough = setTimeout(() => fit(false), SOON);
     draw();
   }
 
@@ -132,7 +137,7 @@ export async function startStep(app) {
       const values = model.parameters.map((p) => [p.name, `${digits(fitted.parameters[p.name] * p.factor)} ${p.unit}`]);
       result.replaceChildren(facts([['Error, rms', `${fitted.rms_px.toFixed(2)} px`],
         ['Worst pair', `${fitted.worst + 1}, ${errors[fitted.worst].toFixed(2)} px`],
-        ...(atRest.checked ? [] : values), ['Fitted in', `${Math.round(fitted.ms)} ms`]]),
+        ...(atRest.checked ? [] : values), ...(fitted.ms ? [['Fitted in', `${Math.round(fitted.ms)} ms`]] : [])]),
       ...fitted.warnings.map((one) => el('p', { className: 'warning note' }, one)));
     }
     left.querySelector('.bar')?.remove();
@@ -145,5 +150,5 @@ export async function startStep(app) {
   image.setImage(await frame(number));
   if (pairs.length) { const was = saved; await fit(); saved = was; }
   draw();
-  return {};
+  return { close: () => clearTimeout(thorough) };
 }
