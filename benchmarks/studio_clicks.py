@@ -10,10 +10,12 @@ from __future__ import annotations
 import argparse
 import http.client
 import json
+import re
 import shutil
+import signal
+import subprocess
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 
@@ -22,26 +24,33 @@ import numpy as np
 import morph_dslam as md
 from morph_dslam.extend import run_and_report_errors
 from morph_dslam.extend.registration import load_landmarks
-from morph_dslam.studio.server import StudioServer
 
 DEMO = Path(__file__).resolve().parents[1] / "demo"
 
 
 class User:
-    """Asks a studio as its page does."""
+    """Asks a studio as its page does; a context manager, as long as which the studio runs."""
 
     def __init__(self, folder: Path) -> None:
-        self.server = StudioServer(folder, port=0)
-        threading.Thread(target=self.server.run, daemon=True).start()
-        while not self.server.started:
-            time.sleep(0.01)
+        command = [sys.executable, "-m", "morph_dslam.cli", "studio", str(folder), "--port", "0"]
+        self._studio = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+
+    def __enter__(self) -> User:
+        assert self._studio.stdout is not None
+        found = re.search(r":(\d+)/\?token=([\w-]+)", self._studio.stdout.readline())
+        assert found is not None
+        self._port, token = int(found[1]), found[2]
+        self._headers = {"Origin": f"http://127.0.0.1:{self._port}", "Cookie": f"morph_studio_{self._port}={token}"}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._studio.send_signal(signal.SIGINT)
+        self._studio.communicate()
 
     def call(self, action: str, **arguments) -> bytes:
         """Call an action of a step."""
-        port = self.server.port
-        connection = http.client.HTTPConnection("127.0.0.1", port)
-        headers = {"Origin": f"http://127.0.0.1:{port}", "Cookie": f"morph_studio_{port}={self.server.token}"}
-        connection.request("POST", f"/api/{action}", json.dumps(arguments), headers)
+        connection = http.client.HTTPConnection("127.0.0.1", self._port)
+        connection.request("POST", f"/api/{action}", json.dumps(arguments), self._headers)
         answer = connection.getresponse()
         content = answer.read()
         connection.close()
@@ -59,19 +68,16 @@ def click_and_track(project: Path, seed: int, noise_px: float) -> tuple[list[flo
     landmarks = load_landmarks(DEMO / "sequence" / "landmarks.csv")
     noise = noise_px * np.random.default_rng(seed).standard_normal(landmarks.pixels.shape)
     pairs = np.column_stack([1e3 * landmarks.points, landmarks.pixels + noise]).tolist()
-    user, seconds = User(project), []
-    for count in range(4, len(pairs) + 1):
-        begin = time.perf_counter()
-        try:
+    seconds = []
+    with User(project) as user:
+        for count in range(4, len(pairs) + 1):
+            begin = time.perf_counter()
             user.call("fit", pairs=pairs[:count], at_rest=False, quick=True)
-        except md.MorphError as error:  # the first few pairs may not be spread far enough
-            print(f"{count} pairs: {error}")
-        seconds.append(time.perf_counter() - begin)
-    user.call("save_start", pairs=pairs, frame=0, at_rest=False)
-    user.call("track", refine=True)
-    while not user.has_ended():
-        time.sleep(0.5)
-    user.server.stop()
+            seconds.append(time.perf_counter() - begin)
+        user.call("save_start", pairs=pairs, frame=0, at_rest=False)
+        user.call("track", refine=True)
+        while not user.has_ended():
+            time.sleep(0.5)
     return seconds[1:], float(md.evaluate(project / "run", DEMO / "sequence" / "truth.npz", 0)["mean_mm"])
 
 
