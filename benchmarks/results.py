@@ -237,6 +237,14 @@ BENCHMARKS = {
         "python benchmarks/slam_7scenes.py --data DIR",
         "measured: the recording's own camera path, accurate to about a centimetre",
     ),
+    "floors": Benchmark(
+        "Camera tracking",
+        "Times as multiples of a floor",
+        "python benchmarks/floors.py --data DIR",
+        "none: processor time of a frame over that of OpenCV's Lucas-Kanade of 300 points, in the same run",
+        lines=8,
+        about="`p95` is the 95th percentile.",
+    ),
     "slam_rendered": Benchmark(
         "Camera tracking",
         "Rendered scenes",

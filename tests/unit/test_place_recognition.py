@@ -1,18 +1,13 @@
-"""Descriptors, the bag of words that recognises places, and keyframes warped to be seen from elsewhere."""
+"""Descriptors, and the bag of words that recognises places."""
 
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from morph_dslam.slam.frame_images import describe, least_distances, match_points, orientations
 from morph_dslam.slam.relocalization import PlaceIndex, Vocabulary
 from morph_dslam.slam.rigid_map import Keyframe, RigidMap
-from morph_dslam.slam.tracking import WarpedViews, is_small, local_change, plane_homography, warp_pixels
-from tests.support.rendered_room import pose as rigid_pose
 from tests.support.rendered_sequence import printed_texture
-
-INTRINSICS = np.array([500.0, 510.0, 200.0, 190.0])
 
 
 def corners_of(image):
@@ -106,46 +101,3 @@ def test_an_image_resembles_the_keyframe_of_its_place():
         similarities = places.similarities(descriptors)
         assert similarities.argmax() == number
         assert similarities[number] > 1.1 * np.delete(similarities, number).max()
-
-
-def project(pose, points):
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    return local[:, :2] / local[:, 2:] * INTRINSICS[:2] + INTRINSICS[2:]
-
-
-def test_the_homography_of_a_plane_moves_pixels_as_projection_does():
-    keyframe, now = (rigid_pose([0.3, 0.0, 0.1], [0.1, 0.2, 0.0]), rigid_pose([0.2, -0.3, 0.4], [0, 0.1, 0.5]))
-    local = np.column_stack([np.random.default_rng(3).uniform(-0.5, 0.5, (30, 2)), np.full(30, 2.5)])
-    points = (local - keyframe[:3, 3]) @ keyframe[:3, :3]
-    homography = plane_homography(keyframe, now, 2.5, INTRINSICS)
-    pixels = project(keyframe, points)
-    assert warp_pixels(homography, pixels) == pytest.approx(project(now, points), abs=1e-9)
-    step = 1e-5 * np.eye(2)
-    around = warp_pixels(homography, pixels[0] + np.vstack([step, -step]))
-    numerical = (around[:2] - around[2:]).T / 2e-5
-    assert local_change(homography, pixels[0]) == pytest.approx(numerical, abs=1e-6)
-
-
-def test_only_views_that_look_much_different_are_warped():
-    image = printed_texture(380, 400)
-    keyframe, views = (Keyframe(0, 0.0, image, np.eye(4), np.arange(0), np.empty((0, 2))), WarpedViews(INTRINSICS))
-    near, homography = views.view(0, keyframe, rigid_pose([0.1, 0, 0], [0, 0, 0.1]), 2.0)
-    assert near is image
-    assert homography is None
-    turned, homography = views.view(0, keyframe, rigid_pose([0, 0, 0], [0, 0, 0.6]), 2.0)
-    angle = Rotation.from_matrix(np.block([[homography[:2, :2], np.zeros((2, 1))], [0, 0, 1]])).magnitude()
-    assert angle == pytest.approx(0.6, abs=0.01)
-    assert turned is not image
-    # A little further on the same warped view still serves; much further another one is made.
-    again, same = views.view(0, keyframe, rigid_pose([0, 0, 0], [0, 0, 0.65]), 2.0)
-    assert again is turned
-    assert np.array_equal(same, homography)
-    assert views.view(0, keyframe, rigid_pose([0, 0, 0], [0, 0, 1.0]), 2.0)[0] is not turned
-
-
-@pytest.mark.parametrize(
-    ("change", "small"),
-    [(np.eye(2), True), (1.2 * np.eye(2), True), (1.3 * np.eye(2), False), (np.diag([1.0, 0.75]), False)],
-)
-def test_changes_within_reach_of_following(change, small):
-    assert is_small(change) is small

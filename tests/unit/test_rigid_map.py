@@ -8,7 +8,7 @@ from morph_dslam.slam.map_files import save_map
 from morph_dslam.slam.mapping import ENOUGH_KEYFRAMES, MOST_AT_ONCE, RECENT, cull_keyframes
 from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, REMOVED, Followed, Keyframe, RigidMap
 from morph_dslam.slam.scene import load_scene
-from morph_dslam.slam.tracking import FewTemplates
+from morph_dslam.slam.tracking import FewViews
 from tests.support.rendered_room import pose
 
 
@@ -80,7 +80,9 @@ def test_few_keyframes_are_chosen_that_show_most_points():
     rigid_map.add_points(np.zeros((60, 3)), np.zeros((60, 2)), 0, GOOD)
     for number, seen in enumerate([ids[:20], ids[5:45], ids[40:55], ids[50:60:2]]):
         rigid_map.add_keyframe(keyframe(seen, np.column_stack([seen, np.full(len(seen), number)])))
-    views, pixels = FewTemplates(rigid_map).choose(ids[:58])
+    chosen = FewViews(rigid_map)
+    chosen.choose(ids[:58])
+    views, pixels = chosen.template_keyframe[:58], chosen.template_pixels[:58]
     # The second shows 40 points; of the rest the third shows 10; what is left keeps its newest view.
     expected = [0] * 5 + [1] * 40 + [2] * 10 + [0, 3, 0]
     assert views.tolist() == expected

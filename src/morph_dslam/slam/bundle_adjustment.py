@@ -73,15 +73,25 @@ def turned_and_shifted(pose, rotation, shift, out):
         out[i, 3] += shift[i]
 
 
-def orthonormal(poses):
-    """Rigid transforms (..., 4, 4) with the rotation nearest to what rounding has made of it.
+@njit(cache=True, nogil=True)
+def make_orthonormal(pose):
+    """Make the rotation of a rigid transform (4, 4) the one nearest to what rounding has made of it.
 
-    A prediction that multiplies poses by transposed ones would double what is off in every frame.
+    A prediction that multiplies poses by transposed ones would double what is off in every frame. Two steps of Newton's
+    iteration for the polar decomposition (Higham, Functions of Matrices, 2008, section 8.3), which squares the error.
     """
-    u, _, vt = np.linalg.svd(poses[..., :3, :3])
-    result = poses.copy()
-    result[..., :3, :3] = u @ vt
-    return result
+    for _ in range(2):
+        square = np.zeros((3, 3))
+        for i in range(3):
+            for j in range(3):
+                for k in range(3):
+                    square[i, j] += pose[k, i] * pose[k, j]
+        for row in pose[:3]:
+            old = row[:3].copy()
+            for j in range(3):
+                row[j] = 1.5 * old[j]
+                for k in range(3):
+                    row[j] -= 0.5 * old[k] * square[k, j]
 
 
 Array = NDArray[np.float64]
@@ -191,9 +201,12 @@ def _reduced_system(pose_block, pose_right, point_inverse, point_right, cross, s
     """Schur complement (6 c, 6 c) of the free cameras, its lower half, and right-hand side (6 c,)."""
     n_free = len(pose_block)
     blocks, right = np.zeros((n_free, n_free, 6, 6)), np.zeros(6 * n_free)
+    # Entry by entry: numba takes seconds to compile the assignment of one array to a part of another.
     for c in range(n_free):
-        blocks[c, c] = pose_block[c]
-        right[6 * c : 6 * c + 6] = pose_right[c]
+        for i in range(6):
+            right[6 * c + i] = pose_right[c, i]
+            for j in range(6):
+                blocks[c, c, i, j] = pose_block[c, i, j]
     half = np.zeros((6, 3))
     for p in range(len(point_inverse)):
         for first in range(start[p], start[p + 1]):
@@ -220,7 +233,9 @@ def _reduced_system(pose_block, pose_right, point_inverse, point_right, cross, s
     system = np.zeros((6 * n_free, 6 * n_free))
     for c in range(n_free):
         for d in range(c + 1):
-            system[6 * c : 6 * c + 6, 6 * d : 6 * d + 6] = blocks[c, d]
+            for i in range(6):
+                for j in range(6):
+                    system[6 * c + i, 6 * d + j] = blocks[c, d, i, j]
     return system, right
 
 
@@ -252,7 +267,8 @@ def _step(blocks, slot, camera_idx, start, damping):
     pose_step = cholesky_solve(system, right)
     point_step, rest = np.zeros_like(point_right), np.empty(3)
     for p in range(len(point_inverse)):
-        rest[:] = point_right[p]
+        for i in range(3):
+            rest[i] = point_right[p, i]
         for o in range(start[p], start[p + 1]):
             free = slot[camera_idx[o]]
             if free < 0:
@@ -267,25 +283,27 @@ def _step(blocks, slot, camera_idx, start, damping):
 
 
 @njit(cache=True, nogil=True)
-def _adjust(poses, points, slot, camera_idx, point_idx, start, pixels, camera, width, iterations, tolerance):
+def _adjust(poses, points, slot, camera_idx, point_idx, start, pixels, camera, width, iterations, tolerance, damping):
+    """Poses, points, cost, iterations done, the damping to go on with, and whether another iteration may help."""
     cost = total_cost(poses, points, camera_idx, point_idx, pixels, camera, width)
-    damping, done = FIRST_DAMPING, 0
+    done, may_help = 0, True
     blocks = _normal_equations(poses, points, slot, camera_idx, point_idx, pixels, camera, width)
-    while done < iterations and damping < MOST_DAMPING:
+    while done < iterations and may_help:
         done += 1
         pose_step, point_step = _step(blocks, slot, camera_idx, start, damping)
         new_poses, new_points = _moved(poses, points, slot, pose_step, point_step)
         new_cost = total_cost(new_poses, new_points, camera_idx, point_idx, pixels, camera, width)
         if not new_cost < cost:
             damping *= 10.0
+            may_help = damping < MOST_DAMPING
             continue
         gain = (cost - new_cost) / cost
         poses, points, cost = new_poses, new_points, new_cost
         damping = max(0.1 * damping, LEAST_DAMPING)
-        if gain < tolerance:
-            break
-        blocks = _normal_equations(poses, points, slot, camera_idx, point_idx, pixels, camera, width)
-    return poses, points, cost, done
+        may_help = gain >= tolerance
+        if may_help and done < iterations:
+            blocks = _normal_equations(poses, points, slot, camera_idx, point_idx, pixels, camera, width)
+    return poses, points, cost, done, damping, may_help
 
 
 @dataclass(frozen=True)
@@ -321,40 +339,69 @@ class Adjustment:
     iterations: int
 
 
-def adjust(
-    camera_from_world: Array,
-    points: Array,
-    observations: Observations,
-    intrinsics: Array,
-    fixed: NDArray[np.bool_],
-    baseline_px: float = 0.0,
-    huber_px: float = 2.0,
-    iterations: int = 15,
-    tolerance: float = 1e-6,
-) -> Adjustment:
-    """Refine poses and points together.
+class BundleAdjuster:
+    """Refines poses and points together, at once or a few iterations at a time.
 
     Parameters
     ----------
     camera_from_world : (c, 4, 4).
     points : (p, 3) in the world.
+    observations : what the cameras saw.
     intrinsics : (4,) fx, fy, cx, cy, of all cameras.
     fixed : (c,) cameras that stay; without depth at least two of them, or the scale is free.
     baseline_px : focal length times baseline, px m, for observations with depth.
     huber_px : errors longer than this count linearly.
+    iterations : at most.
     tolerance : ends when an iteration lowers the cost by less than this part.
     """
-    order = np.lexsort([observations.camera_idx, observations.point_idx])
-    camera_idx = np.ascontiguousarray(observations.camera_idx[order], dtype=np.int64)
-    point_idx = np.ascontiguousarray(observations.point_idx[order], dtype=np.int64)
-    start = np.searchsorted(point_idx, np.arange(len(points) + 1))
-    slot = np.where(fixed, -1, np.cumsum(~fixed) - 1)
-    pixels = np.ascontiguousarray(observations.rows()[order])
-    camera = np.append(np.asarray(intrinsics, dtype=np.float64), baseline_px)
-    poses = np.ascontiguousarray(camera_from_world, dtype=np.float64)
-    points = np.ascontiguousarray(points, dtype=np.float64)
-    poses, points, cost, done = _adjust(
-        poses, points, slot, camera_idx, point_idx, start, pixels, camera, huber_px, iterations, tolerance
-    )
-    poses[~fixed] = orthonormal(poses[~fixed])
-    return Adjustment(poses, points, float(cost), int(done))
+
+    def __init__(
+        self,
+        camera_from_world: Array,
+        points: Array,
+        observations: Observations,
+        intrinsics: Array,
+        fixed: NDArray[np.bool_],
+        baseline_px: float = 0.0,
+        huber_px: float = 2.0,
+        iterations: int = 15,
+        tolerance: float = 1e-6,
+    ) -> None:
+        order = np.lexsort([observations.camera_idx, observations.point_idx])
+        camera_idx = np.ascontiguousarray(observations.camera_idx[order], dtype=np.int64)
+        point_idx = np.ascontiguousarray(observations.point_idx[order], dtype=np.int64)
+        start = np.searchsorted(point_idx, np.arange(len(points) + 1))
+        slot = np.where(fixed, -1, np.cumsum(~fixed) - 1)
+        pixels = np.ascontiguousarray(observations.rows()[order])
+        camera = np.append(np.asarray(intrinsics, dtype=np.float64), baseline_px)
+        self._problem = slot, camera_idx, point_idx, start, pixels, camera, huber_px
+        self._poses = np.ascontiguousarray(camera_from_world, dtype=np.float64)
+        self._points = np.ascontiguousarray(points, dtype=np.float64)
+        self._fixed, self._most, self._tolerance = fixed, iterations, tolerance
+        self._cost, self._damping, self._done, self._may_help = float("nan"), FIRST_DAMPING, 0, True
+
+    @property
+    def is_done(self) -> bool:
+        """Whether no further iteration is allowed, or would help."""
+        return self._done >= self._most or not self._may_help
+
+    def advance(self, iterations: int) -> None:
+        """Do at most so many more iterations."""
+        count = min(iterations, self._most - self._done)
+        self._poses, self._points, self._cost, done, self._damping, self._may_help = _adjust(
+            self._poses, self._points, *self._problem, count, self._tolerance, self._damping
+        )
+        self._done += done
+
+    def solve(self) -> Adjustment:
+        """Do all iterations; returns what they come to."""
+        self.advance(self._most)
+        return self.result
+
+    @property
+    def result(self) -> Adjustment:
+        """What it has come to."""
+        poses = self._poses.copy()
+        for c in np.flatnonzero(~self._fixed):
+            make_orthonormal(poses[c])
+        return Adjustment(poses, self._points, float(self._cost), self._done)

@@ -8,6 +8,7 @@ fixed size, makes the same surface look different from nearer or farther.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import cv2
@@ -20,6 +21,7 @@ from morph_dslam.camera import Camera, StereoCamera
 from morph_dslam.errors import CameraError
 from morph_dslam.slam.options import LEAST_CORRELATION, PATCH_HALF
 from morph_dslam.slam.pose import inside
+from morph_dslam.slam.templates import Pyramid, image_pyramid
 from morph_dslam.tracking.patches import follow, normalize_contrast, patch_correlation
 
 Array = NDArray[np.float64]
@@ -279,6 +281,11 @@ class FrameView:
     grey: Image
     normalized: Image
     depth: FrameDepth | None = None
+
+    @cached_property
+    def pyramid(self) -> Pyramid:
+        """The normalized image at several sizes."""
+        return image_pyramid(self.normalized)
 
 
 class FrameImages:

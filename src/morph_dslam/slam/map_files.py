@@ -56,7 +56,7 @@ def map_from_trajectory(trajectory: Trajectory, source: FrameSource, images: Fra
             mapper.begin_at(view, pose)
             tracker.place(pose, rigid_map.keyframes[-1].seen)
             continue
-        tracked = tracker.track_at(view.normalized, pose)
+        tracked = tracker.track_at(view, pose)
         if mapper.wants_keyframe(tracked, view.index):
             do_all(mapper.insert(tracked, view))
             tracker.points = rigid_map.keyframes[-1].seen
@@ -86,16 +86,16 @@ def _check(trajectory: Trajectory, source: FrameSource, n_posed: int, times: lis
 class _PosedTracker(Tracker):
     """Follows points through frames of known pose."""
 
-    def track_at(self, normalized: NDArray[np.uint8], camera_from_world: Array) -> Tracked:
+    def track_at(self, view: FrameView, camera_from_world: Array) -> Tracked:
         """The points of the next frame, at its pose (4, 4)."""
-        found = self._follow(normalized, camera_from_world, LEVELS + 1)
-        found = found.joined(self._search(normalized, camera_from_world, found.ids))
+        found = self._follow(view.pyramid, self._followable(), camera_from_world, LEVELS + 1)
+        found = found.joined(self._search(view.pyramid, camera_from_world, found.ids))
         known = self._map.state[found.ids] == GOOD
         positions, pixels = self._map.positions[found.ids[known]], found.pixels[known]
         errors = reprojection_errors(camera_from_world, positions, pixels, self._intrinsics)
         rms = float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0
         pose = PoseEstimate(camera_from_world, np.zeros((6, 6)), errors < INLIER_PX, rms)
-        result = self._tracked(normalized, pose, found, NOWHERE)
+        result = self._tracked(view.normalized.shape, pose, found, NOWHERE)
         self.camera_from_world, self.points = camera_from_world, result.points
         return result
 

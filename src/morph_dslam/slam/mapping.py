@@ -208,7 +208,7 @@ class Mapper:
 
     def _adjust(self, free: Indices, fixed: Indices, iterations: int) -> None:
         problem = gather(self._map, self._intrinsics, free, fixed, iterations, self._hold_poses)
-        put_back(self._map, problem, problem.solve())
+        put_back(self._map, problem, problem.adjuster().solve())
 
     def _cull(self) -> None:
         """Take out map points that are hardly ever found where they should be."""

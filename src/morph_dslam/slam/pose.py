@@ -8,6 +8,7 @@ matches about as well, the scene is plane or the camera has only turned, and the
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -22,7 +23,7 @@ from morph_dslam.slam.bundle_adjustment import (
     huber,
     in_camera,
     jacobians,
-    orthonormal,
+    make_orthonormal,
     residual,
     turned_and_shifted,
 )
@@ -83,11 +84,13 @@ ROUNDS = 2
 
 
 @njit(cache=True, nogil=True)
-def _normal_equations(pose, points, pixels, camera, width):
+def _normal_equations(pose, points, pixels, camera, width, used):
     """Huber cost, J'WJ (6, 6) and -J'Wr (6,) by the pose's twist from the left (rotation, translation)."""
     matrix, right, cost = np.zeros((6, 6)), np.zeros(6), 0.0
     poses, rows, by_point, misses = pose.reshape(1, 4, 4), np.zeros((3, 6)), np.zeros((3, 3)), np.zeros(3)
     for i in range(len(points)):
+        if not used[i]:
+            continue
         x, y, z = in_camera(poses, 0, points, i)
         if z < LEAST_DEPTH:
             cost += width * 1000.0
@@ -100,14 +103,17 @@ def _normal_equations(pose, points, pixels, camera, width):
             for j in range(6):
                 weighted = weight * rows[row, j]
                 right[j] -= weighted * misses[row]
-                for k in range(6):
+                for k in range(j + 1):
                     matrix[j, k] += weighted * rows[row, k]
+    for j in range(6):
+        for k in range(j):
+            matrix[k, j] = matrix[j, k]
     return cost, matrix, right
 
 
 @njit(cache=True, nogil=True)
-def _refine(pose, points, pixels, camera, width, iterations):
-    cost, matrix, right = _normal_equations(pose, points, pixels, camera, width)
+def _refine(pose, points, pixels, camera, width, used, iterations):
+    cost, matrix, right = _normal_equations(pose, points, pixels, camera, width, used)
     damping = 1e-6
     for _ in range(iterations):
         damped = matrix.copy()
@@ -116,7 +122,7 @@ def _refine(pose, points, pixels, camera, width, iterations):
         step = cholesky_solve(damped, right)
         moved = pose.copy()
         turned_and_shifted(pose, rotation_exp(step[:3]), step[3:], moved)
-        new_cost, new_matrix, new_right = _normal_equations(moved, points, pixels, camera, width)
+        new_cost, new_matrix, new_right = _normal_equations(moved, points, pixels, camera, width, used)
         if new_cost > cost:
             damping = max(10.0 * damping, 1e-4)
             continue
@@ -126,6 +132,65 @@ def _refine(pose, points, pixels, camera, width, iterations):
         if small:
             break
     return pose, matrix
+
+
+@njit(cache=True, nogil=True)
+def _errors(pose, points, pixels, camera):
+    """Distances (n,) in pixels between projected points (n, 3) and pixels (n, 2 or 3); inf behind the camera."""
+    result, poses = np.empty(len(points)), pose.reshape(1, 4, 4)
+    for i in range(len(points)):
+        x, y, z = in_camera(poses, 0, points, i)
+        result[i] = np.inf
+        if z > LEAST_DEPTH:
+            result[i] = math.hypot(
+                camera[0] * x / z + camera[2] - pixels[i, 0], camera[1] * y / z + camera[3] - pixels[i, 1]
+            )
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _inverse_of_normal(matrix):
+    """The inverse (6, 6) of normal equations, solved in units in which their diagonal is 1."""
+    scale = np.empty(6)
+    for j in range(6):
+        scale[j] = 1.0 / math.sqrt(max(matrix[j, j], 1e-300))
+    scaled, unit, result = np.empty((6, 6)), np.zeros(6), np.empty((6, 6))
+    for j in range(6):
+        for k in range(6):
+            scaled[j, k] = matrix[j, k] * scale[j] * scale[k]
+    for j in range(6):
+        unit[:] = 0.0
+        unit[j] = 1.0
+        column = cholesky_solve(scaled, unit)
+        for k in range(6):
+            result[k, j] = column[k] * scale[j] * scale[k]
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _refine_in_rounds(pose, points, pixels, camera, huber_px, inlier_px, used):
+    """A pose refined by the points that fit: pose, covariance, errors (n,) and their root mean square, `inf` without.
+
+    After each round the points that miss by more than ``inlier_px``, or by much more than most inliers, are left out.
+    """
+    matrix, errors = np.zeros((6, 6)), np.full(len(points), np.inf)
+    for _ in range(ROUNDS):
+        if used.sum() < 4:
+            return pose, matrix, np.full(len(points), np.inf), np.inf
+        pose, matrix = _refine(pose, points, pixels, camera, huber_px, used, 10)
+        make_orthonormal(pose)
+        errors = _errors(pose, points, pixels, camera)
+        inliers = errors[errors < inlier_px]
+        core_px = min(inlier_px, max(CORE_RATIO * np.median(inliers), LEAST_CORE_PX)) if len(inliers) else 0.0
+        used = errors < core_px
+    square, n = 0.0, 0
+    for error in errors:
+        if error < inlier_px:
+            square += error * error
+            n += 1
+    rms = math.sqrt(square / n) if n else np.inf
+    # Two residuals a point: the noise of one coordinate is the rms over sqrt(2).
+    return pose, _inverse_of_normal(matrix) * (max(rms, 0.1) ** 2 / 2.0), errors, rms
 
 
 @dataclass(frozen=True)
@@ -148,8 +213,9 @@ class PoseEstimate:
 
 def reprojection_errors(camera_from_world: Array, points: Array, pixels: Array, intrinsics: Array) -> Array:
     """Distances (n,) in pixels between projected points (n, 3) and pixels (n, 2); inf behind the camera."""
-    projected, _ = project(camera_from_world, points, intrinsics)
-    return np.nan_to_num(np.linalg.norm(projected - pixels, axis=1), nan=np.inf)
+    return _errors(
+        np.ascontiguousarray(camera_from_world), np.ascontiguousarray(points), np.ascontiguousarray(pixels), intrinsics
+    )
 
 
 def refine_pose(
@@ -170,34 +236,16 @@ def refine_pose(
     out of the next; the first one uses the ``trusted`` points (n,), all by default. Without four points that
     fit there is no inlier and the covariance is infinite.
     """
-    pose, used = np.ascontiguousarray(start, dtype=np.float64), np.ones(len(points), dtype=bool)
-    if trusted is not None:
-        used = trusted
-    matrix = np.eye(6)
-    columns = np.full(len(points), np.nan) if right is None else right
-    rows, camera = np.column_stack([pixels, columns]), np.append(intrinsics, baseline_px)
-    for _ in range(ROUNDS):
-        if used.sum() < 4:
-            return PoseEstimate(pose, np.full((6, 6), np.inf), np.zeros(len(points), dtype=bool), float("inf"))
-        pose, matrix = _refine(
-            pose, np.ascontiguousarray(points[used]), np.ascontiguousarray(rows[used]), camera, huber_px, 10
-        )
-        pose = orthonormal(pose)
-        errors = reprojection_errors(pose, points, pixels, intrinsics)
-        used = np.asarray(errors < _core_px(errors, inlier_px))
-    used = np.asarray(errors < inlier_px)
-    if not used.any():
-        return PoseEstimate(pose, np.full((6, 6), np.inf), used, float("inf"))
-    rms = float(np.sqrt(np.mean(errors[used] ** 2)))
-    # Two residuals a point: the noise of one coordinate is the rms over sqrt(2).
-    covariance = np.asarray(np.linalg.pinv(matrix) * max(rms, 0.1) ** 2 / 2.0, dtype=float)
-    return PoseEstimate(pose, covariance, used, rms)
-
-
-def _core_px(errors: Array, inlier_px: float) -> float:
-    """How far the points (n,) that determine a pose may miss, at most ``inlier_px``."""
-    inliers = errors[errors < inlier_px]
-    return min(inlier_px, max(CORE_RATIO * float(np.median(inliers)), LEAST_CORE_PX)) if len(inliers) else 0.0
+    pose, n = np.array(start, dtype=np.float64, order="C"), len(points)
+    rows, camera = np.empty((n, 3)), np.append(intrinsics, baseline_px)
+    rows[:, :2], rows[:, 2] = pixels, np.nan if right is None else right
+    used = np.ones(n, dtype=np.bool_) if trusted is None else trusted
+    pose, covariance, errors, rms = _refine_in_rounds(
+        pose, np.ascontiguousarray(points), rows, camera, float(huber_px), float(inlier_px), used
+    )
+    if not np.isfinite(rms):
+        return PoseEstimate(pose, np.full((6, 6), np.inf), np.zeros(n, dtype=np.bool_), rms)
+    return PoseEstimate(pose, covariance, errors < inlier_px, rms)
 
 
 def ransac_pose(

@@ -117,7 +117,6 @@ class PlaceIndex:
         return common / np.maximum(np.maximum(known.sum(axis=1), seen.sum()), 1e-12)
 
 
-Image = NDArray[np.uint8]
 #: Corners of the image that are described.
 N_CORNERS = 600
 #: Keyframes tried in one frame: the one that looks most alike, and one more in turn of those that follow.
@@ -177,7 +176,7 @@ class Relocalizer:
         if not len(tracker.points.ids):
             return None
         number = int(np.bincount(self._map.template_keyframe[tracker.points.ids]).argmax())
-        return self._confirmed(self.group(number), view.normalized, tracker.camera_from_world, tracker)
+        return self._confirmed(self.group(number), view, tracker.camera_from_world, tracker)
 
     def locate(self, view: FrameView, group: Indices, tracker: Tracker) -> tuple[PoseEstimate, Followed] | None:
         """The pose by the points of some keyframes, and the points that support it; None if they do not."""
@@ -187,7 +186,7 @@ class Relocalizer:
         self, view: FrameView, corners: _Corners, group: Indices, tracker: Tracker
     ) -> tuple[PoseEstimate, Followed] | None:
         rough = self._rough_pose(group, corners)
-        return None if rough is None else self._confirmed(group, view.normalized, rough.camera_from_world, tracker)
+        return None if rough is None else self._confirmed(group, view, rough.camera_from_world, tracker)
 
     def _candidates(self, descriptors: Descriptors) -> list[int]:
         order = np.argsort(-self.places.similarities(descriptors), kind="stable").tolist()
@@ -215,14 +214,13 @@ class Relocalizer:
         return find_pose(positions, corners.pixels[first], self._intrinsics, ROUGH_PX, least=ROUGH_INLIERS)
 
     def _confirmed(
-        self, group: Indices, normalized: Image, pose: Array, tracker: Tracker
+        self, group: Indices, view: FrameView, pose: Array, tracker: Tracker
     ) -> tuple[PoseEstimate, Followed] | None:
         """The pose from all points of the group, found near a rough pose (4, 4); None if too few are."""
         ids = np.unique(np.concatenate([self._map.good_in(k) for k in group]))
-        guesses, depths = project(pose, self._map.positions[ids], self._intrinsics)
-        seen = inside(guesses, normalized.shape, PATCH_HALF + 2)
-        seen &= tracker.is_similar_view(ids, pose, depths)
-        found = tracker.find(normalized, Followed(ids[seen], guesses[seen]), pose, 2)
+        guesses, _ = project(pose, self._map.positions[ids], self._intrinsics)
+        seen = inside(guesses, view.normalized.shape, PATCH_HALF + 2) & tracker.is_similar_view(ids, pose)
+        found = tracker.find(view.pyramid, Followed(ids[seen], guesses[seen]), pose, 2)
         refined = refine_pose(pose, self._map.positions[found.ids], found.pixels, self._intrinsics, inlier_px=INLIER_PX)
         enough = max(LEAST_INLIERS, LEAST_FIT * len(found.ids), LEAST_SHARE * int(seen.sum()))
         most = max(MOST_ERROR_RATIO * self._map.usual_rms_px, MOST_ERROR_PX)

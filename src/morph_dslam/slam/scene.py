@@ -19,7 +19,7 @@ from morph_dslam.errors import MapError, SourceError
 from morph_dslam.io.colmap import ColmapModel
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam import rolling_shutter
-from morph_dslam.slam.bundle_adjustment import Observations, adjust
+from morph_dslam.slam.bundle_adjustment import BundleAdjuster, Observations
 from morph_dslam.slam.frame_images import least_distances, orientations
 from morph_dslam.slam.map_files import load_map_and_trajectory, map_from_colmap, map_from_trajectory, save_map
 from morph_dslam.slam.options import SlamOptions
@@ -37,6 +37,8 @@ from morph_dslam.slam.self_calibration import (
     with_terms_of,
 )
 from morph_dslam.slam.slam import Slam
+from morph_dslam.slam.templates import Templates, image_pyramid
+from morph_dslam.slam.tracking import similar_views
 from morph_dslam.sources import FrameSource, FrameStream, open_source, open_stream
 from morph_dslam.sources.frames import has_registered_depth
 from morph_dslam.sources.live import LiveStream
@@ -328,10 +330,15 @@ def warm_up() -> None:
     pixels = points[:, :2] / points[:, 2:] * 100.0
     refine_pose(np.eye(4), points, pixels, intrinsics)
     seen = Observations(np.repeat([0, 1], 20), np.tile(np.arange(20), 2), np.concatenate([pixels, pixels]))
-    adjust(np.stack([np.eye(4)] * 2), points, seen, intrinsics, np.array([True, False]), iterations=1)
+    BundleAdjuster(np.stack([np.eye(4)] * 2), points, seen, intrinsics, np.array([True, False]), iterations=1).solve()
     image, centre = rng.integers(0, 255, (32, 32)).astype(np.uint8), np.array([[16.0, 16.0]])
     patch_correlation(image, image, centre, centre, 5)
     orientations(image, centre)
+    templates, pyramid, ids = Templates(intrinsics), image_pyramid(np.tile(image, (4, 4))), np.zeros(1, dtype=np.int64)
+    templates.outdated(ids, ids, np.eye(4), (np.eye(4)[None], ids), points, centre)
+    templates.make(ids, centre, pyramid)
+    templates.align(ids, pyramid, centre, 0)
+    similar_views(np.eye(4), np.eye(4)[None], ids, points[:1])
     words, rows = rng.integers(0, 255, (4, 32)).astype(np.uint8), np.arange(4)
     least_distances(words, rows, words, rows)
     bit_counts(words, rows, len(words))

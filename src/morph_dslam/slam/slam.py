@@ -110,7 +110,7 @@ class Slam:
         # In a map from elsewhere the camera is lost until it is found.
         self._n_lost, self._n_held, self._n_deforming = int(bool(rigid_map.keyframes)), 0, 0
         if self.is_frozen:
-            self._tracker.choose_templates()
+            self._tracker.choose_views()
 
     def process_frame(
         self,
@@ -159,7 +159,7 @@ class Slam:
             self._making.stop()
             self.is_frozen = True
             self._tracker.drop_candidates()
-            self._tracker.choose_templates()
+            self._tracker.choose_views()
 
     def refine_map(self) -> None:
         """Adjust all keyframes and points together, once the sequence is over; a frozen map stays."""
@@ -217,7 +217,7 @@ class Slam:
             if isinstance(points, NoPose):
                 return self._without_pose(view, SlamStatus.WAITING, points)
             self._tracker.place(self.map.keyframes[-1].camera_from_world, points)
-            tracked = self._tracker.track(view.normalized, view.depth)
+            tracked = self._tracker.track(view)
         if isinstance(tracked, NoPose):
             self._restart()
             return self._without_pose(view, SlamStatus.WAITING, NoPose(SlamReason.FIRST_MAP_FAILED, cause=tracked))
@@ -241,7 +241,7 @@ class Slam:
 
     def _track(self, view: FrameView) -> SlamFrame:
         with stage("track"):
-            tracked = self._tracker.track(view.normalized, view.depth)
+            tracked = self._tracker.track(view)
         if isinstance(tracked, NoPose):
             found = self._relocalize(view)
             return self._without_pose(view, SlamStatus.LOST, tracked) if found.pose is None else found

@@ -1,10 +1,9 @@
 """Following the map from frame to frame: where its points are now, and from them the camera's pose.
 
 Each point is followed from a keyframe that saw it, not from the previous frame, so that errors do not add up; the
-previous frame only says where to begin. Where the view has changed much, the keyframe is first warped as if its scene
-were a plane at the points' median depth (Klein and Murray 2007 warp each patch by itself). Points lost from sight are
-looked for again where the pose says they are. Points that leave the place where a rigid scene has them do not count for
-the pose, but are followed on.
+previous frame only says where to begin. A few points are followed over large motions and give a rough pose; from there
+all others, and points lost from sight, are looked for where it says they are. Points that leave the place where a rigid
+scene has them do not count for the pose, but are followed on.
 """
 
 from __future__ import annotations
@@ -12,17 +11,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from morph_dslam.slam.frame_images import FrameDepth
+from morph_dslam.slam.frame_images import FrameDepth, FrameView
 from morph_dslam.slam.options import INLIER_PX, LEAST_CORRELATION, LEAST_INLIERS, PATCH_HALF
 from morph_dslam.slam.pose import (
     LEAST_DEPTH,
     PoseEstimate,
-    camera_centre,
-    camera_matrix,
     find_pose,
     inside,
     inverse,
@@ -31,40 +28,38 @@ from morph_dslam.slam.pose import (
     reprojection_errors,
 )
 from morph_dslam.slam.result import NoPose, SlamReason
-from morph_dslam.slam.rigid_map import (
-    CANDIDATE,
-    FIRST_RMS_PX,
-    GOOD,
-    NOWHERE,
-    REMOVED,
-    Followed,
-    Indices,
-    Keyframe,
-    RigidMap,
-)
-from morph_dslam.tracking.patches import FLOW_WINDOW, LEVELS, NEUTRAL, follow, patch_correlation
+from morph_dslam.slam.rigid_map import CANDIDATE, FIRST_RMS_PX, GOOD, NOWHERE, REMOVED, Followed, Indices, RigidMap
+from morph_dslam.slam.templates import Pyramid, Templates, image_pyramid, shape_of
+from morph_dslam.tracking.patches import FLOW_WINDOW, LEVELS
 
 Array = NDArray[np.float64]
-#: Keyframes chosen for most points; one that adds fewer points than this is not worth its image.
+#: Keyframes chosen for most points; one that adds fewer points than this is not worth its view.
 MOST_VIEWS, LEAST_POINTS = 4, 10
 
 
-class FewTemplates:
-    """Chooses templates in a complete map."""
+class FewViews:
+    """Chooses the keyframes that points of a complete map are looked for from.
+
+    Attributes
+    ----------
+    template_keyframe, template_pixels : (p,), (p, 2) of each point of the map.
+    """
 
     def __init__(self, rigid_map: RigidMap) -> None:
         self._map = rigid_map
+        self.template_keyframe, self.template_pixels = (
+            rigid_map.template_keyframe.copy(),
+            rigid_map.template_pixels.copy(),
+        )
         self._seen = np.concatenate([keyframe.point_ids for keyframe in rigid_map.keyframes])
         counts = [len(keyframe.point_ids) for keyframe in rigid_map.keyframes]
         self._seen_by = np.repeat(np.arange(len(counts)), counts)
 
-    def choose(self, ids: Indices) -> tuple[Indices, Array]:
-        """Keyframe (n,) and pixels (n, 2) there to look for each point from.
+    def choose(self, ids: Indices) -> None:
+        """Choose for these points (n,).
 
-        Keyframes that show most of the points left are taken one after the other; the last points keep the
-        map's templates.
+        Keyframes that show most of the points left are taken one after the other; the last points keep what they had.
         """
-        views, pixels = self._map.template_keyframe[ids], self._map.template_pixels[ids]
         left, n_keyframes = np.ones(len(ids), dtype=bool), len(self._map.keyframes)
         wanted = np.zeros(len(self._map.state), dtype=bool)
         for _ in range(MOST_VIEWS):
@@ -77,80 +72,9 @@ class FewTemplates:
             keyframe = self._map.keyframes[best]
             rows, seen = keyframe.rows_of(ids)
             seen &= left
-            views[seen], pixels[seen] = best, keyframe.pixels[rows[seen]]
+            self.template_keyframe[ids[seen]] = best
+            self.template_pixels[ids[seen]] = keyframe.pixels[rows[seen]]
             left &= ~seen
-        return views, pixels
-
-
-Image = NDArray[np.uint8]
-#: Patches that are turned by less and scaled by less, along either axis, are followed as they are.
-MOST_TURN_DEG, MOST_STRETCH = 14.0, 1.25
-#: A warped view is used again while what it lacks is this part of those.
-REUSE = 0.5
-
-
-def plane_homography(keyframe_pose: Array, pose: Array, depth: float, intrinsics: Array) -> Array:
-    """Pixels from a keyframe's pixels (3, 3), for a plane at a depth that is parallel to its image.
-
-    Poses (4, 4) are camera_from_world.
-    """
-    matrix = camera_matrix(intrinsics)
-    relative = pose @ inverse(keyframe_pose)
-    plane = relative[:3, :3].copy()
-    plane[:, 2] += relative[:3, 3] / depth
-    return matrix @ plane @ np.linalg.inv(matrix)
-
-
-def warp_pixels(homography: Array, pixels: Array) -> Array:
-    """Pixels (n, 2) moved by a homography (3, 3)."""
-    moved = pixels @ homography[:, :2].T + homography[:, 2]
-    return moved[:, :2] / moved[:, 2:]
-
-
-def local_change(homography: Array, pixel: Array) -> Array:
-    """Derivative (2, 2) of a homography at a pixel (2,)."""
-    x, y, w = homography @ [*pixel, 1.0]
-    return np.array([homography[0, :2] * w - x * homography[2, :2], homography[1, :2] * w - y * homography[2, :2]]) / (
-        w * w
-    )
-
-
-def is_small(change: Array, part: float = 1.0) -> bool:
-    """Whether patches changed by this matrix (2, 2) can be followed as they are."""
-    (a, b), (c, d) = change.tolist()
-    # The turn of the nearest rotation, and the singular values of a 2 x 2 matrix.
-    turn, sheared = math.hypot(a + d, c - b), math.hypot(a - d, c + b)
-    largest, smallest = 0.5 * (turn + sheared), 0.5 * (turn - sheared)
-    angle = abs(math.degrees(math.atan2(c - b, a + d)))
-    limit = MOST_STRETCH**part
-    return angle < part * MOST_TURN_DEG and largest < limit and smallest > 1.0 / limit
-
-
-class WarpedViews:
-    """Keyframes as seen from about where the camera is."""
-
-    def __init__(self, intrinsics: Array) -> None:
-        self._intrinsics = intrinsics
-        self._views: dict[int, tuple[Array, Image]] = {}
-
-    def view(self, number: int, keyframe: Keyframe, pose: Array, depth: float) -> tuple[Image, Array | None]:
-        """The image (h, w) to look for patches of, and the homography (3, 3) from the keyframe's pixels.
-
-        That is None where the keyframe itself will do. ``pose`` (4, 4) is camera from world, ``depth`` that
-        of the points before the keyframe, in the map's unit.
-        """
-        now = plane_homography(keyframe.camera_from_world, pose, depth, self._intrinsics)
-        centre = self._intrinsics[2:]
-        change = local_change(now, centre)
-        if is_small(change) or not np.isfinite(change).all() or np.linalg.det(change) <= 0.0:
-            return keyframe.normalized, None
-        if number in self._views:
-            before, image = self._views[number]
-            if is_small(change @ np.linalg.inv(local_change(before, centre)), REUSE):
-                return image, before
-        image = cv2.warpPerspective(keyframe.normalized, now, keyframe.normalized.shape[::-1], borderValue=NEUTRAL)
-        self._views[number] = now, np.asarray(image, dtype=np.uint8)
-        return self._views[number][1], now
 
 
 Mask = NDArray[np.bool_]
@@ -162,6 +86,11 @@ DOUBTFUL_SHARE = 0.25
 #: Points that disagree have moved if they did so in the frame before, too, or if all at once they are more
 #: than this share of the points that agree.
 MOST_LEAVING = 0.1
+#: Points that are followed over large motions to give a rough pose, the share of them that has to agree on it, and the
+#: levels on which points are looked for whose place is known that well.
+N_PILOTS, AGREEING_PILOTS, NEAR_LEVELS = 64, 0.5, 2
+#: Keyframes whose pyramids are kept.
+MOST_PYRAMIDS = 8
 #: Lost points looked for in a frame, from at most so many keyframes.
 SEARCH_POINTS, SEARCH_KEYFRAMES = 80, 3
 #: In a frozen map lost points are looked for while fewer than this are followed.
@@ -187,6 +116,29 @@ SENIOR_AGE, LEAST_SENIORS = 3, 30
 #: Points that leave together, by a motion of their own, and are as many as this part of those that stay: then
 #: which of them stands still is ambiguous.
 RIVAL_SHARE = 0.6
+
+
+@njit(cache=True, nogil=True)
+def similar_views(pose, keyframes, rows, points):
+    """Whether points (n, 3) look from a pose (4, 4) about as from keyframes (k, 4, 4), each from that of its row."""
+    result = np.empty(len(points), dtype=np.bool_)
+    least, there, here = math.cos(math.radians(MOST_VIEW_ANGLE_DEG)), np.empty(3), np.empty(3)
+    for i in range(len(points)):
+        keyframe = keyframes[rows[i]]
+        # From the point to the centres of both cameras, and its depth.
+        depth = pose[2, 3]
+        for j in range(3):
+            there[j] = here[j] = -points[i, j]
+            for k in range(3):
+                there[j] -= keyframe[k, j] * keyframe[k, 3]
+                here[j] -= pose[k, j] * pose[k, 3]
+            depth += pose[2, j] * points[i, j]
+        product = there[0] * here[0] + there[1] * here[1] + there[2] * here[2]
+        far_there = math.sqrt(there[0] ** 2 + there[1] ** 2 + there[2] ** 2)
+        far_here = math.sqrt(here[0] ** 2 + here[1] ** 2 + here[2] ** 2)
+        near = far_here < MOST_SCALE_CHANGE * far_there and far_there < MOST_SCALE_CHANGE * far_here
+        result[i] = near and product > least * far_there * far_here and depth > 0.0
+    return result
 
 
 def misfit(errors: Array, core_px: float) -> float:
@@ -308,8 +260,8 @@ class Tracker:
         self._map = rigid_map
         self._intrinsics = intrinsics
         self._motion = np.eye(4)
-        self._warped = WarpedViews(intrinsics)
-        self._templates: FewTemplates | None = None
+        self._templates, self._pyramids = Templates(intrinsics), dict[int, Pyramid]()
+        self._views: FewViews | None = None
         self._astray = NOWHERE
         self.camera_from_world = np.eye(4)
         self.points = NOWHERE
@@ -334,11 +286,11 @@ class Tracker:
         """Follow map points only."""
         self.points = self.points[self._map.state[self.points.ids] == GOOD]
 
-    def choose_templates(self) -> None:
+    def choose_views(self) -> None:
         """The map is complete: look for points from the few keyframes that show most of them."""
-        self._templates = FewTemplates(self._map)
+        self._views = FewViews(self._map)
 
-    def track(self, normalized: Image, depth: FrameDepth | None = None) -> Tracked | NoPose:
+    def track(self, view: FrameView) -> Tracked | NoPose:
         """Pose and points of the next frame, or why it is lost; then the newest pose stays what it was."""
         reasons = []
         # The prediction is that the motion goes on; if it has changed abruptly, that the camera stands still.
@@ -346,8 +298,7 @@ class Tracker:
             (self._motion @ self.camera_from_world, LEVELS),
             (self.camera_from_world, LEVELS + 1),
         ):
-            found = self._follow(normalized, predicted, levels)
-            result = self._estimate(normalized, depth, predicted, found)
+            result = self._attempt(view, predicted, levels)
             if isinstance(result, Tracked):
                 self._motion = result.pose.camera_from_world @ inverse(self.camera_from_world)
                 self.camera_from_world = result.pose.camera_from_world
@@ -361,26 +312,72 @@ class Tracker:
 
     def _note_candidates(self, points: Followed) -> None:
         """Let the map know where points without depth are."""
-        if self._templates is not None:
+        if self._views is not None:
             return
         waiting = points[self._map.state[points.ids] == CANDIDATE]
         newest = len(self._map.keyframes) - 1
         at = self._map.keyframes[newest].camera_from_world
         self._map.passing.note(newest, at, self.camera_from_world, waiting.ids, waiting.pixels)
 
-    def _follow(self, normalized: Image, predicted: Array, levels: int) -> Followed:
-        """Followed points, astray ones too, found again, begun where the predicted motion takes them."""
-        # A further keyframe costs as much as all points of one: those astray come along with others only.
-        views = self._map.template_keyframe
-        along = np.isin(views[self._astray.ids], views[self.points.ids])
-        points = self.points.joined(self._astray[along])
-        # The mapper may have taken some out, and the view with their patches too.
-        points = points[self._map.state[points.ids] != REMOVED]
+    def _attempt(self, view: FrameView, predicted: Array, levels: int) -> Tracked | NoPose:
+        """Pose and points, if the motion is about as predicted: within what so many levels reach."""
+        points = self._followable()
+        if self._views is not None:
+            self._views.choose(points.ids)
+        pilots = self._pilots(points)
+        found = self._follow(view.pyramid, points[pilots], predicted, levels)
+        rough = self._rough_pose(predicted, found)
+        rest = np.ones(len(points.ids), dtype=bool)
+        rest[pilots] = False
+        if rough is None:
+            found = found.joined(self._follow(view.pyramid, points[rest], predicted, levels))
+        else:
+            found = found.joined(self._follow(view.pyramid, points[rest], rough, NEAR_LEVELS))
+        was_astray = self._among(self._astray.ids)[found.ids]
+        astray, found = found[was_astray], found[~was_astray]
+        if rough is not None:
+            astray = self._still_astray(rough, astray)
+            found = found.joined(self._search(view.pyramid, rough, np.concatenate([found.ids, astray.ids])))
+        found = self.measured(found, predicted if rough is None else rough, view.depth)
+        # From the prediction, so that no few points decide which others are trusted.
+        pose = self._pose(predicted, found)
+        if isinstance(pose, NoPose):
+            return pose
+        if rough is None:
+            astray = self._still_astray(pose.camera_from_world, astray)
+        return self._tracked(view.normalized.shape, pose, found, astray)
+
+    def _among(self, ids: Indices) -> Mask:
+        """Of all points of the map, which are these."""
+        result = np.zeros(len(self._map.state), dtype=bool)
+        result[ids] = True
+        return result
+
+    def _followable(self) -> Followed:
+        """Followed points, astray ones too; the mapper may have taken some out."""
+        points = self.points.joined(self._astray)
+        return points[self._map.state[points.ids] != REMOVED]
+
+    def _pilots(self, points: Followed) -> Indices:
+        """Rows of a few of the points, spread over them, whose depth is known and that have not left the scene."""
+        rows = np.flatnonzero((self._map.state[points.ids] == GOOD) & ~self._among(self._astray.ids)[points.ids])
+        return rows[np.linspace(0, len(rows) - 1, N_PILOTS).astype(int)] if len(rows) > N_PILOTS else rows
+
+    def _rough_pose(self, start: Array, pilots: Followed) -> Array | None:
+        """The pose (4, 4) that the few points found first agree on, if most of them do."""
+        if len(pilots.ids) < LEAST_INLIERS:
+            return None
+        positions = self._map.positions[pilots.ids]
+        pose = refine_pose(start, positions, pilots.pixels, self._intrinsics, inlier_px=INLIER_PX)
+        return pose.camera_from_world if pose.inliers.mean() > AGREEING_PILOTS else None
+
+    def _follow(self, image: Pyramid, points: Followed, pose: Array, levels: int) -> Followed:
+        """Those of the points that are found where the motion to a pose (4, 4) takes them."""
         positions = self._map.positions[points.ids]
         before, _ = project(self.camera_from_world, positions, self._intrinsics)
-        after, _ = project(predicted, positions, self._intrinsics)
+        after, _ = project(pose, positions, self._intrinsics)
         guesses = points.pixels + np.nan_to_num(after - before)
-        return self.find(normalized, Followed(points.ids, guesses), predicted, levels)
+        return self._look_for(image, Followed(points.ids, guesses), pose, levels)
 
     def _still_astray(self, pose: Array, followed: Followed) -> Followed:
         """Those of the points that had left the rigid scene that are still away from their places."""
@@ -389,31 +386,39 @@ class Tracker:
         errors = reprojection_errors(pose, positions, followed.pixels, self._intrinsics)
         return followed[errors > INLIER_PX]
 
-    def find(self, normalized: Image, guesses: Followed, pose: Array, levels: int) -> Followed:
+    def find(self, image: Pyramid, guesses: Followed, pose: Array, levels: int) -> Followed:
         """Points found near their guessed pixels, by the patches of their keyframes as seen from a pose."""
-        ids = guesses.ids
-        if self._templates is not None:
-            views, templates = self._templates.choose(ids)
-        else:
-            views, templates = self._map.template_keyframe[ids], self._map.template_pixels[ids]
-        found, good = guesses.pixels.copy(), np.zeros(len(ids), dtype=bool)
-        for view in np.unique(views):
-            rows = np.flatnonzero((views == view) & inside(guesses.pixels, normalized.shape, 0.0))
-            source, starts = self._seen_from(pose, int(view), ids[rows], templates[rows])
-            pixels, ok = follow(source, normalized, starts, guesses.pixels[rows], levels)
-            likeness = patch_correlation(source, normalized, starts, pixels, PATCH_HALF)
-            found[rows], good[rows] = pixels, ok & (likeness > LEAST_CORRELATION)
-        return Followed(ids, found)[good]
+        if self._views is not None:
+            self._views.choose(guesses.ids)
+        return self._look_for(image, guesses, pose, levels)
 
-    def _seen_from(self, pose: Array, number: int, ids: Indices, pixels: Array) -> tuple[Image, Array]:
-        """A keyframe's image, warped where it looks much different from the pose, and its pixels there."""
-        keyframe = self._map.keyframes[number]
+    def _look_for(self, image: Pyramid, guesses: Followed, pose: Array, levels: int) -> Followed:
+        guesses = guesses[inside(guesses.pixels, shape_of(image), 0.0)]
+        ids = guesses.ids
         if not len(ids):
-            return keyframe.normalized, pixels
-        _, depths = project(keyframe.camera_from_world, self._map.positions[ids], self._intrinsics)
-        depth = max(float(np.median(depths)), LEAST_DEPTH)
-        image, homography = self._warped.view(number, keyframe, pose, depth)
-        return image, pixels if homography is None else warp_pixels(homography, pixels)
+            return guesses
+        of_views = self._map if self._views is None else self._views
+        views, pixels = of_views.template_keyframe[ids], of_views.template_pixels[ids]
+        keyframes = self._keyframe_poses(views)
+        outdated = self._templates.outdated(ids, views, pose, keyframes, self._map.positions, pixels)
+        for number in np.unique(views[outdated]).tolist():
+            rows = outdated & (views == number)
+            self._templates.make(ids[rows], pixels[rows], self._pyramid_of(number))
+        found, likeness = self._templates.align(ids, image, guesses.pixels, levels)
+        return Followed(ids, found)[likeness > LEAST_CORRELATION]
+
+    def _keyframe_poses(self, views: Indices) -> tuple[Array, Indices]:
+        """Poses (k, 4, 4) of the keyframes among some, and the row (n,) of each."""
+        numbers, rows = np.unique(views, return_inverse=True)
+        return np.array([self._map.keyframes[k].camera_from_world for k in numbers]).reshape(-1, 4, 4), rows
+
+    def _pyramid_of(self, number: int) -> Pyramid:
+        """The images of a keyframe; those used last are kept."""
+        image = self._pyramids.pop(number, None) or image_pyramid(self._map.keyframes[number].normalized)
+        self._pyramids[number] = image
+        if len(self._pyramids) > MOST_PYRAMIDS:
+            del self._pyramids[next(iter(self._pyramids))]
+        return image
 
     def measured(self, found: Followed, pose: Array, depth: FrameDepth | None) -> Followed:
         """Map points with their columns in the right image, where those are near what the pose expects."""
@@ -426,34 +431,16 @@ class Tracker:
         right[known] = depth.right_columns(found.pixels[known], columns)
         return Followed(found.ids, found.pixels, right)
 
-    def _estimate(
-        self, normalized: Image, depth: FrameDepth | None, predicted: Array, found: Followed
-    ) -> Tracked | NoPose:
-        """Pose from what was followed, then with the lost points that are found again."""
-        was_astray = np.isin(found.ids, self._astray.ids)
-        followed_astray, found = found[was_astray], self.measured(found[~was_astray], predicted, depth)
-        pose = self._pose(predicted, found)
-        if isinstance(pose, NoPose):
-            return pose
-        astray = self._still_astray(pose.camera_from_world, followed_astray)
-        searched = self._search(normalized, pose.camera_from_world, np.concatenate([found.ids, astray.ids]))
-        if len(searched.ids):
-            found = found.joined(self.measured(searched, pose.camera_from_world, depth))
-            pose = self._pose(pose.camera_from_world, found)
-            if isinstance(pose, NoPose):
-                return pose
-        return self._tracked(normalized, pose, found, astray)
-
-    def _tracked(self, normalized: Image, pose: PoseEstimate, found: Followed, astray: Followed) -> Tracked:
+    def _tracked(self, shape: tuple[int, ...], pose: PoseEstimate, found: Followed, astray: Followed) -> Tracked:
         """Which points obey a pose; counted in the map."""
         known = self._map.state[found.ids] == GOOD
         fits = np.zeros(len(found.ids), dtype=bool)
         fits[known] = pose.inliers
         wanted = self.points.ids[self._map.state[self.points.ids] == GOOD]
-        self._map.n_expected[np.union1d(np.union1d(wanted, found.ids[known]), astray.ids)] += 1
+        self._map.n_expected += self._among(np.concatenate([wanted, found.ids[known], astray.ids]))
         self._map.n_found[found.ids[fits]] += 1
         keep = fits | (self._map.state[found.ids] == CANDIDATE)
-        keep &= inside(found.pixels, normalized.shape, PATCH_HALF + 2)
+        keep &= inside(found.pixels, shape, PATCH_HALF + 2)
         before, _ = project(self.camera_from_world, self._map.positions[found.ids[fits]], self._intrinsics)
         moved = np.linalg.norm(found.pixels[fits] - np.nan_to_num(before), axis=1)
         leaving = found[known & ~fits]
@@ -469,40 +456,30 @@ class Tracker:
         known = found[self._map.state[found.ids] == GOOD]
         return Sight(self._map, known, self._intrinsics).pose(start)
 
-    def _search(self, normalized: Image, pose: Array, followed: Indices) -> Followed:
+    def _search(self, image: Pyramid, pose: Array, followed: Indices) -> Followed:
         """Map points that are not followed but in view, found where the pose says."""
         # In a complete map points have no need to be seen again for their own sake.
         most = SEARCH_POINTS
-        if self._templates is not None:
+        if self._views is not None:
             most = min(ENOUGH_POINTS - len(followed), most)
             if most <= 0:
                 return NOWHERE
         lost = self._map.state == GOOD
         lost[followed] = False
         ids = np.flatnonzero(lost)
-        pixels, depths = project(pose, self._map.positions[ids], self._intrinsics)
-        seen = inside(pixels, normalized.shape, FLOW_WINDOW) & self.is_similar_view(ids, pose, depths)
-        wanted = Followed(ids, pixels)[seen]
+        pixels, _ = project(pose, self._map.positions[ids], self._intrinsics)
+        wanted = Followed(ids, pixels)[inside(pixels, shape_of(image), FLOW_WINDOW)]
+        wanted = wanted[self.is_similar_view(wanted.ids, pose)]
         wanted = wanted[self._chosen(wanted.ids, most)]
-        if not len(wanted.ids):
-            return wanted
-        found = self.find(normalized, wanted, pose, 1)
+        found = self._look_for(image, wanted, pose, NEAR_LEVELS)
         errors = reprojection_errors(pose, self._map.positions[found.ids], found.pixels, self._intrinsics)
-        self._map.n_expected[np.setdiff1d(wanted.ids, found.ids)] += 1
+        self._map.n_expected[wanted.ids[~self._among(found.ids)[wanted.ids]]] += 1
         return found[errors < SEARCH_RADIUS_PX]
 
-    def is_similar_view(self, ids: Indices, pose: Array, depths: Array) -> Mask:
+    def is_similar_view(self, ids: Indices, pose: Array) -> Mask:
         """Whether points look from here about as from their keyframe."""
-        numbers, views = np.unique(self._map.template_keyframe[ids], return_inverse=True)
-        poses = np.array([self._map.keyframes[k].camera_from_world for k in numbers]).reshape(-1, 4, 4)
-        centres = -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])[views]
-        points = self._map.positions[ids]
-        there, here = centres - points, camera_centre(pose) - points
-        far_there, far_here = np.linalg.norm(there, axis=1), np.linalg.norm(here, axis=1)
-        cosine = np.einsum("nx,nx->n", there, here) / np.maximum(far_there * far_here, 1e-12)
-        ratio = far_here / np.maximum(far_there, 1e-12)
-        near = (ratio < MOST_SCALE_CHANGE) & (ratio > 1.0 / MOST_SCALE_CHANGE)
-        return near & (cosine > np.cos(np.radians(MOST_VIEW_ANGLE_DEG))) & (depths > 0.0)
+        poses, rows = self._keyframe_poses(self._map.template_keyframe[ids])
+        return similar_views(pose, poses, rows, self._map.positions[ids])
 
     def _chosen(self, ids: Indices, most: int) -> Indices:
         """Rows of at most ``most`` points to look for: of keyframes that saw most, reliable ones first."""
