@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import tomllib
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -39,8 +40,6 @@ def client(server):
 @pytest.fixture(scope="module")
 def folder(client):
     """The project folder with an object in it."""
-    from pathlib import Path
-
     folder = Path(client.state()["folder"])
     write_part(folder.parent / "part.inp")
     assert client.upload("object", "part.inp", (folder.parent / "part.inp").read_bytes()) == 200

@@ -11,9 +11,9 @@ import h5py
 import numpy as np
 import pytest
 
-from morph_dslam import load_camera, load_model, load_study, simulate
+from morph_dslam import load_camera, load_model, load_study, open_source, simulate
 from tests.support.chromium import Page, find_chromium
-from tests.support.studio import running_studio, write_part, write_scene
+from tests.support.studio import Client, running_studio, write_part, write_scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(find_chromium() is None, reason="no Chromium on this machine")]
 #: Points on the part's faces that both the camera and the first view of the mesh see, millimetres.
@@ -158,6 +158,29 @@ def track(page, shots):
     page.wait_for("document.querySelector('#result-image').dataset.frame === '7'")
     page.wait_for("document.querySelector('.bar') !== null")
     shoot(page, shots / "7_results.png")
+
+
+def test_a_camera_of_the_computer_is_recorded(tmp_path):
+    """The browser's own fake camera, a clock on green ground."""
+    fake = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
+    with running_studio(tmp_path / "project") as server, Page(tmp_path / "profile", (1440, 900), fake) as page:
+        page.send("Page.navigate", url=server.address)
+        page.click("#step-camera")
+        page.click("#record")
+        page.wait_for("document.querySelector('#record-video')?.currentTime > 1")
+        page.click("#record")
+        page.wait_for("document.querySelector('#panel').textContent.includes('webcam.webm')")
+        page.wait_for("document.querySelector('#view canvas') !== null")
+        shoot(page, tmp_path / "recorded.png")
+        assert page.problems == []
+        facts = Client(server).state()["recording"]
+    frames = list(open_source(tmp_path / "project" / "webcam.webm"))
+    assert len(frames) == facts["frames"] >= 5
+    assert 1.0 < facts["fps"] < 40.0
+    image = frames[-1].image
+    assert image.shape == (facts["height"], facts["width"], 3)
+    green = (image[..., 1] > 1.5 * image[..., [0, 2]].max(axis=2)).mean()
+    assert green > 0.2  # the ground of the fake camera's picture
 
 
 def test_the_study_is_what_was_clicked(project):

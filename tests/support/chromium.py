@@ -24,7 +24,7 @@ def find_chromium():
 class Page:
     """One page of one browser; ``problems`` and ``requests`` collect what it reports."""
 
-    def __init__(self, profile, size=(1000, 700)):
+    def __init__(self, profile, size=(1000, 700), more_options=()):
         to_browser, self._out = os.pipe()
         self._in, from_browser = os.pipe()
         # Chromium reads messages from descriptor 3 and writes to 4; the shell puts the pipes there.
@@ -32,7 +32,7 @@ class Page:
             find_chromium(), "--headless", "--no-sandbox", "--remote-debugging-pipe", "--no-first-run",
             "--disable-dev-shm-usage", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
             "--disable-background-networking", "--disable-component-update", "--hide-scrollbars",
-            f"--user-data-dir={profile}", f"--window-size={size[0]},{size[1]}",
+            f"--user-data-dir={profile}", f"--window-size={size[0]},{size[1]}", *more_options,
         ]  # fmt: skip
         self._process = subprocess.Popen(
             ["bash", "-c", f'exec "$@" 3<&{to_browser} 4>&{from_browser}', "chromium", *options],

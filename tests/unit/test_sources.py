@@ -86,6 +86,28 @@ def test_video_timestamps_are_the_containers(tmp_path, monkeypatch):
     assert [frame.timestamp for frame in open_source(path)] == pytest.approx([0.0, 0.033, 0.1, 3 / 25.0])
 
 
+def test_a_browser_s_recording_is_counted_and_timed(tmp_path, monkeypatch):
+    """A WebM declares no count, and milliseconds for its rate: 5 frames, 40 ms apart, would be 200 of 1 ms."""
+    path, original = make_video(tmp_path / "clip.mkv", "MJPG", n_frames=5), cv2.VideoCapture
+
+    class Recorded:
+        def __init__(self, name):
+            self.capture = original(name)
+
+        def __getattr__(self, name):
+            return getattr(self.capture, name)
+
+        def get(self, what):
+            declared = {cv2.CAP_PROP_FPS: 1000.0, cv2.CAP_PROP_FRAME_COUNT: 200.0}
+            return declared[what] if what in declared else self.capture.get(what)
+
+    monkeypatch.setattr(cv2, "VideoCapture", Recorded)
+    source = open_source(path)
+    assert len(source) == 5
+    assert source.fps == pytest.approx(25.0)
+    assert [frame.timestamp for frame in source] == pytest.approx([0.0, 0.04, 0.08, 0.12, 0.16])
+
+
 def test_truncated_video_gives_its_frames_and_then_the_break(tmp_path):
     path = make_video(tmp_path / "clip.avi", "MJPG", n_frames=20)
     data = path.read_bytes()

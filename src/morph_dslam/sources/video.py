@@ -13,6 +13,8 @@ from morph_dslam.sources.frames import Frame, check_range, frame_rate, open_capt
 
 #: Containers that only estimate their length from its duration are off by so many frames without damage.
 LENGTH_TOLERANCE = 1
+#: The first bytes of a Matroska or WebM file.
+MATROSKA = b"\x1aE\xdf\xa3"
 
 
 def _open(path: Path) -> cv2.VideoCapture:
@@ -25,15 +27,23 @@ def _open(path: Path) -> cv2.VideoCapture:
     return capture
 
 
-def _count_frames(path: Path, capture: cv2.VideoCapture) -> int:
-    """The declared number of frames, counted where the container does not declare it."""
-    count = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
-    if count == 0:
-        while capture.grab():
-            count += 1
+def _count_and_rate(path: Path, capture: cv2.VideoCapture) -> tuple[int, float]:
+    """The declared number of frames and their rate; counted, and taken from the times, where they are not declared.
+
+    Matroska and WebM, which browsers record, declare a duration alone: where frames were dropped, OpenCV's count is
+    wrong.
+    """
+    with path.open("rb") as file:
+        is_matroska = file.read(len(MATROSKA)) == MATROSKA
+    count, fps = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0), frame_rate(capture)
+    if count and not is_matroska:
+        return count, fps
+    count, last = 0, 0.0
+    while capture.grab():
+        count, last = count + 1, 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC)
     if count == 0:
         raise SourceError(f"{path} holds no frames")
-    return count
+    return count, (count - 1) / last if is_matroska and count > 1 and last > 0.0 else fps
 
 
 class VideoFile:
@@ -42,8 +52,7 @@ class VideoFile:
     def __init__(self, path: Path, first: int | None = None, last: int | None = None) -> None:
         capture = _open(path)
         try:
-            self._declared = _count_frames(path, capture)
-            self.fps = frame_rate(capture)
+            self._declared, self.fps = _count_and_rate(path, capture)
         finally:
             capture.release()
         self._path, self._open_ended, self.name = path, last is None, str(path)

@@ -27,8 +27,9 @@ from morph_dslam.studio.steps import Steps
 _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 #: The pages' own files, and those of the explorer that they share.
 _PAGES = (
-    "studio.css", "studio.js", "server.js", "parts.js", "mesh_view.js", "overlay.js", "plot.js", "object_step.js",
-    "study_step.js", "build_step.js", "camera_step.js", "start_step.js", "track_step.js", "results_step.js",
+    "studio.css", "studio.js", "server.js", "parts.js", "mesh_view.js", "overlay.js", "plot.js", "recorder.js",
+    "object_step.js", "study_step.js", "build_step.js", "camera_step.js", "start_step.js", "track_step.js",
+    "results_step.js",
 )  # fmt: skip
 _SHARED = (
     "solid_view.js", "colour_bar.js", "three/three.module.min.js", "three/three.core.min.js", "three/OrbitControls.js",

@@ -3,6 +3,7 @@
 import { call, frame, upload } from './server.js';
 import { choice, command, digits, dropZone, el, facts, field, title } from './parts.js';
 import { ImageView } from './overlay.js';
+import { recordButton } from './recorder.js';
 
 const PICTURES = '.png,.jpg,.jpeg,.bmp,.tif,.tiff';
 const VIDEOS = '.mp4,.mov,.avi,.mkv,.webm,.m4v';
@@ -16,33 +17,39 @@ export async function cameraStep(app) {
   const lens = choice('lens', [['radial-tangential', 'normal'], ['fisheye', 'fisheye']]);
   let boards = app.state.files.includes('board') ? 'Pictures of the board are there.' : 'No pictures yet.';
   const boardNote = el('p', { className: 'note' }, boards);
+  const takeRecording = async (files) => {
+    if (isPicture(files[0])) {
+      await call('forget_frames', { folder: 'frames' });
+      for (const [i, file] of files.entries()) {
+        app.message(`uploading image ${i + 1} of ${files.length}`);
+        await upload('frame', file);
+      }
+      app.message('');
+    } else await upload('recording', files[0]);
+    await refresh();
+  };
+  const takeBoard = async (files) => {
+    await call('forget_frames', { folder: 'board' });
+    for (const file of files) await upload('board', file);
+    boardNote.textContent = `${files.length} file${files.length > 1 ? 's' : ''} uploaded.`;
+    await draw();
+  };
+  const record = recordButton(app, 'record', 'Record with a camera of this computer', 'webcam', takeRecording);
+  const recordBoard = recordButton(app, 'record-board', 'Record the board', 'board', takeBoard);
   app.panel.append(
     ...title('Camera', 'The video of the object, and what is known of the camera that took it.'),
     el('h3', { style: 'margin-top: 8px' }, 'Recording'),
     dropZone('drop-recording', 'Drop a video, or numbered images', 'MP4, MOV, AVI, MKV, WebM; PNG, JPEG', `${VIDEOS},${PICTURES}`,
-      (files) => app.doing(async () => {
-        if (isPicture(files[0])) {
-          await call('forget_frames', { folder: 'frames' });
-          for (const [i, file] of files.entries()) {
-            app.message(`uploading image ${i + 1} of ${files.length}`);
-            await upload('frame', file);
-          }
-        } else await upload('recording', files[0]);
-        await refresh();
-      })),
-    recording,
+      (files) => app.doing(() => takeRecording(files))),
+    el('p', {}, record.button), recording,
     el('h3', {}, 'Intrinsics'),
     dropZone('drop-camera', 'Drop a camera file', 'of this program, OpenCV, ROS, Kalibr, COLMAP', '.yaml,.yml,.txt',
       ([file]) => app.doing(async () => { await upload('camera', file); await refresh(); })),
     camera,
     el('details', {}, el('summary', {}, 'Calibrate with a checkerboard'),
       dropZone('drop-board', 'Drop 15 to 30 pictures of the board', 'or a slow video of it', `${VIDEOS},${PICTURES}`,
-        (files) => app.doing(async () => {
-          await call('forget_frames', { folder: 'board' });
-          for (const file of files) await upload('board', file);
-          boardNote.textContent = `${files.length} file${files.length > 1 ? 's' : ''} uploaded.`;
-        })),
-      boardNote,
+        (files) => app.doing(() => takeBoard(files))),
+      el('p', {}, recordBoard.button), boardNote,
       el('div', { className: 'row' }, field('Inner corners', board), field('Square', square), field('Lens', lens)),
       el('button', { id: 'calibrate', onclick: () => app.doing(() => call('calibrate',
         { board: board.value, square: square.value, lens: lens.value })) }, 'Calibrate'),
@@ -86,5 +93,8 @@ export async function cameraStep(app) {
   }
 
   await draw();
-  return { job: (job, ended) => { if (ended && job.kind === 'calibrate') app.doing(draw); } };
+  return {
+    close: () => [record, recordBoard].forEach((one) => one.close()),
+    job: (job, ended) => { if (ended && job.kind === 'calibrate') app.doing(draw); },
+  };
 }
