@@ -5,6 +5,7 @@ import io
 import json
 import re
 import signal
+import ssl
 import subprocess
 import sys
 import tomllib
@@ -289,6 +290,47 @@ def test_it_ends_quietly_although_a_page_is_open(tmp_path):
 
 def test_a_port_that_is_taken_is_one_message(server, refused):
     assert f"127.0.0.1:{server.port} cannot be taken" in refused("studio", "--port", str(server.port))
+
+
+def test_a_phone_is_let_in_once_to_bring_a_recording(tmp_path):
+    """Over HTTPS with a certificate that nobody else has signed."""
+    _, data = cv2.imencode(".png", np.zeros((24, 32, 3), np.uint8))
+    writer = cv2.VideoWriter(str(tmp_path / "phone.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 30, (32, 24))
+    for _ in range(3):
+        writer.write(cv2.imdecode(data, cv2.IMREAD_COLOR))
+    writer.release()
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    with running_studio(tmp_path / "project", phone=True) as server:
+
+        def ask(method, path, body=b"", **headers):
+            connection = http.client.HTTPSConnection("127.0.0.1", server.phone_port, timeout=30, context=context)
+            connection.request(method, path, body, headers)
+            answer = connection.getresponse()
+            content = answer.read()
+            connection.close()
+            return answer.status, answer.getheader("set-cookie"), content
+
+        computer = Client(server)
+        token = computer.state()["phone"].partition("token=")[2]
+        code = cv2.imdecode(np.frombuffer(computer.ask("GET", "/api/phone.png")[2], np.uint8), cv2.IMREAD_GRAYSCALE)
+        assert cv2.QRCodeDetector().detectAndDecode(code)[0] == computer.state()["phone"]
+        assert ask("GET", "/")[0] == ask("GET", "/?token=guess")[0] == ask("GET", f"/?token={server.token}")[0] == 401
+        status, cookie, _ = ask("GET", f"/?token={token}")
+        assert status == 303
+        assert "Secure" in cookie
+        assert ask("GET", f"/?token={token}")[0] == 401  # once
+        assert computer.state()["phone"].partition("token=")[2] not in ("", token)
+        own = {"Cookie": cookie.partition(";")[0], "Origin": f"https://127.0.0.1:{server.phone_port}"}
+        assert b"/phone.js" in ask("GET", "/", **own)[2]
+        for path in ("/api/state", "/api/events", "/report", "/files/study.toml", "/studio.js", "/explore/"):
+            assert ask("GET", path, **own)[0] == 404
+        assert ask("PUT", "/api/upload/object/part.stl", b"solid", **own)[0] == 404
+        video = (tmp_path / "phone.mp4").read_bytes()
+        assert ask("PUT", "/api/upload/recording/phone.mp4", video, Cookie=own["Cookie"])[0] == 403
+        assert computer.state()["recording"] is None
+        assert ask("PUT", "/api/upload/recording/phone.mp4", video, **own)[0] == 200
+        assert computer.state()["recording"]["frames"] == 3
 
 
 def test_an_upload_that_breaks_off_leaves_nothing(server, client, folder):

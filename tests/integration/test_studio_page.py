@@ -183,6 +183,29 @@ def test_a_camera_of_the_computer_is_recorded(tmp_path):
     assert green > 0.2  # the ground of the fake camera's picture
 
 
+def test_a_phone_records_for_the_computer(tmp_path):
+    """Two browsers: one has the studio open, the other a fake camera and the address for phones."""
+    fake = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream", "--ignore-certificate-errors")
+    with (
+        running_studio(tmp_path / "project", phone=True) as server,
+        Page(tmp_path / "computer", (1440, 900)) as computer,
+        Page(tmp_path / "phone", (420, 800), fake) as phone,
+    ):
+        computer.send("Page.navigate", url=server.address)
+        computer.click("#step-camera")
+        computer.wait_for("document.querySelector('#phone-address') !== null")
+        phone.send("Page.navigate", url=computer.evaluate("document.querySelector('#phone-address').textContent"))
+        phone.click("#record")
+        phone.wait_for("document.querySelector('#record-video')?.currentTime > 1")
+        shoot(phone, tmp_path / "phone.png")
+        phone.click("#record")
+        phone.wait_for("document.querySelector('#said').textContent.includes('is in the project')")
+        computer.wait_for("document.querySelector('#panel').textContent.includes('phone.webm')")
+        shoot(computer, tmp_path / "computer.png")
+        assert computer.problems == phone.problems == []
+        assert Client(server).state()["recording"]["frames"] >= 5
+
+
 def test_the_study_is_what_was_clicked(project):
     folder, _, _ = project
     study = load_study(folder / "study.toml")
@@ -233,3 +256,14 @@ def test_the_frame_log_holds_the_run(project):
         assert [row["parameters"]["push"] for row in rows] == pytest.approx(file["parameters"][:, 0].tolist())
         force = np.array([row["forces"]["head"] for row in rows])
         np.testing.assert_allclose(force, file["reactions/head/force"][()], rtol=1e-12)
+
+
+def test_steps_that_are_opened_in_haste_do_not_mix(tmp_path):
+    with running_studio(tmp_path / "project") as server, Page(tmp_path / "profile", (1440, 900)) as page:
+        page.send("Page.navigate", url=server.address)
+        page.wait_for("document.querySelector('#step-camera') !== null")
+        names = ["study", "camera", "object", "study", "camera"]
+        page.evaluate(f"{names}.forEach(name => document.getElementById('step-' + name).click())")
+        page.wait_for("document.querySelector('#panel').dataset.ready === 'camera'")
+        assert page.evaluate("[...document.querySelectorAll('#panel h2')].map(h => h.textContent)") == ["Camera"]
+        assert page.problems == []

@@ -56,9 +56,9 @@ def write_scene(folder):
 
 
 @contextmanager
-def running_studio(folder):
+def running_studio(folder, phone=False):
     """A studio that answers as long as the context lasts."""
-    server = StudioServer(folder, port=0)
+    server = StudioServer(folder, port=0, phone=phone)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
     end = time.monotonic() + 30

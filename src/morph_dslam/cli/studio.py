@@ -10,7 +10,7 @@ from morph_dslam.errors import StudioError
 HELP = "build, place and track your own object by clicks in the browser"
 KEPT = "the files of the project are kept"
 #: What the extra installs, by the name to import.
-_EXTRA = ("starlette", "tomlkit", "uvicorn")
+_EXTRA = ("cryptography", "starlette", "tomlkit", "uvicorn")
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -21,6 +21,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--host", default="127.0.0.1", metavar="ADDRESS", help="listen at this address (default: this computer only)"
     )
+    add_flag(command, "--phone", "let a phone in the network record, over HTTPS at the next port")
     add_flag(command, "--open", "open the browser at once")
 
 
@@ -32,4 +33,4 @@ def run(arguments: argparse.Namespace) -> None:
         )
     from morph_dslam import open_studio
 
-    open_studio(arguments.folder, arguments.port, arguments.host, arguments.open)
+    open_studio(arguments.folder, arguments.port, arguments.host, arguments.open, arguments.phone)

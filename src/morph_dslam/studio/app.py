@@ -8,7 +8,7 @@ import hashlib
 import json
 import re
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext
 from importlib.resources import files
 from typing import Any
 
@@ -21,7 +21,8 @@ from starlette.routing import Route
 
 from morph_dslam.errors import StudioError
 from morph_dslam.studio import project as names
-from morph_dslam.studio.gate import MOST_BODY, Gate
+from morph_dslam.studio.gate import ANY_ADDRESS, MOST_BODY, Access, Gate
+from morph_dslam.studio.phone import qr_code
 from morph_dslam.studio.steps import Steps
 
 _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
@@ -29,8 +30,9 @@ _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 _PAGES = (
     "studio.css", "studio.js", "server.js", "parts.js", "mesh_view.js", "overlay.js", "plot.js", "recorder.js",
     "object_step.js", "study_step.js", "build_step.js", "camera_step.js", "start_step.js", "track_step.js",
-    "results_step.js",
+    "results_step.js", "phone.js",
 )  # fmt: skip
+_PHONE = ("studio.css", "server.js", "parts.js", "recorder.js", "phone.js")
 _SHARED = (
     "solid_view.js", "colour_bar.js", "three/three.module.min.js", "three/three.core.min.js", "three/OrbitControls.js",
 )  # fmt: skip
@@ -106,6 +108,31 @@ class _Answers:
         finally:
             part.unlink(missing_ok=True)
         return JSONResponse(await self._steps.uploaded(kind, name))
+
+    async def phone_code(self, request: Request) -> Response:
+        """The address that a phone opens, as a QR code."""
+        address = self._steps.phone_address()
+        if address is None:
+            raise HTTPException(404, "no phone is let in: start with --phone")
+        return Response(qr_code(address), media_type="image/png")
+
+    async def phone(self, request: Request) -> Response:
+        """The page of a phone."""
+        return Response(_page("phone.html"), media_type="text/html")
+
+    async def phone_page(self, request: Request) -> Response:
+        """A file of the phone's page."""
+        if request.path_params["name"] not in _PHONE:
+            raise HTTPException(404, "there is no such page")
+        return await self.page(request)
+
+    async def phone_upload(self, request: Request) -> Response:
+        """Take in a recording, and nothing else."""
+        if request.path_params["kind"] != "recording":
+            raise HTTPException(404, "a phone brings recordings")
+        answer = await self.upload(request)
+        self._steps.recording_came()
+        return answer
 
     async def file(self, request: Request) -> Response:
         """A file of the project, to keep."""
@@ -186,20 +213,48 @@ async def _left(request: Request, error: Exception) -> Response:
     return PlainTextResponse("the upload broke off", 400)
 
 
-def make_app(steps: Steps, token: str, hosts: tuple[str, ...] = ()) -> Callable:
+_HANDLERS = {StudioError: _told, HTTPException: _told_http, ClientDisconnect: _left, Exception: _told_nothing}
+
+
+def phone_app(steps: Steps, access: Access) -> Callable:
+    """What a phone may do, behind a gate: record, and bring the recording.
+
+    Parameters
+    ----------
+    steps : of the project.
+    access : of phones.
+    """
+    answers = _Answers(steps)
+    routes = [
+        Route("/", answers.phone),
+        Route("/api/upload/{kind:str}/{name:path}", answers.phone_upload, methods=["PUT"]),
+        Route("/{name:path}", answers.phone_page),
+    ]
+    application = Starlette(routes=routes, exception_handlers=_HANDLERS)  # type: ignore[arg-type]
+    return Gate(application, access, (ANY_ADDRESS,), _policy())
+
+
+def make_app(
+    steps: Steps,
+    access: Access,
+    hosts: tuple[str, ...] = (),
+    beside: Callable[[], AbstractAsyncContextManager] = nullcontext,
+) -> Callable:
     """The studio of a project as an ASGI application, behind its gate.
 
     Parameters
     ----------
     steps : of the project.
-    token : that requests must carry.
+    access : of browsers.
     hosts : names that the server is asked by, beside those of this computer.
+    beside : what runs as long as the application does.
     """
     answers = _Answers(steps)
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
-        yield
+        async with beside():
+            yield
         await steps.close()
 
     routes = [
@@ -207,6 +262,7 @@ def make_app(steps: Steps, token: str, hosts: tuple[str, ...] = ()) -> Callable:
         Route("/api/state", answers.state),
         Route("/api/events", answers.events),
         Route("/api/upload/{kind}/{name:path}", answers.upload, methods=["PUT"]),
+        Route("/api/phone.png", answers.phone_code),
         Route("/api/frame/{number:int}", answers.frame),
         Route("/api/{action}", answers.call, methods=["POST"]),
         Route("/files/{name:path}", answers.file),
@@ -214,6 +270,5 @@ def make_app(steps: Steps, token: str, hosts: tuple[str, ...] = ()) -> Callable:
         Route("/explore/{name:path}", answers.explore),
         Route("/{name:path}", answers.page),
     ]
-    handlers = {StudioError: _told, HTTPException: _told_http, ClientDisconnect: _left, Exception: _told_nothing}
-    application = Starlette(routes=routes, lifespan=lifespan, exception_handlers=handlers)  # type: ignore[arg-type]
-    return Gate(application, token, hosts, _policy())
+    application = Starlette(routes=routes, lifespan=lifespan, exception_handlers=_HANDLERS)  # type: ignore[arg-type]
+    return Gate(application, access, hosts, _policy())

@@ -6,6 +6,7 @@ import hmac
 import ipaddress
 import secrets
 from collections.abc import Iterable
+from dataclasses import dataclass
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, QueryParams
@@ -28,6 +29,38 @@ def new_token() -> str:
     return secrets.token_urlsafe(24)
 
 
+@dataclass
+class Access:
+    """What lets a browser in.
+
+    Attributes
+    ----------
+    invitation : token that an address carries.
+    session : token of the cookie that it is exchanged for.
+    once : whether an invitation works once, and is then replaced.
+    """
+
+    invitation: str
+    session: str
+    once: bool = False
+
+    @classmethod
+    def single(cls) -> Access:
+        """Invitations that work once each."""
+        return cls(new_token(), new_token(), once=True)
+
+    def takes(self, given: str) -> bool:
+        """Whether this is the invitation."""
+        accepted = hmac.compare_digest(given.encode(), self.invitation.encode())
+        if accepted and self.once:
+            self.invitation = new_token()
+        return accepted
+
+    def knows(self, given: str) -> bool:
+        """Whether this is the session's token."""
+        return hmac.compare_digest(given.encode(), self.session.encode())
+
+
 class Gate:
     """Lets requests through to an application if they carry the token, and adds headers that keep others out.
 
@@ -38,13 +71,13 @@ class Gate:
     Parameters
     ----------
     application : behind the gate.
-    token : of this run of the server.
+    access : what is asked for.
     hosts : names that the server is asked by, beside those of this computer; may hold `ANY_ADDRESS`.
     policy : Content-Security-Policy of all answers that have none of their own.
     """
 
-    def __init__(self, application: ASGIApp, token: str, hosts: Iterable[str], policy: str) -> None:
-        self._application, self._token, self._policy = application, token, policy
+    def __init__(self, application: ASGIApp, access: Access, hosts: Iterable[str], policy: str) -> None:
+        self._application, self._access, self._policy = application, access, policy
         self._hosts = {HOST, "localhost", *hosts}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -64,15 +97,13 @@ class Gate:
         origin = headers.get("origin")
         if origin is not None and origin != f"{scope['scheme']}://{headers['host']}":
             return PlainTextResponse("pages from elsewhere are not answered", 403)
-        given = query.get("token")
-        if given is not None and self._is_token(given) and scope["method"] in _SAFE and scope["path"] == "/":
+        given, cookie = query.get("token"), f"{_COOKIE}_{headers['host'].rpartition(':')[2]}"
+        if given is not None and scope["path"] == "/" and scope["method"] in _SAFE and self._access.takes(given):
             answer = RedirectResponse("/", 303)
-            answer.set_cookie(
-                f"{_COOKIE}_{headers['host'].rpartition(':')[2]}", self._token, httponly=True, samesite="strict"
-            )
+            is_secure = scope["scheme"] == "https"
+            answer.set_cookie(cookie, self._access.session, httponly=True, samesite="strict", secure=is_secure)
             return answer
-        cookies = cookie_parser(headers.get("cookie", ""))
-        if not self._is_token(cookies.get(f"{_COOKIE}_{headers['host'].rpartition(':')[2]}", "")):
+        if not self._access.knows(cookie_parser(headers.get("cookie", "")).get(cookie, "")):
             return PlainTextResponse("open the address that `morph studio` printed: it carries the token", 401)
         if scope["method"] not in _SAFE and origin is None:
             return PlainTextResponse("a change must come from the studio's own page", 403)
@@ -80,9 +111,6 @@ class Gate:
 
     def _is_known(self, host: str | None) -> bool:
         return host in self._hosts or (ANY_ADDRESS in self._hosts and _is_address(host or ""))
-
-    def _is_token(self, given: str) -> bool:
-        return hmac.compare_digest(given.encode(), self._token.encode())
 
     def _with_headers(self, send: Send) -> Send:
         async def guarded(message: Message) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import signal
 import socket
 import webbrowser
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 from types import FrameType
 
@@ -12,8 +15,9 @@ import uvicorn
 
 from morph_dslam.errors import StudioError
 from morph_dslam.io.local_server import HOST
-from morph_dslam.studio.app import make_app
-from morph_dslam.studio.gate import ANY_ADDRESS, new_token
+from morph_dslam.studio.app import make_app, phone_app
+from morph_dslam.studio.gate import ANY_ADDRESS, Access, new_token
+from morph_dslam.studio.phone import PhoneServer, own_address
 from morph_dslam.studio.project import Project
 from morph_dslam.studio.steps import Steps
 
@@ -26,10 +30,13 @@ class StudioServer:
     folder : of the project; it is made.
     port : 0 takes any free one.
     host : address to listen at; that of this computer alone by default.
+    phone : whether phones in the network may bring recordings, at the next port.
 
     Attributes
     ----------
     address : with the token, to be opened in a browser.
+    phone_access : of phones, None if none is let in.
+    phone_port : that a phone opens, 0 if none is let in.
 
     Raises
     ------
@@ -37,20 +44,47 @@ class StudioServer:
         If the folder cannot be made, or the address cannot be taken.
     """
 
-    def __init__(self, folder: str | Path, port: int = 8766, host: str = HOST) -> None:
+    def __init__(self, folder: str | Path, port: int = 8766, host: str = HOST, phone: bool = False) -> None:
         project, self.token = Project(folder), new_token()
         self._socket = _listening(host, port)
         self.port = int(self._socket.getsockname()[1])
         # An address is no name that another site could take for its own.
         hosts = () if host == HOST else (host, socket.gethostname(), ANY_ADDRESS)
-        steps = Steps(project)
+        self.phone_access = Access.single() if phone else None
+        self._phone_socket = _listening("0.0.0.0", self.port + 1 if port else 0) if phone else None
+        self.phone_port = int(self._phone_socket.getsockname()[1]) if self._phone_socket else 0
+        self._phone_host = own_address()
+        steps = Steps(project, lambda: self.phone_address)
+        self._phone_app = phone_app(steps, self.phone_access) if self.phone_access else None
+        application = make_app(steps, Access(self.token, self.token), hosts, self._phones)
         config = uvicorn.Config(
-            make_app(steps, self.token, hosts), log_level="error", access_log=False, server_header=False,
-            ws="none", lifespan="on", timeout_graceful_shutdown=2,
+            application, log_level="error", access_log=False, server_header=False, ws="none", lifespan="on",
+            timeout_graceful_shutdown=2,
         )  # fmt: skip
         self._server = _Server(config, steps)
         shown = socket.gethostname() if host in ("0.0.0.0", "::") else host
         self.address = f"http://{shown}:{self.port}/?token={self.token}"
+
+    @property
+    def phone_address(self) -> str | None:
+        """What a phone opens, once; None if none is let in."""
+        if self.phone_access is None:
+            return None
+        return f"https://{self._phone_host}:{self.phone_port}/?token={self.phone_access.invitation}"
+
+    @asynccontextmanager
+    async def _phones(self) -> AsyncIterator[None]:
+        """Let phones in as long as the context lasts."""
+        if self._phone_app is None or self._phone_socket is None:
+            yield
+            return
+        server = PhoneServer(self._phone_app, self._phone_host)
+        task = asyncio.create_task(server.serve([self._phone_socket]))
+        try:
+            yield
+        finally:
+            server.should_exit = True
+            await task
 
     def run(self) -> None:
         """Answer until the process is interrupted, or `stop`."""
@@ -94,7 +128,9 @@ def _listening(host: str, port: int) -> socket.socket:
     return listening
 
 
-def open_studio(folder: str | Path = ".", port: int = 8766, host: str = HOST, open_browser: bool = False) -> None:
+def open_studio(
+    folder: str | Path = ".", port: int = 8766, host: str = HOST, open_browser: bool = False, phone: bool = False
+) -> None:
     """Serve the studio of a project until it is interrupted.
 
     Parameters
@@ -103,14 +139,17 @@ def open_studio(folder: str | Path = ".", port: int = 8766, host: str = HOST, op
     port : 0 takes any free one.
     host : address to listen at; that of this computer alone by default.
     open_browser : whether to open the page at once.
+    phone : whether phones in the network may bring recordings, over HTTPS at the next port.
 
     Raises
     ------
     StudioError
         If the folder cannot be made, or the address cannot be taken.
     """
-    server = StudioServer(folder, port, host)
+    server = StudioServer(folder, port, host, phone)
     print(f"the studio of {Path(folder).resolve()} is at {server.address} (Ctrl-C ends it)", flush=True)
+    if phone:
+        print(f"a phone records at {server.phone_address}, once; its browser warns of the certificate", flush=True)
     if open_browser:
         webbrowser.open(server.address)
     # uvicorn ends on Ctrl-C and raises it again; the studio's own answer to it is to end quietly.

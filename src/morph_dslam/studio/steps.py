@@ -33,10 +33,16 @@ class Steps:
     Parameters
     ----------
     project : the folder.
+    phone : gives the address that a phone opens, None if none is let in.
+
+    Attributes
+    ----------
+    phone_address : the same.
     """
 
-    def __init__(self, project: Project) -> None:
+    def __init__(self, project: Project, phone: Callable[[], str | None] = lambda: None) -> None:
         self.project, self._worker = project, Worker()
+        self.phone_address, self._arrivals = phone, 0
         self._changed = asyncio.Event()
         self._jobs = Jobs(project.folder, self._tell)
         self._ended = False
@@ -51,6 +57,11 @@ class Steps:
 
     def _tell(self) -> None:
         self._changed.set()
+
+    def recording_came(self) -> None:
+        """Tell the pages that a phone has brought a recording."""
+        self._arrivals += 1
+        self._tell()
 
     def end_news(self) -> None:
         """End what is told to pages, so that their connections close."""
@@ -82,6 +93,7 @@ class Steps:
             "choices": self.project.choices,
             "done": done,
             "job": self._jobs.content(),
+            "phone": self.phone_address(),
         }
         for name, path, read in (
             ("camera", names.CAMERA, clicks.camera_facts),
@@ -96,12 +108,15 @@ class Steps:
 
     async def news(self) -> AsyncIterator[tuple[str, Any]]:
         """The job at each change, and the lines of the frame log as they come, until the studio ends."""
-        told, offset = None, 0
+        told, offset, arrivals = None, 0, self._arrivals
         while not self._ended:
             job = self._jobs.content()
             if job != told:
                 told = job
                 yield "job", job
+            if self._arrivals != arrivals:
+                arrivals = self._arrivals
+                yield "recording", self.project.recording
             lines, offset = _new_lines(self.project.path(names.FRAME_LOG), offset)
             if lines is not None:
                 yield "frames", lines

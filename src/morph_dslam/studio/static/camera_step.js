@@ -1,7 +1,7 @@
 // Camera: the recording, and the camera's intrinsics from a file, a board, or a guess.
 
 import { call, frame, upload } from './server.js';
-import { choice, command, digits, dropZone, el, facts, field, title } from './parts.js';
+import { choice, command, digits, dropZone, el, facts, field, there, title } from './parts.js';
 import { ImageView } from './overlay.js';
 import { recordButton } from './recorder.js';
 
@@ -12,6 +12,7 @@ const isPicture = (file) => PICTURES.split(',').some((ending) => file.name.toLow
 export async function cameraStep(app) {
   const recording = el('div');
   const camera = el('div');
+  const phone = el('div');
   const board = el('input', { id: 'board', value: '9x6' });
   const square = el('input', { id: 'square', value: '25 mm' });
   const lens = choice('lens', [['radial-tangential', 'normal'], ['fisheye', 'fisheye']]);
@@ -41,7 +42,7 @@ export async function cameraStep(app) {
     el('h3', { style: 'margin-top: 8px' }, 'Recording'),
     dropZone('drop-recording', 'Drop a video, or numbered images', 'MP4, MOV, AVI, MKV, WebM; PNG, JPEG', `${VIDEOS},${PICTURES}`,
       (files) => app.doing(() => takeRecording(files))),
-    el('p', {}, record.button), recording,
+    el('p', {}, record.button), phone, recording,
     el('h3', {}, 'Intrinsics'),
     dropZone('drop-camera', 'Drop a camera file', 'of this program, OpenCV, ROS, Kalibr, COLMAP', '.yaml,.yml,.txt',
       ([file]) => app.doing(async () => { await upload('camera', file); await refresh(); })),
@@ -67,6 +68,10 @@ export async function cameraStep(app) {
 
   async function draw() {
     const { state } = app;
+    phone.replaceChildren(...there([state.phone && el('div', { className: 'box' },
+      el('p', {}, 'Record with a phone: scan the code, or open the address there. It works once, and the browser warns of the certificate.'),
+      el('img', { id: 'phone-code', src: `/api/phone.png#${Date.now()}`, alt: 'QR code' }),
+      el('p', { className: 'mono', id: 'phone-address' }, state.phone))]));
     const found = state.recording;
     recording.replaceChildren();
     if (found?.message) recording.append(el('p', { className: 'problem' }, found.message));
@@ -95,6 +100,7 @@ export async function cameraStep(app) {
   await draw();
   return {
     close: () => [record, recordBoard].forEach((one) => one.close()),
+    recording: draw,
     job: (job, ended) => { if (ended && job.kind === 'calibrate') app.doing(draw); },
   };
 }

@@ -11,7 +11,9 @@ export function recordButton(app, id, text, name, taken) {
   button.addEventListener('click', () => app.doing(async () => {
     if (stop) return stop();
     if (!navigator.mediaDevices) throw new Error('the browser gives no camera to this page: open it as http://127.0.0.1');
-    const stream = await navigator.mediaDevices.getUserMedia({ video: { width: { ideal: 1280 } }, audio: false });
+    const stream = await navigator.mediaDevices.getUserMedia({
+      video: { width: { ideal: 1280 }, facingMode: { ideal: 'environment' } }, audio: false,
+    });
     const [type, ending] = KINDS.find(([kind]) => MediaRecorder.isTypeSupported(kind));
     const recorder = new MediaRecorder(stream, { mimeType: type, videoBitsPerSecond: 20e6 });
     const parts = [];

@@ -18,15 +18,18 @@ const STEPS = [
 
 class Studio {
   constructor() {
-    this.panel = document.getElementById('panel');
-    this.view = document.getElementById('view');
-    this.frames = [];
+    this.run = { frames: [] };
     this.open = {};
+    // Steps call these through an object of their own.
+    for (const name of ['refresh', 'show', 'doing', 'message']) this[name] = this[name].bind(this);
   }
 
   async start() {
     await this.refresh();
-    server.listen({ job: (job) => this.takeJob(job), frames: (news) => this.takeFrames(news) });
+    server.listen({
+      recording: () => this.doing(async () => { await this.refresh(); await this.open.recording?.(); }),
+      job: (job) => this.takeJob(job), frames: (news) => this.takeFrames(news),
+    });
     const wanted = location.hash.slice(1);
     const first = STEPS.find(([id]) => id === wanted) ?? STEPS.find(([id]) => !this.state.done[id]) ?? STEPS.at(-1);
     await this.show(first[0]);
@@ -56,16 +59,20 @@ class Studio {
     this.current = id;
     history.replaceState(null, '', `#${id}`);
     this.drawSteps();
-    this.panel.replaceChildren();
-    this.view.replaceChildren();
-    this.panel.scrollTop = 0;
+    // Each step fills parts of its own, so that one that is still being opened does not write into the next.
+    const [panel, view] = [el('div'), el('div', { className: 'fill' })];
+    document.getElementById('panel').replaceChildren(panel);
+    document.getElementById('view').replaceChildren(view);
+    document.getElementById('panel').scrollTop = 0;
     const opened = {};
     this.open = opened;
     await this.doing(async () => {
       await this.refresh();
-      Object.assign(opened, await STEPS.find(([key]) => key === id)[2](this) ?? {});
+      const step = Object.create(this, { panel: { value: panel }, view: { value: view } });
+      Object.assign(opened, await STEPS.find(([key]) => key === id)[2](step));
     });
-    this.panel.dataset.ready = id;
+    if (this.open === opened) document.getElementById('panel').dataset.ready = id;
+    else opened.close?.();
   }
 
   async doing(action) {
@@ -95,9 +102,9 @@ class Studio {
   }
 
   takeFrames(news) {
-    if (news.anew) this.frames = [];
-    this.frames.push(...news.frames);
-    this.open.frames?.(this.frames);
+    if (news.anew) this.run.frames = [];
+    this.run.frames.push(...news.frames);
+    this.open.frames?.(this.run.frames);
   }
 
   drawJob() {

@@ -41,9 +41,7 @@ export async function trackStep(app) {
     app.panel.append(el('p', { className: 'problem' }, 'This step needs the model, the camera, the recording and the saved start.'));
     return {};
   }
-  const [mesh, model, { colours }, known] = await Promise.all([
-    call('model_mesh'), call('model'), explored('model.json'), call('tracked_frames')]);
-  app.frames = known.frames;
+  const [mesh, model, { colours }] = await Promise.all([call('model_mesh'), call('model'), explored('model.json')]);
   const refine = el('input', { id: 'refine', checked: !(app.state.choices.at_rest ?? true) });
   const outline = el('input', { id: 'outline' });
   const start = el('button', { id: 'track', className: 'main', onclick: () => app.doing(() => call('track',
@@ -70,9 +68,9 @@ export async function trackStep(app) {
   function drawJob(job) {
     start.textContent = app.state.done.track ? 'Track again' : 'Track';
     start.disabled = Boolean(job?.running);
-    const tracked = app.frames.filter((row) => row.status === 'tracked').length;
+    const tracked = app.run.frames.filter((row) => row.status === 'tracked').length;
     const mine = job?.kind === 'track' ? job : null;
-    const parts = [facts([['Frames', String(app.frames.length)], ['Tracked', String(tracked)]])];
+    const parts = [facts([['Frames', String(app.run.frames.length)], ['Tracked', String(tracked)]])];
     if (mine && !mine.running && mine.status) {
       parts.push(el('p', { className: mine.stopped ? 'warning' : 'problem' }, mine.lines.at(-1) ?? 'it ended without a message'));
     }
@@ -83,6 +81,6 @@ export async function trackStep(app) {
   }
 
   drawJob(app.state.job);
-  drawFrames(app.frames);
+  drawFrames(app.run.frames);
   return { job: drawJob, frames: (frames) => { drawFrames(frames); drawJob(app.state.job); } };
 }
