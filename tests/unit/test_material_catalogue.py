@@ -47,6 +47,10 @@ def test_sylgard_has_its_young_s_modulus():
     assert 6 * number(ENTRIES["sylgard_184"].section["c10"]) == pytest.approx(1.32e6)
 
 
+def test_liver_has_its_shear_modulus():
+    assert 2 * number(ENTRIES["liver"].section["c10"]) == pytest.approx(1.8e3)
+
+
 @pytest.mark.parametrize("name", ENTRIES)
 def test_every_entry_makes_a_study_and_is_documented(name):
     entry = ENTRIES[name]

@@ -91,4 +91,11 @@ _CATALOGUE: tuple[CataloguedMaterial, ...] = (
         source=_TENSILE,
         note=_FIRST_LOADING,
     ),
+    CataloguedMaterial(
+        name="liver",
+        title="Liver, healthy",
+        section={"law": "mooney_rivlin", "c10": "0.9 kPa", "bulk": "1.8 MPa", "density": "1060 kg/m3"},
+        source="Phys. Med. Biol. 64, 225001 (2019), table 1 (PMC6925591), from measurements of several groups",
+        note=f"Shear modulus 1.8 kPa, standard deviation 0.4 kPa, for small strains. {_BULK}",
+    ),
 )
