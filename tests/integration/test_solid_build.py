@@ -52,6 +52,7 @@ held_out = 8
 [reduction]
 max_degree = 5
 """
+LOADED = BLOCK + '[unknown_loads]\non = "x_max"\nmodes = 6\n'
 SCENE = """
 model = "block.morph"
 image_format = "png"
@@ -80,7 +81,7 @@ rotation_deg = [112, 4, 29]
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
     folder = tmp_path_factory.mktemp("block")
-    (folder / "study.toml").write_text(BLOCK)
+    (folder / "study.toml").write_text(LOADED)
     assert cli.main(["build", str(folder / "study.toml"), "-o", str(folder / "block.morph")]) == 0
     return folder
 
@@ -210,6 +211,23 @@ def test_a_solid_is_filmed_and_tracked(built, tracked):
     assert figures["mean_mm"] < 0.5
 
 
+def test_unknown_loads_that_do_not_act_leave_the_result_as_it_is(built, filmed, tracked):
+    """Nothing but the study's own loads acts on the block."""
+    run = built / "with_loads"
+    assert cli.main(["track", *filmed, "--unknown-loads", "--show", "traction", "-o", str(run)]) == 0
+    alone, both = load_run(tracked), load_run(run)
+    assert both.tracked.all()
+    change = np.abs(both.parameters[:, :2] - alone.parameters).max(axis=0)
+    assert (change < [np.radians(0.6), 4e-4]).all()
+    with h5py.File(run / "result.h5") as file:
+        acting, own = (file[f"reactions/{name}/force"][()] for name in ("unknown loads", "z_max"))
+    assert np.linalg.norm(acting, axis=1).max() < 0.1 * np.linalg.norm(own, axis=1).max()
+    assert "force_unknown loads_x_N" in (run / "frames.csv").read_text().splitlines()[0]
+    points = ["--points", str(built / "seq" / "truth.npz"), "--bind-frame", "0"]
+    assert cli.main(["evaluate", str(run), *points]) == 0
+    assert json.loads((run / "evaluation.json").read_text())["mean_mm"] < 0.5
+
+
 def test_arrows_need_reactions(built, filmed, tmp_path, capsys):
     model = load_model(built / "block.morph")
     save_model(tmp_path / "bare.morph", replace(model, reactions={}))
@@ -321,7 +339,7 @@ def test_a_load_past_its_limit_point_names_the_last_value_that_converged(tmp_pat
 
 def test_python_states_the_same_study(built):
     """A dictionary in place of the file: the same solutions are found again, none is solved anew."""
-    study = make_study(tomllib.loads(BLOCK))
+    study = make_study(tomllib.loads(LOADED))
     assert study == load_study(built / "study.toml")
     before = sorted((built / "block.morph.snapshots").glob("*.npz"))
     model = build(study, built / "block.morph")

@@ -25,6 +25,7 @@ from morph_dslam.render.scene_file import load_scene_file
 from morph_dslam.studies.affine import read_affine
 from morph_dslam.studies.defaults import resolve_defaults
 from morph_dslam.studies.external import ExternalStudy, read_table
+from morph_dslam.studies.sections import UnknownLoadsSection
 from morph_dslam.studies.sheet_study import SheetStudy
 from morph_dslam.studies.shell_study import ShellStudy
 from morph_dslam.studies.solid_study import SolidStudy
@@ -50,7 +51,7 @@ def test_every_sample_file_is_read_by_a_test_here():
         ("registration-aids", "csv"): 1,
         ("shell-study", "toml"): 1,
         ("solid-study", "csv"): 1,
-        ("solid-study", "toml"): 6,
+        ("solid-study", "toml"): 7,
         ("study-file", "toml"): 1,
     }
 
@@ -245,7 +246,7 @@ def test_shape_of_a_solid():
 
 
 def test_solutions_of_another_program(tmp_path):
-    study = make_study(tomllib.loads(samples("solid-study", "toml")[5]), tmp_path)
+    study = make_study(tomllib.loads(samples("solid-study", "toml")[6]), tmp_path)
     assert isinstance(study, ExternalStudy)
     (tmp_path / "parameters.csv").write_text(samples("solid-study", "csv")[0])
     parameters, values, rows = read_table(study.external.table)
@@ -330,3 +331,8 @@ def test_evaluation_in_memory(tmp_path, monkeypatch):
     in_frame = run_sample("run-folder")["in_frame"]
     assert in_frame == pytest.approx(dict.fromkeys(("11", "12", "13", "14", "15"), 0.0), abs=1e-4)
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_unknown_loads():
+    section = UnknownLoadsSection(**tomllib.loads(samples("solid-study", "toml")[5])["unknown_loads"])
+    assert (section.on, section.direction, section.modes) == ("top", "inward", 60)

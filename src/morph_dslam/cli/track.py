@@ -83,7 +83,7 @@ def print_summary(folder: Path, summary: dict[str, Any]) -> None:
     for figures in summary["one_over_the_sequence"]:
         print(value_line(figures))
     for figures in summary["largest_forces"]:
-        print("largest force on {on}: {force_N:.4g} ± {standard_deviation_N:.2g} N in frame {frame}".format(**figures))
+        print("largest force, {on}: {force_N:.4g} ± {standard_deviation_N:.2g} N in frame {frame}".format(**figures))
     print(f"wrote {folder}")
     line = f"tracked={summary['n_tracked']}/{summary['n_frames']}"
     if "live" in summary:
@@ -104,12 +104,14 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
     """
     from morph_dslam import TrackerOptions, TrackOptions
     from morph_dslam.extend.registration import InitializerFiles
-    from morph_dslam.extend.tracking import DrawOptions, ObjectOptions, SectionPlane
+    from morph_dslam.extend.tracking import DrawOptions, EstimationOptions, LoadOptions, ObjectOptions, SectionPlane
 
     tracker = TrackerOptions(
         pose=arguments.pose,
         use_depth=arguments.depth,
         use_discrepancy=arguments.discrepancy,
+        use_unknown_loads=arguments.unknown_loads is not None,
+        estimation=EstimationOptions(loads=LoadOptions(work=arguments.unknown_loads or None)),
         start=arguments.start,
         new_views=not arguments.one_view,
         further_views=not arguments.one_view,
@@ -216,6 +218,15 @@ def add_tracking_arguments(command: argparse.ArgumentParser) -> None:
         "look for what the object's shape has beyond the model's: small smooth displacements that "
         "hardly stretch it; with --refine in the reference view too",
     )
+    command.add_argument(
+        "--unknown-loads",
+        nargs="?",
+        type=float,
+        const=0.0,
+        metavar="JOULES",
+        help="estimate loads that the study does not foresee, by [unknown_loads] of its model: what presses or pulls "
+        "and how hard; likely ones do about this work (default: found from the sequence)",
+    )
     add_flag(
         command,
         "--one-view",
@@ -259,8 +270,9 @@ def add_tracking_arguments(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument(
         "--show",
-        choices=("stress", "strain", "displacement"),
-        help="what colours the object: von Mises stress (the default), equivalent strain, displacement",
+        choices=("stress", "strain", "displacement", "traction"),
+        help="what colours the object: von Mises stress (the default), equivalent strain, displacement, or the "
+        "traction of unknown loads",
     )
     command.add_argument(
         "--section",

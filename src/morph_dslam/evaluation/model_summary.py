@@ -74,6 +74,7 @@ def summarise_model(model: ReducedModel) -> dict[str, Table]:
         "reduction": Table.of(_reduction(certificate)),
         "stability": Table.of(_stability(certificate)),
         "contact": Table.of(_self_penetration(model)),
+        "unknown loads": Table.of(_unknown_loads(certificate)),
         "warnings": Table.of({f"{n}": line for n, line in enumerate(certificate.get("warnings", []), start=1)}),
         "made with": Table.of(flatten(_versions_last(model.provenance))),
     }
@@ -215,6 +216,13 @@ def _self_penetration(model: ReducedModel) -> Facts:
         for n, state in enumerate(report["states"][:3], start=1)
     }
     return {"statement": report["statement"]} | states
+
+
+def _unknown_loads(certificate: Mapping[str, Any]) -> Facts:
+    facts = dict(certificate.get("unknown_loads", {}))
+    if facts:
+        facts["response_error"] = f"{100.0 * facts['response_error']:.2g} % where states are left out"
+    return flatten({key.replace("_", " "): value for key, value in facts.items()})
 
 
 def _stability(certificate: Mapping[str, Any]) -> Facts:

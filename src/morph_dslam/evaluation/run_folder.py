@@ -17,6 +17,7 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.camera_files import load_camera
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.discrepancy import Discrepancy, load_discrepancies
+from morph_dslam.model.unknown_loads import with_unknown_loads
 
 if TYPE_CHECKING:
     from morph_dslam.tracking.result import FrameResult
@@ -65,7 +66,7 @@ class Run:
             status=tuple(str(result.status.value) for result in found),
             reasons=tuple(result.reason for result in found),
             camera_from_object=np.array([lost if r.pose is None else r.pose.matrix for r in found]),
-            parameters=np.array([list(result.parameters.values()) for result in found]),
+            parameters=np.array([_parameters(result) for result in found]),
             stage_times={"total": np.array([result.total_ms for result in found])},
             discrepancies={row: r.discrepancy for row, r in enumerate(found) if r.discrepancy is not None},
         )
@@ -95,6 +96,12 @@ class Run:
         return pose.apply(positions)
 
 
+def _parameters(result: FrameResult) -> Array:
+    """(d,), NaN where lost."""
+    lost = np.full(len(result.model.parameters), np.nan)
+    return lost if result.estimate is None else result.estimate.state.parameters
+
+
 def _texts(file: h5py.File, name: str) -> tuple[str, ...]:
     dataset = file[name]
     assert isinstance(dataset, h5py.Dataset)
@@ -121,6 +128,9 @@ def load_run(folder: str | Path) -> Run:
             if file.attrs.get("format") != FORMAT or int(file.attrs["version"]) != VERSION:  # type: ignore[arg-type]
                 raise EvaluationError(f"{path} is not a run of version {VERSION}: track again with this release")
             names = np.atleast_1d(np.asarray(file["timings_ms"].attrs["names"], dtype=str)).tolist()
+            parameters = np.asarray(file["parameters"]).astype(float)
+            if parameters.shape[1] > len(model.parameters):
+                model = with_unknown_loads(model)
             run = Run(
                 model=model,
                 camera=camera,
@@ -128,7 +138,7 @@ def load_run(folder: str | Path) -> Run:
                 status=_texts(file, "status"),
                 reasons=_texts(file, "reason"),
                 camera_from_object=np.asarray(file["camera_from_object"]).astype(float).reshape(-1, 4, 4),
-                parameters=np.asarray(file["parameters"]).astype(float),
+                parameters=parameters,
                 stage_times=dict(zip(names, np.asarray(file["timings_ms"]).T, strict=True)),
                 discrepancies=load_discrepancies(file),
             )

@@ -345,7 +345,7 @@ def write_run_report(folder: Path, run: Run) -> Path:
         _video_section(folder, run),
         _lost_section(run),
         tracking,
-        *(Section(f"Model: {name}", [table]) for name, table in summarise_model(run.model).items()),
+        *(Section(f"Model: {name}", [table]) for name, table in summarise_model(run.model.without_loads).items()),
         settings,
     ]
     path = folder / "report.html"

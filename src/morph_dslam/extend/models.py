@@ -20,5 +20,6 @@ from morph_dslam.model.inner_structure import (
     CarriedStructure as CarriedStructure,
     save_inner_structure as save_inner_structure,
 )
-from morph_dslam.model.reduced_model import von_mises as von_mises
+from morph_dslam.model.reduced_model import spread_over as spread_over, von_mises as von_mises
 from morph_dslam.model.tensor_functions import CPFunctions as CPFunctions
+from morph_dslam.model.unknown_loads import with_unknown_loads as with_unknown_loads

@@ -18,7 +18,11 @@ from morph_dslam.evaluation.pixels import (
     pixel_line as pixel_line,
     pixel_remarks as pixel_remarks,
 )
-from morph_dslam.evaluation.points import PointTruth as PointTruth, load_truth as load_truth
+from morph_dslam.evaluation.points import (
+    PointTruth as PointTruth,
+    load_truth as load_truth,
+    material_error as material_error,
+)
 from morph_dslam.evaluation.report import (
     Block as Block,
     KeyFigures as KeyFigures,

@@ -1,6 +1,7 @@
 """Points bound to a model, and the estimator of parameters and pose that `morph_dslam.Tracker` is built on."""
 
 from morph_dslam.tracking.binding import (
+    View as View,
     bind_pixels as bind_pixels,
     draw_view as draw_view,
     facing as facing,
@@ -17,5 +18,10 @@ from morph_dslam.tracking.estimator import (
     State as State,
     moved as moved,
 )
-from morph_dslam.tracking.reactions import Reaction as Reaction, VectorEstimate as VectorEstimate
+from morph_dslam.tracking.load_prior import LoadOptions as LoadOptions
+from morph_dslam.tracking.reactions import (
+    Reaction as Reaction,
+    Reactions as Reactions,
+    VectorEstimate as VectorEstimate,
+)
 from morph_dslam.tracking.run_options import ObjectOptions as ObjectOptions

@@ -219,10 +219,15 @@ class EnhancedAssembly:
         """F (m, 8, 3, 3) at the quadrature points, at ``x`` (n,) and the present parameters."""
         return self._enhanced.deformed(self._cells(), self._enhanced.unknowns(x)).F
 
-    def deformation_gradient_slopes(self, x: Array, slope: Array, index: int) -> Array:
-        """Total derivative (m, 8, 3, 3) of F by parameter ``index``, by which ``x`` changes by ``slope`` (n,)."""
+    def deformation_gradient_slopes(self, x: Array, slope: Array, index: int | None) -> Array:
+        """Total derivative (m, 8, 3, 3) of F by parameter ``index``, by which ``x`` changes by ``slope`` (n,).
+
+        ``index`` is None where ``x`` changes for another reason.
+        """
         unknowns, cells = self._enhanced.unknowns(x), self._cells()
         result = self._enhanced.deformed(cells, unknowns).change(self._enhanced.unknowns(slope))
+        if index is None:
+            return result
         velocity = self._shape.coordinate_slopes(self._symbols)[index]
         if velocity.any():
             moved = self._enhanced.geometry_slopes(cells, velocity)

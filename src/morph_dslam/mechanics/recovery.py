@@ -84,8 +84,8 @@ class _Compatible:
         """Take a solution (n,)."""
         self._state.vec.FV().NumPy()[:] = dofs
 
-    def set_change(self, dofs: Array, slope: Array, index: int) -> None:
-        """Take the derivative ``slope`` (n,) of the solution ``dofs`` by parameter ``index``."""
+    def set_change(self, dofs: Array, slope: Array, index: int | None) -> None:
+        """Take the derivative ``slope`` (n,) of the solution ``dofs`` by parameter ``index``, None for a load's."""
         self._direction.vec.FV().NumPy()[:] = slope
 
 
@@ -102,7 +102,7 @@ class _Enhanced:
     def set(self, dofs: Array) -> None:
         self._gradient.set(self._assembly.deformation_gradients(dofs))
 
-    def set_change(self, dofs: Array, slope: Array, index: int) -> None:
+    def set_change(self, dofs: Array, slope: Array, index: int | None) -> None:
         self._change.set(self._assembly.deformation_gradient_slopes(dofs, slope, index))
 
 
@@ -147,18 +147,26 @@ class Recovery:
         return result
 
     def slopes_at_nodes(
-        self, dofs: Array, mu: Array, dof_slopes: Array, names: tuple[str, ...] = ("strain", "stress")
+        self,
+        dofs: Array,
+        mu: Array,
+        dof_slopes: Array,
+        names: tuple[str, ...] = ("strain", "stress"),
+        by_parameters: bool = True,
     ) -> dict[str, Array]:
-        """Total derivatives (d, n, c) of the fields at nodes, by the parameters.
+        """Total derivatives (d, n, c) of the fields at nodes, by the parameters or by loads beside them.
 
         Parameters
         ----------
         dof_slopes : (d, n_dofs) derivatives of the solution, `newton.sensitivities`.
+        by_parameters : whether they are those by the parameters, on which constants and shape may depend too.
         """
         points, average = self._node_rule()
         result = {"displacement": np.array([self._problem.nodal_displacement(s) for s in dof_slopes])}
+        indices = range(len(dof_slopes)) if by_parameters else [None] * len(dof_slopes)
+        directions = list(zip(indices, dof_slopes, strict=True))
         for name in names:
-            slopes = [average @ s for s in self._slopes(name, dofs, mu, dof_slopes, points)]
+            slopes = [average @ s for s in self._slopes(name, dofs, mu, directions, points)]
             result[name] = np.array(slopes)
         return result
 
@@ -180,7 +188,10 @@ class Recovery:
             values += _overstress(name, F, history.remembered_at(points))
         return _components(name, values)
 
-    def _slopes(self, name: str, dofs: Array, mu: Array, dof_slopes: Array, points: NDArray) -> list[Array]:
+    def _slopes(
+        self, name: str, dofs: Array, mu: Array, directions: list[tuple[int | None, Array]], points: NDArray
+    ) -> list[Array]:
+        """Derivatives along changes of the solution, each with the parameter that causes it or None."""
         self._set(dofs, mu)
         through_state = [
             self._directional(region, region.fields[name], dp)
@@ -188,10 +199,10 @@ class Recovery:
         ]
         result = []
         by_parameter = [self._problem.symbols.derivatives(region.fields[name]) for region in self._regions]
-        for index, slope in enumerate(dof_slopes):
+        for index, slope in directions:
             self._solution.set_change(dofs, slope, index)
             total = self._by_region(through_state, points)
-            if any(index in explicit for explicit in by_parameter):
+            if index is not None and any(index in explicit for explicit in by_parameter):
                 zero = ngs.CF((0.0,) * 9, dims=(3, 3))
                 total += self._by_region([explicit.get(index, zero) for explicit in by_parameter], points)
             if self._problem.history and name in STRESSES:
@@ -205,13 +216,13 @@ class Recovery:
             change = change + field.Diff(region.pressure, pressure_direction)
         return change
 
-    def _overstress_slope(self, name: str, index: int, points: NDArray) -> Array:
+    def _overstress_slope(self, name: str, index: int | None, points: NDArray) -> Array:
         """Derivative (p, 3, 3) of the remembered stress's part, in the direction that is set."""
         history = self._problem.history
         assert history is not None
         F = self._by_region([region.gradient for region in self._regions], points)
         dF = self._by_region([self._solution.change] * len(self._regions), points)
-        explicit = self._solution.explicit.get(index)
+        explicit = None if index is None else self._solution.explicit.get(index)
         if explicit is not None:
             dF += self._by_region([explicit] * len(self._regions), points)
         H, step = history.remembered_at(points), 1e-6

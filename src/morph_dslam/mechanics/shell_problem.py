@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.kinematics import Kinematics, Shape
+from morph_dslam.mechanics.load_modes import LoadedSurface
 from morph_dslam.mechanics.loads import BodyForce, EdgeLoad, Gravity, Load, NodalForces, PointLoad
 from morph_dslam.mechanics.materials.base import evaluate
 from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
@@ -152,6 +153,12 @@ class ShellProblem(SolidProblem):
         force, moment, rotation = (f.Trace() if hasattr(f, "Trace") else f for f in others)
         force_unit, moment_unit = self.units
         return ShellUnknowns(displacement, force_unit * force, moment_unit * moment, rotation)
+
+    def loaded_surface(self, name: str, inward: bool) -> LoadedSurface:
+        """See `SolidProblem.loaded_surface`; without a name all of the shell."""
+        space = self.displacements
+        region = self.geometry.boundary(name) if name else self.geometry.region("all")
+        return LoadedSurface.of(space.scalar, region, space.node_values, self.n_dofs, inward)
 
     @cached_property
     def units(self) -> tuple[float, float]:

@@ -26,6 +26,7 @@ from morph_dslam.mechanics.contact_assembly import ContactAssembly
 from morph_dslam.mechanics.enhanced_assembly import EnhancedAssembly
 from morph_dslam.mechanics.enhanced_strain import EnhancedStrain, takes_enhanced_strain
 from morph_dslam.mechanics.kinematics import Kinematics, Shape, ShapeField
+from morph_dslam.mechanics.load_modes import LoadedSurface
 from morph_dslam.mechanics.loads import BodyForce, FollowerPressure, Gravity, Load, NodalForces, PointLoad
 from morph_dslam.mechanics.materials.base import Material, isotropic_average
 from morph_dslam.mechanics.ngsolve_mesh import NgsolveMesh
@@ -346,6 +347,15 @@ class SolidProblem:
         """
         return self.recovery.slopes_at_nodes(dofs, mu, dof_slopes)
 
+    def response_slopes(self, dofs: Array, mu: Array, responses: Array) -> dict[str, Array]:
+        """Derivatives (c, n, k) of the fields of `sample_slopes` by loads that change the dofs by (c, n_dofs)."""
+        return self.recovery.slopes_at_nodes(dofs, mu, responses, by_parameters=False)
+
+    def loaded_surface(self, name: str, inward: bool) -> LoadedSurface:
+        """The functions on a surface of the mesh, for tractions there along the inward normal or in any direction."""
+        space, region = self.displacements, self.geometry.boundary(name)
+        return LoadedSurface.of(space.scalar, region, space.node_values, self.n_dofs, inward)
+
     def reactions(self, dofs: Array, mu: Array, name: str, about: Array | None = None) -> tuple[Array, Array]:
         """Force (3,) N and moment (3,) Nm that the supports of a set exert on the solid.
 
@@ -373,6 +383,14 @@ class SolidProblem:
         forces = self._held_part(self.residual(dofs, mu)), self._held_part(force_slopes)
         displacements = self._by_component(dofs), self._by_component(dof_slopes)
         return self.constraints.resultant_slopes(name, forces, displacements, about)
+
+    def response_reactions(
+        self, dofs: Array, mu: Array, responses: Array, forces: Array, name: str, about: Array
+    ) -> tuple[Array, Array]:
+        """`reaction_slopes` (c, 3) by loads that change the dofs by (c, n_dofs) and the residual by ``forces``."""
+        held = self._held_part(self.residual(dofs, mu)), self._held_part(forces)
+        displacements = self._by_component(dofs), self._by_component(responses)
+        return self.constraints.resultant_slopes(name, held, displacements, about, by_parameters=False)
 
     def _by_component(self, dofs: Array) -> Array:
         """(..., 3, n_scalar) displacement part of (..., n_dofs)."""

@@ -103,17 +103,25 @@ class Constraints:
         return f @ constant, np.cross(arms.T, f.T).sum(axis=0)
 
     def resultant_slopes(
-        self, name: str, forces: tuple[Array, Array], displacements: tuple[Array, Array], about: Array
+        self,
+        name: str,
+        forces: tuple[Array, Array],
+        displacements: tuple[Array, Array],
+        about: Array,
+        by_parameters: bool = True,
     ) -> tuple[Array, Array]:
-        """Derivatives (d, 3) by the parameters of `resultant`'s force, and of its moment about a point that stays.
+        """Derivatives (d, 3) of `resultant`'s force, and of its moment about a point that stays.
 
-        ``forces`` and ``displacements`` are given with their derivatives: (3, n_scalar) and (d, 3, n_scalar).
+        ``forces`` and ``displacements`` are given with their derivatives: (3, n_scalar) and (d, 3, n_scalar). They are
+        ``by_parameters``, with which the undeformed shape may move, or by d other loads.
         """
         dofs = self._space.dofs_on(self._mesh.set_nodes(name))
         constant = self._constant[dofs]
         (f, f_slopes), (u, u_slopes) = ([part[..., dofs] for part in pair] for pair in (forces, displacements))
         arms = self._shape.coordinates(self._symbols)[dofs] + u.T - np.outer(constant, about)
-        arm_slopes = np.array(self._shape.coordinate_slopes(self._symbols))[:, dofs] + u_slopes.transpose(0, 2, 1)
+        arm_slopes = u_slopes.transpose(0, 2, 1)
+        if by_parameters:
+            arm_slopes = arm_slopes + np.array(self._shape.coordinate_slopes(self._symbols))[:, dofs]
         moments = np.cross(arm_slopes, f.T) + np.cross(arms, f_slopes.transpose(0, 2, 1))
         return f_slopes @ constant, moments.sum(axis=1)
 

@@ -12,6 +12,7 @@ from scipy.stats import qmc
 
 from morph_dslam.errors import ParameterError
 from morph_dslam.model.separated import Outside, SeparatedField
+from morph_dslam.model.unknown_loads import ElasticEnergy, UnknownLoads
 from morph_dslam.units import from_si
 
 Array = NDArray[np.float64]
@@ -118,6 +119,9 @@ class ReducedModel:
     supports : nodes (k,) that each support holds, by the name of the set.
     reactions : what supports exert, fields of one point: "force_SET" in newtons and "moment_SET" about the
         origin in newton metres, 3 components in the object frame.
+    unknown_loads : tractions beside the study's loads and what they do; None where the study asks for none.
+    energy : of the unknown loads, whose coefficients are then the last parameters (`with_unknown_loads`); None
+        without.
     certificate : held-out errors and how they were measured, plain JSON.
     provenance : versions, study text, mesh hash, plain JSON.
     """
@@ -132,8 +136,25 @@ class ReducedModel:
     strain: SeparatedField | None = None
     supports: dict[str, NDArray[np.int64]] = field(default_factory=dict)
     reactions: dict[str, SeparatedField] = field(default_factory=dict)
+    unknown_loads: UnknownLoads | None = None
+    energy: ElasticEnergy | None = None
     certificate: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def n_loads(self) -> int:
+        """How many of the last parameters are coefficients of unknown loads."""
+        return 0 if self.energy is None else self.energy.loads.count
+
+    @property
+    def study_parameters(self) -> tuple[Parameter, ...]:
+        """The parameters that the study names: all but the coefficients of unknown loads."""
+        return self.parameters[: len(self.parameters) - self.n_loads]
+
+    @property
+    def without_loads(self) -> ReducedModel:
+        """The model with the parameters that its study names alone."""
+        return self if self.energy is None else self.energy.model
 
     @property
     def lower(self) -> Array:
@@ -178,10 +199,17 @@ class ReducedModel:
         return DeformedState(self, self.vector(parameters), outside)
 
     def spread_parameters(self, count: int) -> Array:
-        """The default and ``count`` Sobol samples of the box (1 + count, d); without parameters the default."""
-        d = len(self.parameters)
-        shares = qmc.Sobol(d, scramble=False).random(count) if d else np.empty((0, 0))
-        return np.vstack([self.default, self.lower + shares * (self.upper - self.lower)])
+        """The default and ``count`` Sobol samples of the box (1 + count, d); without parameters the default.
+
+        Unknown loads stay away.
+        """
+        d = len(self.study_parameters)
+        if not d:
+            return self.default[None]
+        samples = np.repeat(self.default[None], 1 + count, axis=0)
+        shares = qmc.Sobol(d, scramble=False).random(count)
+        samples[1:, :d] = self.lower[:d] + shares * (self.upper - self.lower)[:d]
+        return samples
 
     def inside(self, parameters: ParameterValues) -> NDArray[np.bool_]:
         """Which parameters (d,) lie in their range; elsewhere see `separated.Outside`."""
@@ -197,6 +225,7 @@ class ReducedModel:
         result = {"displacement": self.displacement}
         result |= {f"stress_{place}": field for place, field in self.stresses.items()}
         result |= {} if self.strain is None else {"strain": self.strain}
+        result |= {} if self.energy is None else {"traction": self.energy.traction}
         return result | {REACTION + name: field for name, field in self.reactions.items()}
 
     def von_mises(self, parameters: ParameterValues, place: str | None = None, outside: Outside = "bounded") -> Array:

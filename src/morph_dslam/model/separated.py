@@ -27,6 +27,8 @@ def combine_modes(rows, modes):
     for i in range(0, whole, 4):
         for row in range(n_rows):
             a, b, c, d = rows[row, i], rows[row, i + 1], rows[row, i + 2], rows[row, i + 3]
+            if a == 0.0 and b == 0.0 and c == 0.0 and d == 0.0:  # a load's response does not depend on other loads
+                continue
             for p in range(n):
                 result[row, p] += a * modes[i, p] + b * modes[i + 1, p] + c * modes[i + 2, p] + d * modes[i + 3, p]
     for i in range(whole, m):

@@ -21,6 +21,7 @@ from morph_dslam.io.checksum import check_checksum, is_other_hdf5, written_with_
 from morph_dslam.model.field_storage import names, read_array, read_field, read_group, read_text, write_field
 from morph_dslam.model.reduced_model import REACTION, Parameter, ReducedModel
 from morph_dslam.model.separated import SeparatedField
+from morph_dslam.model.unknown_loads import ROOT, UnknownLoads
 from morph_dslam.units import FACTORS
 
 #: Ranges of functions may differ from the parameters' by this share of the range: rounding.
@@ -45,6 +46,8 @@ def check_model(model: ReducedModel) -> None:
         n_points = 1 if name.startswith(REACTION) else n_nodes
         n_components = {"stress": (3, 6), "strain": (6,)}.get(name.split("_")[0], (3,))
         _check_field(name, field, n_points, n_components, model)
+    if model.unknown_loads is not None:
+        _check_loads(model.unknown_loads, model)
 
 
 def check_parameters(parameters: tuple[Parameter, ...]) -> None:
@@ -115,8 +118,51 @@ def save_model(path: str | Path, model: ReducedModel) -> None:
             file.create_dataset(f"cells/{cell_type}", data=connectivity.astype(np.int32))
         for name, nodes in model.supports.items():
             file.create_dataset(f"supports/{quote(name, safe=_PLAIN)}", data=nodes.astype(np.int32))
+        if model.unknown_loads is not None:
+            _write_loads(file.create_group("unknown_loads"), model.unknown_loads)
         for name, field in model.fields.items():
             write_field(file.create_group(f"fields/{quote(name, safe=_PLAIN)}"), field)
+
+
+def _write_loads(group: h5py.Group, loads: UnknownLoads) -> None:
+    group.attrs["surface"], group.attrs["direction"] = loads.surface, "inward" if loads.inward else "any"
+    group.create_dataset("nodes", data=loads.nodes.astype(np.int32))
+    group.create_dataset("tractions", data=loads.tractions)
+    group.create_dataset("resultants", data=loads.resultants)
+    for name, field in loads.responses.items():
+        write_field(group.create_group(f"responses/{quote(name, safe=_PLAIN)}"), field)
+
+
+def _read_loads(file: h5py.File, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> UnknownLoads | None:
+    if "unknown_loads" not in file:
+        return None
+    group = read_group(file, "unknown_loads")
+    responses = read_group(group, "responses")
+    return UnknownLoads(
+        read_text(group, "surface"),
+        read_text(group, "direction") == "inward",
+        read_array(group, "nodes", 1, np.int64),
+        read_array(group, "tractions", 3),
+        read_array(group, "resultants", 2),
+        {unquote(name): read_field(read_group(responses, name), lower, upper) for name in names(responses)},
+    )
+
+
+def _check_loads(loads: UnknownLoads, model: ReducedModel) -> None:
+    """Raise ValueError where responses do not belong to the tractions, or to the model's fields."""
+    m, n_nodes = loads.count, len(model.nodes)
+    _check_indices("nodes with unknown loads", loads.nodes[:, None], 1, n_nodes)
+    if loads.tractions.shape != (len(loads.nodes), 3, m) or m == 0:
+        raise ValueError(f"{len(loads.nodes)} nodes have unknown tractions of shape {loads.tractions.shape}")
+    if loads.resultants.shape != (m, 6):
+        raise ValueError(f"{m} unknown loads have resultants of shape {loads.resultants.shape}")
+    if missing := sorted({*model.fields, ROOT} - loads.responses.keys()):
+        raise ValueError(f"it does not say what unknown loads do to '{missing[0]}'")
+    for name, field in loads.responses.items():
+        n_points = 1 if name == ROOT or name.startswith(REACTION) else n_nodes
+        known = model.fields.get(name)
+        each = m * (m + 1) // 2 if name == ROOT else m * (3 if known is None else known.modes.shape[2])
+        _check_field(f"{name} of unknown loads", field, n_points, (each,), model)
 
 
 def _read_parameters(file: h5py.File) -> tuple[Parameter, ...]:
@@ -160,6 +206,7 @@ def _read_model(file: h5py.File) -> ReducedModel:
         supports=_read_indices(file, "supports", 1),
         strain=fields.pop("strain", None),
         reactions=_with_prefix(fields, REACTION),
+        unknown_loads=_read_loads(file, lower, upper),
         certificate=json.loads(read_text(file, "certificate")),
         provenance=json.loads(read_text(file, "provenance")),
     )

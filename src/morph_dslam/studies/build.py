@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import Executor
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -20,11 +21,20 @@ from morph_dslam.studies.discretisation import discretisation_errors
 from morph_dslam.studies.problem import announce
 from morph_dslam.studies.provenance import locking_warnings, provenance
 from morph_dslam.studies.sections import ReductionSection
+from morph_dslam.studies.shell_study import ShellStudy
+from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.studies.solutions import Snapshots, take_snapshots
 from morph_dslam.studies.study import Study, load_study
+from morph_dslam.studies.unknown_loads import reduce_unknown_loads
 
 #: Fewer held-out solutions than these say nothing of the error.
 FEWEST_HELD_OUT = 4
+#: Responses to unknown loads that are off by more than this share are not to be trusted.
+LARGEST_RESPONSE_ERROR = 0.1
+UNSURE_LOADS = (
+    "responses to unknown loads are off by {:.0f} % between the states where they are known: narrow the ranges of the "
+    "parameters"
+)
 
 
 def build(
@@ -60,6 +70,10 @@ def build(
     chosen = resolve_defaults(described)
     snapshots = take_snapshots(chosen, output.with_name(output.name + ".snapshots"), workers, executor)
     model = certified_model(snapshots, chosen.reduction, chosen.name)
+    if isinstance(chosen, SolidStudy | ShellStudy) and chosen.unknown_loads is not None:
+        announce("reducing the responses to unknown loads")
+        loads, model.certificate["unknown_loads"] = reduce_unknown_loads(chosen, chosen.unknown_loads, snapshots)
+        model = replace(model, unknown_loads=loads)
     model.certificate["discretisation"] = discretisation_errors(chosen, snapshots, model, time.monotonic() - begin)
     model.provenance.update(provenance(text, chosen, model))
     if found := locking_warnings(chosen):
@@ -119,6 +133,8 @@ def _samples(snapshots: Snapshots) -> dict[str, Any]:
 def build_warnings(certificate: dict[str, Any]) -> list[str]:
     """Sentences on the study's elements, what its solutions pass through, their stability, the method of reduction."""
     of_the_method = certificate.get("reduction", {}).get("warnings", [])
+    error = certificate.get("unknown_loads", {}).get("response_error", 0.0)
+    loads = [UNSURE_LOADS.format(100.0 * error)] if error > LARGEST_RESPONSE_ERROR else []
     penetration = certificate.get("self_penetration", {"states": []})
     passing = [penetration["statement"]] if penetration["states"] else []
-    return [*certificate.get("warnings", []), *passing, *stability_warnings(certificate), *of_the_method]
+    return [*certificate.get("warnings", []), *passing, *stability_warnings(certificate), *loads, *of_the_method]

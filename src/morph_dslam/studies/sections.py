@@ -154,6 +154,19 @@ class ReductionSection(Section):
             raise ValueError(str(error)) from error
 
 
+class UnknownLoadsSection(Section):
+    """Unknown tractions: where, along which direction, and how many of the softest.
+
+    ``on`` is a surface, of a shell all of it if absent. ``direction`` "inward" is for what presses: pressures
+    about places spread over the surface, which never pull; "any" for the tractions that the body gives way to most,
+    whatever their direction.
+    """
+
+    on: str = ""
+    direction: Literal["inward", "any"] = "inward"
+    modes: int = Field(default=30, ge=1, le=300)
+
+
 class WorkSection(Section):
     """How the solves share the machine: worker processes, and threads in each (every core if absent)."""
 

@@ -298,7 +298,7 @@ class SheetStudy(Section):
         for option in WorkSection.model_fields:
             del content["solver"][option]
         content["grid"] = self.reduction.grid
-        content["code"] = SOLVER_VERSION
+        content["code"], content["reactions"] = SOLVER_VERSION, True
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def model_parameters(self) -> tuple[Parameter, ...]:

@@ -14,7 +14,7 @@ from morph_dslam.meshing.meshes import Mesh, model_mesh_of
 from morph_dslam.studies.body_study import BodyStudy, check_names, read_once, reader_of
 from morph_dslam.studies.parameters import ParameterSection
 from morph_dslam.studies.problem import ModelMesh, SweepProblem
-from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section, WorkSection
+from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section, UnknownLoadsSection, WorkSection
 from morph_dslam.studies.shell_sections import (
     SetSection,
     ShellLoadSection,
@@ -46,6 +46,7 @@ class ShellStudy(BodyStudy, Section):
     supports: tuple[ShellSupportSection, ...] = ()
     loads: tuple[ShellLoadSection, ...] = ()
     parameters: dict[str, ParameterSection] = Field(min_length=1)
+    unknown_loads: UnknownLoadsSection | None = None
     solver: _ShellSolverSection = _ShellSolverSection()
     sampling: SamplingSection = SamplingSection()
     reduction: ReductionSection = ReductionSection()

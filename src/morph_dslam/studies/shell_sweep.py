@@ -5,13 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError
 from morph_dslam.mechanics.shell_problem import ShellProblem
 from morph_dslam.mechanics.solvers.continuation import loaded_state
 from morph_dslam.mechanics.solvers.relaxation import relaxed_state
 from morph_dslam.studies.problem import Snapshot
-from morph_dslam.studies.solid_sweep import SolidSweep, support_reactions
+from morph_dslam.studies.solid_sweep import SolidSweep, response_reactions, support_reactions
+
+Array = NDArray[np.float64]
 
 
 class ShellSweep(SolidSweep):
@@ -26,6 +29,13 @@ class ShellSweep(SolidSweep):
             return self._with_slopes(loaded_state(self.problem, mu))
         except SolverError:
             return self._with_slopes(relaxed_state(self.problem, mu, self.problem.area))
+
+    def response_fields(self, state: Any, loads: Array, responses: Array) -> dict[str, Array]:
+        """See `unknown_loads.LoadableProblem`."""
+        forces = self._tangent(state).apply(responses) - loads
+        fields = [self.problem.sample(response, state.mu) for response in responses]
+        slopes = {name: np.array([field[name] for field in fields]) for name in fields[0]}
+        return slopes | response_reactions(self.problem, state.dofs, state.mu, responses, forces)
 
     def take_snapshot(self, state: Any) -> Snapshot:
         """Displacement, stresses of both faces and their slopes, reactions, and the tangent's negative pivots."""

@@ -23,7 +23,7 @@ from morph_dslam.studies.body_study import BodyStudy, check_names, read_once, re
 from morph_dslam.studies.material_sections import MaterialSection
 from morph_dslam.studies.parameters import ParameterSection, TimeSection
 from morph_dslam.studies.problem import ModelMesh, SweepProblem
-from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section, WorkSection
+from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section, UnknownLoadsSection, WorkSection
 from morph_dslam.studies.shape_sections import ShapeSection, shape_fields
 from morph_dslam.studies.snapshots import SOLVER_VERSION
 from morph_dslam.studies.solid_sections import (
@@ -72,6 +72,7 @@ class SolidStudy(BodyStudy, Section):
     shape: tuple[ShapeSection, ...] = ()
     parameters: dict[str, ParameterSection] = Field(min_length=1)
     time: TimeSection | None = None
+    unknown_loads: UnknownLoadsSection | None = None
     solver: _SolidSolverSection = _SolidSolverSection()
     sampling: SamplingSection = SamplingSection()
     reduction: ReductionSection = ReductionSection()
@@ -87,6 +88,8 @@ class SolidStudy(BodyStudy, Section):
             raise ValueError("two materials are on the same cell set: give each its own")
         self._check_time(parameters)
         self._check_weight()
+        if self.unknown_loads and self.couplings:
+            raise ValueError("[unknown_loads] is for solids without [[couplings]]: leave out one of both")
         return self
 
     def _check_weight(self) -> None:
@@ -166,6 +169,8 @@ class SolidStudy(BodyStudy, Section):
             elif not isinstance(load, GravityLoad):
                 held.append(load.on)
         check_mesh(mesh, held, regions)
+        if self.unknown_loads:
+            mesh.surface(self.unknown_loads.on)
         return mesh
 
     def fingerprint(self) -> str:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError
 from morph_dslam.mechanics.coupled_solid import CoupledSolid
+from morph_dslam.mechanics.load_modes import LoadedSurface, Respond
 from morph_dslam.mechanics.solid import SolidProblem
 from morph_dslam.mechanics.solvers.continuation import PathError, advance, loaded_state
 from morph_dslam.mechanics.solvers.newton import Linearisation, State, sensitivities, solve, solve_with_kept_tangent
@@ -97,6 +98,31 @@ def _reaction_slopes(
     return outputs
 
 
+def solid_responses(problem: SolidProblem, dofs: Array, mu: Array, changes: Array, forces: Array) -> dict[str, Array]:
+    """Derivatives (c, n, k) of displacement, stress, strain and reactions by loads that act besides the study's.
+
+    Parameters
+    ----------
+    dofs : (n,) of the solution.
+    changes : (c, n) of the dofs by each load.
+    forces : (c, n) of the residual by each, at the dofs that supports hold.
+    """
+    fields = _named(problem.response_slopes(dofs, mu, changes))
+    return fields | response_reactions(problem, dofs, mu, changes, forces)
+
+
+def response_reactions(
+    problem: SolidProblem, dofs: Array, mu: Array, changes: Array, forces: Array
+) -> dict[str, Array]:
+    """The reactions' part of `solid_responses`: (c, 1, 3) each."""
+    outputs = {}
+    for name in problem.held_sets:
+        parts = problem.response_reactions(dofs, mu, changes, forces, name, np.zeros(3))
+        for kind, part in zip((FORCE, MOMENT), parts, strict=True):
+            outputs[REACTION + kind + name] = part[:, None]
+    return outputs
+
+
 def follow(problem: SolidProblem, start: State, target: Array) -> State:
     """Solve at ``target`` (d,) in increments from ``start``."""
     try:
@@ -137,7 +163,7 @@ class SolidSweep:
 
     def __init__(self, problem: SolidProblem) -> None:
         self.problem = problem
-        self._tangent: tuple[Array, Linearisation] | None = None
+        self._kept: tuple[Array, Linearisation] | None = None
         self._solved: Array | None = None
 
     def first_state(self) -> _SolidState:
@@ -152,8 +178,8 @@ class SolidSweep:
         pivots = int(arrays["pivots"])
         state = _SolidState(arrays["mu"], arrays["dofs"], arrays["slopes"], None if pivots < 0 else pivots)
         if self._solved is None or not np.array_equal(self._solved, state.dofs):
-            self._tangent = None  # its memory is needed for the next one
-            self._tangent = state.mu, self.problem.linearise(state.dofs, state.mu)
+            self._kept = None  # its memory is needed for the next one
+            self._kept = state.mu, self.problem.linearise(state.dofs, state.mu)
             self._solved = state.dofs
         return state
 
@@ -163,7 +189,7 @@ class SolidSweep:
         If the tangent at ``start`` is still at hand it serves first.
         """
         predicted = start.dofs + (target - start.mu) @ start.slopes
-        tangent, self._tangent = self._tangent_at(start.mu), None
+        tangent, self._kept = self._tangent_at(start.mu), None
         try:
             state = solve_with_kept_tangent(self.problem, target, predicted, tangent)
             state = state or solve(self.problem, target, State(target, predicted))
@@ -173,19 +199,34 @@ class SolidSweep:
 
     def _tangent_at(self, mu: Array) -> Linearisation | None:
         """The tangent of a solution if it is still at hand."""
-        return self._tangent[1] if self._tangent is not None and np.array_equal(self._tangent[0], mu) else None
+        return self._kept[1] if self._kept is not None and np.array_equal(self._kept[0], mu) else None
 
     def _with_slopes(self, state: State) -> _SolidState:
-        self._tangent = self._solved = None
+        self._kept = self._solved = None
         tangent = self.problem.linearise(state.dofs, state.mu)
         slopes = sensitivities(self.problem, state, tangent)
-        self._tangent, self._solved = (state.mu, tangent), state.dofs
+        self._kept, self._solved = (state.mu, tangent), state.dofs
         return _SolidState(state.mu, state.dofs, slopes, tangent.negative_pivots)
+
+    def loaded_surface(self, name: str, inward: bool) -> LoadedSurface:
+        """See `unknown_loads.LoadableProblem`."""
+        return self.problem.loaded_surface(name, inward)
+
+    def response(self, state: _SolidState) -> Respond:
+        """See `unknown_loads.LoadableProblem`."""
+        return self._tangent(state).solve
+
+    def response_fields(self, state: _SolidState, loads: Array, responses: Array) -> dict[str, Array]:
+        """See `unknown_loads.LoadableProblem`."""
+        forces = self._tangent(state).apply(responses) - loads
+        return solid_responses(self.problem, state.dofs, state.mu, responses, forces)
+
+    def _tangent(self, state: _SolidState) -> Linearisation:
+        return self._tangent_at(state.mu) or self.problem.linearise(state.dofs, state.mu)
 
     def take_snapshot(self, state: _SolidState) -> Snapshot:
         """Fields at the nodes, their slopes, reactions, and the tangent's negative pivots."""
-        tangent = self._tangent_at(state.mu) or self.problem.linearise(state.dofs, state.mu)
-        forces = tangent.apply(state.slopes) + self.problem.residual_slopes(state.dofs, state.mu)
+        forces = self._tangent(state).apply(state.slopes) + self.problem.residual_slopes(state.dofs, state.mu)
         snapshot = solid_snapshot(self.problem, state.dofs, state.mu, state.slopes, forces)
         if state.negative_pivots is not None:
             snapshot.outputs["negative_pivots"] = np.array(state.negative_pivots)

@@ -8,7 +8,7 @@ from pathlib import Path
 from morph_dslam.errors import TrackingError
 from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.drawing import shown_field
-from morph_dslam.tracking.options import NO_DISCREPANCY
+from morph_dslam.tracking.options import NO_DISCREPANCY, NO_LOADS
 from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
 from morph_dslam.tracking.setup import TrackedObject
 
@@ -105,6 +105,7 @@ OF_RUN: tuple[tuple[Callable[[TrackOptions], bool], str], ...] = (
         "the reference is refined for one camera: leave out --refine or --with",
     ),
     (lambda run: bool(run.other_cameras) and any(part.tracker.use_discrepancy for part in run.objects), NO_DISCREPANCY),
+    (lambda run: bool(run.other_cameras) and any(part.tracker.use_unknown_loads for part in run.objects), NO_LOADS),
     (
         lambda run: (
             run.reference_frame is not None

@@ -160,7 +160,7 @@ def _edges(cells: NDArray[np.int64], pairs: list[tuple[int, int]]) -> NDArray[np
     return np.stack([cells[:, list(pair)] for pair in pairs], axis=1)
 
 
-Shown = Literal["stress", "strain", "displacement"]
+Shown = Literal["stress", "strain", "displacement", "traction"]
 #: Opacity of the object's surface, of one that shows what it has inside, and of one that is cut open.
 OPACITY, SEE_THROUGH, CUT_OPEN = 0.65, 0.4, 0.9
 #: Colours of inner structures in turn: violet, yellow, green, blue.
@@ -179,8 +179,8 @@ class DrawOptions:
 
     Attributes
     ----------
-    show : "stress" (von Mises), "strain" (equivalent) or "displacement"; None for stress where the model has
-        one, else the displacement
+    show : "stress" (von Mises), "strain" (equivalent), "displacement" or the "traction" of unknown loads; None for
+        stress where the model has one, else the displacement
     section : a plane that cuts the object open; None for none.
     forces : whether arrows show the forces of supports.
     """
@@ -232,6 +232,7 @@ class AugmentedView:
             "stress": "von Mises stress [MPa]",
             "strain": "equivalent strain [%]",
             "displacement": "displacement [mm]",
+            "traction": "traction of unknown loads [kPa]",
         }[self.show]
 
     def view(self, state: State) -> View:
@@ -257,6 +258,8 @@ class AugmentedView:
             return 1e3 * np.linalg.norm(displacement, axis=1)
         if self.show == "strain":
             return 100.0 * _equivalent_strain(self._fields["strain"].value(parameters))
+        if self.show == "traction":
+            return 1e-3 * np.linalg.norm(self._fields["traction"].value(parameters), axis=1)
         name = "stress_solid"
         if name not in self._fields:
             # Triangles run anticlockwise seen from their top face, that is clockwise in neither y-up nor
@@ -275,6 +278,8 @@ class AugmentedView:
         """One range of colours for all states of the parameter box, known before any is seen."""
         model = self._model
         shapes = model.spread_parameters(SAMPLES)
+        if self.show == "traction" and model.energy is not None:
+            shapes[:, -model.n_loads :] = np.sqrt(model.energy.work)
         return self._range([self._values(mu, self._displacement.value(mu), None) for mu in shapes])
 
     def _range(self, fields: list[Array]) -> tuple[float, float]:
@@ -344,7 +349,12 @@ def with_caption(image: NDArray[np.uint8], caption: str) -> NDArray[np.uint8]:
 
 def shown_field(model: ReducedModel, show: Shown | None) -> Shown:
     """What colours an object, by default the stress of a model that has it; raises TrackingError if it has it not."""
-    has = {"stress": bool(model.stresses), "strain": model.strain is not None, "displacement": True}
+    has = {
+        "stress": bool(model.stresses),
+        "strain": model.strain is not None,
+        "displacement": True,
+        "traction": model.energy is not None,
+    }
     if show is None:
         return "stress" if has["stress"] else "displacement"
     if not has[show]:
@@ -357,7 +367,7 @@ def _fields_of(model: ReducedModel, show: Shown) -> list[str]:
     """Names of the fields that are shown, as in `ReducedModel.fields`."""
     if show == "stress":
         return [f"stress_{place}" for place in model.stresses]
-    return ["strain"] if show == "strain" else []
+    return [show] if show in ("strain", "traction") else []
 
 
 def _equivalent_strain(strain: Array) -> Array:

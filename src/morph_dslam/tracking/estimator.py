@@ -8,7 +8,7 @@ of the camera's, the pose's and the model's derivative (the paper's projected se
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -21,6 +21,7 @@ from morph_dslam.model.separated import combine_modes
 from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR, huber_covariance
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.levenberg_marquardt import Box, Minimum, minimise
+from morph_dslam.tracking.load_prior import LoadOptions, LoadPrior
 from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.state import BoundPoints, Prior, State, moved
 
@@ -157,7 +158,7 @@ class LinearCost:
     ----------
     weighted_jacobian : (p, 2, n) by which an error of a pixel enters the gradient, in units of what a point
         of weight 1 is off by
-    of_depths : (n, n), covariance of the gradient from errors of depths
+    of_depths : (n, n), covariance of the gradient from errors of depths, and of what is known of unknown loads
     hessian : (n, n).
     scale : (n,) of the unknowns.
     """
@@ -252,11 +253,19 @@ class EstimationOptions:
         over wide parts of the surface, which are no outliers.
     tolerance : relative decrease of the cost below which the iteration ends. With some hundred residuals
         what is left to gain is then less than a tenth of a standard deviation.
+    loads : how unknown loads are estimated, where the model has them.
     """
 
     huber_px: float = 3.0
     max_iterations: int = 25
     tolerance: float = 1e-5
+    loads: LoadOptions = field(default_factory=LoadOptions)
+
+
+def padded(terms: tuple[float, Array, Array]) -> tuple[float, Array, Array]:
+    """Terms of a cost that does not depend on the pose, with zeros for it."""
+    cost, hessian, gradient = terms
+    return cost, np.pad(hessian, (0, 6)), np.pad(gradient, (0, 6))
 
 
 @dataclass(frozen=True)
@@ -303,6 +312,7 @@ class Estimator:
         self.model, self.camera = model, camera
         self.options = options or EstimationOptions()
         self.box = Box.of(model)
+        self.loads = None if model.energy is None else LoadPrior(model.energy, self.options.loads)
 
     @property
     def scale(self) -> Array:
@@ -339,6 +349,8 @@ class Estimator:
             points.field.modes, self.camera.intrinsics, pixels, weights, normals, self.options.huber_px,
         )  # fmt: skip
         others = [] if prior is None else [prior.terms(state)]
+        if self.loads is not None:
+            others.append(padded(self.loads.terms(state.parameters)))
         if depths is not None:
             others.append(depths.terms(points, state)[:3])
         for terms in others:
@@ -384,7 +396,12 @@ class Estimator:
     def linear(self, measured: Observations, estimate: Estimate) -> LinearCost:
         """The cost of what was measured, about an estimate made from it."""
         huber = self.options.huber_px
-        return LinearCost.about(measured, estimate.state, estimate.residuals, self.camera, huber, self.scale)
+        linear = LinearCost.about(measured, estimate.state, estimate.residuals, self.camera, huber, self.scale)
+        if self.loads is None:
+            return linear
+        information = padded(self.loads.terms(estimate.state.parameters))[1]
+        of_priors = linear.of_depths + self.loads.squared_px * information
+        return replace(linear, hessian=linear.hessian + information, of_depths=of_priors)
 
     def estimate_from(
         self, points: BoundPoints, pixels: Array, weights: Array, starts: Sequence[State]

@@ -79,8 +79,9 @@ class ShapeSearch:
     def _off_bound(self, estimate: Estimate) -> list[State]:
         """Starts a little inside the box with other values of what is unobservable; none if not needed."""
         model, state = self._model, estimate.state
+        d = len(model.study_parameters)
         free = _unobservable(model, estimate) & ~estimate.at_bound
-        if not (estimate.at_bound.any() and free.any()):
+        if not (estimate.at_bound[:d].any() and free[:d].any()):
             return []
         width = model.upper - model.lower
         inside = np.clip(state.parameters, model.lower + OFF_BOUND * width, model.upper - OFF_BOUND * width)
@@ -112,6 +113,7 @@ class FrameEstimation:
         self._search = ShapeSearch(estimator.model, options.searches)
         brief = replace(options.estimation, max_iterations=10, tolerance=1e-3)
         self._scout = Estimator(estimator.model, estimator.camera, brief)
+        self._scout.loads = estimator.loads
 
     def rough(self, followed: Measurement, start: State, prior: Prior | None) -> State:
         """The state by what was followed from the previous frame; only a start for `correct`."""

@@ -86,10 +86,10 @@ def unobservable_in_run(
     parameters: Sequence[Parameter], estimates: Sequence[Estimate]
 ) -> dict[tuple[int, ...], tuple[int, Unobservable]]:
     """What is unobservable in the frames of a run: by the parameters' indices in how many, and the last of it."""
-    ranges = np.array([p.upper - p.lower for p in parameters])
+    d, ranges = len(parameters), np.array([p.upper - p.lower for p in parameters])
     found: dict[tuple[int, ...], tuple[int, Unobservable]] = {}
     for estimate in estimates:
-        for part in unobservable(covariance_of_parameters(estimate), ranges):
+        for part in unobservable(covariance_of_parameters(estimate)[:d, :d], ranges):
             found[part.indices] = (found.get(part.indices, (0, part))[0] + 1, part)
     return found
 

@@ -16,6 +16,7 @@ PoseFrom = Literal["map", "fixed", "free", "still"]
 StartFrom = Literal["previous", "constant-velocity"]
 
 #: Why several cameras refuse it.
+NO_LOADS = "unknown loads are estimated from one camera: leave out --unknown-loads or --with"
 NO_DISCREPANCY = "the discrepancy is estimated from one camera: leave out --discrepancy or --with"
 
 
@@ -48,6 +49,7 @@ class TrackerOptions:
     modulus_std : standard deviation of a factor common to all moduli, a share; it counts in the reactions.
     depth_sigma : standard deviation of one pixel's depth at 1 m, metres; it grows with the distance squared.
     use_discrepancy : whether to look for what the object's shape has beyond the model's.
+    use_unknown_loads : whether loads that the study does not foresee are estimated too (`estimation.loads`).
     per_sequence : names of the parameters that are one over the whole sequence.
     random_walk : names of parameters that hardly change from frame to frame, each with the standard deviation
         of the change, SI: a prior on them. None by default.
@@ -78,6 +80,7 @@ class TrackerOptions:
     use_texture: bool = True
     use_depth: bool = False
     use_discrepancy: bool = False
+    use_unknown_loads: bool = False
     per_sequence: tuple[str, ...] = ()
     random_walk: tuple[tuple[str, float], ...] = ()
     modulus_std: float = 0.0

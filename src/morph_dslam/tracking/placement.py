@@ -14,6 +14,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, SourceError, TrackingError
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.inner_structure import CarriedStructure
+from morph_dslam.model.unknown_loads import with_unknown_loads
 from morph_dslam.registration.registration import Registration
 from morph_dslam.slam.frame_images import FrameImages
 from morph_dslam.sources import Frame, open_source
@@ -184,13 +185,26 @@ def place(part: TrackedObject, cameras: Sequence[RigCamera], frames_at: FramesAt
         image = image_of(part.keyframes[number])
         others = _beside_keyframe(image, number, camera, frames_at) if len(cameras) > 1 else []
         # The frames may be those of another recording: the object is looked for as after a loss.
-        return PlacedObject(part, tuple(cameras), start, (image, *others), number)
+        return PlacedObject(part, tuple(cameras), with_loads(start, part.options), (image, *others), number)
     frames = frames_at(number)
     camera.check_image(frames[0].image, f"frame {frames[0].index} of {run.frames}")
     registration, images = part.register(camera, frames[0]), tuple(frame.image for frame in frames)
     # A sequence that does not begin with the reference frame is entered as if the object had been lost.
     in_sequence = not run.live and number in (None, run.first)
-    return PlacedObject(part, tuple(cameras), registration, images, frames[0].index, in_sequence)
+    placed = with_loads(registration, part.options)
+    return PlacedObject(part, tuple(cameras), placed, images, frames[0].index, in_sequence)
+
+
+def with_loads(registration: Registration, options: TrackerOptions) -> Registration:
+    """The registration with unknown loads among its parameters, none of which acts then; itself if none are sought."""
+    if not options.use_unknown_loads:
+        return registration
+    model, covariance = with_unknown_loads(registration.model, options.estimation.loads.work), registration.covariance
+    d, m = len(registration.model.parameters), model.n_loads
+    if covariance is not None:
+        covariance = np.insert(np.insert(covariance, [d] * m, 0.0, axis=0), [d] * m, 0.0, axis=1)
+    state = replace(registration.state, parameters=np.append(registration.state.parameters, np.zeros(m)))
+    return replace(registration, model=model, state=state, covariance=covariance)
 
 
 def _beside_keyframe(keyframe: Image, number: int, camera: Camera, frames_at: FramesAt) -> list[NDArray[np.uint8]]:

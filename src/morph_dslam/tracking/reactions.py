@@ -1,4 +1,4 @@
-"""What supports exert on the object in a state, with standard deviations: forces from images.
+"""What supports, and unknown loads, exert on the object in a state, with standard deviations: forces from images.
 
 The reduced model holds force and moment of every support as functions of the parameters. Their deviations follow from
 those of the parameters to first order; a common factor by which all moduli may be off changes every force alike, and is
@@ -15,9 +15,12 @@ from numpy.typing import NDArray
 
 from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.model.reduced_model import FORCE, MOMENT
+from morph_dslam.model.unknown_loads import LOADS, node_areas
 from morph_dslam.tracking.estimator import Estimate
 
 Array = NDArray[np.float64]
+#: Unknown loads are where their traction is at least this part of its largest value.
+MOST = 0.5
 #: Values (3,) of a field at parameters, and their derivatives (d, 3).
 _Field = Callable[[Array], tuple[Array, Array]]
 
@@ -45,12 +48,12 @@ class VectorEstimate:
 
 @dataclass(frozen=True)
 class Reaction:
-    """What one support exerts on the object.
+    """What one support, or all unknown loads together, exert on the object.
 
     Attributes
     ----------
     point : (3,) mean of the deformed nodes that the support holds, object frame, m; the origin for a model file that
-        does not name them.
+        does not name them; of unknown loads where most of their traction is.
     force : N.
     moment : about the point, N m.
     """
@@ -121,7 +124,18 @@ def _fields_of(model: ReducedModel, name: str) -> tuple[_Field, _Field, _Field]:
         return of
 
     place = nothing
-    if name in model.supports:
+    if name == LOADS and model.energy is not None:
+        traction, held = model.energy.traction, model.supports[name]
+        areas = node_areas(model, held)
+
+        def place(mu: Array) -> tuple[Array, Array]:
+            # Where most of it acts: small tractions all over the surface would draw the mean to its middle.
+            sizes = np.linalg.norm(traction.value(mu)[held], axis=1)
+            most = np.where(sizes >= MOST * sizes.max(initial=0.0), sizes * areas, 0.0)
+            positions = (model.nodes + model.displacement.value(mu))[held]
+            return most @ positions / max(float(most.sum()), 1e-300), np.zeros((d, 3))
+
+    elif name in model.supports:
         held = model.supports[name]
         rest = model.nodes[held].mean(axis=0)
         moved = model.displacement.with_modes(model.displacement.modes[:, held].mean(axis=1, keepdims=True))

@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 from morph_dslam.errors import RegistrationError
 from morph_dslam.tracking.binding import bind_pixels, draw_view, view_of
 from morph_dslam.tracking.depth import SIGMA_AT_1M, PointDepths
-from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOptions, Estimator, State, moved
+from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State, moved
 from morph_dslam.tracking.outline import OutlineMeasurement
 
 Array = NDArray[np.float64]
@@ -96,7 +96,7 @@ def refine_reference(
     keyframes: Sequence[Keyframe],
     landmark_px: float = LANDMARK_PX,
 ) -> State:
-    """The reference state that explains the landmarks and the keyframes best.
+    """The reference state that explains the landmarks and the keyframes best, in which no unknown loads act.
 
     Parameters
     ----------
@@ -105,7 +105,8 @@ def refine_reference(
     start : the registered state.
     """
     model, camera = estimator.model, estimator.camera
-    inner = Estimator(model, camera, EstimationOptions(max_iterations=8, tolerance=1e-5))
+    inner = Estimator(model, camera, replace(estimator.options, max_iterations=8, tolerance=1e-5))
+    inner.loads = estimator.loads
     d = len(model.parameters)
     half_ranges = 0.5 * (model.upper - model.lower)
     scale = np.concatenate([0.05 * half_ranges, np.full(3, 0.01), np.full(3, 0.005)])
@@ -127,10 +128,18 @@ def refine_reference(
     bounds = np.full((2, d + 6), np.inf) * [[-1.0], [1.0]]
     bounds[0, :d] = (model.lower - start.parameters) / scale[:d] - 1e-6
     bounds[1, :d] = (model.upper - start.parameters) / scale[:d] + 1e-6
+    free = np.r_[: d - model.n_loads, d : d + 6]
+
+    def whole(step: Array) -> Array:
+        result = np.zeros(d + 6)
+        result[free] = step
+        return result
+
     found = least_squares(
-        residuals, np.zeros(d + 6), bounds=(bounds[0], bounds[1]), diff_step=1e-2, max_nfev=10, ftol=1e-4
-    )
-    return reference(found.x)
+        lambda step: residuals(whole(step)), np.zeros(len(free)), bounds=(bounds[0, free], bounds[1, free]),
+        diff_step=1e-2, max_nfev=10, ftol=1e-4,
+    )  # fmt: skip
+    return reference(whole(found.x))
 
 
 def _frame_residuals(inner: Estimator, points: BoundPoints, met: NDArray[np.bool_], frame: Keyframe) -> Array:

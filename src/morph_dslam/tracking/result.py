@@ -109,15 +109,15 @@ class FrameResult:
     @property
     def parameters(self) -> dict[str, float]:
         """Values by name, SI; NaN unless tracked."""
-        names = [parameter.name for parameter in self.model.parameters]
+        names = [parameter.name for parameter in self.model.study_parameters]
         values = np.full(len(names), np.nan) if self.estimate is None else self.estimate.state.parameters
-        return dict(zip(names, values.tolist(), strict=True))
+        return dict(zip(names, values.tolist(), strict=False))
 
     @property
     def parameter_std(self) -> dict[str, float]:
         """Standard deviations by name, SI; NaN unless tracked."""
         values = np.full(len(self.model.parameters), np.nan) if self.estimate is None else self.estimate.parameter_std
-        return {p.name: float(value) for p, value in zip(self.model.parameters, values, strict=True)}
+        return {p.name: float(value) for p, value in zip(self.model.study_parameters, values, strict=False)}
 
     @property
     def covariance(self) -> Array:

@@ -89,7 +89,7 @@ class RunFolder:
         write_hdf5(path / "result.h5", run)
         write_inner_positions(path / "result.h5", run, self._inner)
         write_csv(path / "frames.csv", run)
-        save_model(path / "model.morph", run.model)
+        save_model(path / "model.morph", run.model.without_loads)
         save_camera(path / "camera.yaml", self._camera)
         summary = summarise(run, notices) | (facts or {}) | {"versions": _versions()}
         (path / "summary.json").write_text(json.dumps(summary, indent=2, default=str) + "\n")
@@ -162,7 +162,7 @@ def _reaction_columns(run: RunResults) -> tuple[list[str], list[list[str]]]:
 
 def write_csv(path: Path, run: RunResults) -> None:
     """Write ``frames.csv``: millimetres, degrees, milliseconds, and parameters in their own units."""
-    parameters = run.model.parameters
+    parameters = run.model.study_parameters
     header = ["frame", "timestamp_s", "status", "reason", "pose_from"]
     for p in parameters:
         header += [f"{p.name}_{p.unit}", f"{p.name}_std_{p.unit}", f"{p.name}_at_bound"]
@@ -246,7 +246,7 @@ def values_over_the_sequence(run: RunResults) -> list[dict[str, object]]:
         return []
     return [
         one_value(parameter, last.state.parameters[k], last.parameter_std[k])
-        for k, parameter in enumerate(run.model.parameters)
+        for k, parameter in enumerate(run.model.study_parameters)
         if parameter.name in run.per_sequence
     ]
 

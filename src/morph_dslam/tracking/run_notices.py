@@ -119,7 +119,7 @@ def _at_bound(run: RunResults) -> list[RunNotice]:
     with np.errstate(invalid="ignore"):
         determined = run.parameter_std() < UNOBSERVABLE_SHARE * (run.model.upper - run.model.lower)
     at_bound, values = run.at_bound() & determined, run.parameters()
-    for k, parameter in enumerate(run.model.parameters):
+    for k, parameter in enumerate(run.model.study_parameters):
         upper = values[:, k] > 0.5 * (parameter.lower + parameter.upper)
         unit = "" if parameter.quantity == "ratio" else f" {parameter.unit}"
         for bound, side, rows in ((parameter.lower, "lower", ~upper), (parameter.upper, "upper", upper)):
@@ -134,7 +134,7 @@ def _at_bound(run: RunResults) -> list[RunNotice]:
 
 def _unobservable(run: RunResults) -> list[RunNotice]:
     """What the images do not give; of per-sequence parameters only what they do not after the last frame."""
-    parameters, estimates = run.model.parameters, [r.estimate for r in run.results if r.estimate]
+    parameters, estimates = run.model.study_parameters, [r.estimate for r in run.results if r.estimate]
     constant, found = {k for k, p in enumerate(parameters) if p.name in run.per_sequence}, []
     for part_of_run, is_last in ((estimates, False), (estimates[-1:], True)):
         for indices, (count, part) in unobservable_in_run(parameters, part_of_run).items():

@@ -21,7 +21,7 @@ MOST_STAGES, LEAST_SHARE = 10, 0.005
 def write_plots(folder: Path, run: RunResults) -> None:
     """Write ``residual.png``, ``timings.png`` and, where there is something in them, the other plots of the run."""
     folder.mkdir(exist_ok=True)
-    if run.model.parameters:
+    if run.model.study_parameters:
         plot_confidence(folder / "confidence.png", run)
         plot_parameters(folder / "parameters.png", run)
     if run.reactions():
@@ -40,10 +40,10 @@ def _shade_lost(axes: Axes, run: RunResults) -> None:
 
 def plot_parameters(path: Path, run: RunResults) -> None:
     """Each parameter in its unit with a band of two standard deviations and the ends of its range."""
-    model, frames = run.model, np.array(run.frames)
-    figure, all_axes = _rows(len(model.parameters), 1.9)
+    parameters, frames = run.model.study_parameters, np.array(run.frames)
+    figure, all_axes = _rows(len(parameters), 1.9)
     values, deviations, at_bound = run.parameters(), run.parameter_std(), run.at_bound()
-    for k, (axes, parameter) in enumerate(zip(all_axes, model.parameters, strict=True)):
+    for k, (axes, parameter) in enumerate(zip(all_axes, parameters, strict=True)):
         unit, held = parameter.display(1.0), at_bound[:, k]
         value, low, high = values[:, k] * unit, parameter.lower * unit, parameter.upper * unit
         margin = 0.06 * (high - low)

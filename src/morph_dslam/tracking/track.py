@@ -293,7 +293,7 @@ def _facts(run: TrackOptions, files: ObjectOptions, part: PlacedObject, results:
     named = {"frames": run.frames, "model": files.model, "camera": run.camera, "landmarks": files.landmarks}
     scene, options = part.object.scene, part.options
     named |= {"registration": files.registration, **vars(files.initializer), "map": scene and scene.path}
-    return temporal_facts(part.model.parameters, options) | {
+    return temporal_facts(part.model.study_parameters, options) | {
         "new_reference_views": {
             "allowed": options.new_views,
             "made": sum(result.made_view for result in results.results),
@@ -306,6 +306,7 @@ def _facts(run: TrackOptions, files: ObjectOptions, part: PlacedObject, results:
         "outline_used": options.use_outline,
         "depth_used": options.use_depth,
         "discrepancy_used": options.use_discrepancy,
+        "unknown_loads_used": options.use_unknown_loads,
         "pose": options.pose if scene is not None or options.pose == "still" else "free",
         "settings": {"click_px": run.click_px, "tracker": asdict(options)},
     }

@@ -330,6 +330,8 @@ class Tracker:
             self._learn(image, hypothesis)
         else:
             self.last_measured = self.reference.nothing_measured
+            if self.estimator.loads is not None:
+                self.estimator.loads.forget()
             placed = self._placed_by_map(camera)
             if placed is not None:
                 self._last = replace(self._last, camera_from_object=placed.pose)
@@ -488,6 +490,8 @@ class Tracker:
                 shape = self.reference.points.field.value(estimate.state.parameters)
                 depth = float(np.median(self.reference.points.in_camera(estimate.state)[:, 2]))
                 self._jumps.learn(estimate.residuals, inliers, shape, depth / self.camera.fx)
+        if self.estimator.loads is not None:
+            self.estimator.loads.learn(estimate.state.parameters, estimate.covariance, estimate.sigma_px)
         self._velocity_base = estimate.state if self._lost else self._last
         self._last = estimate.state
         self._start = with_unobservable_at_default(self.model, estimate)

@@ -1,0 +1,248 @@
+"""Unknown loads of a model: tractions on a surface that act beside the study's loads, with what they cause.
+
+A load is a combination of m tractions, whose coefficients q are unknown. Displacement, stress, strain and reactions
+change linearly with q about the parametric state; how they do is a field of the parameters. The elastic energy of the
+loads is q' C(mu) q / 2 with the compliance C, and tells what loads are likely: exp(-energy / work scale).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from morph_dslam.errors import ModelFileError
+from morph_dslam.model.functions import Functions, ParameterFunctions
+from morph_dslam.model.separated import SeparatedField
+
+if TYPE_CHECKING:
+    from morph_dslam.model.reduced_model import ReducedModel
+
+Array = NDArray[np.float64]
+#: Name of the field that holds the root of the compliance.
+ROOT = "compliance_root"
+#: Under this name reactions have what unknown loads amount to.
+LOADS = "unknown loads"
+#: The search for coefficients ends at so many standard deviations.
+SPAN = 10.0
+
+
+def packed_root(compliance: Array) -> Array:
+    """The symmetric root of a compliance (m, m) as its upper triangle (m (m + 1) / 2,)."""
+    values, vectors = np.linalg.eigh(compliance)
+    root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return root[np.triu_indices(len(root))]
+
+
+@dataclass(frozen=True)
+class UnknownLoads:
+    """The tractions, and what a unit of each does.
+
+    Attributes
+    ----------
+    surface : name of the surface that they act on; empty for all of a shell.
+    inward : whether they are pressures, whose coefficients are not negative.
+    nodes : (k,) that have a traction.
+    tractions : (k, 3, m), N per undeformed square metre and unit of each coefficient, object frame.
+    resultants : (m, 6) force, N, and moment about the origin, N m, of a unit of each.
+    responses : by the name of a model's field, c m components: each of the field's c for each load, loads
+        running slowest; and the `ROOT` of the compliance, J, as its upper triangle.
+    """
+
+    surface: str
+    inward: bool
+    nodes: NDArray[np.int64]
+    tractions: Array
+    resultants: Array
+    responses: dict[str, SeparatedField]
+
+    @property
+    def count(self) -> int:
+        """Number of tractions m."""
+        return self.tractions.shape[2]
+
+    def root(self, mu: Array) -> tuple[Array, Array]:
+        """The root (m, m) of the compliance at parameters (d,), and its derivatives (d, m, m)."""
+        value, slopes = self.responses[ROOT].value_and_sensitivities(mu)
+        rows, columns = np.triu_indices(self.count)
+        full = np.empty((1 + len(slopes), self.count, self.count))
+        full[:, rows, columns] = full[:, columns, rows] = np.concatenate([value, slopes[:, 0]])
+        return full[0], full[1:]
+
+
+@njit(cache=True, nogil=True)
+def _joined_rows(known, of_loads, coefficients):
+    """Values and derivatives (1 + d + m, a + m r) of a functions, then of r functions times each coefficient."""
+    rows, a = known.shape
+    r, m = of_loads.shape[1], len(coefficients)
+    result = np.zeros((rows + m, a + m * r))
+    for i in range(rows):
+        result[i, :a] = known[i]
+        for k in range(m):
+            for j in range(r):
+                result[i, a + k * r + j] = coefficients[k] * of_loads[i, j]
+    for k in range(m):
+        result[rows + k, a + k * r : a + (k + 1) * r] = of_loads[0]
+    return result
+
+
+@dataclass(frozen=True)
+class LoadedFunctions(Functions):
+    """Functions of the parameters, followed by those of the loads' responses times each coefficient.
+
+    Attributes
+    ----------
+    known : functions of the d parameters.
+    of_loads : r functions of them.
+    count : m coefficients, which follow the parameters and have no ends.
+    """
+
+    known: Functions
+    of_loads: Functions
+    count: int
+
+    @property
+    def n_functions(self) -> int:
+        return self.known.n_functions + self.count * self.of_loads.n_functions
+
+    @property
+    def n_floats(self) -> int:
+        return self.known.n_floats + self.of_loads.n_floats
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        lower, upper = self.known.bounds
+        open_end = np.full(self.count, np.inf)
+        return np.concatenate([lower, -open_end]), np.concatenate([upper, open_end])
+
+    def _compiled(self, mu: Array) -> Array:
+        d = self.known.dimension
+        return _joined_rows(self.known.rows(mu[:d]), self.of_loads.rows(mu[:d]), mu[d:])
+
+    def mixed(self, matrix: Array) -> Self:
+        raise NotImplementedError("functions of loads stay as they are")
+
+
+@dataclass(frozen=True)
+class ElasticEnergy:
+    """The elastic energy of unknown loads against its scale: what makes some of them likelier than others.
+
+    Attributes
+    ----------
+    loads : of the model.
+    work : the scale, J: with it as temperature, loads are as likely as exp(-energy / work).
+    model : without the loads among its parameters.
+    traction : field of 3 components, N per undeformed square metre.
+    """
+
+    loads: UnknownLoads
+    work: float
+    model: ReducedModel
+    traction: SeparatedField
+
+
+#: Without a work scale, loads move the nodes by this share of the object's diagonal in the mean.
+USUAL_DISPLACEMENT = 0.02
+
+
+def usual_work(model: ReducedModel) -> float:
+    """A work scale, J, with which unknown loads move the object at its defaults by a small part of its size."""
+    assert model.unknown_loads is not None
+    response = model.unknown_loads.responses["displacement"].value(model.default)
+    moved = float(np.sum(response**2)) / len(model.nodes)
+    size = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
+    return (USUAL_DISPLACEMENT * size) ** 2 / moved
+
+
+def with_unknown_loads(model: ReducedModel, work: float | None = None) -> ReducedModel:
+    """The model with the coefficients of its unknown loads as further parameters.
+
+    Their traction is one more field, and what they amount to is a reaction under the name `LOADS`.
+
+    Parameters
+    ----------
+    model : built with [unknown_loads].
+    work : the work scale, J; `usual_work` if None.
+
+    Raises
+    ------
+    ModelFileError
+        If the model has none.
+    """
+    from morph_dslam.model.reduced_model import REACTION, Parameter
+
+    loads = model.unknown_loads
+    if loads is None:
+        raise ModelFileError(
+            f"the model '{model.name}' has no unknown loads: build it again with [unknown_loads] in its study"
+        )
+    work = usual_work(model) if work is None else work
+    span = SPAN * float(np.sqrt(work))
+    lowest = 0.0 if loads.inward else -span
+    added = [Parameter(f"load {k + 1}", "ratio", "1", lowest, span, 0.0, "unknown load") for k in range(loads.count)]
+    fields = {
+        name: _joined(model.fields.get(name, _nothing(response, model)), response)
+        for name, response in (loads.responses | _of_tractions(model, loads)).items()
+        if name != ROOT
+    }
+    return replace(
+        model,
+        parameters=(*model.parameters, *added),
+        displacement=fields["displacement"],
+        stresses={place: fields[f"stress_{place}"] for place in model.stresses},
+        strain=fields.get("strain"),
+        supports=model.supports | {LOADS: loads.nodes},
+        reactions={name.removeprefix(REACTION): field for name, field in fields.items() if name.startswith(REACTION)},
+        energy=ElasticEnergy(loads, work, model, fields["traction"]),
+    )
+
+
+def _of_tractions(model: ReducedModel, loads: UnknownLoads) -> dict[str, SeparatedField]:
+    """Responses: the tractions at all nodes, and their force and moment about the origin."""
+    from morph_dslam.model.reduced_model import FORCE, MOMENT, REACTION
+
+    everywhere = np.zeros((len(model.nodes), loads.count, 3))
+    everywhere[loads.nodes] = np.swapaxes(loads.tractions, 1, 2)
+    constant = _constant(model)
+
+    def response(values: Array) -> SeparatedField:
+        return SeparatedField(values.reshape(1, len(values), -1), constant)
+
+    return {
+        "traction": response(everywhere),
+        REACTION + FORCE + LOADS: response(loads.resultants[None, :, :3]),
+        REACTION + MOMENT + LOADS: response(loads.resultants[None, :, 3:]),
+    }
+
+
+def node_areas(model: ReducedModel, nodes: NDArray[np.int64]) -> Array:
+    """Area (k,) of the undeformed surface, m2, that belongs to each of ``nodes`` (k,)."""
+    inside = np.isin(model.triangles, nodes).all(axis=1)
+    a, b, c = np.moveaxis(model.nodes[model.triangles[inside]], 1, 0)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6.0
+    totals = np.bincount(model.triangles[inside].ravel(), np.repeat(areas, 3), len(model.nodes))
+    return np.asarray(totals[nodes], dtype=np.float64)
+
+
+def _constant(model: ReducedModel) -> ParameterFunctions:
+    """The function 1 of the parameters."""
+    indices = np.zeros((1, len(model.parameters)), dtype=np.int64)
+    return ParameterFunctions(model.lower, model.upper, indices, np.ones((1, 1)))
+
+
+def _nothing(response: SeparatedField, model: ReducedModel) -> SeparatedField:
+    """A field that vanishes where the study's own loads cause none."""
+    return SeparatedField(np.zeros((1, response.modes.shape[1], 3)), _constant(model))
+
+
+def _joined(field: SeparatedField, response: SeparatedField) -> SeparatedField:
+    """A field of the parameters with its response to each load."""
+    r, n, columns = response.modes.shape
+    c = field.modes.shape[2]
+    count = columns // c
+    by_load = np.moveaxis(response.modes.reshape(r, n, count, c), 2, 0).reshape(count * r, n, c)
+    functions = LoadedFunctions(field.functions, response.functions, count)
+    return SeparatedField(np.concatenate([field.modes, by_load]), functions)

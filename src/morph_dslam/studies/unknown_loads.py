@@ -1,0 +1,147 @@
+"""[unknown_loads] of a study: tractions that it does not foresee, and how the deformed body answers them.
+
+The softest tractions on a surface (`mechanics.load_modes`) are found in several states and joined to one set. In states
+spread over the parameters, the tangent then tells what each of them does: displacement, stress and reactions, which are
+reduced like other fields. So the loads act linearly about every parametric state.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.load_modes import (
+    LoadedSurface,
+    Respond,
+    common_tractions,
+    pressing_tractions,
+    softest_tractions,
+)
+from morph_dslam.model.discrepancy import farthest_points
+from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
+from morph_dslam.model.separated import SeparatedField
+from morph_dslam.model.unknown_loads import ROOT, UnknownLoads, packed_root
+from morph_dslam.reduction.pod import compute_pod
+from morph_dslam.reduction.regression import fit_functions
+from morph_dslam.studies.problem import ParametricStudy, SweepProblem, bounds
+from morph_dslam.studies.sections import UnknownLoadsSection
+from morph_dslam.studies.snapshots import load_state
+from morph_dslam.studies.solutions import Snapshots
+
+Array = NDArray[np.float64]
+#: Most states in which the softest tractions are sought.
+SOUGHT_IN = 6
+#: States for each term of a polynomial of second order; the highest order tried.
+STATES_A_TERM, HIGHEST_DEGREE = 3, 4
+#: Relative norm of the responses' fields that may be left out, and most functions of the parameters.
+TOLERANCE, MOST_FUNCTIONS = 2e-2, 12
+
+
+@runtime_checkable
+class LoadableProblem(SweepProblem, Protocol):
+    """A sweep's problem whose states tell how they answer loads."""
+
+    def loaded_surface(self, name: str, inward: bool) -> LoadedSurface:
+        """The functions on the surface of this name, or on all of a shell; see `LoadedSurface.of`."""
+        ...
+
+    def response(self, state: Any) -> Respond:
+        """How the dofs of a solved state answer loads at them, by its tangent."""
+        ...
+
+    def response_fields(self, state: Any, loads: Array, responses: Array) -> dict[str, Array]:
+        """By the names in the model file, (c, n, k) for each of ``loads`` (c, n_dofs) with its response (c, n_dofs)."""
+        ...
+
+
+def reduce_unknown_loads(
+    study: ParametricStudy, section: UnknownLoadsSection, snapshots: Snapshots
+) -> tuple[UnknownLoads, dict[str, Any]]:
+    """The unknown loads of a study's model, and what the certificate says of them.
+
+    Raises
+    ------
+    StudyError
+        If the study's kind of problem has no tangents to tell.
+    """
+    problem = snapshots.problem() if snapshots.problem is not None else None
+    if not isinstance(problem, LoadableProblem):
+        raise StudyError(
+            "[unknown_loads] is for elastic solids and shells that are solved here, not for viscoelastic ones: leave "
+            "it out"
+        )
+    inward = section.direction == "inward"
+    surface, samples = problem.loaded_surface(section.on, inward), _Samples(study, snapshots)
+    states = [problem.unpack(load_state(file)) for file in samples.files[:SOUGHT_IN]]
+    if inward:
+        tractions = pressing_tractions(surface, snapshots.mesh.nodes, section.modes)
+    else:
+        found = [softest_tractions(surface, problem.response(state), section.modes) for state in states]
+        tractions = common_tractions(surface, found, section.modes)
+    compliance, _ = surface.compliance(tractions, problem.response(states[0]))
+    tractions = tractions / np.sqrt(np.diag(compliance))[:, None, None]
+    responses: dict[str, list[NDArray]] = {}
+    for file in tqdm(samples.files, desc="responses to loads", unit="state"):
+        state = problem.unpack(load_state(file))
+        compliance, changes = surface.compliance(tractions, problem.response(state))
+        fields = problem.response_fields(state, surface.loads(tractions), changes)
+        stacked = {name: np.moveaxis(part, 0, 1).reshape(part.shape[1], -1) for name, part in fields.items()}
+        for name, values in (stacked | {ROOT: packed_root(compliance)[None]}).items():
+            responses.setdefault(name, []).append(values.astype(np.float32))
+    nodal = surface.nodal(tractions)
+    nodes = np.flatnonzero(np.abs(nodal).max(axis=(0, 2)) > 0.0)
+    reduced = {name: samples.reduced(values) for name, values in responses.items()}
+    loads = UnknownLoads(
+        section.on,
+        inward,
+        nodes,
+        np.ascontiguousarray(np.moveaxis(nodal[:, nodes], 0, 2)),
+        surface.resultants(tractions, snapshots.mesh.nodes),
+        {name: field for name, (field, _) in reduced.items()},
+    )
+    return loads, {
+        "surface": section.on,
+        "direction": section.direction,
+        "loads": loads.count,
+        "states": len(samples.files),
+        "response_error": reduced["displacement"][1],
+    }
+
+
+class _Samples:
+    """Training solutions spread over the parameters, that nearest to the defaults first.
+
+    Attributes
+    ----------
+    files : of the solutions.
+    samples : (n, d) their parameters.
+    """
+
+    def __init__(self, study: ParametricStudy, snapshots: Snapshots) -> None:
+        self._box = bounds(study)
+        known = np.array([np.load(file)["coordinates"] for file in snapshots.training_files])
+        widths = np.diff(self._box, axis=1)[:, 0]
+        default = np.array([parameter.default for parameter in study.model_parameters()])
+        first = int(np.linalg.norm((known - default) / widths, axis=1).argmin())
+        count = STATES_A_TERM * len(total_degree_indices(len(widths), 2))
+        chosen = farthest_points(known / widths, count, first)
+        self.files, self.samples = [snapshots.training_files[k] for k in chosen], known[chosen]
+
+    def reduced(self, values: list[NDArray]) -> tuple[SeparatedField, float]:
+        """A separated field of values (n, c) at the samples, and its relative error where they are left out."""
+        flat, lower, upper = np.array([value.ravel() for value in values], dtype=float), *self._box.T
+        pod = compute_pod(flat.copy(), np.full(flat.shape[1], 1.0 / flat.shape[1]), TOLERANCE, MOST_FUNCTIONS)
+        coefficients = pod.project(flat)
+        left_out = np.linalg.norm(coefficients @ pod.modes - flat) / np.linalg.norm(flat)
+        if len(pod.modes) == 1 and np.allclose(coefficients, coefficients[0], rtol=TOLERANCE):
+            indices, missed = np.zeros((1, len(lower)), dtype=np.int64), 0.0
+            functions = ParameterFunctions(lower, upper, indices, coefficients.mean(axis=0)[None])
+        else:
+            folds = np.arange(len(flat))
+            functions, errors = fit_functions(self.samples, coefficients, None, lower, upper, HIGHEST_DEGREE, folds)
+            missed = min(errors.values())
+        return SeparatedField(pod.modes.reshape(-1, *values[0].shape), functions), float(np.hypot(left_out, missed))

@@ -1,0 +1,185 @@
+"""Unknown loads: what a soft block does where it is pressed, against statics and finite elements."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from morph_dslam import Camera, build, make_study
+from morph_dslam.cli import app as cli
+from morph_dslam.errors import ModelFileError, StudyError
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.mechanics.load_modes import softest_tractions
+from morph_dslam.mechanics.loads import FollowerPressure
+from morph_dslam.mechanics.materials.isotropic import LinearElastic
+from morph_dslam.mechanics.parameters import ParameterSymbols
+from morph_dslam.mechanics.solid import SolidProblem
+from morph_dslam.mechanics.solvers.continuation import advance
+from morph_dslam.mechanics.supports import PrescribedDisplacement, fixed
+from morph_dslam.meshing.generators import block
+from morph_dslam.model import Parameter, load_model, save_model
+from morph_dslam.model.reduced_model import REACTION, spread_over
+from morph_dslam.model.unknown_loads import LOADS, with_unknown_loads
+from morph_dslam.studies.build import build_warnings
+from morph_dslam.tracking.estimator import BoundPoints, Estimator, Prior, State
+from morph_dslam.tracking.load_prior import LoadOptions, LoadPrior
+from morph_dslam.tracking.reactions import Reactions
+
+STUDY = {
+    "name": "soft block",
+    "mesh": {"generator": "block", "size": ["60 mm", "60 mm", "20 mm"], "divisions": [8, 8, 3], "cells": "hex8"},
+    "materials": {"silicone": {"law": "neo_hookean", "young": "50 kPa", "poisson": "0.45"}},
+    "supports": [{"kind": "fixed", "on": "z_min"}],
+    "loads": [{"kind": "traction", "on": "z_max", "traction": ["shear", "0 Pa", "0 Pa"]}],
+    "parameters": {"shear": {"range": ["-1 kPa", "1 kPa"], "default": "0 Pa"}},
+    "solver": {"threads": 1},
+    "sampling": {"scheme": "even", "training": 9, "held_out": 4, "refined": 0},
+    "unknown_loads": {"on": "z_max", "modes": 25},
+}
+CAMERA = Camera(640, 480, 560.0, 560.0, 320.0, 240.0)
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("pressed") / "block.morph"
+    build(make_study(STUDY), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def loaded(file):
+    return with_unknown_loads(load_model(file), 1e-3)
+
+
+def test_what_holds_the_block_balances_each_load(loaded):
+    """Force and moment about the origin, in any state: the base is all that holds it."""
+    for shear in (-800.0, 0.0, 500.0):
+        for k in (1, 12, 25):
+            mu = np.array([shear, *np.eye(25)[k - 1]])
+            unloaded = np.where(np.arange(26) == 0, mu, 0.0)
+            change = {name: field.value(mu) - field.value(unloaded) for name, field in loaded.reactions.items()}
+            force = change[f"force_{LOADS}"][0]
+            assert force[2] < 0.0
+            np.testing.assert_allclose(change["force_z_min"][0], -force, atol=2e-3 * np.linalg.norm(force))
+            # A load keeps its direction and its place on the undeformed surface; the displaced arm is of second order.
+            size = 0.06 * np.linalg.norm(force)
+            np.testing.assert_allclose(change["moment_z_min"][0], -change[f"moment_{LOADS}"][0], atol=0.05 * size)
+
+
+def test_a_pressure_on_the_whole_top_is_found_from_pixels(loaded):
+    """Truth by finite elements with the pressure in them: its force is 300 Pa times the area."""
+    symbols = ParameterSymbols([Parameter("pressure", "stress", "Pa", 0.0, 1e3, 0.0)])
+    study = make_study(STUDY)
+    top = FollowerPressure("z_max", symbols["pressure"])
+    silicone = study.problem().regions[0].material
+    problem = SolidProblem(study.solid_mesh(), {"all": silicone}, [fixed("z_min")], [top], symbols)
+    state = advance(problem, problem.initial_state(), np.array([300.0]))[-1]
+    moved = problem.nodal_displacement(state.dofs)
+    upper = (loaded.nodes[loaded.triangles][:, :, 2] > 0.0199).all(axis=1)
+    spread = spread_over(loaded.nodes, loaded.triangles[upper], 300)
+    surface = replace(spread, triangles=np.flatnonzero(upper)[spread.triangles])
+    points = BoundPoints.from_surface(loaded, surface)
+    corners = loaded.triangles[surface.triangles]
+    true_points = points.rest + np.einsum("pc,pcx->px", surface.weights, moved[corners])
+    tilt = np.array([[1.0, 0.0, 0.0], [0.0, -0.8, -0.6], [0.0, 0.6, -0.8]])
+    pose = RigidTransform(tilt, np.array([-0.03, 0.03, 0.25]) - tilt @ [0.0, 0.0, 0.0])
+    pixels = CAMERA.project(pose.apply(true_points))
+    known = Prior(np.zeros(26), np.zeros((26, 26)), pose, np.diag([1e6] * 3 + [1e8] * 3))
+    estimator, reactions = Estimator(loaded, CAMERA), Reactions(loaded)
+    estimator.loads.squared_px = 1e-6  # pixels are exact
+    found = estimator.estimate(points, pixels, np.ones(300), State(loaded.default, pose), prior=known)
+    result = reactions(found)[LOADS]
+    assert result.force.value[2] == pytest.approx(-300.0 * 0.06**2, rel=0.05)
+    assert np.abs(result.force.value[:2]).max() < 1e-9
+    np.testing.assert_allclose(result.point[:2], [0.03, 0.03], atol=2e-3)
+    on_top = np.unique(loaded.triangles[upper])
+    own = loaded.displacement.value(found.state.parameters)[on_top]
+    assert np.linalg.norm(own - moved[on_top]) < 0.05 * np.linalg.norm(moved[on_top])
+    assert (found.state.parameters[1:] >= 0.0).all()
+
+
+def test_the_softest_traction_of_a_guided_block_is_uniform():
+    """Without sideways motion and with nu = 0 it gives way by height / Young's modulus for each pascal."""
+    mesh = block((0.03, 0.02, 0.04), (3, 2, 4), "hex8")
+    guides = [PrescribedDisplacement(side, **{side[0]: 0.0}) for side in ("x_min", "x_max", "y_min", "y_max", "z_min")]
+    problem = SolidProblem(mesh, {"all": LinearElastic(young=2e5, poisson=0.0)}, guides)
+    tangent = problem.linearise(problem.initial_state().dofs, np.empty(0))
+    surface = problem.loaded_surface("z_max", inward=True)
+    tractions, softness = softest_tractions(surface, tangent.solve, 3)
+    assert softness[0] == pytest.approx(0.04 / 2e5, rel=1e-6)
+    assert softness[1] < softness[0]
+    nodal = surface.nodal(tractions[:1])[0]
+    on_top = np.isclose(mesh.nodes[:, 2], 0.04)
+    uniform = 1.0 / np.sqrt(0.03 * 0.02)
+    np.testing.assert_allclose(np.abs(nodal[on_top, 2]), uniform, rtol=1e-6)
+    np.testing.assert_allclose(nodal[~on_top], 0.0, atol=1e-12)
+
+
+def test_terms_of_the_prior_agree_with_differences(loaded):
+    prior, rng = LoadPrior(loaded.energy, LoadOptions()), np.random.default_rng(1)
+    at = np.array([300.0, *(0.03 * rng.random(25))])
+    prior.learn(at, np.diag([1.0, *np.full(25, 1e-4)]), 0.5)
+    here = at + np.array([50.0, *(0.01 * rng.standard_normal(25))])
+    _, hessian, gradient = prior.terms(here)
+    steps = np.array([1.0, *np.full(25, 1e-5)])
+    for k in range(26):
+        change = steps * np.eye(26)[k]
+        slope = (prior.terms(here + change)[0] - prior.terms(here - change)[0]) / (2.0 * steps[k])
+        assert gradient[k] == pytest.approx(slope, rel=1e-4, abs=1e-6 * np.abs(gradient[1:]).max())
+    assert np.linalg.eigvalsh(hessian[1:, 1:]).min() > 0.0
+
+
+def test_work_scales_of_loads_that_are_not_there_vanish(loaded):
+    prior = LoadPrior(loaded.energy, LoadOptions())
+    at, covariance = np.zeros(26), np.diag([1.0, *np.full(25, 1e-6)])
+    at[5] = 0.05
+    for _ in range(60):
+        prior.learn(at, covariance, 0.3)
+    assert prior.work[4] == pytest.approx(0.05**2 + 1e-6, rel=0.01)
+    assert np.delete(prior.work, 4).max() < 0.03 * prior.work[4]
+    stated = LoadPrior(loaded.energy, LoadOptions(work=1e-3))
+    stated.learn(at, covariance, 0.3)
+    np.testing.assert_array_equal(stated.work, np.full(25, 1e-3))
+
+
+def test_a_model_file_keeps_its_loads_and_is_checked(file, tmp_path):
+    model = load_model(file)
+    save_model(tmp_path / "again.morph", model)
+    again = load_model(tmp_path / "again.morph")
+    assert again.unknown_loads.inward
+    np.testing.assert_array_equal(again.unknown_loads.tractions, model.unknown_loads.tractions)
+    mu = np.array([400.0])
+    for name, field in model.unknown_loads.responses.items():
+        np.testing.assert_allclose(again.unknown_loads.responses[name].value(mu), field.value(mu), rtol=1e-5, atol=1e-9)
+    lacking = {k: v for k, v in model.unknown_loads.responses.items() if k != f"{REACTION}force_z_min"}
+    with pytest.raises(ValueError, match="does not say what unknown loads do to 'reaction_force_z_min'"):
+        save_model(
+            tmp_path / "bad.morph", replace(model, unknown_loads=replace(model.unknown_loads, responses=lacking))
+        )
+    with h5py.File(file) as content:
+        assert content["unknown_loads"].attrs["surface"] == "z_max"
+
+
+def test_the_certificate_says_how_well_responses_are_known(file):
+    certificate = load_model(file).certificate
+    assert certificate["unknown_loads"]["loads"] == 25
+    assert 0.0 < certificate["unknown_loads"]["response_error"] < 0.05
+    assert not [text for text in build_warnings(certificate) if "unknown loads" in text]
+    certificate["unknown_loads"]["response_error"] = 0.3
+    assert [text for text in build_warnings(certificate) if "off by 30 %" in text]
+
+
+def test_mistakes_are_one_message(file, tmp_path, capsys):
+    with pytest.raises(StudyError, match=r"no surface 'lid'; it has: .*z_max"):
+        build(make_study(STUDY | {"unknown_loads": {"on": "lid"}}), tmp_path / "x.morph")
+    with pytest.raises(StudyError, match=r"unknown_loads\.direction"):
+        make_study(STUDY | {"unknown_loads": {"on": "z_max", "direction": "outward"}})
+    bare = replace(load_model(file), unknown_loads=None)
+    with pytest.raises(ModelFileError, match="no unknown loads: build it again with"):
+        with_unknown_loads(bare)
+    assert cli.main(["info", str(file)]) == 0
+    assert re.search(r"unknown loads", capsys.readouterr().out)
