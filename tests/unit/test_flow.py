@@ -22,6 +22,7 @@ from morph_dslam.tracking.patches import (
     normalize_contrast,
     patch_correlation,
     spread_corners,
+    strongest_corners,
 )
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, printed_texture, sheet_state
@@ -237,3 +238,13 @@ def test_correlation_ignores_gain_and_offset_and_sees_difference(soft):
     assert patch_correlation(soft, darker, centre, centre, 7).min() > 0.99
     assert patch_correlation(soft, soft, centre, centre + 35.0, 7).max() < 0.6
     assert patch_correlation(soft, soft, centre, np.array([[-3.0, 5.0], [639.0, 5.0]]), 7).tolist() == [-1, -1]
+
+
+@pytest.mark.parametrize(("most", "distance"), [(60, 3.0), (500, 15.2)])
+def test_the_strongest_corners_are_those_of_opencv(most, distance):
+    image = printed_texture(300, 260)
+    mask = np.zeros_like(image)
+    mask[20:270, 10:200] = 255
+    expected = cv2.goodFeaturesToTrack(image, most, 0.005, distance, mask=mask).reshape(-1, 2)
+    assert np.array_equal(strongest_corners(image, mask, most, 0.005, distance), expected)
+    assert strongest_corners(np.full_like(image, 90), mask, most, 0.005, distance).shape == (0, 2)

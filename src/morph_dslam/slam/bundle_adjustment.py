@@ -283,27 +283,25 @@ def _step(blocks, slot, camera_idx, start, damping):
 
 
 @njit(cache=True, nogil=True)
-def _adjust(poses, points, slot, camera_idx, point_idx, start, pixels, camera, width, iterations, tolerance, damping):
-    """Poses, points, cost, iterations done, the damping to go on with, and whether another iteration may help."""
+def _adjust(poses, points, slot, camera_idx, point_idx, start, pixels, camera, width, iterations, tolerance):
     cost = total_cost(poses, points, camera_idx, point_idx, pixels, camera, width)
-    done, may_help = 0, True
+    damping, done = FIRST_DAMPING, 0
     blocks = _normal_equations(poses, points, slot, camera_idx, point_idx, pixels, camera, width)
-    while done < iterations and may_help:
+    while done < iterations and damping < MOST_DAMPING:
         done += 1
         pose_step, point_step = _step(blocks, slot, camera_idx, start, damping)
         new_poses, new_points = _moved(poses, points, slot, pose_step, point_step)
         new_cost = total_cost(new_poses, new_points, camera_idx, point_idx, pixels, camera, width)
         if not new_cost < cost:
             damping *= 10.0
-            may_help = damping < MOST_DAMPING
             continue
         gain = (cost - new_cost) / cost
         poses, points, cost = new_poses, new_points, new_cost
         damping = max(0.1 * damping, LEAST_DAMPING)
-        may_help = gain >= tolerance
-        if may_help and done < iterations:
-            blocks = _normal_equations(poses, points, slot, camera_idx, point_idx, pixels, camera, width)
-    return poses, points, cost, done, damping, may_help
+        if gain < tolerance:
+            break
+        blocks = _normal_equations(poses, points, slot, camera_idx, point_idx, pixels, camera, width)
+    return poses, points, cost, done
 
 
 @dataclass(frozen=True)
@@ -339,69 +337,41 @@ class Adjustment:
     iterations: int
 
 
-class BundleAdjuster:
-    """Refines poses and points together, at once or a few iterations at a time.
+def adjust(
+    camera_from_world: Array,
+    points: Array,
+    observations: Observations,
+    intrinsics: Array,
+    fixed: NDArray[np.bool_],
+    baseline_px: float = 0.0,
+    huber_px: float = 2.0,
+    iterations: int = 15,
+    tolerance: float = 1e-6,
+) -> Adjustment:
+    """Refine poses and points together.
 
     Parameters
     ----------
     camera_from_world : (c, 4, 4).
     points : (p, 3) in the world.
-    observations : what the cameras saw.
     intrinsics : (4,) fx, fy, cx, cy, of all cameras.
     fixed : (c,) cameras that stay; without depth at least two of them, or the scale is free.
     baseline_px : focal length times baseline, px m, for observations with depth.
     huber_px : errors longer than this count linearly.
-    iterations : at most.
     tolerance : ends when an iteration lowers the cost by less than this part.
     """
-
-    def __init__(
-        self,
-        camera_from_world: Array,
-        points: Array,
-        observations: Observations,
-        intrinsics: Array,
-        fixed: NDArray[np.bool_],
-        baseline_px: float = 0.0,
-        huber_px: float = 2.0,
-        iterations: int = 15,
-        tolerance: float = 1e-6,
-    ) -> None:
-        order = np.lexsort([observations.camera_idx, observations.point_idx])
-        camera_idx = np.ascontiguousarray(observations.camera_idx[order], dtype=np.int64)
-        point_idx = np.ascontiguousarray(observations.point_idx[order], dtype=np.int64)
-        start = np.searchsorted(point_idx, np.arange(len(points) + 1))
-        slot = np.where(fixed, -1, np.cumsum(~fixed) - 1)
-        pixels = np.ascontiguousarray(observations.rows()[order])
-        camera = np.append(np.asarray(intrinsics, dtype=np.float64), baseline_px)
-        self._problem = slot, camera_idx, point_idx, start, pixels, camera, huber_px
-        self._poses = np.ascontiguousarray(camera_from_world, dtype=np.float64)
-        self._points = np.ascontiguousarray(points, dtype=np.float64)
-        self._fixed, self._most, self._tolerance = fixed, iterations, tolerance
-        self._cost, self._damping, self._done, self._may_help = float("nan"), FIRST_DAMPING, 0, True
-
-    @property
-    def is_done(self) -> bool:
-        """Whether no further iteration is allowed, or would help."""
-        return self._done >= self._most or not self._may_help
-
-    def advance(self, iterations: int) -> None:
-        """Do at most so many more iterations."""
-        count = min(iterations, self._most - self._done)
-        self._poses, self._points, self._cost, done, self._damping, self._may_help = _adjust(
-            self._poses, self._points, *self._problem, count, self._tolerance, self._damping
-        )
-        self._done += done
-
-    def solve(self) -> Adjustment:
-        """Do all iterations; returns what they come to."""
-        self.advance(self._most)
-        return self.result
-
-    @property
-    def result(self) -> Adjustment:
-        """What it has come to."""
-        poses = self._poses.copy()
-        for c in np.flatnonzero(~self._fixed):
-            make_orthonormal(poses[c])
-        return Adjustment(poses, self._points, float(self._cost), self._done)
+    order = np.lexsort([observations.camera_idx, observations.point_idx])
+    camera_idx = np.ascontiguousarray(observations.camera_idx[order], dtype=np.int64)
+    point_idx = np.ascontiguousarray(observations.point_idx[order], dtype=np.int64)
+    start = np.searchsorted(point_idx, np.arange(len(points) + 1))
+    slot = np.where(fixed, -1, np.cumsum(~fixed) - 1)
+    pixels = np.ascontiguousarray(observations.rows()[order])
+    camera = np.append(np.asarray(intrinsics, dtype=np.float64), baseline_px)
+    poses = np.ascontiguousarray(camera_from_world, dtype=np.float64)
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    poses, points, cost, done = _adjust(
+        poses, points, slot, camera_idx, point_idx, start, pixels, camera, huber_px, iterations, tolerance
+    )
+    for c in np.flatnonzero(~fixed):
+        make_orthonormal(poses[c])
+    return Adjustment(poses, points, float(cost), int(done))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.geometry import rotation_log
-from morph_dslam.slam.bundle_adjustment import BundleAdjuster, Observations
+from morph_dslam.slam.bundle_adjustment import Observations, adjust
 from morph_dslam.slam.frame_images import FrameView
 from morph_dslam.slam.options import LEAST_CORRELATION, LEAST_START_POINTS, PATCH_HALF
 from morph_dslam.slam.pose import TwoViewHypothesis, rays, refine_pose, reprojection_errors, two_view_hypotheses
@@ -204,9 +204,7 @@ class MapInitializer:
         )
         start = np.stack([np.eye(4), hypothesis.second_from_first, pose])
         fixed = np.array([True, False, False])
-        adjusted = BundleAdjuster(
-            start, points[known], observations, self._intrinsics, fixed, huber_px=1.0, iterations=30
-        ).solve()
+        adjusted = adjust(start, points[known], observations, self._intrinsics, fixed, huber_px=1.0, iterations=30)
         errors = np.full((3, len(points)), np.inf)
         for view in range(3):
             errors[view, known] = reprojection_errors(

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.slam.bundle_adjustment import Adjustment, BundleAdjuster, Observations
+from morph_dslam.slam.bundle_adjustment import Adjustment, Observations, adjust
 from morph_dslam.slam.frame_images import FrameDepth, depth_of
 from morph_dslam.slam.pose import check_points, project, rays, reprojection_errors, triangulate, world_points
 from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, Followed, Indices, Keyframe, RigidMap
@@ -173,10 +173,10 @@ class MapProblem:
     baseline_px: float
     iterations: int
 
-    def adjuster(self) -> BundleAdjuster:
-        """What adjusts poses and points; touches no map."""
+    def solve(self) -> Adjustment:
+        """Adjusted poses and points; touches no map."""
         usual = usual_error(self.errors(self.camera_from_world, self.positions))
-        return BundleAdjuster(
+        return adjust(
             self.camera_from_world,
             self.positions,
             self.observations,

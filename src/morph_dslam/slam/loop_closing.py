@@ -9,7 +9,6 @@ are made one, and the whole map is adjusted.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +18,9 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.slam.frame_images import FrameView
-from morph_dslam.slam.mapping import Mapper, Work, one_step
+from morph_dslam.slam.mapping import Mapper, Work
 from morph_dslam.slam.pose import project
-from morph_dslam.slam.relocalization import Relocalizer
+from morph_dslam.slam.relocalization import Relocalizer, described_corners
 from morph_dslam.slam.rigid_map import GOOD, Followed, RigidMap
 from morph_dslam.slam.tracking import Tracker
 
@@ -190,11 +189,19 @@ class LoopCloser:
 
     def search(self, view: FrameView) -> Work:
         """Look for a loop that the newest keyframe ends, in the map as it is when this is called."""
-        self._copy.share(self._map)
-        return one_step(partial(self._look, view))
+        self._copy.copy_of(self._map)
+        return self._look(view)
 
-    def _look(self, view: FrameView) -> None:
-        self._found = self._find(view)
+    def _look(self, view: FrameView) -> Work:
+        group = self._group_that_resembles()
+        if group is None:
+            return
+        yield
+        corners = described_corners(view)
+        yield
+        located = self._relocaliser.locate(view, corners, group, self._tracker)
+        if located is not None:
+            self._found = self._loop(len(self._copy.keyframes) - 1, group, located[0].camera_from_world, located[1])
 
     def close(self) -> None:
         """Close the loop that was found."""
@@ -208,7 +215,8 @@ class LoopCloser:
         self._mapper.adjust_all()
         self.n_closed += 1
 
-    def _find(self, view: FrameView) -> Loop | None:
+    def _group_that_resembles(self) -> Indices | None:
+        """Old keyframes that the newest one resembles as much as its neighbours."""
         number = len(self._copy.keyframes) - 1
         shared = self._copy.shared_points(self._copy.good_in(number))
         old = shared < MOST_SHARED
@@ -222,9 +230,7 @@ class LoopCloser:
         best = int(np.where(old, likeness, -1.0).argmax())
         if neighbours.any() and likeness[best] < LEAST_LIKENESS * likeness[neighbours].max():
             return None
-        group = self._relocaliser.group(best)
-        located = self._relocaliser.locate(view, group, self._tracker)
-        return None if located is None else self._loop(number, group, located[0].camera_from_world, located[1])
+        return self._relocaliser.group(best)
 
     def _loop(self, number: int, group: Indices, pose: Array, found: Followed) -> Loop | None:
         """The drift, from points that the new view sees twice, as old and as new ones."""

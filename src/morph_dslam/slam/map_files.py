@@ -229,5 +229,5 @@ def _add_keyframe(
     seen = Followed(ids, pixels)[good]
     keyframe = Keyframe.of_view(view, image.camera_from_world, seen)
     rigid_map.add_keyframe(keyframe)
-    keyframe.describe(view.grey)
+    do_all(keyframe.describe(view.grey))
     return errors

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from morph_dslam.slam.frame_images import FrameView
 from morph_dslam.slam.initialization import MapStart
 from morph_dslam.slam.loop_closing import LoopCloser
-from morph_dslam.slam.mapping import Mapper, MappingWork, Work, one_step
+from morph_dslam.slam.mapping import Mapper, MappingWork, Work, do_all, one_step
 from morph_dslam.slam.rigid_map import Indices, RigidMap
 from morph_dslam.slam.tracking import Tracked, Tracker
 
@@ -35,6 +35,7 @@ class MapMaking:
         self._loops = LoopCloser(self._draft, intrinsics, self._mapper)
         self._work, self._search = MappingWork(threaded, self._renew, self._publish), MappingWork(threaded)
         self._kept: tuple[FrameView, Tracked] | None = None
+        self._is_waited_for = False
 
     @property
     def can_keep(self) -> bool:
@@ -68,8 +69,10 @@ class MapMaking:
         return n
 
     def wants_keyframe(self, tracked: Tracked, frame_index: int) -> bool:
-        """Whether the map should keep a view."""
-        return self.can_keep and self._mapper.wants_keyframe(tracked, frame_index)
+        """Whether the map should keep a view, and can."""
+        wants = self._mapper.wants_keyframe(tracked, frame_index)
+        self._is_waited_for = wants and not self.can_keep
+        return wants and self.can_keep
 
     def keep(self, tracked: Tracked, view: FrameView) -> None:
         """Keep the view of the newest frame, and follow its points."""
@@ -81,9 +84,9 @@ class MapMaking:
             self._tracker.camera_from_world = keyframe.camera_from_world
 
     def advance(self) -> None:
-        """Take the next step, and let the tracker follow what it changed."""
+        """Take the next step, or all where a view waits to be kept, and let the tracker follow what changed."""
         self._search.advance()
-        self._proceed(to_end=False)
+        self._proceed(to_end=self._is_waited_for and not self._threaded)
 
     def end_frame(self) -> None:
         """Beside the frames, begin to close a loop that was found, unless this frame is being kept.
@@ -115,11 +118,11 @@ class MapMaking:
 
     def _insert(self, tracked: Tracked, view: FrameView) -> Work:
         steps = self._mapper.insert(tracked, view)
-        next(steps)
-        # Beside the frames the new corners are not put off: they would only be followed later.
-        if not self._threaded:
-            yield
-        yield from steps
+        if self._threaded:
+            # Beside the frames nothing is put off: new corners would only be followed later.
+            do_all(steps)
+        else:
+            yield from steps
         # A search for loops may follow, in another frame.
         yield
 

@@ -152,14 +152,15 @@ class Mapper:
             scaled[:3, 3] *= scale
             self._map.add_keyframe(Keyframe.of_view(view.frame, scaled, Followed(ids.copy(), view.pixels)))
         self._adjust_locally()
-        for number in (0, 1):
-            self._map.keyframes[number].describe(start.views[number].frame.grey)
-        do_all(self._finish(2, start.views[2].frame))
+        self._add_corners(2, start.views[2].frame)
+        for keyframe, view in zip(self._map.keyframes, start.views, strict=True):
+            do_all(keyframe.describe(view.frame.grey))
 
     def begin_at(self, view: FrameView, camera_from_world: Array) -> int:
         """Fill the empty map from one view at a pose (4, 4); returns how many points have a depth."""
         number = self._map.add_keyframe(Keyframe.of_view(view, camera_from_world, NOWHERE))
-        do_all(self._finish(number, view))
+        self._add_corners(number, view)
+        do_all(self._map.keyframes[number].describe(view.grey))
         return int((self._map.state == GOOD).sum())
 
     def wants_keyframe(self, tracked: Tracked, frame_index: int) -> bool:
@@ -181,14 +182,16 @@ class Mapper:
         self._cull()
         yield
         cull_keyframes(self._map)
-        yield from self._finish(number, view)
+        self._add_corners(number, view)
+        yield
+        yield from self._map.keyframes[number].describe(view.grey)
 
     def adjust_all(self, iterations: int = 20) -> None:
         """Bundle adjustment of the whole map."""
         self._adjust(self._map.kept_keyframes, np.empty(0, dtype=np.int64), iterations)
 
-    def _finish(self, number: int, view: FrameView) -> Work:
-        """New corners to follow, and a description of what the view sees, so that it can be recognised."""
+    def _add_corners(self, number: int, view: FrameView) -> None:
+        """New corners to follow."""
         keyframe = self._map.keyframes[number]
         corners = free_corners(keyframe.normalized, keyframe.pixels)
         if len(corners):
@@ -198,8 +201,6 @@ class Mapper:
             self._points.add_candidates(number, corners, depth)
         self._points.place_by_depth(number, view.depth)
         self._choice.kept(number, view.index)
-        yield
-        keyframe.describe(view.grey)
 
     def _adjust_locally(self) -> None:
         """Bundle adjustment of the newest keyframes that see the same points, held by others that do."""
@@ -208,7 +209,7 @@ class Mapper:
 
     def _adjust(self, free: Indices, fixed: Indices, iterations: int) -> None:
         problem = gather(self._map, self._intrinsics, free, fixed, iterations, self._hold_poses)
-        put_back(self._map, problem, problem.adjuster().solve())
+        put_back(self._map, problem, problem.solve())
 
     def _cull(self) -> None:
         """Take out map points that are hardly ever found where they should be."""

@@ -134,7 +134,7 @@ LEAST_SHARE, LEAST_FIT, MOST_ERROR_RATIO, MOST_ERROR_PX = 0.35, 0.7, 2.0, 2.0
 
 
 @dataclass(frozen=True)
-class _Corners:
+class Corners:
     """Corners (n, 2) of an image, their descriptors (k, 32), and the row (k,) of each one's corner."""
 
     pixels: Array
@@ -142,9 +142,10 @@ class _Corners:
     descriptors: Descriptors
 
 
-def _described_corners(view: FrameView) -> _Corners:
+def described_corners(view: FrameView) -> Corners:
+    """The corners of a view."""
     pixels = spread_corners(view.normalized, np.full(view.normalized.shape, 255, dtype=np.uint8), N_CORNERS)
-    return _Corners(pixels, *describe(view.grey, pixels, OCTAVES))
+    return Corners(pixels, *describe(view.grey, pixels, OCTAVES))
 
 
 class Relocalizer:
@@ -161,12 +162,12 @@ class Relocalizer:
         found = self._where_it_was(view, tracker)
         if found is not None:
             return found
-        corners = _described_corners(view)
+        corners = described_corners(view)
         if len(corners.rows) < LEAST_INLIERS:
             return NoPose(SlamReason.LITTLE_TEXTURE, (len(corners.pixels),))
         self.places.update()
         for number in self._candidates(corners.descriptors):
-            found = self._locate(view, corners, self.group(number), tracker)
+            found = self.locate(view, corners, self.group(number), tracker)
             if found is not None:
                 return found
         return NoPose(SlamReason.NO_SIMILAR_KEYFRAME)
@@ -178,13 +179,10 @@ class Relocalizer:
         number = int(np.bincount(self._map.template_keyframe[tracker.points.ids]).argmax())
         return self._confirmed(self.group(number), view, tracker.camera_from_world, tracker)
 
-    def locate(self, view: FrameView, group: Indices, tracker: Tracker) -> tuple[PoseEstimate, Followed] | None:
-        """The pose by the points of some keyframes, and the points that support it; None if they do not."""
-        return self._locate(view, _described_corners(view), group, tracker)
-
-    def _locate(
-        self, view: FrameView, corners: _Corners, group: Indices, tracker: Tracker
+    def locate(
+        self, view: FrameView, corners: Corners, group: Indices, tracker: Tracker
     ) -> tuple[PoseEstimate, Followed] | None:
+        """The pose by the points of some keyframes, and the points that support it; None if they do not."""
         rough = self._rough_pose(group, corners)
         return None if rough is None else self._confirmed(group, view, rough.camera_from_world, tracker)
 
@@ -201,7 +199,7 @@ class Relocalizer:
         best = np.argsort(-shared, kind="stable")[:GROUP]
         return best[shared[best] >= LEAST_SHARED]
 
-    def _rough_pose(self, group: Indices, corners: _Corners) -> PoseEstimate | None:
+    def _rough_pose(self, group: Indices, corners: Corners) -> PoseEstimate | None:
         """The pose that matches of descriptors agree on."""
         keyframes = [self._map.keyframes[k] for k in group]
         ids = np.concatenate([keyframe.described_ids for keyframe in keyframes])

@@ -7,6 +7,7 @@ keep theirs.
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from copy import copy
 from dataclasses import dataclass, field
 
@@ -88,10 +89,14 @@ class Keyframe:
             keyframe.depths = view.depth.samples()
         return keyframe
 
-    def describe(self, grey: NDArray[np.uint8]) -> None:
-        """Describe what its points look like in its grey image (h, w), so that they can be recognised."""
-        rows, self.descriptors = describe(grey, self.pixels, OCTAVES)
-        self.described_ids = self.point_ids[rows]
+    def describe(self, grey: NDArray[np.uint8]) -> Generator[None, None, None]:
+        """Describe its points in its grey image (h, w), scale by scale, so that they can be recognised."""
+        parts = []
+        for octave in OCTAVES:
+            parts.append(describe(grey, self.pixels, (octave,)))
+            yield
+        rows, descriptors = zip(*parts, strict=True)
+        self.described_ids, self.descriptors = self.point_ids[np.concatenate(rows)], np.concatenate(descriptors)
 
     @property
     def seen(self) -> Followed:

@@ -171,7 +171,7 @@ def correct_map(rigid_map: RigidMap, camera: Camera, trajectory: Trajectory) -> 
         observations.pixels[own] = middle_row_pixels(camera, pose, twists[row], points, pixels)
         if observations.right_columns is not None:
             observations.right_columns[own] += observations.pixels[own, 0] - pixels[:, 0]
-    result = problem.adjuster().solve()
+    result = problem.solve()
     rigid_map.positions[problem.ids] = result.points
     for k, pose in zip(problem.numbers, result.camera_from_world, strict=True):
         rigid_map.keyframes[k].camera_from_world = pose

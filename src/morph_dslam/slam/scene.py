@@ -19,7 +19,7 @@ from morph_dslam.errors import MapError, SourceError
 from morph_dslam.io.colmap import ColmapModel
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam import rolling_shutter
-from morph_dslam.slam.bundle_adjustment import BundleAdjuster, Observations
+from morph_dslam.slam.bundle_adjustment import Observations, adjust
 from morph_dslam.slam.frame_images import least_distances, orientations
 from morph_dslam.slam.map_files import load_map_and_trajectory, map_from_colmap, map_from_trajectory, save_map
 from morph_dslam.slam.options import SlamOptions
@@ -330,7 +330,7 @@ def warm_up() -> None:
     pixels = points[:, :2] / points[:, 2:] * 100.0
     refine_pose(np.eye(4), points, pixels, intrinsics)
     seen = Observations(np.repeat([0, 1], 20), np.tile(np.arange(20), 2), np.concatenate([pixels, pixels]))
-    BundleAdjuster(np.stack([np.eye(4)] * 2), points, seen, intrinsics, np.array([True, False]), iterations=1).solve()
+    adjust(np.stack([np.eye(4)] * 2), points, seen, intrinsics, np.array([True, False]), iterations=1)
     image, centre = rng.integers(0, 255, (32, 32)).astype(np.uint8), np.array([[16.0, 16.0]])
     patch_correlation(image, image, centre, centre, 5)
     orientations(image, centre)
