@@ -93,8 +93,8 @@ N_PILOTS, AGREEING_PILOTS, NEAR_LEVELS = 64, 0.5, 2
 MOST_PYRAMIDS = 8
 #: Lost points looked for in a frame, from at most so many keyframes.
 SEARCH_POINTS, SEARCH_KEYFRAMES = 80, 3
-#: In a frozen map lost points are looked for while fewer than this are followed.
-ENOUGH_POINTS = 340
+#: In a frozen map lost points are looked for while fewer than this are followed, and so many are missing.
+ENOUGH_POINTS, WORTH_A_SEARCH = 340, 20
 #: How far from its predicted pixel a lost point may be found.
 SEARCH_RADIUS_PX = 5.0
 #: Weight of the newest frame in the usual error.
@@ -462,7 +462,7 @@ class Tracker:
         most = SEARCH_POINTS
         if self._views is not None:
             most = min(ENOUGH_POINTS - len(followed), most)
-            if most <= 0:
+            if most < WORTH_A_SEARCH:
                 return NOWHERE
         lost = self._map.state == GOOD
         lost[followed] = False
