@@ -43,6 +43,8 @@ FREE_LID = ObjectOptions(model=Path("lid.morph"), landmarks=CSV)
         ({"refine_reference": True, "reregister_at": ((7, CSV),)}, "--reregister-at"),
         ({"refine_reference": True, "other_cameras": (Path("aside"),)}, "--with"),
         ({"other_cameras": (Path("aside"),), "tracker": TrackerOptions(use_discrepancy=True)}, "--discrepancy"),
+        ({"other_cameras": (Path("aside"),), "tracker": TrackerOptions(use_unknown_loads=True)}, "--unknown-loads"),
+        ({"tracker": TrackerOptions(use_discrepancy=True), "drawing": DrawOptions("stress")}, "not in equilibrium"),
         ({"reference_frame": 3, **REGISTERED}, "--reference-frame"),
         ({"reference_frame": 3, **REGISTERED, "others": (("lid", LID),)}, "--reference-frame"),
         ({"video": False, "drawing": DrawOptions("strain")}, "--no-video"),

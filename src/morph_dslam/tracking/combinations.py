@@ -8,7 +8,7 @@ from pathlib import Path
 from morph_dslam.errors import TrackingError
 from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.drawing import shown_field
-from morph_dslam.tracking.options import NO_DISCREPANCY, NO_LOADS
+from morph_dslam.tracking.options import NO_DISCREPANCY, NO_LOADS, NOT_IN_EQUILIBRIUM
 from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
 from morph_dslam.tracking.setup import TrackedObject
 
@@ -105,6 +105,10 @@ OF_RUN: tuple[tuple[Callable[[TrackOptions], bool], str], ...] = (
         "the reference is refined for one camera: leave out --refine or --with",
     ),
     (lambda run: bool(run.other_cameras) and any(part.tracker.use_discrepancy for part in run.objects), NO_DISCREPANCY),
+    (
+        lambda run: run.drawing.show in ("stress", "strain") and any(p.tracker.use_discrepancy for p in run.objects),
+        f"{NOT_IN_EQUILIBRIUM}: leave out --show, or --discrepancy",
+    ),
     (lambda run: bool(run.other_cameras) and any(part.tracker.use_unknown_loads for part in run.objects), NO_LOADS),
     (
         lambda run: (
@@ -139,7 +143,7 @@ def check_inputs(run: TrackOptions, objects: Sequence[TrackedObject]) -> None:
         raise TrackingError(
             f"the objects are anchored in different maps, {' and '.join(maps)}: register them all in one"
         )
-    if run.live and len({shown_field(part.model, run.drawing.show) for part in objects}) > 1:
+    if run.live and run.drawing.show is None and len({shown_field(part.model, None) for part in objects}) > 1:
         raise TrackingError("the models hold different fields to colour the objects by: --show displacement")
 
 

@@ -15,7 +15,10 @@ PoseFrom = Literal["map", "fixed", "free", "still"]
 #: Where the search for a frame's state starts.
 StartFrom = Literal["previous", "constant-velocity"]
 
-#: Why several cameras refuse it.
+#: Why stress is left out of pictures, and why several cameras refuse some options.
+NOT_IN_EQUILIBRIUM = (
+    "stress and strain are not drawn on a shape with a discrepancy, which is not in equilibrium under the study's loads"
+)
 NO_LOADS = "unknown loads are estimated from one camera: leave out --unknown-loads or --with"
 NO_DISCREPANCY = "the discrepancy is estimated from one camera: leave out --discrepancy or --with"
 

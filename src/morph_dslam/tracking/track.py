@@ -29,6 +29,7 @@ from morph_dslam.tracking.drawing import AugmentedView, write_video
 from morph_dslam.tracking.frame_estimation import temporal_facts
 from morph_dslam.tracking.frame_log import FrameLog
 from morph_dslam.tracking.hypothesis import Image
+from morph_dslam.tracking.options import NOT_IN_EQUILIBRIUM
 from morph_dslam.tracking.placement import (
     FramesAt,
     PlacedObject,
@@ -181,7 +182,7 @@ class _Job:
 
     def __init__(self, stack: ExitStack, run: TrackOptions, source: Any, placed: list[PlacedObject]) -> None:
         self._run, self._source, self._placed = run, source, placed
-        self._views = [AugmentedView(part.model, part.camera, run.drawing, part.inner) for part in placed]
+        self._views = [_view_of(part, run) for part in placed]
         self._folders = [
             RunFolder(folder, part.name, part.new_results(), part.camera, part.inner, run.overwrite)
             for folder, part in zip(run.folders, placed, strict=True)
@@ -213,7 +214,7 @@ class _Job:
             self._placed = [_refined(part, self._seen[part.name], run) for part in self._placed]
             for folder, part in zip(self._folders, self._placed, strict=True):
                 folder.start_again(part.new_results(refined=isinstance(part.object.start, Landmarks)), part.camera)
-            self._views = [AugmentedView(part.model, part.camera, run.drawing, part.inner) for part in self._placed]
+            self._views = [_view_of(part, run) for part in self._placed]
             sinks: list[Sink] = [*self._folders]
             if self._log is not None:
                 self._log.start_again()
@@ -230,6 +231,8 @@ class _Job:
         notices = [*part.registration.warnings, *self._again[part.name].notices]
         if part.object.scene is not None:
             notices += [Remark(note) for note in part.object.scene.camera_notes]
+        if part.options.use_discrepancy and part.model.stresses:
+            notices.append(Remark(f"{NOT_IN_EQUILIBRIUM}; those in plots and tables are the model's without it"))
         if isinstance(self._source, SynchronizedFrames):
             notices += self._source.notices(len(folder.results))
         if run.live:
@@ -261,6 +264,12 @@ class _Job:
         for name, tracker in self._session.trackers.items():
             if tracked.results[name].tracked and isinstance(tracker, Tracker) and tracker.last_seen is not None:
                 self._seen[name].append(tracker.last_seen)
+
+
+def _view_of(part: PlacedObject, run: TrackOptions) -> AugmentedView:
+    """Draws an object; by its displacement where stress would be drawn on a shape that is not in equilibrium."""
+    by_default = "displacement" if part.options.use_discrepancy and run.drawing.show is None else run.drawing.show
+    return AugmentedView(part.model, part.camera, replace(run.drawing, show=by_default), part.inner)
 
 
 def _refined(part: PlacedObject, keyframes: list[Keyframe], run: TrackOptions) -> PlacedObject:
