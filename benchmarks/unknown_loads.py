@@ -12,6 +12,7 @@ Run: python benchmarks/unknown_loads.py
 from __future__ import annotations
 
 import argparse
+import time
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -186,9 +187,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--places", type=int, default=3, help="at how many places (%(default)s)")
     parser.add_argument("--modes", type=int, default=120, help="unknown loads (%(default)s)")
+    parser.add_argument("--time", action="store_true", help="only the time of an estimate with 30 loads")
     parser.add_argument("--keep", type=Path, help="folder to keep the model in")
     arguments = parser.parse_args()
     with TemporaryDirectory() as temporary:
+        if arguments.time:
+            time_estimator(arguments.keep or Path(temporary))
+            return
         compare(arguments.places, arguments.modes, arguments.keep or Path(temporary))
 
 
@@ -205,6 +210,29 @@ def compare(count: int, modes: int, folder: Path) -> None:
             found.append(run_place(model, loaded, place, case, truth, seed))
             print(f"({1e3 * place[0]:.1f}, {1e3 * place[1]:.1f}) mm, {case}: {_line(found[-1])}", flush=True)
     print(" ".join(_line(np.concatenate(rows[case]), prefix) for case, prefix in CASES.items()))
+
+
+def time_estimator(folder: Path, repeats: int = 300) -> None:
+    """Print the time of an estimate with 30 loads, three parameters, the pose and 500 points, from the last frame's."""
+    traction = {"kind": "traction", "on": "z_max", "traction": ["x", "y", "z"]}
+    study = STUDY | {"loads": [traction], "unknown_loads": {"on": "z_max"}}
+    study["mesh"] = STUDY["mesh"] | {"divisions": [8, 8, 3], "cells": "hex8"}
+    study["parameters"] = {name: {"range": ["-1 kPa", "1 kPa"], "default": "0 Pa"} for name in "xyz"}
+    loaded, rng = with_unknown_loads(md.build(md.make_study(study), folder / "small.morph")), np.random.default_rng(0)
+    top = (loaded.nodes[loaded.triangles][:, :, 2] > SIZE[2] - 1e-9).all(axis=1)
+    points = spread_over(loaded.nodes, loaded.triangles[top], N_POINTS)
+    follower = _Follower(loaded, SurfacePoints(np.flatnonzero(top)[points.triangles], points.weights), looking_down())
+    pixels, seconds, iterations = CAMERA.project(follower.points.in_camera(follower.state)), [], []
+    for _ in range(repeats):
+        seen = pixels + NOISE_PX * rng.standard_normal(pixels.shape)
+        begin = time.process_time()
+        estimate = follower.estimator.estimate(
+            follower.points, seen, np.ones(N_POINTS), follower.state, prior=follower.prior
+        )
+        seconds.append(time.process_time() - begin)
+        iterations.append(estimate.iterations)
+        follower.state = estimate.state
+    print(f"estimator_ms={1e3 * np.median(seconds):.2f} iterations={np.mean(iterations):.1f}")
 
 
 def _line(rows: np.ndarray, prefix: str = "") -> str:

@@ -26,7 +26,7 @@ from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
 from morph_dslam.model.separated import SeparatedField
 from morph_dslam.model.unknown_loads import ROOT, UnknownLoads, packed_root
 from morph_dslam.reduction.pod import compute_pod
-from morph_dslam.reduction.regression import fit_functions
+from morph_dslam.reduction.regression import design_matrix
 from morph_dslam.studies.problem import ParametricStudy, SweepProblem, bounds
 from morph_dslam.studies.sections import UnknownLoadsSection
 from morph_dslam.studies.snapshots import load_state
@@ -35,8 +35,8 @@ from morph_dslam.studies.solutions import Snapshots
 Array = NDArray[np.float64]
 #: Most states in which the softest tractions are sought.
 SOUGHT_IN = 6
-#: States for each term of a polynomial of second order; the highest order tried.
-STATES_A_TERM, HIGHEST_DEGREE = 3, 4
+#: States for each term of a polynomial of second order; the highest order tried, with this many terms a state.
+STATES_A_TERM, HIGHEST_DEGREE, MOST_TERMS_A_STATE = 3, 4, 0.7
 #: Relative norm of the responses' fields that may be left out, and most functions of the parameters.
 TOLERANCE, MOST_FUNCTIONS = 2e-2, 12
 
@@ -113,7 +113,7 @@ def reduce_unknown_loads(
 
 
 class _Samples:
-    """Training solutions spread over the parameters, that nearest to the defaults first.
+    """Solutions spread over the parameters, that nearest to the defaults first.
 
     Attributes
     ----------
@@ -122,26 +122,38 @@ class _Samples:
     """
 
     def __init__(self, study: ParametricStudy, snapshots: Snapshots) -> None:
-        self._box = bounds(study)
-        known = np.array([np.load(file)["coordinates"] for file in snapshots.training_files])
+        self._box, files = bounds(study), [*snapshots.training_files, *snapshots.held_out_files]
+        known = np.array([np.load(file)["coordinates"] for file in files])
         widths = np.diff(self._box, axis=1)[:, 0]
         default = np.array([parameter.default for parameter in study.model_parameters()])
         first = int(np.linalg.norm((known - default) / widths, axis=1).argmin())
         count = STATES_A_TERM * len(total_degree_indices(len(widths), 2))
         chosen = farthest_points(known / widths, count, first)
-        self.files, self.samples = [snapshots.training_files[k] for k in chosen], known[chosen]
+        self.files, self.samples = [files[k] for k in chosen], known[chosen]
 
     def reduced(self, values: list[NDArray]) -> tuple[SeparatedField, float]:
-        """A separated field of values (n, c) at the samples, and its relative error where they are left out."""
-        flat, lower, upper = np.array([value.ravel() for value in values], dtype=float), *self._box.T
+        """A separated field of values (n, c) at the samples, and its relative error where one of them is left out."""
+        flat = np.array([value.ravel() for value in values], dtype=float)
         pod = compute_pod(flat.copy(), np.full(flat.shape[1], 1.0 / flat.shape[1]), TOLERANCE, MOST_FUNCTIONS)
         coefficients = pod.project(flat)
-        left_out = np.linalg.norm(coefficients @ pod.modes - flat) / np.linalg.norm(flat)
-        if len(pod.modes) == 1 and np.allclose(coefficients, coefficients[0], rtol=TOLERANCE):
-            indices, missed = np.zeros((1, len(lower)), dtype=np.int64), 0.0
-            functions = ParameterFunctions(lower, upper, indices, coefficients.mean(axis=0)[None])
-        else:
-            folds = np.arange(len(flat))
-            functions, errors = fit_functions(self.samples, coefficients, None, lower, upper, HIGHEST_DEGREE, folds)
-            missed = min(errors.values())
+        left_out = float(np.linalg.norm(coefficients @ pod.modes - flat) / np.linalg.norm(flat))
+        functions, missed = self._fitted(coefficients)
         return SeparatedField(pod.modes.reshape(-1, *values[0].shape), functions), float(np.hypot(left_out, missed))
+
+    def _fitted(self, coefficients: Array) -> tuple[ParameterFunctions, float]:
+        """Polynomials of the total degree that predicts coefficients (m, r) of left-out samples best, and how well."""
+        (lower, upper), best = self._box.T, (np.inf, np.empty((0, 0), dtype=np.int64), coefficients)
+        for degree in range(HIGHEST_DEGREE + 1):
+            indices = total_degree_indices(len(lower), degree)
+            if len(indices) > MOST_TERMS_A_STATE * len(coefficients):
+                break
+            design = design_matrix(self.samples, lower, upper, indices)[0]
+            orthogonal, triangle = np.linalg.qr(design)
+            fitted = orthogonal @ (orthogonal.T @ coefficients)
+            # What a sample is missed by if it is left out of a linear fit follows from its leverage.
+            leverage = np.minimum(np.sum(orthogonal**2, axis=1, keepdims=True), 1.0 - 1e-6)
+            missed = float(np.linalg.norm((fitted - coefficients) / (1.0 - leverage)) / np.linalg.norm(coefficients))
+            if missed < best[0]:
+                solved = np.linalg.solve(triangle, orthogonal.T @ coefficients)
+                best = missed, indices, np.asarray(solved, dtype=np.float64)
+        return ParameterFunctions(lower, upper, best[1], best[2]), best[0]
