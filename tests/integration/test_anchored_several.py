@@ -281,7 +281,10 @@ def test_a_shorter_recording_ends_the_run_and_is_named(recording, tmp_path, caps
     assert f"frame {FRAMES - 1} is not in" in refused(*arguments)
     row = arguments.index("--range")
     assert main(arguments[:row] + arguments[row + 2 :]) == 0
-    assert "9 were tracked, to the end of the shortest recording" in capsys.readouterr().out
+    frames = load_run(tmp_path / "run").frames
+    assert frames[-1] == SCAN + 1
+    said = capsys.readouterr().out
+    assert f"{len(frames)} were tracked, to the end of the shortest recording" in said
 
 
 def live_command(folder, output, *more):

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import shift
 
-from morph_dslam.geometry import RigidTransform
+from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
-from morph_dslam.tracking.binding import view_of
+from morph_dslam.tracking.binding import View, view_of
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.measurement import ReferenceAppearance, draw_textured
 from morph_dslam.tracking.patches import (
@@ -109,11 +109,31 @@ def test_rendering_looks_like_the_frame_it_predicts():
     assert (rendering.image[~np.isfinite(rendering.depth)] == NEUTRAL).all()
 
 
+def test_a_coarse_oblique_plane_is_rendered_by_its_homography():
+    """A sheet of two triangles, turned by 55 and by 35 degrees: its texture moves by the homography of its corners."""
+    model = bent_sheet_model(2, 2)
+    rest, views = model.positions(model.default), []
+    centre = rest.mean(axis=0)
+    for turn, place in ((0.96, [0.0, 0.0, 0.6]), (0.61, [0.05, -0.03, 0.7])):
+        nodes = (rest - centre) @ rotation_exp(np.array([0.2, turn, 0.0])).T + place
+        views.append(View(nodes, CAMERA.project(nodes)))
+    picture = cv2.GaussianBlur(printed_texture(480, 640, seed=4), (0, 0), 3.0)
+    appearance = ReferenceAppearance(model, CAMERA, [picture], views[:1])
+    first, second = (view.pixels.astype(np.float32) for view in views)
+    moved = cv2.warpPerspective(picture, cv2.getPerspectiveTransform(first, second), (640, 480))
+    for view, expected in zip(views, (picture, moved), strict=True):
+        rendering = appearance.render(view)
+        inside = interior(np.isfinite(rendering.depth), 3) > 0
+        assert inside.sum() > 20_000
+        # OpenCV interpolates between 32 places of a pixel.
+        assert np.abs(rendering.image.astype(int) - expected)[inside].max() <= 2
+
+
 def draw_in_two_passes(pixels, depths, triangles, coordinates, texture, closed, image, depth):
     buffers = rasterise(pixels, depths, triangles, *depth.shape, closed=closed)
     nearest = buffers.depth < depth
     corners = np.arange(3 * len(triangles)).reshape(-1, 3)
-    image[nearest] = render_textured(buffers, corners, coordinates.reshape(-1, 2), texture)[nearest]
+    image[nearest] = render_textured(buffers, corners, coordinates[:, :, :2].reshape(-1, 2), texture)[nearest]
     depth[nearest] = buffers.depth[nearest]
 
 
@@ -122,7 +142,8 @@ def test_drawing_in_one_pass_equals_drawing_in_two(closed):
     model = bent_sheet_model(22, 16)
     texture = np.random.default_rng(4).integers(0, 256, (480, 640)).astype(np.uint8)
     view, other = (view_of(model, CAMERA, sheet_state(bend)) for bend in (0.0, 0.15))
-    pictures, places = [], view.pixels[model.triangles]
+    # A picture taken from far away: all depths are the same.
+    pictures, places = [], np.pad(view.pixels, ((0, 0), (0, 1)), constant_values=1.0)[model.triangles]
     for draw in (draw_textured, draw_in_two_passes):
         image, depth = np.full((480, 640), NEUTRAL, np.uint8), np.full((480, 640), np.inf, np.float32)
         # Something is drawn there already, nearer than the right half.

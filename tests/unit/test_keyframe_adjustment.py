@@ -51,9 +51,11 @@ def test_poses_of_a_path_that_is_off_are_found_by_the_images(disturbed, adjusted
     before = [pose_errors(camera_from_object(view, WORLD), true) for view, true in zip(views, truth, strict=True)]
     after = np.array([pose_errors(found, true) for found, true in zip(adjusted.poses, truth, strict=True)])
     assert np.sqrt(np.mean(np.square(before)[:, 3:])) > 4e-4
-    assert np.sqrt(np.mean(after[:, 3:] ** 2)) < 1.5e-4
+    # Of how far all keyframes are from the object, the images tell least.
+    assert np.sqrt(np.mean(after[:, 3:] ** 2)) < 3e-4
+    assert np.sqrt(np.mean(after[:, 3:5] ** 2)) < 0.5e-4
     assert np.sqrt(np.mean(after[:, :3] ** 2)) < np.radians(0.05)
-    assert adjusted.rms_px < 0.1
+    assert adjusted.rms_px < 0.04
 
 
 def test_the_covariance_is_of_the_size_of_the_errors(adjusted):
@@ -201,5 +203,4 @@ def test_a_texture_carried_into_its_own_view_stays(two_views):
     carried, shown = np.zeros(normalized.shape, np.float32), np.zeros(normalized.shape, dtype=bool)
     carry(first.triangle_ids, first.weights, triangles, pixels, depths, first.depth, normalized, carried, shown)
     assert shown.sum() > 5000
-    # Weights are those in space: within a triangle of 8 mm the image's would be a little others.
-    assert np.abs(carried[shown] - normalized[shown].astype(float)).mean() < 1.0
+    assert np.abs(carried[shown] - normalized[shown].astype(float)).mean() < 0.01

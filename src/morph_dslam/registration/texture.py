@@ -304,10 +304,15 @@ def carry(triangle_ids, weights, triangles, coordinates, depths, depth, image, c
                 continue
             x, y, z = 0.0, 0.0, 0.0
             for corner in range(3):
-                node, weight = triangles[t, corner], weights[row, column, corner]
+                node = triangles[t, corner]
+                weight = weights[row, column, corner] * depths[node]
                 x += weight * coordinates[node, 0]
                 y += weight * coordinates[node, 1]
-                z += weight * depths[node]
+                z += weight
+            if not z > 0.0:
+                continue
+            # Pixels of the first view are projective on a triangle, not linear: they count by their depths there.
+            x, y = x / z, y / z
             x0, y0 = int(np.floor(x)), int(np.floor(y))
             if x0 < 1 or y0 < 1 or x0 + 2 >= width or y0 + 2 >= height:
                 continue

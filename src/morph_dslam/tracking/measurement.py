@@ -72,12 +72,12 @@ class ReferenceAppearance:
         sources = np.zeros(len(self._triangles), dtype=np.int64) if sources is None else sources
         # One picture below the other, so that a triangle's place says which one it is from.
         self._texture = np.ascontiguousarray(np.concatenate(normalized_images))
-        self._coordinates = np.empty((len(self._triangles), 3, 2))
+        self._coordinates = np.empty((len(self._triangles), 3, 3))
         self.facing = np.empty(len(self._triangles), dtype=bool)
         for number, view in enumerate(views):
             rows = sources == number
-            below = np.array([0.0, number * camera.height])
-            self._coordinates[rows] = view.pixels[self._triangles[rows]] + below
+            pixels, depths = view.pixels + [0.0, number * camera.height], view.nodes[:, 2:]
+            self._coordinates[rows] = np.hstack([pixels * depths, depths])[self._triangles[rows]]
             self.facing[rows] = facing(view, self._triangles[rows])
 
     def render(self, view: View) -> Rendering:
@@ -99,9 +99,10 @@ class ReferenceAppearance:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw_triangle(area, u, v, q, x, y, texture, image, depth):
-    """Draw one triangle: twice its area, and its corners' pixels u, v, inverse depths q and texture
-    coordinates x, y, all (3,)."""
+def _draw_triangle(area, u, v, q, corners, texture, image, depth):
+    """Draw one triangle: twice its area, its corners' pixels u, v and inverse depths q (3,), and where they are in the
+    texture, ``corners`` (3, 3)."""
+    x, y, h = corners[:, 0], corners[:, 1], corners[:, 2]
     last_row, last_column = texture.shape[0] - 1, texture.shape[1] - 1
     left, right, top, bottom = pixel_window(u, v, *depth.shape)
     step0, step1 = weight_steps(v, area)
@@ -117,8 +118,10 @@ def _draw_triangle(area, u, v, q, x, y, texture, image, depth):
             if not z < depth[row, column]:
                 continue
             depth[row, column] = z
-            s = min(max((w0 * x[0] + w1 * x[1] + w2 * x[2]) * z, 0.0), last_column)
-            t = min(max((w0 * y[0] + w1 * y[1] + w2 * y[2]) * z, 0.0), last_row)
+            # Pixels of the picture are projective on a triangle, not linear: they count by their depths there.
+            scale = 1.0 / (w0 * h[0] + w1 * h[1] + w2 * h[2])
+            s = min(max((w0 * x[0] + w1 * x[1] + w2 * x[2]) * scale, 0.0), last_column)
+            t = min(max((w0 * y[0] + w1 * y[1] + w2 * y[2]) * scale, 0.0), last_row)
             s0, t0 = int(s), int(t)
             s1, t1 = min(s0 + 1, last_column), min(t0 + 1, last_row)
             a, b = s - s0, t - t0
@@ -134,19 +137,17 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
     Parameters
     ----------
     pixels, depths, triangles, closed : see `rasterise`.
-    coordinates : (m, 3, 2) column and row of each triangle's corners in the texture, texture pixels; outside it is its
-        border
+    coordinates : (m, 3, 3) column and row of each triangle's corners in the texture, texture pixels, times their depth in
+        the camera that took it, and that depth; outside it is its border
     texture : (H, W) uint8.
     image, depth : (h, w) uint8 and float32, the unit of ``depths``; changed where the surface is nearest.
     """
-    u, v, q, x, y = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    u, v, q = np.empty(3), np.empty(3), np.empty(3)
     for t in range(triangles.shape[0]):
         area = load_triangle(pixels, depths, triangles, t, closed, u, v, q)
         if area == 0.0:
             continue
-        for corner in range(3):
-            x[corner], y[corner] = coordinates[t, corner, 0], coordinates[t, corner, 1]
-        _draw_triangle(area, u, v, q, x, y, texture, image, depth)
+        _draw_triangle(area, u, v, q, coordinates[t], texture, image, depth)
 
 
 #: Pyramid levels that reach as far as a correction may: a quarter of the size, with windows of 17 pixels.
