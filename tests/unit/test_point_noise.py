@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from morph_dslam.tracking.noise import LARGEST_POWER, LEAST_SPREAD_PX, PointNoise
+from morph_dslam.tracking.covariance import LEAST_SPREAD_PX, huber_covariance
+from morph_dslam.tracking.noise import LARGEST_POWER, PointNoise
 
 
 def learnt(factor, common_px, frames=60, count=300, seed=0):
@@ -49,6 +50,30 @@ def test_nothing_is_taken_to_be_exact():
     assert noise.common >= LEAST_SPREAD_PX**2
     weights = noise.weights(np.array([1e-6, 0.02]), np.ones(2, dtype=bool))
     assert weights.max() / weights.min() <= 5.5
+
+
+def test_the_reference_picture_itself_tells_nothing_of_noise():
+    """It agrees with itself to rounding: the frames after it are weighed as if it had not been."""
+    _, _, alone = learnt(3.0, 0.1)
+    rng, noise = np.random.default_rng(0), PointNoise()
+    spread = np.exp(rng.uniform(np.log(0.02), np.log(0.3), 300))
+    noise.learn(1e-3 * spread, 1e-6 * rng.standard_normal((300, 2)), np.ones(300, dtype=bool))
+    np.testing.assert_array_equal(noise.weights(spread, np.ones(300, dtype=bool)), np.ones(300))
+    deviation = np.sqrt(3.0 * spread**2 + 0.1**2)
+    for _ in range(60):
+        noise.learn(spread, deviation[:, None] * rng.standard_normal((300, 2)), np.ones(300, dtype=bool))
+    assert noise.common == pytest.approx(alone.common, rel=0.3)
+
+
+def test_residuals_of_nothing_do_not_make_an_estimate_exact():
+    """A line through 50 points: the covariance is that of points off by a hundredth of a pixel."""
+    x = np.linspace(-1.0, 1.0, 50)
+    jacobian = np.stack([np.ones(50), x], axis=1)
+    sigma, covariance = huber_covariance(
+        jacobian.T @ jacobian, np.zeros((50, 2)), np.ones(50), np.full(50, 2), 3.0, np.ones(2)
+    )
+    assert sigma == 0.01
+    np.testing.assert_allclose(covariance, np.diag([1.0 / 50.0, 1.0 / np.sum(x**2)]) * 1e-4, rtol=1e-9, atol=1e-18)
 
 
 @pytest.mark.parametrize("power", [1.15, 1.35])

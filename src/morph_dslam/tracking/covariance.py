@@ -127,6 +127,11 @@ def gaussian_factor(places: Array, length: float) -> Array:
 EIGENVALUE_FLOOR = 1e-12
 
 
+#: Nothing is known better than by this, pixels, whatever residuals and patches say: a frame that is the reference
+#: picture itself agrees with it exactly, with the same noise in both.
+LEAST_SPREAD_PX = 0.01
+
+
 @njit(cache=True, nogil=True)
 def huber_covariance(hessian, residuals, weights, numbers, huber_px, scale):
     """Standard deviation of a pixel coordinate and covariance of an M-estimator.
@@ -167,7 +172,7 @@ def huber_covariance(hessian, residuals, weights, numbers, huber_px, scale):
     else:
         sigma = np.median(np.sqrt(weights) * length) / 0.6745 * np.sqrt(count / freedom)
     mean_slope = max(slopes / len(numbers), 1e-3)
-    variance = psi_squared / freedom * (factors / len(numbers)) / mean_slope**2
+    variance = max(psi_squared / freedom * (factors / len(numbers)) / mean_slope**2, LEAST_SPREAD_PX**2)
     values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
     floored = np.maximum(values, max(values[-1], 1e-30) * EIGENVALUE_FLOOR)
-    return sigma, variance * ((vectors / floored) @ vectors.T) * np.outer(scale, scale)
+    return max(sigma, LEAST_SPREAD_PX), variance * ((vectors / floored) @ vectors.T) * np.outer(scale, scale)

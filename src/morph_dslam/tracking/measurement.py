@@ -76,8 +76,8 @@ class ReferenceAppearance:
         self.facing = np.empty(len(self._triangles), dtype=bool)
         for number, view in enumerate(views):
             rows = sources == number
-            pixels, depths = view.pixels + [0.0, number * camera.height], view.nodes[:, 2:]
-            self._coordinates[rows] = np.hstack([pixels * depths, depths])[self._triangles[rows]]
+            depths, below = view.nodes[:, 2:], np.array([0.0, number * camera.height])
+            self._coordinates[rows] = np.hstack([(view.pixels + below) * depths, depths])[self._triangles[rows]]
             self.facing[rows] = facing(view, self._triangles[rows])
 
     def render(self, view: View) -> Rendering:
@@ -137,8 +137,8 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
     Parameters
     ----------
     pixels, depths, triangles, closed : see `rasterise`.
-    coordinates : (m, 3, 3) column and row of each triangle's corners in the texture, texture pixels, times their depth in
-        the camera that took it, and that depth; outside it is its border
+    coordinates : (m, 3, 3) column and row of each triangle's corners in the texture, texture pixels, times their depth
+        in the camera that took it, and that depth; outside it is its border
     texture : (H, W) uint8.
     image, depth : (h, w) uint8 and float32, the unit of ``depths``; changed where the surface is nearest.
     """

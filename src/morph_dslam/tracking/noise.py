@@ -10,6 +10,7 @@ import scipy.sparse
 from numba import njit
 from numpy.typing import NDArray
 
+from morph_dslam.tracking.covariance import LEAST_SPREAD_PX
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.state import BoundPoints
 
@@ -136,7 +137,7 @@ class PixelNoise:
         numbers = measured.numbers[used].sum()
         # In what a point of weight 1 is off by.
         residuals = np.where(used[:, None], np.sqrt(measured.weights)[:, None] * residuals, np.nan)
-        total = np.nansum(residuals**2) / max(numbers - taken, LEAST_LEFT * numbers, 1)
+        total = max(np.nansum(residuals**2) / max(numbers - taken, LEAST_LEFT * numbers, 1), LEAST_SPREAD_PX**2)
         if self._before is not None:
             products = residuals * self._before
             pairs = np.isfinite(products)
@@ -149,8 +150,6 @@ class PixelNoise:
         self.frame = float(total - self.common)
 
 
-#: Nothing is known better than by this, pixels, whatever the patches say.
-LEAST_SPREAD_PX = 0.01
 #: With differences that are independent from pixel to pixel f is 1; blur makes neighbours alike, so that they
 #: count as fewer. A larger f is no noise of the patches but what the model leaves, where it moves them most.
 LARGEST_FACTOR = 4.0
@@ -216,6 +215,8 @@ class PointNoise:
         moments = np.array(
             [[_middle(spread[half]) ** 2, (_middle(length[half]) / MEDIAN_OF_PAIR) ** 2] for half in (better, ~better)]
         )
+        if moments[:, 1].max() < LEAST_SPREAD_PX**2:
+            return  # the reference picture itself, which tells nothing of noise
         before = moments if self._moments is None else self._moments
         self._moments = before + LEARNING_RATE * (moments - before)
 

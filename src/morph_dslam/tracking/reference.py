@@ -173,6 +173,11 @@ class PosedImage:
         return shown, np.where(drawn.covered & ~shown, np.float32(0.0), drawn.depth)
 
 
+#: Points do not count where the surface is seen this much flatter than in their picture: next to nothing is left of
+#: their patches, and what is beside the surface fills the rest.
+LEAST_BROADNESS = 0.1
+
+
 class ReferenceView:
     """A registered view of the object, or several of the same undeformed one.
 
@@ -207,7 +212,7 @@ class ReferenceView:
         views: Sequence[PosedImage],
         options: TrackerOptions,
         surface: DrawnSurface | None = None,
-        least_broadness: float = 0.0,
+        least_broadness: float = LEAST_BROADNESS,
     ) -> None:
         self._estimator, self._options, self._views = estimator, options, views
         model, camera, first = estimator.model, estimator.camera, views[0]
@@ -310,9 +315,7 @@ class ReferenceView:
             if picture.occluder_depth is not None:
                 tolerance = DEPTH_TOLERANCE * float(np.median(positions[:, 2]))
                 visible &= visible_points(predicted, positions[:, 2], picture.occluder_depth, tolerance)
-            if self._least_broadness.any():
-                seen = foreshortening(view, drawn.triangles[self.points.surface.triangles])
-                visible &= seen >= self._least_broadness
+            visible &= foreshortening(view, drawn.triangles[self.points.surface.triangles]) >= self._least_broadness
             guesses = predicted
             if followed is not None:
                 guesses = np.where(followed.valid[:, None], followed.pixels, predicted)

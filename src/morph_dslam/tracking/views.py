@@ -240,7 +240,7 @@ CHECK_EVERY = 3
 PAUSE = 15
 #: In a made view points do not count where the surface is seen flatter than in the view, by this factor of
 #: its area or a smaller one: patches are compared worst there, and another part, broad in both, tells enough.
-LEAST_BROADNESS = 0.3
+MADE_BROADNESS = 0.3
 
 
 @dataclass(frozen=True)
@@ -424,7 +424,7 @@ class ViewSet:
         try:
             error_factors = error_factors_of(stated.covariance, estimator.scale)
             view = PosedImage(picture, stated.state, error_factors, seen, attempt.discrepancy)
-            made = ReferenceView(estimator, [view], options, surface, LEAST_BROADNESS)
+            made = ReferenceView(estimator, [view], options, surface, MADE_BROADNESS)
         except RegistrationError:
             self._pause = PAUSE
             return None
