@@ -70,7 +70,8 @@ def test_the_commands_in_a_row_find_the_truth(sequence, capsys):
     assert cli.main([str(word) for word in command]) == 0
     last = capsys.readouterr().out.splitlines()[-1]
     assert re.fullmatch(
-        r"mean_mm=[\d.]+ median_mm=[\d.]+ p95_mm=[\d.]+ tracked=16/16 median_ms=[\d.]+ p95_ms=[\d.]+", last
+        r"mean_mm=[\d.]+ median_mm=[\d.]+ p95_mm=[\d.]+ tracked=16/16 median_ms=[\d.]+ p95_ms=[\d.]+ rigid_mm=[\d.]+",
+        last,
     )
     figures = json.loads((sequence / "run" / "evaluation.json").read_text())
     assert figures["mean_mm"] < 1.0

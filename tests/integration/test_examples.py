@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.real_data import ROOT, real_data
 
-RESULT = r"mean_mm=([\d.]+) median_mm=[\d.]+ p95_mm=[\d.]+ tracked=(\d+)/(\d+) median_ms=[\d.]+ p95_ms=[\d.]+"
+RESULT = r"mean_mm=([\d.]+) median_mm=[\d.]+ p95_mm=[\d.]+ tracked=(\d+)/(\d+) .* rigid_mm=[\d.]+"
 
 
 def run_example(name, *options, program="run.py"):

@@ -34,7 +34,9 @@ def test_evaluate_writes_figures_pictures_and_report_and_ends_with_the_result(ru
     run, truth = run_and_truth
     assert main(["evaluate", str(run), "--points", str(truth), "--bind-frame", "10"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[-1] == ("mean_mm=5.000 median_mm=5.000 p95_mm=5.000 tracked=5/6 median_ms=9.00 p95_ms=9.00")
+    assert lines[-1] == (
+        "mean_mm=5.000 median_mm=5.000 p95_mm=5.000 tracked=5/6 median_ms=9.00 p95_ms=9.00 rigid_mm=0.000"
+    )
     assert any("not tracked" in line and "[12]" in line for line in lines)
     figures = json.loads((run / "evaluation.json").read_text())
     assert figures["mean_mm"] == pytest.approx(5.0, abs=1e-3)

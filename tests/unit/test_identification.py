@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from scipy.stats import t
 
+from morph_dslam.camera import Camera
 from morph_dslam.cli import app as cli
 from morph_dslam.errors import EvaluationError, IdentificationError
 from morph_dslam.evaluation.force import ForceCurve, load_curve, reaction_in_direction
+from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.identification.identify import FACTOR, identify
 from morph_dslam.identification.measurements import MeasuredForces, MeasuredPoints, load_points
 from morph_dslam.identification.report import identification_lines, summarise
@@ -94,6 +96,30 @@ def test_forces_give_the_factor_of_the_moduli_and_the_zero_of_the_cell() -> None
     assert found.groups == 8
     low, high = found[FACTOR].interval
     assert low < 0.8 < high < 0.85
+
+
+def test_forces_by_frame_name_the_loading_rate() -> None:
+    """One parameter rises by 0.02 a frame, one frame is lost, the others stay."""
+    model, frames = plate(), np.arange(10, 40)
+    parameters = np.tile([0.0, 0.5, 0.5], (30, 1))
+    parameters[:, 0] = 0.1 + 0.02 * np.arange(30)
+    status = ("tracked",) * 12 + ("lost",) + ("tracked",) * 17
+    run = Run(
+        model,
+        Camera(640, 480, 500.0, 500.0, 319.5, 239.5),
+        frames,
+        status,
+        ("",) * 30,
+        np.tile(np.eye(4), (30, 1, 1)),
+        parameters,
+        {},
+    )
+    curve = ForceCurve("frame", frames.astype(float), 70.0 * parameters[:, 0])
+    forces = MeasuredForces(model, curve, reaction_in_direction(model, "edge:z"), run)
+    figures = summarise(identify(model, [forces], moduli=True))
+    (found,) = figures["measurements"]
+    assert found["loading_rate_per_frame"] == pytest.approx({"a_1": 0.02})
+    assert "loading rate: a_1 0.02 a frame" in "\n".join(identification_lines(figures))
 
 
 def test_points_and_forces_are_weighted_by_what_they_are_missed_by() -> None:

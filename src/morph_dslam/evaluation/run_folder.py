@@ -188,12 +188,13 @@ def alignment_line(figures: Mapping[str, Any]) -> str:
 
 
 def result_line(figures: Mapping[str, Any]) -> str:
-    """The last line that commands and examples print."""
+    """The last line that commands and examples print; ``rigid_mm`` is the mean after one rigid motion of the truth."""
     return (
         f"mean_mm={figures['mean_mm']:.3f} median_mm={figures['median_mm']:.3f} "
         f"p95_mm={figures['p95_mm']:.3f} "
         f"tracked={figures['n_frames_tracked']}/{figures['n_frames']} "
-        f"median_ms={figures['median_ms']:.2f} p95_ms={figures['p95_ms']:.2f}"
+        f"median_ms={figures['median_ms']:.2f} p95_ms={figures['p95_ms']:.2f} "
+        f"rigid_mm={figures['after_one_rigid_motion']['mean_mm']:.3f}"
     )
 
 

@@ -31,6 +31,8 @@ PLACE, MEASURED = ("place_x", "place_y", "place_z"), ("x", "y", "z")
 FARTHEST = 0.25
 #: A force curve counts as so many stretches whose errors are independent of each other.
 STRETCHES = 8
+#: A parameter that changes by less than this share of its range a frame is one over the sequence.
+LEAST_RATE = 1e-6
 #: Fewer forces determine no offset and anything else.
 FEWEST_FORCES = 4
 
@@ -305,3 +307,21 @@ class MeasuredForces:
         names = [parameter.name for parameter in self.run.model.parameters]
         row_of = {int(frame): row for row, frame in enumerate(self.run.frames)}
         return [dict(zip(names, self.run.parameters[row_of[int(p)]].tolist(), strict=True)) for p in self.places]
+
+    @property
+    def loading_rates(self) -> dict[str, float]:
+        """How much the parameters that change change from frame to frame, SI; empty where no run tells.
+
+        The rate of each is the slope of a straight line through its estimates.
+        """
+        if self.curve.against != "frame" or self.run is None:
+            return {}
+        rates = {
+            name: float(np.polyfit(self.places, [known[name] for known in self._known], 1)[0])
+            for name in self._known[0]
+        }
+        return {
+            p.name: rates[p.name]
+            for p in self.run.model.parameters
+            if abs(rates[p.name]) > LEAST_RATE * (p.upper - p.lower)
+        }

@@ -53,6 +53,10 @@ def _misfit_figures(misfit: Misfit) -> dict[str, Any]:
         "rms": measurement.scale * misfit.rms,
         "largest": measurement.scale * float(np.abs(misfit.predicted - measurement.values).max()),
     }
+    if isinstance(measurement, MeasuredForces):
+        units = {p.name: p for p in measurement.model.parameters}
+        rates = measurement.loading_rates.items()
+        figures["loading_rate_per_frame"] = {f"{n}_{units[n].unit}": units[n].display(rate) for n, rate in rates}
     return figures | ({"offset": measurement.scale * misfit.offset} if measurement.has_offset else {})
 
 
@@ -87,6 +91,12 @@ def identification_lines(figures: Mapping[str, Any]) -> list[str]:
     for each in figures["measurements"]:
         offset = f", offset {each['offset']:.3g} {each['unit']}" if "offset" in each else ""
         said.append(f"{each['name']}: {each['values']} values missed by {each['rms']:.3g} {each['unit']} rms{offset}")
+        rates = each.get("loading_rate_per_frame")
+        if rates is not None:
+            rate = ", ".join(f"{name} {rate:.3g} a frame" for name, rate in rates.items())
+            said.append(
+                f"loading rate: {rate or 'not known, forces are not given by frame'}; moduli may differ at others"
+            )
     return said
 
 
