@@ -26,13 +26,34 @@ def test_help_and_version_need_no_heavy_import():
         "import sys; from morph_dslam.cli import main\n"
         "try: main(sys.argv[1:])\n"
         "except SystemExit: pass\n"
-        "heavy = {'numba', 'ngsolve', 'cv2', 'matplotlib', 'scipy', 'h5py'} & sys.modules.keys()\n"
+        "heavy = {'numba', 'ngsolve', 'netgen', 'cv2', 'matplotlib', 'scipy', 'h5py'} & sys.modules.keys()\n"
         "assert not heavy, heavy"
     )
     for option in ("--help", "--version"):
         done = subprocess.run([sys.executable, "-c", program, option], capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         assert "morph" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status"),
+    [
+        (["info", "sheet.morph"], 0),
+        (["info", "absent.morph"], 2),
+        (["track", "film", "--camera", "c.yaml", "--model", "absent.morph", "--landmarks", "l.csv", "-o", "run"], 2),
+    ],
+)
+def test_a_summary_or_a_missing_file_needs_nothing_that_builds_or_draws(tmp_path, arguments, status):
+    save_model(tmp_path / "sheet.morph", bent_sheet_model(9, 7))
+    program = (
+        "import sys; from morph_dslam.cli import main\n"
+        "status = main(sys.argv[1:])\n"
+        "heavy = {'ngsolve', 'netgen', 'matplotlib', 'scipy.stats', 'scipy.signal'} & sys.modules.keys()\n"
+        "assert not heavy, heavy\n"
+        "sys.exit(status)"
+    )
+    done = subprocess.run([sys.executable, "-c", program, *arguments], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == status, done.stderr
 
 
 def test_output_that_nobody_reads_any_more_ends_quietly(tmp_path):

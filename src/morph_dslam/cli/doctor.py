@@ -9,7 +9,6 @@ import platform
 import time
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr
-from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -77,6 +76,8 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _versions() -> Iterator[tuple[str, str]]:
+    from importlib.metadata import PackageNotFoundError, version
+
     from morph_dslam._version import __version__
 
     yield "morph-dslam", __version__

@@ -15,17 +15,9 @@ from morph_dslam.evaluation.force import ForceCurve, force_error, load_curve, su
 from morph_dslam.evaluation.pixels import PixelTracks, load_tracks, pixel_error, summarise_pixels
 from morph_dslam.evaluation.points import PointTruth, load_truth, material_error, summarise
 from morph_dslam.evaluation.run_folder import Run, load_run
-from morph_dslam.evaluation.run_report import (
-    plot_depth_error_map,
-    plot_depth_errors_by_frame,
-    plot_error_map,
-    plot_errors_by_frame,
-    plot_force,
-    plot_pixel_error_map,
-    plot_pixel_errors_by_frame,
-    write_run_report,
-)
 from morph_dslam.evaluation.trajectory import summarise_alignment
+
+# What draws is imported where it draws: matplotlib takes long to load.
 
 
 def evaluate(run: str | Path | Run, truth: str | Path | PointTruth, bind_frame: int) -> dict[str, Any]:
@@ -61,6 +53,8 @@ def evaluate(run: str | Path | Run, truth: str | Path | PointTruth, bind_frame: 
     }
     if not isinstance(run, Run):
         folder = Path(run)
+        from morph_dslam.evaluation.run_report import plot_error_map, plot_errors_by_frame, write_run_report
+
         (folder / "evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
         plot_errors_by_frame(folder / "evaluation.png", error)
         plot_error_map(folder / "error_map.png", error, tracked.model)
@@ -102,6 +96,8 @@ def evaluate_depth(
     figures = {**summarise_depth(error), "depth": path, **_counts(tracked)}
     if not isinstance(run, Run):
         folder = Path(run)
+        from morph_dslam.evaluation.run_report import plot_depth_error_map, plot_depth_errors_by_frame
+
         (folder / "depth_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
         plot_depth_errors_by_frame(folder / "depth_evaluation.png", error)
         plot_depth_error_map(folder / "depth_error_map.png", error, tracked.model)
@@ -140,6 +136,8 @@ def evaluate_pixels(
     }
     if not isinstance(run, Run):
         folder = Path(run)
+        from morph_dslam.evaluation.run_report import plot_pixel_error_map, plot_pixel_errors_by_frame, write_run_report
+
         (folder / "pixel_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
         plot_pixel_errors_by_frame(folder / "pixel_evaluation.png", error)
         plot_pixel_error_map(folder / "pixel_error_map.png", error, tracked.model)
@@ -178,6 +176,8 @@ def evaluate_force(
     figures = {**summarise_force(error), "curve": path, **_counts(tracked)}
     if not isinstance(run, Run):
         folder = Path(run)
+        from morph_dslam.evaluation.run_report import plot_force, write_run_report
+
         (folder / "force_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
         plot_force(folder / "force_evaluation.png", error)
         write_run_report(folder, tracked)

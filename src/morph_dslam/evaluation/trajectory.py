@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -262,6 +261,8 @@ def plot_trajectory(
     path: Path, estimate: Trajectory, truth: Trajectory, absolute: AbsoluteError, relative: RelativeError
 ) -> None:
     """The path beside the truth, seen along its thinnest direction, and the errors over time."""
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(10.0, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.2])
     first, second = sorted(np.argsort(np.ptp(truth.positions, axis=0))[-2:])

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import qmc
 
 from morph_dslam.errors import ParameterError
 from morph_dslam.model.separated import Outside, SeparatedField
@@ -203,6 +202,8 @@ class ReducedModel:
 
         Unknown loads stay away.
         """
+        from scipy.stats import qmc  # loading it takes as long as all else that a model needs
+
         d = len(self.study_parameters)
         if not d:
             return self.default[None]

@@ -5,9 +5,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import cv2
-import matplotlib
 import numpy as np
-from matplotlib.ticker import MaxNLocator
 from numba import njit
 from numpy.typing import NDArray
 
@@ -67,6 +65,8 @@ BACKGROUND = 38
 @lru_cache
 def colour_table(name: str) -> NDArray[np.uint8]:
     """The 256 colours (256, 3) of a matplotlib colour map, as blue, green, red."""
+    import matplotlib  # it takes long to load, and not all who import this draw
+
     colours = matplotlib.colormaps[name](np.arange(256), bytes=True)
     return np.ascontiguousarray(colours[:, 2::-1])
 
@@ -140,5 +140,7 @@ def flat_colour_bar(
 
 def _ticks(low: float, high: float, scale: float) -> tuple[list[float], list[NDArray[np.uint8]]]:
     """Round values from ``low`` to ``high``, and each as text."""
+    from matplotlib.ticker import MaxNLocator
+
     ticks = [tick for tick in MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high) if low <= tick <= high]
     return ticks, [text_patch(f"{tick:.6g}", scale) for tick in ticks]

@@ -29,7 +29,6 @@ from morph_dslam.tracking.observability import one_value
 from morph_dslam.tracking.reactions import Reaction
 from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.run_notices import notices_of
-from morph_dslam.tracking.run_plots import write_plots
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.sinks import TrackedFrame
 
@@ -93,6 +92,8 @@ class RunFolder:
         save_camera(path / "camera.yaml", self._camera)
         summary = summarise(run, notices) | (facts or {}) | {"versions": _versions()}
         (path / "summary.json").write_text(json.dumps(summary, indent=2, default=str) + "\n")
+        from morph_dslam.tracking.run_plots import write_plots  # matplotlib takes long to load
+
         write_plots(path / "plots", run)
         return summary
 
