@@ -17,6 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.model.discrepancy import farthest_points
+from morph_dslam.tracking.patches import FAST
 
 Array = NDArray[np.float64]
 #: Places, as many as there may be, and how far the points of one reach, as a share of the object's diagonal.
@@ -35,6 +36,8 @@ AGAIN = 0.01
 IN_TURN = 5
 #: Earlier frames that are kept, and those of them that a frame is compared with.
 KEPT, COMPARED = 256, 9
+#: Points that are spread less than this across a line, in reaches, are in it.
+LEAST_WIDTH = 1e-4
 #: Points by whose displacement shapes are compared.
 SAMPLES = 40
 
@@ -89,7 +92,7 @@ class JumpDetector:
         apart = np.linalg.norm(self._places[:, None] - self._places, axis=2)
         self._near = (apart < self._reach).astype(int)
         self._samples = _spread(rest, SAMPLES)
-        self._shapes: list[Array] = []
+        self._shapes = np.empty((0, len(self._samples), 3))
         self._steps: list[Array] = []
         self._largest = 0.0
         self._in_turn = np.zeros(len(self._places), dtype=int)
@@ -114,7 +117,8 @@ class JumpDetector:
         if not len(self._places):
             return
         shape = displacement[self._samples]
-        away = np.linalg.norm(np.array(self._shapes).reshape(-1, *shape.shape) - shape, axis=2).mean(axis=1)
+        apart = self._shapes - shape
+        away = np.sqrt(np.einsum("fsk,fsk->fs", apart, apart)).mean(axis=1)
         if len(away):
             self._largest = max(self._largest, float(away[0]))
             if away[-1] <= AGAIN * self._largest:
@@ -129,10 +133,11 @@ class JumpDetector:
             # The deviation of a median is 1.25 times that of a mean, and the median distance 1.18 deviations.
             spread = 1.25 / 1.18 * np.median(np.linalg.norm(like - before, axis=3), axis=0) / np.sqrt(len(like))
             self._compare(np.linalg.norm(steps - before, axis=2), np.hypot(deviations, spread), px)
-        self._shapes.append(shape)
+        self._shapes = np.concatenate([self._shapes, shape[None]])
         self._steps.append(steps)
-        if len(self._shapes) > KEPT:  # the first shape stays: it is what displacements are measured from
-            del self._shapes[1::2], self._steps[1::2]
+        if len(self._steps) > KEPT:  # the first shape stays: it is what displacements are measured from
+            self._shapes = np.delete(self._shapes, np.s_[1::2], axis=0)
+            del self._steps[1::2]
 
     def _like(self, away: Array) -> Array:
         """The steps (f, k, d, 2) in earlier frames with nearly this shape, by how far ``away`` (h,) theirs are."""
@@ -182,51 +187,58 @@ def _fit_steps(rows, first, plane, values, usable, directions, least):
     own pattern is taken from that first (Frisch and Waugh, Econometrica 1, 1933)."""
     count, most = len(first) - 1, np.max(np.diff(first))
     steps, deviations = np.full((count, directions, 2), np.nan), np.full((count, directions), np.nan)
-    # A column of ones, the place's two coordinates, its two values, then the pattern of a step.
-    work = np.empty((most, 6))
+    # By rows: ones and the place's two coordinates, made orthonormal, then the two values, less what these explain.
+    work, sides = np.empty((5, most)), np.empty(most)
     for k in range(count):
         n = 0
         for m in range(first[k], first[k + 1]):
             if usable[rows[m]]:
-                work[n, 0], work[n, 1], work[n, 2] = 1.0, plane[m, 0], plane[m, 1]
-                work[n, 3], work[n, 4] = values[rows[m], 0], values[rows[m], 1]
+                work[0, n], work[1, n], work[2, n] = 1.0, plane[m, 0], plane[m, 1]
+                work[3, n], work[4, n] = values[rows[m], 0], values[rows[m], 1]
                 n += 1
         if n < 2 * least + 2:
             continue
-        inverse = np.linalg.inv(work[:n, :3].T.copy() @ work[:n, :3].copy() + 1e-9 * np.eye(3))
-        _take_plane(work, n, inverse, 3)
-        _take_plane(work, n, inverse, 4)
-        squares = 0.0
-        for i in range(n):
-            squares += work[i, 3] ** 2 + work[i, 4] ** 2
+        right, down = work[1, :n].copy(), work[2, :n].copy()
+        for row in range(5):
+            _take_from(work, n, row)
+        squares = _product(work[3], work[3], n) + _product(work[4], work[4], n)
         for d in range(directions):
             cosine, sine, ahead = np.cos(np.pi * d / directions), np.sin(np.pi * d / directions), 0
             for i in range(n):
-                in_front = work[i, 1] * cosine + work[i, 2] * sine > 0.0
-                work[i, 5] = 0.5 if in_front else -0.5
+                in_front = right[i] * cosine + down[i] * sine > 0.0
+                sides[i] = 0.5 if in_front else -0.5
                 ahead += in_front
             if min(ahead, n - ahead) < least:
                 continue
-            _take_plane(work, n, inverse, 5)
-            size, along_u, along_v = 0.0, 0.0, 0.0
-            for i in range(n):
-                size += work[i, 5] ** 2
-                along_u += work[i, 5] * work[i, 3]
-                along_v += work[i, 5] * work[i, 4]
+            # The values are free of the plane already: of the pattern only the size matters.
+            size = 0.25 * n
+            for row in range(3):
+                size -= _product(work[row], sides, n) ** 2
+            along_u, along_v = _product(work[3], sides, n), _product(work[4], sides, n)
             steps[k, d, 0], steps[k, d, 1] = along_u / size, along_v / size
             unexplained = max(squares - (along_u**2 + along_v**2) / size, 0.0) / (2 * (n - 4))
             deviations[k, d] = np.sqrt(unexplained / size)
     return steps, deviations
 
 
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _product(a, b, n):
+    """Sum of the products of the first ``n`` numbers."""
+    total = 0.0
+    for i in range(n):
+        total += a[i] * b[i]
+    return total
+
+
 @njit(cache=True, nogil=True)
-def _take_plane(work, n, inverse, column):
-    """Take the plane through the first ``n`` rows of a ``column`` from it, by the plane's inverse matrix (3, 3)."""
-    moments = np.zeros(3)
-    for i in range(n):
-        for a in range(3):
-            moments[a] += work[i, a] * work[i, column]
-    for i in range(n):
-        for a in range(3):
-            for b in range(3):
-                work[i, column] -= work[i, a] * inverse[a, b] * moments[b]
+def _take_from(work, n, row):
+    """Take the plane, which the first three rows span, from the first ``n`` numbers of a row; one of these becomes
+    a unit vector, or zero where all points are in a line."""
+    for other in range(min(row, 3)):
+        share = _product(work[other], work[row], n)
+        for i in range(n):
+            work[row, i] -= share * work[other, i]
+    if row < 3:
+        length = np.sqrt(_product(work[row], work[row], n))
+        for i in range(n):
+            work[row, i] *= 1.0 / length if length > LEAST_WIDTH else 0.0

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 
 from morph_dslam.errors import TrackingError
@@ -18,8 +17,8 @@ from morph_dslam.timing import stage
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
-from morph_dslam.tracking.measurement import PATCH_WINDOW, Measurement
-from morph_dslam.tracking.noise import Correlation, Observations, PointNoise, RigObservations, window_correlation
+from morph_dslam.tracking.measurement import PATCH_WINDOW, Followed, Measurement
+from morph_dslam.tracking.noise import Observations, PointNoise, RigObservations, block_diagonal, window_correlation
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outline import REACH_PX, OutlineMeasurement
@@ -115,16 +114,17 @@ class FrameEstimation:
         self._scout = Estimator(estimator.model, estimator.camera, brief)
         self._scout.loads = estimator.loads
 
-    def rough(self, followed: Measurement, start: State, prior: Prior | None) -> State:
+    def rough(self, followed: Followed, start: State, prior: Prior | None) -> State:
         """The state by what was followed from the previous frame; only a start for `correct`."""
         weights = followed.valid.astype(float)
         return self._scout.estimate(self._reference.points, followed.pixels, weights, start, prior=prior).state
 
-    def correct(
-        self, picture: Image, state: State, followed: Measurement | None, prior: Prior | None
-    ) -> PoseHypothesis:
-        """Measure against the reference view rendered in ``state`` and estimate from these measurements."""
-        measurement = self._reference.measure(picture, state, followed)
+    def correct(self, picture: Image, state: State, offsets: Array | None, prior: Prior | None) -> PoseHypothesis:
+        """Measure against the reference view rendered in ``state`` and estimate from these measurements.
+
+        ``offsets`` : see `ReferenceView.measure`.
+        """
+        measurement = self._reference.measure(picture, state, offsets)
         with stage("estimate"):
             return self._trimmed(measurement, state, prior)
 
@@ -298,16 +298,13 @@ class FrameEstimation:
         """
         points, pixels, weights = self._reference.points, attempt.measurement.pixels, attempt.weights
         normals, seen = np.zeros_like(pixels), attempt.outline
-        correlation: Correlation = np.zeros((0, 0))
-        if correlated:
-            correlation = window_correlation(pixels, PATCH_WINDOW)
+        correlation = window_correlation(pixels if correlated else pixels[:0], PATCH_WINDOW)
         if seen is not None:
             points = points.joined(seen.points)
             pixels, normals = np.concatenate([pixels, seen.pixels]), np.concatenate([normals, seen.normals])
             weights = np.concatenate([weights, seen.weights])
             if correlated:
-                blocks = [correlation, scipy.sparse.csr_array(self._balance.correlation(seen))]
-                correlation = scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))
+                correlation = block_diagonal([correlation, self._balance.correlation(seen)])
         return Observations(points, pixels, weights, normals, correlation, attempt.depths)
 
 

@@ -152,6 +152,10 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
 
 #: Pyramid levels that reach as far as a correction may: a quarter of the size, with windows of 17 pixels.
 CORRECTION_LEVELS = 2
+#: The same where it is known from the last frame how far points are from where the state has them.
+NEAR_LEVELS = 1
+#: Points that are followed from frame to frame, at most: for a state from which all of them are within reach.
+N_FOLLOWED = 200
 #: Patches compared are (2 PATCH_HALF + 1) pixels wide.
 PATCH_HALF = 7
 PATCH_WINDOW = 2 * PATCH_HALF + 1
@@ -161,6 +165,22 @@ LEAST_CORRELATION = 0.6
 LARGEST_CORRECTION_PX = 12.0
 #: A point this share of the object's depth behind the z-buffer counts as hidden.
 DEPTH_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class Followed:
+    """Points followed from the last frame to the next one.
+
+    Attributes
+    ----------
+    pixels : (p, 2) where they were found, or are expected.
+    valid : (p,) which were found.
+    offsets : (p, 2) pixels, how far from where the state has them they were in the last frame.
+    """
+
+    pixels: Array
+    valid: NDArray[np.bool_]
+    offsets: Array
 
 
 @dataclass(frozen=True)
@@ -206,7 +226,11 @@ def visible_surface(
 
 
 def compare_with_rendering(
-    frame: NDArray[np.uint8], rendering: Rendering, predicted: Array, guesses: Array, visible: NDArray[np.bool_]
+    frame: NDArray[np.uint8],
+    rendering: Rendering,
+    predicted: Array,
+    visible: NDArray[np.bool_],
+    offsets: Array | None = None,
 ) -> Measurement:
     """Follow points from the rendered reference view to the frame.
 
@@ -214,10 +238,14 @@ def compare_with_rendering(
     ----------
     frame : (h, w) the contrast-normalized frame
     predicted : (p, 2) where the rendering shows the points.
-    guesses : (p, 2) where to start looking for them in the frame.
+    visible : (p,) which of them can be seen.
+    offsets : (p, 2) how far from there they are about to be in the frame; None where that is not known.
     """
     rows = np.flatnonzero(visible)
-    found, ok = follow(rendering.image, frame, predicted[rows], guesses[rows], CORRECTION_LEVELS)
+    guesses, levels = predicted[rows], CORRECTION_LEVELS
+    if offsets is not None:
+        guesses, levels = guesses + offsets[rows], NEAR_LEVELS
+    found, ok = follow(rendering.image, frame, predicted[rows], guesses, levels)
     found, correlation, exactness = compare_patches(rendering.image, frame, predicted[rows], found, PATCH_HALF)
     correction = np.linalg.norm(found - predicted[rows], axis=1)
     ok &= (correction < LARGEST_CORRECTION_PX) & np.isfinite(exactness)

@@ -93,6 +93,10 @@ class Outline:
     Parameters
     ----------
     surface : what of the model is drawn.
+
+    Attributes
+    ----------
+    points : where it was looked for last (`N_POINTS`,).
     """
 
     def __init__(self, model: ReducedModel, camera: Camera, surface: DrawnSurface) -> None:
@@ -100,14 +104,10 @@ class Outline:
         self._triangles = np.ascontiguousarray(surface.model.triangles, dtype=np.int64)
         self._edges = SurfaceEdges.of(self._triangles)
         self._size = float(np.linalg.norm(np.ptp(surface.model.nodes, axis=0)))
-        self._slots = SurfacePoints(np.zeros(N_POINTS, dtype=np.int64), np.tile([1.0, 0.0, 0.0], (N_POINTS, 1)))
+        slots = SurfacePoints(np.zeros(N_POINTS, dtype=np.int64), np.tile([1.0, 0.0, 0.0], (N_POINTS, 1)))
+        self.points = BoundPoints.from_surface(model, slots)
         self._used = np.zeros(N_POINTS, dtype=bool)
         self._picture: _Picture | None = None
-
-    @property
-    def points(self) -> BoundPoints:
-        """Where it was looked for last (`N_POINTS`,)."""
-        return BoundPoints.from_surface(self._model, self._slots)
 
     @property
     def knows_brightness(self) -> bool:
@@ -176,9 +176,10 @@ class Outline:
     def _in_slots(self, contour: Contour, offsets: Array, state: State) -> OutlineMeasurement:
         """Points stay in the places of those that were near them last: what one errs by is then known as the same."""
         slots = self._assigned(contour, state)
-        triangles, weights = self._slots.triangles.copy(), self._slots.weights.copy()
+        triangles, weights = self.points.surface.triangles.copy(), self.points.surface.weights.copy()
         triangles[slots], weights[slots] = contour.points.triangles, contour.points.weights
-        self._slots, self._used = SurfacePoints(triangles, weights), np.zeros(N_POINTS, dtype=bool)
+        self.points = BoundPoints.from_surface(self._model, SurfacePoints(triangles, weights))
+        self._used = np.zeros(N_POINTS, dtype=bool)
         self._used[slots] = True
         found = np.zeros(N_POINTS)
         found[slots] = np.isfinite(offsets)
@@ -192,16 +193,38 @@ class Outline:
         """The place of each point (k,): that of the one before it is nearest to, or a free one."""
         slots = np.full(len(contour), -1)
         if self._used.any() and len(contour):
-            before = np.flatnonzero(self._used)
-            points = BoundPoints.from_surface(self._model, self._slots.take(before))
-            places = np.nan_to_num(self._camera.project(points.in_camera(state)), nan=1e9)
-            squared = sum((a[:, None] - b[None]) ** 2 for a, b in zip(contour.pixels.T, places.T, strict=True))
-            nearest = np.asarray(squared).argmin(axis=1)
-            mutual = np.asarray(squared).argmin(axis=0)[nearest] == np.arange(len(contour))
-            slots[mutual] = before[nearest[mutual]]
-        free = np.setdiff1d(np.arange(N_POINTS), slots)
-        slots[slots < 0] = free[: (slots < 0).sum()]
+            places = self._camera.project(self.points.in_camera(state))
+            slots = nearest_to_each_other(contour.pixels, np.where(self._used[:, None], places, np.nan))
+        is_free = np.ones(N_POINTS, dtype=bool)
+        is_free[slots[slots >= 0]] = False
+        slots[slots < 0] = np.flatnonzero(is_free)[: (slots < 0).sum()]
         return slots
+
+
+@njit(cache=True, nogil=True)
+def nearest_to_each_other(first, second):
+    """The row (n,) of the nearest of ``second`` (m, 2), NaN for none, to each of ``first`` (n, 2) which is also the
+    nearest to that one; -1 where there is none."""
+    nearest, to_other = np.full(len(first), -1), np.full(len(second), -1)
+    squared = np.full(len(second), np.inf)
+    for i in range(len(first)):
+        least = np.inf
+        for j in range(len(second)):
+            distance = (first[i, 0] - second[j, 0]) ** 2 + (first[i, 1] - second[j, 1]) ** 2
+            if distance < least:
+                least, nearest[i] = distance, j
+            if distance < squared[j]:
+                squared[j], to_other[j] = distance, i
+    for i in range(len(first)):
+        if nearest[i] >= 0 and to_other[nearest[i]] != i:
+            nearest[i] = -1
+    return nearest
+
+
+@njit(cache=True, nogil=True)
+def _volume(a, b, c):
+    """Product (a, b, c) of three vectors (3,)."""
+    return a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
 
 
 @njit(cache=True, nogil=True)
@@ -226,13 +249,12 @@ def look_up(pixels, ids, triangles, nodes, known_nodes, known_depth, known_grey,
         ray[2] = 1.0
         # Where the ray meets the plane: a combination of the corners whose weights add up to 1.
         p, q, s = nodes[a], nodes[b], nodes[c]
-        weights = np.array([np.dot(ray, np.cross(q, s)), np.dot(ray, np.cross(s, p)), np.dot(ray, np.cross(p, q))])
-        total = weights.sum()
+        first, second, third = _volume(ray, q, s), _volume(ray, s, p), _volume(ray, p, q)
+        total = first + second + third
         if not abs(total) > 0.0:
             continue
-        weights /= total
         for k in range(3):
-            there[k] = weights[0] * known_nodes[a, k] + weights[1] * known_nodes[b, k] + weights[2] * known_nodes[c, k]
+            there[k] = (first * known_nodes[a, k] + second * known_nodes[b, k] + third * known_nodes[c, k]) / total
         if not there[2] > 0.0:
             continue
         x = int(np.rint(intrinsics[0] * there[0] / there[2] + intrinsics[2]))

@@ -9,6 +9,7 @@ mistaken for thus lowers its weight, and texture that agrees badly with the mode
 from __future__ import annotations
 
 import numpy as np
+import scipy.sparse
 from numba import njit
 from numpy.typing import NDArray
 
@@ -99,11 +100,10 @@ class OutlineBalance:
         ours = self.outline.redundancy * max(self.outline.variance, LEAST_SPREAD_PX**2)
         return self.texture.redundancy * self.texture.variance / ours
 
-    def correlation(self, seen: OutlineMeasurement) -> Array:
+    def correlation(self, seen: OutlineMeasurement) -> scipy.sparse.csr_array:
         """Of the errors (p, p) of the outline's points; those that do not count have none in common."""
-        apart = sum((a[:, None] - a[None]) ** 2 for a in seen.pixels.T)
-        alike = np.exp(-np.sqrt(np.asarray(apart)) / self.outline.length)
-        return np.where(np.outer(seen.valid, seen.valid), alike, np.eye(len(alike)))
+        count = len(seen.pixels)
+        return scipy.sparse.csr_array(_alike(seen.pixels, seen.valid, self.outline.length), shape=(count, count))
 
     def agreeing(self, residuals: Array) -> NDArray[np.bool_]:
         """Which of the outline's points (p,) agree with an estimate that leaves these residuals (p, 2)."""
@@ -145,6 +145,28 @@ class OutlineBalance:
     def learn_texture(self, pixels: Array, residuals: Array, sigma_px: float) -> None:
         """Take in the residuals (p, 2) of the points at ``pixels`` (p, 2) that agree, and their robust spread."""
         self.texture.learn(pixels, residuals, sigma_px**2)
+
+
+@njit(cache=True, nogil=True)
+def _alike(pixels, counts, length):
+    """Values, columns and beginnings of the rows of exp(-d / length) of pairs that count, and ones on the diagonal."""
+    rows = np.flatnonzero(counts)
+    begins = np.zeros(len(pixels) + 1, np.int32)
+    for i in range(len(pixels)):
+        begins[i + 1] = begins[i] + (len(rows) if counts[i] else 1)
+    values, columns = np.ones(begins[-1]), np.empty(begins[-1], np.int32)
+    for i in range(len(pixels)):
+        if not counts[i]:
+            columns[begins[i]] = i
+    for a in range(len(rows)):
+        i = rows[a]
+        columns[begins[i] + a] = i
+        for b in range(a):
+            j = rows[b]
+            alike = np.exp(-np.hypot(pixels[i, 0] - pixels[j, 0], pixels[i, 1] - pixels[j, 1]) / length)
+            values[begins[i] + b] = values[begins[j] + a] = alike
+            columns[begins[i] + b], columns[begins[j] + a] = j, i
+    return values, columns, begins
 
 
 @njit(cache=True, nogil=True)

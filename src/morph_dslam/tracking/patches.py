@@ -21,19 +21,26 @@ Array = NDArray[np.float64]
 LONGEST_STEP = 1.0
 #: Sums may be taken in any order: half the time.
 FAST = {"reassoc", "contract", "nsz"}
+#: Grey level of a pixel that equals its neighbourhood's mean.
+NEUTRAL = 128
+
+_F32 = np.float32
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def _patch(image, x, y, patch):
-    """Fill a patch (n, n) with the image about it, its first pixel at (x, y), bilinearly."""
-    x0, y0 = int(x), int(y)
-    right, down = x - x0, y - y0
-    a, b = (1.0 - right) * (1.0 - down), right * (1.0 - down)
-    c, d = (1.0 - right) * down, right * down
-    for row in range(patch.shape[0]):
-        for column in range(patch.shape[1]):
-            u, v = x0 + column, y0 + row
-            patch[row, column] = a * image[v, u] + b * image[v, u + 1] + c * image[v + 1, u] + d * image[v + 1, u + 1]
+    """Fill a patch (n, n) with the image about it less `NEUTRAL`, its first pixel at (x, y), bilinearly."""
+    size, x0, y0 = len(patch), int(x), int(y)
+    right, down = _F32(x - x0), _F32(y - y0)
+    left, up = _F32(1.0) - right, _F32(1.0) - down
+    for row in range(size):
+        # Slices, whose indices begin at zero, are what the compiler vectorizes.
+        above, below = image[y0 + row, x0 : x0 + size + 1], image[y0 + row + 1, x0 : x0 + size + 1]
+        line = patch[row]
+        for column in range(size):
+            first = left * _F32(above[column]) + right * _F32(above[column + 1])
+            second = left * _F32(below[column]) + right * _F32(below[column + 1])
+            line[column] = up * first + down * second - _F32(NEUTRAL)
 
 
 @njit(cache=True, nogil=True)
@@ -53,16 +60,17 @@ def _both_patches(first, second, first_point, second_point, half, a, b):
 @njit(cache=True, nogil=True, fastmath=FAST)
 def _products(a, b, first_row, first_column, size):
     """Of parts (size, size) of two patches: sums of squares about their means, and of products."""
-    sum_a = sum_b = aa = bb = ab = 0.0
+    sum_a = sum_b = aa = bb = ab = _F32(0.0)
     for row in range(first_row, first_row + size):
-        for column in range(first_column, first_column + size):
-            p, q = a[row, column] - 128.0, b[row, column] - 128.0
+        ours, theirs = a[row, first_column : first_column + size], b[row, first_column : first_column + size]
+        for column in range(size):
+            p, q = ours[column], theirs[column]
             sum_a += p
             sum_b += q
             aa += p * p
             bb += q * q
             ab += p * q
-    count = float(size * size)
+    count = _F32(size * size)
     return aa - sum_a * sum_a / count, bb - sum_b * sum_b / count, ab - sum_a * sum_b / count
 
 
@@ -81,7 +89,7 @@ def patch_correlation(first, second, first_points, second_points, half):
     (p,) normalised, in [-1, 1]; -1 where a patch leaves its image, 0 where one has no contrast.
     """
     correlation, size = np.full(len(first_points), -1.0), 2 * half + 1
-    a, b = np.empty((size, size)), np.empty((size, size))
+    a, b = np.empty((size, size), _F32), np.empty((size, size), _F32)
     for j in range(len(first_points)):
         if _both_patches(first, second, first_points[j], second_points[j], half, a, b):
             aa, bb, ab = _products(a, b, 0, 0, size)
@@ -108,23 +116,49 @@ def _normal_equations(a, b, half, sums, products):
     Of four signals, the slopes to the right and down, the first patch, and the second less the first:
     ``sums`` (4, 3) of each times 1, x and y, and ``products`` (4, 4), the upper half.
     """
+    size, quarter = 2 * half + 1, _F32(0.25)
     sums[:] = 0.0
     products[:] = 0.0
-    signals = np.empty(4)
-    for row in range(1, 2 * half + 2):
-        y = float(row - half - 1)
-        for column in range(1, 2 * half + 2):
-            x = float(column - half - 1)
-            signals[0] = 0.25 * (a[row, column + 1] - a[row, column - 1] + b[row, column + 1] - b[row, column - 1])
-            signals[1] = 0.25 * (a[row + 1, column] - a[row - 1, column] + b[row + 1, column] - b[row - 1, column])
-            signals[2] = a[row, column] - 128.0
-            signals[3] = b[row, column] - a[row, column]
-            for i in range(4):
-                sums[i, 0] += signals[i]
-                sums[i, 1] += signals[i] * x
-                sums[i, 2] += signals[i] * y
-                for j in range(i, 4):
-                    products[i, j] += signals[i] * signals[j]
+    for row in range(size):
+        first, second, left, right = a[row + 1], b[row + 1], a[row + 1, 2:], b[row + 1, 2:]
+        above, below, over, under = a[row], a[row + 2], b[row], b[row + 2]
+        s0 = s1 = s2 = s3 = x0 = x1 = x2 = x3 = _F32(0.0)
+        p00 = p01 = p02 = p03 = p11 = p12 = p13 = p22 = p23 = p33 = _F32(0.0)
+        for column in range(size):
+            grey = first[column + 1]
+            across = quarter * (left[column] - first[column] + right[column] - second[column])
+            along = quarter * (below[column + 1] - above[column + 1] + under[column + 1] - over[column + 1])
+            change, x = second[column + 1] - grey, _F32(column - half)
+            s0 += across
+            s1 += along
+            s2 += grey
+            s3 += change
+            x0 += across * x
+            x1 += along * x
+            x2 += grey * x
+            x3 += change * x
+            p00 += across * across
+            p01 += across * along
+            p02 += across * grey
+            p03 += across * change
+            p11 += along * along
+            p12 += along * grey
+            p13 += along * change
+            p22 += grey * grey
+            p23 += grey * change
+            p33 += change * change
+        y = float(row - half)
+        for i, (total, moment) in enumerate(((s0, x0), (s1, x1), (s2, x2), (s3, x3))):
+            sums[i, 0] += total
+            sums[i, 1] += moment
+            sums[i, 2] += total * y
+        for j, product in enumerate((p00, p01, p02, p03)):
+            products[0, j] += product
+        for j, product in enumerate((p11, p12, p13)):
+            products[1, j + 1] += product
+        products[2, 2] += p22
+        products[2, 3] += p23
+        products[3, 3] += p33
 
 
 @njit(cache=True, nogil=True)
@@ -183,7 +217,7 @@ def compare_patches(first, second, first_points, second_points, half):
     """
     count, size = len(first_points), 2 * half + 1
     places, correlation, spread = second_points.copy(), np.full(count, -1.0), np.full(count, np.inf)
-    a, b = np.empty((size + 2, size + 2)), np.empty((size + 2, size + 2))
+    a, b = np.empty((size + 2, size + 2), _F32), np.empty((size + 2, size + 2), _F32)
     sums, products, step = np.empty((4, 3)), np.empty((4, 4)), np.empty(2)
     for j in range(count):
         if not _both_patches(first, second, first_points[j], second_points[j], half + 1, a, b):
@@ -198,8 +232,6 @@ def compare_patches(first, second, first_points, second_points, half):
     return places, correlation, spread
 
 
-#: Grey level of a pixel that equals its neighbourhood's mean.
-NEUTRAL = 128
 #: What is finer than this, pixels, is smoothed away where texture is distinguished from noise.
 TEXTURE_SCALE_PX = 1.5
 #: Lucas-Kanade's window, pixels, and pyramid levels above the image itself.

@@ -297,10 +297,11 @@ class ReferenceView:
         """This view as it should appear in a state, contrast-normalized."""
         return self.appearance.render(view_of(self.surface.model, self._estimator.camera, state))
 
-    def measure(self, picture: Image, state: State, followed: Measurement | None) -> Measurement:
+    def measure(self, picture: Image, state: State, offsets: Array | None) -> Measurement:
         """Where a frame shows the points, compared with this view rendered in ``state``.
 
-        ``followed`` says where to look first; None where nothing is known but the state.
+        ``offsets`` (p, 2) says how far from there, pixels, the points are about to be; None where nothing is known but
+        the state.
         """
         drawn, camera = self.surface.model, self._estimator.camera
         with stage("render"):
@@ -316,10 +317,7 @@ class ReferenceView:
                 tolerance = DEPTH_TOLERANCE * float(np.median(positions[:, 2]))
                 visible &= visible_points(predicted, positions[:, 2], picture.occluder_depth, tolerance)
             visible &= foreshortening(view, drawn.triangles[self.points.surface.triangles]) >= self._least_broadness
-            guesses = predicted
-            if followed is not None:
-                guesses = np.where(followed.valid[:, None], followed.pixels, predicted)
-            return compare_with_rendering(picture.normalized, rendering, predicted, guesses, visible)
+            return compare_with_rendering(picture.normalized, rendering, predicted, visible, offsets)
 
     def _draw(self, meshes: Sequence[View]) -> tuple[list[NDArray[np.uint8]], float]:
         """Make the texture.

@@ -26,7 +26,7 @@ from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetect
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
 from morph_dslam.tracking.frame_estimation import at_constant_velocity, new_filter, with_unobservable_at_default
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
-from morph_dslam.tracking.measurement import Measurement
+from morph_dslam.tracking.measurement import N_FOLLOWED, Followed
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import (
     CameraLost,
@@ -234,19 +234,21 @@ class Tracker:
             return self._still
         return self._anchoring.prior(camera.pose_prior)
 
-    def _follow(self, image: Image, prior: Prior | None) -> Measurement | None:
-        """Follow the points that supported the previous frame's estimate from there; None after a loss."""
+    def _follow(self, image: Image, prior: Prior | None) -> Followed | None:
+        """Follow some of the points that supported the previous frame's estimate from there; None after a loss."""
         if self._lost or self.reference.outline_alone:
             return None
         with stage("flow"):
             rows = np.flatnonzero(self._supported)
-            guesses = self._pixels + self._expected_motion(prior)
+            rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), N_FOLLOWED)).astype(np.int64)]
+            last = self.reference.projected(self._last)
+            guesses = self._pixels + self._expected_motion(last, prior)
             found, ok = follow(self._image.normalized, image.normalized, self._pixels[rows], guesses[rows])
             pixels, valid = guesses, np.zeros(len(guesses), dtype=bool)
             pixels[rows], valid[rows] = found, ok
-            return Measurement(pixels, valid, self._supported, np.ones(len(pixels)))
+            return Followed(pixels, valid, np.nan_to_num(self._pixels - last))
 
-    def _match(self, image: Image, followed: Measurement | None, prior: Prior | None) -> PoseHypothesis:
+    def _match(self, image: Image, followed: Followed | None, prior: Prior | None) -> PoseHypothesis:
         """Compare with the rendered reference view and solve for pose and parameters."""
         estimation = self._view.estimation
         if self.reference.outline_alone:
@@ -261,7 +263,7 @@ class Tracker:
         else:
             with stage("estimate"):
                 start = estimation.rough(followed, self._start, prior)
-            hypothesis = estimation.correct(image, start, followed, prior)
+            hypothesis = estimation.correct(image, start, followed.offsets, prior)
         return hypothesis
 
     def _search(self, hypothesis: PoseHypothesis) -> PoseHypothesis:
@@ -472,9 +474,11 @@ class Tracker:
         normalized = normalize_contrast(grey)  # type: ignore[arg-type]
         return Image(grey, normalized)  # type: ignore[arg-type]
 
-    def _expected_motion(self, prior: Prior | None) -> Array:
-        """Image motion (p, 2) by the map, or at the velocity of two frames; only a first guess."""
-        last = self.reference.projected(self._last)
+    def _expected_motion(self, last: Array, prior: Prior | None) -> Array:
+        """Image motion (p, 2) by the map, or at the velocity of two frames; only a first guess.
+
+        ``last`` (p, 2) is where the points were in the last state.
+        """
         if prior is not None and prior is not self._still:
             return np.nan_to_num(self.reference.projected(prior.placed(self._last)) - last)
         return np.nan_to_num(last - self.reference.projected(self._velocity_base))
