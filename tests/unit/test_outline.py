@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
@@ -12,7 +13,8 @@ from morph_dslam.meshing.generators import block
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.tracking.binding import DrawnSurface
 from morph_dslam.tracking.estimator import State, moved
-from morph_dslam.tracking.outline import Outline
+from morph_dslam.tracking.outline import Outline, nearest_to_each_other
+from morph_dslam.tracking.outline_weight import OutlineBalance
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.bent_tube import polynomial
 
@@ -153,6 +155,28 @@ def test_wrong_brightness_inside_is_not_taken_for_the_sheet(model):
     outline = outline_of(model, drawn(model, state), state)
     assert not outline.measure(drawn(model, state, inner=100, outer=20), state, 14).valid.any()
     assert not outline.measure(np.full((480, 640), 210, np.uint8), state, 14).valid.any()
+
+
+def test_errors_of_the_outline_are_alike_by_distance_where_points_count(model):
+    state = State(model.default, POSE)
+    seen = outline_of(model, drawn(model, state), state).measure(drawn(model, state), state, 6)
+    seen = seen.weighted(1.0, np.arange(len(seen.pixels)) % 3 > 0)
+    balance, counts = OutlineBalance(), np.flatnonzero(seen.valid)
+    correlation = balance.correlation(seen).toarray()
+    apart = np.linalg.norm(seen.pixels[counts, None] - seen.pixels[counts], axis=2)
+    np.testing.assert_allclose(correlation[np.ix_(counts, counts)], np.exp(-apart / balance.outline.length), atol=1e-15)
+    others = np.setdiff1d(np.arange(len(seen.pixels)), counts)
+    np.testing.assert_array_equal(correlation[others], np.eye(len(correlation))[others])
+
+
+def test_places_are_matched_that_are_nearest_to_each_other():
+    first, second = np.random.default_rng(3).uniform(0.0, 50.0, (2, 40, 2))
+    ahead, back = np.asarray(KDTree(second).query(first)[1]), np.asarray(KDTree(first).query(second)[1])
+    expected = np.where(back[ahead] == np.arange(40), ahead, -1)
+    assert 10 < (expected >= 0).sum() < 40
+    np.testing.assert_array_equal(nearest_to_each_other(first, second), expected)
+    gone = np.where(np.arange(40)[:, None] % 2 == 0, second, np.nan)
+    assert not set(nearest_to_each_other(first, gone)) & set(range(1, 40, 2))
 
 
 def _to_segments(point: np.ndarray, segments: np.ndarray) -> float:

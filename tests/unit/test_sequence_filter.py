@@ -4,12 +4,13 @@ from functools import partial
 
 import numpy as np
 import pytest
+import scipy.sparse
 
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
 from morph_dslam.registration.registration import PosePrior
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, Prior, State, moved
-from morph_dslam.tracking.noise import window_correlation
+from morph_dslam.tracking.noise import block_diagonal, window_correlation
 from morph_dslam.tracking.sequence_filter import PointChange, SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points, measured
@@ -204,6 +205,12 @@ def test_windows_correlate_by_what_they_share():
     np.testing.assert_allclose(window_correlation(many, 17).toarray(), shared, atol=1e-12)
     pixels[1] = np.nan
     np.testing.assert_array_equal(window_correlation(pixels, 10).toarray()[1], np.eye(4)[1])
+
+
+def test_matrices_along_a_diagonal_are_those_of_scipy():
+    rng = np.random.default_rng(0)
+    blocks = [window_correlation(rng.uniform(0.0, 60.0, (count, 2)), 17) for count in (5, 0, 30, 1)]
+    np.testing.assert_array_equal(block_diagonal(blocks).toarray(), scipy.sparse.block_diag(blocks).toarray())
 
 
 def test_points_measured_less_exactly_count_by_their_weights():
