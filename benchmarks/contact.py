@@ -1,12 +1,14 @@
-"""Contact: Hertz's sphere, a seal whose folds touch, and what kinks cost a reduced model.
+"""Contact: Hertz's sphere, a ring beside CalculiX, a seal whose folds touch, and what kinks cost a reduced model.
 
 The seal is half of examples/boot_seal with coarser cells, turned by 52 degrees with and without contact of its surfaces
-with themselves; its depth is that of the deepest node that the certificate would name.
+with themselves; its depth is that of the deepest node that the certificate would name. The ring's figure is the largest
+deviation of its force from CalculiX's, which peers/calculix_ring.py computes.
 Run: python benchmarks/contact.py
 """
 
 from __future__ import annotations
 
+import tempfile
 import time
 import tomllib
 from dataclasses import replace
@@ -24,9 +26,11 @@ from morph_dslam.extend.mechanics import (
     block,
     fixed,
     model_mesh_of,
+    save_mesh,
 )
 from morph_dslam.extend.reduction import penetration_report
 from morph_dslam.extend.studies import Snapshot, SolidStudy
+from peers import calculix_ring
 
 SEAL = Path(__file__).resolve().parents[1] / "examples" / "boot_seal" / "study.toml"
 YOUNG, POISSON, RADIUS, DEPTH = 1e6, 0.3, 1.0, 0.0025
@@ -51,6 +55,23 @@ def hertz(cells: int) -> tuple[float, float]:
     centre = np.argmin(np.linalg.norm(mesh.nodes - [0.0, 0.0, 1.0], axis=1))
     peak = -problem.sample(state.dofs, state.mu)["stress"][centre, 2]
     return np.sqrt(5.0 * square) / radius, peak / (3.0 * force / (2.0 * np.pi * radius**2))
+
+
+def ring() -> float:
+    """Largest deviation (%) of the force on a ring that touches itself from CalculiX's."""
+    with tempfile.TemporaryDirectory() as name:
+        mesh = Path(name) / "ring.inp"
+        save_mesh(mesh, calculix_ring.half_ring(), "mm")
+        made = md.make_study(calculix_ring.study(mesh))
+        assert isinstance(made, SolidStudy)
+        problem = made.problem()
+    state, deviations = problem.initial_state(), []
+    for push, expected in calculix_ring.REFERENCE:
+        state = advance(problem, state, np.array([push / 1e3]))[-1]
+        force = -problem.reactions(state.dofs, state.mu, "end")[0][1]
+        deviations.append(100.0 * abs(force / expected - 1.0))
+        print(f"ring pushed by {push} mm: {force:.5f} N, CalculiX {expected:.5f} N", flush=True)
+    return max(deviations)
 
 
 def seal(contact: bool) -> tuple[float, float]:
@@ -102,12 +123,13 @@ def reduced(first: str) -> tuple[float, float]:
 def main() -> None:
     radius, peak = hertz(16)
     print(f"hertz: radius {radius:.4f}, peak pressure {peak:.4f} of the closed form's", flush=True)
+    from_calculix = ring()
     touching, coming = reduced("3 mm"), reduced("-4 mm")
     for where, (mean, share) in {"in contact": touching, "from 4 mm above": coming}.items():
         print(f"reduced model, {where}: {mean:.3f} mm in the mean, {share:.1f} %", flush=True)
     (deepest, without), (depth, seconds) = seal(False), seal(True)
     print(
-        f"hertz_radius={radius:.4f} hertz_peak={peak:.4f} seal_depth_mm={depth:.4f} "
+        f"hertz_radius={radius:.4f} hertz_peak={peak:.4f} ring_percent={from_calculix:.2f} seal_depth_mm={depth:.4f} "
         f"seal_depth_without_mm={deepest:.3f} time_ratio={seconds / without:.2f} "
         f"reduced_percent={touching[1]:.1f} reduced_from_above_percent={coming[1]:.1f}"
     )

@@ -304,10 +304,11 @@ BENCHMARKS = {
     ),
     "contact": Benchmark(
         "Mechanics",
-        "Contact: Hertz, a seal that touches itself, and what kinks cost",
+        "Contact: Hertz, a ring and a seal that touch themselves, and what kinks cost",
         "python benchmarks/contact.py",
-        "Hertz's closed form; depths by the check of the certificate; finite element solutions for the reduced models",
-        lines=5,
+        "Hertz's closed form; CalculiX on the same mesh for the ring; depths by the check of the certificate; finite "
+        "element solutions for the reduced models",
+        lines=10,
         about="The reduced models, of 40 solutions each, are of a ball that presses at any place on a block of coarse "
         "cells, once always touching and once from 4 mm above it.",
     ),
