@@ -45,6 +45,11 @@ def test_sensitivity_to_the_angle_is_that_of_finite_differences():
         np.testing.assert_allclose(slopes[k], difference, atol=1e-9)
 
 
+def test_only_products_that_count_are_kept():
+    """Of 2 functions and 1 + 2 h harmonics two products make all of this field: z² cos and z² sin, times the load."""
+    assert with_revolution_angle(bent_tube(), AXIS).displacement.n_modes == 2
+
+
 def test_a_turned_model_is_kept_in_a_file(tmp_path):
     turned = with_revolution_angle(bent_tube(), AXIS)
     save_model(tmp_path / "turned.morph", turned)

@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.distance import cdist
 
 from morph_dslam.geometry import fit_similarity
 from morph_dslam.model.field_storage import read_array
@@ -72,7 +73,7 @@ class DiscrepancyBasis:
 
     def _covariance(self, positions: Array) -> Array:
         """Matern 5/2 of the distances to the centres (n, m)."""
-        distance = np.linalg.norm(positions[:, None] - self.centres[None], axis=2)
+        distance = cdist(positions, self.centres)
         scaled = np.sqrt(5.0) * distance / self.length
         return (1.0 + scaled + scaled**2 / 3.0) * np.exp(-scaled) + JITTER * (distance == 0.0)
 

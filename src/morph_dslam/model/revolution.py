@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.errors import ModelFileError
 from morph_dslam.model.basis_functions import fourier_basis
+from morph_dslam.model.functions import Functions
 from morph_dslam.model.reduced_model import Parameter, ReducedModel
 from morph_dslam.model.separated import SeparatedField
 from morph_dslam.model.tensor_functions import CPFunctions, ProductFunctions
@@ -31,6 +32,9 @@ NODE_TOLERANCE = 1e-5
 #: Harmonics of the angle are kept until they leave out less than this part of a mode.
 HARMONICS_LEFT_OUT = 1e-3
 MOST_HARMONICS = 12
+#: Products of a function and a harmonic that are this part of the largest one, all together, are left out; how large a
+#: function becomes is seen at so many states.
+PRODUCTS_LEFT_OUT, SAMPLES = 2e-3, 256
 
 
 def with_revolution_angle(model: ReducedModel, direction: Array, name: str = "turn") -> ReducedModel:
@@ -122,8 +126,9 @@ def _turned(field: SeparatedField, images: NDArray[np.int64], direction: Array, 
     basis, modes = fourier_basis(0.0, 2.0 * np.pi, kept), modes[:, : 1 + 2 * kept]
     unit = np.eye(basis.size)
     around = CPFunctions((basis,), (unit,), unit)
-    functions = ProductFunctions(field.functions, around)
-    return SeparatedField(np.ascontiguousarray(modes).reshape(-1, *field.modes.shape[1:]), functions)
+    needed = _products_needed(field.functions, modes)
+    functions = ProductFunctions(field.functions, around).mixed(np.eye(modes.shape[0] * modes.shape[1])[:, needed])
+    return SeparatedField(modes.reshape(-1, *field.modes.shape[1:])[needed], functions)
 
 
 def _harmonics_needed(modes: Array) -> int:
@@ -134,6 +139,27 @@ def _harmonics_needed(modes: Array) -> int:
     beyond = np.sqrt(np.cumsum(energy[:, ::-1], axis=1)[:, ::-1] / total).max(axis=0)
     small = np.flatnonzero(beyond[1::2] <= HARMONICS_LEFT_OUT)
     return int(small[0]) if small.size else modes.shape[1] // 2
+
+
+def _products_needed(functions: Functions, modes: Array) -> NDArray[np.int64]:
+    """Which products (k,) of a function and a harmonic, in order, have more than a small part of the field.
+
+    Without the others it differs by less than `PRODUCTS_LEFT_OUT` of the largest one, wherever and at whatever
+    parameters, because no harmonic is larger than one.
+
+    Parameters
+    ----------
+    modes : (m, 1 + 2 h, ...) of each product.
+    """
+    lower, upper = (np.where(np.isfinite(ends), ends, 0.0) for ends in functions.bounds)
+    shares = np.random.default_rng(0).random((SAMPLES, functions.dimension))
+    states = np.concatenate([[lower, upper], lower + shares * (upper - lower)])
+    largest = np.max([np.abs(functions.rows(state)[0]) for state in states], axis=0)
+    parts = modes.reshape(*modes.shape[:2], -1)
+    sizes = (largest[:, None] * np.maximum(parts.max(axis=2), -parts.min(axis=2))).ravel()
+    order = np.argsort(sizes)
+    small = np.cumsum(sizes[order]) <= PRODUCTS_LEFT_OUT * sizes.max()
+    return np.sort(order[~small])
 
 
 #: Pairs of axes of the components of a symmetric tensor: xx, yy, zz, yz, xz, xy.

@@ -128,11 +128,14 @@ class JumpDetector:
         steps, deviations = _fit_steps(self._rows, self._first, self._plane, values, usable, DIRECTIONS, LEAST_POINTS)
         steps, deviations = px * steps, px * deviations
         like = self._like(away)
-        if len(like) >= LEAST_LIKE:
+        least = max(self._limit, LEAST_PX * px)
+        if len(like) >= LEAST_LIKE and np.sqrt(2.0) * (_largest(steps) + _largest(like)) < least:
+            self._in_turn[:] = 0  # no difference of these is large enough
+        elif len(like) >= LEAST_LIKE:
             before = np.median(like, axis=0)
             # The deviation of a median is 1.25 times that of a mean, and the median distance 1.18 deviations.
             spread = 1.25 / 1.18 * np.median(np.linalg.norm(like - before, axis=3), axis=0) / np.sqrt(len(like))
-            self._compare(np.linalg.norm(steps - before, axis=2), np.hypot(deviations, spread), px)
+            self._compare(np.linalg.norm(steps - before, axis=2), np.hypot(deviations, spread), least)
         self._shapes = np.concatenate([self._shapes, shape[None]])
         self._steps.append(steps)
         if len(self._steps) > KEPT:  # the first shape stays: it is what displacements are measured from
@@ -145,9 +148,9 @@ class JumpDetector:
         chosen = np.unique(np.linspace(0, len(rows) - 1, min(COMPARED, len(rows))).astype(int))
         return np.array([self._steps[k] for k in rows[chosen]])
 
-    def _compare(self, change: Array, deviations: Array, px: float) -> None:
-        """Note the places at which steps have changed (k, d) by more than steps of these ``deviations`` do."""
-        least = max(self._limit, LEAST_PX * px)
+    def _compare(self, change: Array, deviations: Array, least: float) -> None:
+        """Note the places at which steps have changed (k, d) by ``least``, and by more than steps of these deviations
+        do."""
         with np.errstate(invalid="ignore"):
             sizes = np.where(change > LEAST_DEVIATIONS * deviations, change, 0.0).max(axis=1)
         # A line has several places along it, at which the step is about as large.
@@ -155,6 +158,11 @@ class JumpDetector:
         self._in_turn = np.where(self._near @ (jumps > 0.0) > 0, self._in_turn + 1, 0)
         found = (self._in_turn >= IN_TURN) & (jumps > 0.0)
         self._sizes[found] = np.maximum(self._sizes[found], jumps[found])
+
+
+def _largest(numbers: Array) -> float:
+    """The largest absolute value; what is not a number does not count."""
+    return float(np.fmax.reduce(np.abs(numbers), axis=None, initial=0.0))
 
 
 def _spread(points: Array, most: int) -> NDArray[np.int64]:

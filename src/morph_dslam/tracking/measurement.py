@@ -152,8 +152,6 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
 
 #: Pyramid levels that reach as far as a correction may: a quarter of the size, with windows of 17 pixels.
 CORRECTION_LEVELS = 2
-#: The same where it is known from the last frame how far points are from where the state has them.
-NEAR_LEVELS = 1
 #: Points that are followed from frame to frame, at most: for a state from which all of them are within reach.
 N_FOLLOWED = 200
 #: Patches compared are (2 PATCH_HALF + 1) pixels wide.
@@ -234,6 +232,8 @@ def compare_with_rendering(
 ) -> Measurement:
     """Follow points from the rendered reference view to the frame.
 
+    Where it is known about where they are, they are looked for right there first.
+
     Parameters
     ----------
     frame : (h, w) the contrast-normalized frame
@@ -241,18 +241,22 @@ def compare_with_rendering(
     visible : (p,) which of them can be seen.
     offsets : (p, 2) how far from there they are about to be in the frame; None where that is not known.
     """
-    rows = np.flatnonzero(visible)
-    guesses, levels = predicted[rows], CORRECTION_LEVELS
-    if offsets is not None:
-        guesses, levels = guesses + offsets[rows], NEAR_LEVELS
-    found, ok = follow(rendering.image, frame, predicted[rows], guesses, levels)
-    found, correlation, exactness = compare_patches(rendering.image, frame, predicted[rows], found, PATCH_HALF)
-    correction = np.linalg.norm(found - predicted[rows], axis=1)
-    ok &= (correction < LARGEST_CORRECTION_PX) & np.isfinite(exactness)
-    ok &= correlation > LEAST_CORRELATION
     pixels, valid = predicted.copy(), np.zeros(len(predicted), dtype=bool)
     spread = np.full(len(predicted), np.inf)
-    pixels[rows], valid[rows], spread[rows] = found, ok, exactness
+
+    def look_for(rows: NDArray[np.int64], guesses: Array, levels: int) -> None:
+        places = predicted[rows]
+        found, ok = follow(rendering.image, frame, places, guesses, levels)
+        found, correlation, exactness = compare_patches(rendering.image, frame, places, found, PATCH_HALF)
+        near = np.linalg.norm(found - places, axis=1) < LARGEST_CORRECTION_PX
+        ok &= near & np.isfinite(exactness) & (correlation > LEAST_CORRELATION)
+        pixels[rows], valid[rows], spread[rows] = found, ok, exactness
+
+    if offsets is not None:
+        rows = np.flatnonzero(visible)
+        look_for(rows, predicted[rows] + offsets[rows], 0)
+    rows = np.flatnonzero(visible & ~valid)
+    look_for(rows, predicted[rows], CORRECTION_LEVELS)
     return Measurement(pixels, valid, visible, spread, rendering.depth)
 
 

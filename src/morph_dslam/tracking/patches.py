@@ -262,17 +262,33 @@ def follow(
     """
     if not len(points):
         return np.empty((0, 2)), np.empty(0, dtype=bool)
+    part = _part_around(np.concatenate([points, guesses]), source.shape, levels)
+    corner = np.array([part[1].start, part[0].start], dtype=np.float64)
     found, status, _ = cv2.calcOpticalFlowPyrLK(
-        source,
-        target,
-        points.astype(np.float32),
-        guesses.astype(np.float32),
+        source[part],
+        target[part],
+        (points - corner).astype(np.float32),
+        (guesses - corner).astype(np.float32),
         winSize=(FLOW_WINDOW, FLOW_WINDOW),
         maxLevel=levels,
         criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.02),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
-    return found.reshape(-1, 2).astype(float), status.ravel() == 1
+    return found.reshape(-1, 2).astype(np.float64) + corner, status.ravel() == 1
+
+
+def _part_around(points: Array, shape: tuple[int, ...], levels: int) -> tuple[slice, slice]:
+    """Rows and columns of an image that points (p, 2) are followed in: the pyramid of the rest is not needed.
+
+    It begins where pixels of the coarsest level do, so that the levels are those of the whole image.
+    """
+    size, points = 1 << levels, np.nan_to_num(points)
+    least, most = points.min(axis=0) - FLOW_WINDOW * size, points.max(axis=0) + FLOW_WINDOW * size
+    left, top = (np.clip(least, 0, None) // size * size).astype(int)
+    right, bottom = np.ceil(most).astype(int) + 1
+    if left >= min(right, shape[1]) or top >= min(bottom, shape[0]):  # nothing is in sight
+        return slice(0, shape[0]), slice(0, shape[1])
+    return slice(int(top), int(min(bottom, shape[0]))), slice(int(left), int(min(right, shape[1])))
 
 
 def interior(covered: NDArray[np.bool_], margin: int) -> NDArray[np.uint8]:

@@ -155,7 +155,11 @@ class SystematicErrors:
         self._estimator, self._points, self._still = estimator, points, still
         self._misfit = ReferenceMisfit()
         self._corners = _corners(estimator, points)
-        self._edges = _by_parts(parts, lambda state: _edges(estimator.camera, self._corners, state))
+        edges = _by_parts(parts, lambda state: _edges(estimator.camera, self._corners, state))
+        size = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            adjugate = np.stack([edges[:, 1, 1], -edges[:, 0, 1], -edges[:, 1, 0], edges[:, 0, 0]], axis=1)
+            self._inverse_edges = (adjugate / size[:, None]).reshape(-1, 2, 2)
         self._moved, self._factors = self._by_error_factors(parts), parts[0].error_factors
         self._common = SharedErrors(self._places(parts[0].state), window)
         self.forget_frames()
@@ -284,11 +288,8 @@ class SystematicErrors:
 
     def _warps(self, state: State) -> Array:
         """How pixels (p, 2, 2) move in a view where they move by one in the reference view."""
-        before, now = self._edges, _edges(self._estimator.camera, self._corners, state)
-        size = before[:, 0, 0] * before[:, 1, 1] - before[:, 0, 1] * before[:, 1, 0]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            adjugate = np.stack([before[:, 1, 1], -before[:, 0, 1], -before[:, 1, 0], before[:, 0, 0]], axis=1)
-            warps = now @ (adjugate / size[:, None]).reshape(-1, 2, 2)
+        with np.errstate(invalid="ignore"):
+            warps = _edges(self._estimator.camera, self._corners, state) @ self._inverse_edges
             usable = np.abs(warps).max(axis=(1, 2)) < LARGEST_STRETCH
         return np.where(usable[:, None, None], warps, 0.0)
 
