@@ -196,6 +196,21 @@ def test_the_camera_is_refined_and_the_map_is_of_the_refined_one(tmp_path, room_
     assert np.median(path_errors(load_scene(run / "map.h5", refined).trajectory, room_film[1])) < 0.005
 
 
+@pytest.mark.parametrize(("off_px", "within_px"), [(1.0, 1.0), (30.0, 2.0)])
+def test_a_principal_point_is_refined_only_if_it_is_refuted(tmp_path, room_film, capsys, off_px, within_px):
+    """It is stated a little beside the true one, and far from it."""
+    given = replace(CAMERA, cx=CAMERA.cx + off_px)
+    write_film(tmp_path, room_film[0], given)
+    run = tmp_path / "run"
+    command = ["slam", str(tmp_path / "film"), "--camera", str(tmp_path / "camera.yaml"), "-o", str(run), "--no-video"]
+    assert main([*command, "--refine-camera", "centre", "--refine-camera", "focal"]) == 0
+    refined = load_camera(run / "camera.yaml")
+    assert ("not refuted, kept as given" in capsys.readouterr().out) == (off_px < 10.0)
+    assert (refined.cx == given.cx) == (off_px < 10.0)
+    assert refined.cx == pytest.approx(CAMERA.cx, abs=within_px)
+    assert refined.fx == pytest.approx(CAMERA.fx, rel=0.01)
+
+
 @pytest.mark.parametrize(
     ("more", "message"), [(["--map", "map.h5"], "leave out --map"), (["--trajectory", "t.txt"], "leave out --map")]
 )

@@ -81,7 +81,8 @@ def run(arguments: argparse.Namespace) -> None:
     )
     for term, found in summary.get("refined_camera", {}).items():
         given, values, std = (", ".join(f"{v:.4g}" for v in found[key]) for key in ("given", "estimated", "std"))
-        kept = "" if found["is_observable"] else "; unobservable here, kept as given"
+        why = "not refuted" if found["is_observable"] else "unobservable here"
+        kept = f"; {why}, kept as given" if found["is_kept"] else ""
         print(f"{term}: {values} (standard deviation {std}), was {given}{kept}")
     for flag in summary["flags"]:
         print(f"note: {flag}")

@@ -29,7 +29,7 @@ from morph_dslam.slam.options import SlamOptions
 from morph_dslam.slam.result import STAGES, SlamFrame
 from morph_dslam.slam.rigid_map import GOOD
 from morph_dslam.slam.scene import Scene, finish_scene, load_scene, refine_camera, start_slam, track_frames
-from morph_dslam.slam.self_calibration import CameraEstimate, CameraTerm
+from morph_dslam.slam.self_calibration import CameraEstimate, CameraTerm, with_terms_of
 from morph_dslam.sources import FrameSource, open_source, open_stream
 from morph_dslam.sources.live import LiveStream
 
@@ -97,10 +97,12 @@ def run_slam(
         make_run_folder(output, overwrite, "trajectory.txt")
         known: Scene | Trajectory | ColmapModel | None = None
         refined: CameraEstimate | None = None
+        kept = set[CameraTerm]()
         if refine:
             if not isinstance(stream, FrameSource) or not isinstance(one_or_two, Camera):
                 raise MapError("--refine-camera needs a recording of one camera, no live camera and no stereo pair")
-            refined = refine_camera(stream, one_or_two, refine, options, progress)
+            given, refined = one_or_two, refine_camera(stream, one_or_two, refine, options, progress)
+            kept = {term for term in refine if with_terms_of(refined.camera, given, (term,)) == refined.camera}
             one_or_two = refined.camera
             save_camera(output / "camera.yaml", one_or_two)
         if trajectory is not None:
@@ -121,7 +123,9 @@ def run_slam(
         finally:
             more: dict[str, Any] = {"inputs": {"source": str(source), "camera": str(camera)}}
             if refined is not None:
-                more["refined_camera"] = {term: found.facts() for term, found in refined.terms.items()}
+                more["refined_camera"] = {
+                    term: found.facts() | {"is_kept": term in kept} for term, found in refined.terms.items()
+                }
             if isinstance(stream, LiveStream):
                 more["n_dropped"] = stream.dropped - n_before
             summary = write_run(output, finish_scene(slam, frames), more) if frames else {}

@@ -251,7 +251,8 @@ def refine_camera(
     """A camera's intrinsics, lens and readout time from a recording of a rigid scene.
 
     The scene is mapped, the camera estimated, and both once more with what was found. Terms that the recording does not
-    show stay as given.
+    show stay as given, and the principal point unless the recording refutes it: it is nearly a turn of the camera, so
+    that a small departure is worth little and spoils the other terms.
 
     Parameters
     ----------
@@ -266,21 +267,38 @@ def refine_camera(
     opened = open_source(source) if isinstance(source, str | Path) else source
     terms_found, refined = dict[CameraTerm, TermEstimate](), camera
     free: list[CameraTerm] = list(terms)
-    for _ in range(REFINING_RUNS):
-        estimate = map_scene(opened, refined, options, progress).camera_estimate(free)
-        if estimate is None:
-            raise MapError(
-                f"the camera cannot be estimated from {opened.name}: too few frames have a pose, or too few points "
-                "are seen in several; film a textured, rigid scene, or leave out --refine-camera"
-            )
-        for term, found in estimate.terms.items():
-            terms_found[term] = replace(found, given=terms_found[term].given if term in terms_found else found.given)
+    for number in range(REFINING_RUNS):
+        scene = map_scene(opened, refined, options, progress)
+        estimate = _estimated(scene, free, opened.name)
+        _take_in(terms_found, estimate)
+        if number == 0 and "centre" in free and not estimate.terms["centre"].is_refuted:
+            free.remove("centre")
+            if not free:
+                break
+            estimate = _estimated(scene, free, opened.name)
+            _take_in(terms_found, estimate)
         hidden: list[CameraTerm] = [term for term in free if not estimate.terms[term].is_observable]
         free = [term for term in free if term not in hidden]
         refined = with_terms_of(with_terms_of(refined, estimate.camera, free), camera, hidden)
         if not free:
             break
     return CameraEstimate(refined, terms_found)
+
+
+def _estimated(scene: Scene, terms: Sequence[CameraTerm], name: str) -> CameraEstimate:
+    estimate = scene.camera_estimate(terms)
+    if estimate is None:
+        raise MapError(
+            f"the camera cannot be estimated from {name}: too few frames have a pose, or too few points are seen in "
+            "several; film a textured, rigid scene, or leave out --refine-camera"
+        )
+    return estimate
+
+
+def _take_in(terms: dict[CameraTerm, TermEstimate], estimate: CameraEstimate) -> None:
+    """Take newer estimates of terms; what was given stays what it was at first."""
+    for term, found in estimate.terms.items():
+        terms[term] = replace(found, given=terms[term].given if term in terms else found.given)
 
 
 def _summary_of_run(scene: Scene, slam: Slam) -> dict[str, Any]:

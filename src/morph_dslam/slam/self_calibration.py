@@ -79,9 +79,14 @@ class TermEstimate:
         return values | {"is_wrong": self.is_wrong, "is_observable": self.is_observable}
 
     @property
+    def is_refuted(self) -> bool:
+        """Whether the recording contradicts the given value, by much or by little."""
+        return self.departure > SIGNIFICANT * self.departure_std
+
+    @property
     def is_wrong(self) -> bool:
         """Whether the given value is refuted, and matters."""
-        return self.departure > max(SIGNIFICANT * self.departure_std, self.matters)
+        return self.is_refuted and self.departure > self.matters
 
     @property
     def is_observable(self) -> bool:
