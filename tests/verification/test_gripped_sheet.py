@@ -97,7 +97,8 @@ def test_a_column_is_pushed_with_eulers_force(planar: GrippedSheet) -> None:
     # The grips lie at z = 0 and are pushed inwards: about a point on that line the moments are those at the ends.
     amplitude = 4.0 / 3.0 * 0.002
     assert abs(left[4]) == pytest.approx(euler * amplitude / 2.0, rel=1e-2)
-    assert right[4] == pytest.approx(-left[4], rel=1e-6)
+    # Equilibrium holds as far as Newton's method took it: some 1e-6 of the moments.
+    assert right[4] == pytest.approx(-left[4], rel=1e-5)
 
 
 def test_an_arc_is_bent_by_moments_alone(planar: GrippedSheet) -> None:
