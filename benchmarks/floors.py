@@ -12,7 +12,9 @@ the last line gives medians of processor time. The workloads are
 - seal: the anchored boot seal, camera and solid (made by examples/boot_seal/track.py);
 - sheet: the recorded sheet of paper, free, with its outline and discrepancy (made by examples/kinect_paper/run.py).
 
-One whose files have not been made is left out: its figure is nan. With --beside the workloads are also run with
+One whose files have not been made is left out: its figure is nan. Then the seal's recording is tracked from its files
+by one thread and by two that work on successive frames, in turn: `throughput` is the frames of two a second over those
+of one, and the latency that from when a frame was read to its result. With --beside the workloads are also run with
 the package of another commit, in a worktree and a process of its own, frame by frame in turn; `ratio` is this
 version's time over the other's.
 """
@@ -46,6 +48,7 @@ from morph_dslam import (
     Camera,
     Frame,
     MorphError,
+    Session,
     Tracker,
     TrackerOptions,
     load_camera,
@@ -55,8 +58,9 @@ from morph_dslam import (
     open_source,
     register_landmarks,
 )
-from morph_dslam.extend import run_and_report_errors
+from morph_dslam.extend import run_and_report_errors, threads_side_by_side
 from morph_dslam.extend.slam import Slam, warm_up as warm_up_slam
+from morph_dslam.sources.frames import FrameSource
 from support import data_folder
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -132,14 +136,19 @@ def tracked_workload(name: str, new_tracker: Callable[[], Tracker], frames: list
         yield {name: timed(lambda frame=frame: tracker.track(frame))}
 
 
-def seal_workload(data: Path, n_frames: int) -> Iterator[Times]:
-    """The camera in the map of the scan, and the seal in it, from where the scan ends."""
+def anchored_seal() -> tuple[Callable[[], Tracker], FrameSource]:
+    """The camera in the map of the scan, and the seal in it, and the frames from where the scan ends."""
     folder = ROOT / "examples" / "boot_seal" / "output"
     camera, model = load_camera(folder / "recording" / "camera.yaml"), load_model(folder / "boot_seal.morph")
     scene = load_scene(folder / "scan" / "map.h5", camera)
     start = load_registration(folder / "registration" / "registration.json", model, scene)
-    frames = list(islice(open_source(folder / "recording" / "frames", start.frame), n_frames))
-    return tracked_workload("seal", lambda: Tracker(model, camera, start), frames)
+    return lambda: Tracker(model, camera, start), open_source(folder / "recording" / "frames", start.frame)
+
+
+def seal_workload(data: Path, n_frames: int) -> Iterator[Times]:
+    """`anchored_seal`, frame by frame."""
+    new_tracker, source = anchored_seal()
+    return tracked_workload("seal", new_tracker, list(islice(source, n_frames)))
 
 
 def sheet_workload(data: Path, n_frames: int) -> Iterator[Times]:
@@ -160,6 +169,47 @@ def all_workloads(data: Path, n_frames: int) -> Iterator[Times]:
                 yield spent | floor.measure()
         except MorphError as missing:
             print(f"left out: {missing}", file=sys.stderr)
+
+
+class Clocked:
+    """A recording that notes when each frame was read."""
+
+    def __init__(self, source: FrameSource) -> None:
+        self._source = source
+        self.read: list[float] = []
+
+    def __iter__(self) -> Iterator[Frame]:
+        for frame in self._source:
+            self.read.append(time.perf_counter())
+            yield frame
+
+
+def paced(new_tracker: Callable[[], Tracker], source: FrameSource, two_threads: bool) -> tuple[float, float]:
+    """Wall time of a frame, and the median latency from when it was read to its result; ms."""
+    clocked, done = Clocked(source), []
+    session = Session({"seal": new_tracker()}, clocked)
+    begin = time.perf_counter()
+    if two_threads:
+        done = [time.perf_counter() for _ in session]
+    else:
+        for frame in clocked:
+            session.track((frame,), session.locate((frame,)))
+            done.append(time.perf_counter())
+    latency = np.median(np.subtract(done, clocked.read))
+    return 1e3 * (done[-1] - begin) / len(done), 1e3 * float(latency)
+
+
+def two_threads(rounds: int = 5) -> str:
+    """What two threads on successive frames gain over one, and what it costs in latency; in turn."""
+    new_tracker, source = anchored_seal()
+    with threads_side_by_side():
+        paced(new_tracker, source, False)
+        figures = np.array([[paced(new_tracker, source, both) for both in (False, True)] for _ in range(rounds)])
+    (one, waits), (two, waits_too) = np.median(figures, axis=0)
+    return (
+        f"one_thread_ms={one:.2f} two_threads_ms={two:.2f} throughput={one / two:.2f} "
+        f"one_thread_latency_ms={waits:.2f} two_threads_latency_ms={waits_too:.2f}"
+    )
 
 
 class Other:
@@ -281,6 +331,8 @@ def run(arguments: argparse.Namespace) -> None:
             if other is not None:
                 other.add(theirs)
     print("\n".join(table(ours, other)))
+    if "seal" in ours:
+        print(two_threads())
     print(f"floor_ms={ours.median('floor'):.2f} " + " ".join(f"{n}_F={ours.in_floors(n):.2f}" for n in WORKLOADS))
 
 

@@ -1,10 +1,12 @@
-"""Threads of the linear algebra that numpy and scipy call."""
+"""Threads: those of the linear algebra that numpy and scipy call, and work on the next frames beside this one."""
 
 from __future__ import annotations
 
 import gc
 import sys
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import wraps
 from typing import ParamSpec, TypeVar
@@ -14,6 +16,8 @@ from threadpoolctl import threadpool_limits
 
 P = ParamSpec("P")
 R = TypeVar("R")
+#: Frames that are made ready before they are asked for: one waits while the next is worked on.
+N_AHEAD = 2
 
 
 def one_thread_for_algebra(function: Callable[P, R]) -> Callable[P, R]:
@@ -31,7 +35,28 @@ def one_thread_for_algebra(function: Callable[P, R]) -> Callable[P, R]:
     return alone
 
 
-# Threads that follow a camera live: what they need of the interpreter that they share.
+# Threads that work on successive frames: what they need of the interpreter that they share.
+
+
+def ahead(items: Iterator[R], number: int = N_AHEAD) -> Generator[R, None, None]:
+    """The same items in the same order, made in another thread while the caller works on those before.
+
+    What goes wrong in the other thread is raised where its item would come.
+
+    Parameters
+    ----------
+    items : that take time to make.
+    number : how many may be ready or under way before they are asked for.
+    """
+    end = object()
+    with ThreadPoolExecutor(1, thread_name_prefix="ahead") as other:
+        waiting = deque(other.submit(next, items, end) for _ in range(number))
+        try:
+            while (item := waiting.popleft().result()) is not end:
+                waiting.append(other.submit(next, items, end))
+                yield item  # type: ignore[misc]
+        finally:
+            other.shutdown(cancel_futures=True)
 
 
 #: How long a thread may keep the interpreter while another waits for it, seconds. Tracking gives it up some
@@ -43,7 +68,7 @@ SWITCH_INTERVAL = 1e-4
 
 @contextmanager
 def threads_side_by_side() -> Iterator[None]:
-    """Let the threads of this process take turns quickly, as long as they track live.
+    """Let the threads of this process take turns quickly, as long as they work on successive frames.
 
     OpenCV begins no threads of its own meanwhile. What exists already is left out when Python looks for
     garbage: over all that has been imported that takes tens of milliseconds, in which no thread goes on.

@@ -87,6 +87,17 @@ def test_a_recording_is_tracked_with_the_camera_in_the_map(recording, tmp_path):
     assert np.linalg.norm(apart, axis=1).max() < MAP_ERROR
 
 
+def test_two_threads_find_what_one_finds(recording):
+    folder, _ = recording
+    ahead, alone = OneObject(folder), OneObject(folder)
+    frames = frames_of(folder, 44, 51)
+    session = new_session(ahead.placed, frames)
+    for tracked, frame in zip(session, frames, strict=True):
+        mine, others = tracked.results[ahead.name].estimate, alone.track(frame).estimate
+        assert np.array_equal(mine.state.parameters, others.state.parameters)
+        assert np.array_equal(mine.covariance, others.covariance)
+
+
 def test_a_covered_object_is_hidden_in_its_place_and_few_points_tell_its_shape(recording):
     folder, truth = recording
     sheet = OneObject(folder)

@@ -13,7 +13,7 @@ from morph_dslam.errors import SourceError
 from morph_dslam.sources import open_source, open_stream, register_source
 from morph_dslam.sources.frames import Frame
 from morph_dslam.sources.live import LiveCamera, Newest, PacedRecording
-from morph_dslam.threads import one_thread_for_algebra, threads_side_by_side
+from morph_dslam.threads import ahead, one_thread_for_algebra, threads_side_by_side
 
 
 class FakeCapture:
@@ -214,3 +214,39 @@ def test_linear_algebra_runs_in_one_thread_meanwhile_and_as_before_afterwards():
     assert meanwhile
     assert set(meanwhile) == {1}
     assert algebra_threads() == before
+
+
+def test_the_next_item_is_made_while_this_one_is_worked_on():
+    made = threading.Event()
+
+    def numbers():
+        yield 1
+        made.set()
+        yield 2
+        raise SourceError("the recording breaks off")
+
+    items = ahead(numbers(), 1)
+    assert next(items) == 1
+    assert made.wait(timeout=10.0)
+    assert next(items) == 2
+    with pytest.raises(SourceError, match="breaks off"):
+        next(items)
+    # A frame may be missing where nobody asks for it.
+    assert list(zip(range(2), ahead(numbers()), strict=False)) == [(0, 1), (1, 2)]
+
+
+def test_who_stops_early_has_no_more_items_made():
+    made = []
+
+    def numbers():
+        for number in range(1000):
+            made.append(number)
+            yield number
+
+    items = ahead(numbers())
+    assert [next(items) for _ in range(3)] == [0, 1, 2]
+    items.close()
+    n_made = len(made)
+    assert n_made <= 3 + 2
+    assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("ahead")]
+    assert len(made) == n_made

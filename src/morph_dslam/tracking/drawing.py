@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import starmap
 from pathlib import Path
 from typing import Literal
 
@@ -22,11 +23,13 @@ from morph_dslam.model.inner_structure import CarriedStructure
 from morph_dslam.model.reduced_model import MaterialPoints, von_mises
 from morph_dslam.render.overlay import BarPlace, draw_inner_surface, draw_overlay
 from morph_dslam.render.shading import lambert, text_patch, vertex_normals
-from morph_dslam.sources import FrameSource
+from morph_dslam.sources import Frame, FrameSource
+from morph_dslam.threads import ahead, threads_side_by_side
 from morph_dslam.tracking.binding import DrawnSurface, View, facing
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, near_jumps
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.force_arrows import ForceArrows
+from morph_dslam.tracking.result import FrameResult
 from morph_dslam.tracking.run_results import RunResults
 
 Array = NDArray[np.float64]
@@ -401,14 +404,17 @@ def write_video(path: Path, source: FrameSource, camera: Camera, run: RunResults
     known = [state for state in states if state is not None]
     limits = view.range_of(known[:: max(1, len(known) // MOST_STATES)])
     maps = camera.undistortion_maps()
-    # The source comes last: zip then stops before it asks for a frame that may be missing.
-    rows = zip(states, run.results, source, strict=False)
-    with VideoWriter(path, source.fps, (camera.width, camera.height)) as video:
-        for state, result, frame in tqdm(rows, total=len(run), desc="drawing", unit="frame"):
-            image = frame.image
-            if maps is not None:
-                image = np.asarray(cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
-            if state is None:
-                video.write(with_caption(image, f"frame {frame.index}: {result.reason}"))
-            else:
-                video.write(view.draw(image, state, limits, f"frame {frame.index}", result.discrepancy, result.jumps))
+
+    def drawn(state: State | None, result: FrameResult, frame: Frame) -> NDArray[np.uint8]:
+        image = frame.image
+        if maps is not None:
+            image = np.asarray(cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+        if state is None:
+            return with_caption(image, f"frame {frame.index}: {result.reason}")
+        return view.draw(image, state, limits, f"frame {frame.index}", result.discrepancy, result.jumps)
+
+    # Frames that may be missing after those of the run are read ahead, but never asked for.
+    rows = zip(states, run.results, ahead(iter(source)), strict=False)
+    with VideoWriter(path, source.fps, (camera.width, camera.height)) as video, threads_side_by_side():
+        for image in tqdm(ahead(starmap(drawn, rows)), total=len(run), desc="drawing", unit="frame"):
+            video.write(image)

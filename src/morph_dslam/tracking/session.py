@@ -12,7 +12,7 @@ from morph_dslam.errors import SourceError
 from morph_dslam.sources import Frame
 from morph_dslam.sources.frames import FrameSource
 from morph_dslam.sources.live import LiveStream
-from morph_dslam.threads import one_thread_for_algebra
+from morph_dslam.threads import ahead, one_thread_for_algebra, threads_side_by_side
 from morph_dslam.tracking.anchoring import Anchor
 from morph_dslam.tracking.live import LivePipeline
 from morph_dslam.tracking.multi_camera import RigTracker
@@ -28,8 +28,9 @@ Localizations = dict[str, CameraLocalization]
 class Session:
     """Finds the camera in the map once a frame, and each object in it, and hands the results to sinks.
 
-    A recording is tracked frame by frame. In a live stream one thread finds the camera, one tracks the objects
-    and one draws and hands out; each takes the newest frame, so that some are dropped but none is late.
+    Of a recording one thread reads the next frames and finds the camera in them while another tracks the objects in
+    this one; the results are those of one thread. In a live stream one thread finds the camera, one tracks the
+    objects and one draws and hands out; each takes the newest frame, so that some are dropped but none is late.
 
     Parameters
     ----------
@@ -90,9 +91,14 @@ class Session:
 
     def __iter__(self) -> Iterator[TrackedFrame]:
         """Track a recording frame by frame, without the sinks."""
+        for frames, localizations in ahead(self._located()):
+            yield self._drawn(self.track(frames, localizations))
+
+    def _located(self) -> Iterator[tuple[tuple[Frame, ...], Localizations]]:
+        """The frames of a recording with what `locate` found in them."""
         for item in self._source:
             frames = item if isinstance(item, tuple) else (item,)
-            yield self._drawn(self.track(frames, self.locate(frames)))
+            yield frames, self.locate(frames)
 
     @one_thread_for_algebra
     def run(self, seconds: float | None = None, progress: bool = False) -> None:
@@ -113,8 +119,9 @@ class Session:
             self._pipeline.run(seconds)
             return
         total = len(self._source) if isinstance(self._source, Sized) else None
-        for tracked in tqdm(self, total=total, desc="tracking", unit="frame", disable=not progress):
-            self._hand_out(tracked)
+        with threads_side_by_side():
+            for tracked in tqdm(self, total=total, desc="tracking", unit="frame", disable=not progress):
+                self._hand_out(tracked)
 
     def _locate_live(self, frame: Frame) -> tuple[tuple[Frame, ...], Localizations]:
         return (frame,), self.locate((frame,))
