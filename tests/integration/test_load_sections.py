@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
 from morph_dslam import make_study
 from morph_dslam.errors import StudyError
@@ -28,8 +30,8 @@ MU = np.array([1e4, 0.5, 0.004, np.pi / 6.0, 2e6])
 AREA, HEIGHT = 0.04**2, 0.02
 
 
-def snapshot(mu: np.ndarray = MU, **sections: Any) -> Snapshot:
-    """The solution at ``mu`` of a block of 40 x 40 x 20 mm, fixed below."""
+def study_of(**sections: Any) -> SolidStudy:
+    """A block of 40 x 40 x 20 mm, fixed below."""
     content: dict[str, Any] = {
         "name": "block",
         "mesh": {"generator": "block", "size": ["40 mm", "40 mm", "20 mm"], "divisions": [4, 4, 1]},
@@ -40,7 +42,12 @@ def snapshot(mu: np.ndarray = MU, **sections: Any) -> Snapshot:
     }
     study = make_study(content | sections)
     assert isinstance(study, SolidStudy)
-    sweep = study.sweep_problem()
+    return study
+
+
+def snapshot(mu: np.ndarray = MU, **sections: Any) -> Snapshot:
+    """The solution of the block at ``mu``."""
+    sweep = study_of(**sections).sweep_problem()
     return sweep.take_snapshot(sweep.advance(sweep.first_state(), mu))
 
 
@@ -186,6 +193,23 @@ def test_what_a_contact_keeps_out(kind: str) -> None:
     # and, with its flat faces, touches near nodes.
     assert gap(rest).min() < -0.9e-3
     assert -0.9e-4 < moved.min() < 3e-4
+
+
+def test_a_mesh_file_is_an_obstacle(tmp_path: Path) -> None:
+    """A ball as a file in millimetres keeps out what a sphere does; its content is part of the study's fingerprint."""
+    file = tmp_path / "ball.stl"
+    trimesh.creation.icosphere(5, radius=15.0).export(file)
+    section, _ = CONTACTS["sphere"]
+    place = {"on": "z_max", "place": section["centre"], "file": str(file), "unit": "mm", "spacing": "1 mm"}
+    study = {"materials": {"rubber": SOFT}}
+    sphere = snapshot(**study, contacts=[{"kind": "sphere"} | section]).fields["displacement"]
+    found = snapshot(**study, contacts=[{"kind": "mesh"} | place]).fields["displacement"]
+    np.testing.assert_allclose(found, sphere, atol=5e-3 * np.abs(sphere).max())
+    before = study_of(**study, contacts=[{"kind": "mesh"} | place]).fingerprint()
+    trimesh.creation.icosphere(4, radius=15.0).export(file)
+    assert study_of(**study, contacts=[{"kind": "mesh"} | place]).fingerprint() != before
+    with pytest.raises(StudyError, match=r"contact 1: cannot read the surface .*none\.stl"):
+        study_of(**study, contacts=[{"kind": "mesh"} | place | {"file": str(tmp_path / "none.stl")}])
 
 
 def test_surfaces_in_contact_are_sets_of_the_mesh() -> None:

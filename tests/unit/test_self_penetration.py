@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from morph_dslam.mechanics.contact import RigidPlane
+from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.meshing.generators import block
 from morph_dslam.meshing.meshes import model_mesh_of
 from morph_dslam.model import Parameter
-from morph_dslam.reduction.self_penetration import SurfaceContact, penetration_report
+from morph_dslam.reduction.self_penetration import SurfaceContact, obstacle_report, penetration_report
 from morph_dslam.studies.problem import Snapshot
 
 THICK, LENGTH, RADIUS = 1.0, 40.0, 6.0
@@ -80,3 +82,28 @@ def test_an_open_surface_is_not_checked():
     mesh = model_mesh_of(block((1.0, 1.0, 1.0), (2, 2, 2), "hex8"))
     opened = replace(mesh, triangles=mesh.triangles[1:])
     assert penetration_report(opened, (), []) is None
+
+
+def test_nodes_in_an_obstacle_are_named_with_the_state_and_the_depth():
+    """The plane comes down on a top that one contact names; another lies behind the block's side from the start."""
+    mesh, down = block((1.0, 1.0, 1.0), (2, 2, 2), "hex8"), Parameter("down", "length", "m", 0.0, 0.5, 0.0)
+    symbols = ParameterSymbols([down])
+    lid = RigidPlane("z_max", (0.0, 0.0, 1.0 - symbols["down"]), (0.0, 0.0, -1.0))
+    beside = RigidPlane("x_max", (0.5, 0.0, 0.0), (1.0, 0.0, 0.0))
+    named = [(lid, mesh.set_nodes("z_max")), (beside, mesh.set_nodes("x_max"))]
+    squeezed = [mesh.nodes * [0.0, 0.0, -share] for share in (0.0, 0.1, 0.25)]
+    states = [Snapshot(np.array([0.25]), {"displacement": displacement}) for displacement in squeezed]
+    report = obstacle_report(model_mesh_of(mesh), states, symbols, named)
+    assert [(state["nodes"], state["depth_mm"]) for state in report["states"]] == [
+        (9, pytest.approx(250.0)),
+        (9, pytest.approx(150.0)),
+    ]
+    assert "in 2 of 3 solutions the surface enters an obstacle, by 2.5e+02 mm at down = 0.25 m" in report["statement"]
+    report = obstacle_report(model_mesh_of(mesh), [replace(states[2], coordinates=np.array([0.2]))], symbols, named)
+    assert report["states"] == []
+    # What no contact keeps out is named too, unless it was inside at rest.
+    moved = Snapshot(np.array([0.0]), {"displacement": np.tile([-0.6, 0.0, 0.2], (len(mesh.nodes), 1))})
+    report = obstacle_report(model_mesh_of(mesh), [moved], symbols, [(lid, mesh.set_nodes("x_max"))])
+    assert report["states"][0]["depth_mm"] == pytest.approx(200.0)
+    report = obstacle_report(model_mesh_of(mesh), [moved], symbols, [(beside, mesh.set_nodes("x_max"))])
+    assert report["states"][0]["depth_mm"] == pytest.approx(600.0)

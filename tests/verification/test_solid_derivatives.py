@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from morph_dslam.mechanics.contact import RigidCylinder, RigidPlane, RigidSphere
 from morph_dslam.mechanics.kinematics import ShapeField
@@ -22,6 +23,7 @@ from morph_dslam.mechanics.loads import (
 from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden, Orthotropic, turned_direction
 from morph_dslam.mechanics.materials.isotropic import NeoHookean
 from morph_dslam.mechanics.parameters import ParameterSymbols
+from morph_dslam.mechanics.rigid_mesh import RigidMesh
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.solvers.continuation import advance
 from morph_dslam.mechanics.solvers.linear_solver import default_engine
@@ -143,12 +145,20 @@ def by_shape_in_contact(mu: ParameterSymbols) -> SolidProblem:
     return SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")], [], mu, shape=[thicker], contacts=[plane, sphere])
 
 
+def by_contact_with_a_mesh(mu: ParameterSymbols) -> SolidProblem:
+    """A hexagonal rod with edges, whose distance is smooth all the same."""
+    rod = trimesh.creation.cylinder(0.3, 0.8, sections=6)
+    place = (0.5 + 0.1 * mu["p"], 0.25, 0.9 - 0.2 * mu["p"])
+    contact = RigidMesh("z_max", np.array(rod.vertices), np.array(rod.faces), place, spacing=0.05)
+    return SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")], [], mu, contacts=[contact])
+
+
 MAKERS = [value for name, value in sorted(globals().items()) if name.startswith("by_")]
 
 
 @pytest.mark.parametrize("make", MAKERS, ids=lambda make: make.__name__[3:])
 def test_derivatives_by_a_parameter(make: Callable[[ParameterSymbols], SolidProblem]) -> None:
-    from_rest = make in (by_rotation, by_displacement, by_contact, by_shape_in_contact)
+    from_rest = make in (by_rotation, by_displacement, by_contact, by_contact_with_a_mesh, by_shape_in_contact)
     problem = make(load_parameter(p=0.0 if from_rest else 0.3))
     start = problem.initial_state()
     mu = np.array([0.3])

@@ -73,7 +73,7 @@ def summarise_model(model: ReducedModel) -> dict[str, Table]:
         "error estimator": Table.of(flatten(certificate.get("estimator", {}))),
         "reduction": Table.of(_reduction(certificate)),
         "stability": Table.of(_stability(certificate)),
-        "contact": Table.of(_self_penetration(model)),
+        "contact": Table.of(_penetration(model)),
         "unknown loads": Table.of(_unknown_loads(certificate)),
         "warnings": Table.of({f"{n}": line for n, line in enumerate(certificate.get("warnings", []), start=1)}),
         "made with": Table.of(flatten(_versions_last(model.provenance))),
@@ -206,16 +206,19 @@ def _reduction(certificate: Mapping[str, Any]) -> Facts:
     return flatten({key: value for key, value in content.items() if key not in _DRAWN})
 
 
-def _self_penetration(model: ReducedModel) -> Facts:
-    report = model.certificate.get("self_penetration")
-    if report is None:
-        return {}
-    states = {
-        f"passes through itself {n}": f"{state['depth_mm']:.2g} mm, {state['nodes']} nodes, at "
-        + describe_point(model.parameters, state["coordinates"])
-        for n, state in enumerate(report["states"][:3], start=1)
-    }
-    return {"statement": report["statement"]} | states
+def _penetration(model: ReducedModel) -> Facts:
+    facts: Facts = {}
+    for what in ("self", "obstacle"):
+        report = model.certificate.get(f"{what}_penetration")
+        if report is None:
+            continue
+        facts[f"{what} penetration"] = report["statement"]
+        facts |= {
+            f"{what} penetration {n}": f"{state['depth_mm']:.2g} mm, {state['nodes']} nodes, at "
+            + describe_point(model.parameters, state["coordinates"])
+            for n, state in enumerate(report["states"][:3], start=1)
+        }
+    return facts
 
 
 def _unknown_loads(certificate: Mapping[str, Any]) -> Facts:

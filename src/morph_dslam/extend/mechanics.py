@@ -45,6 +45,7 @@ from morph_dslam.mechanics.materials.isotropic import (
 from morph_dslam.mechanics.materials.library import constant_quantities as constant_quantities, laws as laws
 from morph_dslam.mechanics.materials.viscoelastic import Prony as Prony
 from morph_dslam.mechanics.parameters import ParameterSymbols as ParameterSymbols
+from morph_dslam.mechanics.rigid_mesh import RigidMesh as RigidMesh
 from morph_dslam.mechanics.solid import SolidOptions as SolidOptions
 from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning as NearlyIncompressibleWarning
 from morph_dslam.mechanics.solvers.continuation import advance as advance

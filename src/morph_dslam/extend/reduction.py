@@ -5,7 +5,10 @@ from morph_dslam.reduction.pgd import PgdSolution as PgdSolution, solve_pgd as s
 from morph_dslam.reduction.registry import reduction_method as reduction_method
 from morph_dslam.reduction.report import report_path as report_path
 from morph_dslam.reduction.report_pictures import read_reference_curve as read_reference_curve
-from morph_dslam.reduction.self_penetration import penetration_report as penetration_report
+from morph_dslam.reduction.self_penetration import (
+    obstacle_report as obstacle_report,
+    penetration_report as penetration_report,
+)
 from morph_dslam.reduction.separable_problem import (
     SeparableProblem as SeparableProblem,
     collocation_axis as collocation_axis,

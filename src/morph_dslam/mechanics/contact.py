@@ -47,6 +47,11 @@ class RigidObstacle(Protocol):
         """What messages call it."""
         ...
 
+    @property
+    def tolerance(self) -> float:
+        """By how much its surface may be off, m."""
+        ...
+
     def touch(self, symbols: ParameterSymbols, points: Array) -> Touch:
         """Where ``points`` (q, 3), m, are at the present parameters."""
         ...
@@ -70,19 +75,19 @@ class RigidPlane:
     on: str
     point: Vector
     normal: tuple[float, float, float]
-    name = "plane"
+    name, tolerance = "plane", 0.0
 
     def __post_init__(self) -> None:
         _check_direction(self.on, "normal", self.normal)
 
     def touch(self, symbols: ParameterSymbols, points: Array) -> Touch:
         """See `RigidObstacle`."""
-        unit, point = _unit(self.normal), _values(symbols, self.point)
+        unit, point = _unit(self.normal), vector_values(symbols, self.point)
         return Touch((points - point) @ unit, np.tile(unit, (len(points), 1)), np.zeros((len(points), 3, 3)))
 
     def slopes(self, symbols: ParameterSymbols) -> tuple[Array, Array]:
         """See `RigidObstacle`."""
-        return _slopes(symbols, self.point), np.zeros(len(symbols))
+        return vector_slopes(symbols, self.point), np.zeros(len(symbols))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,16 +106,16 @@ class RigidSphere:
     centre: Vector
     radius: Scalar
     inside: bool = False
-    name = "sphere"
+    name, tolerance = "sphere", 0.0
 
     def touch(self, symbols: ParameterSymbols, points: Array) -> Touch:
         """See `RigidObstacle`."""
-        arms = points - _values(symbols, self.centre)
+        arms = points - vector_values(symbols, self.centre)
         return _around(arms, np.eye(3), symbols.value(self.radius), self.inside)
 
     def slopes(self, symbols: ParameterSymbols) -> tuple[Array, Array]:
         """See `RigidObstacle`."""
-        return _slopes(symbols, self.centre), _sign(self.inside) * -symbols.slopes(self.radius)
+        return vector_slopes(symbols, self.centre), _sign(self.inside) * -symbols.slopes(self.radius)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +136,7 @@ class RigidCylinder:
     axis: tuple[float, float, float]
     radius: Scalar
     inside: bool = False
-    name = "cylinder"
+    name, tolerance = "cylinder", 0.0
 
     def __post_init__(self) -> None:
         _check_direction(self.on, "axis", self.axis)
@@ -139,12 +144,12 @@ class RigidCylinder:
     def touch(self, symbols: ParameterSymbols, points: Array) -> Touch:
         """See `RigidObstacle`."""
         across = np.eye(3) - np.outer(_unit(self.axis), _unit(self.axis))
-        arms = (points - _values(symbols, self.point)) @ across
+        arms = (points - vector_values(symbols, self.point)) @ across
         return _around(arms, across, symbols.value(self.radius), self.inside)
 
     def slopes(self, symbols: ParameterSymbols) -> tuple[Array, Array]:
         """See `RigidObstacle`."""
-        return _slopes(symbols, self.point), _sign(self.inside) * -symbols.slopes(self.radius)
+        return vector_slopes(symbols, self.point), _sign(self.inside) * -symbols.slopes(self.radius)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,11 +183,13 @@ def _unit(direction: tuple[float, float, float]) -> Array:
     return np.array(direction, dtype=float) / np.linalg.norm(direction)
 
 
-def _values(symbols: ParameterSymbols, vector: Vector) -> Array:
+def vector_values(symbols: ParameterSymbols, vector: Vector) -> Array:
+    """(3,) at the present parameters."""
     return np.array([symbols.value(value) for value in vector])
 
 
-def _slopes(symbols: ParameterSymbols, vector: Vector) -> Array:
+def vector_slopes(symbols: ParameterSymbols, vector: Vector) -> Array:
+    """(d, 3) derivatives by the parameters."""
     return np.column_stack([symbols.slopes(value) for value in vector])
 
 

@@ -171,11 +171,13 @@ class ContactAssembly:
 
     def _check_apart(self) -> None:
         for contact, parts in zip(self._contacts, self._entered(np.zeros(3 * self._n)), strict=True):
-            if not isinstance(contact, SurfaceContact) and any(s.any() for s in contact.slopes(self._symbols)):
+            rigid = not isinstance(contact, SurfaceContact)
+            if rigid and any(s.any() for s in contact.slopes(self._symbols)):
                 continue
+            allowed = TOUCHING * self._side(contact.on).surface.widths.mean() + (contact.tolerance if rigid else 0.0)
             entered = min(parts, key=lambda part: part.gap.min(initial=0.0))
             depth = -entered.gap.min(initial=0.0)
-            if depth > TOUCHING * self._side(contact.on).surface.widths.mean():
+            if depth > allowed:
                 where = ", ".join(f"{1e3 * x:.4g}" for x in entered.place[int(np.argmin(entered.gap))])
                 raise StudyError(
                     f"the {contact.name} reaches {1e3 * depth:.3g} mm into the undeformed surface '{contact.on}', "

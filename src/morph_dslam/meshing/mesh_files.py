@@ -19,7 +19,13 @@ from morph_dslam.io.inp_file import InpFile, SurfacePart, read_inp
 from morph_dslam.meshing.cell_types import cell_type
 from morph_dslam.meshing.mesh_repair import reoriented, without_collapsed_cells
 from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces
-from morph_dslam.meshing.netgen_meshing import SURFACES, mesh_step_file, mesh_surface_file, read_surface
+from morph_dslam.meshing.netgen_meshing import (
+    SURFACES,
+    check_watertight,
+    mesh_step_file,
+    mesh_surface_file,
+    read_surface,
+)
 from morph_dslam.units import to_si
 
 Indices = NDArray[np.int64]
@@ -72,6 +78,16 @@ def load_surface_mesh(path: Path | str, unit: str) -> Mesh:
     if path.suffix.lower() in (".step", ".stp"):
         raise StudyError(f"{path} holds solids; a shell needs a mesh of its middle surface")
     return load_mesh(path, unit)
+
+
+def load_closed_surface(path: Path | str, unit: str) -> tuple[NDArray[np.float64], Indices]:
+    """Points (n, 3), m, and outward triangles (t, 3) of an STL, OBJ or PLY file that bounds a body.
+
+    Raises StudyError if the file cannot be read, or its surface is open, branches or is not turned outwards.
+    """
+    surface = read_surface(Path(path))
+    check_watertight(surface, Path(path))
+    return surface.points * to_si(1.0, unit, "length"), surface.triangles
 
 
 #: Abaqus lists a C3D27's centre before the centres of its faces S1 to S6; VTK has opposite faces, then it.

@@ -1,4 +1,4 @@
-"""Where the surface of a deformed solid passes through itself.
+"""Where the surface of a deformed solid passes through itself, or lies in an obstacle.
 
 Without contact in the equations of a solid, parts of a surface that meet go through one another. A node of the surface
 lies inside another part of the solid where the surface winds around it more often than around a point of itself: its
@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from morph_dslam.evaluation.model_summary import describe_point
+from morph_dslam.mechanics.contact import RigidObstacle
+from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.model import Parameter
 from morph_dslam.studies.problem import ModelMesh, Snapshot
 
@@ -45,19 +47,73 @@ def penetration_report(
     surface, states = SurfaceContact(mesh.nodes, mesh.triangles), []
     for solution in solutions:
         found = surface.find(mesh.nodes + solution.fields["displacement"])
-        deep = found.depths[found.depths > TOUCHING * np.linalg.norm(np.ptp(mesh.nodes, axis=0))]
-        if len(deep):
-            depth = 1e3 * float(deep.max())
-            states.append({"coordinates": solution.coordinates.tolist(), "nodes": len(deep), "depth_mm": depth})
+        states += _deep(mesh, solution, found.depths)
+    return _report(
+        parameters,
+        len(solutions),
+        states,
+        "the surface passes through itself",
+        "only contact that the study names keeps surfaces apart",
+    )
+
+
+def obstacle_report(
+    mesh: ModelMesh,
+    solutions: Sequence[Snapshot],
+    symbols: ParameterSymbols,
+    obstacles: Sequence[tuple[RigidObstacle, NDArray[np.int64]]],
+) -> dict[str, Any]:
+    """What a certificate says of solutions whose surface is in an obstacle, as `penetration_report`.
+
+    Nodes that were in an obstacle at rest, and that no contact keeps out of it, are not meant to be outside.
+
+    Parameters
+    ----------
+    symbols : of the parameters that move the obstacles.
+    obstacles : each with the nodes that its contact names.
+    """
+    on_surface, states = np.unique(mesh.triangles), []
+    symbols.set(symbols.default)
+    meant = []
+    for obstacle, named in obstacles:
+        outside = obstacle.touch(symbols, mesh.nodes[on_surface]).gap >= 0.0
+        meant.append(on_surface[outside | np.isin(on_surface, named)])
+    for solution in solutions:
+        symbols.set(solution.coordinates)
+        places = mesh.nodes + solution.fields["displacement"]
+        depths = [
+            -obstacle.touch(symbols, places[nodes]).gap - obstacle.tolerance
+            for (obstacle, _), nodes in zip(obstacles, meant, strict=True)
+        ]
+        states += _deep(mesh, solution, np.concatenate(depths))
+    return _report(
+        symbols.parameters,
+        len(solutions),
+        states,
+        "the surface enters an obstacle",
+        "name all surfaces that meet it in [[contacts]], or make cells finer",
+    )
+
+
+def _deep(mesh: ModelMesh, solution: Snapshot, depths: Array) -> list[dict[str, Any]]:
+    """One state, if any depth (k,) is more than touching."""
+    deep = depths[depths > TOUCHING * np.linalg.norm(np.ptp(mesh.nodes, axis=0))]
+    if not len(deep):
+        return []
+    return [{"coordinates": solution.coordinates.tolist(), "nodes": len(deep), "depth_mm": 1e3 * float(deep.max())}]
+
+
+def _report(
+    parameters: Sequence[Parameter], checked: int, states: list[dict[str, Any]], what: str, remedy: str
+) -> dict[str, Any]:
     states.sort(key=lambda state: -state["depth_mm"])
-    statement = f"in none of {len(solutions)} solutions the surface passes through itself"
+    statement = f"in none of {checked} solutions {what}"
     if states:
         worst = describe_point(parameters, states[0]["coordinates"])
         statement = (
-            f"in {len(states)} of {len(solutions)} solutions the surface passes through itself, by "
-            f"{states[0]['depth_mm']:.2g} mm at {worst}; only contact that the study names keeps surfaces apart"
+            f"in {len(states)} of {checked} solutions {what}, by {states[0]['depth_mm']:.2g} mm at {worst}; {remedy}"
         )
-    return {"statement": statement, "checked": len(solutions), "states": states}
+    return {"statement": statement, "checked": checked, "states": states}
 
 
 @dataclass(frozen=True)

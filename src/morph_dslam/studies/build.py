@@ -14,7 +14,7 @@ from morph_dslam.model import ReducedModel, save_model
 from morph_dslam.reduction.adaptive_sampling import estimator_check
 from morph_dslam.reduction.certificate import certify, compression_percent, stability_warnings
 from morph_dslam.reduction.registry import reduction_method
-from morph_dslam.reduction.self_penetration import penetration_report
+from morph_dslam.reduction.self_penetration import obstacle_report, penetration_report
 from morph_dslam.reduction.task import ReductionTask
 from morph_dslam.studies.defaults import resolve_defaults
 from morph_dslam.studies.discretisation import discretisation_errors
@@ -70,6 +70,9 @@ def build(
     chosen = resolve_defaults(described)
     snapshots = take_snapshots(chosen, output.with_name(output.name + ".snapshots"), workers, executor)
     model = certified_model(snapshots, chosen.reduction, chosen.name)
+    if isinstance(chosen, SolidStudy) and any(section.kind != "surface" for section in chosen.contacts):
+        solutions = [*(group[0] for group in snapshots.training), *snapshots.held_out]
+        model.certificate["obstacle_penetration"] = obstacle_report(snapshots.mesh, solutions, *chosen.obstacles())
     if isinstance(chosen, SolidStudy | ShellStudy) and chosen.unknown_loads is not None:
         announce("reducing the responses to unknown loads")
         loads, model.certificate["unknown_loads"] = reduce_unknown_loads(chosen, chosen.unknown_loads, snapshots)
@@ -135,6 +138,6 @@ def build_warnings(certificate: dict[str, Any]) -> list[str]:
     of_the_method = certificate.get("reduction", {}).get("warnings", [])
     error = certificate.get("unknown_loads", {}).get("response_error", 0.0)
     loads = [UNSURE_LOADS.format(100.0 * error)] if error > LARGEST_RESPONSE_ERROR else []
-    penetration = certificate.get("self_penetration", {"states": []})
-    passing = [penetration["statement"]] if penetration["states"] else []
+    reports = (certificate.get(name) for name in ("self_penetration", "obstacle_penetration"))
+    passing = [report["statement"] for report in reports if report and report["states"]]
     return [*certificate.get("warnings", []), *passing, *stability_warnings(certificate), *loads, *of_the_method]

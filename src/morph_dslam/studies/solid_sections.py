@@ -17,9 +17,10 @@ import numpy as np
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
 from morph_dslam.mechanics import contact, couplings, loads, supports
+from morph_dslam.mechanics.rigid_mesh import RigidMesh
 from morph_dslam.meshing import generators as mesh_generators
 from morph_dslam.meshing.mesh_checks import check_mesh
-from morph_dslam.meshing.mesh_files import load_mesh
+from morph_dslam.meshing.mesh_files import load_closed_surface, load_mesh
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.studies.sections import Angle, LengthUnit, Number, PositiveLength, Section, StudyPath
 from morph_dslam.units import to_si
@@ -397,6 +398,25 @@ class _CylinderContact(Section):
         return contact.RigidCylinder(self.on, point, self.axis, radius, self.inside)
 
 
+class _MeshContact(Section):
+    """A rigid body that a surface cannot enter: the inside of a closed STL, OBJ or PLY ``file``, moved by ``place``.
+
+    ``unit`` is that of the file's coordinates, and ``spacing`` that of the grid on which its distance is kept: a 64th
+    of its longest side if absent.
+    """
+
+    kind: Literal["mesh"]
+    on: str
+    file: StudyPath
+    unit: LengthUnit
+    place: Triple = ("0 mm", "0 mm", "0 mm")
+    spacing: PositiveLength | None = None
+
+    def make(self, read: Reader) -> RigidMesh:
+        points, triangles = load_closed_surface(self.file, self.unit)
+        return RigidMesh(self.on, points, triangles, triple(self.place, "length", read), self.spacing)
+
+
 class _SurfaceContact(Section):
     """A surface that cannot pass through another, ``against``, or through itself where that is absent."""
 
@@ -416,5 +436,5 @@ LoadSection = Annotated[
     Field(discriminator="kind"),
 ]
 ContactSection = Annotated[
-    _PlaneContact | _SphereContact | _CylinderContact | _SurfaceContact, Field(discriminator="kind")
+    _PlaneContact | _SphereContact | _CylinderContact | _MeshContact | _SurfaceContact, Field(discriminator="kind")
 ]

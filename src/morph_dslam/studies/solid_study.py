@@ -7,10 +7,14 @@ import json
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
+from morph_dslam.mechanics.contact import RigidObstacle
 from morph_dslam.mechanics.coupled_solid import CoupledSolid
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
@@ -189,6 +193,9 @@ class SolidStudy(BodyStudy, Section):
         content |= {"shape": [section.fingerprint(mesh) for section in self.shape]} if self.shape else {}
         content |= self.model_dump(mode="json", include={"couplings"}) if self.couplings else {}
         content |= self.model_dump(mode="json", include={"contacts"}) if self.contacts else {}
+        for section in content.get("contacts", ()):
+            if section["kind"] == "mesh":
+                section["file"] = hashlib.sha256(Path(section["file"]).read_bytes()).hexdigest()
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def problem(self, options: SolidOptions | None = None) -> SolidProblem:
@@ -220,6 +227,12 @@ class SolidStudy(BodyStudy, Section):
                 [part if first else part.unloaded() for part, first in couplings],
             )
         return problem
+
+    def obstacles(self) -> tuple[ParameterSymbols, list[tuple[RigidObstacle, NDArray[np.int64]]]]:
+        """What its contacts keep the solid out of, with the nodes that they name, and the symbols of its place."""
+        symbols, mesh = ParameterSymbols(self.model_parameters()), self.solid_mesh()
+        rigid = [section.make(reader_of(symbols)) for section in self.contacts if section.kind != "surface"]
+        return symbols, [(body, mesh.set_nodes(body.on)) for body in rigid]
 
     def _applied_first(self) -> list[Any]:
         """Supports, loads and couplings that act before the others."""
