@@ -60,7 +60,6 @@ from morph_dslam import (
 )
 from morph_dslam.extend import run_and_report_errors, threads_side_by_side
 from morph_dslam.extend.slam import Slam, warm_up as warm_up_slam
-from morph_dslam.sources.frames import FrameSource
 from support import data_folder
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -136,7 +135,7 @@ def tracked_workload(name: str, new_tracker: Callable[[], Tracker], frames: list
         yield {name: timed(lambda frame=frame: tracker.track(frame))}
 
 
-def anchored_seal() -> tuple[Callable[[], Tracker], FrameSource]:
+def anchored_seal() -> tuple[Callable[[], Tracker], Iterable[Frame]]:
     """The camera in the map of the scan, and the seal in it, and the frames from where the scan ends."""
     folder = ROOT / "examples" / "boot_seal" / "output"
     camera, model = load_camera(folder / "recording" / "camera.yaml"), load_model(folder / "boot_seal.morph")
@@ -174,7 +173,7 @@ def all_workloads(data: Path, n_frames: int) -> Iterator[Times]:
 class Clocked:
     """A recording that notes when each frame was read."""
 
-    def __init__(self, source: FrameSource) -> None:
+    def __init__(self, source: Iterable[Frame]) -> None:
         self._source = source
         self.read: list[float] = []
 
@@ -184,7 +183,7 @@ class Clocked:
             yield frame
 
 
-def paced(new_tracker: Callable[[], Tracker], source: FrameSource, two_threads: bool) -> tuple[float, float]:
+def paced(new_tracker: Callable[[], Tracker], source: Iterable[Frame], two_threads: bool) -> tuple[float, float]:
     """Wall time of a frame, and the median latency from when it was read to its result; ms."""
     clocked, done = Clocked(source), []
     session = Session({"seal": new_tracker()}, clocked)

@@ -7,7 +7,9 @@ import h5py
 import numpy as np
 import pytest
 
+from morph_dslam import load_model
 from morph_dslam.cli import app as cli
+from tests.support.block_study import STUDY
 from tests.support.scenes import write_scene
 
 CAMERA = "camera = { width = 480, height = 360, fx = 430.0, fy = 430.0, cx = 239.5, cy = 179.5 }\n"
@@ -91,6 +93,51 @@ def test_the_frame_log_has_a_line_for_each_frame(sequence):
         for key, name in (("camera_from_object", "camera_from_object"), ("largest_von_mises", "largest_von_mises")):
             np.testing.assert_array_equal([row[key] for row in rows], file[name][()])
         np.testing.assert_array_equal([list(row["parameters"].values()) for row in rows], file["parameters"][()])
+
+
+@pytest.fixture
+def project(sequence, tmp_path):
+    """A folder with what is needed to track, by names of its own."""
+    for name, source in (
+        ("rubber.morph", "sheet.morph"),
+        ("phone.yaml", "seq/camera.yaml"),
+        ("clicked.csv", "seq/landmarks.csv"),
+        ("pictures", "seq/frames"),
+    ):
+        (tmp_path / name).symlink_to(sequence / source)
+    (tmp_path / "notes.txt").write_text("filmed on Tuesday\n")
+    (tmp_path / "forces.csv").write_text("frame,force_N\n0,0.0\n")
+    return tmp_path
+
+
+def test_what_is_not_named_is_found_in_the_folder(sequence, project, capsys):
+    assert cli.main(["track", str(project), "--no-video"]) == 0
+    command = capsys.readouterr().out.splitlines()[0].split()
+    inputs = [f"{project}/{name}" for name in ("pictures", "rubber.morph", "phone.yaml", "clicked.csv", "run")]
+    assert [word for word in command if str(project) in word] == inputs
+    with h5py.File(sequence / "run" / "result.h5") as named, h5py.File(project / "run" / "result.h5") as found:
+        np.testing.assert_array_equal(found["parameters"][()], named["parameters"][()])
+
+
+def test_what_a_folder_lacks_or_has_twice_is_named(project, refused):
+    assert "name --camera, --output, --landmarks or another start too" in refused(
+        "track", project / "pictures" / "000000.png", "--model", project / "rubber.morph"
+    )
+    (project / "webcam.yml").write_text((project / "phone.yaml").read_text())
+    assert re.search(r"holds several: .*phone\.yaml, .*webcam\.yml; name one with --camera", refused("track", project))
+    (project / "webcam.yml").unlink()
+    (project / "more").symlink_to(project / "pictures")
+    assert re.search(r"several recordings: .*more, .*pictures", refused("track", project))
+    (project / "clicked.csv").unlink()
+    assert "does not say where the object is" in refused("track", project)
+
+
+def test_a_model_is_built_from_the_study_in_the_folder(project, refused):
+    """A block, whose landmarks are those of something else: the model is there, and the landmarks are refused."""
+    (project / "rubber.morph").unlink()
+    (project / "cube.toml").write_text(STUDY)
+    assert "landmark" in refused("track", project)
+    assert load_model(project / "cube.morph").name == "block"
 
 
 def test_bad_input_is_one_message(sequence, tmp_path, refused):

@@ -60,6 +60,9 @@ $Elements
 $EndElements
 """
 
+#: Corners of the faces of a tetrahedron, seen from outside in their order.
+TET_FACES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3))
+
 
 def inp_text(name):
     """A block of 20 x 20 x 30 mm as an input file; its nodes are numbered from 5 in steps of 3."""
@@ -334,6 +337,25 @@ def test_a_step_solid_is_meshed_and_its_unit_checked(tmp_path):
     path.write_text(path.read_text()[:2000])
     with pytest.raises(StudyError, match="is cut short"):
         load_mesh(path, "mm")
+
+
+@pytest.mark.parametrize("kind", ["inp", "msh", "vtk", "vtu", "ply", "obj", "stl", "binary stl", "step"])
+@pytest.mark.parametrize("name", ["cube.stl", "cube.vtk", "cube"])
+def test_a_mesh_is_read_whatever_its_name(tmp_path, kind, name):
+    written, box = tmp_path / f"written.{kind.split()[-1]}", block((30.0, 20.0, 20.0), (1, 1, 1), "tet4")
+    if kind == "step":
+        occ.Box((0, 0, 0), (30, 20, 20)).WriteStep(str(written))
+    elif kind == "inp":
+        written.write_text("** a cube\n" + inp_text("hex8")[0])
+    else:
+        faces = box.boundary_faces()
+        triangles = np.array([box.blocks[0].connectivity[c][list(TET_FACES[f])] for c, f in faces.tolist()])
+        is_surface = kind in ("ply", "obj", "stl", "binary stl")
+        cells = [("triangle", triangles)] if is_surface else [("tetra", box.blocks[0].connectivity)]
+        options = {"binary": True} if kind == "binary stl" else {"file_format": "gmsh22"} if kind == "msh" else {}
+        meshio.Mesh(box.nodes, cells).write(written, **options)
+    path = written.rename(tmp_path / name)
+    assert cell_volumes(load_mesh(path, "mm")).sum() == pytest.approx(12e-6, rel=1e-6)
 
 
 @pytest.mark.parametrize(

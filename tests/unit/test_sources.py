@@ -55,6 +55,22 @@ def test_grey_images_become_three_channels(tmp_path):
     assert frame.image.shape == (8, 8, 3)
 
 
+def test_images_are_known_by_their_content(tmp_path):
+    """A photograph that was given another ending, and pictures without any beside something else."""
+    misnamed, nameless = tmp_path / "misnamed", tmp_path / "nameless"
+    for folder in (misnamed, nameless):
+        folder.mkdir()
+        for number in range(3):
+            cv2.imwrite(str(folder / f"{number}.jpg"), np.full((8, 8), 70 + number, dtype=np.uint8))
+            (folder / f"{number}.jpg").rename(folder / (f"{number}.png" if folder is misnamed else f"shot {number}"))
+        (folder / "notes.txt").write_text("three pictures\n")
+        assert [int(frame.image[4, 4, 0]) for frame in open_source(folder)] == [70, 71, 72]
+    cut = misnamed / "2.png"
+    cut.write_bytes(cut.read_bytes()[:-2])
+    with pytest.raises(SourceError, match=r"frame 2: .*2\.png is cut short"):
+        list(open_source(misnamed))
+
+
 def test_video_frames_in_order(tmp_path):
     source = open_source(make_video(tmp_path / "clip.avi", "MJPG"), first=2, last=9)
     frames = list(source)

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from morph_dslam.errors import CameraError
+from morph_dslam.io.file_kinds import IMAGES, file_kind
 from morph_dslam.sources import open_source
-from morph_dslam.sources.frames import SUFFIXES, read_image
+from morph_dslam.sources.frames import image_files, read_image
 from morph_dslam.units import FACTORS
 
 Array = NDArray[np.float64]
@@ -164,8 +165,8 @@ def collect_views(sources: Sequence[Path], board: Board, ignored: Path | None = 
 def _image_files(sources: Sequence[Path]) -> list[Path]:
     """The image files named, or in the folder named; none if the source is a recording."""
     if len(sources) == 1 and sources[0].is_dir():
-        return sorted(path for path in sources[0].iterdir() if path.suffix.lower() in SUFFIXES)
-    if all(path.suffix.lower() in SUFFIXES for path in sources):
+        return image_files(sources[0])
+    if all(file_kind(path) in IMAGES for path in sources):
         return list(sources)
     if len(sources) > 1:
         raise CameraError(f"give images, or one folder, or one recording; {sources[0]} is not the only source")

@@ -44,9 +44,9 @@ def add_file(
     command.add_argument(name, type=Path, metavar=metavar, help=text, **more)
 
 
-def add_output(command: argparse.ArgumentParser, metavar: str, text: str) -> None:
+def add_output(command: argparse.ArgumentParser, metavar: str, text: str, required: bool = True) -> None:
     """Add ``-o``, the path to write to."""
-    command.add_argument("-o", "--output", type=Path, required=True, metavar=metavar, help=text)
+    command.add_argument("-o", "--output", type=Path, required=required, metavar=metavar, help=text)
 
 
 def add_flag(command: argparse.ArgumentParser, name: str, text: str) -> None:

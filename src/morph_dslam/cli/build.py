@@ -40,19 +40,23 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _build_study(arguments: argparse.Namespace) -> None:
+    if arguments.unit is not None:
+        raise StudyError("--unit is of a surface (--rigid); a study file states its units itself")
+    build_study(arguments.study, arguments.output, arguments.workers, arguments.reference_curve)
+
+
+def build_study(study: Path, output: Path, workers: int | None = None, curve: Path | None = None) -> None:
+    """Build the model of a study file, write its report, and print what came of it."""
     from morph_dslam import build, write_build_report
     from morph_dslam.extend.mechanics import NearlyIncompressibleWarning
     from morph_dslam.extend.reduction import read_reference_curve, report_path
     from morph_dslam.extend.reports import error_facts
     from morph_dslam.extend.studies import build_warnings
 
-    if arguments.unit is not None:
-        raise StudyError("--unit is of a surface (--rigid); a study file states its units itself")
-    output = arguments.output
-    reference = None if arguments.reference_curve is None else read_reference_curve(arguments.reference_curve)
+    reference = None if curve is None else read_reference_curve(curve)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NearlyIncompressibleWarning)  # printed once, at the end
-        model = build(arguments.study, output, arguments.workers)
+        model = build(study, output, workers)
     write_build_report(report_path(output), model, reference)
     print(f"wrote {output} and {report_path(output)}")
     for name, words in error_facts(model).items():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,16 +23,23 @@ from morph_dslam.errors import TrackingError
 
 if TYPE_CHECKING:
     from morph_dslam import TrackOptions
+    from morph_dslam.extend.tracking import FoundInputs
 
 HELP = "find an object's pose and parameters in every frame, and draw the stress over the video"
+#: Options that say where the object is.
+_STARTS = ("landmarks", "registration", "board", "picture", "guess")
 KEPT = "the frames tracked so far are kept in the run folder"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     add_file(
-        command, "frames", "video file, folder of numbered images, or another recording (docs/sources.md)", "FRAMES"
+        command,
+        "frames",
+        "video file, folder of numbered images, or another recording (docs/sources.md); or a folder that holds one and "
+        "what is not named: model or study, camera, and where the object is",
+        "FRAMES",
     )
-    add_tracking_arguments(command)
+    add_tracking_arguments(command, required=False)
     command.add_argument(
         "--reference-frame",
         type=int,
@@ -60,6 +69,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Track and print the figures of each run folder."""
     from morph_dslam import track
 
+    _complete(arguments)
     options = run_options(
         arguments,
         frames=arguments.frames,
@@ -69,6 +79,47 @@ def run(arguments: argparse.Namespace) -> None:
         other_cameras=tuple(vars(arguments)["with"]),  # a keyword of the language
     )
     track(options, print_summary)
+
+
+def _complete(arguments: argparse.Namespace) -> None:
+    """Find in the folder ``arguments.frames`` what is not named, and print the command that names it all.
+
+    A model that is not there is built from the study that is.
+    """
+    from morph_dslam.extend.tracking import find_inputs
+
+    missing = [name for name in ("model", "camera", "output") if getattr(arguments, name) is None]
+    starts = [name for name in _STARTS if getattr(arguments, name) is not None]
+    if not missing and starts:
+        return
+    folder = arguments.frames
+    if not folder.is_dir():
+        named = [f"--{name}" for name in missing] + ([] if starts else ["--landmarks or another start"])
+        raise TrackingError(f"name {', '.join(named)} too, or give a folder that holds all inputs in place of {folder}")
+    found = find_inputs(folder)
+    if not starts:
+        starts = [found.start[0]]
+        setattr(arguments, *found.start)
+    arguments.frames, arguments.camera = found.recording, arguments.camera or found.camera
+    arguments.model = arguments.model or _found_model(found)
+    arguments.output = arguments.output or folder / "run"
+    named = [(f"--{name}", str(getattr(arguments, name))) for name in ("model", "camera", *starts)]
+    print(shlex.join(["morph", "track", str(arguments.frames), *chain(*named), "-o", str(arguments.output)]))
+
+
+def _found_model(found: FoundInputs) -> Path:
+    """The model in a folder, built first if there is only its study."""
+    if found.models or len(found.studies) != 1:
+        for study in found.studies:
+            if study.stat().st_mtime > found.model.stat().st_mtime:
+                print(f"note: {study} is newer than {found.model}: if it was changed, build the model again")
+        return found.model
+    from morph_dslam.cli.build import build_study
+
+    study, model = found.studies[0], found.studies[0].with_suffix(".morph")
+    print(shlex.join(["morph", "build", str(study), "-o", str(model)]))
+    build_study(study, model)
+    return model
 
 
 def print_summary(folder: Path, summary: dict[str, Any]) -> None:
@@ -176,11 +227,11 @@ def _random_walk(arguments: argparse.Namespace) -> tuple[tuple[str, float], ...]
     return tuple((name, step / units.get(name, 1.0)) for name, step in arguments.random_walk)
 
 
-def add_tracking_arguments(command: argparse.ArgumentParser) -> None:
-    """The arguments that say what is tracked, with what, and where it is at first."""
-    add_file(command, "--model", "model file of `morph build`", required=True)
-    add_file(command, "--camera", "camera file: size, intrinsics, distortion", required=True)
-    start = command.add_mutually_exclusive_group(required=True)
+def add_tracking_arguments(command: argparse.ArgumentParser, required: bool = True) -> None:
+    """The arguments that say what is tracked, with what, and where it is at first; whether these must be named."""
+    add_file(command, "--model", "model file of `morph build`", required=required)
+    add_file(command, "--camera", "camera file: size, intrinsics, distortion", required=required)
+    start = command.add_mutually_exclusive_group(required=required)
     add_file(start, "--landmarks", "object points and their pixels in the reference frame")
     add_flag(command, "--at-rest", "the object is undeformed in the frame of its landmarks")
     add_file(start, "--registration", "registration.json of `morph register` in a map", "JSON")
@@ -208,7 +259,7 @@ def add_tracking_arguments(command: argparse.ArgumentParser) -> None:
         const="still",
         help="camera and support stand still: the pose is one over the sequence, estimated from all frames",
     )
-    add_output(command, "RUN", "run folder to write")
+    add_output(command, "RUN", "run folder to write", required)
     add_flag(command, "--overwrite", "replace a run that is in the run folder")
     add_flag(command, "--outline", "let the object's outline count too, where it stands out from the background")
     add_flag(command, "--no-texture", "follow the object by its outline alone")

@@ -18,6 +18,7 @@ from morph_dslam.tracking.estimator import (
     State as State,
     moved as moved,
 )
+from morph_dslam.tracking.found_inputs import FoundInputs as FoundInputs, find_inputs as find_inputs
 from morph_dslam.tracking.load_prior import LoadOptions as LoadOptions
 from morph_dslam.tracking.reactions import (
     Reaction as Reaction,

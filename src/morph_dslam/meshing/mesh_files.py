@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
+from morph_dslam.io.file_kinds import file_kind
 from morph_dslam.io.inp_file import InpFile, SurfacePart, read_inp
 from morph_dslam.meshing.cell_types import cell_type
 from morph_dslam.meshing.mesh_repair import reoriented, without_collapsed_cells
@@ -29,7 +30,7 @@ from morph_dslam.meshing.netgen_meshing import (
 from morph_dslam.units import to_si
 
 Indices = NDArray[np.int64]
-_VOLUMES = (".inp", ".msh", ".vtk", ".vtu", ".step", ".stp")
+_VOLUMES = (".inp", ".msh", ".vtk", ".vtu", ".step")
 
 
 def load_mesh(path: Path | str, unit: str, size: float | None = None) -> Mesh:
@@ -49,16 +50,16 @@ def load_mesh(path: Path | str, unit: str, size: float | None = None) -> Mesh:
         In metres, without the nodes that no cell uses, mended by `mesh_repair`; `check_mesh` checks it.
     """
     path, scale = Path(path), to_si(1.0, unit, "length")
-    kind = path.suffix.lower()
+    kind = file_kind(path)
     if kind not in _VOLUMES + SURFACES:
         raise StudyError(f"{path} is no mesh file that is read; use {', '.join(_VOLUMES + SURFACES)}")
     if size is not None and size <= 0.0:
         raise StudyError(f"a cell size of {size} m cannot be; give a positive length")
-    if size is not None and kind not in (*SURFACES, ".step", ".stp"):
+    if size is not None and kind not in (*SURFACES, ".step"):
         raise StudyError(f"{path} is meshed already; a cell size is for surfaces and STEP files")
     if kind in SURFACES:
         return mesh_surface_file(path, None if size is None else size / scale).scaled(scale)
-    if kind in (".step", ".stp"):
+    if kind == ".step":
         return mesh_step_file(path, unit, None if size is None else size * 1e3).scaled(1e-3)
     mesh = _mesh_from_inp(read_inp(path)) if kind == ".inp" else _read_with_meshio(path)
     return reoriented(without_collapsed_cells(mesh)).scaled(scale)
@@ -71,11 +72,11 @@ def load_surface_mesh(path: Path | str, unit: str) -> Mesh:
     in metres.
     """
     path = Path(path)
-    if path.suffix.lower() in SURFACES:
+    if file_kind(path) in SURFACES:
         surface = read_surface(path)
         blocks = (CellBlock("tri3", surface.triangles),)
         return Mesh(surface.points, blocks).without_unused_nodes().scaled(to_si(1.0, unit, "length"))
-    if path.suffix.lower() in (".step", ".stp"):
+    if file_kind(path) == ".step":
         raise StudyError(f"{path} holds solids; a shell needs a mesh of its middle surface")
     return load_mesh(path, unit)
 
@@ -177,11 +178,12 @@ def _read_with_meshio(path: Path) -> Mesh:
 
 def _read(path: Path) -> Any:
     readers = {".msh": meshio.gmsh.read, ".vtk": meshio.vtk.read, ".vtu": meshio.vtu.read}
+    kind = file_kind(path)
     try:
-        if path.suffix.lower() == ".msh":
+        if kind == ".msh":
             _check_sections_closed(path)
         with redirect_stdout(StringIO()), redirect_stderr(StringIO()) as warnings:
-            content = readers[path.suffix.lower()](str(path))
+            content = readers[kind](str(path))
     except OSError as error:
         raise StudyError(f"cannot read the mesh {path}: {error.strerror or error}") from error
     except StudyError:
@@ -205,7 +207,7 @@ def _read(path: Path) -> Any:
 
 
 def _damaged(path: Path, error: Exception) -> StudyError:
-    return StudyError(f"{path} is damaged, cut short, or no {path.suffix} file ({type(error).__name__}: {error})")
+    return StudyError(f"{path} is damaged, cut short, or no {file_kind(path)} file ({type(error).__name__}: {error})")
 
 
 def _check_sections_closed(path: Path) -> None:

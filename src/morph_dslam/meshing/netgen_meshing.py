@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import meshio
@@ -22,6 +23,7 @@ from netgen import meshing, occ, stl
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
+from morph_dslam.io.file_kinds import file_kind
 from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces
 
 Array = NDArray[np.float64]
@@ -43,10 +45,11 @@ def read_surface(path: Path) -> _TriangleSurface:
 
     Raises StudyError if it is a file of another kind, cannot be read, or holds no faces.
     """
-    if path.suffix.lower() not in SURFACES:
+    kind = file_kind(path)
+    if kind not in SURFACES:
         raise StudyError(f"{path} is no surface file that is read; use {', '.join(SURFACES)}")
     try:
-        points, triangles = _read_obj(path) if path.suffix.lower() == ".obj" else _read_stl_or_ply(path)
+        points, triangles = _read_obj(path) if kind == ".obj" else _read_stl_or_ply(path, kind)
     except OSError as error:
         raise StudyError(f"cannot read the surface {path}: {error.strerror or error}") from error
     if not len(triangles):
@@ -86,8 +89,8 @@ def _read_obj(path: Path) -> tuple[Array, Indices]:
     return np.array(points).reshape(-1, 3), np.array(triangles, dtype=np.int64).reshape(-1, 3)
 
 
-def _read_stl_or_ply(path: Path) -> tuple[Array, Indices]:
-    reader = meshio.stl.read if path.suffix.lower() == ".stl" else meshio.ply.read
+def _read_stl_or_ply(path: Path, kind: str) -> tuple[Array, Indices]:
+    reader = meshio.stl.read if kind == ".stl" else meshio.ply.read
     try:
         with np.errstate(over="ignore"):  # meshio takes the text of an ASCII file for a count of triangles
             content = reader(str(path))
@@ -95,7 +98,7 @@ def _read_stl_or_ply(path: Path) -> tuple[Array, Indices]:
         raise
     except Exception as error:  # a damaged file ends meshio's readers in errors of every kind
         raise StudyError(
-            f"{path} is damaged, cut short, or no {path.suffix} file ({type(error).__name__}: {error})"
+            f"{path} is damaged, cut short, or no {kind} file ({type(error).__name__}: {error})"
         ) from error
     faces = [_fans(np.asarray(b.data)) for b in content.cells if b.type in ("triangle", "quad", "polygon")]
     triangles = np.concatenate(faces) if faces else np.empty((0, 3))
@@ -245,9 +248,11 @@ def mesh_step_file(path: Path, unit: str, size: float | None) -> Mesh:
     stated = [u for u, prefix in _STEP_UNITS.items() if re.search(rf"SI_UNIT\s*\(\s*{prefix}\s*,\s*\.METRE\.", text)]
     if stated and unit not in stated:
         raise StudyError(f"{path} states that its unit of length is {stated[0]}, but '{unit}' is declared")
-    with _quiet():
+    with _quiet(), TemporaryDirectory() as folder:
+        named = Path(folder) / "solids.step"  # Netgen goes by the name
+        named.symlink_to(path.resolve())
         try:
-            geometry = occ.OCCGeometry(str(path))
+            geometry = occ.OCCGeometry(str(named))
             low, high = geometry.shape.bounding_box
             diagonal = float(np.linalg.norm(np.array([high[i] - low[i] for i in range(3)])))
             content = geometry.GenerateMesh(maxh=size or diagonal / 10.0)

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SourceError
+from morph_dslam.io.file_kinds import IMAGES, content_kind, file_kind, named_kind
 
 #: Frames per second where a recording does not tell it.
 ASSUMED_FPS = 30.0
-SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 #: The bytes with which a complete file of this kind ends; the decoder itself fills what is missing with grey.
-END_MARKERS = {".png": b"IEND", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
+_END_MARKERS = {".png": b"IEND", ".jpg": b"\xff\xd9"}
 
 
 @dataclass(frozen=True)
@@ -105,6 +105,12 @@ class DepthScale:
     registered: bool = True
 
 
+def image_files(folder: Path) -> list[Path]:
+    """The images in a folder, by name: those that are called so or, without any, those that are some."""
+    files = [path for path in sorted(folder.iterdir()) if path.is_file()]
+    return [path for path in files if named_kind(path) in IMAGES] or [f for f in files if file_kind(f) in IMAGES]
+
+
 def read_image(path: Path, what: str) -> NDArray[np.uint8]:
     """Read an image (h, w, 3) uint8 as blue, green, red.
 
@@ -128,9 +134,9 @@ def _decode(path: Path, what: str, flags: int) -> NDArray:
         data = path.read_bytes()
     except OSError as error:
         raise SourceError(f"{what}: cannot read {path}: {error.strerror}") from error
-    marker = END_MARKERS.get(path.suffix.lower())
+    marker = _END_MARKERS.get(content_kind(data) or "")
     if marker and marker not in data[-1024:]:
-        raise SourceError(f"{what}: {path} is cut short or not a {path.suffix[1:]} image: copy it again")
+        raise SourceError(f"{what}: {path} is cut short: copy it again")
     image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
     if image is None:
         raise SourceError(f"{what}: {path} cannot be decoded as an image")

@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from morph_dslam.errors import SourceError
+from morph_dslam.io.file_kinds import IMAGES
 from morph_dslam.sources.frames import (
     ASSUMED_FPS,
-    SUFFIXES,
     DepthScale,
     Frame,
     check_range,
     check_size,
+    image_files,
     read_depth,
     read_image,
 )
@@ -112,9 +113,7 @@ def numbered_images(folder: Path) -> dict[int, Path]:
     Raises SourceError if a name has no number, two have the same, or there is no image.
     """
     images: dict[int, Path] = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() not in SUFFIXES:
-            continue
+    for path in image_files(folder):
         numbers = re.findall(r"\d+", path.stem)
         if not numbers:
             raise SourceError(f"{path} has no number in its name, which gives the frames their order: rename it")
@@ -126,7 +125,7 @@ def numbered_images(folder: Path) -> dict[int, Path]:
             )
         images[number] = path
     if not images:
-        raise SourceError(f"{folder} holds no images ({', '.join(SUFFIXES)})")
+        raise SourceError(f"{folder} holds no images ({', '.join(IMAGES)})")
     return dict(sorted(images.items()))
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SourceError
+from morph_dslam.io.file_kinds import file_kind
 from morph_dslam.sources.frames import Frame, check_range, check_size
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
 def is_bag(path: Path) -> bool:
     """Whether a path, `#topic` after it or not, is a ROS 1 bag, or a file or folder of a ROS 2 bag."""
     bag, _ = _split_topic(path)
-    return bag.suffix in (".bag", ".db3", ".mcap") or (bag / "metadata.yaml").is_file()
+    return file_kind(bag) in (".bag", ".db3", ".mcap") or (bag / "metadata.yaml").is_file()
 
 
 def _split_topic(path: Path) -> tuple[Path, str | None]:
@@ -59,7 +60,7 @@ def _reader(path: Path) -> Iterator[AnyReader]:
     except ImportError as error:
         raise SourceError(f'{path} is a ROS bag, which needs rosbags: pip install "morph-dslam[ros]"') from error
     # ROS 2 bags are folders; older ones do not carry the definitions of their messages.
-    folder = path.parent if path.suffix in (".db3", ".mcap") and (path.parent / "metadata.yaml").is_file() else path
+    folder = path.parent if file_kind(path) in (".db3", ".mcap") and (path.parent / "metadata.yaml").is_file() else path
     try:
         with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             yield reader

@@ -9,12 +9,11 @@ import cv2
 import numpy as np
 
 from morph_dslam.errors import SourceError
+from morph_dslam.io.file_kinds import file_kind
 from morph_dslam.sources.frames import Frame, check_range, frame_rate, open_capture
 
 #: Containers that only estimate their length from its duration are off by so many frames without damage.
 LENGTH_TOLERANCE = 1
-#: The first bytes of a Matroska or WebM file.
-MATROSKA = b"\x1aE\xdf\xa3"
 
 
 def _open(path: Path) -> cv2.VideoCapture:
@@ -33,8 +32,7 @@ def _count_and_rate(path: Path, capture: cv2.VideoCapture) -> tuple[int, float]:
     Matroska and WebM, which browsers record, declare a duration alone: where frames were dropped, OpenCV's count is
     wrong.
     """
-    with path.open("rb") as file:
-        is_matroska = file.read(len(MATROSKA)) == MATROSKA
+    is_matroska = file_kind(path) == ".mkv"
     count, fps = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0), frame_rate(capture)
     if count and not is_matroska:
         return count, fps

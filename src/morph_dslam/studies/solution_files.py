@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
+from morph_dslam.io.file_kinds import file_kind
 
 Array = NDArray[np.float64]
-#: Of meshio, by the ending of a file's name: `meshio.read` itself ends the program where a file is damaged.
-_READERS = {".vtu": meshio.vtu.read, ".vtk": meshio.vtk.read, ".xdmf": meshio.xdmf.read, ".xmf": meshio.xdmf.read}
+#: Of meshio, by what the file is: `meshio.read` itself ends the program where a file is damaged.
+_READERS = {".vtu": meshio.vtu.read, ".vtk": meshio.vtk.read, ".xdmf": meshio.xdmf.read}
 #: Nodes may differ by so much of the mesh's size from file to file, which is written in single precision.
 SAME = 1e-5
 
@@ -23,7 +24,7 @@ def read_solution(path: Path, step: str | None = None) -> meshio.Mesh:
 
     Raises StudyError if it is missing, damaged or of another kind.
     """
-    read = _READERS.get(path.suffix.lower())
+    read = _READERS.get(file_kind(path))
     if read is None:
         raise StudyError(f"{path} is no solution that can be read; use {', '.join(_READERS)}")
     try:

@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 
 from morph_dslam.errors import StudioError
 from morph_dslam.extend.mechanics import Mesh, check_mesh, load_mesh, save_mesh
+from morph_dslam.io.file_kinds import file_kind
 from morph_dslam.studio.packing import packed
 
 Array = NDArray[np.float64]
@@ -81,7 +82,7 @@ class _Outside:
 
 @lru_cache(maxsize=2)
 def _outside(path: Path, unit: str, size: float | None, stamp: tuple[int, int]) -> _Outside:
-    if path.suffix.lower() == ".inp" and _INCLUDE.search(path.read_bytes()):
+    if file_kind(path) == ".inp" and _INCLUDE.search(path.read_bytes()):
         raise StudioError(f"{path.name} includes other files: write one flat file")
     mesh = load_mesh(path, unit, size)
     check_mesh(mesh)
