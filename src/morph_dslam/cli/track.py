@@ -193,6 +193,7 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
         landmarks=arguments.landmarks,
         registration=arguments.registration,
         at_rest=arguments.at_rest,
+        snap=arguments.snap,
         initializer=InitializerFiles(arguments.board, arguments.picture, arguments.guess),
         map_path=arguments.map,
         inner=tuple(arguments.inner),
@@ -234,6 +235,7 @@ def add_tracking_arguments(command: argparse.ArgumentParser, required: bool = Tr
     start = command.add_mutually_exclusive_group(required=required)
     add_file(start, "--landmarks", "object points and their pixels in the reference frame")
     add_flag(command, "--at-rest", "the object is undeformed in the frame of its landmarks")
+    add_flag(command, "--snap", "correct the landmarks by the object's outline in their frame")
     add_file(start, "--registration", "registration.json of `morph register` in a map", "JSON")
     add_file(start, "--board", "a printed board of markers, and where the object is on it", "TOML")
     add_file(start, "--picture", "a picture of the object's print, and where it is on it", "TOML")

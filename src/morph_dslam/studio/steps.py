@@ -318,7 +318,7 @@ class Steps:
 
     # -- track and results -------------------------------------------------------------------------
 
-    async def track(self, refine: bool = False, outline: bool = False) -> dict[str, Any]:
+    async def track(self, refine: bool = False, snap: bool = False, outline: bool = False) -> dict[str, Any]:
         """Start `morph track`."""
         self._model_and_camera()
         self._needed(names.LANDMARKS, "click and save pairs first")
@@ -328,7 +328,7 @@ class Steps:
             words += ["--reference-frame", str(chosen["reference_frame"])]
         # A start that is known to be undeformed is not refined: what is refined counts for less than all frames tell.
         at_rest = chosen.get("at_rest", True) and not refine
-        flags = {"--at-rest": at_rest, "--refine": refine, "--outline": outline}
+        flags = {"--at-rest": at_rest, "--snap": snap, "--refine": refine, "--outline": outline}
         words += [flag for flag, is_set in flags.items() if is_set]
         words += ["--frame-log", names.FRAME_LOG, "--overwrite", "-o", names.RUN]
         self.project.path(names.FRAME_LOG).unlink(missing_ok=True)

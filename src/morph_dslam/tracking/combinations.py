@@ -42,6 +42,14 @@ OF_OBJECT: tuple[tuple[Callable[[ObjectOptions], bool], str], ...] = (
         "the frame of the landmarks shows the object at rest: start from landmarks, or leave out --at-rest",
     ),
     (
+        lambda part: part.snap and part.landmarks is None,
+        "the outline corrects landmarks: start from landmarks, or leave out --snap",
+    ),
+    (
+        lambda part: part.snap and part.tracker.use_depth,
+        "depth says where the object is in the frame of the landmarks: leave out --snap or --depth",
+    ),
+    (
         lambda part: part.tracker.pose == "still" and part.registration is not None,
         "an object that is registered in a map stands still in it already: leave out --still",
     ),

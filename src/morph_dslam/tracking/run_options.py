@@ -21,6 +21,7 @@ class ObjectOptions:
     model : model file.
     landmarks : points of the object and their pixels in the reference frame.
     registration : registration.json of `morph register`.
+    snap : whether the object's outline in the frame of the landmarks corrects them.
     initializer : a board, a picture of its print or a guess, which find it in the reference frame.
     at_rest : whether the object is undeformed in the frame of its landmarks, its parameters at their defaults.
     reregister_at : frames in which to register it anew, with landmarks there, or None for the initializer.
@@ -32,6 +33,7 @@ class ObjectOptions:
     landmarks: Path | None = None
     registration: Path | None = None
     at_rest: bool = False
+    snap: bool = False
     initializer: InitializerFiles = field(default_factory=InitializerFiles)
     reregister_at: tuple[tuple[int, Path | None], ...] = ()
     inner: tuple[Path, ...] = ()

@@ -47,7 +47,7 @@ from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.session import Session, SynchronizedFrames
 from morph_dslam.tracking.setup import TrackedObject, load_cameras, load_objects
 from morph_dslam.tracking.sinks import BrowserSink, LivePicture, LiveTimes, Sink, TrackedFrame, VideoSink
-from morph_dslam.tracking.still_run import Sharpening, with_pose, with_still_pose
+from morph_dslam.tracking.still_run import Sharpening, known_state, with_pose, with_still_pose
 from morph_dslam.tracking.tracker import Tracker
 
 Tell = Callable[[Path, dict[str, Any]], object]
@@ -281,16 +281,14 @@ def _refined(part: PlacedObject, keyframes: list[Keyframe], run: TrackOptions) -
         return part
     tracker = part.new_tracker()
     assert isinstance(tracker, Tracker)
-    landmark_px = landmark_deviation(registration.facts["sigma_px"])
-    bound = bind_landmarks(part.model, landmarks.points)
-    seen, pixels = part.camera.undistort_pixels(landmarks.pixels), tracker.reference.pixels
-    chosen = choose_keyframes(keyframes)
+    pixels, chosen = tracker.reference.pixels, choose_keyframes(keyframes)
     if not part.options.use_discrepancy:
-        state = refine_reference(tracker.estimator, bound, seen, pixels, registration.state, chosen, landmark_px)
+        state = refine_reference(tracker.estimator, known_state(part), pixels, registration.state, chosen)
         refined = replace(registration, state=state, covariance=None)
     else:
         # What the state is wrong by counts with the discrepancy: both at once would be the same twice.
-        known = Reference(registration.state, pixels, bound, seen, landmark_px)
+        bound, seen = bind_landmarks(part.model, landmarks.points), part.camera.undistort_pixels(landmarks.pixels)
+        known = Reference(registration.state, pixels, bound, seen, landmark_deviation(registration.facts["sigma_px"]))
         fit = DiscrepancyFit(part.model, part.camera, part.options.discrepancy)
         found = refine_discrepancy(fit, tracker.estimator, known, chosen)
         refined = replace(registration, discrepancy=found, covariance=None)

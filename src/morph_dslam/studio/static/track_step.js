@@ -43,13 +43,16 @@ export async function trackStep(app) {
   }
   const [mesh, model, { colours }] = await Promise.all([call('model_mesh'), call('model'), explored('model.json')]);
   const refine = el('input', { id: 'refine', checked: !(app.state.choices.at_rest ?? true) });
+  const snap = el('input', { id: 'snap' });
   const outline = el('input', { id: 'outline' });
   const start = el('button', { id: 'track', className: 'main', onclick: () => app.doing(() => call('track',
-    { refine: refine.checked, outline: outline.checked })) });
+    { refine: refine.checked, snap: snap.checked, outline: outline.checked })) });
   const result = el('div', { id: 'track-result' });
   app.panel.append(
     check('Refine the start over the whole video, and track once more', refine),
     el('p', { className: 'note' }, 'Takes twice as long. The start is then not taken as undeformed.'),
+    check('Snap the start to the outline', snap),
+    el('p', { className: 'note' }, 'Corrects the clicks by the edges that their image shows, where the part has those of its mesh.'),
     check('Use the outline too', outline),
     el('p', { className: 'note' }, 'Where the object stands out from the background.'),
     start, command('morph track … --frame-log track.jsonl -o run'), result,
