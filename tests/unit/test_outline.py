@@ -138,6 +138,21 @@ def test_outline_is_found_where_it_was_drawn(model):
         assert np.percentile(distance, 95) < 0.6
 
 
+@pytest.mark.parametrize("shift", [0.003, 0.03], ids=["along the same points", "too far for these"])
+def test_outline_is_found_again_where_it_has_moved_to(model, shift):
+    """The contour of the state before serves as long as it is near; the outline is that of the new state."""
+    before = State(model.default, POSE)
+    true = moved(before, np.r_[np.zeros(len(model.parameters)), 0.0, 0.0, 0.005, shift, 0.5 * shift, 0.0])
+    outline = outline_of(model, drawn(model, before), before)
+    first = outline.measure(drawn(model, before), before, 14)
+    seen = outline.measure_again(drawn(model, true), true, 7)
+    assert seen.valid.sum() > 0.9 * seen.expected.sum() > 100
+    distance = np.array([_to_segments(pixel, boundary(model, true)) for pixel in seen.pixels[seen.valid]])
+    assert np.median(distance) < 0.15
+    assert np.percentile(distance, 95) < 0.6
+    assert (seen.points is first.points) == (shift < 0.01)
+
+
 def test_normals_point_outwards_on_either_side(model):
     for rotation in (np.diag([1.0, -1.0, -1.0]), np.diag([-1.0, -1.0, 1.0])):
         state = State(model.default, RigidTransform(rotation, np.array([0.0, 0.0, 0.55])))

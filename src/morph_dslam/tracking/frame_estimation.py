@@ -193,15 +193,15 @@ class FrameEstimation:
         estimate, balance = attempt.estimate, self._balance
         if picture.has_grey and not outline.knows_brightness:
             outline.take_brightness(picture.grey, estimate.state)
-        seen = outline.measure(picture.grey, estimate.state, REACH_PX, picture.occluder_depth)
+        drawing, occluders = attempt.measurement.drawing, picture.occluder_depth
+        seen = outline.measure(picture.grey, estimate.state, REACH_PX, occluders, drawing)
         if balance.weight == 0.0:
             balance.learn_texture(*self._supporting(attempt, estimate))
             offsets = self._estimator.camera.project(seen.points.in_camera(estimate.state)) - seen.pixels
             balance.learn_outline(seen, offsets, 0.0)
         # After the first search the state only says where to look the second time: it need not be exact.
         estimate = self._with_outline(self._scout, attempt, seen.weighted(balance.weight), estimate.state)
-        seen = outline.measure(picture.grey, estimate.state, REACH_PX // 2, picture.occluder_depth)
-        seen = seen.weighted(balance.weight)
+        seen = outline.measure_again(picture.grey, estimate.state, REACH_PX // 2, occluders).weighted(balance.weight)
         estimate = self._with_outline(self._estimator, attempt, seen, estimate.state)
         agreeing = seen.weighted(balance.weight, balance.agreeing(estimate.residuals[-len(seen.weights) :]))
         balance.learn_outline(seen, estimate.residuals[-len(seen.weights) :], self._taken(attempt, seen, estimate))
