@@ -1,0 +1,85 @@
+"""Where streams go: KIND or KIND:WHERE as the command line takes them, and what opens them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+from morph_dslam.errors import StreamError
+from morph_dslam.io.local_server import HOST
+from morph_dslam.streams.messages import Publisher
+
+DEFAULT_PORT = 8767
+_FORMS = "ws, ws:PORT or ws:ADDRESS:PORT"
+
+
+def _address(where: str) -> tuple[str, int]:
+    """Address and port of "", "PORT", "ADDRESS:PORT" or "[ADDRESS]:PORT"."""
+    host, _, port = where.rpartition(":")
+    if not where:
+        return HOST, DEFAULT_PORT
+    if not port.isdecimal() or int(port) > 65535 or re.search(r"[\s/@?#]", host):
+        raise StreamError(f"'ws:{where}' says no port: write {_FORMS}, with a port from 0 (any) to 65535")
+    return host.strip("[]") or HOST, int(port)
+
+
+def _open_websocket(where: str) -> Publisher:
+    from morph_dslam.streams.websocket import WebSocketPublisher
+
+    return WebSocketPublisher(*_address(where))
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """A kind of stream.
+
+    Attributes
+    ----------
+    module : that it needs.
+    mend : what to do where the module is missing.
+    check : raises StreamError for a place that makes no sense.
+    open : begins the stream.
+    """
+
+    module: str
+    mend: str
+    check: Callable[[str], object]
+    open: Callable[[str], Publisher]
+
+
+_KINDS: dict[str, _Kind] = {"ws": _Kind("websockets", "pip install 'morph-dslam[stream]'", _address, _open_websocket)}
+
+
+def check_destination(text: str) -> None:
+    """Raise StreamError unless ``text`` is a destination that can be opened on this computer."""
+    _kind_and_place(text)
+
+
+def open_destination(text: str) -> Publisher:
+    """Begin a stream.
+
+    Parameters
+    ----------
+    text : KIND or KIND:WHERE (docs/streams.md).
+
+    Raises
+    ------
+    StreamError
+        If there is no such kind, what it needs is not installed, or the place cannot be taken.
+    """
+    kind, where = _kind_and_place(text)
+    return kind.open(where)
+
+
+def _kind_and_place(text: str) -> tuple[_Kind, str]:
+    name, colon, where = text.partition(":")
+    kind = _KINDS.get(name)
+    if kind is None or (colon and not where):
+        raise StreamError(f"'{text}' is no stream: write {', '.join(_KINDS)}, or one of them with :WHERE behind it")
+    kind.check(where)
+    # A name in a package that is missing raises, one that is missing itself gives None.
+    if find_spec(kind.module) is None:
+        raise StreamError(f"--stream {name} needs {kind.module}, which is not installed: {kind.mend}")
+    return kind, where
