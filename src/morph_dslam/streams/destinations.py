@@ -31,6 +31,19 @@ def _open_websocket(where: str) -> Publisher:
     return WebSocketPublisher(*_address(where))
 
 
+def _prefix(where: str) -> str:
+    """Beginning of topics in ROS 2."""
+    if where and not re.fullmatch(r"(/[A-Za-z]\w*)+", where, flags=re.ASCII):
+        raise StreamError(f"'ros2:{where}' is no beginning of topics: write ros2, or ros2:/cell/morph say")
+    return where or "/morph"
+
+
+def _open_ros2(where: str) -> Publisher:
+    from morph_dslam.streams.ros2 import RosPublisher
+
+    return RosPublisher(_prefix(where))
+
+
 @dataclass(frozen=True)
 class _Kind:
     """A kind of stream.
@@ -49,7 +62,11 @@ class _Kind:
     open: Callable[[str], Publisher]
 
 
-_KINDS: dict[str, _Kind] = {"ws": _Kind("websockets", "pip install 'morph-dslam[stream]'", _address, _open_websocket)}
+_ROS_MISSING = "install ROS 2, `source /opt/ros/DISTRIBUTION/setup.bash`, and start `morph` there"
+_KINDS: dict[str, _Kind] = {
+    "ws": _Kind("websockets", "pip install 'morph-dslam[stream]'", _address, _open_websocket),
+    "ros2": _Kind("rclpy", _ROS_MISSING, _prefix, _open_ros2),
+}
 
 
 def check_destination(text: str) -> None:
@@ -79,7 +96,6 @@ def _kind_and_place(text: str) -> tuple[_Kind, str]:
     if kind is None or (colon and not where):
         raise StreamError(f"'{text}' is no stream: write {', '.join(_KINDS)}, or one of them with :WHERE behind it")
     kind.check(where)
-    # A name in a package that is missing raises, one that is missing itself gives None.
     if find_spec(kind.module) is None:
         raise StreamError(f"--stream {name} needs {kind.module}, which is not installed: {kind.mend}")
     return kind, where

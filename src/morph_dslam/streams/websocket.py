@@ -17,8 +17,6 @@ from http import HTTPStatus
 from importlib.resources import files
 from urllib.parse import urlsplit
 
-import matplotlib
-import numpy as np
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
@@ -26,6 +24,7 @@ from websockets.http11 import Request, Response
 
 from morph_dslam.errors import StreamError
 from morph_dslam.io.local_server import HOST
+from morph_dslam.streams.colours import colour_map
 from morph_dslam.streams.gate import StreamGate, stream_token
 from morph_dslam.streams.messages import FrameMessage, SceneMessage
 from morph_dslam.streams.packets import end_packet, frame_packet, scene_packet
@@ -125,8 +124,7 @@ class WebSocketPublisher:
 
     def begin(self, scene: SceneMessage) -> None:
         """Tell the scene to all clients, and to those that come later."""
-        colours = np.asarray(matplotlib.colormaps["turbo"](np.arange(256), bytes=True)).tolist()
-        packet = scene_packet(scene, colours)
+        packet = scene_packet(scene, colour_map().tolist())
 
         def change(newest: _Newest) -> None:
             newest.scene, newest.n_scenes, newest.frame = packet, newest.n_scenes + 1, None
