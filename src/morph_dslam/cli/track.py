@@ -29,7 +29,7 @@ HELP = "find an object's pose and parameters in every frame, and draw the stress
 #: Options that say where the object is.
 _STARTS = ("landmarks", "registration", "board", "picture", "guess")
 #: Kinds of streams, for the help.
-STREAMS = "ws:PORT by WebSocket or ros2:/PREFIX to ROS 2"
+STREAMS = "ws:PORT by WebSocket, rerun:FILE.rrd or ros2:/PREFIX"
 KEPT = "the frames tracked so far are kept in the run folder"
 
 

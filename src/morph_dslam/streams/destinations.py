@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
+from pathlib import Path
 
 from morph_dslam.errors import StreamError
 from morph_dslam.io.local_server import HOST
@@ -44,6 +45,24 @@ def _open_ros2(where: str) -> Publisher:
     return RosPublisher(_prefix(where))
 
 
+def _recording(where: str) -> str:
+    """File or address of rerun."""
+    if where and not where.startswith("rerun+http"):
+        path = Path(where)
+        if path.suffix != ".rrd" or not path.parent.is_dir():
+            raise StreamError(
+                f"'rerun:{where}' is no place: write rerun to start a viewer, rerun:FILE.rrd in a folder that exists, "
+                "or rerun:rerun+http://... for a viewer that runs"
+            )
+    return where
+
+
+def _open_rerun(where: str) -> Publisher:
+    from morph_dslam.streams.rerun import RerunPublisher
+
+    return RerunPublisher(_recording(where))
+
+
 @dataclass(frozen=True)
 class _Kind:
     """A kind of stream.
@@ -65,6 +84,7 @@ class _Kind:
 _ROS_MISSING = "install ROS 2, `source /opt/ros/DISTRIBUTION/setup.bash`, and start `morph` there"
 _KINDS: dict[str, _Kind] = {
     "ws": _Kind("websockets", "pip install 'morph-dslam[stream]'", _address, _open_websocket),
+    "rerun": _Kind("rerun", "pip install 'morph-dslam[rerun]'", _recording, _open_rerun),
     "ros2": _Kind("rclpy", _ROS_MISSING, _prefix, _open_ros2),
 }
 
