@@ -128,7 +128,7 @@ class RerunPublisher:
             recording.log(entity, rr.Mesh3D.from_fields(vertex_positions=now.vertices, vertex_colors=colours))
             if now.scalar is not None and info.scalar is not None:
                 values = {f"{info.scalar.name} [{info.scalar.unit}]": now.scalar}
-                recording.log(f"values/{name}", rr.AnyValues(**values))
+                recording.log(f"values/{name}", rr.AnyValues(drop_untyped_nones=True, **values))
         for parameter, value, deviation in zip(info.parameters, now.parameters, now.parameter_std, strict=True):
             shown = np.array([value, deviation]) / parameter.shown_factor
             recording.log(f"parameters/{name}/{_entity(parameter.name)}", rr.Scalars(shown[:1]))
