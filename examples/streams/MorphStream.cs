@@ -90,7 +90,7 @@ public class MorphStream : MonoBehaviour
         mesh.vertices = Points((float[])arrays[objectName + "/rest"]);
         // Outside is where corners run clockwise in Unity, and anticlockwise in a stream.
         var triangles = (int[])arrays[objectName + "/triangles"];
-        for (int i = 0; i < triangles.Length; i += 3) (triangles[i + 1], triangles[i + 2]) = (triangles[i + 2], triangles[i + 1]);
+        for (int i = 0; i < triangles.Length; i += 3) Array.Reverse(triangles, i, 3);
         mesh.triangles = triangles;
     }
 
@@ -125,10 +125,15 @@ public class MorphStream : MonoBehaviour
 
     void Place(JArray pose)
     {
-        float At(int row, int column) => (float)pose[row][column] * (row == 1 ? -1 : 1) * (column == 1 ? -1 : 1);
-        transform.localPosition = new Vector3(At(0, 3), At(1, 3), At(2, 3));
-        transform.localRotation = Quaternion.LookRotation(
-            new Vector3(At(0, 2), At(1, 2), At(2, 2)), new Vector3(At(0, 1), At(1, 1), At(2, 1)));
+        transform.localPosition = Column(pose, 3);
+        transform.localRotation = Quaternion.LookRotation(Column(pose, 2), Column(pose, 1));
+    }
+
+    static Vector3 Column(JArray pose, int column)
+    {
+        float sign = column == 1 ? -1 : 1;
+        return new Vector3(
+            sign * (float)pose[0][column], -sign * (float)pose[1][column], sign * (float)pose[2][column]);
     }
 
     Color32[] Colours(float[] values, float low, float high)
