@@ -75,5 +75,5 @@ $(INSTALLED): pyproject.toml
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer, with its venv module, is needed: no such python3 was found"; exit 1; }
 	@echo "Installing into $(VENV) with $(PYTHON) (a few minutes, once)"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off --editable '.[dev,docs]' | $(PIP_PROGRESS)
+	@$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off --editable '.[dev,docs,rerun]' | $(PIP_PROGRESS)
 	@touch $@

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 HELP = "find an object's pose and parameters in every frame, and draw the stress over the video"
 #: Options that say where the object is.
 _STARTS = ("landmarks", "registration", "board", "picture", "guess")
+#: Kinds of streams, for the help.
+STREAMS = "ws:PORT by WebSocket, rerun:FILE.rrd or ros2:/PREFIX"
 KEPT = "the frames tracked so far are kept in the run folder"
 
 
@@ -212,6 +214,7 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
         output=arguments.output,
         overwrite=arguments.overwrite,
         video=not arguments.no_video,
+        streams=tuple(arguments.stream),
         frame_log=arguments.frame_log,
         drawing=DrawOptions(arguments.show, section, arguments.forces),
         **more,
@@ -343,6 +346,12 @@ def add_tracking_arguments(command: argparse.ArgumentParser, required: bool = Tr
     )
     add_range(command, "frames to track, of a recording")
     add_flag(command, "--no-video", "do not draw the augmented video")
+    add_repeated(
+        command,
+        "--stream",
+        "send results to other programs as they come, " + STREAMS + " (docs/streams.md)",
+        "KIND[:WHERE]",
+    )
     add_file(
         command,
         "--frame-log",

@@ -20,7 +20,7 @@ from morph_dslam.explorer.server import BadRequest, ModelPages
 from morph_dslam.extend.geometry import RigidTransform
 from morph_dslam.extend.registration import Landmarks, bind_landmarks, load_landmarks, save_landmarks
 from morph_dslam.extend.tracking import State
-from morph_dslam.studio.packing import packed
+from morph_dslam.io.packing import packed
 from morph_dslam.units import from_si
 
 Array = NDArray[np.float64]

@@ -65,6 +65,7 @@ class TrackOptions(ObjectOptions):
     video : whether to draw the augmented video.
     drawing : what is drawn.
     overwrite : whether to replace a run that is in the folder.
+    streams : where results go as they come, for other programs (docs/streams.md).
     frame_log : file that gets a line of JSON for each frame of the first object as soon as it is tracked.
     """
 
@@ -86,6 +87,7 @@ class TrackOptions(ObjectOptions):
     video: bool = True
     drawing: DrawOptions = field(default_factory=DrawOptions)
     overwrite: bool = False
+    streams: tuple[str, ...] = ()
     frame_log: Path | None = None
 
     @property
@@ -103,3 +105,11 @@ class TrackOptions(ObjectOptions):
     def folders(self) -> tuple[Path, ...]:
         """The run folder of each."""
         return (self.output, *(self.output / name for name, _ in self.others))
+
+    @property
+    def stream_names(self) -> tuple[str, ...]:
+        """By which streams call each object: the first one by its model file."""
+        others, first = [name for name, _ in self.others], self.model.stem
+        while first in others:
+            first += "_"
+        return (first, *others)
