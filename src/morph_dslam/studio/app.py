@@ -31,9 +31,9 @@ _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 _PAGES = (
     "studio.css", "studio.js", "server.js", "parts.js", "mesh_view.js", "overlay.js", "plot.js", "recorder.js",
     "object_step.js", "study_step.js", "build_step.js", "camera_step.js", "start_step.js", "track_step.js",
-    "results_step.js", "phone.js",
+    "results_step.js", "phone.js", "live_camera.js", "live_view.js",
 )  # fmt: skip
-_PHONE = ("studio.css", "server.js", "parts.js", "recorder.js", "phone.js")
+_PHONE = ("studio.css", "server.js", "parts.js", "recorder.js", "live_camera.js", "phone.js")
 _SHARED = (
     "solid_view.js", "colour_bar.js", "three/three.module.min.js", "three/three.core.min.js", "three/OrbitControls.js",
 )  # fmt: skip

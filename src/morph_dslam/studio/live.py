@@ -132,6 +132,7 @@ class LiveRelay:
         self._count, self._start = 0, 0.0
         self._open: dict[int, tuple[_Outbox, int]] = {}
         self._what = self._refusal = ""
+        self._size: Size | None = None
         self.newest: bytes | None = None
 
     # -- the command --------------------------------------------------------------------------------
@@ -227,7 +228,8 @@ class LiveRelay:
         if before is not None:
             with suppress(RuntimeError, WebSocketDisconnect):
                 await before.close(_REPLACED, "another camera has taken the place of this one")
-        camera.tell(size=await self._wanted())
+        self._size = await self._wanted()
+        camera.tell(size=self._size)
         self._tell_all()
         try:
             await _until_either(camera.send(), self._take_frames(browser, camera))
@@ -252,8 +254,11 @@ class LiveRelay:
 
     async def _take_frame(self, camera: _Outbox, own: int, jpeg: bytes) -> bool:
         """Look at a frame and hand it on; whether its picture will be the answer."""
-        found = jpeg_size(jpeg)
-        refusal = "the camera's frames are no JPEGs" if found is None else size_refusal(found, await self._wanted())
+        found, wanted = jpeg_size(jpeg), await self._wanted()
+        if wanted != self._size:  # there is another camera file
+            self._size = wanted
+            camera.tell(size=wanted)
+        refusal = "the camera's frames are no JPEGs" if found is None else size_refusal(found, wanted)
         if (refusal or "") != self._refusal:
             self._refusal = refusal or ""
             self._tell_all()

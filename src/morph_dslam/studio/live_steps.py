@@ -103,7 +103,7 @@ class LiveSteps:
         words = ["live", str(socket), "--model", names.MODEL, "--camera", names.CAMERA, "--landmarks", names.LANDMARKS]
         flags = {"--at-rest": self._project.choices.get("at_rest", True), "--outline": outline}
         words += [flag for flag, is_set in flags.items() if is_set]
-        words += ["--reference-image", reference, "--frame-log", names.FRAME_LOG, "--no-video", "--overwrite"]
+        words += ["--reference-image", reference, "--frame-log", names.FRAME_LOG, "--overwrite"]
         self._project.path(names.FRAME_LOG).unlink(missing_ok=True)
         await self._jobs.start("live", [*words, "-o", names.RUN])
         return {}
