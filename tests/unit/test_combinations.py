@@ -36,6 +36,8 @@ FREE_LID = ObjectOptions(model=Path("lid.morph"), landmarks=CSV)
         ({"live": True, "other_cameras": (Path("aside"),)}, "--with"),
         ({"live": True, "refine_reference": True}, "--refine"),
         ({"live": True, "reference_frame": 3}, "--reference-frame"),
+        ({"reference_image": Path("i.png")}, "--reference-frame"),
+        ({"reference_image": Path("i.png"), "live": True, **REGISTERED}, "--reference-image"),
         ({"serve": 0}, "--serve"),
         ({"seconds": 2.0}, "--seconds"),
         ({"refine_reference": True, **REGISTERED}, "--refine"),
@@ -68,6 +70,7 @@ def test_what_makes_no_sense_together_is_refused(changes, named):
         {"others": (("lid", LID),), "map_path": Path("map.h5"), "reference_frame": 3, "refine_reference": True},
         {"others": (("lid", FREE_LID),), "other_cameras": (Path("aside"),)},
         {**REGISTERED, "reference_frame": 3, "other_cameras": (Path("aside"),)},
+        {"live": True, "reference_image": Path("i.png")},
         {"live": True, "others": (("lid", FREE_LID),), "tracker": md.TrackerOptions(use_depth=True)},
     ],
 )

@@ -1,6 +1,7 @@
 """A live camera drops frames rather than falling behind; a recording never does. Threads meanwhile."""
 
 import gc
+import socket
 import sys
 import threading
 
@@ -10,9 +11,10 @@ import pytest
 from threadpoolctl import threadpool_info
 
 from morph_dslam.errors import SourceError
-from morph_dslam.sources import open_source, open_stream, register_source
+from morph_dslam.sources import open_live, open_source, open_stream, register_source
 from morph_dslam.sources.frames import Frame
 from morph_dslam.sources.live import LiveCamera, Newest, PacedRecording
+from morph_dslam.sources.local_socket import FRAME_HEAD, MOST_BYTES, PICTURE_HEAD
 from morph_dslam.threads import ahead, one_thread_for_algebra, threads_side_by_side
 
 
@@ -250,3 +252,61 @@ def test_who_stops_early_has_no_more_items_made():
     assert n_made <= 3 + 2
     assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("ahead")]
     assert len(made) == n_made
+
+
+def sent(number, jpeg, seconds=0.0):
+    return FRAME_HEAD.pack(number, seconds, len(jpeg)) + jpeg
+
+
+@pytest.fixture
+def sender(tmp_path):
+    """A program that listens at a socket, its path, and what accepts who connects."""
+    path = tmp_path / "camera.sock"
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(str(path))
+        listening.listen()
+        yield path, listening
+
+
+def test_frames_come_over_a_socket_and_pictures_go_back(sender):
+    path, listening = sender
+    _, jpeg = cv2.imencode(".jpg", np.full((48, 64, 3), 90, np.uint8))
+    with open_live(path) as stream:
+        other, _ = listening.accept()
+        with other:
+            other.sendall(sent(4, b"no picture at all") + sent(7, jpeg.tobytes(), 2.5))
+            frame = next(iter(stream))
+            assert (frame.index, frame.timestamp, frame.image.shape) == (7, 2.5, (48, 64, 3))
+            assert np.abs(frame.image.astype(int) - 90).max() <= 2
+            stream.show(7, b"picture")
+            head = other.recv(PICTURE_HEAD.size, socket.MSG_WAITALL)
+            assert PICTURE_HEAD.unpack(head) == (7, 7)
+            assert other.recv(7, socket.MSG_WAITALL) == b"picture"
+            other.sendall(sent(8, jpeg.tobytes())[:-5])  # it ends in the middle of a frame
+        assert list(stream) == []
+        stream.show(8, b"picture")  # for nobody
+
+
+def test_a_socket_is_let_go_while_nothing_comes(sender):
+    path, listening = sender
+    stream = open_live(path)
+    other, _ = listening.accept()
+    with other:
+        stream.close()
+        assert other.recv(1) == b""
+    assert list(stream) == []
+
+
+def test_sockets_that_cannot_be_used(sender):
+    path, listening = sender
+    with pytest.raises(SourceError, match="is live and has no range"):
+        open_stream(path, 2, 3)
+    with open_live(path) as stream:
+        other, _ = listening.accept()
+        with other:
+            other.sendall(FRAME_HEAD.pack(0, 0.0, MOST_BYTES + 1))
+            with pytest.raises(SourceError, match="sent 8000001 bytes as frame 0"):
+                list(stream)
+    listening.close()
+    with pytest.raises(SourceError, match=r"does not answer .*: the studio that made it has ended"):
+        open_stream(path)

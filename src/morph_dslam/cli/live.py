@@ -2,7 +2,7 @@
 
 import argparse
 
-from morph_dslam.cli.arguments import positive_number
+from morph_dslam.cli.arguments import add_file, positive_number
 from morph_dslam.cli.track import add_tracking_arguments, print_summary, run_options
 
 HELP = "track an object in the frames of a webcam, or of a recording at its own pace, as they come"
@@ -12,6 +12,11 @@ KEPT = "everything until then is kept in the run folder"
 def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("source", metavar="SOURCE", help="webcam:0, or a recording (docs/sources.md)")
     add_tracking_arguments(command)
+    add_file(
+        command,
+        "--reference-image",
+        "image of this camera that the landmarks, or another start, belong to (default: the first frame that comes)",
+    )
     command.add_argument(
         "--serve", type=int, metavar="PORT", help="show the pictures to browsers on this computer (0: any port)"
     )
@@ -23,6 +28,11 @@ def run(arguments: argparse.Namespace) -> None:
     from morph_dslam import track
 
     options = run_options(
-        arguments, frames=arguments.source, live=True, serve=arguments.serve, seconds=arguments.seconds
+        arguments,
+        frames=arguments.source,
+        live=True,
+        serve=arguments.serve,
+        seconds=arguments.seconds,
+        reference_image=arguments.reference_image,
     )
     track(options, print_summary)

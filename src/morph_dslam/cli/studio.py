@@ -10,7 +10,7 @@ from morph_dslam.errors import StudioError
 HELP = "build, place and track your own object by clicks in the browser"
 KEPT = "the files of the project are kept"
 #: What the extra installs, by the name to import.
-_EXTRA = ("cryptography", "starlette", "tomlkit", "uvicorn")
+_EXTRA = ("cryptography", "starlette", "tomlkit", "uvicorn", "websockets")
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:

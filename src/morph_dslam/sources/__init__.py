@@ -1,4 +1,4 @@
-"""Where frames come from: videos, folders of images, benchmark recordings, ROS bags, webcams, and registered kinds."""
+"""Where frames come from: videos, images, benchmark recordings, ROS bags, webcams, sockets, and registered kinds."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from morph_dslam.errors import SourceError
 from morph_dslam.sources.frames import Frame, FrameSource, FrameStream
 from morph_dslam.sources.live import LiveStream, PacedRecording, is_webcam, open_webcam
+from morph_dslam.sources.local_socket import open_socket
 from morph_dslam.sources.recorded import (
     euroc_recording,
     image_folder,
@@ -89,3 +90,4 @@ register_source(is_euroc, euroc_recording)
 register_source(is_tum, tum_recording)
 register_source(is_bag, RosBag)
 register_source(is_webcam, open_webcam)
+register_source(Path.is_socket, open_socket)

@@ -17,7 +17,8 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
-from starlette.routing import Route
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket
 
 from morph_dslam.errors import StudioError
 from morph_dslam.studio import project as names
@@ -30,9 +31,9 @@ _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 _PAGES = (
     "studio.css", "studio.js", "server.js", "parts.js", "mesh_view.js", "overlay.js", "plot.js", "recorder.js",
     "object_step.js", "study_step.js", "build_step.js", "camera_step.js", "start_step.js", "track_step.js",
-    "results_step.js", "phone.js",
+    "results_step.js", "phone.js", "live_camera.js", "live_view.js",
 )  # fmt: skip
-_PHONE = ("studio.css", "server.js", "parts.js", "recorder.js", "phone.js")
+_PHONE = ("studio.css", "server.js", "parts.js", "recorder.js", "live_camera.js", "phone.js")
 _SHARED = (
     "solid_view.js", "colour_bar.js", "three/three.module.min.js", "three/three.core.min.js", "three/OrbitControls.js",
 )  # fmt: skip
@@ -134,6 +135,18 @@ class _Answers:
         self._steps.recording_came()
         return answer
 
+    async def camera(self, browser: WebSocket) -> None:
+        """Frames of a camera of this computer."""
+        await self._steps.live.relay.camera(browser, "of this computer")
+
+    async def phone_camera(self, browser: WebSocket) -> None:
+        """Frames of a phone."""
+        await self._steps.live.relay.camera(browser, "of the phone")
+
+    async def watch(self, browser: WebSocket) -> None:
+        """Live pictures for a page."""
+        await self._steps.live.relay.watch(browser)
+
     async def file(self, request: Request) -> Response:
         """A file of the project, to keep."""
         path = self._steps.project.path(request.path_params["name"])
@@ -217,7 +230,7 @@ _HANDLERS = {StudioError: _told, HTTPException: _told_http, ClientDisconnect: _l
 
 
 def phone_app(steps: Steps, access: Access) -> Callable:
-    """What a phone may do, behind a gate: record, and bring the recording.
+    """What a phone may do, behind a gate: record, bring the recording, and be the camera of live tracking.
 
     Parameters
     ----------
@@ -228,6 +241,7 @@ def phone_app(steps: Steps, access: Access) -> Callable:
     routes = [
         Route("/", answers.phone),
         Route("/api/upload/{kind:str}/{name:path}", answers.phone_upload, methods=["PUT"]),
+        WebSocketRoute("/api/camera", answers.phone_camera),
         Route("/{name:path}", answers.phone_page),
     ]
     application = Starlette(routes=routes, exception_handlers=_HANDLERS)  # type: ignore[arg-type]
@@ -264,6 +278,8 @@ def make_app(
         Route("/api/upload/{kind}/{name:path}", answers.upload, methods=["PUT"]),
         Route("/api/phone.png", answers.phone_code),
         Route("/api/frame/{number:int}", answers.frame),
+        WebSocketRoute("/api/camera", answers.camera),
+        WebSocketRoute("/api/watch", answers.watch),
         Route("/api/{action}", answers.call, methods=["POST"]),
         Route("/files/{name:path}", answers.file),
         Route("/report", answers.report),

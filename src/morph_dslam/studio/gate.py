@@ -18,6 +18,8 @@ from morph_dslam.io.local_server import HOST
 
 _COOKIE = "morph_studio"
 _SAFE = ("GET", "HEAD")
+#: Scheme of the pages that may open a WebSocket.
+_SCHEMES = {"ws": "http", "wss": "https"}
 #: Among the hosts: the server may be asked by any numeric address.
 ANY_ADDRESS = "address"
 #: Bytes of a request that is no upload.
@@ -85,6 +87,10 @@ class Gate:
         if scope["type"] == "lifespan":
             await self._application(scope, receive, send)
             return
+        if scope["type"] == "websocket":
+            refused = self._refusal(scope | {"scheme": _SCHEMES[scope["scheme"]], "method": "WEBSOCKET"})
+            await (self._application(scope, receive, send) if refused is None else _refuse(receive, send))
+            return
         if scope["type"] != "http":
             return
         refusal = self._refusal(scope)
@@ -127,6 +133,12 @@ class Gate:
             await send(message)
 
         return guarded
+
+
+async def _refuse(receive: Receive, send: Send) -> None:
+    """Refuse a WebSocket before it is opened: the browser gets status 403."""
+    await receive()
+    await send({"type": "websocket.close", "code": 1008})
 
 
 def _is_address(host: str) -> bool:

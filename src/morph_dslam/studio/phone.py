@@ -22,6 +22,8 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
+from morph_dslam.studio.live import WEBSOCKETS
+
 #: Days that a certificate holds; a new one is made at each start.
 _DAYS = 7
 #: Modules of white around a QR code, and pixels of one module.
@@ -77,7 +79,7 @@ class PhoneServer(uvicorn.Server):
         with TemporaryDirectory() as folder:
             certificate, key = write_certificate(Path(folder), address)
             config = uvicorn.Config(
-                application, log_level="critical", access_log=False, server_header=False, ws="none", lifespan="off",
+                application, log_level="critical", access_log=False, server_header=False, lifespan="off", **WEBSOCKETS,
                 ssl_certfile=certificate, ssl_keyfile=key, timeout_graceful_shutdown=2,
             )  # fmt: skip
             config.load()  # reads the certificate, whose files are then gone

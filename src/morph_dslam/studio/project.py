@@ -15,6 +15,8 @@ STUDY, MESH, MODEL, REPORT = "study.toml", "mesh.inp", "model.morph", "model.rep
 CAMERA, LANDMARKS, RUN, FRAME_LOG = "camera.yaml", "landmarks.csv", "run", "track.jsonl"
 #: Folders of pictures: a recording as numbered images, and views of a calibration board.
 FRAMES, BOARD = "frames", "board"
+#: Frames of a live camera: number 0 is that of the start. Pairs that were clicked on another frame before.
+LIVE, EARLIER_LANDMARKS = "live", "landmarks-before.csv"
 _CHOICES = "studio.json"
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. ()+-]{0,99}")
 _MEGABYTE = 1_000_000

@@ -43,11 +43,12 @@ class _Recording:
         if number not in self._kept:
             if len(self._kept) >= _KEPT:
                 self._kept.pop(next(iter(self._kept)))
-            _, data = cv2.imencode(".jpg", self._frame(number), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+            _, data = cv2.imencode(".jpg", self.image(number), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
             self._kept[number] = data.tobytes()
         return self._kept[number]
 
-    def _frame(self, number: int) -> np.ndarray:
+    def image(self, number: int) -> np.ndarray:
+        """A frame (h, w, 3)."""
         if self._last is None or number <= self._last:
             self._frames = iter(open_source(self.path, number))
         for frame in self._frames:
@@ -79,6 +80,13 @@ def recording_facts(path: Path) -> dict[str, Any]:
 def frame_jpeg(path: Path, number: int) -> bytes:
     """A frame of a recording as JPEG."""
     return _opened(path).jpeg(number)
+
+
+def save_frame(path: Path, number: int | None, target: Path) -> None:
+    """Write a frame of a recording, the first one by default, as an image file without loss."""
+    found = _opened(path)
+    if not cv2.imwrite(str(target), found.image(found.first if number is None else number)):
+        raise StudioError(f"{target.name} cannot be written")
 
 
 def camera_from_photo(photo: Path, width: int, height: int) -> tuple[str, str]:

@@ -17,6 +17,7 @@ from morph_dslam.errors import StudioError
 from morph_dslam.io.local_server import HOST
 from morph_dslam.studio.app import make_app, phone_app
 from morph_dslam.studio.gate import ANY_ADDRESS, Access, new_token
+from morph_dslam.studio.live import WEBSOCKETS
 from morph_dslam.studio.phone import PhoneServer, own_address
 from morph_dslam.studio.project import Project
 from morph_dslam.studio.steps import Steps
@@ -58,7 +59,7 @@ class StudioServer:
         self._phone_app = phone_app(steps, self.phone_access) if self.phone_access else None
         application = make_app(steps, Access(self.token, self.token), hosts, self._phones)
         config = uvicorn.Config(
-            application, log_level="error", access_log=False, server_header=False, ws="none", lifespan="on",
+            application, log_level="error", access_log=False, server_header=False, lifespan="on", **WEBSOCKETS,
             timeout_graceful_shutdown=2,
         )  # fmt: skip
         self._server = _Server(config, steps)

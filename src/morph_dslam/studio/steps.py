@@ -13,6 +13,7 @@ from pydantic import Field
 from morph_dslam.errors import StudioError
 from morph_dslam.studio import clicks, object_mesh, project as names, recording, study_file
 from morph_dslam.studio.jobs import Jobs
+from morph_dslam.studio.live_steps import LiveSteps
 from morph_dslam.studio.project import Project
 from morph_dslam.studio.worker import Worker
 
@@ -46,6 +47,7 @@ class Steps:
         self._changed = asyncio.Event()
         self._jobs = Jobs(project.folder, self._tell)
         self._ended = False
+        self.live = LiveSteps(project, self._worker, self._jobs)
         self.actions: dict[str, Callable[..., Awaitable[Any]]] = {
             name: getattr(self, name)
             for name in (
@@ -54,6 +56,7 @@ class Steps:
                 "track", "tracked_frames", "overlay", "export", "forget_frames",
             )
         }  # fmt: skip
+        self.actions |= self.live.actions
 
     def _tell(self) -> None:
         self._changed.set()
@@ -71,6 +74,7 @@ class Steps:
         """Stop the command that runs, and end the worker."""
         self.end_news()
         await self._jobs.stop()
+        await self.live.relay.close()
         self._worker.close()
 
     # -- what there is -----------------------------------------------------------------------------

@@ -81,7 +81,16 @@ OF_RUN: tuple[tuple[Callable[[TrackOptions], bool], str], ...] = (
     ),
     (
         lambda run: run.live and run.reference_frame is not None,
-        "the first frame that comes is the reference frame of a live run: leave out --reference-frame",
+        "the first frame that comes is the reference frame of a live run: leave out --reference-frame, or give an "
+        "image, --reference-image",
+    ),
+    (
+        lambda run: run.reference_image is not None and not run.live,
+        "the reference frame of a recording is one of its own: give its number, --reference-frame",
+    ),
+    (
+        lambda run: run.reference_image is not None and all(part.registration is not None for part in run.objects),
+        "a registration in a map brings its own reference frame: leave out --reference-image",
     ),
     (
         lambda run: not run.live and (run.serve, run.seconds) != (None, None),

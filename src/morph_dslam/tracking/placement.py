@@ -187,7 +187,8 @@ def place(part: TrackedObject, cameras: Sequence[RigCamera], frames_at: FramesAt
         # The frames may be those of another recording: the object is looked for as after a loss.
         return PlacedObject(part, tuple(cameras), with_loads(start, part.options), (image, *others), number)
     frames = frames_at(number)
-    camera.check_image(frames[0].image, f"frame {frames[0].index} of {run.frames}")
+    where = f"frame {frames[0].index} of {run.frames}" if run.reference_image is None else str(run.reference_image)
+    camera.check_image(frames[0].image, where)
     registration, images = part.register(camera, frames[0]), tuple(frame.image for frame in frames)
     # A sequence that does not begin with the reference frame is entered as if the object had been lost.
     in_sequence = not run.live and number in (None, run.first)

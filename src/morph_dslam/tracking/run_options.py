@@ -56,6 +56,8 @@ class TrackOptions(ObjectOptions):
     last : number of the last frame to track; by default that of the recording.
     reference_frame : number of the frame that landmarks and initializers belong to, the first one by default;
         of a registered object before several cameras one in which it is undeformed.
+    reference_image : of a live run, the image that landmarks and initializers belong to; by default the first frame
+        that comes.
     click_px : standard deviation of a landmark's pixel.
     refine_reference : whether to refine the reference state over the whole sequence, and track once more.
     refine_camera : terms of the camera to estimate with a pose that is one over the sequence.
@@ -78,6 +80,7 @@ class TrackOptions(ObjectOptions):
     first: int | None = None
     last: int | None = None
     reference_frame: int | None = None
+    reference_image: Path | None = None
     click_px: float = CLICK_PX
     refine_reference: bool = False
     refine_camera: tuple[CameraTerm, ...] = ()

@@ -20,6 +20,7 @@ from morph_dslam.errors import TrackingError
 from morph_dslam.io.local_server import LocalHandler, local_server
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.sources import Frame
+from morph_dslam.sources.local_socket import SocketCamera
 from morph_dslam.tracking.drawing import AugmentedView, with_caption
 from morph_dslam.tracking.result import FrameResult
 
@@ -163,6 +164,18 @@ class VideoSink:
         self._written += missing
 
 
+class SourceSink:
+    """Sends pictures back to where their frames come from."""
+
+    def __init__(self, source: SocketCamera) -> None:
+        self._source = source
+
+    def __call__(self, tracked: TrackedFrame) -> None:
+        """Send the picture of a frame."""
+        assert tracked.picture is not None
+        self._source.show(tracked.frame.index, _jpeg(tracked.picture))
+
+
 class BrowserSink:
     """Shows pictures to browsers on this computer, as motion JPEG; a context manager.
 
@@ -198,9 +211,9 @@ class BrowserSink:
         """Hand the picture to all who look."""
         if not self.is_watched or tracked.picture is None:
             return
-        _, jpeg = cv2.imencode(".jpg", tracked.picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        jpeg = _jpeg(tracked.picture)
         with self._changed:
-            self._jpeg, self._number = jpeg.tobytes(), self._number + 1
+            self._jpeg, self._number = jpeg, self._number + 1
             self._changed.notify_all()
 
     @property
@@ -219,6 +232,10 @@ class BrowserSink:
         with self._changed:
             self._changed.wait_for(lambda: self._number > number or self._ended)
             return (number, b"") if self._ended else (self._number, self._jpeg)
+
+
+def _jpeg(picture: NDArray[np.uint8]) -> bytes:
+    return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
 
 
 class _Handler(LocalHandler):

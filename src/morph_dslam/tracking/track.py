@@ -20,8 +20,9 @@ from morph_dslam.notices import Remark
 from morph_dslam.registration.landmarks import bind_landmarks
 from morph_dslam.registration.registration import Registration
 from morph_dslam.sources import Frame, open_live, open_source, open_stream
-from morph_dslam.sources.frames import FrameSource
-from morph_dslam.sources.live import LiveCamera, LiveStream
+from morph_dslam.sources.frames import FrameSource, read_image
+from morph_dslam.sources.live import LiveStream, PacedRecording
+from morph_dslam.sources.local_socket import SocketCamera
 from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.tracking.combinations import check_depth, check_inputs, check_options
 from morph_dslam.tracking.discrepancy import DiscrepancyFit, Reference, refine_discrepancy
@@ -47,13 +48,15 @@ from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.session import Session, SynchronizedFrames
 from morph_dslam.tracking.setup import TrackedObject, load_cameras, load_objects
 from morph_dslam.tracking.shown_field import Shown
-from morph_dslam.tracking.sinks import BrowserSink, LivePicture, LiveTimes, Sink, TrackedFrame, VideoSink
+from morph_dslam.tracking.sinks import BrowserSink, LivePicture, LiveTimes, Sink, SourceSink, TrackedFrame, VideoSink
 from morph_dslam.tracking.still_run import Sharpening, known_state, with_pose, with_still_pose
 from morph_dslam.tracking.stream_sink import StreamedObject, StreamSink
 from morph_dslam.tracking.tracker import Tracker
 
 Tell = Callable[[Path, dict[str, Any]], object]
 Source = FrameSource | SynchronizedFrames | LiveStream
+#: Number of a reference image that is no frame of the stream.
+BEFORE_ALL = -1
 
 
 @one_thread_for_algebra
@@ -142,13 +145,15 @@ def _open_recordings(run: TrackOptions) -> tuple[Source, FramesAt]:
 
 
 def _open_live(run: TrackOptions, stack: ExitStack) -> tuple[Source, FramesAt]:
-    """The stream to track, and what gives its first frame as the reference."""
+    """The stream to track, and what gives its reference: an image, or its first frame."""
     stream = stack.enter_context(open_live(run.frames, run.first, run.last))
 
     @cache
     def frames_at(number: int | None) -> tuple[Frame, ...]:
+        if run.reference_image is not None:
+            return (Frame(BEFORE_ALL, 0.0, read_image(run.reference_image, "the reference image")),)
         # A recording is not begun by that: it would play while everything is made ready.
-        for frame in stream if isinstance(stream, LiveCamera) else open_stream(run.frames, run.first, run.last):
+        for frame in open_stream(run.frames, run.first, run.last) if isinstance(stream, PacedRecording) else stream:
             return (frame,)
         raise SourceError(f"{run.frames} ended before the first frame")
 
@@ -254,7 +259,7 @@ class _Job:
 
     def _screens(self, stack: ExitStack) -> list[Sink]:
         """Where the pictures of a live run go."""
-        screens: list[Sink] = []
+        screens: list[Sink] = [SourceSink(self._source)] if isinstance(self._source, SocketCamera) else []
         if self._run.serve is not None:
             browser = stack.enter_context(BrowserSink(self._run.serve))
             print(f"shown at {browser.address}", flush=True)
@@ -329,6 +334,7 @@ def _refined(part: PlacedObject, keyframes: list[Keyframe], run: TrackOptions) -
 def _facts(run: TrackOptions, files: ObjectOptions, part: PlacedObject, results: RunResults) -> dict[str, Any]:
     """What the summary says of a run beside its results."""
     named = {"frames": run.frames, "model": files.model, "camera": run.camera, "landmarks": files.landmarks}
+    named["reference_image"] = run.reference_image
     scene, options = part.object.scene, part.options
     named |= {"registration": files.registration, **vars(files.initializer), "map": scene and scene.path}
     return temporal_facts(part.model.study_parameters, options) | {

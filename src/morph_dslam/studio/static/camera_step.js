@@ -3,6 +3,7 @@
 import { call, frame, upload } from './server.js';
 import { choice, command, digits, dropZone, el, facts, field, there, title } from './parts.js';
 import { ImageView } from './overlay.js';
+import { liveView } from './live_view.js';
 import { recordButton } from './recorder.js';
 
 const PICTURES = '.png,.jpg,.jpeg,.bmp,.tif,.tiff';
@@ -36,6 +37,8 @@ export async function cameraStep(app) {
     await draw();
   };
   const record = recordButton(app, 'record', 'Record with a camera of this computer', 'webcam', takeRecording);
+  const liveWhere = el('div', { className: 'fill' });
+  const live = liveView(app, liveWhere, () => showLive());
   const recordBoard = recordButton(app, 'record-board', 'Record the board', 'board', takeBoard);
   app.panel.append(
     ...title('Camera', 'The video of the object, and what is known of the camera that took it.'),
@@ -43,6 +46,7 @@ export async function cameraStep(app) {
     dropZone('drop-recording', 'Drop a video, or numbered images', 'MP4, MOV, AVI, MKV, WebM; PNG, JPEG', `${VIDEOS},${PICTURES}`,
       (files) => app.doing(() => takeRecording(files))),
     el('p', {}, record.button), phone, recording,
+    el('h3', {}, 'Live'), ...live.parts,
     el('h3', {}, 'Intrinsics'),
     dropZone('drop-camera', 'Drop a camera file', 'of this program, OpenCV, ROS, Kalibr, COLMAP', '.yaml,.yml,.txt',
       ([file]) => app.doing(async () => { await upload('camera', file); await refresh(); })),
@@ -64,12 +68,18 @@ export async function cameraStep(app) {
     el('button', { id: 'to-start', onclick: () => app.show('start') }, 'Next: start'),
   );
 
+  // A live camera is shown in place of the recording, over which its view lies.
+  function showLive() {
+    if (live.facts.camera && !liveWhere.parentElement) app.view.append(liveWhere);
+    else if (!live.facts.camera) liveWhere.remove();
+  }
+
   async function refresh() { await app.refresh(); await draw(); }
 
   async function draw() {
     const { state } = app;
     phone.replaceChildren(...there([state.phone && el('div', { className: 'box' },
-      el('p', {}, 'Record with a phone: scan the code, or open the address there. It works once, and the browser warns of the certificate.'),
+      el('p', {}, 'Record with a phone, or let it be the live camera: scan the code, or open the address there. It works once, and the browser warns of the certificate.'),
       el('img', { id: 'phone-code', src: `/api/phone.png#${Date.now()}`, alt: 'QR code' }),
       el('p', { className: 'mono', id: 'phone-address' }, state.phone))]));
     const found = state.recording;
@@ -98,8 +108,9 @@ export async function cameraStep(app) {
   }
 
   await draw();
+  showLive();
   return {
-    close: () => [record, recordBoard].forEach((one) => one.close()),
+    close: () => [record, recordBoard, live].forEach((one) => one.close()),
     recording: draw,
     job: (job, ended) => { if (ended && job.kind === 'calibrate') app.doing(draw); },
   };

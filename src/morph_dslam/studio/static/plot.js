@@ -104,7 +104,7 @@ function steps(low, high) {
 
 // Lines of a run's frames: parameters in their own units, forces, the largest stress or displacement.
 export function makePlots(container, model) {
-  const parameters = model.parameters.map((p) => ({ p, plot: new Plot(container, p.name, p.unit) })).slice(0, 3);
+  const parameters = model.parameters.slice(0, 3).map((p) => ({ p, plot: new Plot(container, p.name, p.unit) }));
   const largest = model.has_stress ? new Plot(container, 'largest von Mises stress', 'MPa')
     : new Plot(container, 'largest displacement', 'mm');
   const forces = model.supports.length ? new Plot(container, 'reactions', 'N') : null;

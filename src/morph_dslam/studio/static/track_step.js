@@ -3,7 +3,10 @@
 import { call, explored, frame } from './server.js';
 import { check, command, el, facts, title } from './parts.js';
 import { ImageView, colourBar } from './overlay.js';
+import { liveView } from './live_view.js';
 import { makePlots } from './plot.js';
+
+const MOST_PLOTTED = 600; // frames of a live run
 
 // The picture of a frame with the model over it.
 export class RunPicture {
@@ -47,6 +50,9 @@ export async function trackStep(app) {
   const outline = el('input', { id: 'outline' });
   const start = el('button', { id: 'track', className: 'main', onclick: () => app.doing(() => call('track',
     { refine: refine.checked, snap: snap.checked, outline: outline.checked })) });
+  const goLive = el('button', { id: 'go-live', className: 'main', onclick: () => app.doing(() => call('go_live',
+    { snap: snap.checked, outline: outline.checked })) }, 'Go live');
+  const liveParts = el('div');
   const result = el('div', { id: 'track-result' });
   app.panel.append(
     check('Refine the start over the whole video, and track once more', refine),
@@ -55,24 +61,36 @@ export async function trackStep(app) {
     el('p', { className: 'note' }, 'Corrects the clicks by the edges that their image shows, where the part has those of its mesh.'),
     check('Use the outline too', outline),
     el('p', { className: 'note' }, 'Where the object stands out from the background.'),
-    start, command('morph track … --frame-log track.jsonl -o run'), result,
+    start, command('morph track … --frame-log track.jsonl -o run'), liveParts, result,
   );
   const picture = el('div', { className: 'fill', id: 'track-image' });
   const plots = el('div', { className: 'plots' });
   app.view.append(el('div', { className: 'runview' }, el('div', {}, picture), plots));
   const shown = new RunPicture(picture, mesh, colours);
+  const live = liveView(app, picture, () => drawJob(app.state.job));
+  liveParts.append(el('h3', {}, 'Live'), ...live.parts, goLive,
+    command('morph live … --reference-image live/000000.png --frame-log track.jsonl -o run'));
+  live.isCovered = () => !showsLive();
   const plot = makePlots(plots, model);
 
+  // A live camera is shown in place of the recording, unless that is being tracked.
+  function showsLive() {
+    const { job } = app.state;
+    return Boolean(live.facts.camera) && !(job?.running && job.kind === 'track');
+  }
+
   function drawFrames(frames) {
-    plot(frames);
-    if (frames.length) shown.show(frames.at(-1)).catch(() => {});
+    plot(app.state.job?.kind === 'live' ? frames.slice(-MOST_PLOTTED) : frames);
+    if (frames.length && !showsLive()) shown.show(frames.at(-1)).catch(() => {});
   }
 
   function drawJob(job) {
     start.textContent = app.state.done.track ? 'Track again' : 'Track';
     start.disabled = Boolean(job?.running);
+    if (showsLive()) picture.parentElement.querySelector('.bar')?.remove();
+    goLive.disabled = Boolean(job?.running) || !live.facts.camera || Boolean(live.facts.refused);
     const tracked = app.run.frames.filter((row) => row.status === 'tracked').length;
-    const mine = job?.kind === 'track' ? job : null;
+    const mine = ['track', 'live'].includes(job?.kind) ? job : null;
     const parts = [facts([['Frames', String(app.run.frames.length)], ['Tracked', String(tracked)]])];
     if (mine && !mine.running && mine.status) {
       parts.push(el('p', { className: mine.stopped ? 'warning' : 'problem' }, mine.lines.at(-1) ?? 'it ended without a message'));
@@ -85,5 +103,5 @@ export async function trackStep(app) {
 
   drawJob(app.state.job);
   drawFrames(app.run.frames);
-  return { job: drawJob, frames: (frames) => { drawFrames(frames); drawJob(app.state.job); } };
+  return { close: live.close, job: drawJob, frames: (frames) => { drawFrames(frames); drawJob(app.state.job); } };
 }

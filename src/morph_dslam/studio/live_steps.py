@@ -1,0 +1,120 @@
+"""What the pages do with live frames: take one to click pairs on, and track those that follow."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+from morph_dslam.errors import StudioError
+from morph_dslam.studio import clicks, project as names, recording
+from morph_dslam.studio.jobs import Jobs
+from morph_dslam.studio.live import LiveRelay, Size
+from morph_dslam.studio.project import Project
+from morph_dslam.studio.worker import Worker
+
+#: Bytes of frames of a run that are kept; those beyond are tracked only.
+_MOST_KEPT = names.UPLOADS["recording"].largest
+_NO_CAMERA = "no camera sends frames: start the camera of this computer, or press Live on the phone"
+
+
+class LiveSteps:
+    """Live frames of one project. The folder ``live`` holds the frame of the start as number 0, and those tracked.
+
+    Parameters
+    ----------
+    project : the folder.
+    worker : reads files.
+    jobs : runs `morph live`.
+
+    Attributes
+    ----------
+    relay : of the frames.
+    actions : by name.
+    """
+
+    def __init__(self, project: Project, worker: Worker, jobs: Jobs) -> None:
+        self._project, self._worker, self._jobs = project, worker, jobs
+        self.relay = LiveRelay(self._wanted_size, self._keep)
+        self.actions: dict[str, Callable[..., Awaitable[Any]]] = {
+            "take_frame": self.take_frame,
+            "go_live": self.go_live,
+        }
+        self._camera: tuple[tuple[int, int], Size | None] = (0, 0), None
+        self._kept = 0
+
+    async def _wanted_size(self) -> Size | None:
+        """The size of images by the camera file; None if there is none that can be read."""
+        path = self._project.path(names.CAMERA)
+        now = clicks.stamp(path)
+        if now != self._camera[0]:
+            try:
+                facts = await self._worker.call(clicks.camera_facts, path) if now[1] else None
+            except StudioError:
+                facts = None
+            self._camera = now, None if facts is None else (facts["width"], facts["height"])
+        return self._camera[1]
+
+    def _keep(self, number: int, jpeg: bytes) -> None:
+        """Write a frame that is tracked beside that of the start, without waiting for the disk."""
+        job = self._jobs.job
+        if job is None or job.kind != "live" or not job.running or self._kept + len(jpeg) > _MOST_KEPT:
+            return
+        self._kept += len(jpeg)
+        path = self._project.path(f"{names.LIVE}/{number:06d}.jpg")
+        asyncio.get_running_loop().run_in_executor(None, path.write_bytes, jpeg)
+
+    def _emptied(self) -> Path:
+        folder = self._project.path(names.LIVE)
+        folder.mkdir(exist_ok=True)
+        for file in folder.iterdir():
+            file.unlink()
+        self._kept = 0
+        return folder
+
+    async def take_frame(self) -> dict[str, Any]:
+        """Take the newest frame as the recording that pairs are clicked on; earlier pairs are set aside."""
+        self._jobs.check_idle()
+        jpeg = self.relay.newest
+        if jpeg is None:
+            raise StudioError(_NO_CAMERA)
+        folder, landmarks = self._emptied(), self._project.path(names.LANDMARKS)
+        (folder / "000000.jpg").write_bytes(jpeg)
+        await self._worker.call(recording.recording_facts, folder)
+        if landmarks.is_file():
+            landmarks.replace(self._project.path(names.EARLIER_LANDMARKS))
+        self._project.choose(recording=names.LIVE, reference_frame=0)
+        return {"recording": names.LIVE}
+
+    async def go_live(self, snap: bool = False, outline: bool = False) -> dict[str, Any]:
+        """Start `morph live` with the camera that sends, from the frame that the pairs were clicked on."""
+        self._jobs.check_idle()
+        for name, message in (
+            (names.MODEL, "build the model first"),
+            (names.CAMERA, "calibrate the camera, or drop its file"),
+            (names.LANDMARKS, "take a frame, click pairs on it, and save them"),
+        ):
+            if not self._project.has(name):
+                raise StudioError(f"{name} is not there: {message}")
+        if self.relay.newest is None:
+            raise StudioError(self.relay.facts()["refused"] or _NO_CAMERA)
+        socket, reference = await self.relay.listen(), await self._write_reference()
+        words = ["live", str(socket), "--model", names.MODEL, "--camera", names.CAMERA, "--landmarks", names.LANDMARKS]
+        flags = {"--at-rest": self._project.choices.get("at_rest", True), "--snap": snap, "--outline": outline}
+        words += [flag for flag, is_set in flags.items() if is_set]
+        words += ["--reference-image", reference, "--frame-log", names.FRAME_LOG, "--overwrite"]
+        self._project.path(names.FRAME_LOG).unlink(missing_ok=True)
+        await self._jobs.start("live", [*words, "-o", names.RUN])
+        return {}
+
+    async def _write_reference(self) -> str:
+        """Write the frame that the pairs belong to as number 0 of the frames to come; returns its name."""
+        chosen, name = self._project.choices, self._project.recording
+        if name is None:
+            raise StudioError("the recording that the pairs were clicked on is not there: take a frame, and click anew")
+        path, part = self._project.path(name), self._project.path("reference.png")
+        await self._worker.call(recording.save_frame, path, chosen.get("reference_frame"), part)
+        part.replace(self._emptied() / "000000.png")
+        self._project.choose(recording=names.LIVE, reference_frame=0)
+        return f"{names.LIVE}/000000.png"
