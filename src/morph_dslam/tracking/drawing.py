@@ -20,7 +20,7 @@ from morph_dslam.io.video import VideoWriter
 from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.inner_structure import CarriedStructure
-from morph_dslam.model.reduced_model import MaterialPoints, von_mises
+from morph_dslam.model.reduced_model import MaterialPoints, equivalent_strain, von_mises
 from morph_dslam.render.overlay import BarPlace, draw_inner_surface, draw_overlay
 from morph_dslam.render.shading import lambert, text_patch, vertex_normals
 from morph_dslam.sources import Frame, FrameSource
@@ -260,7 +260,7 @@ class AugmentedView:
         if self.show == "displacement":
             return 1e3 * np.linalg.norm(displacement, axis=1)
         if self.show == "strain":
-            return 100.0 * _equivalent_strain(self._fields["strain"].value(parameters))
+            return 100.0 * equivalent_strain(self._fields["strain"].value(parameters))
         if self.show == "traction":
             return 1e-3 * np.linalg.norm(self._fields["traction"].value(parameters), axis=1)
         name = "stress_solid"
@@ -371,13 +371,6 @@ def _fields_of(model: ReducedModel, show: Shown) -> list[str]:
     if show == "stress":
         return [f"stress_{place}" for place in model.stresses]
     return [show] if show in ("strain", "traction") else []
-
-
-def _equivalent_strain(strain: Array) -> Array:
-    """sqrt(2/3 e : e) (n,) of the deviator e of strains (n, 6): xx, yy, zz, yz, xz, xy with tensor shears."""
-    normal = strain[:, :3] - strain[:, :3].mean(axis=1, keepdims=True)
-    squared = np.sum(normal**2, axis=1) + 2.0 * np.sum(strain[:, 3:] ** 2, axis=1)
-    return np.sqrt(2.0 / 3.0 * squared)
 
 
 def _drawn_mesh(model: ReducedModel, section: SectionPlane | None) -> tuple[MaterialPoints, NDArray[np.int64]]:
