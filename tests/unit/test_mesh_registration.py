@@ -108,10 +108,16 @@ def test_a_mesh_that_is_drawn_out_is_accused_by_its_outline(stretch):
 @pytest.mark.slow
 def test_two_of_a_kind_are_ambiguous():
     nodes, triangles, _ = wedge()
-    points, views = scanned(METRIC, objects=(np.array([-0.08, 0.0, 0.0]), np.array([0.08, 0.03, 0.0])))
+    shifts = np.array([[-0.08, 0.0, 0.0], [0.08, 0.03, 0.0]])
+    points, views = scanned(METRIC, objects=tuple(shifts))
     # Of a metric map one size is searched, not three: that takes a third of the time.
     found = register_mesh(nodes, triangles, points, views, CAMERA, metric=True)
     assert found.warnings == (Ambiguous(Ambiguity.SECOND_PLACE, found.runner_up / found.score), TooLittleTexture())
+    both = [METRIC @ SimilarityTransform(1.0, np.eye(3), shift) for shift in shifts]
+    there = [found.world_from_object, found.rivals[0].world_from_object]
+    off = np.array([[apart(place, true, nodes) for true in both] for place in there])
+    assert sorted(off.argmin(axis=1)) == [0, 1]
+    assert off.min(axis=1).max() < 5e-3
 
 
 def test_an_absent_object_is_not_found():
