@@ -20,6 +20,7 @@ from morph_dslam.registration.search_space import TURNS, attitudes, find_planes
 from morph_dslam.registration.texture import TextureComparison
 from morph_dslam.slam.rigid_map import GOOD, Keyframe, RigidMap
 from morph_dslam.slam.scene import Scene
+from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_object import CAMERA, cameras, scanned, wedge
 from tests.support.staged_scenes import bending_wedge
 
@@ -137,6 +138,18 @@ def test_a_tube_may_be_turned_about_its_axis_and_a_wedge_may_not():
     np.testing.assert_allclose(axis.point[:2], 0.0, atol=1e-3)
     nodes, triangles, _ = wedge()
     assert Surface.of_mesh(nodes, triangles).axis_of_revolution is None
+
+
+def test_a_disc_may_be_turned_about_its_axis_and_a_rectangle_may_not():
+    """Both lie in their plane however they are turned."""
+    rectangle = bent_sheet_model(9, 7)
+    assert Surface.of_mesh(rectangle.nodes, rectangle.triangles).axis_of_revolution is None
+    angles = np.linspace(0.0, 2.0 * np.pi, 61)[:-1]
+    nodes = np.vstack([np.zeros(3), np.column_stack([np.cos(angles), np.sin(angles), np.zeros(60)])])
+    rim = np.arange(60)
+    axis = Surface.of_mesh(0.1 * nodes, np.column_stack([0 * rim, rim + 1, (rim + 1) % 60 + 1])).axis_of_revolution
+    assert axis is not None
+    assert abs(axis.direction[2]) > 0.999
 
 
 def test_exact_points_lead_back_from_a_disturbed_place():

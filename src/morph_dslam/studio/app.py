@@ -29,8 +29,8 @@ _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 #: The pages' own files, and those of the explorer that they share.
 _PAGES = (
     "studio.css", "studio.js", "server.js", "parts.js", "mesh_view.js", "overlay.js", "plot.js", "recorder.js",
-    "object_step.js", "study_step.js", "build_step.js", "camera_step.js", "start_step.js", "track_step.js",
-    "results_step.js", "phone.js",
+    "object_step.js", "study_step.js", "build_step.js", "camera_step.js", "start_step.js", "scan_start.js",
+    "track_step.js", "results_step.js", "phone.js",
 )  # fmt: skip
 _PHONE = ("studio.css", "server.js", "parts.js", "recorder.js", "phone.js")
 _SHARED = (
@@ -160,6 +160,10 @@ class _Answers:
         """A frame of the recording."""
         return Response(await self._steps.frame(request.path_params["number"]), media_type="image/jpeg")
 
+    async def scan_frame(self, request: Request) -> Response:
+        """A frame of the scan."""
+        return Response(await self._steps.scan.frame(request.path_params["number"]), media_type="image/jpeg")
+
     async def call(self, request: Request) -> Response:
         """Call a step's action with the body's JSON object as its arguments."""
         action = self._steps.actions.get(request.path_params["action"])
@@ -264,6 +268,7 @@ def make_app(
         Route("/api/upload/{kind}/{name:path}", answers.upload, methods=["PUT"]),
         Route("/api/phone.png", answers.phone_code),
         Route("/api/frame/{number:int}", answers.frame),
+        Route("/api/scan/{number:int}", answers.scan_frame),
         Route("/api/{action}", answers.call, methods=["POST"]),
         Route("/files/{name:path}", answers.file),
         Route("/report", answers.report),

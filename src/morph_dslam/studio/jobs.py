@@ -30,7 +30,7 @@ class Job:
 
     Attributes
     ----------
-    kind : "build", "calibrate", "track" or "export".
+    kind : the command's name, such as "build".
     command : as it could be typed in the project folder.
     running : whether it runs.
     stopped : whether it was asked to stop.
@@ -89,6 +89,11 @@ class Jobs:
         self._start = 0.0
         self.job: Job | None = None
 
+    def check_idle(self) -> None:
+        """Raise StudioError if a command runs."""
+        if self.job is not None and self.job.running:
+            raise StudioError(f"`{self.job.command}` still runs: stop it, or wait until it has ended")
+
     async def start(self, kind: str, words: list[str]) -> None:
         """Run ``morph`` with these words.
 
@@ -97,8 +102,7 @@ class Jobs:
         StudioError
             If another command runs.
         """
-        if self.job is not None and self.job.running:
-            raise StudioError(f"`{self.job.command}` still runs: stop it, or wait until it has ended")
+        self.check_idle()
         self.job = Job(kind, shlex.join(["morph", *words]))
         self._start = time.monotonic()
         self._process = await asyncio.create_subprocess_exec(

@@ -15,6 +15,8 @@ STUDY, MESH, MODEL, REPORT = "study.toml", "mesh.inp", "model.morph", "model.rep
 CAMERA, LANDMARKS, RUN, FRAME_LOG = "camera.yaml", "landmarks.csv", "run", "track.jsonl"
 #: Folders of pictures: a recording as numbered images, and views of a calibration board.
 FRAMES, BOARD = "frames", "board"
+#: Folder of the recording of the still scene.
+SCAN = "scan"
 _CHOICES = "studio.json"
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. ()+-]{0,99}")
 _MEGABYTE = 1_000_000
@@ -44,6 +46,7 @@ UPLOADS = {
     ),
     "camera": UploadKind((".yaml", ".yml", ".txt"), _MEGABYTE),
     "recording": UploadKind(_VIDEOS, 8000 * _MEGABYTE),
+    "scan": UploadKind(_VIDEOS, 8000 * _MEGABYTE, SCAN),
     "frame": UploadKind(_PICTURES, 100 * _MEGABYTE, FRAMES),
     "board": UploadKind((*_PICTURES, *_VIDEOS), 2000 * _MEGABYTE, BOARD),
     "photo": UploadKind((".jpg", ".jpeg"), 100 * _MEGABYTE),

@@ -47,9 +47,12 @@ export async function trackStep(app) {
   const start = el('button', { id: 'track', className: 'main', onclick: () => app.doing(() => call('track',
     { refine: refine.checked, outline: outline.checked })) });
   const result = el('div', { id: 'track-result' });
+  const byScan = app.state.choices.start === 'scan';
+  if (byScan) refine.checked = false;
   app.panel.append(
-    check('Refine the start over the whole video, and track once more', refine),
-    el('p', { className: 'note' }, 'Takes twice as long. The start is then not taken as undeformed.'),
+    ...(byScan ? [el('p', { className: 'note' }, 'The object starts from its place in the scan, and stays in the map.')] : [
+      check('Refine the start over the whole video, and track once more', refine),
+      el('p', { className: 'note' }, 'Takes twice as long. The start is then not taken as undeformed.')]),
     check('Use the outline too', outline),
     el('p', { className: 'note' }, 'Where the object stands out from the background.'),
     start, command('morph track … --frame-log track.jsonl -o run'), result,
