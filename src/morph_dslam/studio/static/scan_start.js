@@ -18,6 +18,7 @@ export async function scanStart(app) {
   let number = 0; // of the keyframe that is shown
   let shown = null; // number of another place that is shown, null for the one that was found
   let hints = null;
+  let failure = null; // what the command said that ended with an error
   const panel = el('div');
   app.panel.append(panel);
   const distance = el('input', { id: 'scan-distance', type: 'number', min: 0, step: 'any', placeholder: 'unknown' });
@@ -46,7 +47,7 @@ export async function scanStart(app) {
   // -- the panel ---------------------------------------------------------------------------------
 
   function drawPanel() {
-    panel.replaceChildren(...there([scan.problem ? el('p', { className: 'problem' }, scan.problem) : null]), ...scanPart(), ...(scan.map ? placePart() : []), ...(scan.place ? judgePart() : []));
+    panel.replaceChildren(...[scan.problem, failure].filter(Boolean).map((one) => el('p', { className: 'problem' }, one)), ...scanPart(), ...(scan.map ? placePart() : []), ...(scan.place ? judgePart() : []));
   }
 
   function scanPart() {
@@ -196,7 +197,11 @@ export async function scanStart(app) {
   await load();
   return {
     close: () => record.close(),
-    job: (job, ended) => { if (ended && ['slam', 'register'].includes(job.kind)) app.doing(load); },
+    job: (job, ended) => {
+      if (!ended || !['slam', 'register'].includes(job.kind)) return;
+      failure = job.status === 0 || job.stopped ? null : job.lines.at(-1);
+      app.doing(load);
+    },
   };
 }
 
