@@ -136,7 +136,8 @@ class Jobs:
             return
         assert self.job is not None
         self.job.stopped = True
-        process.send_signal(signal.SIGINT)
+        # Commands take it as Ctrl-C; one that has not begun ends without a word, where SIGINT would show a traceback.
+        process.send_signal(signal.SIGTERM)
         try:
             await asyncio.wait_for(asyncio.shield(task), _PATIENCE)
         except TimeoutError:
