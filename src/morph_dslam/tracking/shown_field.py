@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import TrackingError
 from morph_dslam.model import ReducedModel, SeparatedField
-from morph_dslam.model.reduced_model import MaterialPoints, von_mises
+from morph_dslam.model.reduced_model import MaterialPoints, equivalent_strain, von_mises
 
 Array = NDArray[np.float64]
 Shown = Literal["stress", "strain", "displacement", "traction"]
@@ -89,7 +89,7 @@ class ShownField:
         if self._show == "displacement":
             return 1e3 * np.linalg.norm(displacement, axis=1)
         if self._show == "strain":
-            return 100.0 * _equivalent_strain(self._fields["strain"].value(parameters))
+            return 100.0 * equivalent_strain(self._fields["strain"].value(parameters))
         if self._show == "traction":
             return 1e-3 * np.linalg.norm(self._fields["traction"].value(parameters), axis=1)
         names = list(self._fields) if side is None else [f"stress_{side}"]
@@ -138,10 +138,3 @@ def _fields_of(model: ReducedModel, show: Shown) -> list[str]:
     if show == "stress":
         return [f"stress_{place}" for place in model.stresses]
     return [show] if show in ("strain", "traction") else []
-
-
-def _equivalent_strain(strain: Array) -> Array:
-    """sqrt(2/3 e : e) (n,) of the deviator e of strains (n, 6): xx, yy, zz, yz, xz, xy with tensor shears."""
-    normal = strain[:, :3] - strain[:, :3].mean(axis=1, keepdims=True)
-    squared = np.sum(normal**2, axis=1) + 2.0 * np.sum(strain[:, 3:] ** 2, axis=1)
-    return np.sqrt(2.0 / 3.0 * squared)

@@ -54,11 +54,14 @@ export async function trackStep(app) {
     { snap: snap.checked, outline: outline.checked })) }, 'Go live');
   const liveParts = el('div');
   const result = el('div', { id: 'track-result' });
+  const byScan = app.state.choices.start === 'scan';
+  if (byScan) refine.checked = false;
   app.panel.append(
-    check('Refine the start over the whole video, and track once more', refine),
-    el('p', { className: 'note' }, 'Takes twice as long. The start is then not taken as undeformed.'),
-    check('Snap the start to the outline', snap),
-    el('p', { className: 'note' }, 'Corrects the clicks by the edges that their image shows, where the part has those of its mesh.'),
+    ...(byScan ? [el('p', { className: 'note' }, 'The object starts from its place in the scan, and stays in the map.')] : [
+      check('Refine the start over the whole video, and track once more', refine),
+      el('p', { className: 'note' }, 'Takes twice as long. The start is then not taken as undeformed.'),
+      check('Snap the start to the outline', snap),
+      el('p', { className: 'note' }, 'Corrects the clicks by the edges that their image shows, where the part has those of its mesh.')]),
     check('Use the outline too', outline),
     el('p', { className: 'note' }, 'Where the object stands out from the background.'),
     start, command('morph track … --frame-log track.jsonl -o run'), liveParts, result,
