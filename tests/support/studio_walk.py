@@ -95,7 +95,9 @@ def describe_study(page, shots):
     page.enter("#supports-z", "0")
     shoot(page, shots / "2_study_form.png")
     page.click("#save-supports")
+    page.wait_for("document.querySelectorAll('#supports li').length === 2")
     page.wait_for("document.querySelector('#study-good') !== null")
+    page.evaluate("document.querySelector('#panel').scrollTo(0, 0)")
     shoot(page, shots / "2_study.png")
 
 
