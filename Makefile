@@ -53,8 +53,9 @@ lint: $(INSTALLED)
 	@$(BIN)/pyright --warnings
 	@$(BIN)/lint-imports
 
-# The site, in build/site: open build/site/index.html.
+# The site, in build/site: open build/site/index.html. Pictures of the studio follow its pages where Chromium is present.
 docs: $(INSTALLED)
+	@$(BIN)/python docs/studio_pictures.py
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "the documentation is in build/site/index.html"
 
