@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from types import TracebackType
 
 import numpy as np
@@ -101,6 +102,10 @@ class StreamSink:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Tell receivers that no frame will follow; once is enough."""
         self._stack.close()
 
     def __call__(self, tracked: TrackedFrame) -> None:
@@ -116,10 +121,14 @@ class StreamSink:
             frame.timestamp,
             None if captured is None else time.time() - (time.monotonic() - captured),
             np.asarray(frame.image, dtype=np.uint8),
-            tuple(part.message(tracked.results[name]) for name, part in self._objects.items()),
+            partial(_described, self._objects, tracked.results),
         )
         for publisher in watched:
             publisher.publish(message)
+
+
+def _described(objects: Mapping[str, _ObjectMessages], results: Mapping[str, FrameResult]) -> tuple[ObjectMessage, ...]:
+    return tuple(part.message(results[name]) for name, part in objects.items())
 
 
 class _ObjectMessages:
@@ -159,7 +168,9 @@ class _ObjectMessages:
             vertices,
             scalar,
             {
-                name: ReactionMessage(one.point, one.force.value, one.force.std, one.moment.value, one.moment.std)
+                name: ReactionMessage(
+                    one.point, one.force.value, one.force.std, one.force.size_std, one.moment.value, one.moment.std
+                )
                 for name, one in reactions.items()
             },
         )
