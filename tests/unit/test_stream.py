@@ -250,6 +250,11 @@ def test_a_token_may_be_kept_from_run_to_run(monkeypatch):
         StreamSink(["ws:0"])
 
 
+def test_frames_before_the_scene_are_refused(publisher, model):
+    with pytest.raises(StreamError, match="begin"):
+        StreamSink([publisher])(tracked_frame(0, 0.0, block=tracked_result(model, 0.1, 0.0)))
+
+
 def test_a_port_that_is_taken(publisher):
     with pytest.raises(StreamError, match="ws:0 takes any free one"):
         StreamSink([f"ws:{publisher.port}"])

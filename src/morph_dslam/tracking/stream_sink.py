@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
+from morph_dslam.errors import StreamError
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.streams.destinations import open_destination
 from morph_dslam.streams.messages import (
@@ -109,7 +110,9 @@ class StreamSink:
         self._stack.close()
 
     def __call__(self, tracked: TrackedFrame) -> None:
-        """Send a frame on, if anybody wants it."""
+        """Send a frame on, if anybody wants it; raises StreamError before `begin`."""
+        if not self._objects:
+            raise StreamError("the stream does not know what is tracked: call its method begin(objects, camera) first")
         number, self._number = self._number, self._number + 1
         watched = [publisher for publisher in self.publishers if publisher.is_watched]
         if not watched:
