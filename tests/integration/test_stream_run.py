@@ -157,8 +157,8 @@ def test_the_page_shows_shape_stress_parameters_and_forces(tmp_path):
         )
         assert rows["stretch"] == "0.150 ± 0.010"
         assert rows["slide"] == "4.00 ± 0.50 mm"
-        force = np.hypot(400.0 * stretch, 5000.0 * slide)
-        assert rows["left end"] == f"{force:.1f} N"
+        # The force (-60, 0, 20) N has components known to (4, 0, 2.5) N.
+        assert rows["left end"] == f"{np.hypot(60.0, 20.0):.1f} ± {np.sqrt(0.9 * 4.0**2 + 0.1 * 2.5**2):.1f} N"
         top = float(page.evaluate("document.querySelector('#bar li').textContent"))
         shot = page.screenshot()
         view = shot[:, 310:860].astype(int)

@@ -109,6 +109,9 @@ def test_a_frame_has_the_values_of_the_closed_form(publisher, sink, model):
         # The left end, x = 0, slides by half of what the top does in the mean.
         assert held["point"] == pytest.approx([slide / 2, SIZE[1] / 2, SIZE[2] / 2])
         assert held["force"] == pytest.approx([-400.0 * stretch, 0.0, 5000.0 * slide])
+        along = np.array(held["force"]) / np.linalg.norm(held["force"])
+        size_std = np.hypot(np.linalg.norm(along * [4.0, 0.0, 2.5]), 0.1 * np.linalg.norm(held["force"]))
+        assert held["force_size_std"] == pytest.approx(size_std)
         # Of the parameters, and of a tenth of the force itself.
         of_parameters = np.array([400.0, 0.0, 5000.0]) * DEVIATIONS[[0, 0, 1]]
         assert held["force_std"] == pytest.approx(np.hypot(of_parameters, 0.1 * np.array(held["force"])))
@@ -245,6 +248,11 @@ def test_a_token_may_be_kept_from_run_to_run(monkeypatch):
     monkeypatch.setenv("MORPH_STREAM_TOKEN", "short")
     with pytest.raises(StreamError, match="16 or more"):
         StreamSink(["ws:0"])
+
+
+def test_frames_before_the_scene_are_refused(publisher, model):
+    with pytest.raises(StreamError, match="begin"):
+        StreamSink([publisher])(tracked_frame(0, 0.0, block=tracked_result(model, 0.1, 0.0)))
 
 
 def test_a_port_that_is_taken(publisher):

@@ -5,7 +5,9 @@ All values are in SI units. The camera looks along +z, with x to the right and y
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -112,6 +114,7 @@ class ReactionMessage:
     point : (3,) where the support is in the middle, metres.
     force : (3,) N.
     force_std : (3,) standard deviations.
+    force_size_std : standard deviation of the force's size, N.
     moment : (3,) about the point, N m.
     moment_std : (3,) standard deviations.
     """
@@ -119,6 +122,7 @@ class ReactionMessage:
     point: Array
     force: Array
     force_std: Array
+    force_size_std: float
     moment: Array
     moment_std: Array
 
@@ -164,7 +168,7 @@ class FrameMessage:
     timestamp : of the frame, seconds.
     captured : when a live frame was captured, seconds since 1970; None in a recording.
     image : (h, w, 3) as recorded: blue, green, red.
-    objects : in the order of the scene.
+    describe : makes `objects`, when somebody asks for them: in the thread of a stream, and not in that of the tracker.
     """
 
     number: int
@@ -172,7 +176,12 @@ class FrameMessage:
     timestamp: float
     captured: float | None
     image: NDArray[np.uint8]
-    objects: tuple[ObjectMessage, ...]
+    describe: Callable[[], tuple[ObjectMessage, ...]]
+
+    @cached_property
+    def objects(self) -> tuple[ObjectMessage, ...]:
+        """In the order of the scene."""
+        return self.describe()
 
 
 class Publisher(Protocol):

@@ -83,7 +83,7 @@ def _state_facts(part: ObjectMessage) -> dict[str, Any]:
         "parameters": _numbers(part.parameters),
         "parameter_std": _numbers(part.parameter_std),
         "reactions": {
-            name: {key: _numbers(value) for key, value in vars(reaction).items()}
+            name: {key: _numbers(value) if np.ndim(value) else _number(value) for key, value in vars(reaction).items()}
             for name, reaction in part.reactions.items()
         },
     }
@@ -91,4 +91,8 @@ def _state_facts(part: ObjectMessage) -> dict[str, Any]:
 
 def _numbers(values: NDArray[np.float64]) -> list[float | None]:
     """A list for JSON, which knows no NaN and no infinity: None where a value is not known."""
-    return [float(value) if np.isfinite(value) else None for value in values]
+    return list(map(_number, values))
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import hashlib
+import logging
 import re
 import socket
 import threading
@@ -29,6 +30,9 @@ from morph_dslam.streams.gate import StreamGate, stream_token
 from morph_dslam.streams.messages import FrameMessage, SceneMessage
 from morph_dslam.streams.packets import end_packet, frame_packet, scene_packet
 
+#: Takes what the server would say of connections that are none, instead of the terminal.
+_LOG = logging.getLogger("morph_dslam.streams")
+_LOG.addHandler(logging.NullHandler())
 #: Where programs connect.
 PATH = "/stream"
 #: Bytes that may wait for a client, in the process and in the system: frames that wait there get old.
@@ -163,7 +167,7 @@ class WebSocketPublisher:
         self._loop, self._newest = asyncio.get_running_loop(), _Newest()
         async with serve(
             self._send_all, sock=self._socket, process_request=self._answer, compression=None, max_size=MOST_RECEIVED,
-            write_limit=WAITING, close_timeout=LAST_SECONDS, server_header=None,
+            write_limit=WAITING, close_timeout=LAST_SECONDS, server_header=None, logger=_LOG,
         ):  # fmt: skip
             self._ready.set()
             while not self._newest.ended:

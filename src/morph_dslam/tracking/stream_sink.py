@@ -6,12 +6,14 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
+from morph_dslam.errors import StreamError
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.streams.destinations import open_destination
 from morph_dslam.streams.messages import (
@@ -101,10 +103,16 @@ class StreamSink:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Tell receivers that no frame will follow; once is enough."""
         self._stack.close()
 
     def __call__(self, tracked: TrackedFrame) -> None:
-        """Send a frame on, if anybody wants it."""
+        """Send a frame on, if anybody wants it; raises StreamError before `begin`."""
+        if not self._objects:
+            raise StreamError("the stream does not know what is tracked: call its method begin(objects, camera) first")
         number, self._number = self._number, self._number + 1
         watched = [publisher for publisher in self.publishers if publisher.is_watched]
         if not watched:
@@ -116,10 +124,14 @@ class StreamSink:
             frame.timestamp,
             None if captured is None else time.time() - (time.monotonic() - captured),
             np.asarray(frame.image, dtype=np.uint8),
-            tuple(part.message(tracked.results[name]) for name, part in self._objects.items()),
+            partial(_described, self._objects, tracked.results),
         )
         for publisher in watched:
             publisher.publish(message)
+
+
+def _described(objects: Mapping[str, _ObjectMessages], results: Mapping[str, FrameResult]) -> tuple[ObjectMessage, ...]:
+    return tuple(part.message(results[name]) for name, part in objects.items())
 
 
 class _ObjectMessages:
@@ -159,7 +171,9 @@ class _ObjectMessages:
             vertices,
             scalar,
             {
-                name: ReactionMessage(one.point, one.force.value, one.force.std, one.moment.value, one.moment.std)
+                name: ReactionMessage(
+                    one.point, one.force.value, one.force.std, one.force.size_std, one.moment.value, one.moment.std
+                )
                 for name, one in reactions.items()
             },
         )

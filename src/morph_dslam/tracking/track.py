@@ -89,6 +89,7 @@ def track(run: TrackOptions, tell: Tell = lambda folder, summary: None) -> dict[
         try:
             job.run()
         finally:
+            job.end_streams()
             summaries = [job.write(number, tell) for number in range(len(placed))]
     return summaries[0]
 
@@ -289,6 +290,11 @@ class _Job:
             for part, name in zip(placed, self._run.stream_names, strict=True)
         }
         return [self._streams.begin(objects, placed[0].camera)]
+
+    def end_streams(self) -> None:
+        """End the streams as soon as the last frame is tracked: a video may take minutes to draw."""
+        if self._streams is not None:
+            self._streams.close()
 
     def _keep_seen(self, tracked: TrackedFrame) -> None:
         """Keep where the points of each object were seen, to refine its reference."""

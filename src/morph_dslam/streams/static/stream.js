@@ -83,7 +83,8 @@ function showFrame(message) {
   element('status').className = state.status;
   fill('parameters', object.parameters.map((one, i) => [
     one.name, measured(state.parameters[i], state.parameter_std[i], one.shown_factor, one.shown_unit)]));
-  fill('reactions', Object.entries(state.reactions).map(([on, one]) => [on, `${Math.hypot(...one.force).toPrecision(3)} N`]));
+  fill('reactions', Object.entries(state.reactions).map(([on, one]) => [
+    on, measured(Math.hypot(...one.force), one.force_size_std, 1, 'N')]));
   fill('frame', [['frame', message.frame], ['time', `${message.timestamp.toFixed(2)} s`],
     ['frames missed', message.number - firstNumber + 1 - received]]);
   const vertices = message.arrays[`${name}/vertices`];
