@@ -14,7 +14,7 @@ from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.tracking.binding import DrawnSurface
 from morph_dslam.tracking.estimator import State, moved
 from morph_dslam.tracking.outline import Outline, nearest_to_each_other
-from morph_dslam.tracking.outline_weight import OutlineBalance
+from morph_dslam.tracking.outline_weight import OutlineBalance, beside_found
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.bent_tube import polynomial
 
@@ -199,3 +199,19 @@ def _to_segments(point: np.ndarray, segments: np.ndarray) -> float:
     start, along = segments[:, 0], segments[:, 1] - segments[:, 0]
     share = np.clip(((point - start) * along).sum(axis=1) / (along**2).sum(axis=1), 0.0, 1.0)
     return float(np.linalg.norm(start + share[:, None] * along - point, axis=1).min())
+
+
+def test_what_covers_the_texture_beside_a_point_is_told_by_its_five_nearest():
+    """Against scipy's search; points of the texture that should not be seen say nothing."""
+    rng = np.random.default_rng(2)
+    pixels, texture, found = rng.uniform(0, 90, (40, 2)), rng.uniform(0, 90, (200, 2)), rng.random(200) < 0.3
+    hidden = rng.random(200) < 0.2
+    nearest = KDTree(texture[~hidden]).query(pixels, 5)[1]
+    expected = found[~hidden][nearest].sum(axis=1) >= 2
+    assert 5 < expected.sum() < 35
+    places = np.where(hidden[:, None], np.nan, texture)
+    np.testing.assert_array_equal(beside_found(pixels, places, found), expected)
+    # Without texture nothing says that something is there; of a single point it is enough.
+    assert beside_found(pixels, places[:0], found[:0]).all()
+    assert beside_found(pixels, texture[:1], np.array([True])).all()
+    assert not beside_found(pixels, texture[:1], np.array([False])).any()
