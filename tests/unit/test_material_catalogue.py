@@ -47,6 +47,12 @@ def test_sylgard_has_its_young_s_modulus():
     assert 6 * number(ENTRIES["sylgard_184"].section["c10"]) == pytest.approx(1.32e6)
 
 
+def test_tango_plus_has_its_author_s_shear_modulus():
+    """About 0.2 MPa by the author of the recordings; of a Mooney-Rivlin rubber it is 2 (c10 + c01)."""
+    section = ENTRIES["tango_plus"].section
+    assert 2 * (number(section["c10"]) + number(section["c01"])) == pytest.approx(0.2e6, rel=0.15)
+
+
 def test_liver_has_its_shear_modulus():
     assert 2 * number(ENTRIES["liver"].section["c10"]) == pytest.approx(1.8e3)
 

@@ -64,6 +64,15 @@ _CATALOGUE: tuple[CataloguedMaterial, ...] = (
         note=f"Young's modulus 1.32 MPa, up to 40 % strain; 2.97 MPa if cured at 200 °C. {_BULK}",
     ),
     CataloguedMaterial(
+        name="tango_plus",
+        title="TangoPlus, printed",
+        section={"law": "mooney_rivlin", "c10": "0.068 MPa", "c01": "0.045 MPa", "bulk": "226 MPa"},
+        source="constants fitted here to the force curves of two notched strips of V. Slesarenko (2019), "
+        "github.com/slslesarenko/jupyterWSM (examples/rubber_tension)",
+        note="First loading in tension, up to 1.5 times the length, within 5 %; a strip of another batch, 3 %. Printed "
+        f"rubber is softer when pulled slowly. {_BULK}",
+    ),
+    CataloguedMaterial(
         name="mold_star_16",
         title="Mold Star 16 FAST",
         section={"law": "yeoh", "c10": "42 kPa", "c20": "2.6 kPa", "bulk": "84 MPa"},
