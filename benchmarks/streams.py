@@ -2,11 +2,11 @@
 
     python benchmarks/streams.py [--rounds 5] [--frames 60]
 
-The boot seal's recording (`examples/boot_seal/track.py`) is tracked as `morph track` does it: without a stream, with a
-WebSocket that nobody or one client in another process listens to, and with a recording of rerun where it is installed.
-Every round tracks all of them; ratios are to the run without a stream in the same round. Printed are medians over the
-rounds, and the smallest ratio: by the clock, and in processor time, which other programs disturb less. Images are in
-memory, nothing is drawn or written beside the stream.
+The sheet of `make demo` is tracked as `morph track` does it: without a stream, with a WebSocket that nobody or one
+client in another process listens to, and with a recording of rerun where it is installed. Every round tracks all of
+them; ratios are to the run without a stream in the same round. Printed are medians over the rounds, and the smallest
+ratio: by the clock, and in processor time, which other programs disturb less. Images are in memory, nothing is drawn or
+written beside the stream.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -24,15 +24,12 @@ from pathlib import Path
 
 import numpy as np
 
-from morph_dslam import Frame, MorphError, TrackOptions, open_source
-from morph_dslam.extend import run_and_report_errors
+import morph_dslam as md
+from morph_dslam.extend import one_thread_for_algebra, run_and_report_errors
 from morph_dslam.extend.streams import StreamSink
-from morph_dslam.threads import one_thread_for_algebra
-from morph_dslam.tracking.placement import PlacedObject
-from morph_dslam.tracking.track import new_session, prepare, warm_up
 
 ROOT = Path(__file__).resolve().parents[1]
-OUTPUT = ROOT / "examples" / "boot_seal" / "output"
+DEMO = ROOT / "demo"
 CLIENT = ROOT / "examples" / "streams" / "client.py"
 
 
@@ -67,50 +64,52 @@ class Cost:
     received: str = ""
 
 
-@one_thread_for_algebra
-def cost(placed: list[PlacedObject], frames: Sequence[Frame], kind: str, folder: Path) -> Cost:
-    """Track the frames with a kind of stream."""
-    (seal,) = placed
-    clocks = (time.perf_counter, time.thread_time, time.process_time)
-    with ExitStack() as stack:
-        sinks, client = [], None
-        if kind != "none":
-            destination = f"rerun:{folder / 'run.rrd'}" if kind == "rerun" else "ws:0"
-            streams = stack.enter_context(StreamSink([destination]))
-            sinks = [streams.begin({seal.name: seal.model}, seal.camera)]
-            client = stack.enter_context(one_client(streams)) if kind == "ws, one client" else None
-        session = new_session(placed, frames, sinks)
-        begin = [clock() for clock in clocks]
-        session.run()
-        spent = [1e3 * (clock() - before) / len(frames) for clock, before in zip(clocks, begin, strict=True)]
-        if client is None:
-            return Cost(*spent)
-        streams.publishers[0].close()
-        assert client.stdout is not None
-        return Cost(*spent, f", {len(client.stdout.read().splitlines())} of {len(frames)} frames received")
+class Measured:
+    """The demo's recording, to be tracked again and again.
+
+    Parameters
+    ----------
+    n_frames : how many of its frames.
+    folder : for recordings of rerun.
+    """
+
+    def __init__(self, n_frames: int, folder: Path) -> None:
+        sequence = DEMO / "sequence"
+        self._model, self._camera = md.load_model(DEMO / "sheet.morph"), md.load_camera(sequence / "camera.yaml")
+        self._start = md.register_landmarks(self._model, self._camera, sequence / "landmarks.csv")
+        self._frames, self._folder = list(md.open_source(sequence / "frames"))[:n_frames], folder
+
+    @one_thread_for_algebra
+    def cost(self, kind: str) -> Cost:
+        """Track the frames with a kind of stream."""
+        clocks, count = (time.perf_counter, time.thread_time, time.process_time), len(self._frames)
+        with ExitStack() as stack:
+            sinks, client = [], None
+            if kind != "none":
+                destination = f"rerun:{self._folder / 'run.rrd'}" if kind == "rerun" else "ws:0"
+                streams = stack.enter_context(StreamSink([destination]))
+                sinks = [streams.begin({"sheet": self._model}, self._camera)]
+                client = stack.enter_context(one_client(streams)) if kind == "ws, one client" else None
+            tracker = md.Tracker(self._model, self._camera, self._start)
+            session = md.Session({"sheet": tracker}, self._frames, sinks)
+            begin = [clock() for clock in clocks]
+            session.run()
+            spent = [1e3 * (clock() - before) / count for clock, before in zip(clocks, begin, strict=True)]
+            if client is None:
+                return Cost(*spent)
+            streams.close()
+            assert client.stdout is not None
+            return Cost(*spent, f", {len(client.stdout.read().splitlines())} of {count} frames received")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    place, recording = OUTPUT / "registration" / "registration.json", OUTPUT / "recording"
-    if not place.is_file():
-        raise MorphError(f"there is no {place}: make it with examples/boot_seal/run.py and track.py first")
-    options = TrackOptions(
-        frames=recording / "frames",
-        model=OUTPUT / "boot_seal.morph",
-        camera=recording / "camera.yaml",
-        registration=place,
-        map_path=OUTPUT / "scan" / "map.h5",
-        output=OUTPUT,
-    )
+    if not (DEMO / "sequence").is_dir():
+        raise md.MorphError(f"there is no recording in {DEMO}: make it with `make demo` first")
     kinds = ["none", "ws, no client", "ws, one client", *(["rerun"] if find_spec("rerun") else [])]
-    with ExitStack() as stack:
-        placed = prepare(options, stack)[2]
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        first = placed[0].frame
-        frames = list(open_source(recording / "frames", first, first + arguments.frames - 1))
-        warm_up(placed)
-        cost(placed, frames, "none", folder)
-        rounds = [{kind: cost(placed, frames, kind, folder) for kind in kinds} for _ in range(arguments.rounds)]
+    with tempfile.TemporaryDirectory() as folder:
+        measured = Measured(arguments.frames, Path(folder))
+        measured.cost("none")  # compiles
+        rounds = [{kind: measured.cost(kind) for kind in kinds} for _ in range(arguments.rounds)]
     print(f"{'':<16}{'clock':>24}{'tracking thread':>24}{'program':>24}")
     for kind in kinds:
         columns = []
