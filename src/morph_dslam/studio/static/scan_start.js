@@ -108,19 +108,25 @@ export async function scanStart(app) {
       await app.refresh();
       await load();
     }) }, place.accepted ? 'Accepted' : 'Accept this place');
-    const others = place.rivals.map((share, i) => el('li', { className: i === shown ? 'chosen' : '' },
-      el('span', {}, share === null ? `Place ${i + 2}` : `Place ${i + 2}: scores ${digits(100 * share, 2)} % of the first`),
-      el('button', { id: `rival-${i}`, onclick: () => app.doing(async () => { shown = i; await showFrame(); drawPanel(); }) }, 'Show'),
+    const look = (which) => app.doing(async () => { shown = which; await showFrame(); drawPanel(); });
+    const others = place.rivals.map((share, i) => el('li', {},
+      el('span', {}, share === null ? `Place ${i + 2}` : `Place ${i + 2}: ${digits(100 * share, 2)} %`),
+      el('button', { id: `rival-${i}`, disabled: i === shown, onclick: () => look(i) }, 'Show'),
       el('button', { id: `take-rival-${i}`, onclick: () => app.doing(() => call('find_place', { frame: number, rival: i })) }, 'Find it there')));
+    const rivals = others.length ? [el('p', { className: 'note' }, 'Other places, with their score over that of the first:'),
+      el('ul', { className: 'list', id: 'rivals' }, ...others)] : [];
+    // What is told, and what is accepted, is the first place: it must be the one that is seen.
+    if (shown !== null) {
+      return [el('h3', {}, `Place ${shown + 2}`), el('p', { className: 'note' }, 'Find the object there to see what speaks for it.'), ...rivals,
+        el('button', { id: 'first-place', onclick: () => look(null) }, 'Show the first place')];
+    }
     return there([
-      el('h3', {}, shown === null ? 'The place' : `Place ${shown + 2}`),
+      el('h3', {}, 'The place'),
       el('p', { id: 'judgement', className: place.ambiguous ? 'warning' : 'good' }, place.ambiguous ? 'Ambiguous: look at it in every keyframe.'
         : 'Clear. Look at it in every keyframe all the same.'),
       ...place.warnings.map((one) => el('p', { className: 'warning note' }, one)),
       ...place.evidence.map((one) => el('p', { className: 'note' }, one)),
-      el('ul', { className: 'list', id: 'rivals' }, ...others),
-      shown === null ? null : el('button', { onclick: () => app.doing(async () => { shown = null; await showFrame(); drawPanel(); }) },
-        'Show the first place'),
+      ...rivals,
       place.ambiguous && !place.accepted ? check('I looked: the drawing is where the object is', sure) : null,
       accept,
       el('p', { className: 'note' }, 'studio.json keeps that the place was accepted, and whether it was ambiguous.'),
