@@ -88,7 +88,7 @@ class Gate:
             await self._application(scope, receive, send)
             return
         if scope["type"] == "websocket":
-            refused = self._refusal(scope | {"scheme": _SCHEMES[scope["scheme"]], "method": "WEBSOCKET"})
+            refused = self._refusal({**scope, "scheme": _SCHEMES[scope["scheme"]], "method": "WEBSOCKET"})
             await (self._application(scope, receive, send) if refused is None else _refuse(receive, send))
             return
         if scope["type"] != "http":
