@@ -130,6 +130,9 @@ def test_a_phone_is_the_camera(project, film, tmp_path, capsys):
         figures = said(phone)
         colours = phone.screenshot().astype(int)
         assert (colours.max(axis=2) - colours.min(axis=2) > 60).mean() > 0.05  # the film is grey, stress is coloured
+        now = phone.evaluate("document.querySelector('#live-picture').camera.socket.close(), performance.now()")
+        phone.wait_for("document.querySelector('#said').textContent.includes('trying again')")
+        phone.wait_for(f"{PICTURES}.at(-1)?.[0] > {now} + 1000")  # it has come back by itself
         stop(computer)
         computer.click("#to-results")
         computer.wait_for("document.querySelector('#result-image')?.dataset.frame !== undefined")

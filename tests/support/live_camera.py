@@ -66,6 +66,10 @@ class LivePage:
         """Send a frame."""
         self._socket.send(NUMBER.pack(number) + jpeg)
 
+    def say(self, message):
+        """Send something that is no frame."""
+        self._socket.send(message)
+
     def receive(self, seconds=60.0):
         """The next message: (number, JPEG) of a picture, or None when facts came."""
         message = self._socket.recv(seconds)

@@ -21,7 +21,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--host", default="127.0.0.1", metavar="ADDRESS", help="listen at this address (default: this computer only)"
     )
-    add_flag(command, "--phone", "let a phone in the network record, over HTTPS at the next port")
+    add_flag(
+        command, "--phone", "let a phone in the network record, or be the live camera, over HTTPS at the next port"
+    )
     add_flag(command, "--open", "open the browser at once")
 
 

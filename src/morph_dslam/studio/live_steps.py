@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +64,7 @@ class LiveSteps:
             return
         self._kept += len(jpeg)
         path = self._project.path(f"{names.LIVE}/{number:06d}.jpg")
-        asyncio.get_running_loop().run_in_executor(None, path.write_bytes, jpeg)
+        asyncio.get_running_loop().run_in_executor(None, _write, path, jpeg)
 
     def _emptied(self) -> Path:
         folder = self._project.path(names.LIVE)
@@ -79,9 +80,9 @@ class LiveSteps:
         jpeg = self.relay.newest
         if jpeg is None:
             raise StudioError(_NO_CAMERA)
+        await self._worker.call(recording.check_jpeg, jpeg)
         folder, landmarks = self._emptied(), self._project.path(names.LANDMARKS)
         (folder / "000000.jpg").write_bytes(jpeg)
-        await self._worker.call(recording.recording_facts, folder)
         if landmarks.is_file():
             landmarks.replace(self._project.path(names.EARLIER_LANDMARKS))
         self._project.choose(recording=names.LIVE, reference_frame=0)
@@ -118,3 +119,8 @@ class LiveSteps:
         part.replace(self._emptied() / "000000.png")
         self._project.choose(recording=names.LIVE, reference_frame=0)
         return f"{names.LIVE}/000000.png"
+
+
+def _write(path: Path, content: bytes) -> None:
+    with suppress(OSError):  # the disk may be full: the frame is tracked all the same
+        path.write_bytes(content)

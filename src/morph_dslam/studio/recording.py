@@ -82,6 +82,12 @@ def frame_jpeg(path: Path, number: int) -> bytes:
     return _opened(path).jpeg(number)
 
 
+def check_jpeg(jpeg: bytes) -> None:
+    """Raise StudioError if this cannot be decoded."""
+    if cv2.imdecode(np.frombuffer(jpeg, dtype=np.uint8), cv2.IMREAD_COLOR) is None:
+        raise StudioError("the frame cannot be decoded: take another one")
+
+
 def save_frame(path: Path, number: int | None, target: Path) -> None:
     """Write a frame of a recording, the first one by default, as an image file without loss."""
     found = _opened(path)

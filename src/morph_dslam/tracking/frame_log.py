@@ -48,7 +48,7 @@ class FrameLog:
 def _line(run: RunResults) -> dict[str, Any]:
     """What is known of the last frame, in SI units; None for what is not known."""
     result = run.results[-1]
-    forces = {name: frames[-1] for name, frames in run.reactions().items()}
+    displacement, stress = run.last_largest()
     return {
         "frame": run.frames[-1],
         "timestamp": run.timestamps[-1],
@@ -57,10 +57,12 @@ def _line(run: RunResults) -> dict[str, Any]:
         "parameters": {name: _number(value) for name, value in result.parameters.items()},
         "parameter_std": {name: _number(value) for name, value in result.parameter_std.items()},
         "camera_from_object": None if result.pose is None else result.pose.matrix.tolist(),
-        "largest_displacement": _number(run.largest_displacements()[-1, 0]),
-        "largest_von_mises": _number(run.largest_stresses()[-1, 0]),
+        "largest_displacement": _number(displacement),
+        "largest_von_mises": _number(stress),
         "residual_rms_px": _number(result.residual_rms_px),
-        "forces": {name: None if one is None else one.force.value.tolist() for name, one in forces.items()},
+        "forces": {
+            name: None if one is None else one.force.value.tolist() for name, one in run.last_reactions().items()
+        },
     }
 
 

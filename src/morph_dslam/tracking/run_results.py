@@ -101,40 +101,70 @@ class RunResults:
 
     def largest_displacements(self) -> Array:
         """The largest displacement of a node of the surface and its standard deviation (f, 2), metres."""
-        return self._added_to(self._largest, largest_displacement, DrawnSurface.of(self.model).model)
+        return np.array(self._known_displacements()).reshape(-1, 2)
 
     def largest_stresses(self) -> Array:
         """The largest von Mises stress of a node of the surface and its standard deviation (f, 2), pascals.
 
         NaN where lost, and in models without stresses.
         """
-        used = np.unique(self.model.triangles)
-        stresses = {place: f.with_modes(f.modes[:, used]) for place, f in self.model.stresses.items()}
-        return self._added_to(self._stressed, largest_von_mises, replace(self.model, stresses=stresses))
+        return np.array(self._known_stresses()).reshape(-1, 2)
 
     def reactions(self) -> dict[str, list[Reaction | None]]:
         """Of each support what it exerts in every frame, None where the object was hidden or lost."""
+        frames = self._known_reactions()
+        return {name: [frame.get(name) for frame in frames] for name in self._reactions_of_model.names}
+
+    def last_largest(self) -> tuple[float, float]:
+        """The largest displacement (m) and von Mises stress (Pa) of the last frame, as above."""
+        return self._known_displacements()[-1][0], self._known_stresses()[-1][0]
+
+    def last_reactions(self) -> dict[str, Reaction | None]:
+        """What each support exerts in the last frame, as above."""
+        last = self._known_reactions()[-1]
+        return {name: last.get(name) for name in self._reactions_of_model.names}
+
+    # What is known of the frames so far is kept, so that a frame costs the same however long the run is.
+
+    def _known_displacements(self) -> list[tuple[float, float]]:
+        return self._added_to(self._largest, largest_displacement, self._surface)
+
+    def _known_stresses(self) -> list[tuple[float, float]]:
+        return self._added_to(self._stressed, largest_von_mises, self._stressed_surface)
+
+    def _known_reactions(self) -> list[dict[str, Reaction]]:
         reactions = self._reactions_of_model
         for result in self.results[len(self._reactions) :]:
             found = result.estimate
             self._reactions.append({} if found is None else reactions(found, self.modulus_std))
-        return {name: [frame.get(name) for frame in self._reactions] for name in reactions.names}
+        return self._reactions
 
     @cached_property
     def _reactions_of_model(self) -> Reactions:
         return Reactions(self.model)
+
+    @cached_property
+    def _surface(self) -> ReducedModel:
+        return DrawnSurface.of(self.model).model
+
+    @cached_property
+    def _stressed_surface(self) -> ReducedModel:
+        """The model with stresses of the nodes of the surface alone."""
+        used = np.unique(self.model.triangles)
+        stresses = {place: f.with_modes(f.modes[:, used]) for place, f in self.model.stresses.items()}
+        return replace(self.model, stresses=stresses)
 
     def _added_to(
         self,
         known: list[tuple[float, float]],
         largest: Callable[[ReducedModel, Estimate], tuple[float, float]],
         surface: ReducedModel,
-    ) -> Array:
-        """What is ``known`` of the frames so far (f, 2), added to by what is ``largest`` in those since."""
+    ) -> list[tuple[float, float]]:
+        """What is ``known`` of the frames so far (f), added to by what is ``largest`` in those since."""
         for result in self.results[len(known) :]:
             found = result.estimate
             known.append((np.nan, np.nan) if found is None else largest(surface, found))
-        return np.array(known).reshape(-1, 2)
+        return known
 
     def timings_ms(self) -> Array:
         """(f, len(STAGES) + 1): each stage, then the whole frame."""

@@ -37,7 +37,7 @@ export async function cameraStep(app) {
     await draw();
   };
   const record = recordButton(app, 'record', 'Record with a camera of this computer', 'webcam', takeRecording);
-  const liveWhere = el('div', { className: 'fill' });
+  const liveWhere = el('div', { className: 'fill', style: 'z-index: 3' });
   const live = liveView(app, liveWhere, () => showLive());
   const recordBoard = recordButton(app, 'record-board', 'Record the board', 'board', takeBoard);
   app.panel.append(

@@ -37,7 +37,7 @@ export function liveView(app, container, told) {
     await call('take_frame');
     await app.show('start');
   }) }, 'Take this frame');
-  const live = { facts: {}, isCovered: () => false, parts: [status, el('p', {}, button, ' ', take)], close };
+  const live = { facts: {}, isCovered: () => false, parts: [status, el('div', { className: 'row' }, button, take)], close };
   let closed = false;
   let socket = null;
   container.append(canvas);
@@ -65,7 +65,7 @@ export function liveView(app, container, told) {
   function draw() {
     const { camera, refused, tracking } = live.facts;
     canvas.hidden = !camera || live.isCovered();
-    button.textContent = own ? 'Stop the camera' : 'Use a camera of this computer';
+    button.textContent = own ? 'Stop the camera' : 'Start a camera here';
     take.disabled = !camera || Boolean(refused) || tracking;
     const figures = own && tracking ? figuresText(own.figures()) : '';
     const nothing = app.state.phone ? 'No camera yet: start one here, or press Live on the phone.' : 'No camera yet.';
