@@ -12,6 +12,7 @@ from morph_dslam.extend.streams import StreamSink
 from morph_dslam.registration.registration import Registration
 from morph_dslam.sources import Frame
 from morph_dslam.streams.websocket import WebSocketPublisher
+from tests.integration.test_session import frame as both_sheets, states
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.chromium import Page, find_chromium
 from tests.support.documents import samples
@@ -173,3 +174,26 @@ def test_the_page_shows_shape_stress_parameters_and_forces(tmp_path):
         publisher.close()
         page.wait_for("document.getElementById('status').textContent === 'the stream has ended'")
         assert page.problems == []
+
+
+def test_each_object_is_told_by_its_name(sheet, tmp_path, capsys):
+    """One sheet passes another: the first has the name of its model file, the other the one that is given."""
+    films = {"behind": SheetFilm(sheet, seed=1), "before": SheetFilm(sheet, seed=2)}
+    write_recording(tmp_path, {n: both_sheets(sheet, films, time) for n, time in enumerate(TIMES[:8])}, sheet)
+    for name, path in (("behind", "landmarks.csv"), ("before", "before.csv")):
+        write_landmarks(tmp_path / path, sheet, states(0.0)[name], count=24)
+    also = ("--also", "before", tmp_path / "sheet.morph", tmp_path / "before.csv", "--show", "displacement")
+    scene, *frames = streamed_run(tmp_path, tmp_path / "run", capsys, *also)
+    shown = [(part["name"], part["scalar"]["name"]) for part in scene["objects"]]
+    assert shown == [("sheet", "displacement"), ("before", "displacement")]
+    for message in frames:
+        truth = states(TIMES[message["frame"]])
+        for found, name in zip(message["objects"], ("behind", "before"), strict=True):
+            assert found["status"] == "tracked"
+            nodes, arrays = scene["arrays"][f"{found['name']}/nodes"], message["arrays"]
+            vertices = arrays[f"{found['name']}/vertices"].reshape(-1, 3).astype(float)
+            pose = np.array(found["camera_from_object"])
+            true = truth[name].camera_from_object.apply(sheet.positions(truth[name].parameters))[nodes]
+            assert np.linalg.norm(vertices @ pose[:3, :3].T + pose[:3, 3] - true, axis=1).mean() < 1e-3
+            moved = np.linalg.norm(sheet.displacement.value(np.array(found["parameters"])), axis=1)
+            np.testing.assert_allclose(arrays[f"{found['name']}/scalar"], moved[nodes], atol=1e-7)

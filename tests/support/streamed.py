@@ -11,6 +11,7 @@ import numpy as np
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
+from morph_dslam.registration.registration import PosePrior
 from morph_dslam.sources import Frame
 from morph_dslam.tracking.estimator import Estimate, State
 from morph_dslam.tracking.outcomes import FoundBy, Rejection, RejectionReason, Status
@@ -52,6 +53,23 @@ def tracked_result(model, stretch, slide):
     covariance = np.diag(DEVIATIONS**2)
     estimate = Estimate(state, 0.0, np.empty((0, 2)), 0.1, covariance, np.zeros(2, dtype=bool), 5, True)
     return FrameResult(model, Status.TRACKED, estimate, FoundBy.FLOW)
+
+
+def rigid_result(model):
+    """A rigid object found at the block's pose."""
+    covariance = np.diag(DEVIATIONS[2:] ** 2)
+    estimate = Estimate(
+        State(np.zeros(0), POSE), 0.0, np.empty((0, 2)), 0.1, covariance, np.zeros(0, dtype=bool), 5, True
+    )
+    return FrameResult(model, Status.TRACKED, estimate, FoundBy.FLOW)
+
+
+def hidden_result(model):
+    """The block at its place in the map, where nothing is seen of it."""
+    prior = PosePrior(POSE, np.diag(DEVIATIONS[2:] ** 2), np.zeros((6, 0)))
+    return FrameResult(
+        model, Status.HIDDEN, rejection=Rejection(RejectionReason.FEW_POINTS, 4, 9, 30), pose_prior=prior
+    )
 
 
 def lost_result(model):

@@ -3,6 +3,7 @@
 import http.client
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -12,13 +13,17 @@ from websockets.sync.client import connect
 
 from morph_dslam.errors import StreamError
 from morph_dslam.extend.streams import StreamedObject, StreamSink
+from morph_dslam.extend.studies import build_rigid
 from morph_dslam.streams.websocket import WebSocketPublisher
+from morph_dslam.tracking.displacement_jumps import DisplacementJump
 from tests.support.rendered_sequence import CAMERA
 from tests.support.streamed import (
     DEVIATIONS,
     POSE,
     held_block_model,
+    hidden_result,
     lost_result,
+    rigid_result,
     stream_example,
     stress_at,
     tracked_frame,
@@ -127,6 +132,46 @@ def test_an_object_that_is_lost_has_a_reason_and_no_shape(publisher, sink, model
     assert block["camera_from_object"] is None
     assert block["parameters"] == block["parameter_std"] == [None, None]
     assert block["reactions"] == message["arrays"] == {}
+
+
+def test_a_hidden_object_has_a_pose_and_no_shape(publisher, sink, model):
+    received = taking(publisher)
+    sink(tracked_frame(3, 0.0, block=hidden_result(model)))
+    message = next(received)
+    (block,) = message["objects"]
+    assert block["status"] == "hidden"
+    np.testing.assert_allclose(block["camera_from_object"], POSE.matrix)
+    assert block["pose_std"] == pytest.approx(DEVIATIONS[2:])
+    assert block["parameters"] == [None, None]
+    assert message["arrays"] == {}
+
+
+def test_a_rigid_object_has_a_shape_and_no_values(publisher, tmp_path):
+    corners = "v 0 0 0\nv 40 0 0\nv 0 40 0\nv 0 0 40\n"
+    (tmp_path / "part.obj").write_text(corners + "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    block = build_rigid(tmp_path / "part.obj", "mm")
+    sink = StreamSink([publisher]).begin({"part": block}, CAMERA)
+    received = client.messages(publisher.place)
+    scene = next(received)
+    (known,) = scene["objects"]
+    assert (known["parameters"], known["scalar"], known["supports"]) == ([], None, [])
+    sink(tracked_frame(0, 0.0, part=rigid_result(block)))
+    message = next(received)
+    assert set(message["arrays"]) == {"part/vertices"}
+    np.testing.assert_array_equal(message["arrays"]["part/vertices"], scene["arrays"]["part/rest"])
+    assert message["objects"][0]["pose_std"] == pytest.approx(DEVIATIONS[2:])
+
+
+def test_stress_near_a_crack_is_not_a_number(publisher, sink, model):
+    """Within 25 mm of the corner at the origin there is no other node: the next is 40 mm away."""
+    received = taking(publisher)
+    result = replace(tracked_result(model, 0.1, 0.0), jumps=(DisplacementJump(np.zeros(3), 1e-3, 0.025),))
+    sink(tracked_frame(0, 0.0, block=result))
+    values = next(received)["arrays"]["block/scalar"]
+    at_corner = np.linalg.norm(model.nodes, axis=1) == 0.0
+    assert at_corner.sum() == 1
+    np.testing.assert_array_equal(np.isnan(values), at_corner)
+    np.testing.assert_allclose(values[~at_corner], stress_at(0.1, 0.0), rtol=1e-5)
 
 
 def test_several_objects_by_their_names(publisher, model):
