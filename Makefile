@@ -53,8 +53,9 @@ lint: $(INSTALLED)
 	@$(BIN)/pyright --warnings
 	@$(BIN)/lint-imports
 
-# The site, in build/site: open build/site/index.html.
+# The site, in build/site: open build/site/index.html. Pictures of the studio follow its pages where Chromium is present.
 docs: $(INSTALLED)
+	@$(BIN)/python docs/studio_pictures.py
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "the documentation is in build/site/index.html"
 
@@ -75,5 +76,5 @@ $(INSTALLED): pyproject.toml
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer, with its venv module, is needed: no such python3 was found"; exit 1; }
 	@echo "Installing into $(VENV) with $(PYTHON) (a few minutes, once)"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off --editable '.[dev,docs]' | $(PIP_PROGRESS)
+	@$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off --editable '.[dev,docs,rerun]' | $(PIP_PROGRESS)
 	@touch $@

@@ -1,7 +1,8 @@
 """A scripted user of the studio on the demo: clicks with noise, how long each fit takes, and the error in the end.
 
 The user clicks the demo's landmarks one after the other in the reference frame, each pixel coordinate off by a standard
-deviation of 1 px, saves them, and tracks with *refine the start*. Run `make demo` first. Times are those of the
+deviation of 1 px, saves them, and tracks with *snap the start to the
+outline* and *refine the start*. Run `make demo` first. Times are those of the
 server's answers over HTTP, without the drawing in the browser.
 """
 
@@ -75,7 +76,7 @@ def click_and_track(project: Path, seed: int, noise_px: float) -> tuple[list[flo
             user.call("fit", pairs=pairs[:count], at_rest=False, quick=True)
             seconds.append(time.perf_counter() - begin)
         user.call("save_start", pairs=pairs, frame=0, at_rest=False)
-        user.call("track", refine=True)
+        user.call("track", refine=True, snap=True)
         while not user.has_ended():
             time.sleep(0.5)
     return seconds[1:], float(md.evaluate(project / "run", DEMO / "sequence" / "truth.npz", 0)["mean_mm"])

@@ -12,8 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import morph_dslam as md
-from morph_dslam.extend.registration import load_landmarks
+from morph_dslam.extend.registration import Landmarks, load_landmarks, save_landmarks
 from morph_dslam.extend.reports import alignment_line, load_truth, remarks, result_line
 
 
@@ -81,6 +83,7 @@ class Recording:
     range : first and last frame to track
     reference_frame : the frame that the landmarks belong to; the first one tracked by default
     refine_reference : refine the reference state over the sequence; for landmarks set by hand
+    snap : correct the landmarks by the outline in their frame
     use_outline : use the outline too; for surfaces with bare margins
     use_discrepancy : estimate what the shape has beyond the model's
     """
@@ -92,6 +95,7 @@ class Recording:
     range: tuple[int | None, int | None] = (None, None)
     reference_frame: int | None = None
     refine_reference: bool = False
+    snap: bool = False
     use_outline: bool = False
     use_discrepancy: bool = False
 
@@ -110,6 +114,14 @@ class Recording:
         if not inside:
             raise md.MorphError(f"{self.truth} has no frame in the range tracked; it has {frames}")
         return inside[0]
+
+
+def clicked(landmarks: Path, output: Path, noise_px: float) -> Path:
+    """Write landmarks as a hand sets them: each pixel coordinate off by this standard deviation; returns the file."""
+    exact = load_landmarks(landmarks)
+    noise = noise_px * np.random.default_rng(0).standard_normal(exact.pixels.shape)
+    save_landmarks(output, Landmarks(exact.points, exact.pixels + noise))
+    return output
 
 
 def check_recording(recording: Recording) -> None:
@@ -135,6 +147,7 @@ def track_and_evaluate(recording: Recording, model: Path, run: Path) -> dict[str
             last=last,
             reference_frame=recording.reference_frame,
             refine_reference=recording.refine_reference,
+            snap=recording.snap,
             tracker=md.TrackerOptions(use_outline=recording.use_outline, use_discrepancy=recording.use_discrepancy),
             overwrite=True,
         )

@@ -98,5 +98,9 @@ class ExploreError(MorphError):
     """A model cannot be shown at the port that was asked for."""
 
 
+class StreamError(MorphError):
+    """Results cannot be sent where they were asked for."""
+
+
 class StudioError(MorphError):
     """`morph studio` cannot start, or a request asks for what the project cannot give."""

@@ -15,8 +15,9 @@ from morph_dslam.io.camera_files import load_camera, save_camera
 from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.registration.landmarks import bind_landmarks
 from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.known_state import LandmarkTerm
 from morph_dslam.tracking.refinement import Keyframe
-from morph_dslam.tracking.still import LandmarkTerm, StillProblem, fit_still
+from morph_dslam.tracking.still import StillProblem, fit_still
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import UPRIGHT, SheetFilm, mean_error, write_recording
 

@@ -41,6 +41,9 @@ FREE_LID = ObjectOptions(model=Path("lid.morph"), landmarks=CSV)
         ({"serve": 0}, "--serve"),
         ({"seconds": 2.0}, "--seconds"),
         ({"refine_reference": True, **REGISTERED}, "--refine"),
+        ({"snap": True, **REGISTERED}, "--snap"),
+        ({"snap": True, **BY_BOARD}, "--snap"),
+        ({"snap": True, "tracker": TrackerOptions(use_depth=True)}, "--snap"),
         ({"refine_reference": True, **BY_BOARD}, "--refine"),
         ({"refine_reference": True, "reregister_at": ((7, CSV),)}, "--reregister-at"),
         ({"refine_reference": True, "other_cameras": (Path("aside"),)}, "--with"),
@@ -51,6 +54,7 @@ FREE_LID = ObjectOptions(model=Path("lid.morph"), landmarks=CSV)
         ({"reference_frame": 3, **REGISTERED, "others": (("lid", LID),)}, "--reference-frame"),
         ({"video": False, "drawing": DrawOptions("strain")}, "--no-video"),
         ({"video": False, "drawing": DrawOptions(section=SectionPlane.parse("x=3"))}, "--no-video"),
+        ({"video": False, "drawing": DrawOptions(section=SectionPlane.parse("x=3")), "streams": ("ws",)}, "--no-video"),
     ],
 )
 def test_what_makes_no_sense_together_is_refused(changes, named):
@@ -69,10 +73,17 @@ def test_what_makes_no_sense_together_is_refused(changes, named):
         {**REGISTERED, "reference_frame": 3, "other_cameras": (Path("aside"),)},
         {"live": True, "reference_image": Path("i.png")},
         {"live": True, "others": (("lid", FREE_LID),), "tracker": md.TrackerOptions(use_depth=True)},
+        {"video": False, "drawing": DrawOptions("strain"), "streams": ("ws", "ws:0")},
     ],
 )
 def test_what_makes_sense_is_not_refused(changes):
     check_options(replace(PLAIN, **changes))
+
+
+def test_streams_call_each_object_by_a_name_of_its_own():
+    assert PLAIN.stream_names == ("m",)
+    others = tuple((name, LID) for name in ("lid", "m"))
+    assert replace(PLAIN, others=others).stream_names == ("m_", "lid", "m")
 
 
 def test_the_command_line_refuses_before_it_reads(tmp_path, refused):

@@ -270,7 +270,7 @@ def test_a_simulated_sequence_is_tracked_in_memory(tmp_path, monkeypatch):
 
 
 def test_every_program_is_run_by_a_test():
-    """Those of model-file and solid-study in `test_docs`, of slam in `test_slam`, the others in tests/tutorials."""
+    """In `test_docs` (model-file, solid-study), `test_slam`, `test_stream_run`, and for the others tests/tutorials."""
     run_elsewhere = {"README", "quick-start", "extending"}
     pages = [page for page in PAGES if "tutorials" not in page and page not in run_elsewhere]
     counts = {page: len(samples(page, "python")) for page in pages}
@@ -284,6 +284,7 @@ def test_every_program_is_run_by_a_test():
         "scene-file": 1,
         "slam": 2,
         "solid-study": 2,
+        "streams": 1,
     }
 
 

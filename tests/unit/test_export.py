@@ -7,10 +7,13 @@ import meshio
 import numpy as np
 import pygltflib
 import pytest
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 
 from morph_dslam.cli import app as cli
 from morph_dslam.errors import ExportError
-from morph_dslam.io.export import FRAMES_PER_SECOND, StateChoice, export
+from morph_dslam.io.export import StateChoice, export
+from morph_dslam.io.gltf import FRAMES_PER_SECOND
 from morph_dslam.meshing.generators import block
 from morph_dslam.model import save_model
 from tests.support.bent_sheet import bent_sheet_model
@@ -138,18 +141,18 @@ def gltf_array(document, index):
     accessor = document.accessors[index]
     view = document.bufferViews[accessor.bufferView]
     blob = document.binary_blob()[view.byteOffset : view.byteOffset + view.byteLength]
-    values = np.frombuffer(blob, dtype={5126: "<f4", 5125: "<u4"}[accessor.componentType])
-    values = values.reshape(accessor.count, {"SCALAR": 1, "VEC3": 3}[accessor.type])
+    values = np.frombuffer(blob, dtype={5126: "<f4", 5125: "<u4", 5123: "<u2"}[accessor.componentType])
+    values = values.reshape(accessor.count, {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor.type])
     np.testing.assert_array_equal(values.min(axis=0), np.float32(accessor.min))
     np.testing.assert_array_equal(values.max(axis=0), np.float32(accessor.max))
     return values
 
 
-def test_a_gltf_animation_is_the_sheet_in_motion(folder, tmp_path):
+def test_modes_as_a_gltf_animation_are_the_sheet_in_motion(folder, tmp_path):
     """Rest positions and weighted morph targets, as a viewer adds them, against the model's closed form."""
     model = bent_sheet_model(9, 7)
     choice = StateChoice(vary=["arch=-60:60:5"], at=["skew=0.3", "twist=10"])
-    document = pygltflib.GLTF2().load(export(folder / "sheet.morph", tmp_path, "gltf", choice))
+    document = pygltflib.GLTF2().load(export(folder / "sheet.morph", tmp_path, "gltf", choice, "none"))
     (primitive,) = document.meshes[0].primitives
     rest = gltf_array(document, primitive.attributes.POSITION)
     targets = [gltf_array(document, target["POSITION"]) for target in primitive.targets]
@@ -167,11 +170,97 @@ def test_a_gltf_animation_is_the_sheet_in_motion(folder, tmp_path):
         np.testing.assert_allclose(moved[triangles], expected[model.triangles], atol=1e-7)
 
 
+def sizes_at(document, time):
+    """The size of each node below the first one, by its scale or by the animation's steps, as a viewer plays it."""
+    sizes = {node: document.nodes[node].scale or [1.0, 1.0, 1.0] for node in document.nodes[0].children}
+    for animation in document.animations:
+        for channel in animation.channels:
+            sampler = animation.samplers[channel.sampler]
+            assert (channel.target.path, sampler.interpolation) == ("scale", "STEP")
+            times = gltf_array(document, sampler.input).ravel()
+            assert (np.diff(times) > 0).all()
+            sizes[channel.target.node] = gltf_array(document, sampler.output)[np.searchsorted(times, time, "right") - 1]
+    return {node: tuple(size) for node, size in sizes.items()}
+
+
+def drawn(document, time):
+    """Corners of the triangles that are seen at a time, object frame, and their colours as linear shares of one."""
+    sizes = sizes_at(document, time)
+    (node,) = (document.nodes[number] for number, size in sizes.items() if size == (1.0, 1.0, 1.0))
+    assert sorted(sizes.values())[:-1] == [(0.0, 0.0, 0.0)] * (len(sizes) - 1)
+    (primitive,) = document.meshes[node.mesh].primitives
+    triangles = gltf_array(document, primitive.indices).reshape(-1, 3)
+    positions = gltf_array(document, primitive.attributes.POSITION) + np.array(node.translation)
+    assert document.accessors[primitive.attributes.COLOR_0].normalized
+    colours = gltf_array(document, primitive.attributes.COLOR_0) / 65535.0
+    return positions[triangles], colours[triangles]
+
+
+def linear(srgb):
+    """IEC 61966-2-1."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def assert_coloured(found, values, model, shown_to):
+    """Colours of corners are those of the nodes' values, from matplotlib's own map."""
+    expected = ScalarMappable(Normalize(0.0, shown_to), "turbo").to_rgba(values)
+    expected[:, :3] = linear(expected[:, :3])
+    # A value at the border of two of the map's 256 colours may fall to either: neighbours differ by 0.04 at most.
+    differences = np.abs(found - expected[model.triangles]).max(axis=(1, 2))
+    assert differences.max() < 0.04
+    assert np.quantile(differences, 0.95) < 1e-4
+
+
+@pytest.mark.parametrize("show", [None, "strain", "displacement"])
+def test_a_gltf_animation_shows_each_state_in_its_colours(folder, tmp_path, show):
+    """What is drawn while each state is shown, from the closed form of a block that is pulled and sheared."""
+    model, choice = stretched_block_model(), StateChoice(vary=["stretch=0:0.2:3"], at=["slide=5"])
+    document = pygltflib.GLTF2().load(export(folder / "block.morph", tmp_path, "gltf", choice, show))
+    stretches, slope = np.array([0.0, 0.1, 0.2]), 5e-3 / SIZE[2]
+    x, _, z = model.nodes.T
+    motions = np.array([np.column_stack([s * x + slope * z, 0 * x, 0 * x]) for s in stretches])
+    # Of a strain (a, 0, 0) and its shear c / 2: sqrt(2/3 (2/3 a² + c² / 2)).
+    uniform = {
+        None: 1e-6 * np.hypot(YOUNG_MODULUS * stretches, 3**0.5 * SHEAR_MODULUS * slope),
+        "strain": 100 * np.sqrt(4 / 9 * stretches**2 + slope**2 / 3),
+    }
+    if show == "displacement":
+        values = 1e3 * np.linalg.norm(motions, axis=2)
+    else:
+        values = np.tile(uniform[show][:, None], len(model.nodes))
+    legend = document.nodes[0].extras["colours"]
+    label = {
+        None: ("von Mises stress", "MPa"),
+        "strain": ("equivalent strain", "%"),
+        "displacement": ("displacement", "mm"),
+    }
+    assert (legend["field"], legend["unit"]) == label[show]
+    on_surface = values[:, np.unique(model.triangles)]
+    assert legend["range"] == [0.0, pytest.approx(np.percentile(on_surface, 99.5), rel=1e-5)]
+    for i, motion in enumerate(motions):
+        corners, colours = drawn(document, (i + 0.5) / FRAMES_PER_SECOND)
+        np.testing.assert_allclose(corners, (model.nodes + motion)[model.triangles], atol=1e-7)
+        assert_coloured(colours, values[i], model, legend["range"][1])
+    assert sizes_at(document, 10.0) == sizes_at(document, 2.5 / FRAMES_PER_SECOND)
+    document.animations = []  # viewers that do not play show the first state
+    np.testing.assert_array_equal(drawn(document, 0.0)[0], drawn(document, 0.5 / FRAMES_PER_SECOND)[0])
+
+
 def test_a_gltf_of_one_state_stands_still(tmp_path):
     """Of a model and a state in memory."""
-    document = pygltflib.GLTF2().load(export(stretched_block_model(), tmp_path, "gltf", [0.2, 0.0]))
+    model = stretched_block_model()
+    document = pygltflib.GLTF2().load(export(model, tmp_path, "gltf", [0.2, 0.0]))
+    assert document.animations == []
+    np.testing.assert_allclose(drawn(document, 0.0)[0][..., 0], 1.2 * model.nodes[model.triangles][..., 0], atol=1e-7)
+    document = pygltflib.GLTF2().load(export(model, tmp_path, "gltf", [0.2, 0.0], "none"))
     assert document.animations == []
     assert document.meshes[0].weights == pytest.approx([0.2, 0.0])
+
+
+def test_colours_that_cannot_be_are_refused(folder, tmp_path, refused):
+    words = ("export", folder / "sheet.morph", "-o", tmp_path / "out", "--show", "strain")
+    assert "holds no strain to show (--show); it has: stress, displacement, none" in refused(*words, "--format", "gltf")
+    assert "chooses the colours of a glTF file" in refused(*words)
 
 
 def test_without_ranges_each_parameter_tours_its_range(folder):

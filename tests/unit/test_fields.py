@@ -34,6 +34,20 @@ def test_polynomials_of_any_number_of_parameters_are_their_sums(dimension, degre
         np.testing.assert_allclose(gradient, expected, rtol=1e-10, atol=1e-10)
 
 
+def test_polynomials_that_are_even_odd_or_nothing_are_their_sums():
+    rng, lower = np.random.default_rng(1), np.array([-1.0, 0.5])
+    indices = total_degree_indices(2, 6)
+    parity = indices[:, :1] % 2 == np.array([0, 1, 1, 0, 1])
+    coefficients = np.where(parity, rng.normal(size=(len(indices), 5)), 1e-17)
+    coefficients[:, 4] = 0.0
+    functions = ParameterFunctions(lower, lower + 1.5, indices, coefficients)
+    for mu in rng.uniform(lower - 0.1, lower + 1.6, (5, 2)):
+        values, gradient = functions.evaluate(mu)
+        np.testing.assert_allclose(values, function_values(functions, mu, (0, 0)), rtol=1e-10, atol=1e-10)
+        expected = [function_values(functions, mu, orders) for orders in np.eye(2, dtype=int)]
+        np.testing.assert_allclose(gradient, expected, rtol=1e-10, atol=1e-10)
+
+
 @every_format
 @pytest.mark.parametrize("bases", [SMOOTH, OTHERS], ids=["smooth bases", "other bases"])
 @pytest.mark.parametrize("mu", [MU, OUTSIDE], ids=["inside", "outside"])

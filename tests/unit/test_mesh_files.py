@@ -339,6 +339,13 @@ def test_a_step_solid_is_meshed_and_its_unit_checked(tmp_path):
         load_mesh(path, "mm")
 
 
+def test_a_ply_file_that_ends_in_its_header_is_refused(tmp_path):
+    """meshio would read on for ever."""
+    (tmp_path / "cut.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 8\nproperty float x\n")
+    with pytest.raises(StudyError, match="its header has no end_header"):
+        load_mesh(tmp_path / "cut.ply", "mm", 10.0)
+
+
 @pytest.mark.parametrize("kind", ["inp", "msh", "vtk", "vtu", "ply", "obj", "stl", "binary stl", "step"])
 @pytest.mark.parametrize("name", ["cube.stl", "cube.vtk", "cube"])
 def test_a_mesh_is_read_whatever_its_name(tmp_path, kind, name):

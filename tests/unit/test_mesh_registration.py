@@ -20,6 +20,7 @@ from morph_dslam.registration.search_space import TURNS, attitudes, find_planes
 from morph_dslam.registration.texture import TextureComparison
 from morph_dslam.slam.rigid_map import GOOD, Keyframe, RigidMap
 from morph_dslam.slam.scene import Scene
+from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_object import CAMERA, cameras, scanned, wedge
 from tests.support.staged_scenes import bending_wedge
 
@@ -108,10 +109,16 @@ def test_a_mesh_that_is_drawn_out_is_accused_by_its_outline(stretch):
 @pytest.mark.slow
 def test_two_of_a_kind_are_ambiguous():
     nodes, triangles, _ = wedge()
-    points, views = scanned(METRIC, objects=(np.array([-0.08, 0.0, 0.0]), np.array([0.08, 0.03, 0.0])))
+    shifts = np.array([[-0.08, 0.0, 0.0], [0.08, 0.03, 0.0]])
+    points, views = scanned(METRIC, objects=tuple(shifts))
     # Of a metric map one size is searched, not three: that takes a third of the time.
     found = register_mesh(nodes, triangles, points, views, CAMERA, metric=True)
     assert found.warnings == (Ambiguous(Ambiguity.SECOND_PLACE, found.runner_up / found.score), TooLittleTexture())
+    both = [METRIC @ SimilarityTransform(1.0, np.eye(3), shift) for shift in shifts]
+    there = [found.world_from_object, found.rivals[0].world_from_object]
+    off = np.array([[apart(place, true, nodes) for true in both] for place in there])
+    assert sorted(off.argmin(axis=1)) == [0, 1]
+    assert off.min(axis=1).max() < 5e-3
 
 
 def test_an_absent_object_is_not_found():
@@ -131,6 +138,18 @@ def test_a_tube_may_be_turned_about_its_axis_and_a_wedge_may_not():
     np.testing.assert_allclose(axis.point[:2], 0.0, atol=1e-3)
     nodes, triangles, _ = wedge()
     assert Surface.of_mesh(nodes, triangles).axis_of_revolution is None
+
+
+def test_a_disc_may_be_turned_about_its_axis_and_a_rectangle_may_not():
+    """Both lie in their plane however they are turned."""
+    rectangle = bent_sheet_model(9, 7)
+    assert Surface.of_mesh(rectangle.nodes, rectangle.triangles).axis_of_revolution is None
+    angles = np.linspace(0.0, 2.0 * np.pi, 61)[:-1]
+    nodes = np.vstack([np.zeros(3), np.column_stack([np.cos(angles), np.sin(angles), np.zeros(60)])])
+    rim = np.arange(60)
+    axis = Surface.of_mesh(0.1 * nodes, np.column_stack([0 * rim, rim + 1, (rim + 1) % 60 + 1])).axis_of_revolution
+    assert axis is not None
+    assert abs(axis.direction[2]) > 0.999
 
 
 def test_exact_points_lead_back_from_a_disturbed_place():

@@ -14,7 +14,7 @@ from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.tracking.binding import DrawnSurface
 from morph_dslam.tracking.estimator import State, moved
 from morph_dslam.tracking.outline import Outline, nearest_to_each_other
-from morph_dslam.tracking.outline_weight import OutlineBalance
+from morph_dslam.tracking.outline_weight import OutlineBalance, beside_found
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.bent_tube import polynomial
 
@@ -138,6 +138,21 @@ def test_outline_is_found_where_it_was_drawn(model):
         assert np.percentile(distance, 95) < 0.6
 
 
+@pytest.mark.parametrize("shift", [0.003, 0.03], ids=["along the same points", "too far for these"])
+def test_outline_is_found_again_where_it_has_moved_to(model, shift):
+    """The contour of the state before serves as long as it is near; the outline is that of the new state."""
+    before = State(model.default, POSE)
+    true = moved(before, np.r_[np.zeros(len(model.parameters)), 0.0, 0.0, 0.005, shift, 0.5 * shift, 0.0])
+    outline = outline_of(model, drawn(model, before), before)
+    first = outline.measure(drawn(model, before), before, 14)
+    seen = outline.measure_again(drawn(model, true), true, 7)
+    assert seen.valid.sum() > 0.9 * seen.expected.sum() > 100
+    distance = np.array([_to_segments(pixel, boundary(model, true)) for pixel in seen.pixels[seen.valid]])
+    assert np.median(distance) < 0.15
+    assert np.percentile(distance, 95) < 0.6
+    assert (seen.points is first.points) == (shift < 0.01)
+
+
 def test_normals_point_outwards_on_either_side(model):
     for rotation in (np.diag([1.0, -1.0, -1.0]), np.diag([-1.0, -1.0, 1.0])):
         state = State(model.default, RigidTransform(rotation, np.array([0.0, 0.0, 0.55])))
@@ -184,3 +199,19 @@ def _to_segments(point: np.ndarray, segments: np.ndarray) -> float:
     start, along = segments[:, 0], segments[:, 1] - segments[:, 0]
     share = np.clip(((point - start) * along).sum(axis=1) / (along**2).sum(axis=1), 0.0, 1.0)
     return float(np.linalg.norm(start + share[:, None] * along - point, axis=1).min())
+
+
+def test_what_covers_the_texture_beside_a_point_is_told_by_its_five_nearest():
+    """Against scipy's search; points of the texture that should not be seen say nothing."""
+    rng = np.random.default_rng(2)
+    pixels, texture, found = rng.uniform(0, 90, (40, 2)), rng.uniform(0, 90, (200, 2)), rng.random(200) < 0.3
+    hidden = rng.random(200) < 0.2
+    nearest = KDTree(texture[~hidden]).query(pixels, 5)[1]
+    expected = found[~hidden][nearest].sum(axis=1) >= 2
+    assert 5 < expected.sum() < 35
+    places = np.where(hidden[:, None], np.nan, texture)
+    np.testing.assert_array_equal(beside_found(pixels, places, found), expected)
+    # Without texture nothing says that something is there; of a single point it is enough.
+    assert beside_found(pixels, places[:0], found[:0]).all()
+    assert beside_found(pixels, texture[:1], np.array([True])).all()
+    assert not beside_found(pixels, texture[:1], np.array([False])).any()

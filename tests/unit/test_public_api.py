@@ -16,7 +16,7 @@ from morph_dslam import extend
 from tests.support.documents import PROJECT
 
 #: Packages that take long to load.
-HEAVY = ("ngsolve", "cv2", "numba", "numpy", "matplotlib")
+HEAVY = ("ngsolve", "cv2", "numba", "numpy", "matplotlib", "websockets", "rerun", "rclpy")
 #: An import of what is not public.
 INNER = re.compile(r"^\s*(?:from|import) morph_dslam\.(?!extend\b)[a-z_.]+.*", re.MULTILINE)
 #: What the command line may import beside public names: itself, its errors and its version.

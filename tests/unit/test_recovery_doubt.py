@@ -11,10 +11,14 @@ from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.recovery import Recovery
 
 
-def attempt(share, sigma_px, prior=None, visible=1.0) -> Any:
+def attempt(share, sigma_px, prior=None, visible=1.0, alike=False) -> Any:
+    """Residuals are independent, or ``alike`` in neighbours as where the model is wrong."""
     inliers, seen = np.arange(200) < 200 * share, np.arange(200) < 200 * visible
-    measurement = SimpleNamespace(visible=seen, valid=inliers)
-    estimate = SimpleNamespace(sigma_px=sigma_px)
+    rng = np.random.default_rng(0)
+    pixels, noise = rng.uniform(0.0, 200.0, (200, 2)), rng.standard_normal((200, 2))
+    residuals = np.sqrt(2.0) * np.sin(pixels / 60.0 + 1.0) + 0.1 * noise if alike else noise
+    measurement = SimpleNamespace(visible=seen, valid=inliers, pixels=pixels)
+    estimate = SimpleNamespace(sigma_px=sigma_px, residuals=sigma_px * residuals)
     counts = int(seen.sum()), int(inliers.sum())
     return SimpleNamespace(
         inliers=inliers, estimate=estimate, prior=prior, measurement=measurement, counts=counts, outline_alone=False
@@ -66,3 +70,10 @@ def test_with_a_pose_from_the_map_fewer_points_will_do(recovery):
 @pytest.mark.parametrize(("share", "sigma_px", "believed"), [(0.4, 0.9, True), (0.4, 2.5, False), (0.6, 2.5, True)])
 def test_few_points_that_do_not_agree_closely_agree_by_chance(share, sigma_px, believed):
     assert (reject(attempt(share, sigma_px), TrackerOptions()) is None) == believed
+
+
+def test_few_points_that_err_as_their_neighbours_do_are_those_of_an_object_that_the_model_does_not_describe():
+    assert reject(attempt(0.4, 2.5, alike=True), TrackerOptions()) is None
+    rejection = reject(attempt(0.4, 2.5), TrackerOptions())
+    assert rejection is not None
+    assert rejection.spread_px == 2.5

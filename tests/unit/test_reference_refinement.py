@@ -9,6 +9,7 @@ from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.registration.landmarks import register_landmarks
 from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
+from morph_dslam.tracking.known_state import LandmarkTerm
 from morph_dslam.tracking.refinement import Keyframe, choose_keyframes, refine_by_depth, refine_reference
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points
@@ -33,12 +34,10 @@ def test_other_frames_correct_a_reference_that_bad_landmarks_spoiled():
     registered = register_landmarks(model, CAMERA, Landmarks(object_points, clicked)).state
     refined = refine_reference(
         Estimator(model, CAMERA),
-        landmarks,
-        clicked,
+        LandmarkTerm(landmarks, clicked, 1.5),
         CAMERA.project(points.in_camera(truth)),
         registered,
         keyframes,
-        landmark_px=1.5,
     )
     before, after = mean_error(model, registered, truth), mean_error(model, refined, truth)
     assert before > 2e-3
@@ -55,7 +54,7 @@ def test_a_right_reference_is_left_where_it_is():
     points = bound_points(model, 80, rng)
     keyframes = [keyframe(points, sheet_state(time), rng, noise=0.0) for time in (0.2, 0.5)]
     pixels = CAMERA.project(points.in_camera(truth))
-    refined = refine_reference(Estimator(model, CAMERA), points, pixels, pixels, truth, keyframes)
+    refined = refine_reference(Estimator(model, CAMERA), LandmarkTerm(points, pixels, 0.5), pixels, truth, keyframes)
     assert mean_error(model, refined, truth) < 1e-5
 
 

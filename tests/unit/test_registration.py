@@ -21,6 +21,7 @@ from morph_dslam.registration.registration import (
     KeyframePose,
     MapRegistration,
     Registration,
+    Rival,
     load_registration,
     registration_in_map,
 )
@@ -54,6 +55,8 @@ def in_map(model, centre=(0.0, 0.0, 0.0), axis=None, warnings=()):
 def test_a_registration_in_a_map_is_read_as_it_was_saved(tmp_path):
     axis = Axis(np.array([0.0, 0.0, 0.05]), np.array([0.0, 0.0, 1.0]))
     saved = in_map(bent_tube(), (0.0, 0.0, 0.05), axis, [Ambiguous(Ambiguity.SECOND_PLACE, 0.9)])
+    rival = Rival(SimilarityTransform(1.5, rotation_exp(np.array([0.3, -0.2, 1.0])), np.array([3.0, 2.0, 1.0])), 45.0)
+    saved = replace(saved, rivals=(rival,))
     saved.save(tmp_path / "place" / "registration.json", tmp_path / "scan" / "map.h5", tmp_path / "tube.morph")
     read = load_registration(tmp_path / "place" / "registration.json", bent_tube())
     assert read.frame == 7
@@ -63,6 +66,9 @@ def test_a_registration_in_a_map_is_read_as_it_was_saved(tmp_path):
     assert read.warnings == saved.warnings == (Ambiguous(Ambiguity.SECOND_PLACE, 0.9), AngleOpen("turn"))
     assert read.per_sequence == (read.model.parameters[-1].name,) == ("turn",)
     assert [view.frame for view in read.views] == [7]
+    (again,) = read.rivals
+    np.testing.assert_allclose(again.world_from_object.matrix, rival.world_from_object.matrix, rtol=0, atol=1e-15)
+    assert again.score == 45.0
     content = json.loads((tmp_path / "place" / "registration.json").read_text())
     assert (content["map"], content["model"]) == ("../scan/map.h5", "../tube.morph")
     assert content["ambiguous"]
@@ -99,6 +105,8 @@ def test_damaged_registrations_are_refused(tmp_path):
         {"axis_of_revolution": "z"},
         {"axis_of_revolution": {"direction": [0, 1]}},
         {"warnings": [{"kind": "nothing"}]},
+        {"rivals": [{"world_from_object": np.eye(4).tolist(), "map_units_per_metre": 2.0, "score": 1.0}]},
+        {"rivals": [{}]},
         {"keyframes": []},
         {"keyframes": [keyframe | {"camera_from_object": [[1.0]]}]},
         {"keyframes": [keyframe | {"covariance": [[1.0]]}]},

@@ -20,6 +20,8 @@ PACKAGES = ("numpy", "scipy", "numba", "ngsolve", "opencv-python-headless", "h5p
 #: What an extra of the package brings, by a module of it.
 EXTRAS = {
     "studio": ("starlette", "the studio in the browser"),
+    "stream": ("websockets", "results by WebSocket"),
+    "rerun": ("rerun", "results in the viewer rerun"),
     "ros": ("rosbags", "ROS bags"),
     "pardiso": ("pypardiso", "MKL's linear solver, faster than NGSolve's"),
     "demo": ("skimage", "photographs of the examples' scenes"),

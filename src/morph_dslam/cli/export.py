@@ -12,6 +12,11 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add_file(command, "model", "model file")
     add_output(command, "FOLDER", "folder to write")
     command.add_argument("--format", choices=("xdmf", "vtu", "gltf"), default="xdmf", help="default: %(default)s")
+    command.add_argument(
+        "--show",
+        choices=("stress", "strain", "displacement", "none"),
+        help="what colours a glTF file: von Mises stress (the default), equivalent strain, displacement, or nothing",
+    )
     add_repeated(
         command,
         "--vary",
@@ -26,5 +31,5 @@ def run(arguments: argparse.Namespace) -> None:
     from morph_dslam import StateChoice, export
 
     choice = StateChoice(arguments.vary, arguments.path, arguments.at)
-    target = export(arguments.model, arguments.output, arguments.format, choice)
+    target = export(arguments.model, arguments.output, arguments.format, choice, arguments.show)
     print(f"wrote {target} and {arguments.output / 'states.csv'}")

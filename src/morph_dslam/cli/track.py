@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 HELP = "find an object's pose and parameters in every frame, and draw the stress over the video"
 #: Options that say where the object is.
 _STARTS = ("landmarks", "registration", "board", "picture", "guess")
+#: Kinds of streams, for the help.
+STREAMS = "ws:PORT by WebSocket, rerun:FILE.rrd or ros2:/PREFIX"
 KEPT = "the frames tracked so far are kept in the run folder"
 
 
@@ -193,6 +195,7 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
         landmarks=arguments.landmarks,
         registration=arguments.registration,
         at_rest=arguments.at_rest,
+        snap=arguments.snap,
         initializer=InitializerFiles(arguments.board, arguments.picture, arguments.guess),
         map_path=arguments.map,
         inner=tuple(arguments.inner),
@@ -211,6 +214,7 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
         output=arguments.output,
         overwrite=arguments.overwrite,
         video=not arguments.no_video,
+        streams=tuple(arguments.stream),
         frame_log=arguments.frame_log,
         drawing=DrawOptions(arguments.show, section, arguments.forces),
         **more,
@@ -234,6 +238,7 @@ def add_tracking_arguments(command: argparse.ArgumentParser, required: bool = Tr
     start = command.add_mutually_exclusive_group(required=required)
     add_file(start, "--landmarks", "object points and their pixels in the reference frame")
     add_flag(command, "--at-rest", "the object is undeformed in the frame of its landmarks")
+    add_flag(command, "--snap", "correct the landmarks by the object's outline in their frame")
     add_file(start, "--registration", "registration.json of `morph register` in a map", "JSON")
     add_file(start, "--board", "a printed board of markers, and where the object is on it", "TOML")
     add_file(start, "--picture", "a picture of the object's print, and where it is on it", "TOML")
@@ -341,6 +346,12 @@ def add_tracking_arguments(command: argparse.ArgumentParser, required: bool = Tr
     )
     add_range(command, "frames to track, of a recording")
     add_flag(command, "--no-video", "do not draw the augmented video")
+    add_repeated(
+        command,
+        "--stream",
+        "send results to other programs as they come, " + STREAMS + " (docs/streams.md)",
+        "KIND[:WHERE]",
+    )
     add_file(
         command,
         "--frame-log",

@@ -14,6 +14,7 @@ file that registers it. Building blocks stand in a module for each subject:
 `extend.reports`       the blocks of a report page, and the lines that sum up a run
 `extend.sheets`        thin sheets and shells, and paths past buckling by arc length
 `extend.slam`          tracking and mapping of a rigid scene, frame by frame
+`extend.streams`       results for other programs, frame by frame
 `extend.studies`       studies as objects, and their solved samples
 `extend.tracking`      points bound to a model, and the estimator of parameters and pose
 =====================  ==============================================================================

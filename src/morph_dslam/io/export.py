@@ -7,13 +7,11 @@ States are parameter values along a path or on a grid. Users give values in each
 from __future__ import annotations
 
 import csv
-import json
 import math
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 from xml.etree import ElementTree
 
 import h5py
@@ -23,8 +21,8 @@ from meshio.xdmf import TimeSeriesWriter
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from morph_dslam._version import __version__
 from morph_dslam.errors import ExportError
+from morph_dslam.io.gltf import Colours, write_glb
 from morph_dslam.model import Parameter, ReducedModel, load_model
 from morph_dslam.model.reduced_model import von_mises
 from morph_dslam.units import to_si
@@ -170,100 +168,6 @@ def write_table(path: Path, model: ReducedModel, states: Array, places: Sequence
             writer.writerow([*place.values(), *values])
 
 
-# Binary glTF 2.0 (Khronos specification, sections 3.7.2, 3.11 and 4): the modes are morph targets, the functions their
-# weights. Normals are left out: a viewer then uses those of the deformed triangles.
-
-
-FRAMES_PER_SECOND = 12.0
-_FLOAT, _UNSIGNED_INT = 5126, 5125
-_VERTICES, _INDICES = 34962, 34963
-#: glTF's y points up and its z to the viewer; this turn makes our z point up, and Blender turns it back.
-_Z_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
-
-
-class _Buffer:
-    """Arrays of 4-byte numbers behind one another, with the accessors that describe them."""
-
-    def __init__(self) -> None:
-        self.parts: list[bytes] = []
-        self.length = 0
-        self.views: list[dict[str, Any]] = []
-        self.accessors: list[dict[str, Any]] = []
-
-    def add(self, array: NDArray, target: int | None = None) -> int:
-        """Append an array of floats or indices, (n,) or (n, 3); returns the number of its accessor."""
-        index = np.issubdtype(array.dtype, np.integer)
-        data = np.ascontiguousarray(array, dtype="<u4" if index else "<f4")
-        view: dict[str, Any] = {"buffer": 0, "byteOffset": self.length, "byteLength": data.nbytes}
-        if target is not None:
-            view["target"] = target
-        low, high = (np.atleast_1d(part).tolist() for part in (data.min(axis=0), data.max(axis=0)))
-        accessor = {
-            "bufferView": len(self.views),
-            "componentType": _UNSIGNED_INT if index else _FLOAT,
-            "count": len(data),
-            "type": "SCALAR" if data.ndim == 1 else "VEC3",
-            "min": low,
-            "max": high,
-        }
-        self.parts.append(data.tobytes())
-        self.length += data.nbytes
-        self.views.append(view)
-        self.accessors.append(accessor)
-        return len(self.accessors) - 1
-
-
-def _animation(buffer: _Buffer, weights: Array) -> dict[str, Any]:
-    times = np.arange(len(weights)) / FRAMES_PER_SECOND
-    sampler = {"input": buffer.add(times), "output": buffer.add(weights.ravel()), "interpolation": "LINEAR"}
-    channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
-    return {"name": "parameters", "samplers": [sampler], "channels": [channel]}
-
-
-def _document(model: ReducedModel, states: Array) -> tuple[dict[str, Any], bytes]:
-    """The JSON part and the binary part."""
-    buffer = _Buffer()
-    nodes, triangles = np.unique(model.triangles, return_inverse=True)
-    weights = np.array([model.displacement.functions.evaluate(mu)[0] for mu in states])
-    primitive = {
-        "attributes": {"POSITION": buffer.add(model.nodes[nodes], _VERTICES)},
-        "indices": buffer.add(triangles.ravel(), _INDICES),
-        "material": 0,
-        "targets": [{"POSITION": buffer.add(mode[nodes], _VERTICES)} for mode in model.displacement.modes],
-    }
-    names = [f"mode {i + 1}" for i in range(model.displacement.n_modes)]
-    mesh = {
-        "name": model.name,
-        "primitives": [primitive],
-        "weights": weights[0].astype(np.float32).tolist(),
-        "extras": {"targetNames": names},
-    }
-    grey = {"baseColorFactor": [0.62, 0.68, 0.74, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.7}
-    document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": f"morph-dslam {__version__}"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": model.name, "mesh": 0, "rotation": _Z_UP}],
-        "meshes": [mesh],
-        "materials": [{"name": "surface", "pbrMetallicRoughness": grey, "doubleSided": True}],
-    }
-    if len(states) > 1:
-        document["animations"] = [_animation(buffer, weights)]
-    document |= {"buffers": [{"byteLength": buffer.length}], "bufferViews": buffer.views, "accessors": buffer.accessors}
-    return document, b"".join(buffer.parts)
-
-
-def write_glb(path: Path, model: ReducedModel, states: Array) -> None:
-    """Write the displacement of ``model`` along ``states`` (s, d); metres, z up in the object frame."""
-    document, binary = _document(model, states)
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    with path.open("wb") as file:
-        file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(binary)))
-        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
-        file.write(struct.pack("<I4s", len(binary), b"BIN\0") + binary)
-
-
 # ParaView: points are the undeformed nodes, values are SI, and tensors have nine components row by row, because VTK and
 # XDMF order six of them differently.
 
@@ -380,6 +284,7 @@ def export(
     folder: str | Path,
     file_format: Literal["xdmf", "vtu", "gltf"] = "xdmf",
     choice: StateChoice | ArrayLike = StateChoice(),
+    show: Colours | None = None,
 ) -> Path:
     """Write a model's states for ParaView or as an animation; returns the file to open.
 
@@ -389,14 +294,19 @@ def export(
     folder : to write into; made if missing.
     file_format : "xdmf" or "vtu" for ParaView, "gltf" for 3-D viewers.
     choice : of the states, by default each parameter in turn; or their parameters (s, d), SI.
+    show : what colours a glTF file: "stress" (von Mises), "strain" (equivalent), "displacement", or "none"; by default
+        the stress of a model that has it, else the displacement.
 
     Raises
     ------
     ModelFileError
         If the model cannot be read.
     ExportError
-        If the states are not in the model's box, or the folder cannot be written.
+        If the states are not in the model's box, the model does not hold what is to be shown, or the folder cannot be
+        written.
     """
+    if show is not None and file_format != "gltf":
+        raise ExportError("show (--show) chooses the colours of a glTF file; XDMF and VTU files hold all fields")
     if isinstance(model, ReducedModel):
         loaded, stem = model, model.name
     else:
@@ -407,7 +317,7 @@ def export(
         folder.mkdir(parents=True, exist_ok=True)
         if file_format == "gltf":
             target = folder / f"{stem}.glb"
-            write_glb(target, loaded, states)
+            write_glb(target, loaded, states, show)
             write_table(folder / "states.csv", loaded, states, [{"frame": i} for i in range(len(states))])
             return target
         write = write_xdmf_series if file_format == "xdmf" else write_vtu_series

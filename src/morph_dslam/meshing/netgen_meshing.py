@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -30,6 +30,8 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 #: Endings of the files that are read.
 SURFACES = (".stl", ".obj", ".ply")
+#: No header of a .ply file has more.
+MOST_HEADER_LINES = 10_000
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,10 @@ def _read_obj(path: Path) -> tuple[Array, Indices]:
 
 def _read_stl_or_ply(path: Path, kind: str) -> tuple[Array, Indices]:
     reader = meshio.stl.read if kind == ".stl" else meshio.ply.read
+    if kind == ".ply":
+        with path.open("rb") as file:  # meshio would look for the end of the header for ever
+            if not any(line.strip() == b"end_header" for line in islice(file, MOST_HEADER_LINES)):
+                raise StudyError(f"{path} is damaged, cut short, or no .ply file: its header has no end_header")
     try:
         with np.errstate(over="ignore"):  # meshio takes the text of an ASCII file for a count of triangles
             content = reader(str(path))

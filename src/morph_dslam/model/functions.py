@@ -99,7 +99,40 @@ class Functions(ABC):
 
 
 @njit(cache=True, nogil=True)
-def evaluate_polynomials(mu, lower, upper, multi_indices, coefficients):
+def _products(mu, lower, upper, degrees):
+    """Each term's product of Chebyshev polynomials and its derivatives (1 + d, n_terms); ``degrees`` (d, n_terms)."""
+    d, n_terms = degrees.shape
+    degree = 0
+    for k in range(d):
+        for t in range(n_terms):
+            degree = max(degree, degrees[k, t])
+    table, knots = np.empty((3, degree + 1)), np.empty(0)
+    products, chosen = np.ones((1 + d, n_terms)), np.empty(n_terms)
+    for k in range(d):
+        fill_basis(CHEBYSHEV, 0, degree + 1, lower[k], upper[k], knots, mu[k], table)
+        values, slopes, of_k, line = table[0], table[1], degrees[k], products[k + 1]
+        for t in range(n_terms):
+            chosen[t] = values[of_k[t]]
+            line[t] *= slopes[of_k[t]]
+        for row in range(1 + d):
+            if row != k + 1:
+                line = products[row]
+                for t in range(n_terms):
+                    line[t] *= chosen[t]
+    return products
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+def _dot(a, b):
+    """Sum of products, in any order."""
+    total = 0.0
+    for i in range(len(a)):
+        total += a[i] * b[i]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def evaluate_polynomials(mu, lower, upper, degrees, first_term, first_function, functions, coefficients):
     """Values and gradient (1 + d, n) of sums of products of Chebyshev polynomials, compiled.
 
     Parameters
@@ -107,37 +140,48 @@ def evaluate_polynomials(mu, lower, upper, multi_indices, coefficients):
     mu : (d,) parameters.
     lower : (d,) lower ends of their ranges.
     upper : (d,) upper ends.
-    multi_indices : (n_terms, d) int, polynomial degree of each factor.
-    coefficients : (n_terms, n).
+    degrees : (d, n_terms) int, polynomial degree of each factor; the terms of one group after those of the other.
+    first_term, first_function : (g + 1,) where the terms and functions of each of g groups begin.
+    functions : (n,) which function each is, group by group.
+    coefficients : those of all functions, one function after the other, as many as its group has terms.
     """
-    n_terms, d = multi_indices.shape
-    n_functions = coefficients.shape[1]
-    degree = 0
-    for t in range(n_terms):
-        for k in range(d):
-            degree = max(degree, multi_indices[t, k])
-    table, knots = np.empty((d, 3, degree + 1)), np.empty(0)
-    for k in range(d):
-        fill_basis(CHEBYSHEV, 0, degree + 1, lower[k], upper[k], knots, mu[k], table[k])
-    factors = np.ones((1 + d, n_terms))
-    for t in range(n_terms):
-        for k in range(d):
-            value, slope = table[k, 0, multi_indices[t, k]], table[k, 1, multi_indices[t, k]]
-            for row in range(1 + d):
-                factors[row, t] *= slope if row == k + 1 else value
-    result = np.zeros((1 + d, n_functions))
-    whole = n_terms - n_terms % 4
-    for row in range(1 + d):
-        sums, of_row = result[row], factors[row]
-        # Four terms at a pass spare traffic to the result.
-        for t in range(0, whole, 4):
-            p, q, r, s = coefficients[t], coefficients[t + 1], coefficients[t + 2], coefficients[t + 3]
-            for i in range(n_functions):
-                sums[i] += of_row[t] * p[i] + of_row[t + 1] * q[i] + of_row[t + 2] * r[i] + of_row[t + 3] * s[i]
-        for t in range(whole, n_terms):
-            for i in range(n_functions):
-                sums[i] += of_row[t] * coefficients[t, i]
+    products = _products(mu, lower, upper, degrees)
+    result, begin = np.zeros((len(products), len(functions))), 0
+    for group in range(len(first_term) - 1):
+        first, end = first_term[group], first_term[group + 1]
+        for i in range(first_function[group], first_function[group + 1]):
+            of_function = coefficients[begin : begin + end - first]
+            begin += end - first
+            for row in range(len(products)):
+                result[row, functions[i]] = _dot(products[row, first:end], of_function)
     return result
+
+
+#: A coefficient smaller than this share of its function's largest one is rounding.
+ROUNDING = 1e-12
+
+
+def _grouped(degrees: NDArray[np.int64], coefficients: Array) -> tuple[NDArray, ...]:
+    """The last five arguments of `evaluate_polynomials`: functions of the same terms together.
+
+    Functions that are even or odd in a parameter, as those of a symmetric object, have half of the terms only.
+    """
+    sizes = np.abs(coefficients)
+    counts = sizes > ROUNDING * sizes.max(axis=0, initial=0.0)
+    of_group: dict[bytes, list[int]] = {}
+    for i, column in enumerate(counts.T):
+        of_group.setdefault(column.tobytes(), []).append(i)
+    groups = [np.array(group) for group in of_group.values()] or [np.empty(0, dtype=np.int64)]
+    terms = [np.flatnonzero(counts[:, group].any(axis=1)) for group in groups]
+    return (
+        np.ascontiguousarray(degrees[np.concatenate(terms)].T, dtype=np.int32),
+        np.cumsum([0, *map(len, terms)]),
+        np.cumsum([0, *map(len, groups)]),
+        np.concatenate(groups),
+        np.concatenate(
+            [coefficients[np.ix_(rows, group)].T.ravel() for rows, group in zip(terms, groups, strict=True)]
+        ),
+    )
 
 
 @dataclass(frozen=True)
@@ -183,7 +227,12 @@ class ParameterFunctions(Functions):
         return self.lower, self.upper
 
     def _compiled(self, mu: Array) -> Array:
-        return evaluate_polynomials(mu, self.lower, self.upper, self.multi_indices, self.coefficients)
+        return evaluate_polynomials(mu, self.lower, self.upper, *self._groups)
+
+    @cached_property
+    def _groups(self) -> tuple[NDArray, ...]:
+        """What is evaluated; see `_grouped`."""
+        return _grouped(self.multi_indices, np.asarray(self.coefficients, dtype=np.float64))
 
     def mixed(self, matrix: Array) -> Self:
         return replace(self, coefficients=self.coefficients @ matrix)

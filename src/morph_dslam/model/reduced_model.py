@@ -95,6 +95,13 @@ def von_mises(stress: Array) -> Array:
     return np.sqrt(normal + 3.0 * sum(shear**2 for shear in shears))
 
 
+def equivalent_strain(strain: Array) -> Array:
+    """sqrt(2/3 e : e) (n,) of the deviator e of strains (n, 6): xx, yy, zz, yz, xz, xy with tensor shears."""
+    normal = strain[:, :3] - strain[:, :3].mean(axis=1, keepdims=True)
+    squared = np.sum(normal**2, axis=1) + 2.0 * np.sum(strain[:, 3:] ** 2, axis=1)
+    return np.sqrt(2.0 / 3.0 * squared)
+
+
 #: Name of a reaction's field in the file: this and its name in the model, "force_SET" (N) or "moment_SET" (N m).
 REACTION, FORCE, MOMENT = "reaction_", "force_", "moment_"
 

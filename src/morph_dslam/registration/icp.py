@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 N_SAMPLES = 12000
 #: A surface turned about its axis of revolution stays where it was, up to this part of its size.
 SYMMETRY_TOLERANCE = 0.01
+#: At 95 % of a surface, a sample is nearer than so many times the median distance of samples; of random ones it is
+#: nearer than twice that.
+FARTHEST_SAMPLE = 4.0
 #: Weight of staying in directions that the points leave open, over the weight of all points.
 PRIOR = 1e-4
 #: A wall of a hollow body, whose other side may be nearer to a point, is at most so thick over its size.
@@ -110,7 +113,9 @@ class Surface:
             farthest = 0.0
             for angle in (0.37, 1.0, 1.93, 2.81):
                 turned = axis.turned(self.points, angle)
-                _, nearest = self.tree.query(turned)
+                away, nearest = self.tree.query(turned)
+                if np.percentile(away, 95) > FARTHEST_SAMPLE * spacing:  # over the rim of an open surface
+                    farthest = np.inf
                 # Across the surface: along it the nearest sample is up to a spacing away.
                 off = np.abs(np.einsum("px,px->p", turned - self.points[nearest], self.normals[nearest]))
                 farthest = max(farthest, float(np.percentile(off, 95)))

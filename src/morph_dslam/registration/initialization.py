@@ -65,8 +65,11 @@ def register_by_initializer(
     initializer: Initializer, model: ReducedModel, camera: Camera, image: Image
 ) -> Registration:
     """The object in a frame (h, w, 3) as recorded; raises RegistrationError if it is not found."""
-    grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+    return initializer.register(model, camera, undistorted_grey(camera, image))
+
+
+def undistorted_grey(camera: Camera, image: Image) -> Image:
+    """The grey image (h, w) without distortion of a frame (h, w, 3) or (h, w) as recorded."""
+    grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
     maps = camera.undistortion_maps()
-    if maps is not None:
-        grey = np.asarray(cv2.remap(grey, *maps, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
-    return initializer.register(model, camera, grey)
+    return grey if maps is None else np.asarray(cv2.remap(grey, *maps, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)

@@ -22,6 +22,7 @@ from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel
+from morph_dslam.registration.initialization import undistorted_grey
 from morph_dslam.registration.messages import (
     Ambiguity,
     Ambiguous,
@@ -32,6 +33,7 @@ from morph_dslam.registration.messages import (
     UnusualSize,
     WrongUnit,
 )
+from morph_dslam.registration.outline_snap import OutlineSnap
 from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.tracking.depth import SIGMA_AT_1M
@@ -69,6 +71,7 @@ def register_landmarks(
     depth_sigma: float = SIGMA_AT_1M,
     at_rest: bool = False,
     near: State | None = None,
+    image: NDArray[np.uint8] | None = None,
 ) -> Registration:
     """The object in the frame in which the landmarks were set.
 
@@ -84,6 +87,8 @@ def register_landmarks(
     at_rest : whether the object is known to be undeformed in the frame, its parameters at their defaults.
     near : a state close by, from fewer landmarks say, that alone is started from. That is quick, and finds neither a
         minimum elsewhere nor an ambiguity.
+    image : the frame as recorded, (h, w, 3) or (h, w), in which the object's outline corrects the landmarks
+        (`outline_snap`); None to rely on them alone. Depth decides instead where there is any.
 
     Raises
     ------
@@ -125,18 +130,26 @@ def register_landmarks(
         "n_alternatives": len(alternatives),
     }
     poor_px = max(POOR_FIT * click_px, POOR_SHARE * diagonal)
-    warnings = _warnings(model, best, len(alternatives), landmarks.points, click_px, poor_px)
     # A few landmarks that happen to fit well, or that a wrong model fits, are not exact for that.
     covariance = best.covariance * max(1.0, (click_px / max(best.sigma_px, 1e-12)) ** 2)
+    notes: tuple[RegistrationWarning, ...] = ()
+    precise = Estimator(model, camera)
+    precise.box = estimator.box
     if depth is not None:
         # How well the landmarks fit shows how carefully they were set, where they are enough to show it.
         sigma = max(best.sigma_px, LEAST_PX) if np.isfinite(best.sigma_px) else UNKNOWN_PX
-        precise = Estimator(model, camera)
-        precise.box = estimator.box
         best = refine_by_depth(precise, bound, pixels, best.state, sigma, depth, depth_sigma)
         facts["along_the_sight_line"], covariance = "by depth", best.covariance
         if at_rest:
             covariance = _without_parameters(covariance)
+    elif image is not None:
+        sigma = max(best.sigma_px, click_px) if np.isfinite(best.sigma_px) else UNKNOWN_PX
+        snap = OutlineSnap(precise, bound, pixels, sigma, undistorted_grey(camera, image))
+        best, alternatives, notes = snap.corrected(best, alternatives)
+        facts["corrected_by_outline"] = not notes
+        covariance = covariance if notes else best.covariance
+    warnings = _warnings(model, best, len(alternatives), landmarks.points, click_px, poor_px)
+    warnings = (*warnings, *notes)
     return Registration(model, best.state, covariance, facts=facts, warnings=warnings, alternatives=alternatives)
 
 

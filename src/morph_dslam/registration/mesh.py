@@ -33,7 +33,7 @@ from morph_dslam.registration.messages import (
 )
 from morph_dslam.registration.outline_fit import OutlineFit, outline_fit
 from morph_dslam.registration.point_evidence import PointEvidence, gather_evidence
-from morph_dslam.registration.registration import Axis
+from morph_dslam.registration.registration import Axis, Rival
 from morph_dslam.registration.scene import MapPoints, View, spread_views
 from morph_dslam.registration.search_space import attitudes, candidate_regions, find_planes
 from morph_dslam.registration.texture import TextureComparison
@@ -64,6 +64,8 @@ FINE = np.array([0.05, 0.04, 0.04, 0.03, 0.03, 0.025, 0.025, 0.02, 0.02, 0.02])
 TOLERANCE = 0.015
 #: A lower score is no evidence.
 FEWEST_EXPLAINED = 20
+#: Other places that are told of.
+MOST_RIVALS = 3
 #: The runner-up's score over the best's above which they are ambiguous.
 AMBIGUOUS = 0.8
 #: An object laid by its edges is confirmed from this score on, if so much of its outline is on edges, of what chance
@@ -89,7 +91,7 @@ class MeshRegistration:
         was too little to compare.
     score : what speaks for it: with ``edges``, percent; else the points explained outside of one plane, less twice
         those it would occlude.
-    runner_up : the score of the next best place.
+    rivals : the next best places, the best first.
     n_explained : points on the surface.
     rms_px : how far the keyframes' images of the surface agree; None if there was too little to compare.
     axis : about which the surface can be turned without a difference, so that this angle is not known.
@@ -103,7 +105,7 @@ class MeshRegistration:
     world_from_object: SimilarityTransform
     covariance: Array | None
     score: float
-    runner_up: float
+    rivals: tuple[Rival, ...]
     n_explained: int
     rms_px: float | None
     axis: Axis | None
@@ -111,6 +113,11 @@ class MeshRegistration:
     outline: OutlineFit = field(default_factory=OutlineFit)
     unconfirmed: bool = False
     edges: EdgeEvidence | None = None
+
+    @property
+    def runner_up(self) -> float:
+        """The score of the next best place, 0 if there is none."""
+        return self.rivals[0].score if self.rivals else 0.0
 
     @property
     def warnings(self) -> tuple[RegistrationWarning, ...]:
@@ -222,7 +229,7 @@ def _by_edges(
         best.place,
         best.covariance,
         score,
-        max([0.0, *(100.0 * other.rank for other in places[1:])]),
+        _best_rivals([Rival(other.place, 100.0 * other.rank) for other in places[1:]]),
         int(best.points.explained.sum()),
         None,
         axis,
@@ -275,6 +282,11 @@ def _by_points(
     outline = outline_fit(found.world_from_object, nodes, triangles, more, camera)
     unconfirmed = found.rms_px is None and any(np.ptp(view.normalized) > 0 for view in views)
     return replace(found, outline=outline, unconfirmed=unconfirmed)
+
+
+def _best_rivals(others: list[Rival]) -> tuple[Rival, ...]:
+    """The best of other places that anything speaks for."""
+    return tuple(sorted((each for each in others if each.score > 0.0), key=lambda each: -each.score)[:MOST_RIVALS])
 
 
 def _adjusted(
@@ -366,15 +378,15 @@ def _chosen(
     misfits = np.array([np.inf if found is None else found[1] for found in aligned])
     row = int(np.argmin(misfits))  # the first where no images can be compared
     best, place = compared[row].evidence, moved[row]
-    others = [other.evidence.score for other in candidates[len(compared) :]]
+    others = [Rival(other.transform, other.evidence.score) for other in candidates[len(compared) :]]
     for other, there, misfit in zip(compared, moved, misfits, strict=True):
         if misfit <= MUCH_WORSE * misfits[row] and not same_place(there, place, surface):
-            others.append(other.evidence.score)
+            others.append(Rival(there, other.evidence.score))
     return MeshRegistration(
         place,
         None,
         best.score,
-        max([0.0, *others]),
+        _best_rivals(others),
         int(best.explained.sum()),
         float(misfits[row]) if np.isfinite(misfits[row]) else None,
         surface.axis_of_revolution,

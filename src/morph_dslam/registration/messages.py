@@ -178,6 +178,39 @@ class OutlineOnly(RegistrationWarning):
 
 
 @dataclass(frozen=True)
+class OutlineUnseen(RegistrationWarning):
+    """Too little of the outline is seen to correct landmarks by it.
+
+    Attributes
+    ----------
+    share : of the outline that is seen.
+    """
+
+    template: ClassVar[str] = (
+        "the landmarks are not corrected by the outline: the frame shows only {share:.0%} of it clearly"
+    )
+    share: float
+
+
+@dataclass(frozen=True)
+class OutlineContradicts(RegistrationWarning):
+    """The outline that was found pulls the object off its landmarks.
+
+    Attributes
+    ----------
+    beside_px : root mean square by which the landmarks fit beside the outline.
+    alone_px : the same without it.
+    """
+
+    template: ClassVar[str] = (
+        "the landmarks are not corrected by the outline: beside it they would fit to {beside_px:.1f} px, alone to "
+        "{alone_px:.1f} px; part and mesh differ, a landmark is wrong, or another edge was taken for the outline"
+    )
+    beside_px: float
+    alone_px: float
+
+
+@dataclass(frozen=True)
 class OutlineElsewhere(RegistrationWarning):
     """The keyframes show the object's outline elsewhere.
 

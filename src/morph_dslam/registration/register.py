@@ -86,7 +86,8 @@ def register(
         "outline_share": _outline_share(found),
     }
     in_map = MapRegistration(found.world_from_object, nodes.mean(axis=0), found.covariance)
-    return registration_in_map(model, in_map, _keyframes(found, views), facts, found.warnings, found.axis, scene)
+    placed = registration_in_map(model, in_map, _keyframes(found, views), facts, found.warnings, found.axis, scene)
+    return replace(placed, rivals=found.rivals)
 
 
 def _outline_share(found: MeshRegistration) -> float | None:

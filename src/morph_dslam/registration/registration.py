@@ -155,6 +155,20 @@ class KeyframePose:
 
 
 @dataclass(frozen=True)
+class Rival:
+    """Another place in the map, which was not chosen.
+
+    Attributes
+    ----------
+    world_from_object : metres to the map's unit.
+    score : what speaks for it, as ``score`` of the place that was chosen.
+    """
+
+    world_from_object: SimilarityTransform
+    score: float
+
+
+@dataclass(frozen=True)
 class Axis:
     """An axis of revolution, object frame, metres.
 
@@ -191,6 +205,7 @@ class Registration:
     discrepancy : what the object's shape has beyond the model's in the frame; None where it is not known.
     scene : whose map it is registered in; None where there is none, or only its file is known.
     alternatives : other states that what it was registered by does not exclude, where they are known.
+    rivals : other places in the map, the best first.
     """
 
     model: ReducedModel
@@ -206,6 +221,7 @@ class Registration:
     discrepancy: Discrepancy | None = None
     scene: Scene | None = field(default=None, repr=False, compare=False)
     alternatives: tuple[State, ...] = ()
+    rivals: tuple[Rival, ...] = ()
 
     @property
     def ambiguous(self) -> bool:
@@ -240,6 +256,14 @@ class Registration:
             "mean_node_m": self.map_registration.centre.tolist(),
             "covariance": _list(self.map_registration.covariance),
             "axis_of_revolution": axis and {"point_m": axis.point.tolist(), "direction": axis.direction.tolist()},
+            "rivals": [
+                {
+                    "world_from_object": rival.world_from_object.matrix.tolist(),
+                    "map_units_per_metre": rival.world_from_object.scale,
+                    "score": rival.score,
+                }
+                for rival in self.rivals
+            ],
             "keyframes": [
                 {
                     "frame": view.frame,
@@ -316,7 +340,7 @@ def state_covariance(of_pose: Array, n_parameters: int) -> Array:
 
 #: What is no figure for the summary in the file of a registration.
 _NO_FACTS = {"ambiguous", "warnings", "parameters", "camera_from_object", "state_covariance", "world_from_object"}
-_NO_FACTS |= {"mean_node_m", "covariance", "axis_of_revolution", "keyframes", "map", "model"}
+_NO_FACTS |= {"mean_node_m", "covariance", "axis_of_revolution", "rivals", "keyframes", "map", "model"}
 
 
 def load_registration(path: str | Path, model: ReducedModel | None = None, scene: Scene | None = None) -> Registration:
@@ -391,14 +415,21 @@ def _from_content(content: dict[str, Any], model: ReducedModel) -> Registration:
         covariance = content["state_covariance"]
         covariance = covariance and np.array(covariance, dtype=np.float64).reshape(d + 6, d + 6)
         return Registration(model, state, covariance, facts=facts, warnings=warnings)
-    matrix, scale = _numbers(content["world_from_object"], (4, 4)), float(content["map_units_per_metre"])
-    if not scale > 0.0 or not np.allclose(matrix[:3, :3] @ matrix[:3, :3].T / scale**2, np.eye(3)):
-        raise ValueError("world_from_object is no rotation scaled by map_units_per_metre")
-    placed = SimilarityTransform(scale, matrix[:3, :3] / scale, matrix[:3, 3])
+    placed = _placed(content)
     found = MapRegistration(placed, _numbers(content["mean_node_m"], (3,)), _optional(content["covariance"], (7, 7)))
     axis = content["axis_of_revolution"]
     axis = axis and Axis(_numbers(axis["point_m"], (3,)), _numbers(axis["direction"], (3,)))
-    return registration_in_map(model, found, _keyframes(content["keyframes"]), facts, warnings, axis)
+    # Earlier files have none.
+    rivals = [Rival(_placed(each), float(each["score"])) for each in content.get("rivals", [])]
+    registration = registration_in_map(model, found, _keyframes(content["keyframes"]), facts, warnings, axis)
+    return replace(registration, rivals=tuple(rivals))
+
+
+def _placed(content: dict[str, Any]) -> SimilarityTransform:
+    matrix, scale = _numbers(content["world_from_object"], (4, 4)), float(content["map_units_per_metre"])
+    if not scale > 0.0 or not np.allclose(matrix[:3, :3] @ matrix[:3, :3].T / scale**2, np.eye(3)):
+        raise ValueError("world_from_object is no rotation scaled by map_units_per_metre")
+    return SimilarityTransform(scale, matrix[:3, :3] / scale, matrix[:3, 3])
 
 
 def _keyframes(entries: list[dict[str, Any]]) -> list[KeyframePose]:

@@ -30,8 +30,8 @@ _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 #: The pages' own files, and those of the explorer that they share.
 _PAGES = (
     "studio.css", "studio.js", "server.js", "parts.js", "mesh_view.js", "overlay.js", "plot.js", "recorder.js",
-    "object_step.js", "study_step.js", "build_step.js", "camera_step.js", "start_step.js", "track_step.js",
-    "results_step.js", "phone.js", "live_camera.js", "live_view.js",
+    "object_step.js", "study_step.js", "build_step.js", "camera_step.js", "start_step.js", "scan_start.js",
+    "track_step.js", "results_step.js", "phone.js", "live_camera.js", "live_view.js",
 )  # fmt: skip
 _PHONE = ("studio.css", "server.js", "parts.js", "recorder.js", "live_camera.js", "phone.js")
 _SHARED = (
@@ -173,6 +173,10 @@ class _Answers:
         """A frame of the recording."""
         return Response(await self._steps.frame(request.path_params["number"]), media_type="image/jpeg")
 
+    async def scan_frame(self, request: Request) -> Response:
+        """A frame of the scan."""
+        return Response(await self._steps.scan.frame(request.path_params["number"]), media_type="image/jpeg")
+
     async def call(self, request: Request) -> Response:
         """Call a step's action with the body's JSON object as its arguments."""
         action = self._steps.actions.get(request.path_params["action"])
@@ -280,6 +284,7 @@ def make_app(
         Route("/api/frame/{number:int}", answers.frame),
         WebSocketRoute("/api/camera", answers.camera),
         WebSocketRoute("/api/watch", answers.watch),
+        Route("/api/scan/{number:int}", answers.scan_frame),
         Route("/api/{action}", answers.call, methods=["POST"]),
         Route("/files/{name:path}", answers.file),
         Route("/report", answers.report),

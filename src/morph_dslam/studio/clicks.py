@@ -20,7 +20,7 @@ from morph_dslam.explorer.server import BadRequest, ModelPages
 from morph_dslam.extend.geometry import RigidTransform
 from morph_dslam.extend.registration import Landmarks, bind_landmarks, load_landmarks, save_landmarks
 from morph_dslam.extend.tracking import State
-from morph_dslam.studio.packing import packed
+from morph_dslam.io.packing import packed
 from morph_dslam.units import from_si
 
 Array = NDArray[np.float64]
@@ -135,7 +135,7 @@ def fit_clicks(
     Facts: ``residuals_px`` (k,), ``rms_px``, ``worst`` position, ``parameters`` in SI, ``warnings``; and what
     `overlay` returns. Without a fit, ``message`` says why.
     """
-    landmarks = _landmarks(pairs)
+    landmarks = landmarks_of(pairs)
     missing = FEWEST_PAIRS - len(pairs)
     if missing > 0:
         return packed({"message": f"click {missing} more pair{'s' if missing > 1 else ''}"})
@@ -170,7 +170,8 @@ def _registered(
     return register_landmarks(model, camera, landmarks, at_rest=at_rest)
 
 
-def _landmarks(pairs: Sequence[Sequence[float]]) -> Landmarks:
+def landmarks_of(pairs: Sequence[Sequence[float]]) -> Landmarks:
+    """Pairs of a page as landmarks; raises StudioError if they are none."""
     try:
         table = np.array(pairs, dtype=np.float64).reshape(-1, 5)
     except (TypeError, ValueError, OverflowError):
@@ -251,7 +252,7 @@ def _top(path: Path) -> float:
 
 def save_clicks(pairs: Sequence[Sequence[float]], target: Path) -> None:
     """Write pairs as the file of landmarks that `morph track` takes."""
-    save_landmarks(target, _landmarks(pairs))
+    save_landmarks(target, landmarks_of(pairs))
 
 
 def read_clicks(path: Path) -> list[list[float]]:

@@ -30,7 +30,7 @@ class Job:
 
     Attributes
     ----------
-    kind : "build", "calibrate", "track", "live" or "export".
+    kind : the command's name, such as "build".
     command : as it could be typed in the project folder.
     running : whether it runs.
     stopped : whether it was asked to stop.
@@ -136,7 +136,8 @@ class Jobs:
             return
         assert self.job is not None
         self.job.stopped = True
-        process.send_signal(signal.SIGINT)
+        # Commands take it as Ctrl-C; one that has not begun ends without a word, where SIGINT would show a traceback.
+        process.send_signal(signal.SIGTERM)
         try:
             await asyncio.wait_for(asyncio.shield(task), _PATIENCE)
         except TimeoutError:

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from morph_dslam.errors import StudioError
 from morph_dslam.extend.mechanics import Mesh, check_mesh, load_mesh, save_mesh
 from morph_dslam.io.file_kinds import file_kind
-from morph_dslam.studio.packing import packed
+from morph_dslam.io.packing import packed
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

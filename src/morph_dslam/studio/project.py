@@ -17,6 +17,8 @@ CAMERA, LANDMARKS, RUN, FRAME_LOG = "camera.yaml", "landmarks.csv", "run", "trac
 FRAMES, BOARD = "frames", "board"
 #: Frames of a live camera: number 0 is that of the start. Pairs that were clicked on another frame before.
 LIVE, EARLIER_LANDMARKS = "live", "landmarks-before.csv"
+#: Folder of the recording of the still scene.
+SCAN = "scan"
 _CHOICES = "studio.json"
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. ()+-]{0,99}")
 _MEGABYTE = 1_000_000
@@ -46,6 +48,7 @@ UPLOADS = {
     ),
     "camera": UploadKind((".yaml", ".yml", ".txt"), _MEGABYTE),
     "recording": UploadKind(_VIDEOS, 8000 * _MEGABYTE),
+    "scan": UploadKind(_VIDEOS, 8000 * _MEGABYTE, SCAN),
     "frame": UploadKind(_PICTURES, 100 * _MEGABYTE, FRAMES),
     "board": UploadKind((*_PICTURES, *_VIDEOS), 2000 * _MEGABYTE, BOARD),
     "photo": UploadKind((".jpg", ".jpeg"), 100 * _MEGABYTE),

@@ -15,6 +15,7 @@ from morph_dslam.studio import clicks, object_mesh, project as names, recording,
 from morph_dslam.studio.jobs import Jobs
 from morph_dslam.studio.live_steps import LiveSteps
 from morph_dslam.studio.project import Project
+from morph_dslam.studio.scan_steps import ScanSteps
 from morph_dslam.studio.worker import Worker
 
 #: Seconds between two looks at the file that a run appends to.
@@ -47,7 +48,8 @@ class Steps:
         self._changed = asyncio.Event()
         self._jobs = Jobs(project.folder, self._tell)
         self._ended = False
-        self.live = LiveSteps(project, self._worker, self._jobs)
+        self.scan = ScanSteps(project, self._worker, self._jobs)
+        self.live = LiveSteps(project, self._worker, self._jobs, self.scan)
         self.actions: dict[str, Callable[..., Awaitable[Any]]] = {
             name: getattr(self, name)
             for name in (
@@ -57,6 +59,7 @@ class Steps:
             )
         }  # fmt: skip
         self.actions |= self.live.actions
+        self.actions |= self.scan.actions
 
     def _tell(self) -> None:
         self._changed.set()
@@ -87,7 +90,7 @@ class Steps:
             "study": has(names.STUDY) and not (await self.study())["problems"],
             "build": has(names.MODEL),
             "camera": has(names.CAMERA) and self.project.recording is not None,
-            "start": has(names.LANDMARKS),
+            "start": self.scan.is_accepted if self.scan.is_chosen else has(names.LANDMARKS),
             "track": has(f"{names.RUN}/summary.json"),
             "results": has(f"{names.RUN}/summary.json"),
         }
@@ -144,6 +147,9 @@ class Steps:
             elif kind == "recording":
                 await self._worker.call(recording.recording_facts, path)
                 project.choose(recording=name, reference_frame=None)
+            elif kind == "scan":
+                await self._worker.call(recording.recording_facts, path)
+                self.scan.uploaded(name)
             elif kind == "landmarks":
                 await self._worker.call(clicks.read_clicks, path)
                 project.write(names.LANDMARKS, path.read_text()) if path.name != names.LANDMARKS else None
@@ -322,22 +328,27 @@ class Steps:
 
     # -- track and results -------------------------------------------------------------------------
 
-    async def track(self, refine: bool = False, outline: bool = False) -> dict[str, Any]:
+    async def track(self, refine: bool = False, snap: bool = False, outline: bool = False) -> dict[str, Any]:
         """Start `morph track`."""
         self._model_and_camera()
-        self._needed(names.LANDMARKS, "click and save pairs first")
-        chosen, path = self.project.choices, self._recording()
-        words = ["track", path.name, "--model", names.MODEL, "--camera", names.CAMERA, "--landmarks", names.LANDMARKS]
-        if chosen.get("reference_frame") is not None:
-            words += ["--reference-frame", str(chosen["reference_frame"])]
-        # A start that is known to be undeformed is not refined: what is refined counts for less than all frames tell.
-        at_rest = chosen.get("at_rest", True) and not refine
-        flags = {"--at-rest": at_rest, "--refine": refine, "--outline": outline}
-        words += [flag for flag, is_set in flags.items() if is_set]
+        words = ["track", self._recording().name, "--model", names.MODEL, "--camera", names.CAMERA]
+        words += self.scan.track_words() if self.scan.is_chosen else self._pairs_words(refine, snap)
+        words += ["--outline"] if outline else []
         words += ["--frame-log", names.FRAME_LOG, "--overwrite", "-o", names.RUN]
         self.project.path(names.FRAME_LOG).unlink(missing_ok=True)
         await self._jobs.start("track", words)
         return {}
+
+    def _pairs_words(self, refine: bool, snap: bool) -> list[str]:
+        """The options of `morph track` that start from pairs."""
+        self._needed(names.LANDMARKS, "click and save pairs first")
+        chosen, words = self.project.choices, ["--landmarks", names.LANDMARKS]
+        if chosen.get("reference_frame") is not None:
+            words += ["--reference-frame", str(chosen["reference_frame"])]
+        # A start that is known to be undeformed is not refined: what is refined counts for less than all frames tell.
+        at_rest = chosen.get("at_rest", True) and not refine
+        flags = {"--at-rest": at_rest, "--snap": snap, "--refine": refine}
+        return words + [flag for flag, is_set in flags.items() if is_set]
 
     async def tracked_frames(self) -> dict[str, Any]:
         """The frames that were tracked, and the summary of the run where it is finished."""

@@ -32,6 +32,24 @@ class View:
 
 
 @dataclass(frozen=True)
+class Drawing:
+    """The drawn surface in one state, as each pixel sees it.
+
+    Attributes
+    ----------
+    state : of the object.
+    view : of its drawn surface.
+    triangle_ids : (h, w) int32, the nearest triangle, -1 where there is none.
+    depth : (h, w) metres, infinite where the object is not.
+    """
+
+    state: State
+    view: View
+    triangle_ids: NDArray[np.int32]
+    depth: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
 class DrawnSurface:
     """What of a model is drawn.
 

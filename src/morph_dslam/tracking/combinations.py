@@ -7,10 +7,11 @@ from pathlib import Path
 
 from morph_dslam.errors import TrackingError
 from morph_dslam.registration.registration import Registration
-from morph_dslam.tracking.drawing import shown_field
+from morph_dslam.streams.destinations import check_destination
 from morph_dslam.tracking.options import NO_DISCREPANCY, NO_LOADS, NOT_IN_EQUILIBRIUM
 from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
 from morph_dslam.tracking.setup import TrackedObject
+from morph_dslam.tracking.shown_field import shown_field
 
 
 def _n_starts(part: ObjectOptions) -> int:
@@ -40,6 +41,14 @@ OF_OBJECT: tuple[tuple[Callable[[ObjectOptions], bool], str], ...] = (
     (
         lambda part: part.at_rest and part.landmarks is None,
         "the frame of the landmarks shows the object at rest: start from landmarks, or leave out --at-rest",
+    ),
+    (
+        lambda part: part.snap and part.landmarks is None,
+        "the outline corrects landmarks: start from landmarks, or leave out --snap",
+    ),
+    (
+        lambda part: part.snap and part.tracker.use_depth,
+        "depth says where the object is in the frame of the landmarks: leave out --snap or --depth",
     ),
     (
         lambda part: part.tracker.pose == "still" and part.registration is not None,
@@ -128,17 +137,23 @@ OF_RUN: tuple[tuple[Callable[[TrackOptions], bool], str], ...] = (
         "a registration in a map brings its own reference frame: leave out --reference-frame",
     ),
     (
-        lambda run: not run.video and run.serve is None and (run.drawing.show, run.drawing.section) != (None, None),
-        "--show and --section say what the video shows: leave them or --no-video out",
+        lambda run: not run.video and run.serve is None and run.drawing.section is not None,
+        "--section says what the video shows: leave it or --no-video out",
+    ),
+    (
+        lambda run: not run.video and run.serve is None and not run.streams and run.drawing.show is not None,
+        "--show says what the video and streams show: leave it or --no-video out",
     ),
 )
 
 
 def check_options(run: TrackOptions) -> None:
-    """Raise TrackingError if options make no sense together."""
+    """Raise TrackingError if options make no sense together, StreamError for a stream that cannot be."""
     for part in run.objects:
         _refuse((message for refuses, message in OF_OBJECT if refuses(part)))
     _refuse((message for refuses, message in OF_RUN if refuses(run)))
+    for destination in run.streams:
+        check_destination(destination)
 
 
 def check_inputs(run: TrackOptions, objects: Sequence[TrackedObject]) -> None:

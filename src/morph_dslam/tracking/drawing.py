@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import starmap
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -17,10 +16,10 @@ from tqdm import tqdm
 from morph_dslam.camera import Camera
 from morph_dslam.errors import TrackingError
 from morph_dslam.io.video import VideoWriter
-from morph_dslam.model import ReducedModel, SeparatedField
+from morph_dslam.model import ReducedModel
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.inner_structure import CarriedStructure
-from morph_dslam.model.reduced_model import MaterialPoints, von_mises
+from morph_dslam.model.reduced_model import MaterialPoints
 from morph_dslam.render.overlay import BarPlace, draw_inner_surface, draw_overlay
 from morph_dslam.render.shading import lambert, text_patch, vertex_normals
 from morph_dslam.sources import Frame, FrameSource
@@ -31,6 +30,7 @@ from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.force_arrows import ForceArrows
 from morph_dslam.tracking.result import FrameResult
 from morph_dslam.tracking.run_results import RunResults
+from morph_dslam.tracking.shown_field import SHOWN, Shown, ShownField, shown_field, surface_points
 
 Array = NDArray[np.float64]
 #: A hexahedron as six tetrahedra around its diagonal 0-6, corners in VTK's order.
@@ -163,17 +163,12 @@ def _edges(cells: NDArray[np.int64], pairs: list[tuple[int, int]]) -> NDArray[np
     return np.stack([cells[:, list(pair)] for pair in pairs], axis=1)
 
 
-Shown = Literal["stress", "strain", "displacement", "traction"]
 #: Opacity of the object's surface, of one that shows what it has inside, and of one that is cut open.
 OPACITY, SEE_THROUGH, CUT_OPEN = 0.65, 0.4, 0.9
 #: Colours of inner structures in turn: violet, yellow, green, blue.
 INNER_COLOURS = ((235, 60, 235), (60, 220, 255), (90, 235, 90), (255, 190, 60))
 #: Direction to the light, camera frame, and what it leaves in the shade.
 LIGHT, AMBIENT = np.array([0.3, -0.4, -1.0]), 0.55
-#: Colours end at this percentile of the field: stress has narrow peaks.
-PERCENTILE = 99.5
-#: States of the parameter box from which the range of colours is taken (a power of two).
-SAMPLES = 32
 
 
 @dataclass(frozen=True)
@@ -213,34 +208,25 @@ class AugmentedView:
     ) -> None:
         options = options or DrawOptions()
         self._camera, self._inner, self._model, self._bar = camera, inner, model, BarPlace()
-        self.show = shown_field(model, options.show)
-        self._points, self._triangles = _drawn_mesh(model, options.section)
+        self.show: Shown = shown_field(model, options.show)
+        points, self._triangles = _drawn_mesh(model, options.section)
         self._closed = options.section is None and DrawnSurface.of(model).closed
         self._alpha = SEE_THROUGH if inner else OPACITY if options.section is None else CUT_OPEN
-        self._rest = model.rest_positions(self._points)
-        self._displacement = self._restricted("displacement")
-        self._fields = {name: self._restricted(name) for name in _fields_of(model, self.show)}
+        self._rest = model.rest_positions(points)
+        self._field = ShownField(model, points, self.show)
         self._arrows = ForceArrows(model) if options.forces else None
-
-    def _restricted(self, name: str) -> SeparatedField:
-        field = self._model.restrict(self._points, name)
-        return field.with_modes(field.modes.astype(np.float32))  # type: ignore[arg-type]
 
     @property
     def label(self) -> str:
         """Name and unit of the field; empty for a rigid object, which is drawn grey."""
         if not self._model.parameters:
             return ""
-        return {
-            "stress": "von Mises stress [MPa]",
-            "strain": "equivalent strain [%]",
-            "displacement": "displacement [mm]",
-            "traction": "traction of unknown loads [kPa]",
-        }[self.show]
+        kind = SHOWN[self.show]
+        return f"{kind.name} [{kind.unit}]"
 
     def view(self, state: State) -> View:
         """The drawn nodes in a state."""
-        return self._view(state, self._displacement.value(state.parameters))
+        return self._view(state, self._field.displacement(state.parameters))
 
     def _view(self, state: State, displacement: Array) -> View:
         nodes = state.camera_from_object.apply(self._rest + displacement)
@@ -252,43 +238,24 @@ class AugmentedView:
 
     def values(self, state: State) -> Array:
         """The field (n,) at the drawn nodes, in the unit of `label`; for a sheet on the side that is seen."""
-        return self._values(state.parameters, self._displacement.value(state.parameters), self.view(state))
+        return self._values(state.parameters, self._field.displacement(state.parameters), self.view(state))
 
-    def _values(self, parameters: Array, displacement: Array, view: View | None) -> Array:
-        if not self._model.parameters:
-            return np.full(len(displacement), np.nan)
-        if self.show == "displacement":
-            return 1e3 * np.linalg.norm(displacement, axis=1)
-        if self.show == "strain":
-            return 100.0 * _equivalent_strain(self._fields["strain"].value(parameters))
-        if self.show == "traction":
-            return 1e-3 * np.linalg.norm(self._fields["traction"].value(parameters), axis=1)
-        name = "stress_solid"
-        if name not in self._fields:
-            # Triangles run anticlockwise seen from their top face, that is clockwise in neither y-up nor
-            # y-down images: on the image's y-down axes a top face seen from the front has a negative area.
-            back = view is not None and facing(view, self._triangles).mean() > 0.5
-            name = "stress_bottom" if back else "stress_top"
-        return 1e-6 * von_mises(self._fields[name].value(parameters))
+    def _values(self, parameters: Array, displacement: Array, view: View) -> Array:
+        # Triangles run anticlockwise seen from their top face, that is clockwise in neither y-up nor
+        # y-down images: on the image's y-down axes a top face seen from the front has a negative area.
+        sides = self._field.has_sides
+        back = sides and facing(view, self._triangles).mean() > 0.5
+        return self._field.values(parameters, displacement, ("bottom" if back else "top") if sides else None)
 
     def range_of(self, states: Sequence[State]) -> tuple[float, float]:
         """One range of colours for these states; from 0 to 1 where there are none."""
         if not states:
             return 0.0, 1.0
-        return self._range([self.values(state) for state in states])
+        return self._field.range_of([self.values(state) for state in states])
 
     def range_of_box(self) -> tuple[float, float]:
         """One range of colours for all states of the parameter box, known before any is seen."""
-        model = self._model
-        shapes = model.spread_parameters(SAMPLES)
-        if self.show == "traction" and model.energy is not None:
-            shapes[:, -model.n_loads :] = np.sqrt(model.energy.work)
-        return self._range([self._values(mu, self._displacement.value(mu), None) for mu in shapes])
-
-    def _range(self, fields: list[Array]) -> tuple[float, float]:
-        if not self._model.parameters:
-            return 0.0, 1.0
-        return 0.0, max(float(np.percentile(np.stack(fields), PERCENTILE)), 1e-6)
+        return self._field.range_of_box()
 
     def draw(
         self,
@@ -304,7 +271,7 @@ class AugmentedView:
         The object is drawn where ``discrepancy`` has it beyond the model; stress and strain are the model's, and
         grey near ``jumps``.
         """
-        displacement = self._displacement.value(state.parameters)
+        displacement = self._field.displacement(state.parameters)
         if discrepancy is not None:
             displacement = displacement + discrepancy.displacement(self._rest)
         view = self._view(state, displacement)
@@ -350,42 +317,10 @@ def with_caption(image: NDArray[np.uint8], caption: str) -> NDArray[np.uint8]:
     return result
 
 
-def shown_field(model: ReducedModel, show: Shown | None) -> Shown:
-    """What colours an object, by default the stress of a model that has it; raises TrackingError if it has it not."""
-    has = {
-        "stress": bool(model.stresses),
-        "strain": model.strain is not None,
-        "displacement": True,
-        "traction": model.energy is not None,
-    }
-    if show is None:
-        return "stress" if has["stress"] else "displacement"
-    if not has[show]:
-        held = ", ".join(name for name, held in has.items() if held)
-        raise TrackingError(f"the model '{model.name}' holds no {show} to show; it has: {held}")
-    return show
-
-
-def _fields_of(model: ReducedModel, show: Shown) -> list[str]:
-    """Names of the fields that are shown, as in `ReducedModel.fields`."""
-    if show == "stress":
-        return [f"stress_{place}" for place in model.stresses]
-    return [show] if show in ("strain", "traction") else []
-
-
-def _equivalent_strain(strain: Array) -> Array:
-    """sqrt(2/3 e : e) (n,) of the deviator e of strains (n, 6): xx, yy, zz, yz, xz, xy with tensor shears."""
-    normal = strain[:, :3] - strain[:, :3].mean(axis=1, keepdims=True)
-    squared = np.sum(normal**2, axis=1) + 2.0 * np.sum(strain[:, 3:] ** 2, axis=1)
-    return np.sqrt(2.0 / 3.0 * squared)
-
-
 def _drawn_mesh(model: ReducedModel, section: SectionPlane | None) -> tuple[MaterialPoints, NDArray[np.int64]]:
     """The nodes that are drawn and their triangles: the surface, or what a section leaves of it, and that."""
     if section is None:
-        used, corners = np.unique(model.triangles, return_inverse=True)
-        pairs, weights = np.column_stack([used, used]), np.tile([1.0, 0.0], (len(used), 1))
-        return MaterialPoints(pairs, weights), corners.reshape(-1, 3)
+        return surface_points(model)
     inside, cut_open = cut(model, section)
     left, triangles = surface_before(model, section)
     points = MaterialPoints(

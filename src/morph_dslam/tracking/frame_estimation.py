@@ -22,7 +22,7 @@ from morph_dslam.tracking.noise import Observations, PointNoise, RigObservations
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outline import REACH_PX, OutlineMeasurement
-from morph_dslam.tracking.outline_weight import OutlineBalance
+from morph_dslam.tracking.outline_weight import OutlineBalance, beside_found
 from morph_dslam.tracking.reference import ReferenceView
 from morph_dslam.tracking.sequence_filter import Fitter, SequenceFilter
 from morph_dslam.tracking.systematic_errors import Unexplained
@@ -193,21 +193,32 @@ class FrameEstimation:
         estimate, balance = attempt.estimate, self._balance
         if picture.has_grey and not outline.knows_brightness:
             outline.take_brightness(picture.grey, estimate.state)
-        seen = outline.measure(picture.grey, estimate.state, REACH_PX, picture.occluder_depth)
+        drawing, occluders = attempt.measurement.drawing, picture.occluder_depth
+        seen = outline.measure(picture.grey, estimate.state, REACH_PX, occluders, drawing)
+        seen = self._uncovered(seen, attempt, estimate.state)
         if balance.weight == 0.0:
             balance.learn_texture(*self._supporting(attempt, estimate))
             offsets = self._estimator.camera.project(seen.points.in_camera(estimate.state)) - seen.pixels
             balance.learn_outline(seen, offsets, 0.0)
         # After the first search the state only says where to look the second time: it need not be exact.
         estimate = self._with_outline(self._scout, attempt, seen.weighted(balance.weight), estimate.state)
-        seen = outline.measure(picture.grey, estimate.state, REACH_PX // 2, picture.occluder_depth)
-        seen = seen.weighted(balance.weight)
+        seen = outline.measure_again(picture.grey, estimate.state, REACH_PX // 2, occluders)
+        seen = self._uncovered(seen, attempt, estimate.state).weighted(balance.weight)
         estimate = self._with_outline(self._estimator, attempt, seen, estimate.state)
         agreeing = seen.weighted(balance.weight, balance.agreeing(estimate.residuals[-len(seen.weights) :]))
         balance.learn_outline(seen, estimate.residuals[-len(seen.weights) :], self._taken(attempt, seen, estimate))
         balance.learn_texture(*self._supporting(attempt, estimate))
         estimate = self._with_outline(self._estimator, attempt, agreeing, estimate.state)
         return replace(attempt, estimate=estimate, outline=agreeing)
+
+    def _uncovered(self, seen: OutlineMeasurement, attempt: PoseHypothesis, state: State) -> OutlineMeasurement:
+        """The outline without what lies beside texture that should be seen and was not found.
+
+        There something is before the object, and the edge that was found may be its own.
+        """
+        places = self._reference.projected(state)
+        places[~attempt.measurement.visible] = np.nan
+        return seen.weighted(1.0, beside_found(seen.pixels, places, attempt.measurement.valid))
 
     def by_outline(self, picture: Image, start: State, prior: Prior | None, lost: bool) -> PoseHypothesis:
         """Estimate from the outline alone: searched for far first, then nearer, from one state to the next.

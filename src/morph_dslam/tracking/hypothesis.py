@@ -14,6 +14,7 @@ from morph_dslam.tracking.measurement import Measurement
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import Rejection, RejectionReason
 from morph_dslam.tracking.outline import OutlineMeasurement
+from morph_dslam.tracking.outline_weight import MEDIAN_OF_NUMBER
 
 #: Where less than this share of all points agree, they must agree closely.
 MOST_AGREE = 0.5
@@ -92,9 +93,10 @@ class PoseHypothesis:
 def reject(hypothesis: PoseHypothesis, options: TrackerOptions) -> Rejection | None:
     """Why a hypothesis is not accepted; None when it is.
 
-    What occludes an object may look like it by chance in places, but such points do not agree closely. With a
-    pose prior from the map only the parameters are left to be found, which few points can tell. These must
-    agree closely then, and be most of those that were found.
+    What occludes an object may look like it by chance in places, but such points do not agree closely; nor do they err
+    as their neighbours do, as points of an object do that the model does not quite describe. With a pose prior from the
+    map only the parameters are left to be found, which few points can tell. These must agree closely then, and be most
+    of those that were found.
     """
     visible, count = hypothesis.counts
     if hypothesis.outline_alone:
@@ -102,7 +104,8 @@ def reject(hypothesis: PoseHypothesis, options: TrackerOptions) -> Rejection | N
     needed = min(options.least_inliers, int(np.ceil(options.least_share * len(hypothesis.inliers))))
     spread = hypothesis.estimate.sigma_px
     if count >= needed:
-        if count < MOST_AGREE * len(hypothesis.inliers) and spread > options.few_sigma_px:
+        few, limit = count < MOST_AGREE * len(hypothesis.inliers), options.few_sigma_px
+        if few and spread > limit and _own_spread(hypothesis) > limit:
             return Rejection(RejectionReason.LOOSE_AGREEMENT, count, visible, spread_px=spread)
         return None
     if hypothesis.prior is None:
@@ -113,6 +116,21 @@ def reject(hypothesis: PoseHypothesis, options: TrackerOptions) -> Rejection | N
     if spread < options.few_sigma_px and count >= options.anchored_share * found:
         return None
     return Rejection(RejectionReason.NO_COMMON_SHAPE, count, found, spread_px=spread)
+
+
+def _own_spread(hypothesis: PoseHypothesis) -> float:
+    """Robust standard deviation of a pixel coordinate of the supporting points, without what neighbours have in common.
+
+    It is that of the difference between a point and the one nearest to it, over the root of two.
+    """
+    rows = hypothesis.inliers
+    pixels, residuals = hypothesis.measurement.pixels[rows], hypothesis.estimate.residuals[: len(rows)][rows]
+    if len(pixels) < 2:
+        return hypothesis.estimate.sigma_px
+    squared = np.sum((pixels[:, None] - pixels) ** 2, axis=2)
+    np.fill_diagonal(squared, np.inf)
+    apart = np.median(np.abs(residuals - residuals[squared.argmin(axis=1)]))
+    return float(apart / MEDIAN_OF_NUMBER / np.sqrt(2.0))
 
 
 def _reject_outline(hypothesis: PoseHypothesis, visible: int, count: int) -> Rejection | None:

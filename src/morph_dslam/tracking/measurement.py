@@ -23,7 +23,7 @@ from morph_dslam.render.rasteriser import (
     weight_steps,
     weights_at,
 )
-from morph_dslam.tracking.binding import View, facing, signed_areas
+from morph_dslam.tracking.binding import Drawing, View, facing, signed_areas
 from morph_dslam.tracking.patches import NEUTRAL, compare_patches, follow
 
 Array = NDArray[np.float64]
@@ -37,10 +37,12 @@ class Rendering:
     ----------
     image : (h, w) uint8, the contrast-normalized texture as it should appear; `NEUTRAL` off the object.
     depth : (h, w) float32 metres, infinity off the object.
+    triangle_ids : (h, w) int32, the triangle that a pixel sees, -1 off the object.
     """
 
     image: NDArray[np.uint8]
     depth: NDArray[np.float32]
+    triangle_ids: NDArray[np.int32]
 
 
 class ReferenceAppearance:
@@ -85,6 +87,7 @@ class ReferenceAppearance:
         height, width = self._camera.height, self._camera.width
         image = np.full((height, width), NEUTRAL, dtype=np.uint8)
         depth = np.full((height, width), np.inf, dtype=np.float32)
+        triangle_ids = np.full((height, width), -1, dtype=np.int32)
         draw_textured(
             view.pixels,
             np.ascontiguousarray(view.nodes[:, 2]),
@@ -94,12 +97,13 @@ class ReferenceAppearance:
             self._closed,
             image,
             depth,
+            triangle_ids,
         )
-        return Rendering(image, depth)
+        return Rendering(image, depth, triangle_ids)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw_triangle(area, u, v, q, corners, texture, image, depth):
+def _draw_triangle(triangle_id, area, u, v, q, corners, texture, image, depth, triangle_ids):
     """Draw one triangle: twice its area, its corners' pixels u, v and inverse depths q (3,), and where they are in the
     texture, ``corners`` (3, 3)."""
     x, y, h = corners[:, 0], corners[:, 1], corners[:, 2]
@@ -117,7 +121,7 @@ def _draw_triangle(area, u, v, q, corners, texture, image, depth):
             z = 1.0 / (w0 + w1 + w2)
             if not z < depth[row, column]:
                 continue
-            depth[row, column] = z
+            depth[row, column], triangle_ids[row, column] = z, triangle_id
             # Pixels of the picture are projective on a triangle, not linear: they count by their depths there.
             scale = 1.0 / (w0 * h[0] + w1 * h[1] + w2 * h[2])
             s = min(max((w0 * x[0] + w1 * x[1] + w2 * x[2]) * scale, 0.0), last_column)
@@ -131,8 +135,8 @@ def _draw_triangle(area, u, v, q, corners, texture, image, depth):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image, depth):
-    """Draw a textured surface over what is in ``image`` and ``depth`` already.
+def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image, depth, triangle_ids):
+    """Draw a textured surface over what is in ``image``, ``depth`` and ``triangle_ids`` already.
 
     Parameters
     ----------
@@ -140,14 +144,15 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
     coordinates : (m, 3, 3) column and row of each triangle's corners in the texture, texture pixels, times their depth
         in the camera that took it, and that depth; outside it is its border
     texture : (H, W) uint8.
-    image, depth : (h, w) uint8 and float32, the unit of ``depths``; changed where the surface is nearest.
+    image, depth, triangle_ids : (h, w) uint8, float32, the unit of ``depths``, and int32; changed where the surface is
+        nearest.
     """
     u, v, q = np.empty(3), np.empty(3), np.empty(3)
     for t in range(triangles.shape[0]):
         area = load_triangle(pixels, depths, triangles, t, closed, u, v, q)
         if area == 0.0:
             continue
-        _draw_triangle(area, u, v, q, coordinates[t], texture, image, depth)
+        _draw_triangle(t, area, u, v, q, coordinates[t], texture, image, depth, triangle_ids)
 
 
 #: Pyramid levels that reach as far as a correction may: a quarter of the size, with windows of 17 pixels.
@@ -191,14 +196,14 @@ class Measurement:
     valid : (p,) which to believe.
     visible : (p,) which no other part of the object hides.
     spread : (p,) how exactly by what the patches differ, pixels, up to a factor; see `compare_patches`.
-    depth : (h, w) metres, of the object as it was drawn for the comparison; None where it was not.
+    drawing : of the object, made for the comparison; None where there was none.
     """
 
     pixels: Array
     valid: NDArray[np.bool_]
     visible: NDArray[np.bool_]
     spread: Array
-    depth: NDArray[np.float32] | None = None
+    drawing: Drawing | None = None
 
 
 def visible_surface(
@@ -257,7 +262,7 @@ def compare_with_rendering(
         look_for(rows, predicted[rows] + offsets[rows], 0)
     rows = np.flatnonzero(visible & ~valid)
     look_for(rows, predicted[rows], CORRECTION_LEVELS)
-    return Measurement(pixels, valid, visible, spread, rendering.depth)
+    return Measurement(pixels, valid, visible, spread)
 
 
 #: Another picture takes a triangle over from the first where it shows that much more area: seams are few, and

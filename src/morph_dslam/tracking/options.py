@@ -36,7 +36,8 @@ class TrackerOptions:
     search_above_px, searches : where the residuals' spread exceeds this, so many other shapes are tried in
         the frame as starts, in turn, lest the estimate stay in a local minimum.
     least_inliers, least_share : points that must support it, as a number or a share of all, if that is fewer.
-    few_sigma_px : where less than half of all points support it, their residuals must spread less than this.
+    few_sigma_px : where less than half of all points support it, their residuals must spread less than this, as they
+        are or without what neighbours have in common.
     least_anchored, anchored_share : where the map tells the pose, fewer points will do: at least this many,
         if they are this share of the points found and agree as closely as few must.
     pose : of an object in a map: "map", the camera is found in the map and the object with it; "fixed", and the

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.render.rasteriser import draw_depth
-from morph_dslam.tracking.binding import DrawnSurface, View, view_of
+from morph_dslam.tracking.binding import Drawing, DrawnSurface, View, view_of
 from morph_dslam.tracking.contours import Contour, SurfaceEdges, find_contour
 from morph_dslam.tracking.estimator import BoundPoints, State
 
@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 N_POINTS = 160
 #: How far the outline is searched for to either side of where the estimate shows it, pixels.
 REACH_PX = 14
+#: While its points move by less than this, pixels, the contour is looked for along the same points of the surface.
+SAME_CONTOUR_PX = 8.0
 #: Pixels averaged on each side of a candidate.
 SIDE_PX = 4
 #: How far from the candidate the steepest place is looked for, pixels.
@@ -128,13 +130,17 @@ class Outline:
         state : of the object in it.
         seen : (h, w) where it shows the object; None where it is all that it covers.
         """
-        view, (_, depth) = self._drawn(state)
-        if seen is not None:
-            depth = np.where(seen, depth, np.float32(np.inf))
-        self._picture = _Picture(cv2.blur(grey, (3, 3)), view.nodes, depth)  # type: ignore[arg-type]
+        drawing = self._drawn(state)
+        depth = drawing.depth if seen is None else np.where(seen, drawing.depth, np.float32(np.inf))
+        self._picture = _Picture(cv2.blur(grey, (3, 3)), drawing.view.nodes, depth)  # type: ignore[arg-type]
 
     def measure(
-        self, grey: NDArray[np.uint8], state: State, reach: int, occluder_depth: NDArray[np.float32] | None = None
+        self,
+        grey: NDArray[np.uint8],
+        state: State,
+        reach: int,
+        occluder_depth: NDArray[np.float32] | None = None,
+        drawing: Drawing | None = None,
     ) -> OutlineMeasurement:
         """Search for the outline around where ``state`` shows it.
 
@@ -143,22 +149,67 @@ class Outline:
         grey : (h, w) undistorted image
         reach : how far to search to either side, pixels.
         occluder_depth : (h, w) of other objects, metres, infinite where there are none.
+        drawing : of the object in a state that may be near enough; None to draw it here.
         """
-        view, (ids, depth) = self._drawn(state)
-        focal = 0.5 * (self._camera.fx + self._camera.fy)
-        contour = find_contour(self._edges, view.nodes, view.pixels, depth, focal, self._size, N_POINTS, occluder_depth)
-        brightness = self._brightness(contour, view, ids)
-        offsets = search_outline(
-            grey, contour.pixels, contour.normals, brightness, reach, SIDE_PX, LEAST_CONTRAST, BRIGHTNESS_TOLERANCE
-        )
-        return self._in_slots(contour, np.asarray(offsets), state)
+        if drawing is None:
+            self._take_contour(self._drawn(state), occluder_depth)
+            return self._searched(grey, self._contour.pixels, reach)
+        self._take_contour(drawing, occluder_depth)
+        return self.measure_again(grey, state, reach, occluder_depth)
 
-    def _drawn(self, state: State) -> tuple[View, tuple[NDArray[np.int32], NDArray[np.float32]]]:
-        """The mesh in a state, and the triangle and the depth that each pixel sees."""
+    def measure_again(
+        self, grey: NDArray[np.uint8], state: State, reach: int, occluder_depth: NDArray[np.float32] | None = None
+    ) -> OutlineMeasurement:
+        """`measure` along the same points of the surface as the last time, unless they have moved far since then.
+
+        By first order the contour of a smooth surface moves as the points on it do.
+        """
+        places = self._camera.project(self.points.in_camera(state)[self._slots])
+        moved = np.linalg.norm(places - self._contour.pixels, axis=1)
+        if not len(moved) or not moved.max() < SAME_CONTOUR_PX:
+            return self.measure(grey, state, reach, occluder_depth)
+        return self._searched(grey, places, reach)
+
+    def _take_contour(self, drawing: Drawing, occluder_depth: NDArray[np.float32] | None) -> None:
+        """Find the contour in a drawing, and how bright the object is beside it."""
+        view, focal = drawing.view, 0.5 * (self._camera.fx + self._camera.fy)
+        self._contour = contour = find_contour(
+            self._edges, view.nodes, view.pixels, drawing.depth, focal, self._size, N_POINTS, occluder_depth
+        )
+        self._beside = self._brightness(contour, view, drawing.triangle_ids)
+        self._slots = self._assigned(contour, drawing.state)
+        triangles, weights = self.points.surface.triangles.copy(), self.points.surface.weights.copy()
+        triangles[self._slots], weights[self._slots] = contour.points.triangles, contour.points.weights
+        self.points = BoundPoints.from_surface(self._model, SurfacePoints(triangles, weights))
+        self._used = np.zeros(N_POINTS, dtype=bool)
+        self._used[self._slots] = True
+
+    def _searched(self, grey: NDArray[np.uint8], places: Array, reach: int) -> OutlineMeasurement:
+        """Search along the contour's normals from ``places`` (k, 2), where its points are in the image by now.
+
+        Points stay in the places of those that were near them last: what one errs by is then known as the same.
+        """
+        slots, normals_there = self._slots, self._contour.normals
+        offsets = np.asarray(
+            search_outline(
+                grey, places, normals_there, self._beside, reach, SIDE_PX, LEAST_CONTRAST, BRIGHTNESS_TOLERANCE
+            )
+        )
+        found = np.zeros(N_POINTS)
+        found[slots] = np.isfinite(offsets)
+        pixels, normals = np.zeros((N_POINTS, 2)), np.zeros((N_POINTS, 2))
+        normals[:, 0] = 1.0  # of points that are not there; they count as ones of an outline all the same
+        pixels[slots] = places + np.nan_to_num(offsets)[:, None] * normals_there
+        normals[slots] = normals_there
+        return OutlineMeasurement(self.points, pixels, normals, self._used, found)
+
+    def _drawn(self, state: State) -> Drawing:
+        """The object in a state."""
         camera, surface = self._camera, self._surface
         view = view_of(surface.model, camera, state)
         depths = np.ascontiguousarray(view.nodes[:, 2])
-        return view, draw_depth(view.pixels, depths, self._triangles, surface.closed, camera.height, camera.width)
+        drawn = draw_depth(view.pixels, depths, self._triangles, surface.closed, camera.height, camera.width)
+        return Drawing(state, view, *drawn)
 
     def _brightness(self, contour: Contour, view: View, ids: NDArray[np.int32]) -> Array:
         """Grey (k, 2, `SIDE_PX`) of the object inside and outside of each point, in the picture that is known.
@@ -172,22 +223,6 @@ class Outline:
         places = contour.pixels[:, None] + away[None, :, None] * contour.normals[:, None]
         args = ids, self._triangles, view.nodes, known.nodes, known.depth, known.grey, self._camera.intrinsics
         return look_up(places.reshape(-1, 2), *args).reshape(len(contour), 2, SIDE_PX)
-
-    def _in_slots(self, contour: Contour, offsets: Array, state: State) -> OutlineMeasurement:
-        """Points stay in the places of those that were near them last: what one errs by is then known as the same."""
-        slots = self._assigned(contour, state)
-        triangles, weights = self.points.surface.triangles.copy(), self.points.surface.weights.copy()
-        triangles[slots], weights[slots] = contour.points.triangles, contour.points.weights
-        self.points = BoundPoints.from_surface(self._model, SurfacePoints(triangles, weights))
-        self._used = np.zeros(N_POINTS, dtype=bool)
-        self._used[slots] = True
-        found = np.zeros(N_POINTS)
-        found[slots] = np.isfinite(offsets)
-        pixels, normals = np.zeros((N_POINTS, 2)), np.zeros((N_POINTS, 2))
-        normals[:, 0] = 1.0  # of points that are not there; they count as ones of an outline all the same
-        pixels[slots] = contour.pixels + np.nan_to_num(offsets)[:, None] * contour.normals
-        normals[slots] = contour.normals
-        return OutlineMeasurement(self.points, pixels, normals, self._used, found)
 
     def _assigned(self, contour: Contour, state: State) -> NDArray[np.int64]:
         """The place of each point (k,): that of the one before it is nearest to, or a free one."""

@@ -32,6 +32,9 @@ MOST_UNUSUAL = 1.5
 MEDIAN_OF_NUMBER = 0.6745
 #: Fewer points do not tell how exact they are.
 LEAST_POINTS = 12
+#: Of so many of the texture's points, the nearest to one of the outline, so many must be found, or something covers
+#: both. Chosen on rendered sheets; one and three do nearly as well.
+NEIGHBOURS, LEAST_NEIGHBOURS = 5, 2
 
 
 #: Pairs are made of no more points than these.
@@ -184,6 +187,34 @@ def near_products(pixels, residuals, near):
     if pairs == 0:
         return 0.0, near
     return total / (pairs * residuals.shape[1]), max(apart / pairs, 1.0)
+
+
+@njit(cache=True, nogil=True)
+def beside_found(pixels, texture, found):
+    """Which points (p,) have `LEAST_NEIGHBOURS` that were found among the `NEIGHBOURS` nearest of the texture.
+
+    Parameters
+    ----------
+    pixels : (p, 2) of the points.
+    texture : (n, 2) where the texture's points should be seen; NaN for those that should not.
+    found : (n,) which of them were found there.
+    """
+    result = np.ones(len(pixels), np.bool_)
+    nearest, is_found = np.empty(NEIGHBOURS), np.empty(NEIGHBOURS, np.bool_)
+    for i in range(len(pixels)):
+        count = 0
+        for j in range(len(texture)):
+            squared = (pixels[i, 0] - texture[j, 0]) ** 2 + (pixels[i, 1] - texture[j, 1]) ** 2
+            if not np.isfinite(squared) or (count == NEIGHBOURS and squared >= nearest[-1]):
+                continue
+            count = min(count + 1, NEIGHBOURS)
+            k = count - 1
+            while k > 0 and nearest[k - 1] > squared:
+                nearest[k], is_found[k] = nearest[k - 1], is_found[k - 1]
+                k -= 1
+            nearest[k], is_found[k] = squared, found[j]
+        result[i] = is_found[:count].sum() >= min(count, LEAST_NEIGHBOURS)
+    return result
 
 
 @njit(cache=True, nogil=True)

@@ -21,6 +21,7 @@ from morph_dslam.model.reduced_model import spread_over, triangle_normals
 from morph_dslam.render.rasteriser import Buffers, visible_points
 from morph_dslam.timing import stage
 from morph_dslam.tracking.binding import (
+    Drawing,
     DrawnSurface,
     View,
     bind_pixels,
@@ -317,7 +318,8 @@ class ReferenceView:
                 tolerance = DEPTH_TOLERANCE * float(np.median(positions[:, 2]))
                 visible &= visible_points(predicted, positions[:, 2], picture.occluder_depth, tolerance)
             visible &= foreshortening(view, drawn.triangles[self.points.surface.triangles]) >= self._least_broadness
-            return compare_with_rendering(picture.normalized, rendering, predicted, visible, offsets)
+            found = compare_with_rendering(picture.normalized, rendering, predicted, visible, offsets)
+        return replace(found, drawing=Drawing(state, view, rendering.triangle_ids, rendering.depth))
 
     def _draw(self, meshes: Sequence[View]) -> tuple[list[NDArray[np.uint8]], float]:
         """Make the texture.

@@ -2,8 +2,8 @@
 
 The landmarks of one view fix the reference state only to a few millimetres along the sight line, and every
 followed point is bound to the mesh by it. Other frames tell more: a wrong reference state binds the points
-wrongly, and no state of another frame then explains all of them. So the landmarks' residuals and those of
-keyframes, each at its own best state (variable projection), are minimised over the reference state.
+wrongly, and no state of another frame then explains all of them. So the residuals of what the registration rests on and
+those of keyframes, each at its own best state (variable projection), are minimised over the reference state.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from morph_dslam.errors import RegistrationError
 from morph_dslam.tracking.binding import bind_pixels, draw_view, view_of
 from morph_dslam.tracking.depth import SIGMA_AT_1M, PointDepths
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State, moved
+from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
 from morph_dslam.tracking.outline import OutlineMeasurement
 
 Array = NDArray[np.float64]
@@ -89,20 +90,19 @@ def choose_keyframes(keyframes: Sequence[Keyframe], count: int = N_KEYFRAMES) ->
 
 def refine_reference(
     estimator: Estimator,
-    landmarks: BoundPoints,
-    landmark_pixels: Array,
+    known: LandmarkTerm | StateTerm,
     reference_pixels: Array,
     start: State,
     keyframes: Sequence[Keyframe],
-    landmark_px: float = LANDMARK_PX,
 ) -> State:
-    """The reference state that explains the landmarks and the keyframes best, in which no unknown loads act.
+    """The reference state that explains the registration and the keyframes best, in which no unknown loads act.
 
     Parameters
     ----------
-    landmarks, landmark_pixels : (k) as registered; pixels (k, 2) undistorted.
+    known : what the registration rests on.
     reference_pixels : (p, 2) of the followed points in the reference view.
     start : the registered state.
+    keyframes : where these points were seen in other frames.
     """
     model, camera = estimator.model, estimator.camera
     inner = Estimator(model, camera, replace(estimator.options, max_iterations=8, tolerance=1e-5))
@@ -117,8 +117,7 @@ def refine_reference(
 
     def residuals(step: Array) -> Array:
         state = reference(step)
-        seen = camera.project(landmarks.in_camera(state))
-        parts = [((seen - landmark_pixels) / landmark_px).ravel()]
+        parts = [known.residuals(camera, state)]
         surface, met = bind_pixels(model, camera, view_of(model, camera, state), reference_pixels)
         points = BoundPoints.from_surface(model, surface)
         for frame in keyframes:

@@ -21,6 +21,7 @@ class ObjectOptions:
     model : model file.
     landmarks : points of the object and their pixels in the reference frame.
     registration : registration.json of `morph register`.
+    snap : whether the object's outline in the frame of the landmarks corrects them.
     initializer : a board, a picture of its print or a guess, which find it in the reference frame.
     at_rest : whether the object is undeformed in the frame of its landmarks, its parameters at their defaults.
     reregister_at : frames in which to register it anew, with landmarks there, or None for the initializer.
@@ -32,6 +33,7 @@ class ObjectOptions:
     landmarks: Path | None = None
     registration: Path | None = None
     at_rest: bool = False
+    snap: bool = False
     initializer: InitializerFiles = field(default_factory=InitializerFiles)
     reregister_at: tuple[tuple[int, Path | None], ...] = ()
     inner: tuple[Path, ...] = ()
@@ -65,6 +67,7 @@ class TrackOptions(ObjectOptions):
     video : whether to draw the augmented video.
     drawing : what is drawn.
     overwrite : whether to replace a run that is in the folder.
+    streams : where results go as they come, for other programs (docs/streams.md).
     frame_log : file that gets a line of JSON for each frame of the first object as soon as it is tracked.
     """
 
@@ -87,6 +90,7 @@ class TrackOptions(ObjectOptions):
     video: bool = True
     drawing: DrawOptions = field(default_factory=DrawOptions)
     overwrite: bool = False
+    streams: tuple[str, ...] = ()
     frame_log: Path | None = None
 
     @property
@@ -104,3 +108,11 @@ class TrackOptions(ObjectOptions):
     def folders(self) -> tuple[Path, ...]:
         """The run folder of each."""
         return (self.output, *(self.output / name for name, _ in self.others))
+
+    @property
+    def stream_names(self) -> tuple[str, ...]:
+        """By which streams call each object: the first one by its model file."""
+        others, first = [name for name, _ in self.others], self.model.stem
+        while first in others:
+            first += "_"
+        return (first, *others)

@@ -44,6 +44,7 @@ class TrackedObject:
     reregister_at : frames in which to register it anew, with landmarks there, or None for the initializer.
     click_px : standard deviation of a landmark's pixel.
     at_rest : whether it is undeformed in the frame of its landmarks.
+    snap : whether its outline in the frame of landmarks corrects them.
     """
 
     name: str
@@ -55,6 +56,7 @@ class TrackedObject:
     reregister_at: Mapping[int, Landmarks | None] = field(default_factory=dict)
     click_px: float = CLICK_PX
     at_rest: bool = False
+    snap: bool = False
 
     @property
     def scene(self) -> Scene | None:
@@ -80,9 +82,9 @@ class TrackedObject:
         if isinstance(start, Landmarks):
             depth = frame.depth if self.options.use_depth else None
             at_rest = self.at_rest and start is self.start
-            return register_landmarks(
-                self.model, camera, start, self.click_px, depth, self.options.depth_sigma, at_rest
-            )
+            image = np.asarray(frame.image, dtype=np.uint8) if self.snap else None
+            sigma = self.options.depth_sigma
+            return register_landmarks(self.model, camera, start, self.click_px, depth, sigma, at_rest, image=image)
         return register_by_initializer(start, self.model, camera, np.asarray(frame.image, dtype=np.uint8))
 
     def tracker_options(self, registration: Registration) -> TrackerOptions:
@@ -129,9 +131,8 @@ def _load_object(name: str, part: ObjectOptions, run: TrackOptions, scene_of: Ca
     if part.registration is None:
         start = initializer if part.landmarks is None else load_landmarks(part.landmarks)
         assert start is not None
-        return TrackedObject(
-            name, model, start, options, inner, reregister_at=again, click_px=run.click_px, at_rest=part.at_rest
-        )
+        said = {"click_px": run.click_px, "at_rest": part.at_rest, "snap": part.snap}
+        return TrackedObject(name, model, start, options, inner, reregister_at=again, **said)
     registration, path = load_registration(part.registration, model), map_of(part.registration, run.map_path)
     if path is None and options.pose != "free":
         note = "no map was given or found beside the registration: the object is tracked as a free one"

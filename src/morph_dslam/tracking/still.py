@@ -20,6 +20,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, State, moved
+from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
 from morph_dslam.tracking.levenberg_marquardt import bounded_step
 from morph_dslam.tracking.refinement import EFFECTIVE_POINTS, Keyframe
 from morph_dslam.tracking.state import Prior, pose_increment
@@ -34,56 +35,10 @@ TERM_STD: dict[CameraTerm, float] = {"focal": 0.3, "radial": 0.05}
 LEAST_SIGMA_PX = 0.3
 #: Rounds with weights by the residuals of the round before; steps of a keyframe's own parameters.
 ROUNDS, STEPS = 2, 6
-#: Residual of a landmark behind the camera, and the least variance of a scaled unknown that is believed.
-UNSEEN, LEAST_VARIANCE = 1e3, 1e-12
 #: Unknowns closer than this, scaled, are the same minimum; twice the log-likelihood ratio that excludes another one.
 SAME, EXCLUDED = 1.0, 9.0
 #: How much more than by a frame's own points a pose counts that is one over the sequence.
 HELD = 1e4
-
-
-@dataclass(frozen=True)
-class LandmarkTerm:
-    """What landmarks say of the reference state.
-
-    Attributes
-    ----------
-    points : k of them, bound.
-    recorded : (k, 2) pixels as recorded.
-    sigma_px : standard deviation of each.
-    """
-
-    points: BoundPoints
-    recorded: Array
-    sigma_px: float
-
-    def residuals(self, camera: Camera, state: State) -> Array:
-        """(2 k,) in standard deviations."""
-        away = camera.project(self.points.in_camera(state)) - camera.undistort_pixels(self.recorded)
-        return np.nan_to_num(away / self.sigma_px, nan=UNSEEN).ravel()
-
-
-@dataclass(frozen=True)
-class StateTerm:
-    """What another registration says of the reference state.
-
-    Attributes
-    ----------
-    state : as registered.
-    covariance : (d + 6, d + 6) of it.
-    scale : (d + 6,) of the unknowns.
-    """
-
-    state: State
-    covariance: Array
-    scale: Array
-
-    def residuals(self, camera: Camera, state: State) -> Array:
-        """(d + 6,) in standard deviations; the camera does not matter."""
-        turned = pose_increment(self.state.camera_from_object, state.camera_from_object)
-        away = np.concatenate([state.parameters - self.state.parameters, turned])
-        values, vectors = np.linalg.eigh(self.covariance / np.outer(self.scale, self.scale))
-        return np.asarray((vectors.T @ (away / self.scale)) / np.sqrt(np.maximum(values, LEAST_VARIANCE)))
 
 
 @dataclass(frozen=True)

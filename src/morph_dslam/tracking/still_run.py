@@ -12,13 +12,14 @@ from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.registration.landmarks import bind_landmarks
 from morph_dslam.registration.messages import Ambiguity, Ambiguous
 from morph_dslam.sources import Frame
+from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
 from morph_dslam.tracking.levenberg_marquardt import Box
 from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
 from morph_dslam.tracking.options import PoseFrom
 from morph_dslam.tracking.placement import PlacedObject
 from morph_dslam.tracking.refinement import N_KEYFRAMES, Keyframe, choose_keyframes, landmark_deviation
 from morph_dslam.tracking.reregistration import Reregistration
-from morph_dslam.tracking.still import CameraTerm, LandmarkTerm, StateTerm, StillProblem, fit_still
+from morph_dslam.tracking.still import CameraTerm, StillProblem, fit_still
 from morph_dslam.tracking.tracker import Tracker
 
 #: Live, the pose is estimated anew after so many frames, and whenever there are twice as many.
@@ -54,7 +55,7 @@ def with_still_pose(
         registration.state,
         tracker.reference.pixels,
         choose_keyframes(keyframes),
-        _state_term(part) if estimated else _known(part),
+        _state_term(part) if estimated else known_state(part),
         constant,
         [n for n in range(len(names)) if part.object.at_rest and n not in constant],
         terms,
@@ -74,12 +75,12 @@ def with_still_pose(
     return with_pose(replace(part, registration=registration, cameras=cameras), "still")
 
 
-def _known(part: PlacedObject) -> LandmarkTerm | StateTerm:
-    """What the registration rests on."""
-    landmarks = part.object.start
-    if not isinstance(landmarks, Landmarks):
+def known_state(part: PlacedObject) -> LandmarkTerm | StateTerm:
+    """What an object's registration rests on: its landmarks, or what these and other measurements gave together."""
+    landmarks, registration = part.object.start, part.registration
+    if not isinstance(landmarks, Landmarks) or registration.facts.get("corrected_by_outline", False):
         return _state_term(part)
-    sigma = landmark_deviation(part.registration.facts["sigma_px"])
+    sigma = landmark_deviation(registration.facts["sigma_px"])
     return LandmarkTerm(bind_landmarks(part.model, landmarks.points), landmarks.pixels, sigma)
 
 

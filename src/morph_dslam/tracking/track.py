@@ -47,8 +47,10 @@ from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.session import Session, SynchronizedFrames
 from morph_dslam.tracking.setup import TrackedObject, load_cameras, load_objects
+from morph_dslam.tracking.shown_field import Shown
 from morph_dslam.tracking.sinks import BrowserSink, LivePicture, LiveTimes, Sink, SourceSink, TrackedFrame, VideoSink
-from morph_dslam.tracking.still_run import Sharpening, with_pose, with_still_pose
+from morph_dslam.tracking.still_run import Sharpening, known_state, with_pose, with_still_pose
+from morph_dslam.tracking.stream_sink import StreamedObject, StreamSink
 from morph_dslam.tracking.tracker import Tracker
 
 Tell = Callable[[Path, dict[str, Any]], object]
@@ -87,6 +89,7 @@ def track(run: TrackOptions, tell: Tell = lambda folder, summary: None) -> dict[
         try:
             job.run()
         finally:
+            job.end_streams()
             summaries = [job.write(number, tell) for number in range(len(placed))]
     return summaries[0]
 
@@ -196,14 +199,18 @@ class _Job:
         self._again = {p.name: Sharpening(p) if sharpens[p.name] else Reregistration(p) for p in placed}
         self._times, self._seen = LiveTimes(), {part.name: [] for part in placed}
         self._log = None if run.frame_log is None else FrameLog(run.frame_log, self._folders[0])
+        self._streams = self._opened_streams(stack)
         sinks: list[Sink] = [*self._folders, *([] if self._log is None else [self._log])]
         screens = self._screens(stack) if run.live else []
         if run.live:
             sinks += [self._times, *screens]
         if run.in_two_passes:
+            # What is sent is final: the second pass.
             sinks.append(self._keep_seen)
             # By its own points in each frame, which shows more of them as long as the one pose is not known well.
             placed = [with_pose(part, "free") if part.options.pose == "still" else part for part in placed]
+        else:
+            sinks += self._begun_streams(placed)
         views = {part.name: view for part, view in zip(placed, self._views, strict=True)}
         picture = LivePicture(placed[0].camera, views) if screens else None
         self._session = new_session(placed, source, sinks, picture=picture, reregistration=self._again)
@@ -224,6 +231,7 @@ class _Job:
             if self._log is not None:
                 self._log.start_again()
                 sinks.append(self._log)
+            sinks += self._begun_streams(self._placed)
             new_session(self._placed, self._source, sinks).run(progress=True)
 
     def write(self, number: int, tell: Tell) -> dict[str, Any]:
@@ -264,6 +272,30 @@ class _Job:
             screens.append(VideoSink(writer, fps))
         return screens
 
+    def _opened_streams(self, stack: ExitStack) -> StreamSink | None:
+        """What sends results to other programs; None if nobody asked for it."""
+        if not self._run.streams:
+            return None
+        streams = stack.enter_context(StreamSink(self._run.streams))
+        for publisher in streams.publishers:
+            print(f"streamed to {publisher.place}", flush=True)
+        return streams
+
+    def _begun_streams(self, placed: Sequence[PlacedObject]) -> list[Sink]:
+        """The sink of the streams, told what will be tracked; none if nobody asked for it."""
+        if self._streams is None:
+            return []
+        objects = {
+            part.name: StreamedObject(part.model, name, _shown_of(part, self._run), part.options.modulus_std)
+            for part, name in zip(placed, self._run.stream_names, strict=True)
+        }
+        return [self._streams.begin(objects, placed[0].camera)]
+
+    def end_streams(self) -> None:
+        """End the streams as soon as the last frame is tracked: a video may take minutes to draw."""
+        if self._streams is not None:
+            self._streams.close()
+
     def _keep_seen(self, tracked: TrackedFrame) -> None:
         """Keep where the points of each object were seen, to refine its reference."""
         for name, tracker in self._session.trackers.items():
@@ -271,10 +303,15 @@ class _Job:
                 self._seen[name].append(tracker.last_seen)
 
 
+def _shown_of(part: PlacedObject, run: TrackOptions) -> Shown | None:
+    """What colours an object: its displacement where stress would be drawn on a shape that is not in equilibrium."""
+    return "displacement" if part.options.use_discrepancy and run.drawing.show is None else run.drawing.show
+
+
 def _view_of(part: PlacedObject, run: TrackOptions) -> AugmentedView:
-    """Draws an object; by its displacement where stress would be drawn on a shape that is not in equilibrium."""
-    by_default = "displacement" if part.options.use_discrepancy and run.drawing.show is None else run.drawing.show
-    return AugmentedView(part.model, part.camera, replace(run.drawing, show=by_default), part.inner)
+    """Draws an object."""
+    drawing = replace(run.drawing, show=_shown_of(part, run))
+    return AugmentedView(part.model, part.camera, drawing, part.inner)
 
 
 def _refined(part: PlacedObject, keyframes: list[Keyframe], run: TrackOptions) -> PlacedObject:
@@ -286,16 +323,14 @@ def _refined(part: PlacedObject, keyframes: list[Keyframe], run: TrackOptions) -
         return part
     tracker = part.new_tracker()
     assert isinstance(tracker, Tracker)
-    landmark_px = landmark_deviation(registration.facts["sigma_px"])
-    bound = bind_landmarks(part.model, landmarks.points)
-    seen, pixels = part.camera.undistort_pixels(landmarks.pixels), tracker.reference.pixels
-    chosen = choose_keyframes(keyframes)
+    pixels, chosen = tracker.reference.pixels, choose_keyframes(keyframes)
     if not part.options.use_discrepancy:
-        state = refine_reference(tracker.estimator, bound, seen, pixels, registration.state, chosen, landmark_px)
+        state = refine_reference(tracker.estimator, known_state(part), pixels, registration.state, chosen)
         refined = replace(registration, state=state, covariance=None)
     else:
         # What the state is wrong by counts with the discrepancy: both at once would be the same twice.
-        known = Reference(registration.state, pixels, bound, seen, landmark_px)
+        bound, seen = bind_landmarks(part.model, landmarks.points), part.camera.undistort_pixels(landmarks.pixels)
+        known = Reference(registration.state, pixels, bound, seen, landmark_deviation(registration.facts["sigma_px"]))
         fit = DiscrepancyFit(part.model, part.camera, part.options.discrepancy)
         found = refine_discrepancy(fit, tracker.estimator, known, chosen)
         refined = replace(registration, discrepancy=found, covariance=None)

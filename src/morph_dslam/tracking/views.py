@@ -368,8 +368,8 @@ class ViewSet:
             with stage("views"):
                 return self._gone_on(stated.state)
         with stage("views"):
-            assert attempt.measurement.depth is not None
-            now = self._samples.seen(stated.state, attempt.measurement.depth)
+            assert attempt.measurement.drawing is not None
+            now = self._samples.seen(stated.state, attempt.measurement.drawing.depth)
             shares = [covered_share(now, seen) for seen in self._seen]
         active, errors = self._kept.index(self.active), [view.error for view in self._kept]
         while (chosen := choose_view(shares, errors, active)) is not None:

@@ -7,8 +7,10 @@ import { OrbitControls } from './three/OrbitControls.js';
 const VIEWED_FROM = new THREE.Vector3(-0.45, -0.9, 0.75).normalize();
 const FIELD_OF_VIEW = 30;
 
+// The colours, and above them the grey of nodes whose value is not a number.
 function colourTexture(colours) {
-  const texture = new THREE.DataTexture(new Uint8Array(colours.flat()), colours.length, 1);
+  const grey = colours.map(() => [128, 128, 128, 255]);
+  const texture = new THREE.DataTexture(new Uint8Array([...colours, ...grey].flat()), colours.length, 2);
   texture.colorSpace = THREE.SRGBColorSpace;
   texture.minFilter = texture.magFilter = THREE.LinearFilter;
   texture.needsUpdate = true;
@@ -37,7 +39,8 @@ export class SolidView {
     this.renderer.setClearColor(0x5a646f);
     container.append(this.renderer.domElement);
     this.placeCamera(reach);
-    new ResizeObserver(() => this.resize()).observe(container);
+    this.resized = new ResizeObserver(() => this.resize());
+    this.resized.observe(container);
     this.resize();
   }
 
@@ -78,8 +81,8 @@ export class SolidView {
     const { position, uv } = this.geometry.attributes;
     for (let i = 0; i < displacement.length; i++) position.array[i] = this.nodes[i] + scale * displacement[i];
     for (let i = 0; i < values.length; i++) {
-      uv.array[2 * i] = Math.min(Math.max(values[i] / top, 0), 1);
-      uv.array[2 * i + 1] = 0.5;
+      uv.array[2 * i] = Math.min(Math.max((values[i] || 0) / top, 0), 1);
+      uv.array[2 * i + 1] = Number.isNaN(values[i]) ? 0.75 : 0.25;
     }
     position.needsUpdate = uv.needsUpdate = true;
     this.draw();
@@ -97,6 +100,15 @@ export class SolidView {
     this.camera.aspect = width / Math.max(height, 1);
     this.camera.updateProjectionMatrix();
     this.draw();
+  }
+
+  // Take it off the page.
+  dispose() {
+    this.resized.disconnect();
+    this.controls.dispose();
+    this.geometry.dispose();
+    this.renderer.dispose();
+    this.renderer.domElement.remove();
   }
 
   draw() {

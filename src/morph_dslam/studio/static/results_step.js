@@ -24,8 +24,8 @@ export async function resultsStep(app) {
   const exported = el('p', { className: 'note' });
   const download = (name, text) => el('a', { href: `/files/${name}`, download: '', className: 'button' }, text);
   const write = (format, text) => el('button', { id: `export-${format}`, onclick: () => app.doing(async () => {
-    const { folder } = await call('export', { format });
-    exported.textContent = `written to ${folder} in the project folder`;
+    await call('export', { format });
+    exported.replaceChildren();
   }) }, text);
   const pictureplace = el('div', { className: 'fill', id: 'result-image' });
   const solidPlace = el('div', { className: 'fill', id: 'result-solid' });
@@ -71,5 +71,12 @@ export async function resultsStep(app) {
     has('model.report.html') ? el('p', {}, el('a', { href: '/report', target: '_blank' }, 'Report of the model')) : null,
   ]));
   show();
-  return {};
+  return {
+    job: (job, ended) => {
+      if (!ended || job.kind !== 'export' || job.status !== 0) return;
+      const format = job.command.match(/--format (\w+)/)[1];
+      exported.replaceChildren(`written to export-${format} in the project folder `,
+        format === 'gltf' ? download('export-gltf/model.glb', 'Download') : '');
+    },
+  };
 }

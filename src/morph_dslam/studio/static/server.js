@@ -35,6 +35,10 @@ export async function frame(number) {
   return createImageBitmap(await (await told(await fetch(`/api/frame/${number}`))).blob());
 }
 
+export async function scanFrame(number) {
+  return createImageBitmap(await (await told(await fetch(`/api/scan/${number}`))).blob());
+}
+
 // Names become what the project takes: letters, digits and a few signs.
 export function properName(name) {
   const plain = name.normalize('NFKD').replace(/[^A-Za-z0-9_. ()+-]/g, '_').replace(/^[^A-Za-z0-9_]+/, '');

@@ -1,10 +1,11 @@
 // Start: pairs of a point on the mesh and a pixel place the object in one frame.
 
 import { call, explored, frame } from './server.js';
-import { check, command, digits, dropZone, el, facts, title } from './parts.js';
+import { check, choice, command, digits, dropZone, el, facts, field, title } from './parts.js';
 import { MeshView } from './mesh_view.js';
 import { ImageView, colourBar } from './overlay.js';
 import { upload } from './server.js';
+import { scanStart } from './scan_start.js';
 
 const SOON = 500; // milliseconds without a click
 const GOOD = '#0f6e8c';
@@ -13,12 +14,17 @@ const PENDING = '#f08c00';
 const PLAIN = Array(256).fill([40, 170, 200]); // of an undeformed object, which has no stress
 
 export async function startStep(app) {
-  app.panel.append(...title('Start', 'Click a point on the mesh and the same point in the image, four pairs or more.'));
+  app.panel.append(...title('Start', 'Where the object is: by four clicked pairs or more, or by a scan of the still scene.'));
   const { recording, camera, done } = app.state;
   if (!done.build || !recording || recording.message || !camera || camera.message) {
     app.panel.append(el('p', { className: 'problem' }, 'This step needs the model, the recording and the camera.'));
     return {};
   }
+  const way = choice('start-by', [['pairs', 'pairs in a frame'], ['scan', 'a scan of the still scene']],
+    app.state.choices.start ?? 'pairs');
+  way.addEventListener('change', () => app.doing(async () => { await call('start_by', { way: way.value }); await app.show('start'); }));
+  app.panel.append(field('Start by', way));
+  if (way.value === 'scan') return scanStart(app);
   const [mesh, known, model, { colours }] = await Promise.all([
     call('model_mesh'), call('start_files'), call('model'), explored('model.json')]);
   const first = recording.first;

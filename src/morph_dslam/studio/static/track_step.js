@@ -46,16 +46,22 @@ export async function trackStep(app) {
   }
   const [mesh, model, { colours }] = await Promise.all([call('model_mesh'), call('model'), explored('model.json')]);
   const refine = el('input', { id: 'refine', checked: !(app.state.choices.at_rest ?? true) });
+  const snap = el('input', { id: 'snap' });
   const outline = el('input', { id: 'outline' });
   const start = el('button', { id: 'track', className: 'main', onclick: () => app.doing(() => call('track',
-    { refine: refine.checked, outline: outline.checked })) });
+    { refine: refine.checked, snap: snap.checked, outline: outline.checked })) });
   const goLive = el('button', { id: 'go-live', className: 'main', onclick: () => app.doing(() => call('go_live',
-    { outline: outline.checked })) }, 'Go live');
+    { snap: snap.checked, outline: outline.checked })) }, 'Go live');
   const liveParts = el('div');
   const result = el('div', { id: 'track-result' });
+  const byScan = app.state.choices.start === 'scan';
+  if (byScan) refine.checked = false;
   app.panel.append(
-    check('Refine the start over the whole video, and track once more', refine),
-    el('p', { className: 'note' }, 'Takes twice as long. The start is then not taken as undeformed.'),
+    ...(byScan ? [el('p', { className: 'note' }, 'The object starts from its place in the scan, and stays in the map.')] : [
+      check('Refine the start over the whole video, and track once more', refine),
+      el('p', { className: 'note' }, 'Takes twice as long. The start is then not taken as undeformed.'),
+      check('Snap the start to the outline', snap),
+      el('p', { className: 'note' }, 'Corrects the clicks by the edges that their image shows, where the part has those of its mesh.')]),
     check('Use the outline too', outline),
     el('p', { className: 'note' }, 'Where the object stands out from the background.'),
     start, command('morph track … --frame-log track.jsonl -o run'), liveParts, result,
@@ -66,7 +72,7 @@ export async function trackStep(app) {
   const shown = new RunPicture(picture, mesh, colours);
   const live = liveView(app, picture, () => drawJob(app.state.job));
   liveParts.append(el('h3', {}, 'Live'), ...live.parts, goLive,
-    command('morph live … --reference-image live/000000.png --frame-log track.jsonl -o run'));
+    command(`morph live … ${byScan ? '' : '--reference-image live/000000.png '}--frame-log track.jsonl -o run`));
   live.isCovered = () => !showsLive();
   const plot = makePlots(plots, model);
 

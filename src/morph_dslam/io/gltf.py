@@ -1,0 +1,241 @@
+"""States of a model as an animation in binary glTF 2.0 (Khronos specification, sections 3.7.2, 3.11 and 4).
+
+With colours, each state is a mesh with colours at its vertices, and the animation shows one after the other by the
+scale of their nodes: zero hides a mesh (section 3.11, note on visibility). glTF can also change colours by morph
+targets, but viewers need not heed them, and most do not. Without colours, modes are morph targets, and functions their
+weights.
+
+Normals are left out: a viewer then uses those of the triangles.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from morph_dslam._version import __version__
+from morph_dslam.errors import ExportError
+from morph_dslam.model import ReducedModel
+from morph_dslam.model.reduced_model import equivalent_strain, von_mises
+
+Array = NDArray[np.float64]
+Colours = Literal["stress", "strain", "displacement", "none"]
+
+FRAMES_PER_SECOND = 12.0
+#: Colours from 0 to this percentile of all values that are written: stress has narrow peaks.
+PERCENTILE = 99.5
+COLOUR_MAP = "turbo"
+_LABELS = {
+    "stress": ("von Mises stress", "MPa"), "strain": ("equivalent strain", "%"), "displacement": ("displacement", "mm"),
+}  # fmt: skip
+#: Bytes of a vertex in one state: three floats, and a colour of four 16-bit numbers.
+_VERTEX_BYTES = 20
+#: Lengths in the file are unsigned 32-bit numbers; the rest is left for what is no vertex.
+_MOST_BYTES = 2**32 - 2**28
+_NUMBERS = {"f": (5126, "<f4"), "u": (5125, "<u4"), "i": (5125, "<u4")}
+_COLOUR_NUMBERS = (5123, "<u2")
+_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_VERTICES, _INDICES = 34962, 34963
+#: glTF's y points up and its z to the viewer; this turn makes our z point up, and Blender turns it back.
+_Z_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
+
+
+class _Buffer:
+    """Arrays behind one another, each a multiple of four bytes long, with the accessors that describe them."""
+
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+        self.length = 0
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+
+    def add(self, array: NDArray, target: int | None = None) -> int:
+        """Append floats, indices, or 16-bit colours, (n,) or (n, c); returns the number of its accessor."""
+        is_colour = array.dtype == np.uint16
+        number, stored = _COLOUR_NUMBERS if is_colour else _NUMBERS[array.dtype.kind]
+        data = np.ascontiguousarray(array, dtype=stored)
+        view: dict[str, Any] = {"buffer": 0, "byteOffset": self.length, "byteLength": data.nbytes}
+        if target is not None:
+            view["target"] = target
+        low, high = (np.atleast_1d(part).tolist() for part in (data.min(axis=0), data.max(axis=0)))
+        accessor = {
+            "bufferView": len(self.views),
+            "componentType": number,
+            "count": len(data),
+            "type": _TYPES[data[0].size],
+            "min": low,
+            "max": high,
+        }
+        if is_colour:
+            accessor["normalized"] = True
+        self.parts.append(data.tobytes())
+        self.length += data.nbytes
+        self.views.append(view)
+        self.accessors.append(accessor)
+        return len(self.accessors) - 1
+
+
+def write_glb(path: Path, model: ReducedModel, states: Array, show: Colours | None = None) -> None:
+    """Write the surface of ``model`` along ``states`` (s, d); metres, z up in the object frame.
+
+    Parameters
+    ----------
+    path : of the file.
+    model : of the object.
+    states : (s, d) SI.
+    show : what colours it; by default the stress of a model that has it, else the displacement.
+
+    Raises
+    ------
+    ExportError
+        If the model does not hold what is to be shown, or the file would be larger than glTF allows.
+    """
+    buffer = _Buffer()
+    shown = _shown(model, show)
+    content = _modes(buffer, model, states) if shown == "none" else _coloured(buffer, model, states, shown)
+    document = {
+        "asset": {"version": "2.0", "generator": f"morph-dslam {__version__}"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        **content,
+        "buffers": [{"byteLength": buffer.length}],
+        "bufferViews": buffer.views,
+        "accessors": buffer.accessors,
+    }
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    with path.open("wb") as file:
+        file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + buffer.length))
+        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+        file.write(struct.pack("<I4s", buffer.length, b"BIN\0"))
+        file.writelines(buffer.parts)
+
+
+def _shown(model: ReducedModel, show: Colours | None) -> Colours:
+    has = {"stress": bool(model.stresses), "strain": model.strain is not None, "displacement": True, "none": True}
+    if show is None:
+        return "stress" if has["stress"] else "displacement"
+    if not has.get(show, False):
+        held = ", ".join(name for name, held in has.items() if held)
+        raise ExportError(f"the model '{model.name}' holds no {show} to show (--show); it has: {held}")
+    return show
+
+
+def _material(colour: list[float]) -> dict[str, Any]:
+    look = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 0.7}
+    return {"name": "surface", "pbrMetallicRoughness": look, "doubleSided": True}
+
+
+def _modes(buffer: _Buffer, model: ReducedModel, states: Array) -> dict[str, Any]:
+    """The grey surface at rest, its modes as morph targets, and their weights."""
+    nodes, triangles = np.unique(model.triangles, return_inverse=True)
+    weights = np.array([model.displacement.functions.evaluate(mu)[0] for mu in states])
+    primitive = {
+        "attributes": {"POSITION": buffer.add(model.nodes[nodes], _VERTICES)},
+        "indices": buffer.add(triangles.ravel(), _INDICES),
+        "material": 0,
+        "targets": [{"POSITION": buffer.add(mode[nodes], _VERTICES)} for mode in model.displacement.modes],
+    }
+    mesh = {
+        "name": model.name,
+        "primitives": [primitive],
+        "weights": weights[0].astype(np.float32).tolist(),
+        "extras": {"targetNames": [f"mode {i + 1}" for i in range(model.displacement.n_modes)]},
+    }
+    content: dict[str, Any] = {
+        "nodes": [{"name": model.name, "mesh": 0, "rotation": _Z_UP}],
+        "meshes": [mesh],
+        "materials": [_material([0.62, 0.68, 0.74, 1.0])],
+    }
+    if len(states) > 1:
+        times = np.arange(len(weights)) / FRAMES_PER_SECOND
+        sampler = {"input": buffer.add(times), "output": buffer.add(weights.ravel()), "interpolation": "LINEAR"}
+        channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
+        content["animations"] = [{"name": "parameters", "samplers": [sampler], "channels": [channel]}]
+    return content
+
+
+def _coloured(buffer: _Buffer, model: ReducedModel, states: Array, show: Colours) -> dict[str, Any]:
+    """A mesh a state, all but the first one hidden, and the animation that shows them in turn."""
+    used, corners = np.unique(model.triangles, return_inverse=True)
+    size = _VERTEX_BYTES * len(used) * len(states)
+    if size > _MOST_BYTES:
+        raise ExportError(
+            f"{len(states)} states of {len(used)} coloured points take {size / 2**30:.1f} GB, and a glTF file has "
+            "4 GB at most: choose fewer states, or --show none, which writes the modes"
+        )
+    surface = _Surface(model, used, show)
+    values = np.array([surface.values(mu) for mu in tqdm(states, desc="states", unit="state")], dtype=np.float32)
+    top = float(np.percentile(values, PERCENTILE)) or 1.0
+    # Positions are relative to the middle, and nodes stand there, so that hidden ones do not widen what is framed.
+    nodes: list[dict[str, Any]] = [{"name": model.name, "rotation": _Z_UP, "children": []}]
+    middle, indices, meshes = surface.rest.mean(axis=0), buffer.add(corners.ravel(), _INDICES), []
+    for i, mu in enumerate(states):
+        attributes = {
+            "POSITION": buffer.add(surface.positions(mu) - middle, _VERTICES),
+            "COLOR_0": buffer.add(_linear_colours(values[i] / top), _VERTICES),
+        }
+        primitive = {"attributes": attributes, "indices": indices, "material": 0}
+        meshes.append({"name": f"state {i}", "primitives": [primitive]})
+        scale = {} if i == 0 else {"scale": [0.0, 0.0, 0.0]}
+        nodes.append({"name": f"state {i}", "mesh": i, "translation": middle.tolist(), **scale})
+        nodes[0]["children"].append(i + 1)
+    label, unit = _LABELS[show]
+    nodes[0]["extras"] = {"colours": {"field": label, "unit": unit, "range": [0.0, top], "colour_map": COLOUR_MAP}}
+    content: dict[str, Any] = {"nodes": nodes, "meshes": meshes, "materials": [_material([1.0] * 4)]}
+    if len(states) > 1:
+        content["animations"] = [_turns(buffer, len(states))]
+    return content
+
+
+def _turns(buffer: _Buffer, count: int) -> dict[str, Any]:
+    """Each node (1, 2, ...) is shown for the time of one state, and has no size before and after."""
+    samplers, channels = [], []
+    for i in range(count):
+        sizes = {0.0: 0.0, i / FRAMES_PER_SECOND: 1.0, (i + 1) / FRAMES_PER_SECOND: float(i == count - 1)}
+        times, shown = np.array(list(sizes)), np.array(list(sizes.values()))
+        output = buffer.add(np.repeat(shown[:, None], 3, axis=1))
+        samplers.append({"input": buffer.add(times), "output": output, "interpolation": "STEP"})
+        channels.append({"sampler": i, "target": {"node": i + 1, "path": "scale"}})
+    return {"name": "states", "samplers": samplers, "channels": channels}
+
+
+class _Surface:
+    """The surface's nodes and what colours them, evaluated there alone."""
+
+    def __init__(self, model: ReducedModel, used: NDArray[np.int64], show: Colours) -> None:
+        def at_nodes(field: Any) -> Any:
+            return field.restrict(used[:, None], np.ones((len(used), 1)))
+
+        self.rest, self._show = model.nodes[used], show
+        self._displacement = at_nodes(model.displacement)
+        self._stresses = [at_nodes(field) for field in model.stresses.values()] if show == "stress" else []
+        self._strain = at_nodes(model.strain) if show == "strain" else None
+
+    def positions(self, mu: Array) -> Array:
+        """Deformed nodes (n, 3), metres."""
+        return self.rest + self._displacement.value(mu)
+
+    def values(self, mu: Array) -> Array:
+        """What colours the nodes (n,), in the unit of its label; for sheets the larger one of both faces."""
+        if self._show == "stress":
+            return 1e-6 * np.max([von_mises(field.value(mu)) for field in self._stresses], axis=0)
+        if self._strain is not None:
+            return 100.0 * equivalent_strain(self._strain.value(mu))
+        return 1e3 * np.linalg.norm(self._displacement.value(mu), axis=1)
+
+
+def _linear_colours(shares: Array) -> NDArray[np.uint16]:
+    """Colours (n, 4) of shares (n,) of the range; glTF's are linear, those of colour maps sRGB (IEC 61966-2-1)."""
+    import matplotlib  # it takes long to load, and not all who import this draw
+
+    srgb = matplotlib.colormaps[COLOUR_MAP](np.clip(shares, 0.0, 1.0))
+    rgb = srgb[:, :3]
+    srgb[:, :3] = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    return np.round(65535 * srgb).astype(np.uint16)

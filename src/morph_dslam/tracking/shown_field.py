@@ -1,0 +1,140 @@
+"""The field that colours an object in pictures and streams: stress, strain, displacement, or the traction of loads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import TrackingError
+from morph_dslam.model import ReducedModel, SeparatedField
+from morph_dslam.model.reduced_model import MaterialPoints, equivalent_strain, von_mises
+
+Array = NDArray[np.float64]
+Shown = Literal["stress", "strain", "displacement", "traction"]
+#: Colours end at this percentile of the field: stress has narrow peaks.
+PERCENTILE = 99.5
+#: States of the parameter box from which the range of colours is taken (a power of two).
+SAMPLES = 32
+
+
+@dataclass(frozen=True)
+class ShownKind:
+    """How a field is called.
+
+    Attributes
+    ----------
+    name : for people.
+    unit : in which people read it.
+    si_unit : "%" is a ratio, "1".
+    si_factor : a value in SI is that in ``unit`` times this.
+    """
+
+    name: str
+    unit: str
+    si_unit: str
+    si_factor: float
+
+
+SHOWN: dict[Shown, ShownKind] = {
+    "stress": ShownKind("von Mises stress", "MPa", "Pa", 1e6),
+    "strain": ShownKind("equivalent strain", "%", "1", 1e-2),
+    "displacement": ShownKind("displacement", "mm", "m", 1e-3),
+    "traction": ShownKind("traction of unknown loads", "kPa", "Pa", 1e3),
+}
+
+
+class ShownField:
+    """A field at points of a model, and their displacement, in single precision: as exact as the model file.
+
+    Parameters
+    ----------
+    model : that holds the field.
+    points : where.
+    show : the field.
+    """
+
+    def __init__(self, model: ReducedModel, points: MaterialPoints, show: Shown) -> None:
+        self._model, self._points, self._show = model, points, show
+        self._displacement = self._restricted("displacement")
+        self._fields = {name: self._restricted(name) for name in _fields_of(model, show)}
+
+    def _restricted(self, name: str) -> SeparatedField:
+        field = self._model.restrict(self._points, name)
+        return field.with_modes(field.modes.astype(np.float32))  # type: ignore[arg-type]
+
+    @property
+    def has_sides(self) -> bool:
+        """Whether the field has a value on either face of a sheet."""
+        return "stress_top" in self._fields
+
+    def displacement(self, parameters: Array) -> Array:
+        """(n, 3), metres."""
+        return self._displacement.value(parameters)
+
+    def values(self, parameters: Array, displacement: Array, side: Literal["top", "bottom"] | None = None) -> Array:
+        """The field (n,) in the unit of its `ShownKind`; NaN for a rigid object.
+
+        Parameters
+        ----------
+        parameters : (d,), SI.
+        displacement : (n, 3) of the points, metres.
+        side : of a sheet; by default the larger stress of both.
+        """
+        if not self._model.parameters:
+            return np.full(len(displacement), np.nan)
+        if self._show == "displacement":
+            return 1e3 * np.linalg.norm(displacement, axis=1)
+        if self._show == "strain":
+            return 100.0 * equivalent_strain(self._fields["strain"].value(parameters))
+        if self._show == "traction":
+            return 1e-3 * np.linalg.norm(self._fields["traction"].value(parameters), axis=1)
+        names = list(self._fields) if side is None else [f"stress_{side}"]
+        return 1e-6 * np.max([von_mises(self._fields[name].value(parameters)) for name in names], axis=0)
+
+    def range_of(self, fields: Sequence[Array]) -> tuple[float, float]:
+        """One range of colours for values (n,) of several states; from 0 to 1 for a rigid object."""
+        if not self._model.parameters:
+            return 0.0, 1.0
+        return 0.0, max(float(np.percentile(np.stack(fields), PERCENTILE)), 1e-6)
+
+    def range_of_box(self) -> tuple[float, float]:
+        """One range of colours for all states of the parameter box, known before any is seen."""
+        model = self._model
+        shapes = model.spread_parameters(SAMPLES)
+        if self._show == "traction" and model.energy is not None:
+            shapes[:, -model.n_loads :] = np.sqrt(model.energy.work)
+        return self.range_of([self.values(mu, self.displacement(mu)) for mu in shapes])
+
+
+def surface_points(model: ReducedModel) -> tuple[MaterialPoints, NDArray[np.int64]]:
+    """The nodes of a model's surface, each as its first corner, and the triangles (m, 3) in them."""
+    used, corners = np.unique(model.triangles, return_inverse=True)
+    pairs, weights = np.column_stack([used, used]), np.tile([1.0, 0.0], (len(used), 1))
+    return MaterialPoints(pairs, weights), corners.reshape(-1, 3)
+
+
+def shown_field(model: ReducedModel, show: Shown | None) -> Shown:
+    """What colours an object, by default the stress of a model that has it; raises TrackingError if it has it not."""
+    has = {
+        "stress": bool(model.stresses),
+        "strain": model.strain is not None,
+        "displacement": True,
+        "traction": model.energy is not None,
+    }
+    if show is None:
+        return "stress" if has["stress"] else "displacement"
+    if not has[show]:
+        held = ", ".join(name for name, held in has.items() if held)
+        raise TrackingError(f"the model '{model.name}' holds no {show} to show; it has: {held}")
+    return show
+
+
+def _fields_of(model: ReducedModel, show: Shown) -> list[str]:
+    """Names of the fields that are shown, as in `ReducedModel.fields`."""
+    if show == "stress":
+        return [f"stress_{place}" for place in model.stresses]
+    return [show] if show in ("strain", "traction") else []

@@ -1,0 +1,84 @@
+"""Landmarks corrected by the outline in their frame, on rendered images of known states."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morph_dslam.io.landmarks import Landmarks
+from morph_dslam.registration.landmarks import register_landmarks
+from morph_dslam.registration.messages import OutlineContradicts, OutlineUnseen
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.rendered_sequence import CAMERA, SheetFilm, colours, mean_error, sheet_state
+
+MODEL = bent_sheet_model(22, 16)
+CLICKS = 12
+
+
+def clicked(state, seed, sigma_px=1.5, model=MODEL):
+    """Landmarks on nodes of the sheet, as a hand sets them."""
+    rng = np.random.default_rng(seed)
+    nodes = rng.choice(len(model.nodes), CLICKS, replace=False)
+    pixels = CAMERA.project(state.camera_from_object.apply(model.positions(state.parameters)))[nodes]
+    return Landmarks(model.nodes[nodes], pixels + sigma_px * rng.standard_normal((CLICKS, 2)))
+
+
+def pose_and_parameter_errors(found, truth):
+    """Errors of the parameters and the translation in their stated standard deviations."""
+    away = [
+        found.state.parameters - truth.parameters,
+        found.state.camera_from_object.translation - truth.camera_from_object.translation,
+    ]
+    std = np.sqrt(np.diag(found.covariance))
+    return np.concatenate(away) / np.concatenate([std[: len(away[0])], std[-3:]])
+
+
+def test_the_outline_takes_out_most_of_what_clicks_are_off_by():
+    before, after, in_deviations = [], [], []
+    for seed in range(8):
+        truth = sheet_state(0.12 * seed)
+        image, landmarks = SheetFilm(MODEL, seed=seed).frame(truth), clicked(truth, seed)
+        alone = register_landmarks(MODEL, CAMERA, landmarks)
+        snapped = register_landmarks(MODEL, CAMERA, landmarks, image=image)
+        assert snapped.facts["corrected_by_outline"]
+        before.append(1e3 * mean_error(MODEL, alone.state, truth))
+        after.append(1e3 * mean_error(MODEL, snapped.state, truth))
+        in_deviations.append(pose_and_parameter_errors(snapped, truth))
+    assert np.mean(before) > 3.0
+    assert np.mean(after) < 0.2 * np.mean(before)
+    assert 0.5 < np.sqrt(np.mean(np.square(in_deviations))) < 1.6
+
+
+def with_margin(margin):
+    """The sheet with a margin all around that its mesh does not have."""
+    sides = np.abs(MODEL.nodes) > [0.2099, 0.1484, 1.0]
+    return replace(MODEL, nodes=MODEL.nodes + margin * sides * np.sign(MODEL.nodes))
+
+
+@pytest.mark.parametrize(("seed", "why"), [(0, OutlineUnseen), (1, OutlineUnseen), (2, OutlineContradicts)])
+def test_a_sheet_that_is_larger_than_its_mesh_is_left_to_the_landmarks(seed, why):
+    truth = sheet_state(0.3)
+    image, landmarks = SheetFilm(with_margin(0.006)).frame(truth), clicked(truth, seed, sigma_px=0.5)
+    alone = register_landmarks(MODEL, CAMERA, landmarks)
+    found = register_landmarks(MODEL, CAMERA, landmarks, image=image)
+    assert why in [type(warning) for warning in found.warnings]
+    np.testing.assert_array_equal(found.state.parameters, alone.state.parameters)
+
+
+@pytest.mark.parametrize("grey", [0.0, 130.0])
+def test_an_image_without_the_object_corrects_nothing(grey):
+    truth = sheet_state(0.3)
+    image = colours(np.full((CAMERA.height, CAMERA.width), grey))
+    found = register_landmarks(MODEL, CAMERA, clicked(truth, 2), image=image)
+    assert OutlineUnseen in [type(warning) for warning in found.warnings]
+    assert mean_error(MODEL, found.state, register_landmarks(MODEL, CAMERA, clicked(truth, 2)).state) == 0.0
+
+
+def test_an_undeformed_object_stays_so():
+    truth = replace(sheet_state(0.4), parameters=MODEL.default)
+    image, landmarks = SheetFilm(MODEL).frame(truth), clicked(truth, 3)
+    alone = register_landmarks(MODEL, CAMERA, landmarks, at_rest=True)
+    found = register_landmarks(MODEL, CAMERA, landmarks, at_rest=True, image=image)
+    np.testing.assert_array_equal(found.state.parameters, MODEL.default)
+    np.testing.assert_array_equal(found.covariance[: len(MODEL.default)], 0.0)
+    assert mean_error(MODEL, found.state, truth) < 0.3 * mean_error(MODEL, alone.state, truth)

@@ -1,0 +1,273 @@
+"""Streams by WebSocket: what comes over the wire, late and slow clients, and who is not let in."""
+
+import http.client
+import time
+from concurrent.futures import ThreadPoolExecutor
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosedError, InvalidStatus
+from websockets.sync.client import connect
+
+from morph_dslam.errors import StreamError
+from morph_dslam.extend.streams import StreamedObject, StreamSink
+from morph_dslam.streams.websocket import WebSocketPublisher
+from tests.support.rendered_sequence import CAMERA
+from tests.support.streamed import (
+    DEVIATIONS,
+    POSE,
+    held_block_model,
+    lost_result,
+    stream_example,
+    stress_at,
+    tracked_frame,
+    tracked_result,
+    vertices_at,
+)
+from tests.support.stretched_block import SIZE
+
+client = stream_example("client")
+#: Of a client that takes messages of any size and reads one ahead.
+PLAIN = {"max_size": None, "compression": None, "max_queue": 1}
+STATES = [(0.1, 0.002), (-0.05, 0.004), (0.15, -0.006)]
+
+
+@pytest.fixture
+def model():
+    return held_block_model()
+
+
+@pytest.fixture
+def publisher():
+    publisher = WebSocketPublisher()
+    yield publisher
+    publisher.close()
+
+
+@pytest.fixture
+def sink(publisher, model):
+    return StreamSink([publisher]).begin({"block": StreamedObject(model, modulus_std=0.1)}, CAMERA)
+
+
+def wait_until(condition):
+    end = time.monotonic() + 20.0
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def taking(publisher):
+    """A client that is connected and has the scene."""
+    received = client.messages(publisher.place)
+    assert next(received)["type"] == "scene"
+    wait_until(lambda: publisher.is_watched)
+    return received
+
+
+def test_the_scene_says_what_will_be_tracked(publisher, sink, model):
+    scene = next(client.messages(publisher.place))
+    assert (scene["protocol"], scene["version"], scene["type"]) == ("morph-stream", 1, "scene")
+    assert scene["camera"] == {"width": 640, "height": 480, "fx": 528.0, "fy": 528.0, "cx": 320.0, "cy": 240.0}
+    (block,) = scene["objects"]
+    assert (block["name"], block["model"], block["supports"]) == ("block", "stretched block", ["left end"])
+    stretch, slide = block["parameters"]
+    assert (stretch["name"], stretch["unit"], stretch["shown_unit"]) == ("stretch", "1", "1")
+    assert (slide["unit"], slide["shown_unit"], slide["shown_factor"]) == ("m", "mm", 1e-3)
+    assert (slide["lower"], slide["upper"]) == (-0.01, 0.01)
+    scalar = block["scalar"]
+    assert (scalar["name"], scalar["unit"], scalar["shown_unit"]) == ("von Mises stress", "Pa", "MPa")
+    # No state of the box has more than its corner.
+    assert 0.5 * stress_at(0.2, 0.01) < scalar["high"] <= stress_at(0.2, 0.01)
+    arrays = scene["arrays"]
+    nodes = arrays["block/nodes"]
+    np.testing.assert_allclose(arrays["block/rest"].reshape(-1, 3), model.nodes[nodes], atol=1e-9)
+    corners = arrays["block/rest"].reshape(-1, 3)[arrays["block/triangles"].reshape(-1, 3)].astype(float)
+    # Outward triangles enclose the block's volume.
+    volume = np.einsum("ti,ti->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
+    assert volume == pytest.approx(np.prod(SIZE), rel=1e-6)
+
+
+def test_a_frame_has_the_values_of_the_closed_form(publisher, sink, model):
+    received = taking(publisher)
+    for number, (stretch, slide) in enumerate(STATES):
+        sink(tracked_frame(10 + number, 0.1 * number, block=tracked_result(model, stretch, slide)))
+        message = next(received)
+        assert (message["type"], message["number"], message["frame"]) == ("frame", number, 10 + number)
+        assert message["timestamp"] == pytest.approx(0.1 * number)
+        assert message["captured"] is None
+        (block,) = message["objects"]
+        assert (block["name"], block["status"]) == ("block", "tracked")
+        assert block["parameters"] == pytest.approx([stretch, slide])
+        assert block["parameter_std"] == pytest.approx(DEVIATIONS[:2])
+        np.testing.assert_allclose(block["camera_from_object"], POSE.matrix)
+        assert block["pose_std"] == pytest.approx(DEVIATIONS[2:])
+        vertices = message["arrays"]["block/vertices"].reshape(-1, 3)
+        np.testing.assert_allclose(vertices, vertices_at(model, stretch, slide), atol=1e-8)
+        np.testing.assert_allclose(message["arrays"]["block/scalar"], stress_at(stretch, slide), rtol=1e-5)
+        held = block["reactions"]["left end"]
+        # The left end, x = 0, slides by half of what the top does in the mean.
+        assert held["point"] == pytest.approx([slide / 2, SIZE[1] / 2, SIZE[2] / 2])
+        assert held["force"] == pytest.approx([-400.0 * stretch, 0.0, 5000.0 * slide])
+        along = np.array(held["force"]) / np.linalg.norm(held["force"])
+        size_std = np.hypot(np.linalg.norm(along * [4.0, 0.0, 2.5]), 0.1 * np.linalg.norm(held["force"]))
+        assert held["force_size_std"] == pytest.approx(size_std)
+        # Of the parameters, and of a tenth of the force itself.
+        of_parameters = np.array([400.0, 0.0, 5000.0]) * DEVIATIONS[[0, 0, 1]]
+        assert held["force_std"] == pytest.approx(np.hypot(of_parameters, 0.1 * np.array(held["force"])))
+
+
+def test_an_object_that_is_lost_has_a_reason_and_no_shape(publisher, sink, model):
+    received = taking(publisher)
+    sink(tracked_frame(3, 0.0, block=lost_result(model)))
+    message = next(received)
+    (block,) = message["objects"]
+    assert block["status"] == "lost"
+    assert "4 of 300 points" in block["text"]
+    assert block["camera_from_object"] is None
+    assert block["parameters"] == block["parameter_std"] == [None, None]
+    assert block["reactions"] == message["arrays"] == {}
+
+
+def test_several_objects_by_their_names(publisher, model):
+    shown = {"run": StreamedObject(model, "seal", "displacement"), "run/lid": StreamedObject(model, "lid", "strain")}
+    sink = StreamSink([publisher]).begin(shown, CAMERA)
+    received = client.messages(publisher.place)
+    assert [(part["name"], part["scalar"]["unit"]) for part in next(received)["objects"]] == [
+        ("seal", "m"),
+        ("lid", "1"),
+    ]
+    sink(tracked_frame(0, 0.0, **{"run": tracked_result(model, 0.1, 0.0), "run/lid": tracked_result(model, 0.0, 0.01)}))
+    arrays = next(received)["arrays"]
+    np.testing.assert_allclose(arrays["seal/scalar"], 0.1 * model.nodes[:, 0], atol=1e-8)
+    # Simple shear by 1/4 has a Green-Lagrange shear of 1/8, of which the model holds the linear part.
+    np.testing.assert_allclose(arrays["lid/scalar"], np.sqrt(4.0 / 3.0) * 0.125, rtol=1e-5)
+
+
+def test_a_late_client_gets_the_mesh_and_then_the_newest_frame(publisher, sink, model):
+    first = taking(publisher)
+    for number, (stretch, slide) in enumerate(STATES):
+        sink(tracked_frame(number, 0.0, block=tracked_result(model, stretch, slide)))
+        assert next(first)["frame"] == number
+    late = client.messages(publisher.place)
+    assert [next(late)["type"], next(late)["frame"]] == ["scene", 2]
+
+
+def test_nobody_waits_for_a_slow_client_who_misses_frames_and_gets_the_newest(publisher, sink, model):
+    received, n_sent = taking(publisher), 3000
+    with connect(stream_address(publisher), **PLAIN) as slow, ThreadPoolExecutor(2) as pool:
+        quick = pool.submit(lambda: [message["number"] for message in received])
+        # The slow one reads nothing until all frames are sent.
+        for number in range(n_sent):
+            sink(tracked_frame(number, 0.0, block=tracked_result(model, 0.1 * number / n_sent, 0.0)))
+        behind = pool.submit(lambda: [client.unpack(data) for data in slow])
+        publisher.close()
+        assert quick.result(20)[-1] == n_sent - 1
+        late = behind.result(20)
+    assert [late[0]["type"], late[-1]["type"]] == ["scene", "end"]
+    numbers = [message["number"] for message in late[1:-1]]
+    assert numbers == sorted(set(numbers))
+    assert len(numbers) < n_sent
+    assert numbers[-1] == n_sent - 1
+
+
+def test_a_client_that_takes_nothing_does_not_keep_the_stream_from_its_end(publisher, sink, model):
+    with connect(stream_address(publisher), **PLAIN) as stuck:
+        wait_until(lambda: publisher.is_watched)
+        for number in range(3000):
+            sink(tracked_frame(number, 0.0, block=tracked_result(model, 0.0, 0.0)))
+        publisher.close()
+        assert not publisher.is_watched
+        with pytest.raises(ConnectionClosedError):
+            list(stuck)
+
+
+def stream_address(publisher, token=None):
+    return f"ws://127.0.0.1:{publisher.port}/stream?token={publisher.token if token is None else token}"
+
+
+@pytest.mark.parametrize(
+    ("token", "headers", "status"),
+    [
+        ("wrong", {}, 401),
+        ("", {}, 401),
+        (None, {"Origin": "http://example.org"}, 403),
+        (None, {"Origin": "null"}, 403),
+        (None, {"Host": "example.org"}, 403),
+        (None, {"Host": "10.0.0.1"}, 403),
+    ],
+)
+def test_strangers_are_refused(publisher, token, headers, status):
+    """By a wrong token, from a page elsewhere, or by a name that another site could take for its own."""
+    answer, _, _ = ask(publisher, "/stream?token=" + (publisher.token if token is None else token), **headers)
+    assert answer == status
+    if "Host" not in headers:
+        with (
+            pytest.raises(InvalidStatus) as refused,
+            connect(stream_address(publisher, token), additional_headers=headers),
+        ):
+            pass
+        assert refused.value.response.status_code == status
+    assert not publisher.is_watched
+
+
+def ask(publisher, path, **headers):
+    """Status, headers and content of an answer."""
+    connection = http.client.HTTPConnection("127.0.0.1", publisher.port, timeout=20)
+    try:
+        connection.request("GET", path, headers=headers)
+        answer = connection.getresponse()
+        return answer.status, dict(answer.getheaders()), answer.read()
+    finally:
+        connection.close()
+
+
+def test_the_page_exchanges_the_token_for_a_cookie(publisher):
+    assert ask(publisher, "/")[0] == 401
+    status, headers, _ = ask(publisher, f"/?{urlsplit(publisher.place).query}")
+    assert (status, headers["Location"]) == (303, "/")
+    cookie = headers["Set-Cookie"].partition(";")[0]
+    assert {"HttpOnly", "SameSite=Strict"} <= set(headers["Set-Cookie"].split("; "))
+    status, headers, content = ask(publisher, "/", Cookie=cookie)
+    assert status == 200
+    assert b"stream.js" in content
+    assert "default-src 'self'" in headers["Content-Security-Policy"]
+    assert ask(publisher, "/three/three.module.min.js", Cookie=cookie)[0] == 200
+    assert ask(publisher, "/../messages.py", Cookie=cookie)[0] == 404
+    assert ask(publisher, "/", Cookie=cookie.partition("=")[0] + "=wrong")[0] == 401
+    assert ask(publisher, "/", Cookie=cookie, Host="example.org")[0] == 403
+    own = f"http://127.0.0.1:{publisher.port}"
+    with connect(f"ws://127.0.0.1:{publisher.port}/stream", origin=own, additional_headers={"Cookie": cookie}):
+        wait_until(lambda: publisher.is_watched)
+
+
+def test_a_token_may_be_kept_from_run_to_run(monkeypatch):
+    monkeypatch.setenv("MORPH_STREAM_TOKEN", "kept-from-run-to-run")
+    with StreamSink(["ws:0"]) as streams:
+        assert streams.publishers[0].place.endswith("/?token=kept-from-run-to-run")
+    monkeypatch.setenv("MORPH_STREAM_TOKEN", "short")
+    with pytest.raises(StreamError, match="16 or more"):
+        StreamSink(["ws:0"])
+
+
+def test_frames_before_the_scene_are_refused(publisher, model):
+    with pytest.raises(StreamError, match="begin"):
+        StreamSink([publisher])(tracked_frame(0, 0.0, block=tracked_result(model, 0.1, 0.0)))
+
+
+def test_a_port_that_is_taken(publisher):
+    with pytest.raises(StreamError, match="ws:0 takes any free one"):
+        StreamSink([f"ws:{publisher.port}"])
+
+
+@pytest.mark.parametrize(
+    "destination", ["carrier", "ws:", "ws:x", "ws:99999", "ws:127.0.0.1:", "ws:a b:80", "", ":80", "WS:80"]
+)
+def test_destinations_that_are_none(destination, refused, tmp_path):
+    with pytest.raises(StreamError):
+        StreamSink([destination])
+    message = refused(
+        "track", tmp_path, "--model", "a", "--camera", "b", "--landmarks", "c", "-o", tmp_path / "run",
+        "--stream", destination,
+    )  # fmt: skip
+    assert "ws" in message

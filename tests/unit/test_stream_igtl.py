@@ -1,0 +1,110 @@
+"""The sample for OpenIGTLink: bytes as pyigtl writes them, what arrives over loopback, and attributes by the format."""
+
+import socket
+import struct
+import threading
+import time
+
+import crcmod
+import numpy as np
+import pyigtl
+import pytest
+from pyigtl import messages as igtl
+
+from morph_dslam.extend.streams import StreamSink
+from morph_dslam.streams.websocket import WebSocketPublisher
+from tests.support.rendered_sequence import CAMERA
+from tests.support.streamed import (
+    POSE,
+    held_block_model,
+    stream_example,
+    stress_at,
+    tracked_frame,
+    tracked_result,
+    vertices_at,
+)
+
+sample = stream_example("openigtlink")
+POINTS = np.array([[0.0, 1.0, 2.5], [3.0, -4.0, 5.0], [6.0, 7.0, 8.0], [-1.5, 0.0, 0.25]])
+TRIANGLES = np.array([[0, 1, 2], [2, 1, 3]])
+
+
+def test_the_check_sum_is_that_of_ecma_182():
+    # The value that catalogues of check sums give for these digits.
+    assert sample.crc64(b"123456789") == 0x6C40DF5F0B497347
+    data = np.random.default_rng(0).bytes(1000)
+    other = crcmod.mkCrcFun(0x142F0E1EBA9EA3693, rev=False, initCrc=0, xorOut=0)
+    assert sample.crc64(data) == other(data)
+
+
+def test_messages_are_byte_for_byte_those_of_another_library():
+    seconds = 1234.5
+    transform = igtl.TransformMessage(POSE.matrix, timestamp=seconds, device_name="seal_pose").pack()
+    assert sample.packed("TRANSFORM", "seal_pose", sample.transform_body(POSE.matrix), seconds) == transform
+    polygons = np.column_stack([[3, 3], TRIANGLES]).ravel()
+    surface = igtl.PolyDataMessage(points=POINTS, polygons=polygons, timestamp=seconds, device_name="seal").pack()
+    assert sample.packed("POLYDATA", "seal", sample.polydata_body(POINTS, TRIANGLES), seconds) == surface
+
+
+class PolyData(igtl.MessageBase):
+    """POLYDATA read by the published format; the library's own reader does not work yet."""
+
+    def _unpack_content(self, content):
+        n_points, *counts, n_attributes = struct.unpack_from(">10I", content)
+        n_vertices, _, n_lines, _, n_polygons, polygon_bytes, n_strips, _ = counts
+        assert (n_vertices, n_lines, n_strips, n_attributes) == (0, 0, 0, 1)
+        place = 40
+        self.points = np.frombuffer(content, ">f4", 3 * n_points, place).reshape(-1, 3)
+        place += 12 * n_points
+        self.polygons = np.frombuffer(content, ">u4", polygon_bytes // 4, place).reshape(n_polygons, -1)
+        place += polygon_bytes
+        kind, components, n_values = struct.unpack_from(">BBI", content, place)
+        assert (kind, components, n_values) == (0, 1, n_points)
+        end = content.index(b"\0", place + 6)
+        self.name = content[place + 6 : end].decode()
+        # Names are filled up to an even number of bytes, with the zero at their ends.
+        place = end + 1 + (len(self.name) + 1) % 2
+        self.values = np.frombuffer(content, ">f4", n_values, place)
+        assert place + 4 * n_values == len(content)
+
+
+@pytest.mark.parametrize("name", ["stress", "strain2"])
+def test_values_at_the_points(name):
+    values = np.array([1.0, 2.0, np.nan, -4.5])
+    data = PolyData()
+    data._unpack_content(sample.polydata_body(POINTS, TRIANGLES, name, values))
+    assert data.name == name
+    np.testing.assert_array_equal(data.points, POINTS)
+    np.testing.assert_array_equal(data.polygons, [[3, 0, 1, 2], [3, 2, 1, 3]])
+    np.testing.assert_array_equal(data.values, values.astype(np.float32))
+
+
+def test_a_client_receives_pose_surface_and_stress(monkeypatch):
+    """From the tracker's results by WebSocket and by OpenIGTLink to pyigtl's client."""
+    monkeypatch.setitem(igtl.message_type_to_class_constructor, "POLYDATA", PolyData)
+    model, publisher, server = held_block_model(), WebSocketPublisher(), socket.create_server(("127.0.0.1", 0))
+    sink = StreamSink([publisher]).begin({"block": model}, CAMERA)
+    relay = threading.Thread(target=sample.relay, args=(publisher.place, server))
+    relay.start()
+    viewer = pyigtl.OpenIGTLinkClient("127.0.0.1", server.getsockname()[1])
+    stretch, slide, received, number, end = 0.1, 0.004, {}, 0, time.monotonic() + 30.0
+    try:
+        while set(received) != {"block_pose", "block"}:
+            assert time.monotonic() < end
+            sink(tracked_frame(number, 12.25, block=tracked_result(model, stretch, slide)))
+            number += 1
+            time.sleep(0.02)
+            received |= {message.device_name: message for message in viewer.get_latest_messages()}
+    finally:
+        viewer.stop()
+        publisher.close()
+        relay.join(20)
+    pose, surface = received["block_pose"], received["block"]
+    assert (pose.message_type, surface.message_type) == ("TRANSFORM", "POLYDATA")
+    assert pose.timestamp == pytest.approx(12.25)
+    np.testing.assert_allclose(pose.matrix[:3, :3], POSE.rotation, atol=1e-6)
+    np.testing.assert_allclose(pose.matrix[:3, 3], 1e3 * POSE.translation, atol=1e-4)
+    np.testing.assert_allclose(surface.points, 1e3 * vertices_at(model, stretch, slide), atol=1e-4)
+    np.testing.assert_array_equal(surface.polygons[:, 1:], model.triangles)
+    assert surface.name == "von Mises stress"
+    np.testing.assert_allclose(surface.values, 1e-6 * stress_at(stretch, slide), rtol=1e-5)
