@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from morph_dslam import load_camera, load_model
+from tests.support.live_camera import LivePage
 from tests.support.rendered_anchored import FRAMES, SCAN
 from tests.support.studio import Client, running_studio
 
@@ -140,6 +141,45 @@ def test_the_video_is_tracked_from_the_place(studio, placed):
             for k, pose, mu in found
         ]
     assert np.median(off) < 3e-3
+
+
+@pytest.mark.slow
+def test_a_live_camera_is_tracked_from_the_place(studio, placed):
+    """The frames after the scan come from a camera, each when the picture of the one before has come; no pairs."""
+    client, folder, truth = studio
+    client.call("accept_place", despite_ambiguity=True)
+    sent = list(range(SCAN, min(SCAN + 12, FRAMES)))
+    with LivePage(client.port, "/api/camera", client.own) as camera:
+        jpegs = []
+        for number in sent:
+            image = cv2.imread(str(sorted((folder / "frames").iterdir())[number]))
+            jpegs.append(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 92])[1].tobytes())
+        camera.send(0, jpegs[0])
+        camera.wait_for("seen", 0)
+        client.call("go_live")
+        while not client.state()["job"]["what"].startswith("tracking"):
+            assert client.state()["job"]["running"], client.state()["job"]
+            time.sleep(0.1)
+        for number, jpeg in enumerate(jpegs):
+            camera.send(number, jpeg)
+            camera.picture_of(number)
+        client.call("stop")
+    assert "--map map/map.h5 --registration place/registration.json" in job_of(client)["command"]
+    model = load_model(folder / "model.morph")
+    with h5py.File(folder / "run/result.h5") as file:
+        states = list(
+            zip(file["status"].asstr()[()], file["camera_from_object"][()], file["parameters"][()], strict=True)
+        )
+    off = [
+        errors(model, truth["camera_from_object"][k], pose, (mu, truth["parameters"][k])).mean()
+        for k, (status, pose, mu) in zip(sent, states, strict=True)
+        if status == "tracked"
+    ]
+    assert len(off) > 0.8 * len(sent)
+    assert np.median(off) < 3e-3
+    assert client.state()["choices"]["recording"] == "live"
+    assert client.call("scan")["source"] == "frames"  # what the map is of
+    (folder / "studio.json").write_text(json.dumps(client.state()["choices"] | {"recording": "frames"}))
 
 
 def test_a_place_that_is_written_anew_is_accepted_anew(studio, placed):

@@ -82,7 +82,7 @@ class Client:
     """
 
     def __init__(self, server):
-        self._server = server
+        self._server, self.port = server, server.port
         self.own = {
             "Host": f"127.0.0.1:{server.port}",
             "Cookie": f"morph_studio_{server.port}={server.token}",

@@ -13,6 +13,7 @@ from morph_dslam.studio import clicks, project as names, recording
 from morph_dslam.studio.jobs import Jobs
 from morph_dslam.studio.live import LiveRelay, Size
 from morph_dslam.studio.project import Project
+from morph_dslam.studio.scan_steps import ScanSteps
 from morph_dslam.studio.worker import Worker
 
 #: Bytes of frames of a run that are kept; those beyond are tracked only.
@@ -28,6 +29,7 @@ class LiveSteps:
     project : the folder.
     worker : reads files.
     jobs : runs `morph live`.
+    scan : may give the start in place of pairs.
 
     Attributes
     ----------
@@ -35,8 +37,8 @@ class LiveSteps:
     actions : by name.
     """
 
-    def __init__(self, project: Project, worker: Worker, jobs: Jobs) -> None:
-        self._project, self._worker, self._jobs = project, worker, jobs
+    def __init__(self, project: Project, worker: Worker, jobs: Jobs, scan: ScanSteps) -> None:
+        self._project, self._worker, self._jobs, self._scan = project, worker, jobs, scan
         self.relay = LiveRelay(self._wanted_size, self._keep)
         self.actions: dict[str, Callable[..., Awaitable[Any]]] = {
             "take_frame": self.take_frame,
@@ -89,25 +91,35 @@ class LiveSteps:
         return {"recording": names.LIVE}
 
     async def go_live(self, snap: bool = False, outline: bool = False) -> dict[str, Any]:
-        """Start `morph live` with the camera that sends, from the frame that the pairs were clicked on."""
+        """Start `morph live` with the camera that sends, from the frame with pairs, or from the place in the scan."""
         self._jobs.check_idle()
-        for name, message in (
-            (names.MODEL, "build the model first"),
-            (names.CAMERA, "calibrate the camera, or drop its file"),
-            (names.LANDMARKS, "take a frame, click pairs on it, and save them"),
-        ):
-            if not self._project.has(name):
-                raise StudioError(f"{name} is not there: {message}")
+        self._need(names.MODEL, "build the model first")
+        self._need(names.CAMERA, "calibrate the camera, or drop its file")
         if self.relay.newest is None:
             raise StudioError(self.relay.facts()["refused"] or _NO_CAMERA)
-        socket, reference = await self.relay.listen(), await self._write_reference()
-        words = ["live", str(socket), "--model", names.MODEL, "--camera", names.CAMERA, "--landmarks", names.LANDMARKS]
-        flags = {"--at-rest": self._project.choices.get("at_rest", True), "--snap": snap, "--outline": outline}
-        words += [flag for flag, is_set in flags.items() if is_set]
-        words += ["--reference-image", reference, "--frame-log", names.FRAME_LOG, "--overwrite"]
+        words = ["live", str(await self.relay.listen()), "--model", names.MODEL, "--camera", names.CAMERA]
+        if self._scan.is_chosen:
+            words += self._scan.track_words()
+            self._emptied()
+            self._project.choose(recording=names.LIVE, reference_frame=None)
+        else:
+            words += await self._pairs_words(snap)
+        words += ["--outline"] if outline else []
+        words += ["--frame-log", names.FRAME_LOG, "--overwrite", "-o", names.RUN]
         self._project.path(names.FRAME_LOG).unlink(missing_ok=True)
-        await self._jobs.start("live", [*words, "-o", names.RUN])
+        await self._jobs.start("live", words)
         return {}
+
+    def _need(self, name: str, message: str) -> None:
+        if not self._project.has(name):
+            raise StudioError(f"{name} is not there: {message}")
+
+    async def _pairs_words(self, snap: bool) -> list[str]:
+        """The options of `morph live` that start from pairs, in their frame."""
+        self._need(names.LANDMARKS, "take a frame, click pairs on it, and save them")
+        flags = {"--at-rest": self._project.choices.get("at_rest", True), "--snap": snap}
+        words = ["--landmarks", names.LANDMARKS, *(flag for flag, is_set in flags.items() if is_set)]
+        return [*words, "--reference-image", await self._write_reference()]
 
     async def _write_reference(self) -> str:
         """Write the frame that the pairs belong to as number 0 of the frames to come; returns its name."""

@@ -90,7 +90,14 @@ class ScanSteps:
         return {}
 
     def _source(self) -> str:
-        """Name of the recording that is the scan."""
+        """Name of the recording that the map is of, also where another one has come since; or would be of."""
+        mapped = self._project.choices.get("mapped")
+        if isinstance(mapped, str) and self._project.has(mapped):
+            return mapped
+        return self._source_to_map()
+
+    def _source_to_map(self) -> str:
+        """Name of the recording that a map would be made of."""
         chosen = self._project.choices.get("scan")
         if isinstance(chosen, str) and self._project.has(f"{names.SCAN}/{chosen}"):
             return f"{names.SCAN}/{chosen}"
@@ -138,7 +145,7 @@ class ScanSteps:
         """Start `morph slam` with the frames up to one; a place in an earlier map is forgotten."""
         self._jobs.check_idle()
         _, camera = self._model_and_camera()
-        source = self._source()
+        source = self._source_to_map()
         facts = await self._worker.call(recording.recording_facts, self._project.path(source))
         lens = await self._worker.call(camera_facts, camera)
         if (facts["width"], facts["height"]) != (lens["width"], lens["height"]):
@@ -153,12 +160,13 @@ class ScanSteps:
         words = ["slam", source, "--camera", names.CAMERA]
         words += [] if last is None else ["--range", f"{first}-{last}"]
         await self._jobs.start("slam", [*words, "--no-video", "--overwrite", "-o", _MAP.partition("/")[0]])
-        self._project.choose(scan_last=last)
+        self._project.choose(scan_last=last, mapped=source)
         return {}
 
     def _forget_map(self) -> None:
         self._forget_place()
         self._project.path(_MAP_SUMMARY).unlink(missing_ok=True)
+        self._project.choose(mapped=None)
 
     def _forget_place(self) -> None:
         self._project.path(_PLACE).unlink(missing_ok=True)

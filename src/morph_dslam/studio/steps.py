@@ -48,8 +48,8 @@ class Steps:
         self._changed = asyncio.Event()
         self._jobs = Jobs(project.folder, self._tell)
         self._ended = False
-        self.live = LiveSteps(project, self._worker, self._jobs)
         self.scan = ScanSteps(project, self._worker, self._jobs)
+        self.live = LiveSteps(project, self._worker, self._jobs, self.scan)
         self.actions: dict[str, Callable[..., Awaitable[Any]]] = {
             name: getattr(self, name)
             for name in (

@@ -72,7 +72,7 @@ export async function trackStep(app) {
   const shown = new RunPicture(picture, mesh, colours);
   const live = liveView(app, picture, () => drawJob(app.state.job));
   liveParts.append(el('h3', {}, 'Live'), ...live.parts, goLive,
-    command('morph live … --reference-image live/000000.png --frame-log track.jsonl -o run'));
+    command(`morph live … ${byScan ? '' : '--reference-image live/000000.png '}--frame-log track.jsonl -o run`));
   live.isCovered = () => !showsLive();
   const plot = makePlots(plots, model);
 
