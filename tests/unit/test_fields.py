@@ -4,6 +4,7 @@ from math import radians
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from morph_dslam.errors import ParameterError, StudyError
 from morph_dslam.mechanics.point_location import material_points
@@ -58,6 +59,19 @@ def test_values_and_gradients_are_the_sums_that_define_the_format(form, bases, m
     expected = [function_values(functions, mu, orders) for orders in np.eye(3, dtype=int)]
     np.testing.assert_allclose(gradient, expected, rtol=1e-10, atol=1e-10)
     assert functions.n_functions == 7
+
+
+@pytest.mark.parametrize(("precision", "tolerance"), [(np.float64, 1e-13), (np.float32, 1e-6)])
+def test_placed_points_are_moved_turned_and_shifted(precision, tolerance):
+    """More numbers than are added up at a time, and modes that are no multiple of four."""
+    rng, functions = np.random.default_rng(5), make_functions(FORMATS[0])
+    field = SeparatedField(rng.normal(size=(7, 301, 3)).astype(precision), functions)
+    rest, shift = rng.normal(size=(301, 3)), rng.normal(size=3)
+    turn = Rotation.from_rotvec([0.3, -1.1, 0.7])
+    displacement = np.einsum("mpx,m->px", field.modes.astype(float), function_values(functions, MU))
+    expected = turn.apply(rest + displacement) + shift
+    scale = np.abs(displacement).max()
+    np.testing.assert_allclose(field.placed(rest, MU, turn.as_matrix(), shift), expected, atol=tolerance * scale)
 
 
 @every_format

@@ -39,6 +39,48 @@ def combine_modes(rows, modes):
     return result
 
 
+#: Numbers that are added up at a time: they stay in the processor's nearest memory meanwhile.
+_AT_A_TIME = 384
+
+
+@njit(cache=True, nogil=True)
+def placed_points(row, rest, modes, rotation, translation):
+    """Points moved by a field and then by a rigid motion (n, 3), compiled; sums are in the modes' precision.
+
+    Parameters
+    ----------
+    row : (m,) values of the functions.
+    rest : (n, 3) points
+    modes : (m, n, 3) at them, same unit.
+    rotation, translation : (3, 3) and (3,).
+    """
+    m, size = len(row), 3 * len(rest)
+    result, flat_rest, flat_modes = np.empty((len(rest), 3)), rest.reshape(size), modes.reshape(m, size)
+    numbers, sums = row.astype(modes.dtype), np.empty(_AT_A_TIME, modes.dtype)
+    whole = m - m % 4
+    for begin in range(0, size, _AT_A_TIME):
+        count = min(_AT_A_TIME, size - begin)
+        end = begin + count
+        sums[:] = 0.0
+        for i in range(0, whole, 4):
+            a, b, c, d = numbers[i], numbers[i + 1], numbers[i + 2], numbers[i + 3]
+            first, second = flat_modes[i, begin:end], flat_modes[i + 1, begin:end]
+            third, fourth = flat_modes[i + 2, begin:end], flat_modes[i + 3, begin:end]
+            for k in range(count):
+                sums[k] += a * first[k] + b * second[k] + c * third[k] + d * fourth[k]
+        for i in range(whole, m):
+            a, first = numbers[i], flat_modes[i, begin:end]
+            for k in range(count):
+                sums[k] += a * first[k]
+        for k in range(0, count, 3):
+            x, y, z = (flat_rest[begin + k] + sums[k], flat_rest[begin + k + 1] + sums[k + 1],
+                       flat_rest[begin + k + 2] + sums[k + 2])  # fmt: skip
+            for j in range(3):
+                moved = rotation[j, 0] * x + rotation[j, 1] * y + rotation[j, 2] * z + translation[j]
+                result[(begin + k) // 3, j] = moved
+    return result
+
+
 @dataclass(frozen=True)
 class SeparatedField:
     """U(X, mu) = sum_i F_i(X) H_i(mu), the paper's separated representation.
@@ -76,6 +118,18 @@ class SeparatedField:
         """The field (n_points, n_components) at parameters ``mu`` (d,)."""
         rows = self.functions.rows(self._state(mu, outside))
         return combine_modes(rows[:1], self.modes.reshape(self.n_modes, -1)).reshape(self.modes.shape[1:])
+
+    def placed(self, rest: Array, mu: ArrayLike, rotation: Array, translation: Array) -> Array:
+        """Points (n_points, 3) moved by the bounded field at ``mu`` (d,), then turned and shifted.
+
+        Parameters
+        ----------
+        rest : (n_points, 3), in the field's unit.
+        rotation, translation : (3, 3), and (3,) in the field's unit.
+        """
+        row = self.functions.rows(self._state(mu, "bounded"))[0]
+        rest, modes, rotation, translation = map(np.ascontiguousarray, (rest, self.modes, rotation, translation))
+        return placed_points(row, rest, modes, rotation, translation)
 
     def value_and_sensitivities(self, mu: ArrayLike, outside: Outside = "bounded") -> tuple[Array, Array]:
         """The field (n_points, n_components) and its derivatives (d, n_points, n_components).

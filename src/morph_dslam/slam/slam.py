@@ -49,6 +49,7 @@ class Slam:
     ----------
     camera : the camera of the undistorted images
     frame_images : makes these of the frames
+    newest_view : the newest frame, made ready; None before the first
     map : what is known of the scene; replaced when a young map is given up
     n_restarts : how many young maps were given up
     is_frozen : whether the map is kept as it is
@@ -65,6 +66,7 @@ class Slam:
         self.options = options or SlamOptions()
         self.frame_images = FrameImages(camera, with_depth)
         self.camera = self.frame_images.camera
+        self.newest_view: FrameView | None = None
         self.is_frozen, self.frozen_at = False, None
         self.n_restarts, self.threaded = 0, threaded
         self._begin(RigidMap(self.frame_images.baseline_px))
@@ -137,6 +139,7 @@ class Slam:
         with frame_clock(STAGES) as clock:
             with stage("prepare"):
                 view = self.frame_images.prepare(image, index, timestamp, depth, right)
+                self.newest_view = view
             with stage("map"):
                 self._making.advance()
             frame = self._locate(view)

@@ -28,7 +28,7 @@ from morph_dslam.slam.rolling_shutter import RowPoses
 from morph_dslam.slam.slam import Slam
 from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR
 from morph_dslam.tracking.estimator import Estimator, Prior, moved
-from morph_dslam.tracking.hypothesis import PoseHypothesis
+from morph_dslam.tracking.hypothesis import Image, PoseHypothesis
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.reference import ReferenceView
 
@@ -127,6 +127,13 @@ class Anchor:
                 seen_at = self._rows.where_seen(place.world_from_object.apply(place.centre))
                 poses[name] = replace(frame.pose, camera_from_world=seen_at)
         return {name: place.pose_prior(poses[name]) for name, place in self._places.items()}, frame
+
+    def image_for(self, camera: Camera) -> Image | None:
+        """The frame that was located last as a tracker with this camera takes it; None if it is of another one."""
+        view = self.slam.newest_view
+        if view is None or self.slam.frame_images.camera != camera:
+            return None
+        return Image(view.grey, view.normalized)
 
 
 def _check_places(movable: Mapping[str, NDArray[np.bool_]]) -> None:

@@ -97,10 +97,10 @@ def _closes_a_volume(nodes: Array, triangles: NDArray[np.int64]) -> bool:
 
 def view_of(model: ReducedModel, camera: Camera, state: State, discrepancy: Discrepancy | None = None) -> View:
     """Deform, place and project the mesh; with what its shape has beyond the model's, if that is known."""
-    positions = model.positions(state.parameters)
+    pose = state.camera_from_object
+    nodes = model.displacement.placed(model.nodes, model.vector(state.parameters), pose.rotation, pose.translation)
     if discrepancy is not None:
-        positions = positions + discrepancy.displacement(model.nodes)
-    nodes = state.camera_from_object.apply(positions)
+        nodes = nodes + discrepancy.displacement(model.nodes) @ pose.rotation.T
     return View(nodes, camera.project(nodes))
 
 

@@ -90,7 +90,7 @@ class JumpDetector:
         self._limit, self._reach = LEAST_SHARE * diagonal, REACH * diagonal
         self._places, self._rows, self._first, self._plane = _surroundings(rest, self._reach)
         apart = np.linalg.norm(self._places[:, None] - self._places, axis=2)
-        self._near = (apart < self._reach).astype(int)
+        self._near = (apart < self._reach).astype(np.float64)
         self._samples = _spread(rest, SAMPLES)
         self._shapes = np.empty((0, len(self._samples), 3))
         self._steps: list[Array] = []

@@ -157,8 +157,9 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
 
 #: Pyramid levels that reach as far as a correction may: a quarter of the size, with windows of 17 pixels.
 CORRECTION_LEVELS = 2
-#: Points that are followed from frame to frame, at most: for a state from which all of them are within reach.
-N_FOLLOWED = 200
+#: Points that are followed from frame to frame for each unknown, for a state from which all of them are within reach;
+#: at least and at most so many.
+FOLLOWED_A_UNKNOWN, LEAST_FOLLOWED, MOST_FOLLOWED = 8, 64, 200
 #: Patches compared are (2 PATCH_HALF + 1) pixels wide.
 PATCH_HALF = 7
 PATCH_WINDOW = 2 * PATCH_HALF + 1

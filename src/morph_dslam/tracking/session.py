@@ -77,8 +77,8 @@ class Session:
         frame, first = frames[0], next(iter(self.trackers.values()))
         first.camera.check_image(frame.image, f"frame {frame.index}")
         poses, camera = self._anchor.locate(frame.image, frame.index, frame.timestamp)
-        why = str(camera.reason or "")
-        return {name: CameraLocalization(poses.get(name), why, camera.total_ms) for name in self._anchor.names}
+        why, image = str(camera.reason or ""), self._anchor.image_for(first.camera)
+        return {name: CameraLocalization(poses.get(name), why, camera.total_ms, image) for name in self._anchor.names}
 
     def track(self, frames: tuple[Frame, ...], localizations: Localizations) -> TrackedFrame:
         """Find the objects in frames that `locate` has seen."""

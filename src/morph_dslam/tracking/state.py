@@ -57,7 +57,8 @@ class BoundPoints:
 
     def in_camera(self, state: State) -> Array:
         """Positions (p, 3) in the camera frame, metres."""
-        return state.camera_from_object.apply(self.rest + self.field.value(state.parameters))
+        pose = state.camera_from_object
+        return self.field.placed(self.rest, state.parameters, pose.rotation, pose.translation)
 
 
 def moved(state: State, step: Array) -> State:

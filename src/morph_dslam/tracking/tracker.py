@@ -27,7 +27,7 @@ from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetect
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
 from morph_dslam.tracking.frame_estimation import at_constant_velocity, new_filter, with_unobservable_at_default
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, own_spread, reject
-from morph_dslam.tracking.measurement import N_FOLLOWED, Followed
+from morph_dslam.tracking.measurement import FOLLOWED_A_UNKNOWN, LEAST_FOLLOWED, MOST_FOLLOWED, Followed
 from morph_dslam.tracking.model_error import with_model_error
 from morph_dslam.tracking.options import MODEL_ERROR_ALONE, TrackerOptions
 from morph_dslam.tracking.outcomes import (
@@ -73,11 +73,13 @@ class CameraLocalization:
     pose_prior : of the object; None for a free one, or where the camera is lost.
     why_lost : why the camera is; empty if it is not.
     milliseconds : that it took.
+    image : the frame made ready, where it was needed for that by the same camera.
     """
 
     pose_prior: PosePrior | None = None
     why_lost: str = ""
     milliseconds: float = 0.0
+    image: Image | None = None
 
 
 class Tracker:
@@ -175,7 +177,7 @@ class Tracker:
         """
         camera = localization or self.locate(frame)
         with frame_clock(STAGES) as clock:
-            image = self._prepare(frame, occluder_depth)
+            image = self._prepare(frame, occluder_depth, camera.image)
             prior = self._predict(camera)
             followed = self._follow(image, prior)
             hypothesis = self._match(image, followed, prior)
@@ -206,7 +208,8 @@ class Tracker:
         if self.anchor is None:
             return CameraLocalization()
         poses, camera = self.anchor.locate(frame.image, frame.index, frame.timestamp)
-        return CameraLocalization(next(iter(poses.values()), None), str(camera.reason or ""), camera.total_ms)
+        image = self.anchor.image_for(self.camera)
+        return CameraLocalization(next(iter(poses.values()), None), str(camera.reason or ""), camera.total_ms, image)
 
     def _from_scene(self) -> Image:
         """Take what the scene shows of the object, and its map, and return the reference image."""
@@ -222,14 +225,14 @@ class Tracker:
 
     # -- the steps of a frame -----------------------------------------------------------------------------
 
-    def _prepare(self, frame: Frame | NDArray[np.uint8], occluder_depth: NDArray[np.float32] | None) -> Image:
+    def _prepare(
+        self, frame: Frame | NDArray[np.uint8], occluder_depth: NDArray[np.float32] | None, ready: Image | None
+    ) -> Image:
         """Undistort and normalize contrast; the first frame is the reference if none was given."""
         with stage("prepare"):
-            if isinstance(frame, Frame):
-                depth = frame.depth if self.options.use_depth else None
-                image = replace(self._prepared(frame.image), depth=depth, occluder_depth=occluder_depth)
-            else:
-                image = replace(self._prepared(frame), occluder_depth=occluder_depth)
+            depth = frame.depth if isinstance(frame, Frame) and self.options.use_depth else None
+            image = ready or self._prepared(frame.image if isinstance(frame, Frame) else frame)
+            image = replace(image, depth=depth, occluder_depth=occluder_depth)
             if self._views is None:
                 self._begin(image)
             return image
@@ -246,7 +249,8 @@ class Tracker:
             return None
         with stage("flow"):
             rows = np.flatnonzero(self._supported)
-            rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), N_FOLLOWED)).astype(np.int64)]
+            count = min(max(FOLLOWED_A_UNKNOWN * len(self.estimator.scale), LEAST_FOLLOWED), MOST_FOLLOWED, len(rows))
+            rows = rows[np.linspace(0, len(rows) - 1, count).astype(np.int64)]
             last = self.reference.projected(self._last)
             guesses = self._pixels + self._expected_motion(last, prior)
             found, ok = follow(self._image.normalized, image.normalized, self._pixels[rows], guesses[rows])
