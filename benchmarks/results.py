@@ -215,6 +215,24 @@ BENCHMARKS = {
         "python benchmarks/live.py --minutes 1",
         "none: frame rate, latency and memory only",
     ),
+    "phone": Benchmark(
+        "Tracking",
+        "A phone's browser as the camera",
+        "python benchmarks/phone.py",
+        SAME_MODEL,
+        f"{NOISE}, sent as JPEG; landmarks exact",
+        1,
+        "Two headless browsers without a graphics card share the two cores with the tracker: a phone would do its part "
+        "by itself. Latency is from the camera's frame until its picture is on the page, with the object drawn over it.",
+    ),
+    "streams": Benchmark(
+        "Tracking",
+        "What streams cost",
+        "python benchmarks/streams.py",
+        "none: times over those of the same run without a stream",
+        "",
+        5,
+    ),
     "alternatives": Benchmark(
         "Tracking", "The tracker beside plain alternatives", "python benchmarks/alternatives.py", SAME_MODEL, NOISE, 20
     ),
