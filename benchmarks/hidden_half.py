@@ -39,11 +39,11 @@ BEFORE = {"left": 17.6, "right": 27.1, "lower": 7.8, "upper": 7.1}
 BEYOND, GREY = 9, 128
 #: The models by name: whether they are bicubic, and what is allowed for beyond them.
 METHODS = {
-    "physics": (False, md.TrackerOptions(use_outline=True)),
-    "physics_model_error": (False, md.TrackerOptions(use_outline=True, use_model_error=True)),
-    "physics_discrepancy": (False, md.TrackerOptions(use_outline=True, use_discrepancy=True)),
-    "polynomial": (True, md.TrackerOptions(use_outline=True)),
-    "polynomial_discrepancy": (True, md.TrackerOptions(use_outline=True, use_discrepancy=True)),
+    "physics": (False, {}),
+    "physics_model_error": (False, {"use_model_error": True}),
+    "physics_discrepancy": (False, {"use_discrepancy": True}),
+    "polynomial": (True, {}),
+    "polynomial_discrepancy": (True, {"use_discrepancy": True}),
 }
 
 
@@ -63,9 +63,9 @@ def polynomial_sheet(model: md.ReducedModel, reference: np.ndarray) -> md.Reduce
     return md.ReducedModel("bicubic sheet", model.nodes, model.triangles, parameters, displacement)
 
 
-def tracked(data: Path, frames: Path, model: Path, method: tuple[bool, md.TrackerOptions], folder: Path) -> None:
+def tracked(data: Path, frames: Path, model: Path, method: tuple[bool, dict[str, bool]], folder: Path) -> None:
     """Track the pictures of a folder; the results are kept in ``folder``."""
-    bicubic, tracker = method
+    bicubic, beyond = method
     own = [data / name if (data / name).is_file() else KINECT / name for name in ("camera.yaml", "landmarks.csv")]
     md.track(
         md.TrackOptions(
@@ -81,7 +81,7 @@ def tracked(data: Path, frames: Path, model: Path, method: tuple[bool, md.Tracke
             at_rest=bicubic,
             video=False,
             overwrite=True,
-            tracker=tracker,
+            tracker=md.TrackerOptions(use_outline=True, **beyond),
         )
     )
 

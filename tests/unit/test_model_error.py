@@ -27,7 +27,7 @@ def test_the_state_is_that_of_generalised_least_squares():
     """Points, some of which count along one direction only, and with different weights; one does not count."""
     rng = np.random.default_rng(3)
     model = bent_sheet_model(22, 16)
-    points, estimator = bound_points(model, 80, 3), Estimator(model, CAMERA)
+    points, estimator = bound_points(model, 80, rng), Estimator(model, CAMERA)
     rest = points.rest
     smooth = 1.5 * np.sin(rest[:, :2] / 0.07)
     pixels = CAMERA.project(points.in_camera(TRUTH)) + smooth + 0.3 * rng.standard_normal((80, 2))
