@@ -27,15 +27,9 @@ MOST_ALIKE = 20.0
 
 @dataclass(frozen=True)
 class _Covariance:
-    """Of the residuals (2 p,) of a frame: W^-1 + F F' in units of the noise's variance.
+    """Of the residuals (2 p,) of a frame, W^-1 + F F' in units of the noise's: W and F' W, and the root of 1 + F' W F.
 
     Its inverse is W - W F (1 + F' W F)^-1 F' W, by Woodbury's identity.
-
-    Attributes
-    ----------
-    weights : (2 p,), the diagonal of W; zero for what does not count.
-    loads : (k, 2 p), F' W.
-    root : (k, k), lower, of 1 + F' W F.
     """
 
     weights: Array
@@ -54,8 +48,7 @@ class _Covariance:
         factor[directed] = np.einsum("pi,pj,pjkr->pikr", normals, normals, factor[directed])
         flat, weights = factor.reshape(2 * len(used), -1), np.repeat(np.where(used, measured.weights, 0.0), 2)
         loads = np.ascontiguousarray((weights[:, None] * flat).T)
-        root = np.linalg.cholesky(np.eye(len(loads)) + loads @ flat)
-        return cls(weights, loads, np.asarray(root, dtype=np.float64))
+        return cls(weights, loads, np.linalg.cholesky(np.eye(len(loads)) + loads @ flat))
 
     def reduced(self, rows: Array) -> Array:
         """The part of F' W rows (2 p, n) by whose squares the products with W are too large."""
