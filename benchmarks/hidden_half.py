@@ -3,8 +3,7 @@
 The recording is that of examples/kinect_paper, with measured points. From its second frame on, one half of the sheet is
 painted grey, the left, right, lower and upper one in turn. The same tracker follows the other half with the example's
 model of the sheet, and with bicubic displacements of the flat sheet without any mechanics, both with and without a
-discrepancy, and the sheet's also with errors of the model allowed for. The errors are those of the measured points on
-the hidden half.
+discrepancy. The errors are those of the measured points on the hidden half.
 Which pixels are painted comes from a run over the whole pictures; nothing else does.
 Run: python benchmarks/hidden_half.py --data FOLDER
 """
@@ -37,13 +36,12 @@ HALVES = {"left": (0, -1.0), "right": (0, 1.0), "lower": (1, -1.0), "upper": (1,
 BEFORE = {"left": 17.6, "right": 27.1, "lower": 7.8, "upper": 7.1}
 #: Painted beyond the half's edge on all sides, pixels, and the grey.
 BEYOND, GREY = 9, 128
-#: The models by name: whether they are bicubic, and what is allowed for beyond them.
+#: The models by name: whether they are bicubic, and have a discrepancy.
 METHODS = {
-    "physics": (False, {}),
-    "physics_model_error": (False, {"use_model_error": True}),
-    "physics_discrepancy": (False, {"use_discrepancy": True}),
-    "polynomial": (True, {}),
-    "polynomial_discrepancy": (True, {"use_discrepancy": True}),
+    "physics": (False, False),
+    "physics_discrepancy": (False, True),
+    "polynomial": (True, False),
+    "polynomial_discrepancy": (True, True),
 }
 
 
@@ -63,9 +61,9 @@ def polynomial_sheet(model: md.ReducedModel, reference: np.ndarray) -> md.Reduce
     return md.ReducedModel("bicubic sheet", model.nodes, model.triangles, parameters, displacement)
 
 
-def tracked(data: Path, frames: Path, model: Path, method: tuple[bool, dict[str, bool]], folder: Path) -> None:
+def tracked(data: Path, frames: Path, model: Path, method: tuple[bool, bool], folder: Path) -> None:
     """Track the pictures of a folder; the results are kept in ``folder``."""
-    bicubic, beyond = method
+    bicubic, discrepancy = method
     own = [data / name if (data / name).is_file() else KINECT / name for name in ("camera.yaml", "landmarks.csv")]
     md.track(
         md.TrackOptions(
@@ -81,7 +79,7 @@ def tracked(data: Path, frames: Path, model: Path, method: tuple[bool, dict[str,
             at_rest=bicubic,
             video=False,
             overwrite=True,
-            tracker=md.TrackerOptions(use_outline=True, **beyond),
+            tracker=md.TrackerOptions(use_outline=True, use_discrepancy=discrepancy),
         )
     )
 

@@ -79,16 +79,3 @@ def test_half_a_sheet_is_followed_that_its_model_does_not_quite_describe(model):
     assert errors[:, hidden].mean() < 15e-3
     # The deviations that are stated say how far off it is.
     assert 0.5 < np.sqrt(np.mean((errors / deviations)[:, hidden] ** 2)) < 2.0
-
-
-@pytest.mark.parametrize(("height", "sign"), [(0.3, -1.0), (1.0, 1.0)])
-def test_errors_of_the_model_bend_the_covered_half_less_where_they_are_allowed_for(model, height, sign):
-    hidden = sign * model.nodes[:, 1] > 0.0
-    without = followed(model, height, sign, use_outline=True)[0][:, hidden].mean()
-    errors, deviations = followed(model, height, sign, use_outline=True, use_model_error=True)
-    assert errors[:, hidden].mean() < 0.96 * without
-    assert 0.4 < np.sqrt(np.mean((errors / deviations)[:, hidden] ** 2)) < 2.0
-
-
-def test_a_model_that_is_right_stays_right_where_errors_of_it_are_allowed_for(model):
-    assert followed(model, 0.0, 1.0, use_model_error=True)[0].mean() < 0.1e-3

@@ -164,7 +164,6 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
         use_depth=arguments.depth,
         use_discrepancy=arguments.discrepancy,
         use_unknown_loads=arguments.unknown_loads is not None,
-        use_model_error=arguments.model_error,
         estimation=EstimationOptions(loads=LoadOptions(work=arguments.unknown_loads or None)),
         start=arguments.start,
         new_views=not arguments.one_view,
@@ -283,12 +282,6 @@ def add_tracking_arguments(command: argparse.ArgumentParser, required: bool = Tr
         metavar="JOULES",
         help="estimate loads that the study does not foresee, by [unknown_loads] of its model: what presses or pulls "
         "and how hard; likely ones do about this work (default: found from the sequence)",
-    )
-    add_flag(
-        command,
-        "--model-error",
-        "allow for errors of the model, which are alike in neighbouring points: for objects of which a large part is "
-        "hidden and that the model does not quite describe",
     )
     add_flag(
         command,

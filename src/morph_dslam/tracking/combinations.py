@@ -8,7 +8,7 @@ from pathlib import Path
 from morph_dslam.errors import TrackingError
 from morph_dslam.registration.registration import Registration
 from morph_dslam.streams.destinations import check_destination
-from morph_dslam.tracking.options import MODEL_ERROR_ALONE, NO_DISCREPANCY, NO_LOADS, NO_MODEL_ERROR, NOT_IN_EQUILIBRIUM
+from morph_dslam.tracking.options import NO_DISCREPANCY, NO_LOADS, NOT_IN_EQUILIBRIUM
 from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
 from morph_dslam.tracking.setup import TrackedObject
 from morph_dslam.tracking.shown_field import shown_field
@@ -128,8 +128,6 @@ OF_RUN: tuple[tuple[Callable[[TrackOptions], bool], str], ...] = (
         f"{NOT_IN_EQUILIBRIUM}: leave out --show, or --discrepancy",
     ),
     (lambda run: bool(run.other_cameras) and any(part.tracker.use_unknown_loads for part in run.objects), NO_LOADS),
-    (lambda run: bool(run.other_cameras) and any(part.tracker.use_model_error for part in run.objects), NO_MODEL_ERROR),
-    (lambda run: any(part.tracker.allows_twice for part in run.objects), MODEL_ERROR_ALONE),
     (
         lambda run: (
             run.reference_frame is not None

@@ -105,7 +105,7 @@ def reject(hypothesis: PoseHypothesis, options: TrackerOptions) -> Rejection | N
     spread = hypothesis.estimate.sigma_px
     if count >= needed:
         few, limit = count < MOST_AGREE * len(hypothesis.inliers), options.few_sigma_px
-        if few and spread > limit and own_spread(hypothesis) > limit:
+        if few and spread > limit and _own_spread(hypothesis) > limit:
             return Rejection(RejectionReason.LOOSE_AGREEMENT, count, visible, spread_px=spread)
         return None
     if hypothesis.prior is None:
@@ -118,7 +118,7 @@ def reject(hypothesis: PoseHypothesis, options: TrackerOptions) -> Rejection | N
     return Rejection(RejectionReason.NO_COMMON_SHAPE, count, found, spread_px=spread)
 
 
-def own_spread(hypothesis: PoseHypothesis) -> float:
+def _own_spread(hypothesis: PoseHypothesis) -> float:
     """Robust standard deviation of a pixel coordinate of the supporting points, without what neighbours have in common.
 
     It is that of the difference between a point and the one nearest to it, over the root of two.

@@ -28,7 +28,7 @@ from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.levenberg_marquardt import minimise
 from morph_dslam.tracking.measurement import PATCH_WINDOW
 from morph_dslam.tracking.noise import RigObservations
-from morph_dslam.tracking.options import NO_DISCREPANCY, NO_MODEL_ERROR, TrackerOptions
+from morph_dslam.tracking.options import NO_DISCREPANCY, TrackerOptions
 from morph_dslam.tracking.outcomes import (
     CameraIgnored,
     CameraLost,
@@ -254,8 +254,6 @@ class RigTracker:
         self.cameras, self.options = tuple(cameras), options or TrackerOptions()
         if self.options.use_discrepancy:
             raise TrackingError(NO_DISCREPANCY)
-        if self.options.use_model_error:
-            raise TrackingError(NO_MODEL_ERROR)
         self.estimator = RigEstimator(self.model, self.cameras, self.options.estimation)
         error_factors = error_factors_of(registration.covariance, self.estimator.scale)
         # What earlier frames add is found from all cameras together.

@@ -20,12 +20,6 @@ NOT_IN_EQUILIBRIUM = (
     "stress and strain are not drawn on a shape with a discrepancy, which is not in equilibrium under the study's loads"
 )
 NO_LOADS = "unknown loads are estimated from one camera: leave out --unknown-loads or --with"
-NO_MODEL_ERROR = "the model's error is allowed for with one camera: leave out --model-error or --with"
-#: Why it does not go with what else explains, or carries on, what the model leaves.
-MODEL_ERROR_ALONE = (
-    "--model-error allows for what the model leaves: leave it out, or else --discrepancy, --unknown-loads, "
-    "--per-sequence and --random-walk"
-)
 NO_DISCREPANCY = "the discrepancy is estimated from one camera: leave out --discrepancy or --with"
 
 
@@ -60,7 +54,6 @@ class TrackerOptions:
     depth_sigma : standard deviation of one pixel's depth at 1 m, metres; it grows with the distance squared.
     use_discrepancy : whether to look for what the object's shape has beyond the model's.
     use_unknown_loads : whether loads that the study does not foresee are estimated too (`estimation.loads`).
-    use_model_error : whether the state allows for what the model is off by, which is alike in neighbours.
     per_sequence : names of the parameters that are one over the whole sequence.
     random_walk : names of parameters that hardly change from frame to frame, each with the standard deviation
         of the change, SI: a prior on them. None by default.
@@ -92,7 +85,6 @@ class TrackerOptions:
     use_depth: bool = False
     use_discrepancy: bool = False
     use_unknown_loads: bool = False
-    use_model_error: bool = False
     per_sequence: tuple[str, ...] = ()
     random_walk: tuple[tuple[str, float], ...] = ()
     modulus_std: float = 0.0
@@ -103,9 +95,3 @@ class TrackerOptions:
     depth_sigma: float = SIGMA_AT_1M
     discrepancy: DiscrepancyOptions = field(default_factory=DiscrepancyOptions)
     estimation: EstimationOptions = field(default_factory=EstimationOptions)
-
-    @property
-    def allows_twice(self) -> bool:
-        """Whether the model's errors are allowed for together with what else explains them, or carries them on."""
-        others = self.use_discrepancy or self.use_unknown_loads or bool(self.per_sequence) or bool(self.random_walk)
-        return self.use_model_error and others

@@ -357,7 +357,6 @@ def _facts(run: TrackOptions, files: ObjectOptions, part: PlacedObject, results:
         "depth_used": options.use_depth,
         "discrepancy_used": options.use_discrepancy,
         "unknown_loads_used": options.use_unknown_loads,
-        "model_error_used": options.use_model_error,
         "pose": options.pose if scene is not None or options.pose == "still" else "free",
         "settings": {"click_px": run.click_px, "tracker": asdict(options)},
     }

@@ -21,15 +21,13 @@ from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import Anchor, Anchoring
-from morph_dslam.tracking.covariance import LEAST_SPREAD_PX
 from morph_dslam.tracking.discrepancy import DiscrepancyFit
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetector, largest_jump
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
 from morph_dslam.tracking.frame_estimation import at_constant_velocity, new_filter, with_unobservable_at_default
-from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, own_spread, reject
+from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.measurement import FOLLOWED_A_UNKNOWN, LEAST_FOLLOWED, MOST_FOLLOWED, Followed
-from morph_dslam.tracking.model_error import with_model_error
-from morph_dslam.tracking.options import MODEL_ERROR_ALONE, TrackerOptions
+from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import (
     CameraLost,
     FewPointsAgree,
@@ -138,8 +136,6 @@ class Tracker:
         self._discrepancy = DiscrepancyFit(self.model, camera, sought) if use else None
         self._filter = new_filter(self.estimator, self.options)
         self._unfiltered = np.zeros((len(self.model.parameters) + 6,) * 2)
-        if self.options.allows_twice:
-            raise TrackingError(MODEL_ERROR_ALONE)
         if registration.scene is not None and self.options.pose == "still":
             raise TrackingError(
                 "an object in a mapped scene stands still in its map already, and the camera need not: take the pose "
@@ -189,8 +185,6 @@ class Tracker:
             if rejection is None:
                 hypothesis = self._refine(image, hypothesis, camera)
             self._update(image, hypothesis, rejection, camera)
-            if rejection is None and self.options.use_model_error:
-                hypothesis = self._allow_for_model_error(hypothesis)
             result = self._result(hypothesis, found_by, rejection, camera)
             change = self._choose_view(image, hypothesis, result)
         times = clock.milliseconds | {"locate": camera.milliseconds}
@@ -333,16 +327,6 @@ class Tracker:
         if camera.pose_prior is not None and not hypothesis.outline_alone:
             self._anchoring.note(self._anchoring.contradicts(camera.pose_prior, hypothesis))
         return hypothesis
-
-    def _allow_for_model_error(self, hypothesis: PoseHypothesis) -> PoseHypothesis:
-        """Correct the state for what the model is off by; the next frame starts from what was found without this."""
-        if hypothesis.outline_alone:
-            return hypothesis
-        with stage("estimate"):
-            whole, n = self.last_measured, len(hypothesis.inliers)
-            own = max(own_spread(hypothesis), LEAST_SPREAD_PX)
-            found = with_model_error(self.estimator, whole, hypothesis.estimate, own, hypothesis.prior)
-            return replace(hypothesis, estimate=replace(found, residuals=found.residuals[:n]))
 
     def _update(
         self, image: Image, hypothesis: PoseHypothesis, rejection: Rejection | None, camera: CameraLocalization
