@@ -223,7 +223,7 @@ BENCHMARKS = {
         f"{NOISE}, sent as JPEG; landmarks exact",
         1,
         "Two headless browsers without a graphics card share the two cores with the tracker: a phone would do its part "
-        "by itself. Latency is from the camera's frame until its picture is on the page, with the object drawn over it.",
+        "by itself. Latency is from the camera's frame until its picture, drawn over, is on the page.",
     ),
     "streams": Benchmark(
         "Tracking",
