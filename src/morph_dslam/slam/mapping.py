@@ -12,7 +12,6 @@ import sys
 import threading
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,8 +122,8 @@ def redundancy(rigid_map: RigidMap, numbers: Indices) -> NDArray[np.float64]:
 
 #: Map points that are found in a smaller share of the frames that should show them are taken out.
 LEAST_FOUND = 0.1
-#: Iterations of local bundle adjustment, and those before its pause: about half of what is needed.
-LOCAL_ITERATIONS, FIRST_ITERATIONS = 10, 3
+#: Iterations of local bundle adjustment.
+LOCAL_ITERATIONS = 10
 
 
 class Mapper:
@@ -152,7 +151,7 @@ class Mapper:
             scaled = pose.copy()
             scaled[:3, 3] *= scale
             self._map.add_keyframe(Keyframe.of_view(view.frame, scaled, Followed(ids.copy(), view.pixels)))
-        do_all(self._adjust_locally())
+        self._adjust_locally()
         self._add_corners(2, start.views[2].frame)
         for keyframe, view in zip(self._map.keyframes, start.views, strict=True):
             do_all(keyframe.describe(view.frame.grey))
@@ -169,7 +168,7 @@ class Mapper:
         return self._choice.wants(tracked, frame_index)
 
     def insert(self, tracked: Tracked, view: FrameView) -> Work:
-        """Keep a view: its points, then the adjustment, then new corners, then its description.
+        """Keep a view: its points and the adjustment, then new corners, then its description.
 
         Points that have left the rigid scene are taken out: when an object comes back to where it was, its
         points must not hold the camera.
@@ -179,8 +178,7 @@ class Mapper:
         self._points.place_by_depth(number, view.depth)
         self._points.triangulate(number)
         self._points.fuse(number)
-        yield
-        yield from self._adjust_locally()
+        self._adjust_locally()
         self._cull()
         yield
         cull_keyframes(self._map)
@@ -204,19 +202,10 @@ class Mapper:
         self._points.place_by_depth(number, view.depth)
         self._choice.kept(number, view.index)
 
-    def _adjust_locally(self) -> Work:
-        """Bundle adjustment of the newest keyframes that see the same points, held by others that do; in two parts."""
+    def _adjust_locally(self) -> None:
+        """Bundle adjustment of the newest keyframes that see the same points, held by others that do."""
         window, holders = local_window(self._map)
-        problem = gather(self._map, self._intrinsics, window, holders, FIRST_ITERATIONS, self._hold_poses)
-        found = problem.solve()
-        yield
-        problem = replace(
-            problem,
-            camera_from_world=found.camera_from_world,
-            positions=found.points,
-            iterations=LOCAL_ITERATIONS - FIRST_ITERATIONS,
-        )
-        put_back(self._map, problem, problem.solve())
+        self._adjust(window, holders, LOCAL_ITERATIONS)
 
     def _adjust(self, free: Indices, fixed: Indices, iterations: int) -> None:
         problem = gather(self._map, self._intrinsics, free, fixed, iterations, self._hold_poses)
