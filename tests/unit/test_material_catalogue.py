@@ -53,6 +53,12 @@ def test_tango_plus_has_its_author_s_shear_modulus():
     assert 2 * (number(section["c10"]) + number(section["c01"])) == pytest.approx(0.2e6, rel=0.15)
 
 
+def test_the_mold_stars_of_shore_15_and_16_are_about_as_stiff():
+    """Two data sets, two laws, two makes of nearly one hardness: initial shear moduli 2 c10 within a fifth."""
+    fifteen, sixteen = (number(ENTRIES[f"mold_star_{shore}"].section["c10"]) for shore in (15, 16))
+    assert fifteen == pytest.approx(sixteen, rel=0.2)
+
+
 def test_liver_has_its_shear_modulus():
     assert 2 * number(ENTRIES["liver"].section["c10"]) == pytest.approx(1.8e3)
 
