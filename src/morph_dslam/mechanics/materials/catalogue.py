@@ -85,7 +85,7 @@ _CATALOGUE: tuple[CataloguedMaterial, ...] = (
         section={"law": "mooney_rivlin", "c10": "48.3 kPa", "bulk": "96.7 MPa", "density": "1080 kg/m3"},
         source="shear modulus 96.7 kPa fitted here to the depth image of a bar that hangs by its own weight "
         "(examples/diffcal_silicone)",
-        note=f"Bending under own weight. A coarse mesh of linear tetrahedra gives half of it, because it locks. {_BULK}",
+        note=f"Bending under own weight. Coarse linear tetrahedra, which lock, give half of it. {_BULK}",
     ),
     CataloguedMaterial(
         name="dragon_skin_10",
